@@ -1,0 +1,41 @@
+"""High-order geometric integrators for nonholonomic mechanical systems, in JAX."""
+
+from . import systems as systems
+from ._errors import (
+    ConstraintViolationError as ConstraintViolationError,
+    DependentConstraintsError as DependentConstraintsError,
+    DTypeError as DTypeError,
+    IncompatibleConstraintsError as IncompatibleConstraintsError,
+    IntegrationError as IntegrationError,
+    IrregularLagrangianError as IrregularLagrangianError,
+    NewtonError as NewtonError,
+    NonFiniteError as NonFiniteError,
+    ShapeError as ShapeError,
+)
+from ._integrate import integrate as integrate
+from ._interpolation import DenseInterpolation as DenseInterpolation
+from ._manifold import AbstractLieGroup as AbstractLieGroup, Euclidean as Euclidean
+from ._method import (
+    AbstractMethod as AbstractMethod,
+    Gauss as Gauss,
+    LobattoIIIAB as LobattoIIIAB,
+    PartitionedRungeKutta as PartitionedRungeKutta,
+)
+from ._newton import (
+    AbstractStageSolver as AbstractStageSolver,
+    Newton as Newton,
+    SimplifiedNewton as SimplifiedNewton,
+)
+from ._progress_meter import (
+    AbstractProgressMeter as AbstractProgressMeter,
+    NoProgressMeter as NoProgressMeter,
+    TextProgressMeter as TextProgressMeter,
+    TqdmProgressMeter as TqdmProgressMeter,
+)
+from ._saveat import SaveAt as SaveAt
+from ._solution import RESULTS as RESULTS, Solution as Solution
+from ._state import initial_state as initial_state, State as State
+from ._system import LagrangianSystem as LagrangianSystem
+
+
+__version__ = "0.1.0"

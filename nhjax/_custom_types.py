@@ -1,0 +1,17 @@
+"""Aliases for the arrays and scalars that appear in public signatures."""
+
+from collections.abc import Callable
+from typing import Any, TypeAlias
+
+from jaxtyping import Array, Bool, Float, Int
+import numpy as np
+
+
+FloatScalar: TypeAlias = Float[Array, ""]
+FloatScalarLike: TypeAlias = float | int | Float[Array, ""] | np.ndarray
+IntScalar: TypeAlias = Int[Array, ""]
+BoolScalar: TypeAlias = Bool[Array, ""]
+Args: TypeAlias = Any
+
+# L(t, q, v, args) -> (),  Φ(t, q, v, args) -> () or (m,),  F(t, q, v, args) -> (n,)
+PhaseFunction: TypeAlias = Callable[[Any, Any, Any, Any], Any]

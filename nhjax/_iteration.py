@@ -1,0 +1,115 @@
+"""The loop that ends at round-off, and Newton's method for small dense problems."""
+
+from collections.abc import Callable
+from typing import Generic, NamedTuple, TypeVar
+
+import jax
+from jax.flatten_util import ravel_pytree
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int, PyTree
+
+from ._custom_types import BoolScalar, FloatScalar, FloatScalarLike
+
+
+X = TypeVar("X")
+Aux = TypeVar("Aux")
+
+
+class Solved(NamedTuple, Generic[X, Aux]):
+    """The outcome of an iteration: `aux` belongs to the last evaluation."""
+
+    x: X
+    aux: Aux
+    converged: BoolScalar
+    num_iterations: Int[Array, ""]
+
+
+class _Progress(NamedTuple):
+    smallest: FloatScalar
+    stalls: Int[Array, ""]
+    count: Int[Array, ""]
+    done: BoolScalar
+    converged: BoolScalar
+
+
+def iterate(
+    sweep: Callable[[X], tuple[X, FloatScalar, Aux]],
+    x: X,
+    *,
+    max_iterations: int,
+    tolerance: FloatScalarLike = 0.0,
+    skip: Bool[Array, ""] | bool = False,
+) -> Solved[X, Aux]:
+    """Repeat `sweep` until its increments no longer fall.
+
+    `sweep(x)` returns the next iterate, the relative size of the increment, and
+    whatever was evaluated at x. An increment below the unit round-off (or `tolerance`)
+    ends the iteration; so do small increments that have ceased to fall, since that is
+    round-off speaking. The floor of round-off depends on the conditioning of the
+    problem, so that one absolute threshold would be either too coarse or never met
+    (Hairer, Lubich, Wanner, GNI, section VIII.6): the more often increments fail to
+    fall, the larger a floor is believed.
+    """
+    aux_shape = jax.eval_shape(lambda x: sweep(x)[2], x)
+    aux = jax.tree.map(lambda s: jnp.zeros(s.shape, s.dtype), aux_shape)
+    dtype = jnp.result_type(*[leaf.dtype for leaf in jax.tree.leaves(x)])
+    eps = jnp.finfo(dtype).eps
+    floor = jnp.maximum(jnp.asarray(eps, dtype), jnp.asarray(tolerance, dtype))
+    patience = 30.0
+
+    def body(carry):
+        x, _, progress = carry
+        x_next, size, aux = sweep(x)
+        finite = jnp.isfinite(size)
+        stalls = progress.stalls + (size >= progress.smallest).astype(jnp.int32)
+        smallest = jnp.minimum(size, progress.smallest)
+        count = progress.count + 1
+        believed = jnp.minimum(eps * patience ** stalls.astype(dtype), eps**0.5)
+        stagnant = (stalls >= 1) & (progress.smallest <= believed)
+        converged = finite & ((size <= floor) | stagnant)
+        done = converged | ~finite | (count >= max_iterations)
+        return x_next, aux, _Progress(smallest, stalls, count, done, converged)
+
+    zero = jnp.zeros((), jnp.int32)
+    skip = jnp.asarray(skip)
+    start = _Progress(jnp.asarray(jnp.inf, dtype), zero, zero, skip, skip)
+    x, aux, progress = jax.lax.while_loop(
+        lambda carry: ~carry[2].done, body, (x, aux, start)
+    )
+    return Solved(x, aux, progress.converged, progress.count)
+
+
+def dense_increment(
+    residual: Callable[[Float[Array, " k"]], tuple[Float[Array, " k"], Aux]],
+    x: Float[Array, " k"],
+) -> tuple[Float[Array, " k"], Aux]:
+    """The Newton increment -J⁻¹ r at x with the exact Jacobian J by autodiff."""
+
+    def evaluated_twice_is_once(x):
+        r, aux = residual(x)
+        return r, (r, aux)
+
+    jacobian, (r, aux) = jax.jacfwd(evaluated_twice_is_once, has_aux=True)(x)
+    return jnp.linalg.solve(jacobian, -r), aux
+
+
+def relative_size(increment: Array, x: Array) -> FloatScalar:
+    """max |δ| / max |x|, with a zero x measured absolutely."""
+    scale = jnp.max(jnp.abs(x))
+    return jnp.max(jnp.abs(increment)) / jnp.where(scale > 0, scale, 1)
+
+
+def root(
+    residual: Callable[[X], PyTree[Array]], x0: X, max_iterations: int = 30
+) -> Solved[X, None]:
+    """A root of `residual` near `x0`, to round-off, by Newton's method."""
+    flat, unravel = ravel_pytree(x0)
+
+    def sweep(x):
+        dx, _ = dense_increment(
+            lambda z: (ravel_pytree(residual(unravel(z)))[0], None), x
+        )
+        return x + dx, relative_size(dx, x), None
+
+    solved = iterate(sweep, flat, max_iterations=max_iterations)
+    return solved._replace(x=unravel(solved.x))

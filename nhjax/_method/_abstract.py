@@ -1,0 +1,225 @@
+"""The interface of a method: its coefficients and what is known of them."""
+
+import abc
+import math
+import operator
+
+import equinox as eqx
+import numpy as np
+from jax.typing import ArrayLike
+from jaxtyping import Array, Float
+
+from nhjax._method import _basis, _conditions
+from nhjax._method._closure import Closure, make_closure
+from nhjax._method._conditions import Hypotheses, SimplifyingAssumptions
+from nhjax._method._tableau import Tableau
+
+
+MULTIPLIERS = ("propagated", "consistent", "symmetric")
+
+_STATEMENTS = {
+    "H1": "H1 (a_1j = 0, first stage at t_k)",
+    "H2": "H2 (the submatrix of a_ij with i, j >= 2 is invertible)",
+    "H3": "H3 (a_sj = b_j, last stage at t_{k+1})",
+}
+
+# R_A(∞) of a user's tableau is a ratio of sums of products of float64 coefficients. At
+# s = 12 the rounding of those of Lobatto IIIA moves it by less than 1e-10.
+_UNIT_TOLERANCE = 1e-9
+
+
+class AbstractMethod(eqx.Module):
+    """A symplectic partitioned Runge-Kutta method: (a, b) for q, its conjugate for p.
+
+    All of its data is static: a method is hashable, has no array leaves, can be a
+    static argument of `jax.jit`, and equals any other with the same data. Coefficients
+    are computed in 60 digits and rounded once. A subclass has `stages`, `multiplier`
+    and `_tableau`, and is final.
+    """
+
+    stages: eqx.AbstractVar[int]
+    multiplier: eqx.AbstractVar[str]
+
+    @abc.abstractmethod
+    def _tableau(self) -> Tableau:
+        """The tableau, one object for all equal methods."""
+
+    @property
+    def a(self) -> np.ndarray:
+        """a_ij, read-only float64 of shape (s, s)."""
+        return self._tableau().a
+
+    @property
+    def b(self) -> np.ndarray:
+        """b_j, read-only float64 of shape (s,)."""
+        return self._tableau().b
+
+    @property
+    def c(self) -> np.ndarray:
+        """c_i, read-only float64 of shape (s,)."""
+        return self._tableau().c
+
+    @property
+    def a_hat(self) -> np.ndarray:
+        """â_ij = b_j (1 - a_ji / b_i), read-only float64 of shape (s, s)."""
+        return self._tableau().a_hat
+
+    @property
+    def orders(self) -> SimplifyingAssumptions:
+        """The simplifying assumptions B(p), C(q), D(r) and CĈ(Q) that hold."""
+        return _conditions.simplifying_assumptions(self._tableau())
+
+    @property
+    def order(self) -> int:
+        """min(p, 2q, q + r), the order of q and p by the paper's theorem."""
+        p, q, r, _ = self.orders
+        return min(p, 2 * q, q + r)
+
+    @property
+    def hypotheses(self) -> Hypotheses:
+        """Which of H1, H2, H3, needed by systems with constraints, hold."""
+        return _conditions.hypotheses(self._tableau())
+
+    @property
+    def is_symmetric(self) -> bool:
+        """Whether a_{s+1-i,s+1-j} + a_ij = b_j: a step of -h undoes a step of h."""
+        return _conditions.is_symmetric(self._tableau())
+
+    @property
+    def stability_at_infinity(self) -> float:
+        """R_A(∞), the limit of the stability function of (a, b); inf if unbounded."""
+        return _conditions.stability_at_infinity(self._tableau())
+
+    @property
+    def multiplier_order(self) -> int:
+        """The order of the multiplier that a solution reports.
+
+        `"propagated"`: q of C(q), less one if R_A(∞) = 1 (the paper's theorem on global
+        convergence). Otherwise the multiplier is the continuous one, as exact as the
+        state.
+
+        **Raises:** a `ValueError` as `require_constraint_hypotheses` does.
+        """
+        self.require_constraint_hypotheses()
+        if self.multiplier != "propagated":
+            return self.order
+        accumulates = abs(self.stability_at_infinity - 1) <= _UNIT_TOLERANCE
+        return self.orders.C - int(accumulates)
+
+    @property
+    def closure(self) -> Closure:
+        """How the multipliers of a step follow from its unknowns; see `Closure`.
+
+        **Raises:** a `ValueError` as `require_constraint_hypotheses` does.
+        """
+        self.require_constraint_hypotheses()
+        return make_closure(self._tableau(), self.multiplier == "symmetric")
+
+    def basis(self, theta: ArrayLike) -> Float[Array, "*batch s"]:
+        """The Lagrange basis ℓ_1(θ), ..., ℓ_s(θ) on the nodes c.
+
+        **Arguments:**
+
+        - `theta`: θ = (t - t_k) / h, of any shape, traceable; beyond [0, 1] it
+            extrapolates.
+
+        **Returns:**
+
+        An array of shape `theta.shape + (s,)` and of the dtype of `theta`.
+
+        **Raises:**
+
+        A `ValueError` if two nodes coincide.
+        """
+        return _basis.lagrange(self._tableau(), theta)
+
+    def integrated_basis(self, theta: ArrayLike) -> Float[Array, "*batch s"]:
+        """∫_0^θ ℓ_j: the weights of a collocation polynomial at t_k + θ h.
+
+        At θ = 0 it is exactly 0, and at θ = 1 exactly `b` for a collocation method, so
+        dense output meets the states at both ends. Arguments, result and errors are
+        those of `basis`.
+        """
+        return _basis.integrated_lagrange(self._tableau(), theta)
+
+    def require_constraint_hypotheses(self) -> None:
+        """Check that the method can integrate systems with constraints.
+
+        H1, H2 and H3 (the paper's section on holonomic constraints) make the first and
+        last stages the states at t_k and t_{k+1} and the multipliers solvable. Carried
+        multipliers stay bounded if |R_A(∞)| <= 1; the symmetric closure needs a
+        symmetric tableau and |R_A(∞)| = 1.
+
+        **Raises:**
+
+        A `ValueError` naming the first condition that fails.
+        """
+        for name, holds in self.hypotheses._asdict().items():
+            if not holds:
+                self._reject(f"hypothesis {_STATEMENTS[name]} fails; use LobattoIIIAB")
+        size = abs(self.stability_at_infinity)
+        if self.multiplier == "propagated" and size > 1 + _UNIT_TOLERANCE:
+            self._reject(
+                "multiplier='propagated' needs |R_A(∞)| <= 1, the factor that a step "
+                f"applies to an error in the multiplier, and it is {size:.6g}; "
+                "use multiplier='consistent'"
+            )
+        if self.multiplier != "symmetric":
+            return
+        alternatives = "use multiplier='propagated' or 'consistent'"
+        if not math.isclose(size, 1, rel_tol=_UNIT_TOLERANCE):
+            self._reject(
+                f"multiplier='symmetric' needs |R_A(∞)| = 1, and it is {size:.6g}; "
+                + alternatives
+            )
+        if not self.is_symmetric:
+            self._reject(
+                "multiplier='symmetric' needs a symmetric tableau "
+                "(a_{s+1-i,s+1-j} + a_ij = b_j); " + alternatives
+            )
+
+    def _reject(self, reason: str) -> None:
+        raise ValueError(
+            f"{type(self).__name__}(stages={self.stages}) cannot integrate a "
+            f"constrained system: {reason}"
+        )
+
+
+def check_stages(stages: int, minimum: int, method: str) -> int:
+    """`stages` as an int.
+
+    **Arguments:**
+
+    - `stages`: the number of stages s.
+    - `minimum`: the fewest that the method can have.
+    - `method`: its name, for the error.
+
+    **Raises:**
+
+    A `TypeError` if it is no integer, a `ValueError` if it is less than `minimum`.
+    """
+    try:
+        if isinstance(stages, bool):
+            raise TypeError
+        count = operator.index(stages)
+    except TypeError:
+        raise TypeError(
+            f"stages of {method} must be an int, got {stages!r} of type "
+            f"{type(stages).__name__}"
+        ) from None
+    if count < minimum:
+        raise ValueError(f"stages of {method} must be >= {minimum}, got {count}")
+    return count
+
+
+def check_multiplier(multiplier: str) -> str:
+    """`multiplier` if it is one of `MULTIPLIERS`.
+
+    **Raises:**
+
+    A `ValueError` that lists the choices.
+    """
+    if multiplier not in MULTIPLIERS:
+        choices = ", ".join(repr(m) for m in MULTIPLIERS)
+        raise ValueError(f"multiplier must be one of {choices}, got {multiplier!r}")
+    return multiplier

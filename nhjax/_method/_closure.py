@@ -1,0 +1,82 @@
+"""How the multipliers of one step follow from as many unknowns as it has equations.
+
+The constraint at stage 1 holds by hypothesis H1, which leaves (s - 1) equations per
+constraint for s multipliers. A closure writes
+
+    (Λ^1, ..., Λ^s) = start λ_k + end λ_{k+1} + E y,    y of s - 1 entries,
+
+and the leading part of the constraints' linearisation is A_{2:,:} E.
+"""
+
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+
+from nhjax._method._conditions import stability_at_infinity
+from nhjax._method._precision import CONTEXT, to_float64
+from nhjax._method._tableau import Tableau
+
+
+@dataclass(frozen=True, eq=False)
+class Closure:
+    """The closure of the multipliers; read-only float64 arrays, compared by identity.
+
+    **Fields:**
+
+    - `E`: shape (s, s-1), the weights of the unknowns y.
+    - `start`: shape (s,), the weights of the multiplier λ_k at t_k.
+    - `end`: shape (s,), the weights of the continuous multiplier λ_c(q_{k+1}, p_{k+1}).
+    - `schur_inverse`: shape (s-1, s-1), the inverse of A_{2:,:} E.
+    """
+
+    E: np.ndarray
+    start: np.ndarray
+    end: np.ndarray
+    schur_inverse: np.ndarray
+
+
+@lru_cache(maxsize=128)
+def make_closure(t: Tableau, symmetric: bool) -> Closure:
+    """The closure of a tableau that satisfies H1, H2 and H3.
+
+    Unless symmetric, Λ^1 = λ_k and y = (Λ^2, ..., Λ^s): the equations of the paper. The
+    symmetric one has y = (ν, Λ^2, ..., Λ^{s-1}), Λ^1 = λ_k + ν and Λ^s = λ_{k+1} + σ ν.
+    A step back exchanges the two ends and maps ν to σ ν, so it retraces the step if
+    σ = ±1. Of these σ = -R_A(∞) is the one with A_{2:,:} E invertible: the solutions of
+    Σ_j a_ij Λ^j = 0, i >= 2, have Λ^s = R_A(∞) Λ^1.
+
+    **Arguments:**
+
+    - `t`: the tableau.
+    - `symmetric`: whether to make the symmetric closure; needs R_A(∞) = ±1.
+
+    **Returns:**
+
+    A `Closure`, the same object at every call.
+
+    !!! example
+
+        >>> from nhjax._method._tableau import lobatto_tableau
+        >>> make_closure(lobatto_tableau(3), symmetric=True).E.tolist()
+        [[1.0, 0.0], [0.0, 1.0], [-1.0, 0.0]]
+    """
+    s = t.stages
+    e = CONTEXT.matrix(s, s - 1)
+    end = [CONTEXT.mpf(0)] * s
+    if symmetric:
+        e[0, 0] = CONTEXT.one
+        e[s - 1, 0] = CONTEXT.mpf(-round(stability_at_infinity(t)))
+        end[s - 1] = CONTEXT.one
+        for i in range(1, s - 1):
+            e[i, i] = CONTEXT.one
+    else:
+        for i in range(1, s):
+            e[i, i - 1] = CONTEXT.one
+    schur = CONTEXT.matrix(t.mp_a.tolist()[1:]) * e
+    return Closure(
+        E=to_float64(e),
+        start=to_float64([CONTEXT.one] + [CONTEXT.mpf(0)] * (s - 1)),
+        end=to_float64(end),
+        schur_inverse=to_float64(CONTEXT.inverse(schur)),
+    )

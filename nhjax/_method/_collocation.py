@@ -1,0 +1,82 @@
+"""The collocation methods: the Lobatto IIIA-IIIB pair and Gauss."""
+
+import equinox as eqx
+
+from nhjax._method._abstract import AbstractMethod, check_multiplier, check_stages
+from nhjax._method._tableau import gauss_tableau, lobatto_tableau, Tableau
+
+
+class LobattoIIIAB(AbstractMethod):
+    """The Lobatto IIIA-IIIB pair: order 2s - 2, symmetric, for any system.
+
+    Lobatto IIIA (a, b) for q and its symplectic conjugate, Lobatto IIIB (â, b), for p:
+    the paper's methods. s = 2 is the trapezoidal rule with its conjugate, that is
+    Störmer-Verlet for a separable Lagrangian.
+
+    !!! example
+
+        >>> method = LobattoIIIAB(stages=3)
+        >>> method.order, method.orders
+        (4, SimplifyingAssumptions(B=4, C=3, D=1, mixed=3))
+    """
+
+    stages: int = eqx.field(static=True)
+    multiplier: str = eqx.field(static=True)
+
+    def __init__(self, stages: int, multiplier: str = "symmetric"):
+        """
+        **Arguments:**
+
+        - `stages`: s >= 2.
+        - `multiplier`: how the constraints' multipliers are closed from step to step.
+            `"propagated"` carries Λ^s to the next step as its Λ^1 (the paper's);
+            `"consistent"` starts each step from the continuous multiplier of the state;
+            `"symmetric"` does so at both ends, up to one unknown that makes the step
+            symmetric, and remembers nothing but the state.
+
+        **Raises:**
+
+        A `TypeError` if `stages` is no integer; a `ValueError` if it is less than 2, or
+        if `multiplier` is not one of the three.
+        """
+        self.stages = check_stages(stages, 2, "LobattoIIIAB")
+        self.multiplier = check_multiplier(multiplier)
+
+    def _tableau(self) -> Tableau:
+        return lobatto_tableau(self.stages)
+
+
+class Gauss(AbstractMethod):
+    """The Gauss methods: order 2s, symplectic and symmetric, without constraints.
+
+    (a, b) is its own symplectic conjugate. Its stages do not include the ends of the
+    step (H1 and H3 fail), so with constraints it is refused.
+
+    !!! example
+
+        >>> method = Gauss(stages=2)
+        >>> method.order, method.hypotheses
+        (4, Hypotheses(H1=False, H2=True, H3=False))
+    """
+
+    stages: int = eqx.field(static=True)
+
+    def __init__(self, stages: int):
+        """
+        **Arguments:**
+
+        - `stages`: s >= 1.
+
+        **Raises:**
+
+        A `TypeError` if `stages` is no integer, a `ValueError` if it is less than 1.
+        """
+        self.stages = check_stages(stages, 1, "Gauss")
+
+    @property
+    def multiplier(self) -> str:
+        """`"symmetric"`, as is every method's default; Gauss never has constraints."""
+        return "symmetric"
+
+    def _tableau(self) -> Tableau:
+        return gauss_tableau(self.stages)

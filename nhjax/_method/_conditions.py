@@ -1,0 +1,234 @@
+"""What a tableau satisfies: order conditions, hypotheses, symmetry, stability.
+
+The simplifying assumptions are those of Butcher (Hairer, Lubich, Wanner, "Geometric
+Numerical Integration", II.1) and the mixed one of L. Jay ("Symplectic partitioned
+Runge-Kutta methods for constrained Hamiltonian systems", SIAM J. Numer. Anal. 33,
+1996):
+
+    B(p):  Σ_i b_i c_i^{k-1} = 1/k                               k = 1..p
+    C(q):  Σ_j a_ij c_j^{k-1} = c_i^k / k                        k = 1..q
+    D(r):  Σ_i b_i c_i^{k-1} a_ij = b_j (1 - c_j^k) / k          k = 1..r
+    CĈ(Q): Σ_j Σ_l a_ij â_jl c_l^{k-2} = c_i^k / (k (k-1))       k = 2..Q
+"""
+
+import math
+from collections.abc import Callable
+from functools import lru_cache
+from typing import NamedTuple
+
+from nhjax._method._precision import CONTEXT, Matrix, Number
+from nhjax._method._tableau import Tableau
+
+
+class SimplifyingAssumptions(NamedTuple):
+    """The largest p, q, r and Q for which B(p), C(q), D(r) and CĈ(Q) hold.
+
+    `mixed` is Q; it is 1, the empty assumption, when even k = 2 fails. No quadrature of
+    s stages has an order above 2s, and none of the four is searched beyond it.
+    """
+
+    B: int
+    C: int
+    D: int
+    mixed: int
+
+
+class Hypotheses(NamedTuple):
+    """Which hypotheses on (a, b) hold for systems with constraints.
+
+    - `H1`: a_1j = 0, the first stage is the state at t_k.
+    - `H2`: the submatrix (a_ij), i, j >= 2, is invertible.
+    - `H3`: a_sj = b_j, the last stage is the state at t_{k+1}.
+    """
+
+    H1: bool
+    H2: bool
+    H3: bool
+
+
+def _powers(c: list[Number], exponent: int) -> list[Number]:
+    return [x**exponent if exponent else CONTEXT.mpf(1) for x in c]
+
+
+def _times(a: Matrix, x: list[Number]) -> list[Number]:
+    return [CONTEXT.fdot(zip(row, x, strict=True)) for row in a.tolist()]
+
+
+def _largest(defects: Callable[[int], list[Number]], first: int, t: Tableau) -> int:
+    """The largest k for which the defects of orders `first`..k are all round-off."""
+    k = first
+    while k <= 2 * t.stages and all(abs(d) <= t.tolerance for d in defects(k)):
+        k += 1
+    return k - 1
+
+
+@lru_cache(maxsize=128)
+def simplifying_assumptions(t: Tableau) -> SimplifyingAssumptions:
+    """The orders B(p), C(q), D(r) of (a, b, c) and CĈ(Q) of the pair (a, â).
+
+    **Arguments:**
+
+    - `t`: the tableau.
+
+    **Returns:**
+
+    A `SimplifyingAssumptions`.
+
+    !!! example
+
+        >>> from nhjax._method._tableau import lobatto_tableau
+        >>> simplifying_assumptions(lobatto_tableau(3))
+        SimplifyingAssumptions(B=4, C=3, D=1, mixed=3)
+    """
+    a, a_hat, b, c = t.mp_a, t.mp_a_hat, t.mp_b, t.mp_c
+
+    def quadrature(k: int) -> list[Number]:
+        return [CONTEXT.fdot(zip(b, _powers(c, k - 1), strict=True)) - CONTEXT.one / k]
+
+    def stage(k: int) -> list[Number]:
+        sums = _times(a, _powers(c, k - 1))
+        return [left - x / k for left, x in zip(sums, _powers(c, k), strict=True)]
+
+    def transposed(k: int) -> list[Number]:
+        bc = [w * x for w, x in zip(b, _powers(c, k - 1), strict=True)]
+        ends = zip(_times(a.T, bc), b, _powers(c, k), strict=True)
+        return [left - w * (1 - x) / k for left, w, x in ends]
+
+    def mixed(k: int) -> list[Number]:
+        sums = _times(a, _times(a_hat, _powers(c, k - 2)))
+        ends = zip(sums, _powers(c, k), strict=True)
+        return [left - x / (k * (k - 1)) for left, x in ends]
+
+    return SimplifyingAssumptions(
+        B=_largest(quadrature, 1, t),
+        C=_largest(stage, 1, t),
+        D=_largest(transposed, 1, t),
+        mixed=_largest(mixed, 2, t),
+    )
+
+
+@lru_cache(maxsize=128)
+def hypotheses(t: Tableau) -> Hypotheses:
+    """The hypotheses H1, H2, H3 of the integrator for constrained systems.
+
+    **Arguments:**
+
+    - `t`: the tableau.
+
+    **Returns:**
+
+    A `Hypotheses` of booleans.
+
+    !!! example
+
+        >>> from nhjax._method._tableau import gauss_tableau
+        >>> hypotheses(gauss_tableau(2))
+        Hypotheses(H1=False, H2=True, H3=False)
+    """
+    s, a, b = t.stages, t.mp_a, t.mp_b
+    first = all(abs(a[0, j]) <= t.tolerance for j in range(s))
+    last = all(abs(a[s - 1, j] - b[j]) <= t.tolerance for j in range(s))
+    degree, _ = _leading_term(a.tolist(), range(1, s), t.tolerance)
+    return Hypotheses(H1=first, H2=degree == s - 1, H3=last)
+
+
+@lru_cache(maxsize=128)
+def is_symmetric(t: Tableau) -> bool:
+    """Whether a_{s+1-i,s+1-j} + a_ij = b_j, i.e. the method equals its adjoint.
+
+    Hairer, Lubich, Wanner, V.2.1. The conjugate â is then symmetric too. Applying the
+    identity twice gives b_{s+1-j} = b_j.
+
+    **Arguments:**
+
+    - `t`: the tableau.
+
+    **Returns:**
+
+    A bool.
+    """
+    s, a, b = t.stages, t.mp_a, t.mp_b
+    return all(
+        abs(a[s - 1 - i, s - 1 - j] + a[i, j] - b[j]) <= t.tolerance
+        for i in range(s)
+        for j in range(s)
+    )
+
+
+def is_symplectic_pair(t: Tableau, a_hat: Matrix) -> bool:
+    """Whether b_i â_ij + b_j a_ji = b_i b_j (Hairer, Lubich, Wanner, VI.4.1).
+
+    **Arguments:**
+
+    - `t`: the tableau (a, b).
+    - `a_hat`: the coefficients of the other method, an s x s mp matrix; its weights are
+        those of `t`.
+
+    **Returns:**
+
+    A bool.
+    """
+    s, a, b = t.stages, t.mp_a, t.mp_b
+    return all(
+        abs(b[i] * a_hat[i, j] + b[j] * a[j, i] - b[i] * b[j]) <= t.tolerance
+        for i in range(s)
+        for j in range(s)
+    )
+
+
+@lru_cache(maxsize=128)
+def stability_at_infinity(t: Tableau) -> float:
+    """R_A(∞), the limit of R(z) = det(I - zA + z 1 bᵀ) / det(I - zA) as z → ∞.
+
+    Hairer, Wanner, "Solving Ordinary Differential Equations II", IV.3, for any tableau,
+    A singular or not: the ratio of the leading coefficients.
+
+    **Arguments:**
+
+    - `t`: the tableau.
+
+    **Returns:**
+
+    A float; `inf` when the numerator has the higher degree (R is unbounded), 0 when the
+    denominator has.
+
+    !!! example
+
+        >>> from nhjax._method._tableau import lobatto_tableau
+        >>> [stability_at_infinity(lobatto_tableau(s)) for s in (2, 3, 4)]
+        [-1.0, 1.0, -1.0]
+    """
+    a, b, every = t.mp_a.tolist(), t.mp_b, range(t.stages)
+    shifted = [[x - w for x, w in zip(row, b, strict=True)] for row in a]
+    top, numerator = _leading_term(shifted, every, t.tolerance)
+    bottom, denominator = _leading_term(a, every, t.tolerance)
+    if top > bottom:
+        return math.inf
+    return float(numerator / denominator) if top == bottom else 0.0
+
+
+def _leading_term(
+    rows: list[list[Number]], keep: range, tolerance: Number
+) -> tuple[int, Number]:
+    """Degree and leading coefficient of z ↦ det(I - zM), M = rows restricted to `keep`.
+
+    By Faddeev and LeVerrier: det(I - zM) = 1 + f_1 z + ... + f_n z^n with
+    f_k = -tr(M N_k) / k, N_1 = I, N_{k+1} = M N_k + f_k I.
+    """
+    n = len(keep)
+    degree, leading = 0, CONTEXT.one
+    if n == 0:
+        return degree, leading
+    m = CONTEXT.matrix([[rows[i][j] for j in keep] for i in keep])
+    sums: list[Number] = [CONTEXT.fsum(row, absolute=True) for row in m.tolist()]
+    norm = max(sums)
+    auxiliary = CONTEXT.eye(n)
+    for k in range(1, n + 1):
+        product = m * auxiliary
+        f = -CONTEXT.fsum(product[i, i] for i in range(n)) / k
+        # f_k scales like the k-th power of M and falls like 1/(2n)!: zero is judged
+        # against the last coefficient that is not zero, never on an absolute scale.
+        if abs(f) > tolerance * abs(leading) * norm ** (k - degree):
+            degree, leading = k, f
+        auxiliary = product + f * CONTEXT.eye(n)
+    return degree, leading

@@ -1,0 +1,120 @@
+from abc import abstractmethod
+import sys
+from typing import Any
+
+import equinox as eqx
+import jax
+from jaxtyping import Array, Int
+import tqdm
+
+
+class AbstractProgressMeter(eqx.Module):
+    """Shows how many steps of a run are done, from inside the compiled loop."""
+
+    @abstractmethod
+    def update(self, done: int, total: int) -> None:
+        """Called on the host now and then, with done = total at the end."""
+
+    @property
+    def silent(self) -> bool:
+        """Whether there is nothing to show, so that the loop need not call back."""
+        return False
+
+    def report(self, k: Int[Array, ""], num_steps: int) -> None:
+        """Show, from inside a traced loop, that step `k` is complete."""
+        if self.silent:
+            return
+        # About a hundred calls a run: each one leaves the compiled program.
+        every = max(1, num_steps // 100)
+        done = k + 1
+
+        def callback(done):
+            self.update(int(done), num_steps)
+
+        jax.lax.cond(
+            (done % every == 0) | (done == num_steps) | (k == 0),
+            lambda: jax.debug.callback(callback, done),
+            lambda: None,
+        )
+
+
+class NoProgressMeter(AbstractProgressMeter):
+    """Shows nothing.
+
+    !!! example
+
+        >>> import nhjax
+        >>> nhjax.NoProgressMeter().silent
+        True
+    """
+
+    @property
+    def silent(self) -> bool:
+        """True."""
+        return True
+
+    def update(self, done: int, total: int) -> None:
+        """Do nothing."""
+
+
+class TextProgressMeter(AbstractProgressMeter):
+    """Prints a line for every tenth of the run.
+
+    !!! example
+
+        >>> import nhjax
+        >>> nhjax.TextProgressMeter().update(50, 100)
+        50 of 100 steps
+    """
+
+    def update(self, done: int, total: int) -> None:
+        """Print how many steps are done."""
+        every = max(1, total // 10)
+        if done == total or done % every < max(1, total // 100):
+            print(f"{done} of {total} steps", flush=True)
+
+
+class TqdmProgressMeter(AbstractProgressMeter):
+    """Shows a tqdm bar on the standard error stream.
+
+    **Arguments:**
+
+    - `description`: the text before the bar.
+
+    !!! example
+
+        >>> import nhjax
+        >>> nhjax.TqdmProgressMeter("pendulum").description
+        'pendulum'
+    """
+
+    description: str = eqx.field(static=True, default="")
+    _bars: dict[int, Any] = eqx.field(static=True, init=False, repr=False)
+
+    def __init__(self, description: str = ""):
+        self.description = description
+        self._bars = _Bars()
+
+    def update(self, done: int, total: int) -> None:
+        """Move the bar to `done`, and close it at the end."""
+        bar = self._bars.get(total)
+        if bar is None:
+            bar = tqdm.tqdm(
+                total=total, desc=self.description, unit="step", file=sys.stderr
+            )
+            self._bars[total] = bar
+        bar.n = max(bar.n, done)
+        bar.refresh()
+        if done == total:
+            bar.close()
+            del self._bars[total]
+
+
+class _Bars(dict):
+    """The open bars of a meter: host state, which jit must not look into."""
+
+    def __hash__(self) -> int:  # pyright: ignore[reportIncompatibleVariableOverride]
+        return 0
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, _Bars)

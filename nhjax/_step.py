@@ -1,0 +1,127 @@
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int, PyTree
+
+from ._compensated import two_sum
+from ._custom_types import Args, BoolScalar, FloatScalar
+from ._linearisation import Linearisation, linearise
+from ._method import AbstractMethod
+from ._newton import AbstractStageSolver
+from ._solution import RESULTS
+from ._stages import StageSystem
+from ._state import State
+from ._step_record import StepRecord
+from ._system import LagrangianSystem
+
+
+class Node(eqx.Module):
+    """What is carried from step to step: a state and what is known there.
+
+    The compensations are the rounding errors of the running sums q and p; the
+    linearisation is both the Jacobian of the next step and the source of λ_c.
+    """
+
+    state: State
+    q_compensation: PyTree[Array]
+    p_compensation: Float[Array, " n"]
+    lin: Linearisation
+
+
+class StepOutcome(NamedTuple):
+    """A step: the next node, or the reason why there is none."""
+
+    node: Node
+    record: StepRecord
+    result: RESULTS
+    num_iterations: Int[Array, ""]
+    residual: FloatScalar
+    constraint_violation: FloatScalar
+    multiplier_defect: FloatScalar
+
+
+def first_node(system: LagrangianSystem, t: FloatScalar, y0: State, args: Args) -> Node:
+    """The node to start from at a consistent state."""
+    return Node(
+        state=y0,
+        q_compensation=system.manifold_of(y0.q).no_compensation(y0.q),
+        p_compensation=jnp.zeros_like(y0.p),
+        lin=linearise(system, t, y0.q, y0.v, args),
+    )
+
+
+def step(
+    system: LagrangianSystem,
+    method: AbstractMethod,
+    solver: AbstractStageSolver,
+    t: FloatScalar,
+    h: FloatScalar,
+    node: Node,
+    args: Args,
+    skip: BoolScalar,
+) -> StepOutcome:
+    """One step of size h: (q_k, p_k, λ_k) -> (q_{k+1}, p_{k+1}, λ_{k+1}).
+
+    Where `skip` is true nothing is solved and the outcome is to be discarded.
+    """
+    state, lin = node.state, node.lin
+    propagated = method.multiplier == "propagated"
+    stages = StageSystem(
+        system,
+        method,
+        t,
+        h,
+        state.q,
+        state.p,
+        state.multiplier if propagated else lin.multiplier,
+        args,
+    )
+    x0 = stages.starting_values(state.v, lin)
+    solved = solver.solve(stages, x0, lin, skip)
+    x, forces = solved.x, solved.aux.forces
+
+    manifold = system.manifold_of(state.q)
+    q, q_compensation = manifold.advance(
+        state.q, stages.increment(x), node.q_compensation
+    )
+    p_increment = h * (stages.coefficients("b") @ forces.force)
+    p, p_compensation = two_sum(state.p, p_increment + node.p_compensation)
+    v = x.node_velocity[-1]
+    lin_next = linearise(system, t + h, q, v, args)
+    multiplier = forces.multiplier[-1] if propagated else lin_next.multiplier
+    next_node = Node(
+        State(q, v, p, multiplier), q_compensation, p_compensation, lin_next
+    )
+
+    residual = jnp.maximum(
+        jnp.max(jnp.abs(forces.residual)), jnp.max(jnp.abs(solved.aux.node_residual))
+    )
+    scale = forces.momentum_scale
+    return StepOutcome(
+        node=next_node,
+        record=StepRecord(state, x.velocity, forces.force, forces.multiplier),
+        result=_result(solved.converged, lin, next_node),
+        num_iterations=solved.num_iterations,
+        residual=residual / jnp.where(scale > 0, scale, 1),
+        constraint_violation=_largest(lin_next.violation),
+        multiplier_defect=_largest(forces.multiplier[-1] - lin_next.multiplier),
+    )
+
+
+def _result(converged: BoolScalar, lin: Linearisation, node: Node) -> RESULTS:
+    finite = jnp.all(
+        jnp.stack([jnp.all(jnp.isfinite(leaf)) for leaf in jax.tree.leaves(node.state)])
+    )
+    # A singular M or C at the end is found at once: λ_c does not exist there.
+    singular = ~lin.is_finite | (converged & finite & ~node.lin.is_finite)
+    failed = RESULTS.where(
+        finite, RESULTS.nonlinear_divergence, RESULTS.nonfinite_state
+    )
+    result = RESULTS.where(converged & finite, RESULTS.successful, failed)
+    return RESULTS.where(singular, RESULTS.singular_stage_matrix, result)
+
+
+def _largest(x: Float[Array, " m"]) -> FloatScalar:
+    return jnp.max(jnp.abs(x), initial=0.0)

@@ -1,0 +1,134 @@
+"""What every example of the gallery shares."""
+
+import abc
+import math
+from collections.abc import Callable
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, ArrayLike, DTypeLike
+
+from .._custom_types import Args, FloatScalarLike
+from .._errors import is_traced
+from .._state import initial_state, State
+from .._system import LagrangianSystem
+
+
+# Gauss-Legendre rule of one panel: exact to round-off on panels whose length is
+# below the distance of the integrand's nearest complex singularity.
+_NODES, _WEIGHTS = np.polynomial.legendre.leggauss(20)
+
+
+def parameter(value: ArrayLike) -> Array:
+    """Make `value` an array leaf.
+
+    A Python or NumPy scalar becomes a weakly-typed float, so that it takes part in
+    float32 and float64 arithmetic alike, strict dtype promotion included.
+    """
+    if isinstance(value, (int, float, np.number)):
+        return jnp.asarray(float(value))
+    return jnp.asarray(value)
+
+
+def coordinates(value: ArrayLike | tuple[float, ...]) -> Array:
+    """Make a floating array of a tuple or an array of coordinates."""
+    array = jnp.asarray(value)
+    if not jnp.issubdtype(array.dtype, jnp.inexact):
+        array = array.astype(jnp.result_type(float))
+    return array
+
+
+def require_positive(**parameters: Array) -> None:
+    """Raise for a parameter that is not positive, unless it is being traced."""
+    for name, value in parameters.items():
+        if not is_traced(value) and not np.all(np.asarray(value) > 0):
+            raise ValueError(f"`{name}` must be positive, got {value}.")
+
+
+def require_nonzero(name: str, value: float, consequence: str) -> None:
+    """Raise where a closed formula would divide by `value` = 0."""
+    if value == 0:
+        raise ValueError(f"`{name}` must be nonzero, got {value}: {consequence}.")
+
+
+def integral(
+    integrand: Callable[[np.ndarray], np.ndarray], t: float, rate: float
+) -> np.ndarray:
+    """Integrate over [0, t] to round-off.
+
+    `integrand` maps an array of times to values along its last axes; `rate` is the
+    inverse of the shortest time scale on which it varies.
+    """
+    panels = math.ceil(abs(t) * rate) + 1
+    edges = np.linspace(0.0, t, panels + 1)
+    half_width = 0.5 * t / panels
+    times = 0.5 * (edges[1:] + edges[:-1])[:, None] + half_width * _NODES
+    return half_width * np.sum(integrand(times) * _WEIGHTS, axis=(-2, -1))
+
+
+class AbstractExample(eqx.Module):
+    """A mechanical system with parameters and default initial data."""
+
+    q0: eqx.AbstractVar[Array]
+    v0: eqx.AbstractVar[Array]
+
+    @abc.abstractmethod
+    def lagrangian(self, t: FloatScalarLike, q: Array, v: Array, args: Args) -> Array:
+        """The Lagrangian L(t, q, v)."""
+
+    @abc.abstractmethod
+    def invariants(self, t: FloatScalarLike, q: Array, v: Array) -> dict[str, Array]:
+        """The conserved quantities at one point (q, v); `jax.vmap` it over many."""
+
+    @property
+    @abc.abstractmethod
+    def system(self) -> LagrangianSystem:
+        """The system to integrate; its leaves are the parameters."""
+
+    def energy(self, t: FloatScalarLike, q: Array, v: Array) -> Array:
+        """The energy D2L · v - L at one point."""
+        value, momentum = jax.value_and_grad(self.lagrangian, argnums=2)(t, q, v, None)
+        return momentum @ v - value
+
+    def initial_state(self, dtype: DTypeLike | None = None) -> State:
+        """The consistent state at (`q0`, `v0`).
+
+        `dtype` defaults to JAX's default float.
+        """
+        if dtype is None:
+            dtype = jnp.result_type(float)
+        q0, v0 = self.q0.astype(dtype), self.v0.astype(dtype)
+        return initial_state(self.system, q0, v=v0)
+
+
+class AbstractConstrainedExample(AbstractExample):
+    """An example with nonholonomic constraints."""
+
+    @abc.abstractmethod
+    def constraint(self, t: FloatScalarLike, q: Array, v: Array, args: Args) -> Array:
+        """The constraint Φ(t, q, v), a scalar or of shape (m,)."""
+
+    @property
+    def system(self) -> LagrangianSystem:
+        """The system to integrate; its leaves are the parameters."""
+        return LagrangianSystem(self.lagrangian, nonholonomic=self.constraint)
+
+    def _consistent_data(self) -> tuple[np.ndarray, np.ndarray]:
+        """(q0, v0) in float64 on the host, where they satisfy the constraint.
+
+        A closed-form solution uses the constraint to drop velocities: for data that
+        violate it the formula would silently answer for other data.
+        """
+        q0 = np.asarray(self.q0, dtype=np.float64)
+        v0 = np.asarray(self.v0, dtype=np.float64)
+        time = jnp.asarray(0.0, dtype=self.q0.dtype)
+        violation = np.max(np.abs(self.constraint(time, self.q0, self.v0, None)))
+        tolerance = math.sqrt(jnp.finfo(self.q0.dtype).eps) * (1 + np.max(np.abs(v0)))
+        if not violation <= tolerance:
+            raise ValueError(
+                f"`v0` violates the constraint by {violation:.3e}; the exact solution "
+                "needs consistent initial data."
+            )
+        return q0, v0

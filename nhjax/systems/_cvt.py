@@ -1,0 +1,108 @@
+"""The pendulum-driven continuously variable transmission."""
+
+import math
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, ArrayLike
+from scipy.special import ellipj, ellipkinc
+
+from .._custom_types import Args, FloatScalarLike
+from ._base import AbstractConstrainedExample, coordinates, parameter
+
+
+class ContinuouslyVariableTransmission(AbstractConstrainedExample):
+    """The pendulum-driven continuously variable transmission (CVT).
+
+    L = ½ (ẋ² + ẏ² + ż²) - ½ (x² + z² - 2 cos y + ε sin 2y),
+    Φ = ż + sin(y) ẋ,  q = (x, y, z), in dimensionless units.
+
+    The driver y is a pendulum that the passenger (x, z) does not act on. Their
+    energies E_d = ½ ẏ² - cos y + ½ ε sin 2y and E_p = ½ (ẋ² + ż² + x² + z²) are
+    conserved one by one.
+
+    **Parameters:** `epsilon` ε >= 0, the perturbation of the pendulum [1]. `low` and
+    `high` give the two sets of initial data: an oscillating driver (E_d = 4/5,
+    E_p = 1; the default) and a rotating one (E_d = 3, E_p = 1).
+
+    **Source:** Modin and Verdier; Martín de Diego and Sato Martín de Almagro,
+    *High-order geometric methods for nonholonomic mechanical systems*, second
+    numerical experiment.
+
+    !!! example
+
+        >>> from nhjax.systems import ContinuouslyVariableTransmission as CVT
+        >>> cvt = CVT.high(epsilon=0.0)
+        >>> y0, (y, dy) = cvt.initial_state(), cvt.exact_driver(1.0)
+    """
+
+    epsilon: Array = eqx.field(converter=parameter, default=0.5)
+    q0: Array = eqx.field(converter=coordinates, default=(1.0, 0.0, 1.0), kw_only=True)
+    v0: Array = eqx.field(
+        converter=coordinates, default=(0.0, 0.6 * math.sqrt(10.0), 0.0), kw_only=True
+    )
+
+    @classmethod
+    def low(cls, epsilon: ArrayLike = 0.5) -> "ContinuouslyVariableTransmission":
+        """The paper's low energy: the driver oscillates."""
+        return cls(epsilon, v0=(0.0, 0.6 * math.sqrt(10.0), 0.0))
+
+    @classmethod
+    def high(cls, epsilon: ArrayLike = 0.5) -> "ContinuouslyVariableTransmission":
+        """The paper's high energy: the driver rotates."""
+        return cls(epsilon, v0=(0.0, math.sqrt(8.0), 0.0))
+
+    def lagrangian(self, t: FloatScalarLike, q: Array, v: Array, args: Args) -> Array:
+        """L = ½ (ẋ² + ẏ² + ż²) - ½ (x² + z² - 2 cos y + ε sin 2y)."""
+        springs = 0.5 * (q[0] ** 2 + q[2] ** 2)
+        return 0.5 * (v @ v) - springs - self._driver_potential(q)
+
+    def constraint(self, t: FloatScalarLike, q: Array, v: Array, args: Args) -> Array:
+        """Φ = ż + sin(y) ẋ."""
+        return v[2] + jnp.sin(q[1]) * v[0]
+
+    def driver_energy(self, q: Array, v: Array) -> Array:
+        """E_d = ½ ẏ² - cos y + ½ ε sin 2y."""
+        return 0.5 * v[1] ** 2 + self._driver_potential(q)
+
+    def passenger_energy(self, q: Array, v: Array) -> Array:
+        """E_p = ½ (ẋ² + ż² + x² + z²)."""
+        return 0.5 * (v[0] ** 2 + v[2] ** 2 + q[0] ** 2 + q[2] ** 2)
+
+    def invariants(self, t: FloatScalarLike, q: Array, v: Array) -> dict[str, Array]:
+        """Energy, and the energies of driver and passenger."""
+        return {
+            "energy": self.energy(t, q, v),
+            "driver_energy": self.driver_energy(q, v),
+            "passenger_energy": self.passenger_energy(q, v),
+        }
+
+    def exact_driver(self, t: float) -> tuple[float, float]:
+        """(y, ẏ) at `t`, for ε = 0 and any (`q0`, `v0`) but the upright equilibrium.
+
+        With k² = (1 + E_d)/2 the pendulum is sin(y/2) = k sn(t + t0 | k²) where it
+        oscillates, k <= 1, and y/2 = ±am(k(t + t0) | 1/k²) where it rotates.
+        """
+        if float(self.epsilon) != 0:
+            raise ValueError(
+                f"`epsilon` must be 0 for the exact driver, got {self.epsilon}."
+            )
+        half, rate = 0.5 * float(self.q0[1]), 0.5 * float(self.v0[1])
+        modulus_squared = math.sin(half) ** 2 + rate**2
+        modulus = math.sqrt(modulus_squared)
+        turns = round(half / math.pi)
+        half -= turns * math.pi
+        if modulus_squared < 1:
+            phase = math.atan2(math.sin(half), rate)
+            start = ellipkinc(phase, modulus_squared)
+            sn, cn, dn, _ = ellipj(t + start, modulus_squared)
+            half, rate = math.atan2(modulus * sn, dn), modulus * cn
+        else:
+            direction = math.copysign(1.0, rate)
+            start = ellipkinc(direction * half, 1 / modulus_squared)
+            _, _, dn, am = ellipj(modulus * t + start, 1 / modulus_squared)
+            half, rate = direction * am, direction * modulus * dn
+        return float(2 * (half + turns * math.pi)), float(2 * rate)
+
+    def _driver_potential(self, q: Array) -> Array:
+        return 0.5 * self.epsilon * jnp.sin(2.0 * q[1]) - jnp.cos(q[1])
