@@ -1,12 +1,13 @@
 """The exceptions that nhjax raises, and the one place where a condition is enforced."""
 
 from collections.abc import Callable
-from typing import TypeVar
+from typing import NamedTuple, TypeVar
 
 import equinox as eqx
-import jax
-from jaxtyping import Array, Bool
+import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
+from jaxtyping import Array, Bool
 
 
 T = TypeVar("T")
@@ -50,23 +51,32 @@ class IntegrationError(RuntimeError):
 
 def is_traced(*arrays: object) -> bool:
     """Whether any of the arrays has no value yet (inside jit, vmap or grad)."""
-    return any(isinstance(x, jax.core.Tracer) for x in arrays)
+    return any(isinstance(x, Tracer) for x in arrays)
 
 
-def require(
-    tree: T,
-    ok: Bool[Array, ""] | np.bool_ | bool,
-    error: Callable[[], Exception],
-    under_jit: str,
-) -> T:
-    """Return `tree` if `ok`; otherwise raise.
+class Check(NamedTuple):
+    """A condition, the exception if it fails, and the message if only at run time."""
 
-    With a concrete `ok` the exception made by `error` is raised here and now, with the
-    offending values in its message. With a traced one they are not known yet: the
+    ok: Bool[Array, ""] | np.bool_ | bool
+    error: Callable[[], Exception]
+    under_jit: str
+
+
+def require(tree: T, *checks: Check) -> T:
+    """Return `tree` if all checks hold; otherwise raise for the first that fails.
+
+    With a concrete condition the exception made by `error` is raised here and now, with
+    the offending values in its message. With a traced one they are not known yet: the
     message `under_jit` is raised when the compiled program runs.
     """
-    if is_traced(ok):
-        return eqx.error_if(tree, ~ok, under_jit)  # pyright: ignore[reportArgumentType, reportOperatorIssue]
-    if not bool(ok):
-        raise error()
-    return tree
+    for check in checks:
+        if not is_traced(check.ok) and not check.ok:
+            raise check.error()
+    traced = [check for check in checks if is_traced(check.ok)]
+    if not traced:
+        return tree
+    # One call-back for all of them: each costs as much to compile as the arithmetic.
+    bad = ~jnp.stack([jnp.asarray(check.ok) for check in traced])
+    return eqx.branched_error_if(
+        tree, jnp.any(bad), jnp.argmax(bad), [check.under_jit for check in traced]
+    )

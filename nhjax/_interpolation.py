@@ -1,10 +1,13 @@
+from typing import Any
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Int
 
-from ._custom_types import Args, FloatScalar, FloatScalarLike
-from ._errors import is_traced, require
+from ._checks import real_scalar
+from ._custom_types import Args, BoolScalar, FloatScalar, FloatScalarLike
+from ._errors import Check, require
 from ._iteration import root
 from ._linearisation import linearise
 from ._method import AbstractMethod
@@ -46,39 +49,72 @@ class DenseInterpolation(eqx.Module):
     They are defined on [t0, t0 + num_steps dt]; use `Solution.evaluate`.
     """
 
-    system: LagrangianSystem
     method: AbstractMethod = eqx.field(static=True)
     num_steps: int = eqx.field(static=True)
     t0: FloatScalar
     dt: FloatScalar
     records: StepRecord
-    args: Args
+    # The system and args, taken apart: a function is no leaf that `jax.jit` and
+    # `jax.vmap` may return.
+    _arrays: list[Array]
+    _rest: tuple[Any, ...] = eqx.field(static=True)
+    _treedef: Any = eqx.field(static=True)
+
+    def __init__(
+        self,
+        system: LagrangianSystem,
+        method: AbstractMethod,
+        num_steps: int,
+        t0: FloatScalar,
+        dt: FloatScalar,
+        records: StepRecord,
+        args: Args,
+    ):
+        self.method, self.num_steps = method, num_steps
+        self.t0, self.dt, self.records = t0, dt, records
+        leaves, self._treedef = jax.tree.flatten((system, args))
+        self._arrays = [leaf for leaf in leaves if eqx.is_array(leaf)]
+        self._rest = tuple(None if eqx.is_array(leaf) else leaf for leaf in leaves)
+
+    @property
+    def _system_and_args(self) -> tuple[LagrangianSystem, Args]:
+        arrays = iter(self._arrays)
+        leaves = [next(arrays) if leaf is None else leaf for leaf in self._rest]
+        return jax.tree.unflatten(self._treedef, leaves)
 
     def evaluate(self, t: FloatScalarLike) -> State:
         """The state at time `t`."""
-        t = jnp.asarray(t)
-        if t.ndim != 0:
+        batch = self.records.force.shape[:-3]
+        if batch:
             raise ValueError(
-                f"`t` has shape {t.shape}, but one time is needed; for many use "
-                "`jax.vmap(sol.evaluate)(ts)`."
+                f"This solution is a batch of shape {batch}: evaluate each lane, "
+                "`jax.vmap(lambda sol: sol.evaluate(t))(sol)`."
             )
-        t = t.astype(self.t0.dtype)
-        if not is_traced(t, self.t0, self.dt):
-            return _evaluate_jit(self, self._checked(t))
-        return _evaluate(self, self._checked(t))
-
-    def _checked(self, t: FloatScalar) -> FloatScalar:
-        position = (t - self.t0) / self.dt
-        slack = 1e-6
-        return require(
+        t = real_scalar("t", t, self.t0.dtype)
+        _, inside = step_position(t, self.t0, self.dt, self.num_steps)
+        t = require(
             t,
-            (position >= -slack) & (position <= self.num_steps + slack),
-            lambda: ValueError(
-                f"`t` = {float(t)} lies outside the run, from {float(self.t0)} to "
-                f"{float(self.t0 + self.num_steps * self.dt)}."
+            Check(
+                inside,
+                lambda: ValueError(
+                    f"`t` = {float(t)} lies outside the run, from {float(self.t0)} to "
+                    f"{float(self.t0 + self.num_steps * self.dt)}."
+                ),
+                "Solution.evaluate: `t` lies outside the run.",
             ),
-            "Solution.evaluate: `t` lies outside the run.",
         )
+        return _evaluate(self, t)
+
+
+def step_position(
+    t: Array, t0: FloatScalar, dt: FloatScalar, num_steps: int
+) -> tuple[Array, BoolScalar]:
+    """Times in units of steps, and which of them lie in the run, but for round-off."""
+    position = (t - t0) / dt
+    # The times themselves are rounded, by as much as the largest of them.
+    steps = num_steps + jnp.abs(t0 / dt)
+    slack = jnp.maximum(1e-6, 8 * jnp.finfo(t.dtype).eps * steps)
+    return position, (position >= -slack) & (position <= num_steps + slack)
 
 
 def step_index(
@@ -89,22 +125,19 @@ def step_index(
     return jnp.clip(k, 0, num_steps - 1)
 
 
+@eqx.filter_jit
 def _evaluate(self: DenseInterpolation, t: FloatScalar) -> State:
     k = step_index(t, self.t0, self.dt, self.num_steps)
     record = jax.tree.map(lambda x: x[k], self.records)
     start = self.t0 + k.astype(t.dtype) * self.dt
     theta = (t - start) / self.dt
-    return interpolate(
-        self.system, self.method, record, start, self.dt, theta, self.args
-    )
-
-
-_evaluate_jit = eqx.filter_jit(_evaluate)
+    system, args = self._system_and_args
+    return interpolate(system, self.method, record, start, self.dt, theta, args)
 
 
 def require_collocation(method: AbstractMethod) -> None:
     """Raise unless the method is a collocation method, so that u(t) exists."""
-    if method.orders.C < method.stages:
+    if method.stages > method.orders.C:
         raise ValueError(
             f"Dense output and `SaveAt(ts=...)` need a collocation method, one with "
             f"C(q) for q >= stages = {method.stages}; this tableau has "

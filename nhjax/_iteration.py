@@ -4,8 +4,8 @@ from collections.abc import Callable
 from typing import Generic, NamedTuple, TypeVar
 
 import jax
-from jax.flatten_util import ravel_pytree
 import jax.numpy as jnp
+from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from ._custom_types import BoolScalar, FloatScalar, FloatScalarLike
@@ -27,7 +27,7 @@ class Solved(NamedTuple, Generic[X, Aux]):
 class _Progress(NamedTuple):
     smallest: FloatScalar
     stalls: Int[Array, ""]
-    count: Int[Array, ""]
+    iterations: Int[Array, ""]
     done: BoolScalar
     converged: BoolScalar
 
@@ -63,7 +63,7 @@ def iterate(
         finite = jnp.isfinite(size)
         stalls = progress.stalls + (size >= progress.smallest).astype(jnp.int32)
         smallest = jnp.minimum(size, progress.smallest)
-        count = progress.count + 1
+        count = progress.iterations + 1
         believed = jnp.minimum(eps * patience ** stalls.astype(dtype), eps**0.5)
         stagnant = (stalls >= 1) & (progress.smallest <= believed)
         converged = finite & ((size <= floor) | stagnant)
@@ -76,7 +76,7 @@ def iterate(
     x, aux, progress = jax.lax.while_loop(
         lambda carry: ~carry[2].done, body, (x, aux, start)
     )
-    return Solved(x, aux, progress.converged, progress.count)
+    return Solved(x, aux, progress.converged, progress.iterations)
 
 
 def dense_increment(
@@ -112,4 +112,4 @@ def root(
         return x + dx, relative_size(dx, x), None
 
     solved = iterate(sweep, flat, max_iterations=max_iterations)
-    return solved._replace(x=unravel(solved.x))
+    return Solved(unravel(solved.x), None, solved.converged, solved.num_iterations)

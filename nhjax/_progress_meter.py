@@ -1,11 +1,11 @@
-from abc import abstractmethod
 import sys
+from abc import abstractmethod
 from typing import Any
 
 import equinox as eqx
 import jax
-from jaxtyping import Array, Int
 import tqdm
+from jaxtyping import Array, Int
 
 
 class AbstractProgressMeter(eqx.Module):
@@ -69,8 +69,9 @@ class TextProgressMeter(AbstractProgressMeter):
 
     def update(self, done: int, total: int) -> None:
         """Print how many steps are done."""
-        every = max(1, total // 10)
-        if done == total or done % every < max(1, total // 100):
+        # Reports come a hundredth of the run apart, not at each step.
+        tenth, apart = max(1, total // 10), max(1, total // 100)
+        if done == total or (done >= tenth and done % tenth < apart):
             print(f"{done} of {total} steps", flush=True)
 
 
@@ -89,32 +90,34 @@ class TqdmProgressMeter(AbstractProgressMeter):
     """
 
     description: str = eqx.field(static=True, default="")
-    _bars: dict[int, Any] = eqx.field(static=True, init=False, repr=False)
+    _open: "_Open" = eqx.field(static=True, init=False, repr=False)
 
     def __init__(self, description: str = ""):
         self.description = description
-        self._bars = _Bars()
+        self._open = _Open()
 
     def update(self, done: int, total: int) -> None:
         """Move the bar to `done`, and close it at the end."""
-        bar = self._bars.get(total)
+        bar = self._open.bars.get(total)
         if bar is None:
-            bar = tqdm.tqdm(
+            bar = self._open.bars[total] = tqdm.tqdm(
                 total=total, desc=self.description, unit="step", file=sys.stderr
             )
-            self._bars[total] = bar
         bar.n = max(bar.n, done)
         bar.refresh()
         if done == total:
             bar.close()
-            del self._bars[total]
+            del self._open.bars[total]
 
 
-class _Bars(dict):
-    """The open bars of a meter: host state, which jit must not look into."""
+class _Open:
+    """The open bars of a meter: host state, for which jit must not compile anew."""
 
-    def __hash__(self) -> int:  # pyright: ignore[reportIncompatibleVariableOverride]
+    def __init__(self):
+        self.bars: dict[int, Any] = {}
+
+    def __hash__(self) -> int:
         return 0
 
     def __eq__(self, other: object) -> bool:
-        return isinstance(other, _Bars)
+        return isinstance(other, _Open)

@@ -1,15 +1,16 @@
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, PyTree
 import numpy as np
+from jaxtyping import Array, Float, PyTree
 
 from ._custom_types import FloatScalar
-from ._errors import is_traced
-from ._state import as_floats, State
+from ._errors import Check, DTypeError, is_traced, NonFiniteError, require
+from ._interpolation import step_position
+from ._state import State
 
 
 def save_state(t: FloatScalar, y: State, args: Any) -> State:
@@ -25,8 +26,8 @@ class SaveAt(eqx.Module):
 
     - `t0`: save the initial state.
     - `t1`: save the final state.
-    - `ts`: save at these times, by the collocation polynomials; sorted in the direction
-        of time.
+    - `ts`: save at these times, by the collocation polynomials; sorted in the
+        direction of time.
     - `steps`: save after every step (True), or after every k-th step (an int k). With
         `t1=True` the final state is saved too, but not twice.
     - `dense`: save the collocation polynomials for `Solution.evaluate`.
@@ -36,8 +37,9 @@ class SaveAt(eqx.Module):
     `ts` keep no buffer of the length of the run, unless `dense` does. Differentiating
     in reverse mode with respect to samples at `ts` needs `dense=True` beside it.
 
-    **Raises:** `ValueError` if nothing is saved, `steps` is not a bool or an int >= 1,
-    `ts` is not a sorted vector, or `ts` and `steps` are given together.
+    **Raises:** `ValueError` if nothing is saved, a flag is not a bool, `steps` is not a
+    bool or an int >= 1, `ts` is not a sorted vector, or `ts` and `steps` are given
+    together.
 
     !!! example
 
@@ -58,44 +60,72 @@ class SaveAt(eqx.Module):
         *,
         t0: bool = False,
         t1: bool = False,
-        ts: Float[Array, " k"] | list[float] | None = None,
+        ts: Float[Array, " k"] | np.ndarray | Sequence[float] | None = None,
         steps: bool | int = False,
         dense: bool = False,
         fn: Callable[[Any, Any, Any], PyTree[Array]] = save_state,
     ):
-        self.t0, self.t1, self.dense, self.fn = t0, t1, dense, fn
-        self.ts = None if ts is None else as_floats("ts", jnp.asarray(ts))
-        if not isinstance(steps, int) or steps < 0:
+        for name, flag in (("t0", t0), ("t1", t1), ("dense", dense)):
+            if not isinstance(flag, bool):
+                raise ValueError(
+                    f"SaveAt: `{name}` must be True or False, got {flag!r}; times "
+                    "belong in `ts`, and `integrate` sets the ends of the run."
+                )
+        if not isinstance(steps, int | np.integer) or steps < 0:
             raise ValueError(
                 f"SaveAt: `steps` must be a bool or an int >= 1, got {steps!r}."
             )
-        self.steps = int(steps)
-        if not (t0 or t1 or dense or self.steps or ts is not None):
+        if not (t0 or t1 or dense or steps or ts is not None):
             raise ValueError(
                 "SaveAt: nothing is saved. Ask for some of `t0`, `t1`, `ts`, `steps`, "
                 "`dense`."
+            )
+        if ts is not None and steps:
+            raise ValueError(
+                "SaveAt: give `ts` or `steps`, not both; with `dense=True` the "
+                "solution can be evaluated anywhere afterwards."
             )
         if not callable(fn):
             raise ValueError(
                 f"SaveAt: `fn` must be a function (t, y, args), got {fn!r}."
             )
-        if self.ts is not None:
-            self._check_ts(self.ts)
+        self.t0, self.t1, self.dense, self.fn = t0, t1, dense, fn
+        self.steps = int(steps)
+        self.ts = None if ts is None else _times(ts)
 
-    def _check_ts(self, ts: Array) -> None:
-        if self.steps:
+    def within(self, t0: FloatScalar, dt: FloatScalar, num_steps: int) -> "SaveAt":
+        """This, checked against the run that it is for, with `ts` of its dtype."""
+        if self.num_saved(num_steps) == 0 and not self.dense:
             raise ValueError(
-                "SaveAt: give `ts` or `steps`, not both; with `dense=True` the solution "
-                "can be evaluated anywhere afterwards."
+                f"SaveAt: `steps={self.steps}` saves nothing in a run of {num_steps} "
+                "steps. Add `t1=True`."
             )
-        if ts.ndim != 1 or ts.shape[0] == 0:
-            raise ValueError(f"SaveAt: `ts` must have shape (k,), got {ts.shape}.")
-        if not is_traced(ts):
-            gaps = np.diff(np.asarray(ts))
-            if not (np.all(gaps >= 0) or np.all(gaps <= 0)):
-                raise ValueError(
-                    "SaveAt: `ts` must be sorted in the direction of time."
-                )
+        if self.ts is None:
+            return self
+        ts = self.ts.astype(dt.dtype)
+        # In units of steps, so that direction and dtype need no cases.
+        position, inside = step_position(ts, t0, dt, num_steps)
+        ts = require(
+            ts,
+            Check(
+                jnp.all(inside),
+                lambda: ValueError(
+                    f"SaveAt: `ts` reaches from {float(jnp.min(ts))} to "
+                    f"{float(jnp.max(ts))}, outside the run from {float(t0)} to "
+                    f"{float(t0 + num_steps * dt)}."
+                ),
+                "SaveAt: `ts` lies outside the run.",
+            ),
+            Check(
+                jnp.all(jnp.diff(position) >= 0),
+                lambda: ValueError(
+                    "SaveAt: `ts` must be sorted in the direction of time, which runs "
+                    f"{'forward' if dt > 0 else 'backward'} here."
+                ),
+                "SaveAt: `ts` must be sorted in the direction of time.",
+            ),
+        )
+        return eqx.tree_at(lambda s: s.ts, self, ts)
 
     def num_saved(self, num_steps: int) -> int:
         """The length of the output for a run of `num_steps` steps."""
@@ -114,3 +144,20 @@ def stack_saved(pieces: list[PyTree[Array]]) -> PyTree[Array]:
     if len(pieces) == 1:
         return pieces[0]
     return jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *pieces)
+
+
+def _times(ts: Any) -> Float[Array, " k"]:
+    ts = jnp.asarray(ts)
+    if jnp.issubdtype(ts.dtype, jnp.integer):
+        ts = ts.astype(jnp.result_type(float))
+    if not jnp.issubdtype(ts.dtype, jnp.floating):
+        raise DTypeError(f"SaveAt: `ts` must be real, got dtype {ts.dtype}.")
+    if ts.ndim != 1 or ts.shape[0] == 0:
+        raise ValueError(f"SaveAt: `ts` must have shape (k,), k >= 1, got {ts.shape}.")
+    if not is_traced(ts):
+        if not jnp.all(jnp.isfinite(ts)):
+            raise NonFiniteError(f"SaveAt: `ts` is not finite: {ts}.")
+        gaps = jnp.diff(ts)
+        if not (jnp.all(gaps >= 0) or jnp.all(gaps <= 0)):
+            raise ValueError("SaveAt: `ts` must be sorted in the direction of time.")
+    return ts

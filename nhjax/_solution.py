@@ -1,9 +1,11 @@
+import functools
 from typing import Any
 
 import equinox as eqx
 import jax
-from jaxtyping import Array, Float, PyTree
+import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Float, PyTree
 
 from ._custom_types import FloatScalarLike
 from ._errors import IntegrationError, is_traced
@@ -25,8 +27,13 @@ class RESULTS(eqx.Enumeration):
         "the edge of its domain."
     )
     nonfinite_state = (
-        "The state became infinite or NaN. Check the functions of the system along the "
-        "trajectory, or try a smaller `dt`."
+        "The state became infinite or NaN, or was so from the start. Check `y0` and "
+        "the functions of the system along the trajectory, or try a smaller `dt`."
+    )
+    inconsistent_start = (
+        "The initial state violates the constraints at `t0`, or its p is not "
+        "D2L(t0, q, v). Make `y0` with `nhjax.initial_state`, for the system, args and "
+        "time of the integration."
     )
 
 
@@ -39,9 +46,10 @@ class Solution(eqx.Module):
         `SaveAt(fn=...)` returned, stacked; None if nothing was.
     - `stats`: `num_steps` (steps completed), `num_iterations` (of the nonlinear solver,
         in all), `max_residual` (of the stage equations, relative to the momenta),
-        `max_constraint_violation` (|Φ| at the nodes), `max_multiplier_defect`
-        (|Λ^s - λ_c|, how far the last stage multiplier of a step is from the
-        continuous one), `failed_step` (index of the step that failed, -1 if none).
+        `max_constraint_violation` (|Φ| at the nodes, the first included),
+        `max_multiplier_defect` (|Λ^s - λ_c|, how far the last stage multiplier of a
+        step is from the continuous one), `failed_step` (index of the step that
+        failed, -1 if none).
     - `result`: a `RESULTS`.
     - `interpolation`: the collocation polynomials, with `SaveAt(dense=True)`.
 
@@ -50,8 +58,9 @@ class Solution(eqx.Module):
 
     t0: Float[Array, ""]
     t1: Float[Array, ""]
-    ts: Float[Array, " k"] | None
-    ys: PyTree[Array] | None
+    # None, the empty tree, if nothing was saved.
+    ts: PyTree[Float[Array, " k"]]
+    ys: PyTree[Array]
     stats: dict[str, Any]
     result: RESULTS
     interpolation: DenseInterpolation | None
@@ -89,53 +98,95 @@ class Solution(eqx.Module):
             )
         return self.interpolation.evaluate(t)
 
-    def failures(self) -> list[tuple[int | None, int, str]]:
-        """The failed lanes as (lane, step, reason); lane is None without a batch."""
+    def failures(self) -> list[tuple[int | tuple[int, ...] | None, int, str]]:
+        """The failed lanes as (lane, step, reason).
+
+        `lane` is None without a batch, an index into a batch, and a tuple of indices
+        into a batch of batches.
+        """
         codes, steps = self.result._value, self.stats["failed_step"]
         if is_traced(codes, steps):
             raise RuntimeError(
                 "Solution.failures() needs a computed solution, outside jit and vmap; "
                 "inside them use `sol.result` and `sol.stats['failed_step']`."
             )
-        messages = _messages()
-        flat_codes, flat_steps = np.ravel(codes), np.ravel(steps)
-        batched = np.ndim(codes) > 0
-        return [
-            (lane if batched else None, int(flat_steps[lane]), messages[int(code)])
-            for lane, code in enumerate(flat_codes)
-            if messages[int(code)]
-        ]
+        return _failures(codes, steps)
 
 
 def raise_failures(sol: Solution) -> Solution:
-    """`sol`, or an `IntegrationError` that names step, time and reason."""
-    failed = sol.result != RESULTS.successful
-    if is_traced(failed):
-        dynamic, static = eqx.partition(sol, eqx.is_array)
-        dynamic = sol.result.error_if(dynamic, failed)
-        return eqx.combine(dynamic, static)
-    failures = sol.failures()
-    if failures:
-        lane, k, reason = failures[0]
-        where = "" if lane is None else f"lane {lane}, "
-        others = f" ({len(failures) - 1} more lanes failed)" if failures[1:] else ""
-        raise IntegrationError(
-            f"Integration failed in {where}step {k}{others}: {reason} "
-            "With `throw=False` the part before the failure is returned."
-        )
+    """`sol`, or an `IntegrationError` that names lane, step and reason."""
+    codes, steps = sol.result._value, sol.stats["failed_step"]
+    if is_traced(codes, steps):
+        return _raise_later(sol)
+    _verdict(codes, steps)
     return sol
 
 
-def _messages() -> dict[int, str]:
-    # Enumeration items are arrays; codes are needed on the host.
-    names = (
-        "successful",
-        "nonlinear_divergence",
-        "singular_stage_matrix",
-        "nonfinite_state",
+def _verdict(codes: Any, steps: Any) -> np.ndarray:
+    failures = _failures(codes, steps)
+    if failures:
+        raise IntegrationError(_failure_message(failures))
+    return np.ones(np.shape(codes), bool)
+
+
+# Compiled, since an eager `vmap` would compile the call-back anew at each call.
+@eqx.filter_jit
+def _raise_later(sol: Solution) -> Solution:
+    codes, steps = sol.result._value, sol.stats["failed_step"]
+    # Only the host can put numbers into a message, and only a call-back of our own
+    # sees the lanes of a batch.
+    passed = jax.lax.cond(
+        codes != _messages().index(""),
+        lambda: jax.pure_callback(
+            _verdict,
+            jax.ShapeDtypeStruct((), bool),
+            codes,
+            steps,
+            vmap_method="broadcast_all",
+        ),
+        lambda: jnp.asarray(True),
     )
+    # Whatever part of the solution is used must wait for the verdict.
+    dynamic, static = eqx.partition(sol, eqx.is_array)
+    dynamic = jax.tree.map(lambda x: jnp.where(passed, x, jnp.zeros_like(x)), dynamic)
+    return eqx.combine(dynamic, static)
+
+
+def _failures(
+    codes: Any, steps: Any
+) -> list[tuple[int | tuple[int, ...] | None, int, str]]:
+    codes, steps = np.asarray(codes), np.asarray(steps)
+    messages, failures = _messages(), []
+    for index in np.ndindex(codes.shape):
+        message = messages[int(codes[index])]
+        if message:
+            lane = index if len(index) > 1 else (index[0] if index else None)
+            failures.append((lane, int(steps[index]), message))
+    return failures
+
+
+def _failure_message(
+    failures: list[tuple[int | tuple[int, ...] | None, int, str]],
+) -> str:
+    lane, k, reason = failures[0]
+    where = "" if lane is None else f"lane {lane}, "
+    others = f" ({len(failures) - 1} more lanes failed)" if failures[1:] else ""
+    return (
+        f"Integration failed in {where}step {k}{others}: {reason} "
+        "With `throw=False` the part before the failure is returned."
+    )
+
+
+@functools.cache
+def _messages() -> list[str]:
+    """The messages of `RESULTS` in the order of their codes."""
+    # Items are arrays, and their codes are needed on the host.
+    items = [
+        RESULTS.successful,
+        RESULTS.nonlinear_divergence,
+        RESULTS.singular_stage_matrix,
+        RESULTS.nonfinite_state,
+        RESULTS.inconsistent_start,
+    ]
     with jax.ensure_compile_time_eval():
-        return {
-            int(getattr(RESULTS, name)._value): RESULTS[getattr(RESULTS, name)]
-            for name in names
-        }
+        return [RESULTS[item] for item in sorted(items, key=lambda x: int(x._value))]

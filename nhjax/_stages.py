@@ -12,7 +12,7 @@ from ._system import LagrangianSystem
 
 
 class Stages(eqx.Module):
-    """The unknowns of one step.
+    """The unknowns of one step; those that a system or closure lacks are empty.
 
     - `velocity`: V^1..V^s, the stage velocities.
     - `node_velocity`: v^2..v^s at the constrained nodes, the last of them v_{k+1};
@@ -20,15 +20,13 @@ class Stages(eqx.Module):
     - `closure`: y, which gives Λ = (start) λ_k + (end) λ_{k+1} + E y.
     - `end_acceleration`, `end_multiplier`: the acceleration and λ_c at
         (q_{k+1}, v_{k+1}), unknowns of the symmetric closure alone.
-
-    Fields that a system or closure does not have are None.
     """
 
     velocity: Float[Array, "s n"]
     node_velocity: Float[Array, "r n"]
-    closure: Float[Array, "s-1 m"] | None
-    end_acceleration: Float[Array, " n"] | None
-    end_multiplier: Float[Array, " m"] | None
+    closure: Float[Array, "s-1 m"]
+    end_acceleration: Float[Array, " n"]
+    end_multiplier: Float[Array, " m"]
 
 
 class StageForces(NamedTuple):
@@ -101,32 +99,33 @@ class StageSystem(eqx.Module):
         They need no memory of the step before, so a step is a function of its state.
         """
         push = self.h * lin.acceleration
-        a_hat, nodes = self.coefficients("a_hat"), self.node_weights
-        velocity = v[None] + jnp.outer(jnp.sum(a_hat, axis=1), push)
-        node_velocity = v[None] + jnp.outer(jnp.sum(nodes, axis=1), push)
-        if not self.constrained:
-            return Stages(velocity, node_velocity, None, None, None)
-        # E y = (1 - start - end) λ for y constant, but for the row of ν, which is zero.
-        rows = jnp.ones((self.method.stages - 1,), self.p.dtype)
+        stage_times = jnp.sum(self.coefficients("a_hat"), axis=1)
+        node_times = jnp.sum(self.node_weights, axis=1)
+        free = jnp.ones((self.method.stages - 1,), self.p.dtype)
         if self.symmetric:
-            rows = rows.at[0].set(0)
-        closure = jnp.outer(rows, lin.multiplier)
-        if not self.symmetric:
-            return Stages(velocity, node_velocity, closure, None, None)
+            free = free.at[0].set(0)  # ν vanishes with h, the others are multipliers
+        nothing = jnp.zeros((0,), self.p.dtype)
         return Stages(
-            velocity, node_velocity, closure, lin.acceleration, lin.multiplier
+            velocity=v[None] + jnp.outer(stage_times, push),
+            node_velocity=v[None] + jnp.outer(node_times, push),
+            closure=jnp.outer(free, lin.multiplier),
+            end_acceleration=lin.acceleration if self.symmetric else nothing,
+            end_multiplier=lin.multiplier if self.symmetric else nothing,
         )
 
     def multipliers(self, x: Stages) -> Float[Array, "s m"]:
         """Λ^1..Λ^s from the unknowns of the closure."""
-        if x.closure is None:
+        if not self.constrained:
             return jnp.zeros((self.method.stages, 0), self.p.dtype)
-        multiplier = self.closure("E") @ x.closure
-        multiplier = multiplier + jnp.outer(self.closure("start"), self.multiplier)
-        if x.end_multiplier is not None:
-            end = jnp.outer(self.closure("end"), x.end_multiplier)
-            multiplier = multiplier + end
-        return multiplier
+        start = jnp.outer(self.closure("start"), self.multiplier)
+        return start + self.multiplier_change(x)
+
+    def multiplier_change(self, dx: Stages) -> Float[Array, "s m"]:
+        """The part of Λ that is linear in the unknowns."""
+        change = self.closure("E") @ dx.closure
+        if self.symmetric:
+            change = change + jnp.outer(self.closure("end"), dx.end_multiplier)
+        return change
 
     def _positions(self, increments: Float[Array, "r n"]) -> Array:
         manifold = self.system.manifold_of(self.q)
@@ -189,10 +188,3 @@ class StageSystem(eqx.Module):
             x.end_multiplier,
             self.args,
         )
-
-    def multiplier_effect(self, dx: Stages, lin: Linearisation) -> Float[Array, "s n"]:
-        """h M⁻¹ Bᵀ δΛ, the change of velocities that a change of multipliers makes."""
-        if dx.closure is None:
-            return jnp.zeros_like(dx.velocity)
-        unforced = eqx.tree_at(lambda z: z.multiplier, self, 0 * self.multiplier)
-        return self.h * (unforced.multipliers(dx) @ lin.reaction.T)

@@ -5,8 +5,18 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from ._checks import (
+    all_finite,
+    check_functions,
+    check_type,
+    finite,
+    floating,
+    parameters,
+    real_scalar,
+)
 from ._custom_types import Args, BoolScalar, FloatScalar, FloatScalarLike
 from ._errors import (
+    Check,
     ConstraintViolationError,
     DependentConstraintsError,
     DTypeError,
@@ -63,7 +73,7 @@ def initial_state(
     - `system`: the mechanical system.
     - `q`: the configuration, shape (n,), floating point.
     - `v`, `p`: velocity or momentum, shape (n,), of the dtype of q. Give exactly one.
-    - `t`, `args`: passed on to the functions of the system.
+    - `t`, `args`: passed on to the functions of the system, as `integrate` does.
     - `project`: replace v by the nearest velocity, in the kinetic metric, that
         satisfies the constraints (one linear solve for constraints linear or affine in
         v, Newton's method for others).
@@ -87,15 +97,21 @@ def initial_state(
         >>> [float(x) for x in y0.v]
         [1.0, 1.0, 0.0]
     """
+    # At the top it would be a circle: the system's methods take states.
+    from ._system import LagrangianSystem
+
+    check_type("system", system, LagrangianSystem)
     q, v, p, t = _check_inputs(system, q, v, p, t)
-    _check_functions(system, t, q, args)
+    args = parameters(args)
+    check_functions(system, t, q, args)
     found = _solve(system, t, q, v, p, args, project)
-    return _check_found(found, project)
+    return _check_found(found, p, project)
 
 
 class _Found(NamedTuple):
     state: State
     lin: Linearisation
+    lagrangian: FloatScalar
     regularity: FloatScalar
     admissibility: FloatScalar
     compatibility: FloatScalar
@@ -117,19 +133,32 @@ def _solve(system, t, q, v, p, args, project: bool) -> _Found:
     if p is None or project:
         p = momentum
     compliance = lin.jacobian @ lin.reaction
-    # Row by row the size of the terms that cancel in Φ, for an affine Φ.
-    affine = jnp.nan_to_num(system.constraint(t, q, jnp.zeros_like(v), args))
-    size = jnp.abs(lin.jacobian) @ jnp.abs(v) + jnp.abs(affine)
     return _Found(
         state=State(q, v, p, lin.multiplier),
         lin=lin,
+        lagrangian=system.lagrangian(t, q, v, args),
         regularity=_conditioning(system.mass_matrix(t, q, v, args)),
         admissibility=_conditioning(lin.jacobian),
         compatibility=_conditioning(compliance),
-        allowed=1e3 * jnp.finfo(v.dtype).eps * size,
+        allowed=1e3
+        * jnp.finfo(v.dtype).eps
+        * violation_scale(system, lin, t, q, v, args),
         legendre_solved=legendre_solved,
         projected=projected,
     )
+
+
+def violation_scale(
+    system: "LagrangianSystem",
+    lin: Linearisation,
+    t: FloatScalar,
+    q: Array,
+    v: Float[Array, " n"],
+    args: Args,
+) -> Float[Array, " m"]:
+    """Row by row the size of the terms that cancel in Φ, for an affine Φ."""
+    affine = jnp.nan_to_num(system.constraint(t, q, jnp.zeros_like(v), args))
+    return jnp.abs(lin.jacobian) @ jnp.abs(v) + jnp.abs(affine)
 
 
 def _project(system, t, q, v, args) -> tuple[Float[Array, " n"], BoolScalar]:
@@ -162,89 +191,103 @@ def _conditioning(matrix: Float[Array, "k l"]) -> FloatScalar:
     if matrix.shape[0] > matrix.shape[1]:
         return jnp.zeros((), matrix.dtype)
     singular = jnp.linalg.svd(scaled, compute_uv=False)
-    return jnp.where(singular[0] > 0, singular[-1] / singular[0], 0)
+    # Not "> 0": what is not a number must not pass for singular.
+    return jnp.where(singular[0] == 0, 0, singular[-1] / singular[0])
 
 
-def _check_found(found: _Found, project: bool) -> State:
+def _check_found(found: _Found, p: Float[Array, " n"] | None, project: bool) -> State:
     state, lin = found.state, found.lin
     n, eps = state.v.shape[0], jnp.finfo(state.v.dtype).eps
     singular = 10 * n * eps
-    state = require(
-        state,
-        jnp.all(jnp.isfinite(found.regularity)) & jnp.all(jnp.isfinite(lin.violation)),
-        lambda: NonFiniteError(
-            "The Lagrangian, its second derivatives in v, or the constraint is not "
-            f"finite at q = {state.q}, v = {state.v}; Φ = {lin.violation}. Check the "
-            "functions of the system at this state."
-        ),
-        "initial_state: the Lagrangian or the constraint is not finite at this state.",
-    )
-    state = require(
-        state,
-        found.regularity > singular,
-        lambda: IrregularLagrangianError(
-            "The Lagrangian is not regular: the mass matrix D2D2L is singular at "
-            f"q = {state.q}, v = {state.v} (reciprocal condition number "
-            f"{float(found.regularity):.1e}). Give every coordinate a kinetic energy, "
-            "or remove those without."
-        ),
-        "initial_state: the Lagrangian is not regular (D2D2L is singular).",
-    )
-    state = require(
-        state,
-        found.legendre_solved,
-        lambda: NewtonError(
-            f"No velocity with D2L(t, q, v) = p was found for p = {state.p}. Give `v` "
-            "instead of `p`."
-        ),
-        "initial_state: no velocity with D2L(t, q, v) = p was found.",
-    )
-    state = require(
-        state,
-        found.admissibility > singular,
-        lambda: DependentConstraintsError(
-            "The constraints are dependent: D2Φ has not full rank at "
-            f"q = {state.q}, v = {state.v} (the paper's admissibility condition; "
-            f"D2Φ = {lin.jacobian.tolist()}). Remove redundant constraints, or start "
-            "from a state at which they are independent."
-        ),
-        "initial_state: the constraints are dependent (D2Φ has not full rank).",
-    )
-    state = require(
-        state,
-        found.compatibility > singular,
-        lambda: IncompatibleConstraintsError(
-            "The constraints are not compatible with the Lagrangian: C = D2Φ M⁻¹ D2Φᵀ "
-            f"is singular at q = {state.q}, v = {state.v} (the paper's compatibility "
-            f"condition; reciprocal condition number {float(found.compatibility):.1e})."
-            " No multiplier is determined there."
-        ),
-        "initial_state: the compatibility matrix C = D2Φ M⁻¹ D2Φᵀ is singular.",
-    )
-    state = require(
-        state,
-        found.projected,
-        lambda: NewtonError(
-            "The velocity could not be projected onto the constraints: Newton's method "
-            f"stopped at v = {state.v} with Φ = {lin.violation}. Start nearer to them."
-        ),
-        "initial_state: the velocity could not be projected onto the constraints.",
-    )
-    state = require(
-        state,
-        jnp.all(jnp.abs(lin.violation) <= found.allowed),
-        lambda: _violation_error(found, project),
-        "initial_state: the constraints are violated; pass `project=True` to project.",
-    )
+
+    def where():
+        # A velocity that was not found would be a riddle.
+        return f"q = {state.q}, " + (f"v = {state.v}" if p is None else f"p = {p}")
+
     return require(
         state,
-        lin.is_finite,
-        lambda: NonFiniteError(
-            "The forces D1L + F, or the time derivative of Φ, are not finite at "
-            f"q = {state.q}, v = {state.v}: the multiplier would be "
-            f"{lin.multiplier}. Check the functions of the system at this state."
+        # Not ">": a matrix that is not finite is no singular matrix.
+        Check(
+            ~(found.regularity <= singular),
+            lambda: IrregularLagrangianError(
+                "The Lagrangian is not regular: the mass matrix D2D2L is singular at "
+                f"{where()} (reciprocal condition number {float(found.regularity):.1e})"
+                ". Give every coordinate a kinetic energy, or remove those without."
+            ),
+            "initial_state: the Lagrangian is not regular (D2D2L is singular).",
         ),
-        "initial_state: the forces or the multiplier are not finite at this state.",
+        Check(
+            found.legendre_solved,
+            lambda: NewtonError(
+                f"No velocity with D2L(t, q, v) = p was found for q = {state.q}, "
+                f"p = {p}. Give `v` instead of `p`."
+            ),
+            "initial_state: no velocity with D2L(t, q, v) = p was found.",
+        ),
+        Check(
+            all_finite((found.lagrangian, found.regularity, lin.violation)),
+            lambda: NonFiniteError(
+                "The Lagrangian, its second derivatives in v, or the constraint is not "
+                f"finite at {where()}: L = {found.lagrangian}, Φ = {lin.violation}. "
+                "Check the functions of the system at this state."
+            ),
+            "initial_state: the Lagrangian or the constraint is not finite there.",
+        ),
+        Check(
+            ~(found.admissibility <= singular),
+            lambda: _dependence_error(found, where()),
+            "initial_state: the constraints are dependent (D2Φ has not full rank).",
+        ),
+        Check(
+            ~(found.compatibility <= singular),
+            lambda: IncompatibleConstraintsError(
+                "The constraints are not compatible with the Lagrangian: C = D2Φ M⁻¹ "
+                f"D2Φᵀ is singular at {where()} (the paper's compatibility condition; "
+                f"reciprocal condition number {float(found.compatibility):.1e}). No "
+                "multiplier is determined there."
+            ),
+            "initial_state: the compatibility matrix C = D2Φ M⁻¹ D2Φᵀ is singular.",
+        ),
+        Check(
+            found.projected,
+            lambda: NewtonError(
+                "The velocity could not be projected onto the constraints: Newton's "
+                f"method stopped at v = {state.v} with Φ = {lin.violation}. Start "
+                "nearer to them."
+            ),
+            "initial_state: the velocity could not be projected onto the constraints.",
+        ),
+        Check(
+            jnp.all(jnp.abs(lin.violation) <= found.allowed),
+            lambda: _violation_error(found, project),
+            "initial_state: the constraints are violated; pass `project=True`.",
+        ),
+        Check(
+            lin.is_finite,
+            lambda: NonFiniteError(
+                "The forces D1L + F, or the derivatives of Φ, are not finite at "
+                f"{where()}: the acceleration would be {lin.acceleration}, the "
+                f"multiplier {lin.multiplier}. Check the functions of the system at "
+                "this state."
+            ),
+            "initial_state: the forces or the multiplier are not finite there.",
+        ),
+    )
+
+
+def _dependence_error(found: _Found, where: str) -> DependentConstraintsError:
+    jacobian = found.lin.jacobian
+    zero = [a for a in range(jacobian.shape[0]) if not jnp.any(jacobian[a])]
+    advice = (
+        f"Φ[{zero[0]}] does not depend on v there; give a constraint on positions "
+        "by its time derivative."
+        if zero
+        else "Remove redundant constraints, or start from a state at which they are "
+        "independent."
+    )
+    return DependentConstraintsError(
+        f"The constraints are dependent: D2Φ has not full rank at {where} (the paper's "
+        f"admissibility condition; D2Φ = {jacobian.tolist()}). {advice}"
     )
 
 
@@ -266,23 +309,12 @@ def _violation_error(found: _Found, project: bool) -> ConstraintViolationError:
     )
 
 
-def as_floats(name: str, x: Array) -> Array:
-    """`x` as an array, or a `DTypeError` if it is not floating point."""
-    x = jnp.asarray(x)
-    if not jnp.issubdtype(x.dtype, jnp.floating):
-        raise DTypeError(
-            f"`{name}` has dtype {x.dtype}, but floating point is needed: write "
-            f"1.0 for 1, or convert with `jnp.asarray({name}, float)`."
-        )
-    return x
-
-
 def _check_inputs(system, q, v, p, t):
     if (v is None) == (p is None):
         given = "neither" if v is None else "both"
         raise ValueError(f"Give either `v` or `p`; got {given} of them.")
     name, fibre = ("v", v) if p is None else ("p", p)
-    q, fibre = as_floats("q", q), as_floats(name, fibre)
+    q, fibre = floating("q", q), floating(name, fibre)
     if q.ndim != 1 and system.manifold is None:
         raise ShapeError(
             f"`q` has shape {q.shape}, but a configuration has shape (n,). For many "
@@ -299,44 +331,7 @@ def _check_inputs(system, q, v, p, t):
         raise DTypeError(
             f"`{name}` has dtype {fibre.dtype}, but `q` has {q.dtype}: they must agree."
         )
-    t = jnp.asarray(t)
-    if t.shape != ():
-        raise ShapeError(f"`t` has shape {t.shape}, but a time is a scalar.")
-    t = t.astype(q.dtype)
-    for what, x in (("q", q), (name, fibre), ("t", t)):
-        q = require(
-            q,
-            jnp.all(jnp.isfinite(x)),
-            lambda what=what, x=x: NonFiniteError(f"`{what}` is not finite: {x}."),
-            f"initial_state: `{what}` is not finite.",
-        )
+    t = real_scalar("t", t, q.dtype)
+    # All on q, which no system ignores: jit drops a check of what is not used.
+    q = require(q, finite("q", q), finite(name, fibre), finite("t", t))
     return (q, fibre, None, t) if p is None else (q, None, fibre, t)
-
-
-def _check_functions(system, t, q, args) -> None:
-    n = system.manifold_of(q).dim
-    v = jax.ShapeDtypeStruct((n,), q.dtype)
-    expected = {
-        "lagrangian": ("a scalar ()", lambda shape: shape == ()),
-        "nonholonomic": (
-            f"() or (m,) with 1 <= m <= {n}",
-            lambda shape: shape == () or (len(shape) == 1 and 1 <= shape[0] <= n),
-        ),
-        "force": (f"({n},)", lambda shape: shape == (n,)),
-    }
-    for name, (wanted, fits) in expected.items():
-        function = getattr(system, name)
-        if function is None:
-            continue
-        out = eqx.filter_eval_shape(function, t, q, v, args)
-        shape = getattr(out, "shape", None)
-        if shape is None or not fits(shape):
-            raise ShapeError(
-                f"`{name}(t, q, v, args)` must return shape {wanted}, got "
-                f"{out if shape is None else shape}."
-            )
-        if out.dtype != q.dtype:
-            raise DTypeError(
-                f"`{name}(t, q, v, args)` returns dtype {out.dtype}, but `q` has "
-                f"{q.dtype}: constants of another precision inside it?"
-            )

@@ -57,7 +57,7 @@ class LagrangianSystem(eqx.Module):
             )
 
     def manifold_of(self, q: Array) -> AbstractLieGroup:
-        """The configuration manifold, R^n with n the length of `q` if none was given."""
+        """The configuration manifold; R^n with the length of `q` if none was given."""
         return Euclidean(q.shape[0]) if self.manifold is None else self.manifold
 
     def momentum(

@@ -27,13 +27,11 @@ class Closure:
     - `E`: shape (s, s-1), the weights of the unknowns y.
     - `start`: shape (s,), the weights of the multiplier λ_k at t_k.
     - `end`: shape (s,), the weights of the continuous multiplier λ_c(q_{k+1}, p_{k+1}).
-    - `schur_inverse`: shape (s-1, s-1), the inverse of A_{2:,:} E.
     """
 
     E: np.ndarray
     start: np.ndarray
     end: np.ndarray
-    schur_inverse: np.ndarray
 
 
 @lru_cache(maxsize=128)
@@ -73,10 +71,8 @@ def make_closure(t: Tableau, symmetric: bool) -> Closure:
     else:
         for i in range(1, s):
             e[i, i - 1] = CONTEXT.one
-    schur = CONTEXT.matrix(t.mp_a.tolist()[1:]) * e
     return Closure(
         E=to_float64(e),
         start=to_float64([CONTEXT.one] + [CONTEXT.mpf(0)] * (s - 1)),
         end=to_float64(end),
-        schur_inverse=to_float64(CONTEXT.inverse(schur)),
     )

@@ -1,0 +1,1 @@
+"""Long-run studies and timings: `python -m benchmarks.closures` and its siblings."""

@@ -1,0 +1,41 @@
+"""Where the benchmarks put what they measured."""
+
+import datetime
+import json
+from pathlib import Path
+from typing import Any
+
+import jax
+
+import nhjax
+
+
+RESULTS = Path(__file__).parent / "results"
+
+
+def markdown_table(header: list[str], rows: list[list[str]]) -> str:
+    """A Markdown table."""
+    lines = [header, ["---"] * len(header), *rows]
+    return "\n".join("| " + " | ".join(line) + " |" for line in lines)
+
+
+def number(x: float) -> str:
+    """Two significant digits, as the tables need."""
+    return f"{x:.1e}"
+
+
+def write(name: str, title: str, text: str, data: dict[str, Any]) -> None:
+    """Print a report and keep it, as Markdown and JSON."""
+    about = {
+        "date": datetime.date.today().isoformat(),
+        "device": jax.devices()[0].device_kind,
+        "jax": jax.__version__,
+        "nhjax": nhjax.__version__,
+        "command": f"python -m benchmarks.{name}",
+    }
+    heading = f"# {title}\n\n" + ", ".join(f"{k}: {v}" for k, v in about.items())
+    report = f"{heading}\n\n{text}\n"
+    print(report)
+    RESULTS.mkdir(exist_ok=True)
+    (RESULTS / f"{name}.md").write_text(report)
+    (RESULTS / f"{name}.json").write_text(json.dumps(about | data, indent=1) + "\n")

@@ -1,0 +1,104 @@
+"""How round-off grows: Brouwer's law says as the square root of the number of steps.
+
+Energy errors of ensembles, at steps so small (or orders so high) that truncation does
+not show. A slope of 1/2 means that rounding errors are random, 1 that they are biased.
+"""
+
+import argparse
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import nhjax
+from nhjax import systems
+from nhjax.systems._base import AbstractExample
+
+from ._report import markdown_table, number, write
+
+
+def energy_rms(
+    example: AbstractExample,
+    method: nhjax.AbstractMethod,
+    solver: nhjax.AbstractStageSolver,
+    dt: float,
+    counts: list[int],
+    members: int,
+) -> np.ndarray:
+    """Root mean square over the ensemble of (E_k - E_0)/E_0 after each of `counts`."""
+    system = example.system
+    noise = np.random.default_rng(0).uniform(-0.1, 0.1, (2, members, len(example.q0)))
+    q0 = example.q0 + jnp.asarray(noise[0])
+    v0 = example.v0 * (1 + jnp.asarray(noise[1]))
+    stride = counts[0]
+
+    @jax.jit
+    @jax.vmap
+    def errors(q, v):
+        y0 = nhjax.initial_state(system, q, v, project=True)
+        saveat = nhjax.SaveAt(steps=stride, fn=system.energy)
+        sol = nhjax.integrate(
+            system,
+            method,
+            y0,
+            dt=dt,
+            num_steps=counts[-1],
+            saveat=saveat,
+            solver=solver,
+        )
+        start = system.energy(0.0, y0)
+        return (sol.ys - start) / start
+
+    error = np.asarray(errors(q0, v0))
+    rms = np.sqrt(np.mean(error**2, axis=0))
+    return rms[[count // stride - 1 for count in counts]]
+
+
+def main() -> None:
+    """Print and save the slopes."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--members", type=int, default=64)
+    parser.add_argument("--doublings", type=int, default=9)
+    options = parser.parse_args()
+    jax.config.update("jax_enable_x64", True)
+    counts = [64 * 2**k for k in range(options.doublings)]
+    lobatto = nhjax.LobattoIIIAB
+    cases = [
+        ("harmonic oscillator", systems.HarmonicOscillator(), lobatto(6), 0.1),
+        ("harmonic oscillator", systems.HarmonicOscillator(), nhjax.Gauss(5), 0.1),
+        ("particle", systems.NonholonomicParticle(), lobatto(6), 0.1),
+        ("particle", systems.NonholonomicParticle(), lobatto(6, "propagated"), 0.1),
+        ("rolling disc", systems.VerticalRollingDisc(), lobatto(5), 0.1),
+    ]
+    rows, data = [], []
+    for name, example, method, dt in cases:
+        for solver in (nhjax.SimplifiedNewton(), nhjax.Newton()):
+            rms = energy_rms(example, method, solver, dt, counts, options.members)
+            slope = float(np.polyfit(np.log(counts[2:]), np.log(rms[2:]), 1)[0])
+            label = f"{type(method).__name__}({method.stages}), {method.multiplier}"
+            solver_name = type(solver).__name__
+            rows.append([name, label, solver_name, f"{slope:.2f}"])
+            rows[-1] += [number(x) for x in rms[[0, len(rms) // 2, -1]]]
+            data.append(
+                {
+                    "system": name,
+                    "method": label,
+                    "solver": solver_name,
+                    "dt": dt,
+                    "steps": counts,
+                    "rms": rms.tolist(),
+                    "slope": slope,
+                }
+            )
+            print(*rows[-1], sep="\t", flush=True)
+    header = ["system", "method", "solver", "slope"]
+    header += [f"rms at {counts[k]}" for k in (0, len(counts) // 2, -1)]
+    text = (
+        f"Relative energy error, root mean square over {options.members} members, "
+        "slope fitted from the third entry on.\n\n" + markdown_table(header, rows)
+    )
+    write("brouwer", "Growth of round-off", text, {"cases": data})
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,199 @@
+"""The command line: `nhjax list` and `nhjax run STUDY`."""
+
+import argparse
+import inspect
+import json
+import math
+import sys
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import jax
+
+from . import __version__
+from ._errors import IntegrationError
+from ._method._abstract import MULTIPLIERS
+from .studies import ArgumentError, STUDIES, write
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the command line and return its exit code."""
+    arguments = _parser().parse_args(argv)
+    if arguments.command == "list":
+        for name, study in STUDIES.items():
+            print(f"{name:<16}{_headline(study)}")
+        return 0
+    # The studies reach errors of 1e-16, which float32 cannot show.
+    jax.config.update("jax_enable_x64", True)
+    return _run(**vars(arguments))
+
+
+def _run(
+    command: str,
+    study: str,
+    parser: argparse.ArgumentParser,
+    out: Path | None,
+    json_output: bool,
+    progress: bool | None,
+    num_steps: int | None = None,
+    **options: Any,
+) -> int:
+    del command
+    function = STUDIES[study]
+    out = Path("nhjax-results") / study if out is None else out
+    if progress is None:
+        progress = sys.stderr.isatty()
+    try:
+        if num_steps is not None:
+            if num_steps < 1:
+                parser.error(f"argument --num-steps: must be at least 1: {num_steps}")
+            dt = options.get("dt", inspect.signature(function).parameters["dt"].default)
+            options["final_time"] = num_steps * max(dt)
+        # Before hours of computing, not after them.
+        out.mkdir(parents=True, exist_ok=True)
+        result = function(progress=progress, **options)
+    except ArgumentError as error:
+        name = error.argument.replace("_", "-")
+        if num_steps is not None and name == "final-time":
+            name = "num-steps"
+        parser.error(f"argument --{name}: {error.problem}")
+    except OSError as error:
+        parser.error(f"argument --out: {error}")
+    except IntegrationError as error:
+        print(f"nhjax: {error}", file=sys.stderr)
+        return 1
+    record = write(result, out)
+    if json_output:
+        print(json.dumps(record, indent=2))
+    else:
+        print(result.table())
+        files = record["files"]
+        for path in (*files["figures"], files["data"], files["record"]):
+            print(f"wrote {path}")
+    return 0
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="nhjax",
+        description="Experiments with integrators for nonholonomic systems.",
+    )
+    parser.add_argument("--version", action="version", version=__version__)
+    commands = parser.add_subparsers(dest="command", metavar="COMMAND", required=True)
+    commands.add_parser("list", help="list the studies")
+    run = commands.add_parser("run", help="run a study and write its results")
+    studies = run.add_subparsers(dest="study", metavar="STUDY", required=True)
+    for name, function in STUDIES.items():
+        headline = _headline(function)
+        study = studies.add_parser(name, help=headline, description=headline)
+        study.set_defaults(parser=study)
+        _add_options(study, function)
+    return parser
+
+
+def _add_options(parser: argparse.ArgumentParser, function: Callable) -> None:
+    parameters = inspect.signature(function).parameters
+    length = parser.add_mutually_exclusive_group()
+    for name, parameter in parameters.items():
+        if name == "progress":
+            continue
+        default = parameter.default
+        shown = "" if default is None else f" (default: {_shown(default)})"
+        keywords = dict(_OPTIONS[name])
+        keywords["help"] += shown
+        group = length if name == "final_time" else parser
+        # The defaults stay where they are: in the study.
+        group.add_argument(
+            f"--{name.replace('_', '-')}", default=argparse.SUPPRESS, **keywords
+        )
+    length.add_argument(
+        "--num-steps",
+        type=int,
+        metavar="N",
+        default=argparse.SUPPRESS,
+        help="instead of --final-time: as long as N steps of the largest step size",
+    )
+    parser.add_argument(
+        "--out",
+        type=Path,
+        metavar="DIR",
+        help="where to write the results (default: nhjax-results/STUDY)",
+    )
+    parser.add_argument(
+        "--json",
+        action="store_true",
+        dest="json_output",
+        help="print the record of the run, as JSON, instead of a table",
+    )
+    parser.add_argument(
+        "--progress",
+        action=argparse.BooleanOptionalAction,
+        help="progress bars on the standard error stream (default: on a terminal)",
+    )
+
+
+def _number(text: str) -> float:
+    """A float, or a fraction of π such as pi/10."""
+    numerator, slash, denominator = text.partition("/")
+    value = math.pi if numerator == "pi" else float(numerator)
+    divisor = float(denominator) if slash else 1.0
+    if divisor == 0:
+        raise ValueError(f"{text} divides by zero")
+    return value / divisor
+
+
+# argparse names the type in its message.
+_number.__name__ = "number"
+
+_OPTIONS: dict[str, dict[str, Any]] = {
+    "stages": {"type": int, "nargs": "+", "metavar": "S", "help": "numbers of stages"},
+    "dt": {
+        "type": _number,
+        "nargs": "+",
+        "metavar": "H",
+        "help": "step sizes, such as 0.1 or pi/10",
+    },
+    "final_time": {"type": _number, "metavar": "T", "help": "the length of the runs"},
+    "members": {
+        "type": int,
+        "metavar": "J",
+        "help": "the ensemble holds the members 0..J",
+    },
+    "multiplier": {
+        "choices": MULTIPLIERS,
+        "help": "how the multiplier is closed from step to step",
+    },
+    "times": {
+        "type": _number,
+        "nargs": "+",
+        "metavar": "T",
+        "help": "when to report the error (default: 10 50 100 200, as far as it goes)",
+    },
+    "save_every": {
+        "type": int,
+        "metavar": "K",
+        "help": "save the energies after every K steps",
+    },
+    "regimes": {"nargs": "+", "metavar": "REGIME", "help": "low and high energy"},
+    "epsilon": {"type": _number, "metavar": "E", "help": "perturbation of the driver"},
+    "short_time": {
+        "type": _number,
+        "metavar": "T",
+        "help": "how much of the run the short-term figures show",
+    },
+}
+
+
+def _headline(function: Callable) -> str:
+    return (inspect.getdoc(function) or "").partition("\n")[0]
+
+
+def _shown(default: Any) -> str:
+    if isinstance(default, tuple):
+        return " ".join(map(_shown, default))
+    return f"{default:.6g}" if isinstance(default, float) else str(default)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

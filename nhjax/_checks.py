@@ -1,0 +1,189 @@
+"""What can be wrong with arguments, found before anything is compiled."""
+
+import reprlib
+from typing import Any, TYPE_CHECKING
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from ._custom_types import Args, FloatScalar, FloatScalarLike
+from ._errors import Check, DTypeError, is_traced, NonFiniteError, require, ShapeError
+
+
+if TYPE_CHECKING:
+    from ._state import State
+    from ._system import LagrangianSystem
+
+
+def check_type(name: str, x: object, kind: type, advice: str = "") -> None:
+    """Raise a `TypeError` unless `x` is a `kind`."""
+    if isinstance(x, kind):
+        return
+    if isinstance(x, type):
+        got = f"the class itself; write {x.__name__}(...)"
+    elif isinstance(getattr(x, "system", None), kind):
+        got = f"{type(x).__name__}; pass its attribute `.system`"
+    else:
+        got = f"{reprlib.repr(x)} of type {type(x).__name__}"
+    advice = f" {advice}" if advice else ""
+    raise TypeError(f"`{name}` must be an nhjax.{kind.__name__}, got {got}.{advice}")
+
+
+def check_num_steps(num_steps: Any) -> int:
+    """`num_steps` as an int >= 1."""
+    if isinstance(num_steps, bool) or not isinstance(num_steps, int | np.integer):
+        raise TypeError(
+            "`num_steps` must be an int known when tracing (under `jax.jit` a static "
+            f"argument), got {num_steps!r} of type {type(num_steps).__name__}."
+        )
+    # Steps are counted in int32.
+    if not 1 <= num_steps < 2**31:
+        raise ValueError(f"`num_steps` must be in 1..2^31 - 1, got {num_steps}.")
+    return int(num_steps)
+
+
+def floating(name: str, x: Any) -> Array:
+    """`x` as an array, or a `DTypeError` if it is not of float32 or float64."""
+    try:
+        array = jnp.asarray(x)
+    except (TypeError, ValueError):
+        raise DTypeError(
+            f"`{name}` must be an array of floats, got {reprlib.repr(x)} of type "
+            f"{type(x).__name__}."
+        ) from None
+    if array.dtype not in (jnp.float32, jnp.float64):
+        raise DTypeError(
+            f"`{name}` has dtype {array.dtype}, but float32 or float64 is needed: "
+            f"write 1.0 for 1, or convert with `jnp.asarray({name}, float)`."
+        )
+    return array
+
+
+def real_scalar(name: str, x: FloatScalarLike, dtype: Any) -> FloatScalar:
+    """`x` as a scalar of `dtype`; integers are welcome."""
+    array = jnp.asarray(x) if eqx.is_array_like(x) else None
+    if array is None or not (
+        jnp.issubdtype(array.dtype, jnp.floating)
+        or jnp.issubdtype(array.dtype, jnp.integer)
+    ):
+        raise DTypeError(
+            f"`{name}` must be a real number, got {reprlib.repr(x)} of type "
+            f"{type(x).__name__}."
+        )
+    if array.shape != ():
+        raise ShapeError(
+            f"`{name}` has shape {array.shape}, but a scalar is needed; for several "
+            "values use `jax.vmap`."
+        )
+    return array.astype(dtype)
+
+
+def finite(name: str, x: Any) -> Check:
+    """The check that every number in `x` is finite."""
+    return Check(
+        all_finite(x),
+        lambda: NonFiniteError(f"`{name}` is not finite: {x}."),
+        f"`{name}` is not finite.",
+    )
+
+
+def parameters(args: Args) -> Args:
+    """`args` with its floats as arrays, so that changing one recompiles nothing."""
+
+    def leaf(x):
+        # Through `float`: a weakly-typed scalar takes part in float32 and float64
+        # arithmetic alike.
+        return jnp.asarray(float(x)) if isinstance(x, float) else x
+
+    return jax.tree.map(leaf, args)
+
+
+def all_finite(tree: Any) -> Array:
+    """Whether every number in `tree` is finite."""
+    leaves = [jnp.all(jnp.isfinite(leaf)) for leaf in jax.tree.leaves(tree)]
+    return jnp.all(jnp.stack(leaves))
+
+
+def check_functions(system: "LagrangianSystem", t: Array, q: Array, args: Args) -> None:
+    """Raise unless the functions of the system return what they should."""
+    n = system.manifold_of(q).dim
+    v = jax.ShapeDtypeStruct((n,), q.dtype)
+    expected = {
+        "lagrangian": ("shape (), a scalar", lambda shape: shape == ()),
+        "nonholonomic": (
+            f"shape () or (m,) with 1 <= m <= {n}, the number of coordinates",
+            lambda shape: shape == () or (len(shape) == 1 and 1 <= shape[0] <= n),
+        ),
+        "force": (f"shape ({n},)", lambda shape: shape == (n,)),
+    }
+    for name, (wanted, fits) in expected.items():
+        function = getattr(system, name)
+        if function is None:
+            continue
+        out = eqx.filter_eval_shape(function, t, q, v, args)
+        shape = getattr(out, "shape", None)
+        if shape is None:
+            raise ShapeError(
+                f"`{name}(t, q, v, args)` must return an array of {wanted}, got "
+                f"{reprlib.repr(out)} of type {type(out).__name__}."
+            )
+        if not fits(shape):
+            raise ShapeError(
+                f"`{name}(t, q, v, args)` must return {wanted}, got shape {shape}."
+            )
+        if out.dtype != q.dtype:
+            raise DTypeError(
+                f"`{name}(t, q, v, args)` returns dtype {out.dtype}, but `q` has "
+                f"{q.dtype}: constants of another precision inside it?"
+            )
+
+
+def check_state(system: "LagrangianSystem", y0: "State", args: Args) -> None:
+    """Raise unless `y0` can be a state of `system`."""
+    parts = {name: getattr(y0, name) for name in ("p", "v", "q", "multiplier")}
+    for name, x in parts.items():
+        for leaf in jax.tree.leaves(x, is_leaf=lambda leaf: leaf is None):
+            if not eqx.is_array(leaf):
+                raise TypeError(
+                    f"`y0.{name}` must be an array, got {reprlib.repr(leaf)} of type "
+                    f"{type(leaf).__name__}. Use `initial_state`."
+                )
+            floating(f"y0.{name}", leaf)
+            if leaf.dtype != y0.p.dtype:
+                raise DTypeError(
+                    f"`y0.{name}` has dtype {leaf.dtype} and `y0.p` {y0.p.dtype}: all "
+                    "parts of a state must agree. Use `initial_state`."
+                )
+    advice = (
+        "For many trajectories use `jax.vmap` over `y0`; the last state of a solution "
+        "is `jax.tree.map(lambda x: x[-1], sol.ys)`."
+    )
+    for name in ("q", "p") if system.manifold is None else ("p",):
+        if parts[name].ndim != 1:
+            raise ShapeError(
+                f"`y0.{name}` has shape {parts[name].shape}, but a state has shape "
+                f"(n,). {advice}"
+            )
+    manifold = system.manifold_of(y0.q)
+    manifold.check(y0.q)
+    for name in ("v", "p"):
+        shape = parts[name].shape
+        if shape != (manifold.dim,):
+            raise ShapeError(
+                f"`y0.{name}` has shape {shape}, but `y0.q` needs ({manifold.dim},). "
+                "Use `initial_state`."
+            )
+    t = jnp.zeros((), y0.v.dtype)
+    expected = eqx.filter_eval_shape(system.constraint, t, y0.q, y0.v, args).shape
+    if y0.multiplier.shape != expected:
+        raise ShapeError(
+            f"`y0.multiplier` has shape {y0.multiplier.shape}, but the constraints of "
+            f"the system have shape {expected}. Use `initial_state` with this system."
+        )
+    for name, x in parts.items():
+        # Of traced parts the integration itself reports it, lane by lane.
+        if not is_traced(*jax.tree.leaves(x)):
+            require(x, finite(f"y0.{name}", x))

@@ -1,0 +1,164 @@
+"""What a physicist asks of a computed trajectory."""
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from ._custom_types import Args
+from ._errors import is_traced, ShapeError
+from ._solution import Solution
+from ._state import State
+from ._system import LagrangianSystem
+
+
+def energy_error(
+    system: LagrangianSystem, sol: Solution, args: Args = None
+) -> Float[Array, "... k"]:
+    """The energy error E(t) - E(t0) along a saved trajectory.
+
+    It works under `vmap`, and on a solution that comes out of `vmap` as long as all
+    members share `system` and `args`.
+
+    **Arguments:**
+
+    - `system`: the system that was integrated.
+    - `sol`: a `Solution` that holds states, the initial one first: save with
+        `SaveAt(t0=True, steps=True)`.
+    - `args`: those of the integration.
+
+    **Returns:** an array of the shape of `sol.ts`.
+
+    **Raises:** `ValueError` if `sol` holds no states, or not the initial one.
+
+    !!! example
+
+        >>> import nhjax
+        >>> disc = nhjax.systems.VerticalRollingDisc()
+        >>> sol = nhjax.integrate(disc.system, nhjax.LobattoIIIAB(3),
+        ...     disc.initial_state(), dt=0.1, num_steps=10,
+        ...     saveat=nhjax.SaveAt(t0=True, steps=True))
+        >>> nhjax.energy_error(disc.system, sol).shape
+        (11,)
+    """
+    ts, ys = saved_states(sol)
+    first = ts[..., 0]
+    if not is_traced(first, sol.t0) and np.any(np.asarray(first != sol.t0)):
+        raise ValueError(
+            "The initial state was not saved, so that there is no energy to compare "
+            "with: pass `saveat=nhjax.SaveAt(t0=True, ...)` to `integrate`."
+        )
+    energy = map_over_axes(ts.ndim, lambda t, y: system.energy(t, y, args))(ts, ys)
+    return energy - energy[..., :1]
+
+
+def momentum_map(
+    y: State, generator: Callable[[Any], Float[Array, " n"]]
+) -> Float[Array, "..."]:
+    """The momentum p · ξ_Q(q) along an infinitesimal symmetry ξ_Q.
+
+    It is conserved when ξ_Q is a symmetry of the Lagrangian that the constraints allow
+    as a virtual displacement, D2Φ · ξ_Q = 0; otherwise it obeys the nonholonomic
+    momentum equation.
+
+    **Arguments:**
+
+    - `y`: a state, or a trajectory of them such as `sol.ys`.
+    - `generator`: the vector field ξ_Q, called as `generator(q)` with one
+        configuration, of shape (n,).
+
+    **Returns:** one number for each state.
+
+    **Raises:** `ShapeError` if `generator` returns something of another shape.
+
+    !!! example
+
+        The spin of a rolling disc about the vertical:
+
+        >>> import jax.numpy as jnp, nhjax
+        >>> y0 = nhjax.systems.VerticalRollingDisc().initial_state()
+        >>> turn = lambda q: jnp.array([0.0, 0.0, 0.0, 1.0], q.dtype)
+        >>> round(float(nhjax.momentum_map(y0, turn)), 6)
+        0.175
+    """
+
+    def pairing(q, p):
+        direction = jnp.asarray(generator(q))
+        if direction.shape != p.shape:
+            raise ShapeError(
+                f"`generator(q)` has shape {direction.shape}, expected {p.shape}: one "
+                "component for each velocity."
+            )
+        return p @ direction
+
+    return map_over_axes(y.p.ndim - 1, pairing)(y.q, y.p)
+
+
+def convergence_order(
+    step_sizes: Float[np.ndarray, " k"] | list[float] | tuple[float, ...],
+    errors: Float[np.ndarray, "k ..."] | list[float] | tuple[float, ...],
+) -> Float[np.ndarray, "l ..."]:
+    """The observed order between successive step sizes, Δ log(error) / Δ log(h).
+
+    **Arguments:**
+
+    - `step_sizes`: at least two different ones, shape (k,).
+    - `errors`: the error for each of them, shape (k, ...).
+
+    **Returns:** a NumPy array of shape (k - 1, ...).
+
+    **Raises:** `ValueError` for sizes or errors that have no slope between them.
+
+    !!! example
+
+        >>> import nhjax
+        >>> nhjax.convergence_order([0.2, 0.1, 0.05], [1.6e-3, 1e-4, 6.25e-6])
+        array([4., 4.])
+    """
+    h = np.abs(np.asarray(step_sizes, dtype=np.float64))
+    e = np.asarray(errors, dtype=np.float64)
+    if h.ndim != 1 or h.shape[0] < 2:
+        raise ValueError(
+            f"`step_sizes` must be a vector of at least two, got shape {h.shape}."
+        )
+    if e.shape[:1] != h.shape:
+        raise ValueError(
+            f"`errors` must have one entry for each of the {h.shape[0]} step sizes, "
+            f"got shape {e.shape}."
+        )
+    if not np.all(np.isfinite(h) & (h > 0)):
+        raise ValueError(f"`step_sizes` must be finite and nonzero, got {step_sizes}.")
+    if np.any(h[1:] == h[:-1]):
+        raise ValueError(
+            f"`step_sizes` must differ from one to the next, got {step_sizes}."
+        )
+    bad = ~(np.isfinite(e) & (e > 0))
+    if np.any(bad):
+        where = tuple(int(i) for i in np.argwhere(bad)[0])
+        raise ValueError(
+            f"`errors` must be positive and finite to have a slope, but errors{where} "
+            f"= {e[where]}. Leave it out."
+        )
+    widths = np.diff(np.log(h)).reshape(-1, *([1] * (e.ndim - 1)))
+    return np.diff(np.log(e), axis=0) / widths
+
+
+def saved_states(sol: Solution) -> tuple[Float[Array, "... k"], State]:
+    """The times and states that `sol` holds, or an error that says how to save them."""
+    if sol.ts is None or not isinstance(sol.ys, State):
+        held = "nothing" if sol.ts is None else f"values of type {type(sol.ys)}"
+        raise ValueError(
+            f"The solution holds {held} where states are needed: pass "
+            "`saveat=nhjax.SaveAt(t0=True, steps=True)`, without `fn`, to `integrate`."
+        )
+    return sol.ts, sol.ys
+
+
+def map_over_axes(axes: int, function: Callable[..., Array]) -> Callable[..., Array]:
+    """`function` mapped over that many leading axes."""
+    for _ in range(axes):
+        function = jax.vmap(function)
+    return function

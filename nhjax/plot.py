@@ -1,0 +1,245 @@
+"""Pictures of trajectories and of convergence, on matplotlib.
+
+Every function draws into `ax` if one is given and into the axes of a new figure
+otherwise, returns the axes, and never shows or saves anything. Matplotlib is imported
+by the first call.
+"""
+
+from collections.abc import Sequence
+from typing import Any, TYPE_CHECKING
+
+import numpy as np
+from jaxtyping import Float
+
+from ._custom_types import Args
+from ._solution import Solution
+from ._system import LagrangianSystem
+from .diagnostics import energy_error, map_over_axes, saved_states
+
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+
+def trajectory(
+    sol: Solution,
+    coordinates: Sequence[int] = (0, 1),
+    *,
+    names: Sequence[str] | None = None,
+    ax: "Axes | None" = None,
+    **style: Any,
+) -> "Axes":
+    """The path in the plane, or the space, of some coordinates.
+
+    **Arguments:**
+
+    - `sol`: a `Solution` that holds states; a batch is drawn as one path for each.
+    - `coordinates`: the indices of two or three entries of q.
+    - `names`: what to call them on the axes.
+    - `ax`: the axes to draw into; for three coordinates, with a 3d projection.
+    - `style`: passed on to `Axes.plot`.
+
+    **Returns:** the axes.
+
+    **Raises:** `ValueError` if `sol` holds no states or `coordinates` do not fit it.
+
+    !!! example
+
+        >>> import nhjax
+        >>> disc = nhjax.systems.VerticalRollingDisc()
+        >>> sol = nhjax.integrate(disc.system, nhjax.LobattoIIIAB(3),
+        ...     disc.initial_state(), dt=0.1, num_steps=90,
+        ...     saveat=nhjax.SaveAt(t0=True, steps=True))
+        >>> ax = nhjax.plot.trajectory(sol, names=("x", "y"))
+    """
+    _, ys = saved_states(sol)
+    q = np.asarray(ys.q)
+    n = q.shape[-1]
+    if len(coordinates) not in (2, 3) or not all(-n <= i < n for i in coordinates):
+        raise ValueError(
+            f"`coordinates` must be two or three indices into the {n} coordinates of "
+            f"the system, got {tuple(coordinates)}."
+        )
+    names = _names(names, [f"$q_{i % n + 1}$" for i in coordinates])
+    spatial = len(coordinates) == 3
+    ax = _axes(ax, projection="3d" if spatial else None)
+    for path in q.reshape(-1, *q.shape[-2:])[..., list(coordinates)]:
+        ax.plot(*path.T, **style)
+    for letter, name in zip("xyz", names, strict=False):
+        getattr(ax, f"set_{letter}label")(name)
+    if not spatial:
+        ax.set_aspect("equal", adjustable="datalim")
+    return ax
+
+
+def energy(
+    system: LagrangianSystem,
+    sol: Solution,
+    args: Args = None,
+    *,
+    ax: "Axes | None" = None,
+    **style: Any,
+) -> "Axes":
+    """The energy error E(t) - E(t0) against time.
+
+    **Arguments:**
+
+    - `system`, `sol`, `args`: as for `nhjax.energy_error`.
+    - `ax`: the axes to draw into.
+    - `style`: passed on to `Axes.plot`.
+
+    **Returns:** the axes.
+
+    **Raises:** what `nhjax.energy_error` raises.
+    """
+    ax = _against_time(sol.ts, energy_error(system, sol, args), ax, style)
+    ax.set_ylabel("$E(t) - E(t_0)$")
+    return ax
+
+
+def multiplier(sol: Solution, *, ax: "Axes | None" = None, **style: Any) -> "Axes":
+    """The multipliers λ_a against time, one line for each constraint.
+
+    **Arguments:**
+
+    - `sol`: a `Solution` that holds states.
+    - `ax`: the axes to draw into.
+    - `style`: passed on to `Axes.plot`.
+
+    **Returns:** the axes.
+
+    **Raises:** `ValueError` if `sol` holds no states.
+    """
+    ts, ys = saved_states(sol)
+    ax = _each_constraint(ts, np.asarray(ys.multiplier), r"\lambda", ax, style)
+    ax.set_ylabel("multiplier")
+    return ax
+
+
+def constraint(
+    system: LagrangianSystem,
+    sol: Solution,
+    args: Args = None,
+    *,
+    ax: "Axes | None" = None,
+    **style: Any,
+) -> "Axes":
+    """The constraint functions Φ_a at the saved states against time.
+
+    **Arguments:**
+
+    - `system`: the system that was integrated.
+    - `sol`: a `Solution` that holds states.
+    - `args`: those of the integration.
+    - `ax`: the axes to draw into.
+    - `style`: passed on to `Axes.plot`.
+
+    **Returns:** the axes.
+
+    **Raises:** `ValueError` if `sol` holds no states.
+    """
+    ts, ys = saved_states(sol)
+
+    violation = map_over_axes(
+        ts.ndim, lambda t, y: system.constraint_violation(t, y, args)
+    )
+    ax = _each_constraint(ts, np.asarray(violation(ts, ys)), r"\Phi", ax, style)
+    ax.set_ylabel("constraint")
+    return ax
+
+
+def convergence(
+    step_sizes: Float[np.ndarray, " k"] | Sequence[float],
+    errors: Float[np.ndarray, " k"] | Sequence[float],
+    *,
+    order: int | None = None,
+    ax: "Axes | None" = None,
+    **style: Any,
+) -> "Axes":
+    """Errors against step sizes on logarithmic scales.
+
+    **Arguments:**
+
+    - `step_sizes`, `errors`: vectors of one length; errors that are not positive are
+        left out.
+    - `order`: draw a dashed line of this slope through the error in the middle.
+    - `ax`: the axes to draw into.
+    - `style`: passed on to `Axes.plot`.
+
+    **Returns:** the axes.
+
+    **Raises:** `ValueError` if the lengths differ, or no error is positive.
+
+    !!! example
+
+        >>> import nhjax
+        >>> ax = nhjax.plot.convergence([0.2, 0.1], [1.6e-3, 1e-4], order=4)
+    """
+    h, e = np.abs(np.asarray(step_sizes)), np.asarray(errors)
+    if h.ndim != 1 or h.shape != e.shape:
+        raise ValueError(
+            "`step_sizes` and `errors` must be vectors of one length, got shapes "
+            f"{h.shape} and {e.shape}."
+        )
+    shown = np.isfinite(e) & (e > 0)
+    if not np.any(shown):
+        raise ValueError(f"`errors` must hold a positive number, got {errors}.")
+    h, e = h[shown], e[shown]
+    ax = _axes(ax)
+    (line,) = ax.plot(h, e, **{"marker": "o", "markersize": 4, **style})
+    if order is not None:
+        # The largest step need not be asymptotic yet, the smallest may be round-off.
+        middle = np.argsort(h)[len(h) // 2]
+        reference = e[middle] * (h / h[middle]) ** order
+        ax.plot(h, reference, linestyle="--", linewidth=0.8, color=line.get_color())
+    ax.set_xscale("log")
+    ax.set_yscale("log")
+    ax.set_xlabel("step size $h$")
+    ax.set_ylabel("error")
+    return ax
+
+
+def _axes(ax: "Axes | None", projection: str | None = None) -> "Axes":
+    if ax is not None:
+        return ax
+    # Only here: drawing into given axes must not choose a backend.
+    from matplotlib import pyplot as plt
+
+    keywords = {} if projection is None else {"projection": projection}
+    return plt.figure(layout="constrained").add_subplot(**keywords)
+
+
+def _against_time(ts: Any, values: Any, ax: "Axes | None", style: Any) -> "Axes":
+    ax = _axes(ax)
+    times, values = np.asarray(ts), np.asarray(values)
+    # A batch becomes columns, so that each member is a line.
+    ax.plot(_columns(times), _columns(values), **style)
+    ax.set_xlabel("time $t$")
+    return ax
+
+
+def _each_constraint(
+    ts: Any, values: np.ndarray, symbol: str, ax: "Axes | None", style: Any
+) -> "Axes":
+    count = values.shape[-1]
+    if count == 0:
+        raise ValueError("The system has no constraints.")
+    for a in range(count):
+        label = {"label": f"${symbol}_{a + 1}$"} if count > 1 else {}
+        ax = _against_time(ts, values[..., a], ax, {**label, **style})
+    assert ax is not None
+    if count > 1:
+        ax.legend()
+    return ax
+
+
+def _columns(x: np.ndarray) -> np.ndarray:
+    return x.reshape(-1, x.shape[-1]).T
+
+
+def _names(names: Sequence[str] | None, default: list[str]) -> Sequence[str]:
+    if names is None:
+        return default
+    if len(names) != len(default):
+        raise ValueError(f"`names` must hold {len(default)} names, got {len(names)}.")
+    return names

@@ -1,0 +1,26 @@
+"""The paper's experiments as functions; `nhjax run` is their command line."""
+
+from collections.abc import Callable, Mapping
+from types import MappingProxyType
+
+from ._arguments import ArgumentError as ArgumentError
+from ._chaotic_energy import (
+    chaotic_energy as chaotic_energy,
+    ChaoticEnergy as ChaoticEnergy,
+)
+from ._cvt_energy import cvt_energy as cvt_energy, CVTEnergy as CVTEnergy
+from ._particle_order import (
+    particle_order as particle_order,
+    ParticleOrder as ParticleOrder,
+)
+from ._result import AbstractStudyResult as AbstractStudyResult, write as write
+
+
+# What `nhjax list` shows. The keyword arguments of a study are its options.
+STUDIES: Mapping[str, Callable[..., AbstractStudyResult]] = MappingProxyType(
+    {
+        "particle-order": particle_order,
+        "cvt-energy": cvt_energy,
+        "chaotic-energy": chaotic_energy,
+    }
+)

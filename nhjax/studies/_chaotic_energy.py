@@ -1,0 +1,294 @@
+"""The mean squared energy error of an ensemble of chaotic motions."""
+
+import dataclasses
+from collections.abc import Sequence
+from typing import Any, ClassVar, TYPE_CHECKING
+
+import jax
+import numpy as np
+
+from .._integrate import integrate
+from .._method import LobattoIIIAB
+from .._saveat import SaveAt
+from .._solution import raise_failures
+from .._state import initial_state, State
+from ..systems import ChaoticSystem
+from ._arguments import (
+    ArgumentError,
+    check_at_least_one,
+    check_distinct,
+    check_positive,
+    check_stages,
+    check_step_sizes,
+    whole_steps,
+)
+from ._chaotic_figure import chaotic_figure
+from ._result import AbstractStudyResult, Timing
+from ._run import compile_and_run, meter
+from ._table import format_slope, format_table, slopes
+
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+
+# Means are taken over this long a stretch to either side of a time: μ(E, k) of one
+# step fluctuates with the fast motion of the system.
+WINDOW = 5.0
+TIMES = (10.0, 50.0, 100.0, 200.0)
+
+
+@dataclasses.dataclass(frozen=True)
+class ChaoticRun:
+    """The ensemble with one method and one step size.
+
+    - `energies`: shape (members, saved times).
+    """
+
+    stages: int
+    dt: float
+    times: np.ndarray
+    energies: np.ndarray
+    mean_iterations: float
+    max_constraint_violation: float
+    timing: Timing
+
+    def mean_squared_error(self) -> np.ndarray:
+        """μ(E, k) at the saved times."""
+        return np.mean((self.energies - self.energies[:, :1]) ** 2, axis=0)
+
+    def window_means(self, times: Sequence[float]) -> np.ndarray:
+        """μ(E, k) averaged around each of `times`."""
+        mu = self.mean_squared_error()
+        return np.array(
+            [np.mean(mu[np.abs(self.times - t) <= WINDOW + 1e-9]) for t in times]
+        )
+
+
+@dataclasses.dataclass(frozen=True)
+class ChaoticEnergy(AbstractStudyResult):
+    """The runs of a chaotic-energy study, h falling for each s."""
+
+    name: ClassVar[str] = "chaotic-energy"
+
+    stages: tuple[int, ...]
+    dt: tuple[float, ...]
+    final_time: float
+    members: int
+    multiplier: str
+    times: tuple[float, ...]
+    save_every: int
+    runs: list[ChaoticRun]
+
+    def of_stages(self, s: int) -> list[ChaoticRun]:
+        """The runs with `s` stages, h falling."""
+        return [run for run in self.runs if run.stages == s]
+
+    def slopes(self, s: int) -> np.ndarray:
+        """log-log slopes of the window means, shape (step sizes, times).
+
+        The first row is NaN: there is no larger step to compare with.
+        """
+        means = np.stack([run.window_means(self.times) for run in self.of_stages(s)])
+        return slopes(self.dt, means)
+
+    def parameters(self) -> dict[str, Any]:
+        """Every parameter of the computation, initial data included."""
+        return {
+            "stages": self.stages,
+            "dt": self.dt,
+            "num_steps": [whole_steps(self.final_time, h) for h in self.dt],
+            "final_time": self.final_time,
+            "members": self.members,
+            "multiplier": self.multiplier,
+            "solver": "SimplifiedNewton",
+            "times": self.times,
+            "window": WINDOW,
+            "save_every": self.save_every,
+            "system": "ChaoticSystem",
+            "system_parameters": {"m": ChaoticSystem().m},
+            "initial_data": {
+                "J": self.members,
+                "j": f"0..{self.members}",
+                "q0": "(cos(jπ/2J), 0.6, 0.4, 0.2, 1, 1, 1)",
+                "v0": "(0, sin(jπ/2J), 0, 0, 0, 0, 0)",
+                "E0": 3.06,
+                "multiplier": "continuous, from the hidden constraint",
+            },
+        }
+
+    def summary(self) -> dict[str, Any]:
+        """The results in short, with timings."""
+        entries = []
+        for s in self.stages:
+            for run, slope in zip(self.of_stages(s), self.slopes(s), strict=True):
+                means = run.window_means(self.times)
+                entry = {
+                    "stages": s,
+                    "dt": run.dt,
+                    "mu": means,
+                    "mu_over_h^{4(s-1)}": means / run.dt ** (4 * (s - 1)),
+                    "slopes": slope,
+                    "expected_slope": 4 * (s - 1),
+                    "mean_iterations": run.mean_iterations,
+                    "max_constraint_violation": run.max_constraint_violation,
+                    **dataclasses.asdict(run.timing),
+                }
+                entries.append(entry)
+        return {
+            "times": self.times,
+            "runs": entries,
+            "compile_seconds": sum(run.timing.compile_seconds for run in self.runs),
+            "run_seconds": sum(run.timing.run_seconds for run in self.runs),
+        }
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """The data behind the figure."""
+        data = {}
+        for run in self.runs:
+            key = f"s{run.stages}_h{run.dt:.6g}"
+            data[f"{key}_times"] = run.times
+            data[f"{key}_mu"] = run.mean_squared_error()
+            data[f"{key}_energies"] = run.energies
+        return data
+
+    def table(self) -> str:
+        """μ/h^{4(s-1)} and the slopes of μ at the times."""
+        header = ["s", "h", "4(s-1)"]
+        header += [f"μ/h^4(s-1) t={t:g}" for t in self.times]
+        header += [f"slope t={t:g}" for t in self.times]
+        header += ["compile s", "run s"]
+        rows = []
+        for s in self.stages:
+            for run, slope in zip(self.of_stages(s), self.slopes(s), strict=True):
+                power = 4 * (s - 1)
+                scaled = run.window_means(self.times) / run.dt**power
+                rows.append(
+                    [str(s), f"{run.dt:.6g}", str(power)]
+                    + [f"{x:.3g}" for x in scaled]
+                    + [format_slope(x) for x in slope]
+                    + [f"{run.timing.compile_seconds:.2f}"]
+                    + [f"{run.timing.run_seconds:.2f}"]
+                )
+        return format_table(header, rows)
+
+    def figures(self) -> "dict[str, Figure]":
+        """μ against time in both normalisations, ours and the paper's."""
+        curves = [
+            (run.stages, run.dt, run.times, run.mean_squared_error())
+            for run in self.runs
+        ]
+        title = f"J = {self.members}, {self.multiplier} multiplier"
+        return {self.name: chaotic_figure(curves, title)}
+
+
+def chaotic_energy(
+    *,
+    stages: Sequence[int] = (2, 3, 4),
+    dt: Sequence[float] = (0.1, 0.2),
+    final_time: float = 200.0,
+    members: int = 100,
+    multiplier: str = "propagated",
+    times: Sequence[float] | None = None,
+    save_every: int = 1,
+    progress: bool = False,
+) -> ChaoticEnergy:
+    """Mean squared energy error of an ensemble of the chaotic system.
+
+    The paper's third experiment, J + 1 motions of a system with 7 degrees of freedom on
+    one energy surface. μ(E, k), the mean of (E_jk - E_0)² over the ensemble at step k,
+    is found to go as h^{4(s-1)}. Every motion is chaotic: only such statistics can be
+    compared.
+
+    **Arguments:**
+
+    - `stages`: the numbers of stages s.
+    - `dt`: the step sizes h, each of which must divide `final_time`.
+    - `final_time`: the length of each run.
+    - `members`: the paper's J.
+    - `multiplier`: the closure, as for `nhjax.LobattoIIIAB`; the paper's by default.
+    - `times`: when to report μ, as means over a window of ±5; 10, 50, 100 and 200 as
+        far as the run goes (its end if it is shorter) by default.
+    - `save_every`: save energies after every this many steps.
+    - `progress`: show a bar for each run on the standard error stream.
+
+    **Returns:** a `ChaoticEnergy`.
+
+    **Raises:** `ArgumentError` for arguments that cannot be right, and
+    `nhjax.IntegrationError` if a step cannot be solved.
+    """
+    check_stages(stages)
+    check_step_sizes(dt)
+    check_positive("final_time", final_time)
+    check_at_least_one("members", members)
+    check_at_least_one("save_every", save_every)
+    if times is None:
+        times = [t for t in TIMES if t <= final_time] or [final_time]
+    check_distinct("times", times)
+    for t in times:
+        if not 0 < t <= final_time:
+            raise ArgumentError("times", f"must lie within the run, got {t:g}")
+    dt = tuple(sorted(dt, reverse=True))
+    num_steps = {h: whole_steps(final_time, h) for h in dt}
+    for h in dt:
+        if save_every * h > WINDOW:
+            name, value = ("dt", h) if save_every == 1 else ("save_every", save_every)
+            raise ArgumentError(
+                name, f"must leave samples in a window of ±{WINDOW:g}, got {value:g}"
+            )
+    chaotic = ChaoticSystem()
+    q0, v0 = chaotic.ensemble(members)
+    y0 = jax.vmap(lambda q, v: initial_state(chaotic.system, q, v))(q0, v0)
+    runs = [
+        _run(chaotic, y0, LobattoIIIAB(s, multiplier), h, n, save_every, progress)
+        for s in stages
+        for h, n in num_steps.items()
+    ]
+    return ChaoticEnergy(
+        stages=tuple(stages),
+        dt=dt,
+        final_time=final_time,
+        members=members,
+        multiplier=multiplier,
+        times=tuple(times),
+        save_every=save_every,
+        runs=runs,
+    )
+
+
+def _run(
+    chaotic: ChaoticSystem,
+    y0: State,
+    method: LobattoIIIAB,
+    h: float,
+    num_steps: int,
+    save_every: int,
+    progress: bool,
+) -> ChaoticRun:
+    system = chaotic.system
+    save_every = min(save_every, num_steps)
+
+    def run(y0):
+        return integrate(
+            system,
+            method,
+            y0,
+            dt=h,
+            num_steps=num_steps,
+            saveat=SaveAt(t0=True, steps=save_every, fn=system.energy),
+            throw=False,
+            progress_meter=meter(progress, f"s = {method.stages}, h = {h:.4g}"),
+        )
+
+    sol, timing = compile_and_run(jax.vmap(run), y0)
+    raise_failures(sol)
+    ts, ys, stats = jax.tree.map(np.asarray, (sol.ts, sol.ys, sol.stats))
+    return ChaoticRun(
+        stages=method.stages,
+        dt=h,
+        times=ts[0],
+        energies=ys,
+        mean_iterations=float(np.mean(stats["num_iterations"])) / num_steps,
+        max_constraint_violation=float(np.max(stats["max_constraint_violation"])),
+        timing=timing,
+    )

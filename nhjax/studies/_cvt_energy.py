@@ -1,0 +1,297 @@
+"""Long-term energies of the continuously variable transmission."""
+
+import dataclasses
+import math
+from collections.abc import Sequence
+from typing import Any, ClassVar, TYPE_CHECKING
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from .._integrate import integrate
+from .._method import LobattoIIIAB
+from .._newton import Newton
+from .._saveat import SaveAt
+from .._solution import raise_failures
+from ..systems import ContinuouslyVariableTransmission
+from ._arguments import (
+    ArgumentError,
+    check_distinct,
+    check_positive,
+    check_stages,
+    check_step_sizes,
+)
+from ._result import AbstractStudyResult, Timing
+from ._run import compile_and_run, meter
+from ._table import format_table
+
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+
+REGIMES = {
+    "low": ContinuouslyVariableTransmission.low,
+    "high": ContinuouslyVariableTransmission.high,
+}
+ENERGIES = ("total", "driver", "passenger")
+
+
+@dataclasses.dataclass(frozen=True)
+class CVTRun:
+    """The energies of one run, at every step.
+
+    - `energies`: shape (k + 1, 3): total, driver and passenger.
+    - `timing`: of the program that runs all regimes with this s and h side by side.
+    """
+
+    regime: str
+    stages: int
+    dt: float
+    times: np.ndarray
+    energies: np.ndarray
+    max_multiplier_defect: float
+    timing: Timing
+
+    @property
+    def key(self) -> str:
+        """A name for files and arrays."""
+        return f"{self.regime}_s{self.stages}_h{self.dt:.6g}"
+
+    def deviations(self) -> np.ndarray:
+        """The energies less their initial values."""
+        return self.energies - self.energies[0]
+
+    def by_fifths(self) -> list[float]:
+        """Max |E - E0| over each fifth of the run."""
+        error = np.abs(self.deviations()[1:, 0])
+        return [float(np.max(part)) for part in np.array_split(error, 5)]
+
+    def ranges(self) -> dict[str, tuple[float, float]]:
+        """The least and the greatest deviation of each energy."""
+        low, high = self.deviations().min(axis=0), self.deviations().max(axis=0)
+        return {
+            name: (float(low[i]), float(high[i])) for i, name in enumerate(ENERGIES)
+        }
+
+
+@dataclasses.dataclass(frozen=True)
+class CVTEnergy(AbstractStudyResult):
+    """Energies of the transmission, for each regime, s and h."""
+
+    name: ClassVar[str] = "cvt-energy"
+
+    final_time: float
+    multiplier: str
+    epsilon: float
+    short_time: float
+    runs: list[CVTRun]
+
+    def parameters(self) -> dict[str, Any]:
+        """Every parameter of the computation, initial data included."""
+        regimes = dict.fromkeys(run.regime for run in self.runs)
+        examples = {name: REGIMES[name](self.epsilon) for name in regimes}
+        return {
+            "regimes": list(regimes),
+            "stages": list(dict.fromkeys(run.stages for run in self.runs)),
+            "dt": list(dict.fromkeys(run.dt for run in self.runs)),
+            "final_time": self.final_time,
+            "multiplier": self.multiplier,
+            "solver": "Newton",
+            "epsilon": self.epsilon,
+            "short_time": self.short_time,
+            "system": "ContinuouslyVariableTransmission",
+            "initial_data": {
+                name: {"q0": np.asarray(cvt.q0), "v0": np.asarray(cvt.v0)}
+                for name, cvt in examples.items()
+            },
+        }
+
+    def summary(self) -> dict[str, Any]:
+        """The results in short, with timings."""
+        return {
+            "runs": [
+                {
+                    "regime": run.regime,
+                    "stages": run.stages,
+                    "dt": run.dt,
+                    "num_steps": len(run.times) - 1,
+                    "last_time": run.times[-1],
+                    "max_energy_error_by_fifths": run.by_fifths(),
+                    "ranges": run.ranges(),
+                    "max_multiplier_defect": run.max_multiplier_defect,
+                    **dataclasses.asdict(run.timing),
+                }
+                for run in self.runs
+            ]
+        }
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """The data behind the figures."""
+        data = {}
+        for run in self.runs:
+            data[f"{run.key}_times"] = run.times
+            data[f"{run.key}_energies"] = run.energies
+        return data
+
+    def table(self) -> str:
+        """Energy errors by fifths of the run, and the ranges of E_d and E_p."""
+        header = ["regime", "s", "h"]
+        header += [f"max|E-E0| {i}/5" for i in range(1, 6)]
+        header += ["range of ΔE_d", "range of ΔE_p", "run s"]
+        rows = []
+        for run in self.runs:
+            ranges = run.ranges()
+            rows.append(
+                [run.regime, str(run.stages), f"{run.dt:.6g}"]
+                + [f"{x:.2e}" for x in run.by_fifths()]
+                + [
+                    f"[{low:.3g}, {high:.3g}]"
+                    for low, high in (ranges["driver"], ranges["passenger"])
+                ]
+                + [f"{run.timing.run_seconds:.2f}"]
+            )
+        return format_table(header, rows)
+
+    def figures(self) -> "dict[str, Figure]":
+        """For each regime and step size: short and long term, as in the paper."""
+        cases = dict.fromkeys((run.regime, run.dt) for run in self.runs)
+        return {
+            f"{self.name}-{regime}-h{h:.4g}": self._figure(regime, h)
+            for regime, h in cases
+        }
+
+    def _figure(self, regime: str, h: float) -> "Figure":
+        from matplotlib.figure import Figure
+
+        figure = Figure(figsize=(10, 8), layout="constrained")
+        axes = figure.subplots(3, 2, sharex="col", sharey="row")
+        runs = [run for run in self.runs if (run.regime, run.dt) == (regime, h)]
+        # The least accurate first, so that it does not cover the others.
+        for run in sorted(runs, key=lambda run: run.stages):
+            short = run.times <= self.short_time
+            for row, deviation in zip(axes, run.deviations().T, strict=True):
+                for ax, part in zip(row, (short, slice(None)), strict=True):
+                    ax.plot(
+                        run.times[part],
+                        deviation[part],
+                        linewidth=0.6,
+                        label=f"s = {run.stages}",
+                    )
+        for row, name in zip(axes, ENERGIES, strict=True):
+            row[0].set_ylabel(f"{name} energy, $E - E_0$")
+        for ax, title in zip(axes[0], ("short term", "long term"), strict=True):
+            ax.set_title(title)
+        for ax in axes[-1]:
+            ax.set_xlabel("time $t$")
+        axes[0, 1].legend(loc="upper right")
+        figure.suptitle(
+            f"CVT, {regime} energy, $h$ = {h:.4g}, $\\epsilon$ = {self.epsilon:g}, "
+            f"{self.multiplier} multiplier"
+        )
+        return figure
+
+
+def cvt_energy(
+    *,
+    regimes: Sequence[str] = ("low", "high"),
+    stages: Sequence[int] = (2,),
+    dt: Sequence[float] = (0.1, math.pi / 10),
+    final_time: float = 5000.0,
+    multiplier: str = "propagated",
+    epsilon: float = 0.5,
+    short_time: float = 100.0,
+    progress: bool = False,
+) -> CVTEnergy:
+    """Energies of the CVT, its driver and its passenger over a long time.
+
+    The paper's second experiment: the driver oscillates at low energy and rotates at
+    high energy. Driver and passenger conserve their energies one by one.
+
+    **Arguments:**
+
+    - `regimes`: "low" and "high" energy.
+    - `stages`: the numbers of stages s.
+    - `dt`: the step sizes h.
+    - `final_time`: the length of each run, to the nearest whole step.
+    - `multiplier`: the closure, as for `nhjax.LobattoIIIAB`; the paper's by default.
+    - `epsilon`: the perturbation ε of the pendulum.
+    - `short_time`: how much of the run the pictures of the short term show.
+    - `progress`: show a bar for each s and h on the standard error stream.
+
+    **Returns:** a `CVTEnergy`.
+
+    **Raises:** `ArgumentError` for arguments that cannot be right, and
+    `nhjax.IntegrationError` if a step cannot be solved.
+    """
+    check_distinct("regimes", regimes)
+    for regime in regimes:
+        if regime not in REGIMES:
+            raise ArgumentError(
+                "regimes", f"must be among {list(REGIMES)}, got {regime!r}"
+            )
+    check_stages(stages)
+    check_step_sizes(dt)
+    check_positive("final_time", final_time)
+    check_positive("short_time", short_time)
+    if not (math.isfinite(epsilon) and epsilon >= 0):
+        raise ArgumentError("epsilon", f"must be at least 0, got {epsilon:g}")
+    for h in dt:
+        if final_time < 5 * h:
+            raise ArgumentError("final_time", f"must hold 5 steps of {h:g}")
+    runs = []
+    for s in stages:
+        for h in dt:
+            method = LobattoIIIAB(s, multiplier)
+            runs += _runs(regimes, method, h, final_time, epsilon, progress)
+    runs.sort(key=lambda run: regimes.index(run.regime))
+    return CVTEnergy(
+        final_time=final_time,
+        multiplier=multiplier,
+        epsilon=epsilon,
+        short_time=short_time,
+        runs=runs,
+    )
+
+
+def _runs(
+    regimes: Sequence[str],
+    method: LobattoIIIAB,
+    h: float,
+    final_time: float,
+    epsilon: float,
+    progress: bool,
+) -> list[CVTRun]:
+    """One run for each regime, side by side."""
+    cvt = ContinuouslyVariableTransmission(epsilon)
+    system = cvt.system
+
+    def energies(t, y, args):
+        parts = cvt.driver_energy(y.q, y.v), cvt.passenger_energy(y.q, y.v)
+        return jnp.stack([system.energy(t, y, args), *parts])
+
+    def run(y0):
+        return integrate(
+            system,
+            method,
+            y0,
+            dt=h,
+            num_steps=round(final_time / h),
+            saveat=SaveAt(t0=True, steps=True, fn=energies),
+            # h = π/10 is a large step for the rotating driver.
+            solver=Newton(),
+            throw=False,
+            progress_meter=meter(progress, f"s = {method.stages}, h = {h:.4g}"),
+        )
+
+    starts = [REGIMES[regime](epsilon).initial_state() for regime in regimes]
+    y0 = jax.tree.map(lambda *leaves: jnp.stack(leaves), *starts)
+    sol, timing = compile_and_run(jax.vmap(run), y0)
+    raise_failures(sol)
+    ts, ys, stats = jax.tree.map(np.asarray, (sol.ts, sol.ys, sol.stats))
+    defect = stats["max_multiplier_defect"]
+    return [
+        CVTRun(regime, method.stages, h, ts[i], ys[i], float(defect[i]), timing)
+        for i, regime in enumerate(regimes)
+    ]

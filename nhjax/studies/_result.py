@@ -1,0 +1,111 @@
+"""What every study returns, and how it is written to files."""
+
+import abc
+import dataclasses
+import importlib.metadata
+import json
+import math
+import os
+import platform
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, ClassVar, TYPE_CHECKING
+
+import jax
+import numpy as np
+
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+
+@dataclasses.dataclass(frozen=True)
+class Timing:
+    """Wall-clock seconds of one compiled program."""
+
+    compile_seconds: float
+    run_seconds: float
+
+
+class AbstractStudyResult(abc.ABC):
+    """The outcome of a study: numbers, a table and figures."""
+
+    name: ClassVar[str]
+
+    @abc.abstractmethod
+    def parameters(self) -> dict[str, Any]:
+        """Every parameter of the computation, initial data included."""
+
+    @abc.abstractmethod
+    def summary(self) -> dict[str, Any]:
+        """The results in short, with timings."""
+
+    @abc.abstractmethod
+    def arrays(self) -> dict[str, np.ndarray]:
+        """The data behind the figures."""
+
+    @abc.abstractmethod
+    def table(self) -> str:
+        """The results in short, to read."""
+
+    @abc.abstractmethod
+    def figures(self) -> "dict[str, Figure]":
+        """The figures by file name, without suffix."""
+
+
+def write(result: AbstractStudyResult, directory: str | Path) -> dict[str, Any]:
+    """Write figures (PNG), data (NPZ) and a record (JSON) of a study.
+
+    **Arguments:**
+
+    - `result`: what a study returned.
+    - `directory`: where to; it is made if need be.
+
+    **Returns:** the record, as in the JSON file.
+    """
+    directory = Path(directory)
+    directory.mkdir(parents=True, exist_ok=True)
+    data = directory / f"{result.name}.npz"
+    np.savez_compressed(data, **result.arrays())  # pyright: ignore[reportArgumentType]
+    pictures = []
+    for name, figure in result.figures().items():
+        picture = directory / f"{name}.png"
+        figure.savefig(picture, dpi=150)
+        pictures.append(str(picture))
+    path = directory / f"{result.name}.json"
+    record = {
+        "study": result.name,
+        "parameters": result.parameters(),
+        "results": result.summary(),
+        "environment": environment(),
+        "files": {"record": str(path), "data": str(data), "figures": pictures},
+    }
+    record = _plain(record)
+    path.write_text(json.dumps(record, indent=2, allow_nan=False) + "\n")
+    return record
+
+
+def environment() -> dict[str, Any]:
+    """The versions, the precision and the device that the numbers depend on."""
+    device = jax.devices()[0]
+    packages = ("nhjax", "jax", "jaxlib", "equinox", "numpy", "matplotlib")
+    return {
+        "versions": {name: importlib.metadata.version(name) for name in packages},
+        "python": platform.python_version(),
+        "precision": str(np.dtype(jax.numpy.result_type(float))),
+        "device": {"platform": device.platform, "kind": device.device_kind},
+        "cpu_count": os.cpu_count(),
+    }
+
+
+def _plain(x: Any) -> Any:
+    """`x` in terms of JSON, with null for what is not a finite number."""
+    if isinstance(x, Mapping):
+        return {str(key): _plain(value) for key, value in x.items()}
+    if isinstance(x, list | tuple | np.ndarray):
+        return [_plain(value) for value in x]
+    if dataclasses.is_dataclass(x) and not isinstance(x, type):
+        return _plain(dataclasses.asdict(x))
+    if isinstance(x, np.generic):
+        x = x.item()
+    return None if isinstance(x, float) and not math.isfinite(x) else x

@@ -1,0 +1,26 @@
+"""How studies compute: compile and run apart, with a progress meter or none."""
+
+import time
+from collections.abc import Callable
+from typing import Any
+
+import jax
+
+from .._progress_meter import AbstractProgressMeter, NoProgressMeter, TqdmProgressMeter
+from ._result import Timing
+
+
+def compile_and_run(function: Callable[..., Any], *args: Any) -> tuple[Any, Timing]:
+    """`function(*args)` as one compiled program, and what it took."""
+    start = time.perf_counter()
+    program = jax.jit(function).lower(*args).compile()
+    compiled = time.perf_counter()
+    value = jax.block_until_ready(program(*args))
+    # Callbacks of progress meters may outlast the program.
+    jax.effects_barrier()
+    return value, Timing(compiled - start, time.perf_counter() - compiled)
+
+
+def meter(progress: bool, description: str) -> AbstractProgressMeter:
+    """A bar on the standard error stream if `progress`."""
+    return TqdmProgressMeter(description) if progress else NoProgressMeter()

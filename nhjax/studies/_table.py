@@ -1,0 +1,39 @@
+"""Tables of numbers as text, and the slopes in them."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from ..diagnostics import convergence_order
+
+
+def format_table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """Right-aligned columns under a ruled header."""
+    widths = [max(map(len, column)) for column in zip(header, *rows, strict=True)]
+    ruler = ["-" * width for width in widths]
+    return "\n".join(
+        "  ".join(cell.rjust(width) for cell, width in zip(row, widths, strict=True))
+        for row in (header, ruler, *rows)
+    )
+
+
+def format_slope(x: float) -> str:
+    """A slope, or a dash where there is none."""
+    return f"{x:.2f}" if np.isfinite(x) else "-"
+
+
+def slopes(
+    step_sizes: Sequence[float] | np.ndarray, errors: np.ndarray, floor: float = 0.0
+) -> np.ndarray:
+    """Observed orders, aligned with `errors`; NaN where there is none.
+
+    The first row has no predecessor, and errors at or below `floor` are round-off.
+    """
+    above = errors > floor
+    order = np.full(errors.shape, np.nan)
+    if len(errors) > 1:
+        order[1:] = convergence_order(
+            np.asarray(step_sizes), np.where(above, errors, 1.0)
+        )
+        order[1:][~(above[1:] & above[:-1])] = np.nan
+    return order

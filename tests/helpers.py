@@ -1,0 +1,144 @@
+"""Systems and runs that several test files share."""
+
+from functools import cache
+
+import jax
+import jax.numpy as jnp
+import nhjax
+from nhjax import systems
+import numpy as np
+
+
+CVT = systems.ContinuouslyVariableTransmission
+
+CLOSURES = ("propagated", "consistent", "symmetric")
+SOLVERS = {"simplified": nhjax.SimplifiedNewton(), "dense": nhjax.Newton()}
+
+GALLERY = {
+    "particle": systems.NonholonomicParticle(1.7, 0.6),
+    "sleigh": systems.ChaplyginSleigh(1.3, 0.2, 0.3),
+    "knife edge": systems.KnifeEdge(),
+    "rolling disc": systems.VerticalRollingDisc(1.2, 0.5, 0.25, 0.8, v0=(1.04, 0, 1.3, 0.7)),
+    "Appell": systems.Appell(1.4, 0.7, 0.5),
+    "CVT low": CVT.low(),
+    "CVT high": CVT.high(),
+    "chaotic": systems.ChaoticSystem(),
+    "chaotic 5": systems.ChaoticSystem(m=2),
+    "oscillator": systems.HarmonicOscillator(),
+}
+
+DRIVEN_FIELD, DRIVEN_FRICTION = 0.4, 0.25
+
+
+def driven_lagrangian(t, q, v, args):
+    """½ μ(t) (ẋ² + ẏ²) + ½ ż² + β x ẏ - ½ |q|² with μ = 1 + ½ sin t."""
+    mu = 1.0 + 0.5 * jnp.sin(t)
+    kinetic = 0.5 * mu * (v[0] ** 2 + v[1] ** 2) + 0.5 * v[2] ** 2
+    return kinetic + DRIVEN_FIELD * q[0] * v[1] - 0.5 * (q @ q)
+
+
+def driven_constraint(t, q, v, args):
+    """ż - y ẋ - (1 + x) cos t."""
+    return v[2] - q[1] * v[0] - (1.0 + q[0]) * jnp.cos(t)
+
+
+def driven_friction(t, q, v, args):
+    """-γ v with γ = args."""
+    return -args * v
+
+
+# Explicit time in L and Φ, an affine constraint, a force, a use of `args`.
+DRIVEN = nhjax.LagrangianSystem(
+    driven_lagrangian, nonholonomic=driven_constraint, force=driven_friction
+)
+
+
+def driven_state():
+    """A consistent state of the driven system at t = 0."""
+    q, v = jnp.array([0.5, -0.3, 0.2]), jnp.array([0.4, 0.6, 1.38])
+    return nhjax.initial_state(DRIVEN, q, v=v, args=jnp.asarray(DRIVEN_FRICTION))
+
+
+def gallery_state(name):
+    """The system and the initial state of an example, without `args`."""
+    return GALLERY[name].system, GALLERY[name].initial_state()
+
+
+BESIDE = ("particle", "chaotic", "sleigh", "Appell")
+_ENDS = np.cumsum([GALLERY[name].q0.size for name in BESIDE])
+
+
+def _split(x):
+    return jnp.split(x, _ENDS)
+
+
+def _beside_lagrangian(t, q, v, args):
+    pieces = list(zip(_split(q), _split(v), strict=True))
+    total = driven_lagrangian(t, *pieces.pop(), args)
+    for name, (q_part, v_part) in zip(BESIDE, pieces, strict=True):
+        total = total + GALLERY[name].lagrangian(t, q_part, v_part, None)
+    return total
+
+
+def _beside_constraint(t, q, v, args):
+    pieces = list(zip(_split(q), _split(v), strict=True))
+    last = driven_constraint(t, *pieces.pop(), args)
+    values = [
+        GALLERY[name].constraint(t, q_part, v_part, None)
+        for name, (q_part, v_part) in zip(BESIDE, pieces, strict=True)
+    ]
+    return jnp.concatenate([jnp.atleast_1d(value) for value in [*values, last]])
+
+
+def _beside_friction(t, q, v, args):
+    parts = _split(v)
+    rest = [jnp.zeros_like(part) for part in parts[:-1]]
+    return jnp.concatenate([*rest, driven_friction(t, q, parts[-1], args)])
+
+
+# One program for five systems that do not know of one another: n = 19, m = 5.
+SIDE_BY_SIDE = nhjax.LagrangianSystem(
+    _beside_lagrangian, nonholonomic=_beside_constraint, force=_beside_friction
+)
+
+
+def side_by_side_state():
+    """The consistent states of `BESIDE` and of the driven system, one after another."""
+    states = [gallery_state(name)[1] for name in BESIDE] + [driven_state()]
+    return jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *states)
+
+
+@cache
+def problem(name):
+    """(system, y0, args) by name."""
+    if name == "driven":
+        return DRIVEN, driven_state(), jnp.asarray(DRIVEN_FRICTION)
+    if name == "side by side":
+        return SIDE_BY_SIDE, side_by_side_state(), jnp.asarray(DRIVEN_FRICTION)
+    return *gallery_state(name), None
+
+
+RECORDED_STEP, RECORDED_STEPS = 0.1, 20
+
+
+def integrate_recorded(name, stages, closure, solver, y0, dt, t0=0.0):
+    """A run with all nodes and all stage data: one program for every `y0`, `dt`."""
+    system, _, args = problem(name)
+    return nhjax.integrate(
+        system,
+        nhjax.LobattoIIIAB(stages, closure),
+        y0,
+        dt=dt,
+        num_steps=RECORDED_STEPS,
+        t0=t0,
+        args=args,
+        solver=SOLVERS[solver],
+        saveat=nhjax.SaveAt(t0=True, steps=True, dense=True),
+    )
+
+
+@cache
+def recorded(name, stages, closure, solver):
+    """The run of a problem from its initial state."""
+    y0 = problem(name)[1]
+    return integrate_recorded(name, stages, closure, solver, y0, RECORDED_STEP)

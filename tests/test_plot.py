@@ -1,0 +1,136 @@
+"""Every picture has labelled axes and shows its data."""
+
+import subprocess
+import sys
+
+import jax
+import jax.numpy as jnp
+import matplotlib
+import numpy as np
+import pytest
+from matplotlib.figure import Figure
+
+import nhjax
+from nhjax import plot
+
+
+matplotlib.use("Agg")
+
+
+@pytest.fixture(autouse=True)
+def _close_figures():
+    from matplotlib import pyplot as plt
+
+    yield
+    plt.close("all")
+
+
+@pytest.fixture(scope="module")
+def disc():
+    return nhjax.systems.VerticalRollingDisc()
+
+
+def _run(example, y0):
+    return nhjax.integrate(
+        example.system,
+        nhjax.LobattoIIIAB(2),
+        y0,
+        dt=0.1,
+        num_steps=8,
+        saveat=nhjax.SaveAt(t0=True, steps=True),
+    )
+
+
+@pytest.fixture(scope="module")
+def sol(disc):
+    return _run(disc, disc.initial_state())
+
+
+@pytest.fixture(scope="module")
+def batch(disc):
+    y0 = jax.tree.map(lambda x: jnp.stack([x, x, x]), disc.initial_state())
+    return jax.vmap(lambda y: _run(disc, y))(y0)
+
+
+def test_trajectory(sol):
+    ax = plot.trajectory(sol, (0, -1), names=("east", "heading"), color="k")
+    assert (ax.get_xlabel(), ax.get_ylabel()) == ("east", "heading")
+    (line,) = ax.lines
+    np.testing.assert_array_equal(line.get_ydata(), sol.ys.q[:, 3])
+    assert line.get_color() == "k"
+
+
+def test_trajectory_in_space(sol):
+    ax = plot.trajectory(sol, (0, 1, 2))
+    assert ax.get_zlabel() == "$q_3$"  # pyright: ignore[reportAttributeAccessIssue]
+    ax.figure.canvas.draw()
+
+
+@pytest.mark.parametrize("kind", ["trajectory", "energy", "multiplier", "constraint"])
+def test_a_batch_has_a_line_for_each_member(kind, disc, batch):
+    given = Figure().add_subplot()
+    if kind in ("energy", "constraint"):
+        ax = getattr(plot, kind)(disc.system, batch, ax=given)
+    else:
+        ax = getattr(plot, kind)(batch, ax=given)
+    assert ax is given
+    # The disc has two constraints.
+    assert len(ax.lines) == (6 if kind in ("multiplier", "constraint") else 3)
+    assert ax.get_xlabel()
+    assert ax.get_ylabel()
+
+
+def test_energy(disc, sol):
+    ax = plot.energy(disc.system, sol)
+    assert ax.get_xlabel() == "time $t$"
+    assert ax.get_ylabel() == "$E(t) - E(t_0)$"
+    np.testing.assert_array_equal(ax.lines[0].get_xdata(), sol.ts)
+
+
+def test_multiplier(sol):
+    ax = plot.multiplier(sol)
+    assert ax.get_ylabel() == "multiplier"
+    legend = ax.get_legend()
+    assert legend is not None
+    assert [text.get_text() for text in legend.texts] == [
+        r"$\lambda_1$",
+        r"$\lambda_2$",
+    ]
+
+
+def test_multiplier_needs_constraints():
+    oscillator = nhjax.systems.HarmonicOscillator()
+    free = _run(oscillator, oscillator.initial_state())
+    with pytest.raises(ValueError, match="no constraints"):
+        plot.multiplier(free)
+
+
+def test_convergence():
+    h = np.array([0.4, 0.2, 0.1])
+    errors = np.array([1e-2, 6e-4, 0.0])
+    ax = plot.convergence(h, errors, order=4, label="s = 3")
+    data, reference = ax.lines
+    np.testing.assert_array_equal(data.get_xdata(), h[:2])
+    x, y = np.asarray(reference.get_xdata()), np.asarray(reference.get_ydata())
+    assert np.log2(y[0] / y[1]) == pytest.approx(4 * np.log2(x[0] / x[1]))
+    assert (ax.get_xscale(), ax.get_yscale()) == ("log", "log")
+    assert ax.get_xlabel()
+    assert ax.get_ylabel()
+
+
+def test_errors(sol):
+    with pytest.raises(ValueError, match="two or three indices into the 4"):
+        plot.trajectory(sol, (0, 4))
+    with pytest.raises(ValueError, match="two or three indices"):
+        plot.trajectory(sol, (0,))
+    with pytest.raises(ValueError, match="`names` must hold 2"):
+        plot.trajectory(sol, names=("x",))
+    with pytest.raises(ValueError, match="vectors of one length"):
+        plot.convergence([0.1, 0.2], [1.0])
+    with pytest.raises(ValueError, match="positive number"):
+        plot.convergence([0.1], [0.0])
+
+
+def test_importing_the_library_does_not_import_matplotlib():
+    code = "import sys, nhjax, nhjax.plot; sys.exit('matplotlib' in sys.modules)"
+    subprocess.run([sys.executable, "-c", code], check=True)

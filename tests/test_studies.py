@@ -1,0 +1,224 @@
+"""The studies with tiny arguments, from Python and from the command line."""
+
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from nhjax import studies
+from nhjax.__main__ import main
+from nhjax.systems import NonholonomicParticle
+
+
+PNG = b"\x89PNG\r\n\x1a\n"
+
+TINY = {
+    "particle-order": "--stages 2 --dt 0.25 0.125",
+    "cvt-energy": "--stages 2 --dt pi/10 --final-time 4",
+    "chaotic-energy": "--stages 2 --dt 0.2 --num-steps 10 --members 2",
+}
+
+
+@pytest.fixture(scope="module")
+def particle():
+    return studies.particle_order(stages=(3, 4), dt=(0.25, 0.125, 0.1875))
+
+
+@pytest.fixture(scope="module")
+def chaotic():
+    return studies.chaotic_energy(
+        stages=(2, 3), final_time=4.0, members=3, dt=(0.1, 0.2), save_every=2
+    )
+
+
+def test_list(capsys):
+    assert main(["list"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert [line.split()[0] for line in lines] == list(studies.STUDIES)
+
+
+@pytest.mark.parametrize("study", studies.STUDIES)
+def test_run_writes_figures_data_and_record(study, tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert main(["run", study, *TINY[study].split(), "--json", "--progress"]) == 0
+    shown = capsys.readouterr()
+    assert "100%" in shown.err
+    record = json.loads(shown.out)
+    out = Path("nhjax-results") / study
+    assert json.loads((out / f"{study}.json").read_text()) == record
+    assert record["study"] == study
+    for name in ("nhjax", "jax", "jaxlib", "equinox", "numpy"):
+        assert record["environment"]["versions"][name]
+    assert record["environment"]["precision"] == "float64"
+    assert record["environment"]["device"]["platform"]
+    parameters = record["parameters"]
+    for name in ("stages", "dt", "final_time", "multiplier", "initial_data", "solver"):
+        assert parameters[name]
+    assert parameters["multiplier"] == "propagated"
+    for run in record["results"]["runs"]:
+        assert run["compile_seconds"] > 0
+        assert run["run_seconds"] > 0
+    pictures = sorted(out.glob("*.png"))
+    assert [str(p) for p in pictures] == sorted(record["files"]["figures"])
+    for picture in pictures:
+        assert picture.read_bytes()[:8] == PNG
+        assert picture.stat().st_size > 10_000
+    with np.load(out / f"{study}.npz") as data:
+        assert len(data.files) > 0
+
+
+def test_run_prints_a_table(tmp_path, capsys):
+    out = tmp_path / "deep" / "er"
+    arguments = "--regimes high --stages 3 --dt 0.1 --num-steps 20 --epsilon 0.25"
+    arguments += " --multiplier symmetric --short-time 1"
+    assert main(["run", "cvt-energy", *arguments.split(), "--out", str(out)]) == 0
+    shown = capsys.readouterr()
+    assert shown.err == ""
+    header, ruler, row, *files = shown.out.splitlines()
+    assert "range of ΔE_d" in header
+    assert set(ruler) == {"-", " "}
+    assert row.split()[:3] == ["high", "3", "0.1"]
+    assert [line.split()[0] for line in files] == ["wrote"] * 3
+    assert all((out / Path(line.split()[1]).name).is_file() for line in files)
+    parameters = json.loads((out / "cvt-energy.json").read_text())["parameters"]
+    assert parameters["regimes"] == ["high"]
+    assert parameters["epsilon"] == 0.25
+    assert parameters["multiplier"] == "symmetric"
+    assert parameters["final_time"] == 2.0
+    assert parameters["short_time"] == 1.0
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ("run nonsense", "invalid choice: 'nonsense' (choose from"),
+        ("run", "required: STUDY"),
+        ("run chaotic-energy --members 0", "--members: must be at least 1, got 0"),
+        ("run chaotic-energy --members x", "--members: invalid int value: 'x'"),
+        ("run chaotic-energy --stages 1", "--stages: must be at least 2"),
+        ("run chaotic-energy --stages 2 2", "--stages: holds a value twice: [2, 2]"),
+        ("run chaotic-energy --dt 0.3", "--dt: 0.3 does not divide the final time 200"),
+        ("run chaotic-energy --dt -0.1", "--dt: must be positive and finite, got -0.1"),
+        ("run chaotic-energy --dt zero", "--dt: invalid number value: 'zero'"),
+        ("run chaotic-energy --dt 1/0", "--dt: invalid number value: '1/0'"),
+        ("run chaotic-energy --final-time 0", "--final-time: must be positive"),
+        ("run chaotic-energy --num-steps 0", "--num-steps: must be at least 1"),
+        ("run chaotic-energy --num-steps 5 --final-time 1", "not allowed with"),
+        ("run chaotic-energy --times 300", "--times: must lie within the run, got 300"),
+        ("run chaotic-energy --save-every 90", "--save-every: must leave samples"),
+        ("run chaotic-energy --multiplier free", "--multiplier: invalid choice"),
+        ("run cvt-energy --regimes middle", "--regimes: must be among"),
+        ("run cvt-energy --epsilon -1", "--epsilon: must be at least 0"),
+        ("run cvt-energy --dt 1 --num-steps 3", "--num-steps: must hold 5 steps"),
+        ("run particle-order --dt 0.7", "--dt: 0.7 does not divide the final time 3"),
+    ],
+)
+def test_bad_arguments_name_the_argument(arguments, message, tmp_path, capsys):
+    command = arguments.split()
+    if len(command) > 2:
+        command += ["--out", str(tmp_path)]
+    with pytest.raises(SystemExit) as ended:
+        main(command)
+    assert ended.value.code == 2
+    assert message in capsys.readouterr().err
+
+
+def test_unknown_study_lists_the_known(capsys):
+    with pytest.raises(SystemExit):
+        main(["run", "nonsense"])
+    message = capsys.readouterr().err
+    assert all(name in message for name in studies.STUDIES)
+
+
+def test_an_output_directory_that_cannot_be_made(tmp_path, capsys):
+    (tmp_path / "file").write_text("")
+    command = ["run", "chaotic-energy", "--out", str(tmp_path / "file" / "x")]
+    with pytest.raises(SystemExit) as ended:
+        main(command)
+    assert ended.value.code == 2
+    assert "argument --out:" in capsys.readouterr().err
+
+
+def test_an_unsolvable_step_is_reported(tmp_path, capsys):
+    command = "run chaotic-energy --stages 4 --dt 4 --final-time 40 --members 1"
+    assert main([*command.split(), "--out", str(tmp_path)]) == 1
+    assert "Integration failed in lane" in capsys.readouterr().err
+
+
+def test_errors_in_python_name_the_parameter():
+    with pytest.raises(studies.ArgumentError, match="`members` must be at least 1"):
+        studies.chaotic_energy(members=0)
+
+
+def test_particle_order_finds_the_orders(particle):
+    assert particle.dt == (0.25, 0.1875, 0.125)
+    assert particle.errors.shape == (2, 3, 4)
+    np.testing.assert_allclose(
+        particle.orders(), [[4, 4, 2, 4], [6, 6, 4, 6]], atol=0.15
+    )
+    assert np.all(np.isnan(particle.slopes()[:, 0]))
+    assert (
+        particle.table().splitlines()[-1].split()
+        == (
+            f"4 {particle.orders()[1, 0]:.2f} (6) {particle.orders()[1, 1]:.2f} (6) "
+            f"{particle.orders()[1, 2]:.2f} (4) {particle.orders()[1, 3]:.2f} (6)"
+        ).split()
+    )
+
+
+def test_particle_order_leaves_round_off_out():
+    errors = np.full((1, 3, 4), 1e-16)
+    errors[0, 0] = 1.0
+    result = studies.ParticleOrder(
+        stages=(6,),
+        dt=(0.4, 0.2, 0.1),
+        final_time=1.0,
+        multiplier="propagated",
+        particle=NonholonomicParticle(),
+        errors=errors,
+        timings=[],
+    )
+    assert np.all(np.isnan(result.orders()))
+    assert "-" in result.table().splitlines()[-1]
+
+
+def test_chaotic_energy_shapes_and_slopes(chaotic):
+    assert chaotic.times == (4.0,)
+    data = chaotic.arrays()
+    assert data["s2_h0.2_energies"].shape == (4, 11)
+    assert data["s3_h0.1_mu"].shape == (21,)
+    np.testing.assert_allclose(data["s2_h0.1_energies"][:, 0], 3.06, atol=1e-14)
+    slopes = [float(chaotic.slopes(s)[1, 0]) for s in (2, 3)]
+    np.testing.assert_allclose(slopes, [4, 8], atol=0.3)
+    for run in chaotic.runs:
+        assert run.max_constraint_violation < 1e-13
+
+
+def test_chaotic_energy_draws_both_normalisations(chaotic):
+    (figure,) = chaotic.figures().values()
+    shown = [ax.get_ylabel() for ax in figure.axes]
+    assert shown == [rf"$\mu(E, k) / h^{{{power}}}$" for power in (4, 8, 4, 10)]
+
+
+def test_cvt_energy_of_a_short_run():
+    result = studies.cvt_energy(dt=(0.1,), final_time=10.0, short_time=5.0)
+    low, high = result.runs
+    assert low.energies.shape == (101, 3)
+    np.testing.assert_allclose(low.energies[0], [1.8, 0.8, 1.0], atol=1e-14)
+    np.testing.assert_allclose(high.energies[0], [4.0, 3.0, 1.0], atol=1e-14)
+    np.testing.assert_allclose(
+        low.energies[:, 0], low.energies[:, 1] + low.energies[:, 2], atol=1e-14
+    )
+    assert len(low.by_fifths()) == 5
+    least, greatest = high.ranges()["driver"]
+    assert least == pytest.approx(-5.3e-3, rel=0.02)
+    assert greatest == pytest.approx(1.26e-2, rel=0.02)
+
+
+def test_number_of_steps_follows_from_the_nearest_whole_one():
+    result = studies.cvt_energy(
+        regimes=("low",), dt=(math.pi / 10,), final_time=4.0, short_time=1.0
+    )
+    assert len(result.runs[0].times) == 1 + round(40 / math.pi)
