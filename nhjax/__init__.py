@@ -1,6 +1,6 @@
 """High-order geometric integrators for nonholonomic mechanical systems, in JAX."""
 
-from . import systems as systems
+from . import plot as plot, systems as systems
 from ._errors import (
     ConstraintViolationError as ConstraintViolationError,
     DependentConstraintsError as DependentConstraintsError,
@@ -36,6 +36,11 @@ from ._saveat import SaveAt as SaveAt
 from ._solution import RESULTS as RESULTS, Solution as Solution
 from ._state import initial_state as initial_state, State as State
 from ._system import LagrangianSystem as LagrangianSystem
+from .diagnostics import (
+    convergence_order as convergence_order,
+    energy_error as energy_error,
+    momentum_map as momentum_map,
+)
 
 
 __version__ = "0.1.0"

@@ -175,6 +175,7 @@ _OPTIONS: dict[str, dict[str, Any]] = {
         "metavar": "K",
         "help": "save the energies after every K steps",
     },
+    "system": {"metavar": "NAME", "help": "particle or sleigh"},
     "regimes": {"nargs": "+", "metavar": "REGIME", "help": "low and high energy"},
     "epsilon": {"type": _number, "metavar": "E", "help": "perturbation of the driver"},
     "short_time": {

@@ -4,9 +4,10 @@ from functools import cache
 
 import jax
 import jax.numpy as jnp
+import numpy as np
+
 import nhjax
 from nhjax import systems
-import numpy as np
 
 
 CVT = systems.ContinuouslyVariableTransmission
@@ -18,12 +19,13 @@ GALLERY = {
     "particle": systems.NonholonomicParticle(1.7, 0.6),
     "sleigh": systems.ChaplyginSleigh(1.3, 0.2, 0.3),
     "knife edge": systems.KnifeEdge(),
-    "rolling disc": systems.VerticalRollingDisc(1.2, 0.5, 0.25, 0.8, v0=(1.04, 0, 1.3, 0.7)),
+    "rolling disc": systems.VerticalRollingDisc(
+        1.2, 0.5, 0.25, 0.8, v0=(1.04, 0, 1.3, 0.7)
+    ),
     "Appell": systems.Appell(1.4, 0.7, 0.5),
     "CVT low": CVT.low(),
     "CVT high": CVT.high(),
     "chaotic": systems.ChaoticSystem(),
-    "chaotic 5": systems.ChaoticSystem(m=2),
     "oscillator": systems.HarmonicOscillator(),
 }
 
@@ -121,7 +123,7 @@ def problem(name):
 RECORDED_STEP, RECORDED_STEPS = 0.1, 20
 
 
-def integrate_recorded(name, stages, closure, solver, y0, dt, t0=0.0):
+def integrate_recorded(name, stages, closure, solver, y0, dt, t0=0.0, throw=True):
     """A run with all nodes and all stage data: one program for every `y0`, `dt`."""
     system, _, args = problem(name)
     return nhjax.integrate(
@@ -133,6 +135,7 @@ def integrate_recorded(name, stages, closure, solver, y0, dt, t0=0.0):
         t0=t0,
         args=args,
         solver=SOLVERS[solver],
+        throw=throw,
         saveat=nhjax.SaveAt(t0=True, steps=True, dense=True),
     )
 

@@ -98,38 +98,38 @@ class Mechanics(abc.ABC):
     """
 
     @abc.abstractmethod
-    def d1l(self, t, q, v):
+    def d1l(self, t, q, v) -> np.ndarray:
         """D1L + F, shape (..., n)."""
 
     @abc.abstractmethod
-    def d2l(self, t, q, v):
+    def d2l(self, t, q, v) -> np.ndarray:
         """D2L, shape (..., n)."""
 
     @abc.abstractmethod
-    def mass(self, t, q):
+    def mass(self, t, q) -> np.ndarray:
         """D2D2L, shape (..., n, n)."""
 
     @abc.abstractmethod
-    def phi(self, t, q, v):
+    def phi(self, t, q, v) -> np.ndarray:
         """Φ, shape (..., m)."""
 
     @abc.abstractmethod
-    def d2phi(self, t, q, v):
+    def d2phi(self, t, q, v) -> np.ndarray:
         """D2Φ, shape (..., m, n)."""
 
     @abc.abstractmethod
-    def phi_rate(self, t, q, v):
+    def phi_rate(self, t, q, v) -> np.ndarray:
         """∂Φ/∂t + D1Φ v, shape (..., m)."""
 
-    def d2l_rate(self, t, q, v):
+    def d2l_rate(self, t, q, v) -> np.ndarray:
         """∂D2L/∂t + D1D2L v, shape (..., n); zero for a constant mass."""
         return np.zeros_like(v)
 
-    def d1l_size(self, t, q, v):
+    def d1l_size(self, t, q, v) -> np.ndarray:
         """The size of the terms of D1L + F, where they can cancel."""
         return np.abs(self.d1l(t, q, v))
 
-    def velocity(self, t, q, p):
+    def velocity(self, t, q, p) -> np.ndarray:
         """The solution v of D2L(t, q, v) = p."""
         offset = self.d2l(t, q, np.zeros_like(p))
         return np.linalg.solve(self.mass(t, q), (p - offset)[..., None])[..., 0]
@@ -141,7 +141,7 @@ class Mechanics(abc.ABC):
         """
         return self._multiplier(t, q, self.velocity(t, q, p))
 
-    def acceleration(self, t, q, v):
+    def acceleration(self, t, q, v) -> np.ndarray:
         """The continuous equations of motion solved for a: the index-reduced ODE."""
         multiplier, _ = self._multiplier(t, q, v)
         reaction = _apply(_transpose(self.d2phi(t, q, v)), multiplier)
@@ -321,9 +321,7 @@ class Disc(Mechanics):
 
     def mass(self, t, q):
         """diag(m, m, I, J)."""
-        return np.broadcast_to(
-            np.diag([self.m, self.m, self.I, self.J]), (*q.shape, 4)
-        )
+        return np.broadcast_to(np.diag([self.m, self.m, self.I, self.J]), (*q.shape, 4))
 
     def phi(self, t, q, v):
         """(ẋ - R ψ̇ cos φ, ẏ - R ψ̇ sin φ)."""

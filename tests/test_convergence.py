@@ -14,12 +14,13 @@ import equinox as eqx
 import helpers
 import jax
 import jax.numpy as jnp
-import nhjax
-from nhjax.systems import ChaplyginSleigh, NonholonomicParticle
 import numpy as np
 import paper_equations as paper
 import pytest
 from scipy.integrate import solve_ivp
+
+import nhjax
+from nhjax.systems import ChaplyginSleigh, NonholonomicParticle
 
 
 SLOPE_TOLERANCE = 0.3

@@ -3,12 +3,13 @@
 from functools import cache
 
 import helpers
-from helpers import CLOSURES, GALLERY, integrate_recorded, problem, recorded
 import jax
 import jax.numpy as jnp
-import nhjax
 import numpy as np
 import pytest
+from helpers import CLOSURES, GALLERY, integrate_recorded, problem, recorded
+
+import nhjax
 
 
 EVERYTHING = [*GALLERY, "driven"]
@@ -85,7 +86,9 @@ def there_and_back(name, stages, closure, steps):
         node(there.ys, steps),
         dt=-helpers.RECORDED_STEP,
         t0=there.ts[steps],
+        throw=False,  # Appell's system is singular some time before the start.
     )
+    assert not 0 <= back.stats["failed_step"] < steps
     end = node(back.ys, steps)
     return {
         field: np.max(np.abs(getattr(end, field) - getattr(y0, field)), initial=0.0)

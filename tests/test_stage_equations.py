@@ -1,11 +1,12 @@
 """Every step satisfies the paper's equations, checked by an independent residual."""
 
 import helpers
-from helpers import CLOSURES, GALLERY, recorded, SOLVERS
-import nhjax
 import numpy as np
 import paper_equations as paper
 import pytest
+from helpers import CLOSURES, GALLERY, recorded, SOLVERS
+
+import nhjax
 
 
 TOLERANCE = 1e-14
@@ -99,7 +100,9 @@ def test_every_equation_of_the_paper_holds_to_round_off(stages, solver, closure)
 @every_closure
 @pytest.mark.parametrize("name", [*SIDE_BY_SIDE, "rolling disc"])
 def test_every_equation_of_the_paper_holds_for_a_system_on_its_own(name, closure):
-    assert_equations_hold(name, run_of(recorded(name, 3, closure, "simplified")), closure)
+    assert_equations_hold(
+        name, run_of(recorded(name, 3, closure, "simplified")), closure
+    )
 
 
 @every_closure
@@ -123,6 +126,7 @@ def test_the_equations_hold_for_large_steps(name, closure):
 @every_closure
 def test_records_start_at_the_saved_nodes(closure):
     sol = recorded("sleigh", 3, closure, "simplified")
+    assert sol.interpolation is not None
     starts = sol.interpolation.records.start
     for name in ("q", "v", "p", "multiplier"):
         nodes = getattr(sol.ys, name)

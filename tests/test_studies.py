@@ -112,6 +112,10 @@ def test_run_prints_a_table(tmp_path, capsys):
         ("run cvt-energy --regimes middle", "--regimes: must be among"),
         ("run cvt-energy --epsilon -1", "--epsilon: must be at least 0"),
         ("run cvt-energy --dt 1 --num-steps 3", "--num-steps: must hold 5 steps"),
+        (
+            "run particle-order --system top",
+            "--system: must be one of ['particle', 'sleigh'], got 'top'",
+        ),
         ("run particle-order --dt 0.7", "--dt: 0.7 does not divide the final time 3"),
     ],
 )
@@ -176,7 +180,7 @@ def test_particle_order_leaves_round_off_out():
         dt=(0.4, 0.2, 0.1),
         final_time=1.0,
         multiplier="propagated",
-        particle=NonholonomicParticle(),
+        example=NonholonomicParticle(),
         errors=errors,
         timings=[],
     )

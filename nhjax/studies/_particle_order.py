@@ -1,4 +1,4 @@
-"""Orders of convergence on the nonholonomic particle."""
+"""Orders of convergence on a system with an exact solution."""
 
 import dataclasses
 import math
@@ -16,8 +16,14 @@ from .._integrate import integrate
 from .._method import LobattoIIIAB
 from .._newton import Newton
 from .._solution import RESULTS
-from ..systems import NonholonomicParticle
-from ._arguments import check_positive, check_stages, check_step_sizes, whole_steps
+from ..systems import ChaplyginSleigh, NonholonomicParticle
+from ._arguments import (
+    ArgumentError,
+    check_positive,
+    check_stages,
+    check_step_sizes,
+    whole_steps,
+)
 from ._result import AbstractStudyResult, Timing
 from ._run import compile_and_run
 from ._table import format_slope, format_table, slopes
@@ -27,6 +33,8 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
+# The sleigh's mass matrix depends on position.
+EXAMPLES = {"particle": NonholonomicParticle, "sleigh": ChaplyginSleigh}
 QUANTITIES = ("q", "p", "multiplier", "continuous_multiplier")
 SYMBOLS = {
     "q": "$q$",
@@ -51,7 +59,7 @@ class ParticleOrder(AbstractStudyResult):
     dt: tuple[float, ...]
     final_time: float
     multiplier: str
-    particle: NonholonomicParticle
+    example: NonholonomicParticle | ChaplyginSleigh
     errors: np.ndarray
     timings: list[Timing]
 
@@ -77,14 +85,15 @@ class ParticleOrder(AbstractStudyResult):
             "final_time": self.final_time,
             "multiplier": self.multiplier,
             "solver": "Newton",
-            "system": "NonholonomicParticle",
+            "system": type(self.example).__name__,
             "system_parameters": {
-                "mass": float(self.particle.mass),
-                "stiffness": float(self.particle.stiffness),
+                field.name: float(getattr(self.example, field.name))
+                for field in dataclasses.fields(self.example)
+                if field.name not in ("q0", "v0")
             },
             "initial_data": {
-                "q0": np.asarray(self.particle.q0),
-                "v0": np.asarray(self.particle.v0),
+                "q0": np.asarray(self.example.q0),
+                "v0": np.asarray(self.example.v0),
                 "multiplier": "continuous, from the hidden constraint",
             },
             "error": "|x - x_exact| / |x_exact| at the final time, Euclidean norms",
@@ -164,8 +173,8 @@ class ParticleOrder(AbstractStudyResult):
             ax.set_ylim(bottom=1e-16)
             ax.legend(title="order", loc="lower right", fontsize="small")
         figure.suptitle(
-            f"Nonholonomic particle at t = {self.final_time:g}, {self.multiplier} "
-            "multiplier; dashed: the order of the theory"
+            f"{type(self.example).__name__} at t = {self.final_time:g}, "
+            f"{self.multiplier} multiplier; dashed: the order of the theory"
         )
         return {self.name: figure}
 
@@ -183,11 +192,13 @@ def particle_order(
     dt: Sequence[float] = (0.5, 0.375, 0.25, 0.1875, 0.125, 0.0625),
     final_time: float = 3.0,
     multiplier: str = "propagated",
+    system: str = "particle",
     progress: bool = False,
 ) -> ParticleOrder:
     """Orders of q, p and the multiplier on the nonholonomic particle.
 
-    The paper's first experiment, against the exact solution.
+    The paper's first experiment, against the exact solution; the same for Chaplygin's
+    sleigh, whose mass matrix depends on position.
 
     **Arguments:**
 
@@ -195,6 +206,7 @@ def particle_order(
     - `dt`: the step sizes h, each of which must divide `final_time`.
     - `final_time`: when the errors are taken.
     - `multiplier`: the closure, as for `nhjax.LobattoIIIAB`; the paper's by default.
+    - `system`: `"particle"`, or `"sleigh"` for Chaplygin's sleigh.
     - `progress`: show a bar on the standard error stream.
 
     **Returns:** a `ParticleOrder`.
@@ -206,13 +218,16 @@ def particle_order(
     check_positive("final_time", final_time)
     dt = tuple(sorted(dt, reverse=True))
     num_steps = [whole_steps(final_time, h) for h in dt]
-    particle = NonholonomicParticle()
-    q, v, multiplier_end = particle.exact(final_time)
-    exact = (q, float(particle.mass) * v, multiplier_end, multiplier_end)
+    if system not in EXAMPLES:
+        raise ArgumentError("system", f"must be one of {[*EXAMPLES]}, got {system!r}")
+    example = EXAMPLES[system]()
+    q, v, multiplier_end = example.exact(final_time)
+    p = np.asarray(example.system.momentum(final_time, jnp.asarray(q), jnp.asarray(v)))
+    exact = (q, p, multiplier_end, multiplier_end)
     errors, timings = [], []
     for s in tqdm.tqdm(stages, desc=ParticleOrder.name, disable=not progress):
         method = LobattoIIIAB(s, multiplier)
-        ends, timing = _final_states(particle, method, dt, num_steps)
+        ends, timing = _final_states(example, method, dt, num_steps)
         timings.append(timing)
         errors.append(
             [
@@ -228,14 +243,14 @@ def particle_order(
         dt=dt,
         final_time=final_time,
         multiplier=multiplier,
-        particle=particle,
+        example=example,
         errors=np.array(errors),
         timings=timings,
     )
 
 
 def _final_states(
-    particle: NonholonomicParticle,
+    example: NonholonomicParticle | ChaplyginSleigh,
     method: LobattoIIIAB,
     dt: tuple[float, ...],
     num_steps: list[int],
@@ -244,7 +259,7 @@ def _final_states(
     # The length of a run is static in `integrate`; runs of as many equal chunks as
     # they need make one compiled program serve every step size.
     chunk = math.gcd(*num_steps)
-    system = particle.system
+    system = example.system
 
     def run(h, chunks):
         def advance(_, carry):
@@ -262,7 +277,7 @@ def _final_states(
             failed = failed | (sol.result != RESULTS.successful)
             return jax.tree.map(lambda x: x[0], sol.ys), failed
 
-        start = (particle.initial_state(), jnp.array(False))
+        start = (example.initial_state(), jnp.array(False))
         y, failed = jax.lax.fori_loop(0, chunks, advance, start)
         return (y.q, y.p, y.multiplier, system.multiplier(0.0, y)), failed
 
