@@ -91,6 +91,7 @@ def main() -> None:
                 }
             )
             print(*rows[-1], sep="\t", flush=True)
+            jax.clear_caches()
     header = ["system", "method", "solver", "slope"]
     header += [f"rms at {counts[k]}" for k in (0, len(counts) // 2, -1)]
     text = (

@@ -68,9 +68,12 @@ class Solution(eqx.Module):
     def evaluate(self, t: FloatScalarLike) -> State:
         """The state at any time of the run, by the collocation polynomials.
 
-        q(t) is the paper's continuous polynomial u(t) (error O(h^{s+1}) inside a
-        step), p(t) the mixed one v(t) (Proposition on continuous approximation, error
-        O(h^s)), and v(t) follows from p(t) by the Legendre transform.
+        q(t) is the paper's continuous polynomial u(t), p(t) the mixed one v(t) of its
+        Proposition on continuous approximation; v(t) follows from p(t) by the Legendre
+        transform, and λ(t) is the continuous multiplier there (of a propagated
+        multiplier, the polynomial through the Λ^i). At the nodes they are the states.
+        Inside a step the error is O(h^s) in q, v and p, one order better in p and v if
+        no force depends on the velocity.
 
         **Arguments:**
 

@@ -1,6 +1,14 @@
 import jax
+import pytest
 
 
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_numpy_dtype_promotion", "strict")
 jax.config.update("jax_numpy_rank_promotion", "raise")
+
+
+@pytest.fixture(autouse=True, scope="module")
+def few_compiled_programs():
+    """Drop the programs of a module: they hold memory maps, which are limited."""
+    yield
+    jax.clear_caches()

@@ -345,11 +345,10 @@ def test_a_meter_is_called_once_a_step_whatever_the_batch():
     expected = [(k, STEPS) for k in range(1, STEPS + 1)]
     for saveat in (SaveAt(steps=7), SaveAt(ts=[0.1, 0.11, 0.7])):
         recorded.clear()
-        jax.block_until_ready(
-            jax.vmap(
-                lambda dt, s=saveat: run(dt=dt, saveat=s, progress_meter=Recorder()).ys
-            )(dts)
+        program = jax.vmap(
+            lambda dt, s=saveat: run(dt=dt, saveat=s, progress_meter=Recorder()).ys
         )
+        jax.block_until_ready(jax.jit(program)(dts))
         jax.effects_barrier()
         assert recorded == expected
 
@@ -420,7 +419,9 @@ def driven_single():
     return jax.jit(driven_run)
 
 
-@pytest.mark.parametrize("names", [*([name] for name in LANES), list(LANES)])
+@pytest.mark.parametrize(
+    "names", [["q"], ["dt", "t0"], ["mass", "friction"], list(LANES)]
+)
 def test_a_batch_is_its_lanes(names, driven_single):
     first = {name: values[0] for name, values in LANES.items()}
     axes = [0 if name in names else None for name in LANES]

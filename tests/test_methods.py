@@ -393,7 +393,7 @@ def test_symmetric_closure_is_the_better_conditioned(
 
 @pytest.mark.parametrize("s", STAGES)
 def test_the_other_sign_of_the_symmetric_closure_is_singular(s: int):
-    # The solution of Σ_j a_ij Λ^j = 0, i >= 2, has Λ^s = R_A(∞) Λ^1: a closure with that
+    # The solution of Σ_j a_ij Λ^j = 0, i >= 2, has Λ^s = R_A(∞) Λ^1: a closure of that
     # sign contains it and cannot determine the multipliers.
     method = LobattoIIIAB(s)
     other = method.closure.E.copy()
