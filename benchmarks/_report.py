@@ -2,6 +2,7 @@
 
 import datetime
 import json
+import math
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +25,15 @@ def number(x: float) -> str:
     return f"{x:.1e}"
 
 
+def _finite(x: Any) -> Any:
+    """`x` with what JSON does not know, infinities and NaN, as None."""
+    if isinstance(x, dict):
+        return {key: _finite(value) for key, value in x.items()}
+    if isinstance(x, list | tuple):
+        return [_finite(value) for value in x]
+    return x if not isinstance(x, float) or math.isfinite(x) else None
+
+
 def write(name: str, title: str, text: str, data: dict[str, Any]) -> None:
     """Print a report and keep it, as Markdown and JSON."""
     about = {
@@ -38,4 +48,6 @@ def write(name: str, title: str, text: str, data: dict[str, Any]) -> None:
     print(report)
     RESULTS.mkdir(exist_ok=True)
     (RESULTS / f"{name}.md").write_text(report)
-    (RESULTS / f"{name}.json").write_text(json.dumps(about | data, indent=1) + "\n")
+    (RESULTS / f"{name}.json").write_text(
+        json.dumps(_finite(about | data), indent=1, allow_nan=False) + "\n"
+    )

@@ -33,28 +33,33 @@ def solver_for(stages):
     return nhjax.Newton() if stages >= 5 else nhjax.SimplifiedNewton()
 
 
-def trajectories(system, method, y0, counts, args=None):
-    """Nodes of runs of N = counts[lane] steps over the duration, as one program."""
-    most = max(counts)
+@eqx.filter_jit
+def runs_of_all_steps(system, method, y0, dts, num_steps, args):
+    """One lane for each dt, with the continuous multiplier beside the state."""
 
-    @eqx.filter_jit
+    def with_multiplier(t, y, args):
+        return y, system.multiplier(t, y, args)
+
     def run(dt):
         return nhjax.integrate(
             system,
             method,
             y0,
             dt=dt,
-            num_steps=most,
+            num_steps=num_steps,
             args=args,
             solver=solver_for(method.stages),
             throw=False,  # Runs of few steps go on beyond the duration.
             saveat=nhjax.SaveAt(steps=True, fn=with_multiplier),
         )
 
-    def with_multiplier(t, y, args):
-        return y, system.multiplier(t, y, args)
+    return jax.vmap(run)(dts)
 
-    sol = jax.vmap(run)(DURATION / jnp.asarray(counts, float))
+
+def trajectories(system, method, y0, counts, args=None):
+    """Nodes of runs of N = counts[lane] steps over the duration, as one program."""
+    dts = DURATION / jnp.asarray(counts, float)
+    sol = runs_of_all_steps(system, method, y0, dts, max(counts), args)
     lanes = []
     for lane, count in enumerate(counts):
         assert not 0 <= sol.stats["failed_step"][lane] < count
