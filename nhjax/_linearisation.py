@@ -34,10 +34,11 @@ class Linearisation(eqx.Module):
     violation: Float[Array, " m"]
 
     @property
-    def is_finite(self) -> Bool[Array, ""]:
-        """Whether M and C could be inverted."""
-        return jnp.all(jnp.isfinite(self.acceleration)) & jnp.all(
-            jnp.isfinite(self.multiplier)
+    def is_singular(self) -> Bool[Array, ""]:
+        """Whether M or C could not be inverted."""
+        return ~(
+            jnp.all(jnp.isfinite(self.mass_inverse))
+            & jnp.all(jnp.isfinite(self.compliance_inverse))
         )
 
     def solve(

@@ -263,7 +263,7 @@ def _check_found(found: _Found, p: Float[Array, " n"] | None, project: bool) -> 
             "initial_state: the constraints are violated; pass `project=True`.",
         ),
         Check(
-            lin.is_finite,
+            all_finite((lin.acceleration, lin.multiplier)),
             lambda: NonFiniteError(
                 "The forces D1L + F, or the derivatives of Φ, are not finite at "
                 f"{where()}: the acceleration would be {lin.acceleration}, the "

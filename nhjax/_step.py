@@ -1,17 +1,18 @@
 from typing import NamedTuple
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, PyTree
 
+from ._checks import all_finite
 from ._compensated import two_sum
 from ._custom_types import Args, BoolScalar, FloatScalar
+from ._iteration import Solved
 from ._linearisation import Linearisation, linearise
 from ._method import AbstractMethod
-from ._newton import AbstractStageSolver
+from ._newton import AbstractStageSolver, Evaluation
 from ._solution import RESULTS
-from ._stages import StageSystem
+from ._stages import Stages, StageSystem
 from ._state import State
 from ._step_record import StepRecord
 from ._system import LagrangianSystem
@@ -102,7 +103,7 @@ def step(
     return StepOutcome(
         node=next_node,
         record=StepRecord(state, x.velocity, forces.force, forces.multiplier),
-        result=_result(solved.converged, lin, next_node),
+        result=_result(solved, lin, next_node),
         num_iterations=solved.num_iterations,
         residual=residual / jnp.where(scale > 0, scale, 1),
         constraint_violation=_largest(lin_next.violation),
@@ -110,16 +111,20 @@ def step(
     )
 
 
-def _result(converged: BoolScalar, lin: Linearisation, node: Node) -> RESULTS:
-    finite = jnp.all(
-        jnp.stack([jnp.all(jnp.isfinite(leaf)) for leaf in jax.tree.leaves(node.state)])
-    )
-    # A singular M or C at the end is found at once: λ_c does not exist there.
-    singular = ~lin.is_finite | (converged & finite & ~node.lin.is_finite)
+def _result(
+    solved: Solved[Stages, Evaluation], lin: Linearisation, node: Node
+) -> RESULTS:
+    finite = all_finite(node.state) & all_finite(node.lin)
+    # What is not finite at the first iterate is so near the state itself.
     failed = RESULTS.where(
-        finite, RESULTS.nonlinear_divergence, RESULTS.nonfinite_state
+        solved.num_iterations > 1,
+        RESULTS.nonlinear_divergence,
+        RESULTS.nonfinite_state,
     )
-    result = RESULTS.where(converged & finite, RESULTS.successful, failed)
+    converged = RESULTS.where(finite, RESULTS.successful, RESULTS.nonfinite_state)
+    result = RESULTS.where(solved.converged, converged, failed)
+    # A singular M or C at the end is found at once: λ_c does not exist there.
+    singular = lin.is_singular | (solved.converged & node.lin.is_singular)
     return RESULTS.where(singular, RESULTS.singular_stage_matrix, result)
 
 
