@@ -60,7 +60,8 @@ def integrate(
     - `system`: the mechanical system.
     - `method`: such as `nhjax.LobattoIIIAB(stages=3)`; `Gauss` only without
         constraints.
-    - `y0`: a consistent state, from `nhjax.initial_state` or an earlier `Solution`.
+    - `y0`: a consistent state, from `nhjax.initial_state` or an earlier `Solution`. Its
+        multiplier matters to the propagated closure alone.
     - `dt`: the step size, a scalar, in units of time; negative to go back.
     - `num_steps`: how many steps, an int >= 1.
     - `t0`: the time of `y0`.
@@ -154,7 +155,7 @@ class _Loop(eqx.Module):
 
     def start(self, y0: State) -> _Carry:
         """The carry before the first step."""
-        node = first_node(self.system, self.t0, y0, self.args)
+        node = first_node(self.system, self.method, self.t0, y0, self.args)
         result = RESULTS.where(
             self._is_consistent(node),
             RESULTS.successful,
@@ -258,6 +259,7 @@ def _integrate(
         return jax.tree.map(lambda x: x[None], saved)
 
     carry, interpolation = loop.start(y0), None
+    pieces = [one(save(t0, carry.node.state))] if saveat.t0 else []
     if saveat.ts is not None and not saveat.dense:
         carry, saved = _run_to_samples(loop, carry, saveat.ts, save)
     else:
@@ -273,7 +275,6 @@ def _integrate(
                     saveat.ts
                 )
     t1 = loop.time(num_steps)
-    pieces = [one(save(t0, y0))] if saveat.t0 else []
     pieces += [] if saved is None else [saved]
     if saveat.saves_end(num_steps):
         pieces.append(one(save(t1, carry.node.state)))

@@ -43,13 +43,24 @@ class StepOutcome(NamedTuple):
     multiplier_defect: FloatScalar
 
 
-def first_node(system: LagrangianSystem, t: FloatScalar, y0: State, args: Args) -> Node:
-    """The node to start from at a consistent state."""
+def first_node(
+    system: LagrangianSystem,
+    method: AbstractMethod,
+    t: FloatScalar,
+    y0: State,
+    args: Args,
+) -> Node:
+    """The node to start from at a consistent state.
+
+    Closures that do not carry the multiplier report λ_c from the first node on.
+    """
+    lin = linearise(system, t, y0.q, y0.v, args)
+    carried = method.multiplier == "propagated"
     return Node(
-        state=y0,
+        state=State(y0.q, y0.v, y0.p, y0.multiplier if carried else lin.multiplier),
         q_compensation=system.manifold_of(y0.q).no_compensation(y0.q),
         p_compensation=jnp.zeros_like(y0.p),
-        lin=linearise(system, t, y0.q, y0.v, args),
+        lin=lin,
     )
 
 

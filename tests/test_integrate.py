@@ -660,3 +660,20 @@ def test_single_precision_knows_the_end_of_a_long_run():
     np.testing.assert_allclose(end.q, sol.ys.q[0], atol=3e-4)
     with pytest.raises(ValueError, match="outside the run"):
         sol.evaluate(sol.t1 + 0.1)
+
+
+@pytest.mark.parametrize("closure", ["consistent", "symmetric"])
+def test_closures_without_memory_ignore_and_correct_a_stale_multiplier(closure):
+    sleigh = nhjax.systems.ChaplyginSleigh()
+    y0 = sleigh.initial_state()
+    stale = eqx.tree_at(lambda y: y.multiplier, y0, y0.multiplier + 5)
+    sol = nhjax.integrate(
+        sleigh.system,
+        nhjax.LobattoIIIAB(3, closure),
+        stale,
+        dt=0.05,
+        num_steps=2,
+        saveat=nhjax.SaveAt(t0=True, steps=True),
+    )
+    continuous = jax.vmap(sleigh.system.multiplier)(sol.ts, sol.ys)
+    np.testing.assert_allclose(sol.ys.multiplier, continuous, rtol=1e-13)

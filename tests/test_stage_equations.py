@@ -97,30 +97,37 @@ def test_every_equation_of_the_paper_holds_to_round_off(stages, solver, closure)
         assert_equations_hold(name, part_of(run, name), closure)
 
 
-@every_closure
-@pytest.mark.parametrize("name", [*SIDE_BY_SIDE, "rolling disc"])
+@pytest.mark.parametrize(
+    ("name", "closure"),
+    [
+        *((name, closure) for name in ("particle", "sleigh") for closure in CLOSURES),
+        ("chaotic", "symmetric"),
+        ("Appell", "symmetric"),
+        ("rolling disc", "symmetric"),
+        ("driven", "symmetric"),
+    ],
+)
 def test_every_equation_of_the_paper_holds_for_a_system_on_its_own(name, closure):
-    assert_equations_hold(
-        name, run_of(recorded(name, 3, closure, "simplified")), closure
-    )
+    run = run_of(recorded(name, 3, closure, "simplified"))
+    assert_equations_hold(name, run, closure)
 
 
-@every_closure
-def test_the_equations_hold_backwards_from_a_later_time(closure):
+def test_the_equations_hold_backwards_from_a_later_time():
     system, y0, args = helpers.problem("driven")
     later = nhjax.initial_state(system, y0.q, y0.v, t=0.7, args=args, project=True)
     sol = helpers.integrate_recorded(
-        "driven", 3, closure, "simplified", later, dt=-0.08, t0=0.7
+        "driven", 3, "symmetric", "simplified", later, dt=-0.08, t0=0.7
     )
-    assert_equations_hold("driven", run_of(sol, h=-0.08), closure)
+    assert_equations_hold("driven", run_of(sol, h=-0.08), "symmetric")
 
 
-@every_closure
-@pytest.mark.parametrize("name", ["particle", "chaotic", "sleigh"])
-def test_the_equations_hold_for_large_steps(name, closure):
+def test_the_equations_hold_for_large_steps():
     start = helpers.problem("side by side")[1]
-    sol = helpers.integrate_recorded("side by side", 4, closure, "dense", start, dt=0.4)
-    assert_equations_hold(name, part_of(run_of(sol, h=0.4), name), closure)
+    sol = helpers.integrate_recorded(
+        "side by side", 4, "symmetric", "dense", start, dt=0.4
+    )
+    for name in ("particle", "chaotic", "sleigh"):
+        assert_equations_hold(name, part_of(run_of(sol, h=0.4), name), "symmetric")
 
 
 @every_closure
