@@ -20,7 +20,6 @@ from ._report import markdown_table, number, write
 def energy_rms(
     example: AbstractExample,
     method: nhjax.AbstractMethod,
-    solver: nhjax.AbstractStageSolver,
     dt: float,
     counts: list[int],
     members: int,
@@ -44,7 +43,6 @@ def energy_rms(
             dt=dt,
             num_steps=counts[-1],
             saveat=saveat,
-            solver=solver,
         )
         start = system.energy(0.0, y0)
         return (sol.ys - start) / start
@@ -72,27 +70,24 @@ def main() -> None:
     ]
     rows, data = [], []
     for name, example, method, dt in cases:
-        for solver in (nhjax.SimplifiedNewton(), nhjax.Newton()):
-            rms = energy_rms(example, method, solver, dt, counts, options.members)
-            slope = float(np.polyfit(np.log(counts[2:]), np.log(rms[2:]), 1)[0])
-            label = f"{type(method).__name__}({method.stages}), {method.multiplier}"
-            solver_name = type(solver).__name__
-            rows.append([name, label, solver_name, f"{slope:.2f}"])
-            rows[-1] += [number(x) for x in rms[[0, len(rms) // 2, -1]]]
-            data.append(
-                {
-                    "system": name,
-                    "method": label,
-                    "solver": solver_name,
-                    "dt": dt,
-                    "steps": counts,
-                    "rms": rms.tolist(),
-                    "slope": slope,
-                }
-            )
-            print(*rows[-1], sep="\t", flush=True)
-            jax.clear_caches()
-    header = ["system", "method", "solver", "slope"]
+        rms = energy_rms(example, method, dt, counts, options.members)
+        slope = float(np.polyfit(np.log(counts[2:]), np.log(rms[2:]), 1)[0])
+        label = f"{type(method).__name__}({method.stages}), {method.multiplier}"
+        rows.append([name, label, f"{slope:.2f}"])
+        rows[-1] += [number(x) for x in rms[[0, len(rms) // 2, -1]]]
+        data.append(
+            {
+                "system": name,
+                "method": label,
+                "dt": dt,
+                "steps": counts,
+                "rms": rms.tolist(),
+                "slope": slope,
+            }
+        )
+        print(*rows[-1], sep="\t", flush=True)
+        jax.clear_caches()
+    header = ["system", "method", "slope"]
     header += [f"rms at {counts[k]}" for k in (0, len(counts) // 2, -1)]
     text = (
         f"Relative energy error, root mean square over {options.members} members, "
