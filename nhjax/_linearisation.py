@@ -1,3 +1,4 @@
+from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 import equinox as eqx
@@ -50,6 +51,16 @@ class Linearisation(eqx.Module):
         return free + self.reaction @ multiplier, multiplier
 
 
+def _momentum_and_constraint(
+    system: "LagrangianSystem", args: Args
+) -> Callable[..., tuple[Array, Array]]:
+    """(D2L, Φ), whose derivatives are all that the equations of motion need."""
+    return lambda t, q, v: (
+        system.momentum(t, q, v, args),
+        system.constraint(t, q, v, args),
+    )
+
+
 def motion_residual(
     system: "LagrangianSystem",
     t: FloatScalar,
@@ -64,12 +75,10 @@ def motion_residual(
     d/dt D2L - D1L - F - λᵀ D2Φ and dΦ/dt along (q̇, v̇) = (v, a). They vanish at the
     continuous multiplier λ = λ_c(q, v).
     """
-
-    def momentum_and_constraint(t, q, v):
-        return system.momentum(t, q, v, args), system.constraint(t, q, v, args)
-
     _, (p_dot, phi_dot) = jax.jvp(
-        momentum_and_constraint, (t, q, v), (jnp.ones_like(t), v, acceleration)
+        _momentum_and_constraint(system, args),
+        (t, q, v),
+        (jnp.ones_like(t), v, acceleration),
     )
     w, _ = system.force_and_momentum(t, q, v, multiplier, args)
     return p_dot - w, phi_dot
@@ -83,11 +92,9 @@ def linearise(
     args: Args,
 ) -> Linearisation:
     """M⁻¹, B, C⁻¹, the acceleration and the continuous multiplier at (t, q, v)."""
-
-    def momentum_and_constraint(t, q, v):
-        return system.momentum(t, q, v, args), system.constraint(t, q, v, args)
-
-    (_, violation), push = jax.linearize(momentum_and_constraint, t, q, v)
+    (_, violation), push = jax.linearize(
+        _momentum_and_constraint(system, args), t, q, v
+    )
     zero_t, zero_q, zero_v = jnp.zeros_like(t), jnp.zeros_like(q), jnp.zeros_like(v)
     mass, jacobian_t = jax.vmap(lambda e: push(zero_t, zero_q, e))(
         jnp.eye(v.shape[0], dtype=v.dtype)
