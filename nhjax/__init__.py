@@ -12,9 +12,21 @@ from ._errors import (
     NonFiniteError as NonFiniteError,
     ShapeError as ShapeError,
 )
+from ._initial_state import initial_state as initial_state
 from ._integrate import integrate as integrate
 from ._interpolation import DenseInterpolation as DenseInterpolation
-from ._manifold import AbstractLieGroup as AbstractLieGroup, Euclidean as Euclidean
+from ._manifold import (
+    AbstractLieGroup as AbstractLieGroup,
+    AbstractRetraction as AbstractRetraction,
+    Cayley as Cayley,
+    Euclidean as Euclidean,
+    Exponential as Exponential,
+    ProductGroup as ProductGroup,
+    SE2 as SE2,
+    SE3 as SE3,
+    SO2 as SO2,
+    SO3 as SO3,
+)
 from ._method import (
     AbstractMethod as AbstractMethod,
     Gauss as Gauss,
@@ -34,8 +46,12 @@ from ._progress_meter import (
 )
 from ._saveat import SaveAt as SaveAt
 from ._solution import RESULTS as RESULTS, Solution as Solution
-from ._state import initial_state as initial_state, State as State
-from ._system import LagrangianSystem as LagrangianSystem
+from ._state import State as State
+from ._system import (
+    AbstractMechanicalSystem as AbstractMechanicalSystem,
+    HamiltonianSystem as HamiltonianSystem,
+    LagrangianSystem as LagrangianSystem,
+)
 from .diagnostics import (
     convergence_order as convergence_order,
     energy_error as energy_error,

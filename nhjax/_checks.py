@@ -1,13 +1,13 @@
 """What can be wrong with arguments, found before anything is compiled."""
 
 import reprlib
-from typing import Any, TYPE_CHECKING
+from typing import Any, TYPE_CHECKING, TypeAlias
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array
+from jaxtyping import Array, PyTree
 
 from ._custom_types import Args, FloatScalar, FloatScalarLike
 from ._errors import Check, DTypeError, is_traced, NonFiniteError, require, ShapeError
@@ -15,11 +15,14 @@ from ._errors import Check, DTypeError, is_traced, NonFiniteError, require, Shap
 
 if TYPE_CHECKING:
     from ._state import State
-    from ._system import LagrangianSystem
+    from ._system import AbstractMechanicalSystem
 
 
-def check_type(name: str, x: object, kind: type, advice: str = "") -> None:
-    """Raise a `TypeError` unless `x` is a `kind`."""
+Kind: TypeAlias = type | tuple[type, ...]
+
+
+def check_type(name: str, x: object, kind: Kind, advice: str = "") -> None:
+    """Raise a `TypeError` unless `x` is a `kind`, or one of several."""
     if isinstance(x, kind):
         return
     if isinstance(x, type):
@@ -29,7 +32,9 @@ def check_type(name: str, x: object, kind: type, advice: str = "") -> None:
     else:
         got = f"{reprlib.repr(x)} of type {type(x).__name__}"
     advice = f" {advice}" if advice else ""
-    raise TypeError(f"`{name}` must be an nhjax.{kind.__name__}, got {got}.{advice}")
+    kinds = kind if isinstance(kind, tuple) else (kind,)
+    names = " or ".join(f"nhjax.{kind.__name__}" for kind in kinds)
+    raise TypeError(f"`{name}` must be an {names}, got {got}.{advice}")
 
 
 def check_num_steps(num_steps: Any) -> int:
@@ -60,6 +65,13 @@ def floating(name: str, x: Any) -> Array:
             f"write 1.0 for 1, or convert with `jnp.asarray({name}, float)`."
         )
     return array
+
+
+def configuration(q: Any) -> PyTree[Array]:
+    """`q` as an array, or as a tuple (of tuples) of arrays on a product of groups."""
+    if isinstance(q, tuple) and any(eqx.is_array(x) or isinstance(x, tuple) for x in q):
+        return tuple(configuration(part) for part in q)
+    return floating("q", q)
 
 
 def real_scalar(name: str, x: FloatScalarLike, dtype: Any) -> FloatScalar:
@@ -107,41 +119,55 @@ def all_finite(tree: Any) -> Array:
     return jnp.all(jnp.stack(leaves))
 
 
-def check_functions(system: "LagrangianSystem", t: Array, q: Array, args: Args) -> None:
+def check_functions(
+    system: "AbstractMechanicalSystem", t: Array, q: PyTree[Array], args: Args
+) -> None:
     """Raise unless the functions of the system return what they should."""
-    n = system.manifold_of(q).dim
-    v = jax.ShapeDtypeStruct((n,), q.dtype)
+    n, dtype = system.manifold_of(q).dim, jax.tree.leaves(q)[0].dtype
+    u = jax.ShapeDtypeStruct((n,), dtype)
+
+    def few(shape):
+        return shape == () or (len(shape) == 1 and 1 <= shape[0] <= n)
+
+    of_phase = f"(t, q, {system.fibre_name}, args)"
     expected = {
-        "lagrangian": ("shape (), a scalar", lambda shape: shape == ()),
+        system.generator: (of_phase, "shape (), a scalar", lambda shape: shape == ()),
         "nonholonomic": (
+            of_phase,
             f"shape () or (m,) with 1 <= m <= {n}, the number of coordinates",
-            lambda shape: shape == () or (len(shape) == 1 and 1 <= shape[0] <= n),
+            few,
         ),
-        "force": (f"shape ({n},)", lambda shape: shape == (n,)),
+        "holonomic": (
+            "(t, q, args)",
+            f"shape () or (k,) with 1 <= k <= {n}, the number of coordinates",
+            few,
+        ),
+        "force": (of_phase, f"shape ({n},)", lambda shape: shape == (n,)),
     }
-    for name, (wanted, fits) in expected.items():
+    for name, (signature, wanted, fits) in expected.items():
         function = getattr(system, name)
         if function is None:
             continue
-        out = eqx.filter_eval_shape(function, t, q, v, args)
+        arguments = (t, q, args) if name == "holonomic" else (t, q, u, args)
+        out = eqx.filter_eval_shape(function, *arguments)
         shape = getattr(out, "shape", None)
         if shape is None:
             raise ShapeError(
-                f"`{name}(t, q, v, args)` must return an array of {wanted}, got "
+                f"`{name}{signature}` must return an array of {wanted}, got "
                 f"{reprlib.repr(out)} of type {type(out).__name__}."
             )
         if not fits(shape):
             raise ShapeError(
-                f"`{name}(t, q, v, args)` must return {wanted}, got shape {shape}."
+                f"`{name}{signature}` must return {wanted}, got shape {shape}."
             )
-        if out.dtype != q.dtype:
+        if out.dtype != dtype:
             raise DTypeError(
-                f"`{name}(t, q, v, args)` returns dtype {out.dtype}, but `q` has "
-                f"{q.dtype}: constants of another precision inside it?"
+                f"`{name}{signature}` returns dtype {out.dtype}, but `q` has "
+                f"{dtype}: constants of another precision inside it?"
             )
 
 
-def check_state(system: "LagrangianSystem", y0: "State", args: Args) -> None:
+def check_state(system: "AbstractMechanicalSystem", y0: "State", args: Args) -> None:
     """Raise unless `y0` can be a state of `system`."""
     parts = {name: getattr(y0, name) for name in ("p", "v", "q", "multiplier")}
     for name, x in parts.items():
@@ -162,7 +188,7 @@ def check_state(system: "LagrangianSystem", y0: "State", args: Args) -> None:
         "is `jax.tree.map(lambda x: x[-1], sol.ys)`."
     )
     for name in ("q", "p") if system.manifold is None else ("p",):
-        if parts[name].ndim != 1:
+        if jnp.ndim(parts[name]) != 1:
             raise ShapeError(
                 f"`y0.{name}` has shape {parts[name].shape}, but a state has shape "
                 f"(n,). {advice}"
@@ -177,7 +203,8 @@ def check_state(system: "LagrangianSystem", y0: "State", args: Args) -> None:
                 "Use `initial_state`."
             )
     t = jnp.zeros((), y0.v.dtype)
-    expected = eqx.filter_eval_shape(system.constraint, t, y0.q, y0.v, args).shape
+    u = system.fibre(y0)
+    expected = eqx.filter_eval_shape(system.constraint, t, y0.q, u, args).shape
     if y0.multiplier.shape != expected:
         raise ShapeError(
             f"`y0.multiplier` has shape {y0.multiplier.shape}, but the constraints of "

@@ -13,5 +13,8 @@ IntScalar: TypeAlias = Int[Array, ""]
 BoolScalar: TypeAlias = Bool[Array, ""]
 Args: TypeAlias = Any
 
-# L(t, q, v, args) -> (),  Φ(t, q, v, args) -> () or (m,),  F(t, q, v, args) -> (n,)
+# L(t, q, v, args) -> (),  Φ(t, q, v, args) -> () or (m,),  F(t, q, v, args) -> (n,),
+# and of (t, q, p, args) for Hamiltonian systems
 PhaseFunction: TypeAlias = Callable[[Any, Any, Any, Any], Any]
+# Γ(t, q, args) -> () or (k,)
+PositionFunction: TypeAlias = Callable[[Any, Any, Any], Any]

@@ -17,6 +17,7 @@ from ._checks import (
 )
 from ._custom_types import Args, BoolScalar, FloatScalar, FloatScalarLike
 from ._errors import Check, require
+from ._initial_state import position_scale, violation_scale
 from ._interpolation import (
     DenseInterpolation,
     interpolate,
@@ -28,14 +29,14 @@ from ._newton import AbstractStageSolver, SimplifiedNewton
 from ._progress_meter import AbstractProgressMeter, NoProgressMeter
 from ._saveat import SaveAt, stack_saved
 from ._solution import raise_failures, RESULTS, Solution
-from ._state import State, violation_scale
-from ._step import first_node, Node, step, StepOutcome
+from ._state import State
+from ._step import first_node, largest_violation, Node, step, StepOutcome
 from ._step_record import StepRecord
-from ._system import LagrangianSystem
+from ._system import AbstractMechanicalSystem, HamiltonianSystem, LagrangianSystem
 
 
 def integrate(
-    system: LagrangianSystem,
+    system: AbstractMechanicalSystem,
     method: AbstractMethod,
     y0: State,
     *,
@@ -97,7 +98,7 @@ def integrate(
     saveat = SaveAt(t1=True) if saveat is None else saveat
     solver = SimplifiedNewton() if solver is None else solver
     meter = NoProgressMeter() if progress_meter is None else progress_meter
-    check_type("system", system, LagrangianSystem)
+    check_type("system", system, (LagrangianSystem, HamiltonianSystem))
     check_type("method", method, AbstractMethod, "Such as nhjax.LobattoIIIAB(3).")
     check_type("y0", y0, State, "Make one with nhjax.initial_state.")
     check_type("saveat", saveat, SaveAt, "Such as nhjax.SaveAt(t0=True, steps=True).")
@@ -140,7 +141,7 @@ class _Carry(NamedTuple):
 class _Loop(eqx.Module):
     """The time loop's constants, and what it does with a step's outcome."""
 
-    system: LagrangianSystem
+    system: AbstractMechanicalSystem
     method: AbstractMethod = eqx.field(static=True)
     solver: AbstractStageSolver
     t0: FloatScalar
@@ -167,8 +168,8 @@ class _Loop(eqx.Module):
             "num_steps": none,
             "num_iterations": none,
             "max_residual": zero,
-            "max_constraint_violation": jnp.max(
-                jnp.abs(node.lin.violation), initial=zero
+            "max_constraint_violation": largest_violation(
+                self.system, self.t0, node, self.args
             ),
             "max_multiplier_defect": zero,
             "failed_step": jnp.where(result == RESULTS.successful, none - 1, none),
@@ -176,18 +177,27 @@ class _Loop(eqx.Module):
         return _Carry(node, result, stats)
 
     def _is_consistent(self, node: Node) -> BoolScalar:
-        """Whether Φ = 0 and p = D2L at the start, but for small errors.
+        """Whether Φ = 0 and v, p belong together at the start, but for small errors.
 
         The bound is to find a state of another system, or one changed by hand in one
         part; it lets pass the perturbations by which derivatives are approximated.
         """
-        y, lin = node.state, node.lin
+        y, lin, system = node.state, node.lin, self.system
         small = float(jnp.finfo(y.p.dtype).eps) ** 0.25
-        p = self.system.momentum(self.t0, y.q, y.v, self.args)
-        scale = violation_scale(self.system, lin, self.t0, y.q, y.v, self.args)
-        on_constraints = jnp.all(jnp.abs(lin.violation) <= small * scale)
-        size = jnp.max(jnp.abs(p)) + jnp.max(jnp.abs(y.p))
-        return on_constraints & (jnp.max(jnp.abs(p - y.p)) <= small * size)
+        u = system.fibre(y)
+        conjugate, given = system.conjugate(self.t0, y.q, u, self.args), y.v
+        if system.fibre_name == "v":
+            given = y.p
+        size = jnp.max(jnp.abs(conjugate)) + jnp.max(jnp.abs(given))
+        scale = violation_scale(system, lin, self.t0, y.q, u, self.args)
+        positions = system.position_constraint(self.t0, y.q, self.args)
+        allowed = position_scale(system, self.t0, y.q, self.args)
+        return (
+            jnp.all(jnp.abs(lin.violation) <= small * scale)
+            & jnp.all(jnp.abs(positions) <= small * allowed)
+            & (system.manifold_of(y.q).defect(y.q) <= small)
+            & (jnp.max(jnp.abs(conjugate - given)) <= small * size)
+        )
 
     def step(self, carry: _Carry, k: Int[Array, ""]) -> tuple[_Carry, StepRecord]:
         """Step k; a failed trajectory keeps its last good node."""
@@ -239,7 +249,7 @@ class _Loop(eqx.Module):
 
 @eqx.filter_jit
 def _integrate(
-    system: LagrangianSystem,
+    system: AbstractMechanicalSystem,
     method: AbstractMethod,
     solver: AbstractStageSolver,
     y0: State,

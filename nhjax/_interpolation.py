@@ -5,6 +5,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Int
 
+from ._chart import Chart
 from ._checks import real_scalar
 from ._custom_types import Args, BoolScalar, FloatScalar, FloatScalarLike
 from ._errors import Check, require
@@ -13,11 +14,11 @@ from ._linearisation import linearise
 from ._method import AbstractMethod
 from ._state import State
 from ._step_record import StepRecord
-from ._system import LagrangianSystem
+from ._system import AbstractMechanicalSystem
 
 
 def interpolate(
-    system: LagrangianSystem,
+    system: AbstractMechanicalSystem,
     method: AbstractMethod,
     record: StepRecord,
     t: FloatScalar,
@@ -32,14 +33,18 @@ def interpolate(
     """
     start, time = record.start, t + theta * h
     weights = method.integrated_basis(theta)
-    manifold = system.manifold_of(start.q)
-    q = manifold.act(start.q, h * (weights @ record.velocity))
-    p = start.p + h * (weights @ record.force)
-    v = root(lambda u: system.momentum(time, q, u, args) - p, start.v).x
+    chart = Chart(system.manifold_of(start.q), start.q)
+    xi = h * (weights @ record.velocity)
+    q = chart.manifold.act(start.q, xi)
+    p = chart.from_origin(xi, start.p + h * (weights @ record.force))
+    u = p
+    if system.fibre_name == "v":
+        u = root(lambda u: system.momentum(time, q, u, args) - p, start.v).x
+    v = system.velocity(time, q, u, args)
     if method.multiplier == "propagated":
         multiplier = method.basis(theta) @ record.multiplier
     else:
-        multiplier = linearise(system, time, q, v, args).multiplier
+        multiplier = linearise(system, time, q, u, args).multiplier
     return State(q, v, p, multiplier)
 
 
@@ -62,7 +67,7 @@ class DenseInterpolation(eqx.Module):
 
     def __init__(
         self,
-        system: LagrangianSystem,
+        system: AbstractMechanicalSystem,
         method: AbstractMethod,
         num_steps: int,
         t0: FloatScalar,
@@ -77,7 +82,7 @@ class DenseInterpolation(eqx.Module):
         self._rest = tuple(None if eqx.is_array(leaf) else leaf for leaf in leaves)
 
     @property
-    def _system_and_args(self) -> tuple[LagrangianSystem, Args]:
+    def _system_and_args(self) -> tuple[AbstractMechanicalSystem, Args]:
         arrays = iter(self._arrays)
         leaves = [next(arrays) if leaf is None else leaf for leaf in self._rest]
         return jax.tree.unflatten(self._treedef, leaves)

@@ -9,51 +9,78 @@ from ._stages import Stages, StageSystem
 class LeadingStructure(eqx.Module):
     """The leading structure of the linearised stage equations of one step.
 
-    With M at the start of the step, B_i at the nodes as they are foreseen there, R the
-    node rows of a_ij and δΛ = E δy,
+    With N and K at the start of the step, B_i at the nodes as they are foreseen there,
+    R the node rows of a_ij and δΛ the change of all multipliers,
 
-    δV_i = -M⁻¹ r_V + h Σ_j â_ij M⁻¹ B_jᵀ δΛ_j,
-    δv_i = -M⁻¹ r_v + h Σ_j R_ij M⁻¹ B_jᵀ δΛ_j,    B_i δv_i = -r_Φ.
+    δu_i = -N⁻¹ r_u + h Σ_j â_ij K⁻¹ B_jᵀ δΛ_j        (stages),
+    δu_i = -N⁻¹ r_v + h Σ_j R_ij K⁻¹ B_jᵀ δΛ_j        (nodes),
 
-    The last two give a Schur complement for h δy, of size (s-1) m. It is invertible for
+    and for the constraints B_i δu_i = -r_Φ at the nodes, Σ_j a_ij B_i δu_j = -r_Γ at
+    the positions, B_s δu_s = -r of the tangency at the end. The last three give a Schur
+    complement for h δy and h δΛ of the holonomic constraints. It is invertible for
     small h by hypothesis H2 (for the symmetric closure by the sign of ν) and the
     compatibility condition.
     """
 
-    mass_inverse: Float[Array, "n n"]
-    reaction: Float[Array, "s n m"]
-    schur_inverse: Float[Array, "k k"]
+    momentum_inverse: Float[Array, "n n"]
+    reaction: Float[Array, "s n l"]
+    velocity_reaction: Float[Array, "s n l"]
+    schur_inverse: Float[Array, "c c"]
     end: Linearisation
 
-    def correct_stages(self, x: Stages, residual: Float[Array, "s n"]) -> Stages:
-        """V - M⁻¹ r_V."""
-        velocity = x.velocity - residual @ self.mass_inverse.T
-        return eqx.tree_at(lambda z: z.velocity, x, velocity)
+    def correct_stages(
+        self, stages: StageSystem, x: Stages, residual: Float[Array, "s n"]
+    ) -> Stages:
+        """u - N⁻¹ r_u for the stages, and the velocities that belong to them."""
+        change = residual @ self.momentum_inverse.T
+        if not stages.hamiltonian:
+            return eqx.tree_at(lambda z: z.velocity, x, x.velocity - change)
+        x = eqx.tree_at(lambda z: z.momentum, x, x.momentum - change)
+        return eqx.tree_at(lambda z: z.velocity, x, stages.stage_velocities(x))
 
     def correct_nodes(self, x: Stages, residual: Float[Array, "r n"]) -> Stages:
-        """v - M⁻¹ r_v."""
-        node_velocity = x.node_velocity - residual @ self.mass_inverse.T
-        return eqx.tree_at(lambda z: z.node_velocity, x, node_velocity)
+        """u - N⁻¹ r_v for the nodes."""
+        node_fibre = x.node_fibre - residual @ self.momentum_inverse.T
+        return eqx.tree_at(lambda z: z.node_fibre, x, node_fibre)
 
     def correct_multipliers(
-        self, stages: StageSystem, x: Stages, constraint: Float[Array, "r m"]
+        self,
+        stages: StageSystem,
+        x: Stages,
+        kinematic: Float[Array, "r m"],
+        holonomic: Float[Array, "s k"],
     ) -> Stages:
-        """Change the free multipliers so that the constraints hold at the nodes."""
-        h_dy = -(self.schur_inverse @ constraint.reshape(-1)).reshape(constraint.shape)
-        # h M⁻¹ Bᵀ δΛ; h is divided out only where y itself is wanted.
-        push = jnp.einsum("jnm,jm->jn", self.reaction, stages.closure("E") @ h_dy)
+        """Change the free multipliers so that the constraints hold."""
+        residual = jnp.concatenate([kinematic.reshape(-1), holonomic.reshape(-1)])
+        change = -(self.schur_inverse @ residual)
+        h_dy = change[: x.closure.size].reshape(x.closure.shape)
+        h_dholonomic = change[x.closure.size :].reshape(x.holonomic.shape)
+        h_dlambda = h_dholonomic
+        if stages.num_nonholonomic:
+            h_dlambda = stages.closure("E") @ h_dy
+            if stages.num_holonomic:
+                h_dlambda = jnp.concatenate([h_dlambda, h_dholonomic], axis=1)
+        # h K⁻¹ Bᵀ δΛ; h is divided out only where multipliers themselves are wanted.
+        push = jnp.einsum("jnm,jm->jn", self.reaction, h_dlambda)
+        a_hat, momentum = stages.coefficients("a_hat"), x.momentum
+        velocity_push = push
+        if stages.hamiltonian:
+            velocity_push = jnp.einsum("jnm,jm->jn", self.velocity_reaction, h_dlambda)
+            momentum = momentum + a_hat @ push
         return Stages(
-            x.velocity + stages.coefficients("a_hat") @ push,
-            x.node_velocity + stages.node_weights @ push,
-            x.closure + h_dy / stages.h,
-            x.end_acceleration,
-            x.end_multiplier,
+            velocity=x.velocity + a_hat @ velocity_push,
+            momentum=momentum,
+            node_fibre=x.node_fibre + stages.node_weights @ push,
+            closure=x.closure + h_dy / stages.h,
+            holonomic=x.holonomic + h_dholonomic / stages.h,
+            end_acceleration=x.end_acceleration,
+            end_multiplier=x.end_multiplier,
         )
 
     def correct_end(
-        self, x: Stages, residual: tuple[Float[Array, " n"], Float[Array, " m"]]
+        self, x: Stages, residual: tuple[Float[Array, " n"], Float[Array, " l"]]
     ) -> Stages:
-        """Move the acceleration and λ_c at the end towards those of (q, v) there."""
+        """Move the acceleration and λ_c at the end towards those of (q, u) there."""
         momentum_residual, hidden_residual = residual
         da, dlam = self.end.solve(-momentum_residual, -hidden_residual)
         return eqx.tree_at(
@@ -70,19 +97,45 @@ def leading_structure(
     if not stages.constrained:
         n, nothing = stages.p.shape[0], jnp.zeros((0, 0), stages.p.dtype)
         reaction = jnp.zeros((stages.method.stages, n, 0), stages.p.dtype)
-        return LeadingStructure(lin.mass_inverse, reaction, nothing, lin)
-    jacobian = jnp.concatenate([lin.jacobian[None], stages.node_jacobian(x0)])
-    reaction = jnp.einsum("kn,jmn->jkm", lin.mass_inverse, jacobian)
+        return LeadingStructure(lin.momentum_inverse, reaction, reaction, nothing, lin)
+    jacobian = jnp.concatenate([lin.jacobian[None], stages.constraint_jacobian(x0)])
+    reaction = jnp.einsum("kn,jmn->jkm", lin.metric_inverse, jacobian)
     blocks = jnp.einsum("ian,jnb->ijab", jacobian[1:], reaction)
-    schur = jnp.einsum(
-        "ij,jl,ijab->ialb", stages.node_weights, stages.closure("E"), blocks
-    )
-    size = schur.shape[0] * schur.shape[1]
     end = eqx.tree_at(
         lambda z: (z.jacobian, z.reaction, z.compliance_inverse),
         lin,
         (jacobian[-1], reaction[-1], inverse(blocks[-1, -1])),
     )
     return LeadingStructure(
-        lin.mass_inverse, reaction, inverse(schur.reshape(size, size)), end
+        momentum_inverse=lin.momentum_inverse,
+        reaction=reaction,
+        velocity_reaction=(
+            jnp.swapaxes(jacobian, 1, 2) if stages.hamiltonian else reaction
+        ),
+        schur_inverse=inverse(_schur(stages, blocks)),
+        end=end,
     )
+
+
+def _schur(
+    stages: StageSystem, blocks: Float[Array, "s-1 s l l"]
+) -> Float[Array, "c c"]:
+    """The constraints' change with h δy and h δΛ, from the blocks B_i K⁻¹ B_jᵀ."""
+    m, k, s = stages.num_nonholonomic, stages.num_holonomic, stages.method.stages
+    a, a_hat, b = (stages.coefficients(name) for name in ("a", "a_hat", "b"))
+    rows = []
+    if m:
+        nodes = jnp.einsum("ij,ijab->iajb", a[1:], blocks[:, :, :m])
+        rows.append(nodes.reshape((s - 1) * m, s, m + k))
+    if k:
+        positions = jnp.einsum("ij,ijab->iajb", a[1:] @ a_hat, blocks[:, :, m:])
+        rows.append(positions.reshape((s - 1) * k, s, m + k))
+        rows.append(jnp.einsum("j,jab->ajb", b, blocks[-1, :, m:]))
+    change = jnp.concatenate(rows)
+    columns = []
+    if m:
+        closure = jnp.einsum("cjb,jl->clb", change[:, :, :m], stages.closure("E"))
+        columns.append(closure.reshape(change.shape[0], -1))
+    if k:
+        columns.append(change[:, :, m:].reshape(change.shape[0], -1))
+    return jnp.concatenate(columns, axis=1)

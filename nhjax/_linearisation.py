@@ -1,121 +1,148 @@
 from collections.abc import Callable
-from typing import TYPE_CHECKING
+from typing import Literal, TYPE_CHECKING
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, PyTree
 
 from ._custom_types import Args, FloatScalar
 
 
 if TYPE_CHECKING:
-    from ._system import LagrangianSystem
+    from ._system import AbstractMechanicalSystem
 
 
 class Linearisation(eqx.Module):
-    """What is known of the equations of motion at one state (t, q, v).
+    """What is known of the equations of motion at one state (t, q, u).
 
-    With M = D2D2L and B = D2Φ the motion satisfies
+    u is the fibre coordinate of the system, v or p. With N = ∂p/∂u, B = ∂Φ/∂u of the
+    constraints on velocities, and R = ♭ Bᵀ their reactions, the motion satisfies
 
-    M a - Bᵀ λ = D1L + F - D1D2L v - ∂t D2L,    B a = -∂t Φ - D1Φ v,
+    N u̇ - R λ = ad*_v p + free force - ∂t p - D1p v,    B u̇ = -∂t Φ - D1Φ v,
 
-    so that C λ with C = B M⁻¹ Bᵀ is known: C is the paper's compatibility matrix C^{ab}
-    (section 3). The same M⁻¹, B and C⁻¹ are the leading structure of the stage system.
-    Inverses are formed once and multiplied with afterwards: the matrices are tiny, and
-    a triangular solve inside an iteration costs far more than a product.
+    so that C λ with C = B N⁻¹ R is known: C is the paper's compatibility matrix C^{ab}
+    (section 3). For a Lagrangian system N is the mass matrix M = D2D2L, R = Bᵀ and u̇
+    the acceleration; for a Hamiltonian one N = 1 and R = (D2D2H)⁻¹ Bᵀ. In both
+    N⁻¹ R = K⁻¹ Bᵀ with K the metric on the fibre.
+
+    The same matrices are the leading structure of the stage system. Inverses are formed
+    once and multiplied with afterwards: the matrices are tiny, and a triangular solve
+    inside an iteration costs far more than a product.
     """
 
-    mass_inverse: Float[Array, "n n"]
-    jacobian: Float[Array, "m n"]
-    reaction: Float[Array, "n m"]
-    compliance_inverse: Float[Array, "m m"]
-    acceleration: Float[Array, " n"]
-    multiplier: Float[Array, " m"]
-    violation: Float[Array, " m"]
+    metric_inverse: Float[Array, "n n"]  # K⁻¹
+    jacobian: Float[Array, "l n"]  # B
+    reaction: Float[Array, "n l"]  # N⁻¹ R
+    compliance_inverse: Float[Array, "l l"]  # C⁻¹
+    acceleration: Float[Array, " n"]  # u̇
+    multiplier: Float[Array, " l"]
+    violation: Float[Array, " l"]
+    fibre_name: Literal["v", "p"] = eqx.field(static=True)
+
+    @property
+    def momentum_inverse(self) -> Float[Array, "n n"]:
+        """N⁻¹: the inverse mass matrix, or the identity of a Hamiltonian system."""
+        if self.fibre_name == "v":
+            return self.metric_inverse
+        return jnp.eye(self.metric_inverse.shape[0], dtype=self.metric_inverse.dtype)
 
     @property
     def is_singular(self) -> Bool[Array, ""]:
-        """Whether M or C could not be inverted."""
+        """Whether K or C could not be inverted."""
         return ~(
-            jnp.all(jnp.isfinite(self.mass_inverse))
+            jnp.all(jnp.isfinite(self.metric_inverse))
             & jnp.all(jnp.isfinite(self.compliance_inverse))
         )
 
     def solve(
-        self, momentum_residual: Float[Array, " n"], hidden_residual: Float[Array, " m"]
-    ) -> tuple[Float[Array, " n"], Float[Array, " m"]]:
-        """(a, λ) with M a - Bᵀ λ = `momentum_residual`, B a = `hidden_residual`."""
-        free = self.mass_inverse @ momentum_residual
+        self, momentum_residual: Float[Array, " n"], hidden_residual: Float[Array, " l"]
+    ) -> tuple[Float[Array, " n"], Float[Array, " l"]]:
+        """(u̇, λ) with N u̇ - R λ = `momentum_residual`, B u̇ = `hidden_residual`."""
+        free = self.momentum_inverse @ momentum_residual
         multiplier = self.compliance_inverse @ (hidden_residual - self.jacobian @ free)
         return free + self.reaction @ multiplier, multiplier
 
 
 def _momentum_and_constraint(
-    system: "LagrangianSystem", args: Args
+    system: "AbstractMechanicalSystem", q: PyTree[Array], args: Args
 ) -> Callable[..., tuple[Array, Array]]:
-    """(D2L, Φ), whose derivatives are all that the equations of motion need."""
-    return lambda t, q, v: (
-        system.momentum(t, q, v, args),
-        system.constraint(t, q, v, args),
-    )
+    """(p, Φ) on the chart around q, from whose derivatives the motion follows."""
+    manifold = system.manifold_of(q)
+
+    def pair(t, xi, u):
+        g = manifold.act(q, xi)
+        return system.momentum(t, g, u, args), system.constraint(t, g, u, args)
+
+    return pair
+
+
+def _inertial_force(system, q, p: Array, v: Array) -> Array:
+    """ad*_v p, by which the body momentum turns."""
+    manifold = system.manifold_of(q)
+    return jnp.zeros_like(p) if manifold.is_flat else manifold.ad_dual(v, p)
 
 
 def motion_residual(
-    system: "LagrangianSystem",
+    system: "AbstractMechanicalSystem",
     t: FloatScalar,
-    q: Array,
-    v: Float[Array, " n"],
+    q: PyTree[Array],
+    u: Float[Array, " n"],
     acceleration: Float[Array, " n"],
-    multiplier: Float[Array, " m"],
+    multiplier: Float[Array, " l"],
     args: Args,
-) -> tuple[Float[Array, " n"], Float[Array, " m"]]:
+) -> tuple[Float[Array, " n"], Float[Array, " l"]]:
     """Residuals of the equations of motion and of the hidden constraint.
 
-    d/dt D2L - D1L - F - λᵀ D2Φ and dΦ/dt along (q̇, v̇) = (v, a). They vanish at the
-    continuous multiplier λ = λ_c(q, v).
+    ṗ - ad*_v p - W and dΦ/dt along (q̇, u̇) = (q v, a). They vanish at the continuous
+    multiplier λ = λ_c(q, u).
     """
-    _, (p_dot, phi_dot) = jax.jvp(
-        _momentum_and_constraint(system, args),
-        (t, q, v),
+    v = system.velocity(t, q, u, args)
+    (p, _), (p_dot, phi_dot) = jax.jvp(
+        _momentum_and_constraint(system, q, args),
+        (t, jnp.zeros_like(u), u),
         (jnp.ones_like(t), v, acceleration),
     )
-    w, _ = system.force_and_momentum(t, q, v, multiplier, args)
-    return p_dot - w, phi_dot
+    w = system.stage_force(t, q, u, multiplier, args)
+    return p_dot - (w + _inertial_force(system, q, p, v)), phi_dot
 
 
 def linearise(
-    system: "LagrangianSystem",
+    system: "AbstractMechanicalSystem",
     t: FloatScalar,
-    q: Array,
-    v: Float[Array, " n"],
+    q: PyTree[Array],
+    u: Float[Array, " n"],
     args: Args,
 ) -> Linearisation:
-    """M⁻¹, B, C⁻¹, the acceleration and the continuous multiplier at (t, q, v)."""
-    (_, violation), push = jax.linearize(
-        _momentum_and_constraint(system, args), t, q, v
+    """The matrices, the acceleration and the continuous multiplier at (t, q, u)."""
+    zero_t, zero = jnp.zeros_like(t), jnp.zeros_like(u)
+    (p, violation), push = jax.linearize(
+        _momentum_and_constraint(system, q, args), t, zero, u
     )
-    zero_t, zero_q, zero_v = jnp.zeros_like(t), jnp.zeros_like(q), jnp.zeros_like(v)
-    mass, jacobian_t = jax.vmap(lambda e: push(zero_t, zero_q, e))(
-        jnp.eye(v.shape[0], dtype=v.dtype)
+    momentum_by_fibre, jacobian_t = jax.vmap(lambda e: push(zero_t, zero, e))(
+        jnp.eye(u.shape[0], dtype=u.dtype)
     )
-    p_dot, phi_dot = push(jnp.ones_like(t), v, zero_v)
-    # M is symmetric; row i of `mass` is M e_i.
-    mass_inverse = inverse(mass)
-    reaction = mass_inverse @ jacobian_t
+    v = system.velocity(t, q, u, args)
+    p_dot, phi_dot = push(jnp.ones_like(t), v, zero)
+    # Row i of `momentum_by_fibre` is N e_i; for a Lagrangian system N is the metric.
+    metric = (
+        momentum_by_fibre if system.fibre_name == "v" else system.metric(t, q, u, args)
+    )
+    metric_inverse = inverse(metric)
+    reaction = metric_inverse @ jacobian_t
     compliance = jacobian_t.T @ reaction
     lin = Linearisation(
-        mass_inverse=mass_inverse,
+        metric_inverse=metric_inverse,
         jacobian=jacobian_t.T,
         reaction=reaction,
         compliance_inverse=inverse(compliance),
-        acceleration=zero_v,
+        acceleration=zero,
         multiplier=jnp.zeros_like(violation),
         violation=violation,
+        fibre_name=system.fibre_name,
     )
-    acceleration, multiplier = lin.solve(
-        system.free_force(t, q, v, args) - p_dot, -phi_dot
-    )
+    known = system.free_force(t, q, u, args) + _inertial_force(system, q, p, v)
+    acceleration, multiplier = lin.solve(known - p_dot, -phi_dot)
     return eqx.tree_at(
         lambda x: (x.acceleration, x.multiplier), lin, (acceleration, multiplier)
     )

@@ -76,7 +76,7 @@ class SimplifiedNewton(AbstractStageSolver):
             # Each residual is evaluated at the newest iterate (Gauss-Seidel): it costs
             # the same as evaluating all of them at the last one, and contracts faster.
             forces = stages.evaluate(x)
-            x_next = structure.correct_stages(x, forces.residual)
+            x_next = structure.correct_stages(stages, x, forces.residual)
             node_residual = stages.node_residual(x_next, forces.force)
             x_next = structure.correct_nodes(x_next, node_residual)
             if stages.constrained:
@@ -94,12 +94,22 @@ class SimplifiedNewton(AbstractStageSolver):
 
 
 def _constrain(stages: StageSystem, structure: LeadingStructure, x: Stages) -> Stages:
-    x = structure.correct_multipliers(stages, x, stages.node_constraint(x))
+    kinematic, holonomic = _constraints(stages, x)
+    x = structure.correct_multipliers(stages, x, kinematic, holonomic)
     if stages.symmetric:
         # λ_c depends on v_{k+1} at zeroth order: it must see the new velocity, or the
         # two errors would feed each other and contract only as the root of the rate.
         x = structure.correct_end(x, stages.end_residual(x))
     return x
+
+
+def _constraints(stages: StageSystem, x: Stages) -> tuple[Array, Array]:
+    """The nonholonomic constraints at the nodes and the holonomic ones, if any."""
+    none = jnp.zeros((0,), stages.p.dtype)
+    return (
+        stages.node_constraint(x) if stages.num_nonholonomic else none,
+        stages.holonomic_constraint(x) if stages.num_holonomic else none,
+    )
 
 
 class Newton(AbstractStageSolver):
@@ -131,8 +141,9 @@ class Newton(AbstractStageSolver):
             forces = stages.evaluate(x)
             node_residual = stages.node_residual(x, forces.force)
             parts = [forces.residual, node_residual]
-            if stages.constrained:
-                parts.append(stages.node_constraint(x))
+            if stages.hamiltonian:
+                parts.append(x.velocity - stages.stage_velocities(x))
+            parts += _constraints(stages, x)
             if stages.symmetric:
                 parts += stages.end_residual(x)
             return ravel_pytree(parts)[0], Evaluation(forces, node_residual)
@@ -155,15 +166,19 @@ class Newton(AbstractStageSolver):
 def _increment_size(
     stages: StageSystem, x: Stages, x_next: Stages, lin: Linearisation
 ) -> FloatScalar:
-    changes = [
-        x_next.velocity - x.velocity,
-        x_next.node_velocity - x.node_velocity,
+    fibre = [x.node_fibre, x.momentum if stages.hamiltonian else x.velocity]
+    next_fibre = [
+        x_next.node_fibre,
+        x_next.momentum if stages.hamiltonian else x_next.velocity,
     ]
+    changes = [after - before for after, before in zip(next_fibre, fibre, strict=True)]
     if stages.constrained:
-        # Multipliers count by their effect on velocities, h M⁻¹ Bᵀ δΛ, on its own: Λ
-        # can still be wrong where V and v happen to be right.
+        # Multipliers count by their effect on u, h N⁻¹ R δΛ, on its own: Λ can still be
+        # wrong where the stages and nodes happen to be right.
         before, after = stages.multiplier_change(x), stages.multiplier_change(x_next)
         changes.append(stages.h * ((after - before) @ lin.reaction.T))
-    return relative_size(
-        jnp.concatenate(changes), jnp.concatenate([x.velocity, x.node_velocity])
-    )
+    size = relative_size(jnp.concatenate(changes), jnp.concatenate(fibre))
+    if stages.hamiltonian:
+        dv = relative_size(x_next.velocity - x.velocity, x.velocity)
+        size = jnp.maximum(size, dv)
+    return size

@@ -30,10 +30,14 @@ class RESULTS(eqx.Enumeration):
         "The state became infinite or NaN, or was so from the start. Check `y0` and "
         "the functions of the system along the trajectory, or try a smaller `dt`."
     )
+    left_chart = (
+        "A step turned so far that it left the chart of the retraction (a rotation "
+        "near π for Cayley, near 2π for Exponential). Take a smaller `dt`."
+    )
     inconsistent_start = (
-        "The initial state violates the constraints at `t0`, or its p is not "
-        "D2L(t0, q, v). Make `y0` with `nhjax.initial_state`, for the system, args and "
-        "time of the integration."
+        "The initial state violates the constraints at `t0`, its q is off the group, "
+        "or its p is not D2L(t0, q, v). Make `y0` with `nhjax.initial_state`, for the "
+        "system, args and time of the integration."
     )
 
 
@@ -189,6 +193,7 @@ def _messages() -> list[str]:
         RESULTS.nonlinear_divergence,
         RESULTS.singular_stage_matrix,
         RESULTS.nonfinite_state,
+        RESULTS.left_chart,
         RESULTS.inconsistent_start,
     ]
     with jax.ensure_compile_time_eval():

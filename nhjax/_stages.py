@@ -3,58 +3,87 @@ from typing import NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, PyTree
 
+from ._chart import Chart
 from ._custom_types import Args, FloatScalar
 from ._linearisation import Linearisation, motion_residual
 from ._method import AbstractMethod
-from ._system import LagrangianSystem
+from ._system import AbstractMechanicalSystem
 
 
 class Stages(eqx.Module):
     """The unknowns of one step; those that a system or closure lacks are empty.
 
-    - `velocity`: V^1..V^s, the stage velocities.
-    - `node_velocity`: v^2..v^s at the constrained nodes, the last of them v_{k+1};
-        without constraints only v_{k+1}.
-    - `closure`: y, which gives Λ = (start) λ_k + (end) λ_{k+1} + E y.
-    - `end_acceleration`, `end_multiplier`: the acceleration and λ_c at
-        (q_{k+1}, v_{k+1}), unknowns of the symmetric closure alone.
+    - `velocity`: H^1..H^s, the stage velocities in the chart (V^i on R^n).
+    - `momentum`: the stage momenta in the body frame, of a Hamiltonian system; those of
+        a Lagrangian one follow from the velocities.
+    - `node_fibre`: u^2..u^s (v or p) at the nodes, the last of them at the end of the
+        step; without nonholonomic constraints only u_{k+1}.
+    - `closure`: y, which gives the nonholonomic multipliers
+        Λ = (start) λ_k + (end) λ_{k+1} + E y.
+    - `holonomic`: the holonomic multipliers Λ^1..Λ^s.
+    - `end_acceleration`, `end_multiplier`: u̇ and λ_c at the end of the step, unknowns
+        of the symmetric closure alone.
     """
 
     velocity: Float[Array, "s n"]
-    node_velocity: Float[Array, "r n"]
+    momentum: Float[Array, "s n"]
+    node_fibre: Float[Array, "r n"]
     closure: Float[Array, "s-1 m"]
+    holonomic: Float[Array, "s k"]
     end_acceleration: Float[Array, " n"]
-    end_multiplier: Float[Array, " m"]
+    end_multiplier: Float[Array, " l"]
 
 
 class StageForces(NamedTuple):
     """The equations of the stages i = 1..s, evaluated."""
 
-    force: Float[Array, "s n"]  # W^i
-    multiplier: Float[Array, "s m"]  # Λ^i
-    residual: Float[Array, "s n"]  # P^i - p_k - h Σ â_ij W^j
+    force: Float[Array, "s n"]  # n^i, the force W^i carried to the start of the step
+    multiplier: Float[Array, "s l"]  # Λ^i
+    residual: Float[Array, "s n"]  # Π^i - base - h Σ â_ij F^j
     momentum_scale: FloatScalar  # the size of momenta, to judge residuals by
 
 
 class StageSystem(eqx.Module):
-    """The discrete nonholonomic equations of one step from (q_k, p_k, λ_k).
+    """The discrete equations of one step from (q_k, p_k, λ_k).
 
-    Paper, "Summary: Discrete nonholonomic Lagrangian equations. Vector space", in the
-    unknowns V^i, v^i (i >= 2) and the free part of Λ. The constraint at the first node
-    holds by hypothesis H1; the last node is the end of the step by H3. The three
+    The paper's four Summaries in the unknowns of `Stages`. With w^i the body force at
+    stage i (reactions included), n^i = Ad^*_{τ(Ξ^i)⁻¹} w^i and F^i the same force in
+    the chart, they read
+
+    Π^i = base + h Σ â_ij F^j,    μ^i = Ad^*_{τ(Ξ^i)} (μ_k + h Σ a_ij n^j),
+
+    with the nonholonomic constraints at the nodes (q^i, μ^i), the holonomic ones at the
+    positions Q^i, i >= 2, and their tangency at the end. The constraints at the first
+    node hold by hypothesis H1; the last node is the end of the step by H3. The three
     multiplier closures differ in the constant matrices of `method.closure` alone.
     """
 
-    system: LagrangianSystem
+    system: AbstractMechanicalSystem
     method: AbstractMethod = eqx.field(static=True)
     t: FloatScalar
     h: FloatScalar
-    q: Array
+    q: PyTree[Array]
     p: Float[Array, " n"]
-    multiplier: Float[Array, " m"]
+    multiplier: Float[Array, " l"]
     args: Args
+
+    @property
+    def num_holonomic(self) -> int:
+        """k, the number of holonomic constraints."""
+        if self.system.holonomic is None:
+            return 0
+        return jax.eval_shape(
+            lambda t, q: self.system.position_constraint(t, q, self.args),
+            self.t,
+            self.q,
+        ).shape[0]
+
+    @property
+    def num_nonholonomic(self) -> int:
+        """m, the number of nonholonomic constraints."""
+        return self.multiplier.shape[0] - self.num_holonomic
 
     @property
     def constrained(self) -> bool:
@@ -64,7 +93,17 @@ class StageSystem(eqx.Module):
     @property
     def symmetric(self) -> bool:
         """Whether the continuous multiplier at the end of the step is an unknown."""
-        return self.constrained and self.method.multiplier == "symmetric"
+        return self.num_nonholonomic > 0 and self.method.multiplier == "symmetric"
+
+    @property
+    def hamiltonian(self) -> bool:
+        """Whether stage momenta are unknowns beside the stage velocities."""
+        return self.system.fibre_name == "p"
+
+    @property
+    def chart(self) -> Chart:
+        """The chart around q_k."""
+        return Chart(self.system.manifold_of(self.q), self.q)
 
     def coefficients(self, name: str) -> Array:
         """The array `name` of the method, in the working precision."""
@@ -75,11 +114,16 @@ class StageSystem(eqx.Module):
         return jnp.asarray(getattr(self.method.closure, name), self.p.dtype)
 
     @property
+    def stage_times(self) -> Float[Array, " s"]:
+        """t_k + h c_i."""
+        return self.t + self.h * self.coefficients("c")
+
+    @property
     def node_weights(self) -> Float[Array, "r s"]:
         """Rows of a_ij at which node momenta are formed: i >= 2, or the weights b."""
         return (
             self.coefficients("a")[1:]
-            if self.constrained
+            if self.num_nonholonomic
             else (self.coefficients("b")[None])
         )
 
@@ -88,102 +132,174 @@ class StageSystem(eqx.Module):
         """Times of those nodes."""
         nodes = (
             self.coefficients("c")[1:]
-            if self.constrained
+            if self.num_nonholonomic
             else (jnp.ones((1,), self.p.dtype))
         )
         return self.t + self.h * nodes
 
-    def starting_values(self, v: Array, lin: Linearisation) -> Stages:
+    def starting_values(self, u: Array, lin: Linearisation) -> Stages:
         """Stages to first order in h, from the acceleration and λ_c at the start.
 
         They need no memory of the step before, so a step is a function of its state.
         """
+        m, s = self.num_nonholonomic, self.method.stages
         push = self.h * lin.acceleration
         stage_times = jnp.sum(self.coefficients("a_hat"), axis=1)
         node_times = jnp.sum(self.node_weights, axis=1)
-        free = jnp.ones((self.method.stages - 1,), self.p.dtype)
+        free = jnp.ones((s - 1,), u.dtype)
         if self.symmetric:
             free = free.at[0].set(0)  # ν vanishes with h, the others are multipliers
-        nothing = jnp.zeros((0,), self.p.dtype)
+        nothing = jnp.zeros((0,), u.dtype)
+        fibre = u[None] + jnp.outer(stage_times, push)
+        velocity, momentum = fibre, jnp.zeros((s, 0), u.dtype)
+        if self.hamiltonian:
+            velocity, momentum = self._starting_velocities(u, lin, stage_times), fibre
         return Stages(
-            velocity=v[None] + jnp.outer(stage_times, push),
-            node_velocity=v[None] + jnp.outer(node_times, push),
-            closure=jnp.outer(free, lin.multiplier),
+            velocity=velocity,
+            momentum=momentum,
+            node_fibre=u[None] + jnp.outer(node_times, push),
+            closure=jnp.outer(free, lin.multiplier[:m]),
+            holonomic=jnp.outer(jnp.ones((s,), u.dtype), lin.multiplier[m:]),
             end_acceleration=lin.acceleration if self.symmetric else nothing,
             end_multiplier=lin.multiplier if self.symmetric else nothing,
         )
 
-    def multipliers(self, x: Stages) -> Float[Array, "s m"]:
-        """Λ^1..Λ^s from the unknowns of the closure."""
-        if not self.constrained:
-            return jnp.zeros((self.method.stages, 0), self.p.dtype)
-        start = jnp.outer(self.closure("start"), self.multiplier)
-        return start + self.multiplier_change(x)
+    def _starting_velocities(self, u, lin: Linearisation, times) -> Array:
+        v = self.system.velocity(self.t, self.q, u, self.args)
+        _, rate = jax.jvp(
+            lambda t, xi, u: self.system.velocity(
+                t, self.chart.manifold.act(self.q, xi), u, self.args
+            ),
+            (self.t, jnp.zeros_like(u), u),
+            (jnp.ones_like(self.t), v, lin.acceleration),
+        )
+        return v[None] + jnp.outer(times, self.h * rate)
 
-    def multiplier_change(self, dx: Stages) -> Float[Array, "s m"]:
+    def multipliers(self, x: Stages) -> Float[Array, "s l"]:
+        """Λ^1..Λ^s, from the unknowns of the closure and the holonomic ones."""
+        change = self.multiplier_change(x)
+        if not self.num_nonholonomic:
+            return change
+        known = self.multiplier[: self.num_nonholonomic]
+        start = jnp.outer(self.closure("start"), known)
+        if self.num_holonomic:
+            start = jnp.concatenate([start, jnp.zeros_like(x.holonomic)], axis=1)
+        return start + change
+
+    def multiplier_change(self, dx: Stages) -> Float[Array, "s l"]:
         """The part of Λ that is linear in the unknowns."""
+        if not self.num_nonholonomic:
+            return dx.holonomic
         change = self.closure("E") @ dx.closure
         if self.symmetric:
-            change = change + jnp.outer(self.closure("end"), dx.end_multiplier)
-        return change
-
-    def _positions(self, increments: Float[Array, "r n"]) -> Array:
-        manifold = self.system.manifold_of(self.q)
-        return jax.vmap(lambda xi: manifold.act(self.q, xi))(increments)
+            end = dx.end_multiplier[: self.num_nonholonomic]
+            change = change + jnp.outer(self.closure("end"), end)
+        if not self.num_holonomic:
+            return change
+        return jnp.concatenate([change, dx.holonomic], axis=1)
 
     def increment(self, x: Stages) -> Float[Array, " n"]:
-        """ξ = h Σ b_j V^j, which takes q_k to q_{k+1}."""
-        # h * (b @ V): rounding h b_j once and for all would bias every step.
+        """ξ = h Σ b_j H^j, which takes q_k to q_{k+1}."""
+        # h * (b @ H): rounding h b_j once and for all would bias every step.
         return self.h * (self.coefficients("b") @ x.velocity)
 
-    def evaluate(self, x: Stages) -> StageForces:
-        """W^i, Λ^i, and the residuals of the stage momenta P^i = D2L(Q^i, V^i)."""
-        h, a_hat = self.h, self.coefficients("a_hat")
-        multiplier = self.multipliers(x)
-        q = self._positions(h * (self.coefficients("a") @ x.velocity))
-        t = self.t + h * self.coefficients("c")
-        force, momentum = jax.vmap(
-            lambda t, q, v, lam: self.system.force_and_momentum(t, q, v, lam, self.args)
-        )(t, q, x.velocity, multiplier)
-        residual = momentum - (self.p[None] + h * (a_hat @ force))
-        scale = jnp.max(jnp.abs(momentum)) + jnp.max(jnp.abs(h * force))
-        return StageForces(force, multiplier, residual, scale)
+    def stage_increments(self, x: Stages) -> Float[Array, "s n"]:
+        """Ξ^i = h Σ a_ij H^j."""
+        return self.h * (self.coefficients("a") @ x.velocity)
 
-    def node_positions(self, x: Stages) -> Array:
+    def _node_increments(self, x: Stages) -> Float[Array, "r n"]:
+        return self.h * (self.node_weights @ x.velocity)
+
+    def stage_velocities(self, x: Stages) -> Float[Array, "s n"]:
+        """The chart velocities dτ_Ξ⁻¹ D2H(Q^i, P^i) of a Hamiltonian system."""
+        xi = self.stage_increments(x)
+        v = jax.vmap(lambda t, q, u: self.system.velocity(t, q, u, self.args))(
+            self.stage_times, self.chart.positions(xi), x.momentum
+        )
+        return self.chart.chart_velocities(xi, v)
+
+    def evaluate(self, x: Stages) -> StageForces:
+        """n^i, Λ^i, and the residuals of the stage momenta."""
+        h, a_hat, b = self.h, self.coefficients("a_hat"), self.coefficients("b")
+        multiplier = self.multipliers(x)
+        xi = self.stage_increments(x)
+        q = self.chart.positions(xi)
+        u = (
+            x.momentum
+            if self.hamiltonian
+            else self.chart.body_velocities(xi, x.velocity)
+        )
+        force, momentum = jax.vmap(
+            lambda t, q, u, lam: (
+                self.system.stage_force(t, q, u, lam, self.args),
+                self.system.momentum(t, q, u, self.args),
+            )
+        )(self.stage_times, q, u, multiplier)
+        momentum, chart_force = self.chart.to_chart(xi, x.velocity, momentum, force)
+        transported = self.chart.to_origin(xi, force)
+        base = self.chart.base_momentum(
+            self.increment(x), self.p, h * (b @ transported), h * (b @ chart_force)
+        )
+        residual = momentum - (base[None] + h * (a_hat @ chart_force))
+        scale = jnp.max(jnp.abs(momentum)) + jnp.max(jnp.abs(h * chart_force))
+        return StageForces(transported, multiplier, residual, scale)
+
+    def node_positions(self, x: Stages) -> PyTree[Array]:
         """q^i at the nodes; the last is q_{k+1}."""
-        return self._positions(self.h * (self.node_weights @ x.velocity))
+        return self.chart.positions(self._node_increments(x))
 
     def node_residual(
         self, x: Stages, force: Float[Array, "s n"]
     ) -> Float[Array, "r n"]:
-        """D2L(q^i, v^i) - p_k - h Σ a_ij W^j at the nodes."""
-        momentum = jax.vmap(lambda t, q, v: self.system.momentum(t, q, v, self.args))(
-            self.node_times, self.node_positions(x), x.node_velocity
+        """p(q^i, u^i) - Ad^*_{τ(Ξ^i)} (p_k + h Σ a_ij n^j) at the nodes."""
+        momentum = jax.vmap(lambda t, q, u: self.system.momentum(t, q, u, self.args))(
+            self.node_times, self.node_positions(x), x.node_fibre
         )
-        return momentum - (self.p[None] + self.h * (self.node_weights @ force))
+        known = self.p[None] + self.h * (self.node_weights @ force)
+        carried = jax.vmap(self.chart.from_origin)(self._node_increments(x), known)
+        return momentum - carried
 
     def node_constraint(self, x: Stages) -> Float[Array, "r m"]:
-        """Φ(q^i, v^i) at the nodes."""
-        return jax.vmap(lambda t, q, v: self.system.constraint(t, q, v, self.args))(
-            self.node_times, self.node_positions(x), x.node_velocity
-        )
-
-    def node_jacobian(self, x: Stages) -> Float[Array, "r m n"]:
-        """B = D2Φ(q^i, v^i) at the nodes."""
+        """Φ(q^i, u^i) of the nonholonomic constraints at the nodes."""
         return jax.vmap(
-            lambda t, q, v: jax.jacrev(self.system.constraint, argnums=2)(
-                t, q, v, self.args
-            )
-        )(self.node_times, self.node_positions(x), x.node_velocity)
+            lambda t, q, u: self.system.kinematic_constraint(t, q, u, self.args)
+        )(self.node_times, self.node_positions(x), x.node_fibre)
 
-    def end_residual(self, x: Stages) -> tuple[Float[Array, " n"], Float[Array, " m"]]:
+    def holonomic_constraint(self, x: Stages) -> Float[Array, "s k"]:
+        """Γ(Q^i) / h, i >= 2, and the tangency at the end of the step.
+
+        Divided by h they are of the size of velocities, as the tangency is.
+        """
+        positions = self.chart.positions(self.stage_increments(x)[1:])
+        on_positions = jax.vmap(
+            lambda t, q: self.system.position_constraint(t, q, self.args)
+        )(self.stage_times[1:], positions)
+        end = jax.tree.map(lambda leaf: leaf[-1], positions)
+        tangency = self.system.tangency(
+            self.t + self.h, end, x.node_fibre[-1], self.args
+        )
+        return jnp.concatenate([on_positions / self.h, tangency[None]])
+
+    def constraint_jacobian(self, x: Stages) -> Float[Array, "s-1 l n"]:
+        """B = ∂Φ/∂u of all constraints on velocities at the nodes i >= 2."""
+        times, fibre = self.stage_times[1:], x.node_fibre
+        if not self.num_nonholonomic:
+            fibre = jnp.broadcast_to(fibre, (self.method.stages - 1, fibre.shape[1]))
+        positions = self.chart.positions(self.stage_increments(x)[1:])
+        return jax.vmap(
+            lambda t, q, u: jax.jacrev(self.system.constraint, argnums=2)(
+                t, q, u, self.args
+            )
+        )(times, positions, fibre)
+
+    def end_residual(self, x: Stages) -> tuple[Float[Array, " n"], Float[Array, " l"]]:
         """Residuals of the equations of motion at the end, whose root is λ_c there."""
-        q = self.node_positions(x)[-1]
+        end = jax.tree.map(lambda leaf: leaf[-1], self.node_positions(x))
         return motion_residual(
             self.system,
             self.t + self.h,
-            q,
-            x.node_velocity[-1],
+            end,
+            x.node_fibre[-1],
             x.end_acceleration,
             x.end_multiplier,
             self.args,

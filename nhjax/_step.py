@@ -15,7 +15,7 @@ from ._solution import RESULTS
 from ._stages import Stages, StageSystem
 from ._state import State
 from ._step_record import StepRecord
-from ._system import LagrangianSystem
+from ._system import AbstractMechanicalSystem
 
 
 class Node(eqx.Module):
@@ -44,7 +44,7 @@ class StepOutcome(NamedTuple):
 
 
 def first_node(
-    system: LagrangianSystem,
+    system: AbstractMechanicalSystem,
     method: AbstractMethod,
     t: FloatScalar,
     y0: State,
@@ -54,7 +54,7 @@ def first_node(
 
     Closures that do not carry the multiplier report λ_c from the first node on.
     """
-    lin = linearise(system, t, y0.q, y0.v, args)
+    lin = linearise(system, t, y0.q, system.fibre(y0), args)
     carried = method.multiplier == "propagated"
     return Node(
         state=State(y0.q, y0.v, y0.p, y0.multiplier if carried else lin.multiplier),
@@ -65,7 +65,7 @@ def first_node(
 
 
 def step(
-    system: LagrangianSystem,
+    system: AbstractMechanicalSystem,
     method: AbstractMethod,
     solver: AbstractStageSolver,
     t: FloatScalar,
@@ -90,7 +90,7 @@ def step(
         state.multiplier if propagated else lin.multiplier,
         args,
     )
-    x0 = stages.starting_values(state.v, lin)
+    x0 = stages.starting_values(system.fibre(state), lin)
     solved = solver.solve(stages, x0, lin, skip)
     x, forces = solved.x, solved.aux.forces
 
@@ -100,12 +100,23 @@ def step(
     )
     p_increment = h * (stages.coefficients("b") @ forces.force)
     p, p_compensation = two_sum(state.p, p_increment + node.p_compensation)
-    v = x.node_velocity[-1]
-    lin_next = linearise(system, t + h, q, v, args)
-    multiplier = forces.multiplier[-1] if propagated else lin_next.multiplier
+    # Ad^* is linear: it turns the sum and its rounding error alike.
+    p, p_compensation = (
+        stages.chart.from_origin(stages.increment(x), part)
+        for part in (p, p_compensation)
+    )
+    u = p if stages.hamiltonian else x.node_fibre[-1]
+    lin_next = linearise(system, t + h, q, u, args)
+    multiplier = lin_next.multiplier
+    if propagated:
+        # Only nonholonomic multipliers are carried; a step finds the others anew.
+        m = stages.num_nonholonomic
+        multiplier = jnp.concatenate([forces.multiplier[-1, :m], multiplier[m:]])
+    v = system.velocity(t + h, q, u, args)
     next_node = Node(
         State(q, v, p, multiplier), q_compensation, p_compensation, lin_next
     )
+    in_chart = stages.chart.in_domain(stages.stage_increments(x))
 
     residual = jnp.maximum(
         jnp.max(jnp.abs(forces.residual)), jnp.max(jnp.abs(solved.aux.node_residual))
@@ -114,16 +125,19 @@ def step(
     return StepOutcome(
         node=next_node,
         record=StepRecord(state, x.velocity, forces.force, forces.multiplier),
-        result=_result(solved, lin, next_node),
+        result=_result(solved, lin, next_node, in_chart),
         num_iterations=solved.num_iterations,
         residual=residual / jnp.where(scale > 0, scale, 1),
-        constraint_violation=_largest(lin_next.violation),
+        constraint_violation=largest_violation(system, t + h, next_node, args),
         multiplier_defect=_largest(forces.multiplier[-1] - lin_next.multiplier),
     )
 
 
 def _result(
-    solved: Solved[Stages, Evaluation], lin: Linearisation, node: Node
+    solved: Solved[Stages, Evaluation],
+    lin: Linearisation,
+    node: Node,
+    in_chart: BoolScalar,
 ) -> RESULTS:
     finite = all_finite(node.state) & all_finite(node.lin)
     # What is not finite at the first iterate is so near the state itself.
@@ -134,9 +148,18 @@ def _result(
     )
     converged = RESULTS.where(finite, RESULTS.successful, RESULTS.nonfinite_state)
     result = RESULTS.where(solved.converged, converged, failed)
+    result = RESULTS.where(in_chart, result, RESULTS.left_chart)
     # A singular M or C at the end is found at once: λ_c does not exist there.
     singular = lin.is_singular | (solved.converged & node.lin.is_singular)
     return RESULTS.where(singular, RESULTS.singular_stage_matrix, result)
+
+
+def largest_violation(
+    system: AbstractMechanicalSystem, t: FloatScalar, node: Node, args: Args
+) -> FloatScalar:
+    """The largest violation of any constraint at a node."""
+    on_positions = system.position_constraint(t, node.state.q, args)
+    return jnp.maximum(_largest(node.lin.violation), _largest(on_positions))
 
 
 def _largest(x: Float[Array, " m"]) -> FloatScalar:

@@ -12,11 +12,11 @@ from ._custom_types import Args
 from ._errors import is_traced, ShapeError
 from ._solution import Solution
 from ._state import State
-from ._system import LagrangianSystem
+from ._system import AbstractMechanicalSystem
 
 
 def energy_error(
-    system: LagrangianSystem, sol: Solution, args: Args = None
+    system: AbstractMechanicalSystem, sol: Solution, args: Args = None
 ) -> Float[Array, "... k"]:
     """The energy error E(t) - E(t0) along a saved trajectory.
 

@@ -13,7 +13,7 @@ from jaxtyping import Float
 
 from ._custom_types import Args
 from ._solution import Solution
-from ._system import LagrangianSystem
+from ._system import AbstractMechanicalSystem
 from .diagnostics import energy_error, map_over_axes, saved_states
 
 
@@ -73,7 +73,7 @@ def trajectory(
 
 
 def energy(
-    system: LagrangianSystem,
+    system: AbstractMechanicalSystem,
     sol: Solution,
     args: Args = None,
     *,
@@ -117,7 +117,7 @@ def multiplier(sol: Solution, *, ax: "Axes | None" = None, **style: Any) -> "Axe
 
 
 def constraint(
-    system: LagrangianSystem,
+    system: AbstractMechanicalSystem,
     sol: Solution,
     args: Args = None,
     *,

@@ -56,6 +56,6 @@ def test_public_objects_are_documented(name, value):
 
 def test_there_are_examples():
     tested = {test.name for test in _examples()}
-    for name in ("_integrate.integrate", "_saveat.SaveAt", "_state.initial_state"):
+    for name in ("_integrate.integrate", "_saveat.SaveAt", "_initial_state.initial_state"):
         assert f"nhjax.{name}" in tested
     assert len(tested) > 20

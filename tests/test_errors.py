@@ -91,7 +91,11 @@ def system_with(**functions: Any):
         ({"t": 1j}, nhjax.DTypeError, "`t` must be a real number, got 1j"),
         ({"v": None}, ValueError, "Give either `v` or `p`; got neither"),
         ({"p": V}, ValueError, "Give either `v` or `p`; got both"),
-        ({"system": kinetic}, TypeError, "`system`.*nhjax.LagrangianSystem, got <func"),
+        (
+            {"system": kinetic},
+            TypeError,
+            "`system`.*nhjax.LagrangianSystem.*, got <func",
+        ),
         ({"system": PARTICLE}, TypeError, r"NonholonomicParticle; pass .*`\.system`"),
         (
             {"system": nhjax.LagrangianSystem},

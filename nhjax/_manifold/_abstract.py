@@ -2,7 +2,16 @@ from abc import abstractmethod
 from collections.abc import Callable
 
 import equinox as eqx
-from jaxtyping import Array, Float, PyTree
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, DTypeLike, Float, PyTree
+
+from .._custom_types import BoolScalar, FloatScalar
+from .._errors import ShapeError
+
+
+Element = PyTree[Array]
+Vector = Float[Array, " n"]
 
 
 class AbstractLieGroup(eqx.Module):
@@ -11,36 +20,176 @@ class AbstractLieGroup(eqx.Module):
     The stage equations are written on the chart Ξ -> g_k τ(Ξ) around the current
     configuration (paper, section 5). Velocities and momenta are left-trivialised, that
     is, vectors of 𝔤 and 𝔤*.
+
+    A group of one's own is a subclass with `dim`, `identity`, `check`, `compose`,
+    `inverse`, `retract` and `local`; everything else follows from these by automatic
+    differentiation, and may be overridden with closed forms. An element is a pytree of
+    arrays; τ and its inverse must satisfy τ(0) = e and dτ_0 = I.
     """
 
     @property
     @abstractmethod
     def dim(self) -> int:
-        """The dimension of the group."""
+        """The dimension n of the group."""
 
     @abstractmethod
-    def check(self, q: PyTree[Array]) -> PyTree[Array]:
-        """The element `q`, or an exception if it cannot be one of this group."""
+    def identity(self, dtype: DTypeLike | None = None) -> Element:
+        """The identity e."""
 
     @abstractmethod
-    def act(self, q: PyTree[Array], xi: Float[Array, " n"]) -> PyTree[Array]:
-        """The element g τ(Ξ)."""
+    def check(self, q: Element, name: str = "q") -> Element:
+        """`q`, or a `ShapeError` if it cannot be an element; `name` is for messages."""
 
     @abstractmethod
-    def advance(
-        self,
-        q: PyTree[Array],
-        xi: Float[Array, " n"],
-        compensation: PyTree[Array],
-    ) -> tuple[PyTree[Array], PyTree[Array]]:
-        """g τ(Ξ) with the rounding error of the sum carried in `compensation`."""
+    def compose(self, g: Element, h: Element) -> Element:
+        """The product g h."""
 
     @abstractmethod
-    def no_compensation(self, q: PyTree[Array]) -> PyTree[Array]:
+    def inverse(self, g: Element) -> Element:
+        """g⁻¹."""
+
+    @abstractmethod
+    def retract(self, xi: Vector) -> Element:
+        """τ(ξ)."""
+
+    @abstractmethod
+    def local(self, g: Element) -> Vector:
+        """τ⁻¹(g), for g near the identity."""
+
+    @property
+    def is_flat(self) -> bool:
+        """Whether dτ = I and Ad = I everywhere, so that nobody need apply them."""
+        return False
+
+    def in_chart(self, xi: Vector) -> BoolScalar:
+        """Whether τ is invertible around ξ, with a margin."""
+        return jnp.asarray(True)
+
+    def defect(self, q: Element) -> FloatScalar:
+        """How far the array `q` is from the group."""
+        return jnp.zeros((), _dtype(q))
+
+    def normalise(self, q: Element) -> Element:
+        """The element nearest to `q`."""
+        return q
+
+    def matrix(self, g: Element) -> Float[Array, "k k"]:
+        """g as a matrix."""
+        raise NotImplementedError(_no_matrix(self, "matrix"))
+
+    def hat(self, xi: Vector) -> Float[Array, "k k"]:
+        """ξ^, the matrix of a vector of the Lie algebra."""
+        raise NotImplementedError(_no_matrix(self, "hat"))
+
+    def act(self, g: Element, xi: Vector) -> Element:
+        """g τ(ξ)."""
+        return self.compose(g, self.retract(xi))
+
+    def no_compensation(self, q: Element) -> Element:
         """The compensation to start `advance` from."""
+        return jax.tree.map(jnp.zeros_like, q)
 
-    @abstractmethod
-    def left_gradient(
-        self, function: Callable[[PyTree[Array]], Array], q: PyTree[Array]
-    ) -> Float[Array, " n"]:
+    def advance(
+        self, q: Element, xi: Vector, compensation: Element
+    ) -> tuple[Element, Element]:
+        """g τ(ξ), with the rounding error of the sum carried in `compensation`."""
+        return self.act(q, xi), compensation
+
+    def tangent(self, g: Element, eta: Vector) -> Element:
+        """T L_g η: the derivative of ε -> g τ(εη) at ε = 0, shaped like g."""
+        return _jvp(lambda z: self.act(g, z), jnp.zeros_like(eta), eta)
+
+    def left_gradient(self, function: Callable[[Element], Array], q: Element) -> Vector:
         """L_g^* D f(g), the derivative along ξ -> g τ(ξ) at ξ = 0."""
+        zero = jnp.zeros(self.dim, _dtype(q))
+        return transpose(lambda eta: self.tangent(q, eta), zero)(jax.grad(function)(q))
+
+    def dtau(self, xi: Vector, eta: Vector) -> Vector:
+        """dτ_ξ η, the left-trivialised tangent: D τ(ξ) η = τ(ξ) (dτ_ξ η)^."""
+        back = self.inverse(self.retract(xi))
+        return _jvp(lambda z: self.local(self.compose(back, self.retract(z))), xi, eta)
+
+    def dtau_inv(self, xi: Vector, eta: Vector) -> Vector:
+        """dτ_ξ⁻¹ η."""
+        columns = jax.vmap(lambda e: self.dtau(xi, e), out_axes=1)
+        return jnp.linalg.solve(columns(jnp.eye(self.dim, dtype=xi.dtype)), eta)
+
+    def ddtau(self, xi: Vector, eta: Vector, delta: Vector) -> Vector:
+        """ddτ_ξ(η, δ), the second tangent: ∂_ξ(dτ_ξ η) δ = dτ_ξ ddτ_ξ(η, δ)."""
+        # Differentiate dτ_ξ⁻¹ y = η at y = dτ_ξ η. The inverse is the simpler one: for
+        # Cayley's map it is a polynomial.
+        y = self.dtau(xi, eta)
+        return -_jvp(lambda z: self.dtau_inv(z, y), xi, delta)
+
+    def dtau_dual(self, xi: Vector, mu: Vector) -> Vector:
+        """dτ_ξ^* μ: ⟨dτ_ξ^* μ, η⟩ = ⟨μ, dτ_ξ η⟩."""
+        return transpose(lambda eta: self.dtau(xi, eta), mu)(mu)
+
+    def dtau_inv_dual(self, xi: Vector, mu: Vector) -> Vector:
+        """(dτ_ξ⁻¹)^* μ."""
+        return transpose(lambda eta: self.dtau_inv(xi, eta), mu)(mu)
+
+    def ddtau_dual(self, xi: Vector, eta: Vector, mu: Vector) -> Vector:
+        """(ddτ_ξ(η, ·))^* μ: its pairing with δ is ⟨μ, ddτ_ξ(η, δ)⟩."""
+        y = self.dtau(xi, eta)
+        return transpose(lambda z: -self.dtau_inv(z, y), xi)(mu)
+
+    def Ad(self, g: Element, eta: Vector) -> Vector:
+        """Ad_g η = g η g⁻¹."""
+        back = self.inverse(g)
+
+        def conjugate(z):
+            return self.local(self.compose(self.act(g, z), back))
+
+        return _jvp(conjugate, jnp.zeros_like(eta), eta)
+
+    def ad(self, xi: Vector, eta: Vector) -> Vector:
+        """ad_ξ η = [ξ, η]."""
+        return _jvp(lambda z: self.Ad(self.retract(z), eta), jnp.zeros_like(xi), xi)
+
+    def Ad_dual(self, g: Element, mu: Vector) -> Vector:
+        """Ad_g^* μ: ⟨Ad_g^* μ, η⟩ = ⟨μ, Ad_g η⟩."""
+        return transpose(lambda eta: self.Ad(g, eta), mu)(mu)
+
+    def ad_dual(self, xi: Vector, mu: Vector) -> Vector:
+        """ad_ξ^* μ: ⟨ad_ξ^* μ, η⟩ = ⟨μ, ad_ξ η⟩."""
+        return transpose(lambda eta: self.ad(xi, eta), mu)(mu)
+
+
+def transpose(
+    function: Callable[[Vector], PyTree[Array]], at: Vector
+) -> Callable[[PyTree[Array]], Vector]:
+    """The transposed derivative of `function` at a vector."""
+    _, pullback = jax.vjp(function, at)
+    return lambda covector: pullback(covector)[0]
+
+
+def check_shape(q: Element, shape: tuple[int, ...], group: str, name: str) -> Element:
+    """`q`, or a `ShapeError` if it is not one array of this shape."""
+    if isinstance(q, (tuple, list, dict)):
+        raise ShapeError(
+            f"`{name}` is {eqx.tree_pformat(q)}, but the manifold {group} needs an "
+            f"array of shape {shape}."
+        )
+    if jnp.shape(q) != shape:
+        raise ShapeError(
+            f"`{name}` has shape {jnp.shape(q)}, but the manifold {group} needs shape "
+            f"{shape}. For many trajectories use `jax.vmap`."
+        )
+    return q
+
+
+def _jvp(function, at, direction):
+    return jax.jvp(function, (at,), (direction,))[1]
+
+
+def _dtype(q):
+    return jnp.result_type(*jax.tree.leaves(q))
+
+
+def _no_matrix(group, method):
+    name = type(group).__name__
+    return (
+        f"{name} has no matrix representation. The integrators do not need one; to "
+        f"have it, define `{name}.{method}`."
+    )

@@ -1,13 +1,14 @@
-from collections.abc import Callable
-
 import equinox as eqx
-import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, DTypeLike, Float
 
 from .._compensated import two_sum
-from .._errors import ShapeError
-from ._abstract import AbstractLieGroup
+from ._abstract import AbstractLieGroup, check_shape
+from ._homogeneous import homogeneous
+
+
+Point = Float[Array, " n"]
+Vector = Float[Array, " n"]
 
 
 class Euclidean(AbstractLieGroup):
@@ -35,36 +36,87 @@ class Euclidean(AbstractLieGroup):
         """The dimension n."""
         return self.n
 
-    def check(self, q: Float[Array, " n"]) -> Float[Array, " n"]:
+    @property
+    def is_flat(self) -> bool:
+        """True: dτ and Ad are identities."""
+        return True
+
+    def identity(self, dtype: DTypeLike | None = None) -> Point:
+        """The zero vector."""
+        return jnp.zeros(self.n, dtype)
+
+    def check(self, q: Point, name: str = "q") -> Point:
         """`q`, or a `ShapeError` if it is not of shape (n,)."""
-        if jnp.shape(q) != (self.n,):
-            raise ShapeError(
-                f"`q` has shape {jnp.shape(q)}, but the manifold Euclidean({self.n}) "
-                f"needs shape ({self.n},). For many trajectories use `jax.vmap`."
-            )
-        return q
+        return check_shape(q, (self.n,), f"Euclidean({self.n})", name)
 
-    def act(self, q: Float[Array, " n"], xi: Float[Array, " n"]) -> Float[Array, " n"]:
-        """The point q + Ξ."""
-        return q + xi
+    def compose(self, g: Point, h: Point) -> Point:
+        """The sum g + h."""
+        return g + h
 
-    def advance(
-        self,
-        q: Float[Array, " n"],
-        xi: Float[Array, " n"],
-        compensation: Float[Array, " n"],
-    ) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
-        """The point q + Ξ by compensated summation."""
+    def inverse(self, g: Point) -> Point:
+        """-g."""
+        return -g
+
+    def retract(self, xi: Vector) -> Point:
+        """ξ."""
+        return xi
+
+    def local(self, g: Point) -> Vector:
+        """g."""
+        return g
+
+    def advance(self, q: Point, xi: Vector, compensation: Point) -> tuple[Point, Point]:
+        """The point q + ξ by compensated summation."""
         return two_sum(q, xi + compensation)
 
-    def no_compensation(self, q: Float[Array, " n"]) -> Float[Array, " n"]:
-        """A zero vector."""
-        return jnp.zeros_like(q)
+    def matrix(self, g: Point) -> Float[Array, "n+1 n+1"]:
+        """The translation by g, in homogeneous coordinates."""
+        return homogeneous(jnp.eye(self.n, dtype=g.dtype), g, 1.0)
 
-    def left_gradient(
-        self,
-        function: Callable[[Float[Array, " n"]], Array],
-        q: Float[Array, " n"],
-    ) -> Float[Array, " n"]:
-        """The gradient of `function` at q."""
-        return jax.grad(function)(q)
+    def hat(self, xi: Vector) -> Float[Array, "n+1 n+1"]:
+        """ξ as the last column of a matrix."""
+        return homogeneous(jnp.zeros((self.n, self.n), xi.dtype), xi, 0.0)
+
+    def tangent(self, g: Point, eta: Vector) -> Point:
+        """η."""
+        return eta
+
+    def dtau(self, xi: Vector, eta: Vector) -> Vector:
+        """η."""
+        return eta
+
+    def dtau_inv(self, xi: Vector, eta: Vector) -> Vector:
+        """η."""
+        return eta
+
+    def ddtau(self, xi: Vector, eta: Vector, delta: Vector) -> Vector:
+        """Zero."""
+        return jnp.zeros_like(eta)
+
+    def dtau_dual(self, xi: Vector, mu: Vector) -> Vector:
+        """μ."""
+        return mu
+
+    def dtau_inv_dual(self, xi: Vector, mu: Vector) -> Vector:
+        """μ."""
+        return mu
+
+    def ddtau_dual(self, xi: Vector, eta: Vector, mu: Vector) -> Vector:
+        """Zero."""
+        return jnp.zeros_like(mu)
+
+    def Ad(self, g: Point, eta: Vector) -> Vector:
+        """η."""
+        return eta
+
+    def Ad_dual(self, g: Point, mu: Vector) -> Vector:
+        """μ."""
+        return mu
+
+    def ad(self, xi: Vector, eta: Vector) -> Vector:
+        """Zero."""
+        return jnp.zeros_like(eta)
+
+    def ad_dual(self, xi: Vector, mu: Vector) -> Vector:
+        """Zero."""
+        return jnp.zeros_like(mu)

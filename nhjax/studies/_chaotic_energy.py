@@ -7,11 +7,12 @@ from typing import Any, ClassVar, TYPE_CHECKING
 import jax
 import numpy as np
 
+from .._initial_state import initial_state
 from .._integrate import integrate
 from .._method import LobattoIIIAB
 from .._saveat import SaveAt
 from .._solution import raise_failures
-from .._state import initial_state, State
+from .._state import State
 from ..systems import ChaoticSystem
 from ._arguments import (
     ArgumentError,

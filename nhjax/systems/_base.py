@@ -3,22 +3,25 @@
 import abc
 import math
 from collections.abc import Callable
+from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, DTypeLike
+from jaxtyping import Array, ArrayLike, DTypeLike, PyTree
 
 from .._custom_types import Args, FloatScalarLike
 from .._errors import is_traced
-from .._state import initial_state, State
+from .._initial_state import initial_state
+from .._manifold import AbstractLieGroup
+from .._state import State
 from .._system import LagrangianSystem
 
 
 # Gauss-Legendre rule of one panel: exact to round-off on panels whose length is
 # below the distance of the integrand's nearest complex singularity.
-_NODES, _WEIGHTS = np.polynomial.legendre.leggauss(20)
+NODES, WEIGHTS = np.polynomial.legendre.leggauss(20)
 
 
 def parameter(value: ArrayLike) -> Array:
@@ -40,6 +43,12 @@ def coordinates(value: ArrayLike | tuple[float, ...]) -> Array:
     return array
 
 
+def pair(value: tuple) -> tuple[Array, Array]:
+    """Make floating arrays of an element of a product of two groups."""
+    first, second = value
+    return coordinates(first), coordinates(second)
+
+
 def require_positive(**parameters: Array) -> None:
     """Raise for a parameter that is not positive, unless it is being traced."""
     for name, value in parameters.items():
@@ -47,10 +56,38 @@ def require_positive(**parameters: Array) -> None:
             raise ValueError(f"`{name}` must be positive, got {value}.")
 
 
+def require_shape(shape: tuple[int, ...], **parameters: Array) -> None:
+    """Raise for a parameter that has not the `shape`."""
+    for name, value in parameters.items():
+        if value.shape != shape:
+            raise ValueError(f"`{name}` must have shape {shape}, got {value.shape}.")
+
+
 def require_nonzero(name: str, value: float, consequence: str) -> None:
     """Raise where a closed formula would divide by `value` = 0."""
     if value == 0:
         raise ValueError(f"`{name}` must be nonzero, got {value}: {consequence}.")
+
+
+def require_consistent(name: str, violation: ArrayLike, scale: ArrayLike) -> None:
+    """Raise where `name` violates a constraint by more than the rounding of `scale`.
+
+    A closed-form solution uses the constraint to drop velocities: for data that violate
+    it the formula would silently answer for other data.
+    """
+    largest = np.max(np.abs(np.asarray(violation)))
+    sizes = np.asarray(scale)
+    tolerance = math.sqrt(jnp.finfo(sizes.dtype).eps) * (1 + np.max(np.abs(sizes)))
+    if not largest <= tolerance:
+        raise ValueError(
+            f"`{name}` violates the constraint by {largest:.3e}; the exact solution "
+            "needs consistent initial data."
+        )
+
+
+def on_host(tree: PyTree[Array]) -> PyTree[np.ndarray]:
+    """The arrays of `tree` in float64 on the host, where exact solutions live."""
+    return jax.tree.map(lambda x: np.asarray(x, dtype=np.float64), tree)
 
 
 def integral(
@@ -64,22 +101,26 @@ def integral(
     panels = math.ceil(abs(t) * rate) + 1
     edges = np.linspace(0.0, t, panels + 1)
     half_width = 0.5 * t / panels
-    times = 0.5 * (edges[1:] + edges[:-1])[:, None] + half_width * _NODES
-    return half_width * np.sum(integrand(times) * _WEIGHTS, axis=(-2, -1))
+    times = 0.5 * (edges[1:] + edges[:-1])[:, None] + half_width * NODES
+    return half_width * np.sum(integrand(times) * WEIGHTS, axis=(-2, -1))
 
 
 class AbstractExample(eqx.Module):
-    """A mechanical system with parameters and default initial data."""
+    """A mechanical system with parameters and default initial data.
 
-    q0: eqx.AbstractVar[Array]
+    On a Lie group `q` is an element, a tuple of arrays on a product, and `v` the body
+    velocity.
+    """
+
+    q0: eqx.AbstractVar[PyTree[Array]]
     v0: eqx.AbstractVar[Array]
 
     @abc.abstractmethod
-    def lagrangian(self, t: FloatScalarLike, q: Array, v: Array, args: Args) -> Array:
+    def lagrangian(self, t: FloatScalarLike, q: Any, v: Array, args: Args) -> Array:
         """The Lagrangian L(t, q, v)."""
 
     @abc.abstractmethod
-    def invariants(self, t: FloatScalarLike, q: Array, v: Array) -> dict[str, Array]:
+    def invariants(self, t: FloatScalarLike, q: Any, v: Array) -> dict[str, Array]:
         """The conserved quantities at one point (q, v); `jax.vmap` it over many."""
 
     @property
@@ -87,7 +128,7 @@ class AbstractExample(eqx.Module):
     def system(self) -> LagrangianSystem:
         """The system to integrate; its leaves are the parameters."""
 
-    def energy(self, t: FloatScalarLike, q: Array, v: Array) -> Array:
+    def energy(self, t: FloatScalarLike, q: Any, v: Array) -> Array:
         """The energy D2L · v - L at one point."""
         value, momentum = jax.value_and_grad(self.lagrangian, argnums=2)(t, q, v, None)
         return momentum @ v - value
@@ -99,36 +140,45 @@ class AbstractExample(eqx.Module):
         """
         if dtype is None:
             dtype = jnp.result_type(float)
-        q0, v0 = self.q0.astype(dtype), self.v0.astype(dtype)
+        q0, v0 = jax.tree.map(lambda x: x.astype(dtype), (self.q0, self.v0))
         return initial_state(self.system, q0, v=v0)
 
 
-class AbstractConstrainedExample(AbstractExample):
+class AbstractNonholonomicExample(AbstractExample):
     """An example with nonholonomic constraints."""
 
     @abc.abstractmethod
-    def constraint(self, t: FloatScalarLike, q: Array, v: Array, args: Args) -> Array:
+    def constraint(self, t: FloatScalarLike, q: Any, v: Array, args: Args) -> Array:
         """The constraint Φ(t, q, v), a scalar or of shape (m,)."""
+
+    def _consistent_data(self) -> tuple[Any, np.ndarray]:
+        """(q0, v0) in float64 on the host, where they satisfy the constraint."""
+        time = jnp.asarray(0.0, dtype=self.v0.dtype)
+        violation = self.constraint(time, self.q0, self.v0, None)
+        require_consistent("v0", violation, self.v0)
+        return on_host(self.q0), on_host(self.v0)
+
+
+class AbstractConstrainedExample(AbstractNonholonomicExample):
+    """An example with nonholonomic constraints on a vector space."""
 
     @property
     def system(self) -> LagrangianSystem:
         """The system to integrate; its leaves are the parameters."""
         return LagrangianSystem(self.lagrangian, nonholonomic=self.constraint)
 
-    def _consistent_data(self) -> tuple[np.ndarray, np.ndarray]:
-        """(q0, v0) in float64 on the host, where they satisfy the constraint.
 
-        A closed-form solution uses the constraint to drop velocities: for data that
-        violate it the formula would silently answer for other data.
-        """
-        q0 = np.asarray(self.q0, dtype=np.float64)
-        v0 = np.asarray(self.v0, dtype=np.float64)
-        time = jnp.asarray(0.0, dtype=self.q0.dtype)
-        violation = np.max(np.abs(self.constraint(time, self.q0, self.v0, None)))
-        tolerance = math.sqrt(jnp.finfo(self.q0.dtype).eps) * (1 + np.max(np.abs(v0)))
-        if not violation <= tolerance:
-            raise ValueError(
-                f"`v0` violates the constraint by {violation:.3e}; the exact solution "
-                "needs consistent initial data."
-            )
-        return q0, v0
+class AbstractConstrainedGroupExample(AbstractNonholonomicExample):
+    """An example with nonholonomic constraints on a Lie group."""
+
+    @property
+    @abc.abstractmethod
+    def manifold(self) -> AbstractLieGroup:
+        """The configuration manifold, with the example's retraction."""
+
+    @property
+    def system(self) -> LagrangianSystem:
+        """The system to integrate; its leaves are the parameters."""
+        return LagrangianSystem(
+            self.lagrangian, nonholonomic=self.constraint, manifold=self.manifold
+        )

@@ -1,0 +1,123 @@
+import jax.numpy as jnp
+from jaxtyping import Array, DTypeLike, Float
+
+from .._compensated import two_sum
+from .._custom_types import BoolScalar
+from ._abstract import AbstractLieGroup, check_shape
+from ._homogeneous import homogeneous
+from ._plane import rotate, turn
+from ._retraction import AbstractRetraction, Cayley, check_retraction
+from ._so2 import SO2
+
+
+Pose = Float[Array, "3"]
+Vector = Float[Array, "3"]
+
+
+class SE2(AbstractLieGroup):
+    """The rigid motions of the plane: (x, y, θ), with body velocity (v1, v2, ω).
+
+    d(x, y)/dt = R(θ) (v1, v2) and dθ/dt = ω. The angle is a lift, as on `SO2`.
+
+    **Arguments:**
+
+    - `retraction`: `Cayley()` or `Exponential()`.
+
+    !!! example
+
+        >>> import jax.numpy as jnp, nhjax
+        >>> nhjax.SE2().tangent(jnp.zeros(3), jnp.array([1.0, 0.0, 2.0]))
+        Array([1., 0., 2.], dtype=...)
+    """
+
+    retraction: AbstractRetraction = Cayley()
+
+    def __check_init__(self):
+        check_retraction("SE2", self.retraction)
+
+    @property
+    def dim(self) -> int:
+        """3."""
+        return 3
+
+    def identity(self, dtype: DTypeLike | None = None) -> Pose:
+        """(0, 0, 0)."""
+        return jnp.zeros(3, dtype)
+
+    def check(self, q: Pose, name: str = "q") -> Pose:
+        """`q`, or a `ShapeError` if it is not of shape (3,)."""
+        return check_shape(q, (3,), "SE2", name)
+
+    def in_chart(self, xi: Vector) -> BoolScalar:
+        """Whether the rotation of τ(ξ) is short of the end of the chart."""
+        return self.retraction.in_chart(xi[2] ** 2)
+
+    def compose(self, g: Pose, h: Pose) -> Pose:
+        """(x + R(θ) x', θ + θ')."""
+        return g + self.tangent(g, h)
+
+    def inverse(self, g: Pose) -> Pose:
+        """(-R(θ)ᵀ x, -θ)."""
+        return jnp.concatenate([rotate(-g[2], -g[:2]), -g[2:]])
+
+    def retract(self, xi: Vector) -> Pose:
+        """τ(ξ)."""
+        v, omega = xi[:2], xi[2]
+        alpha, beta, _ = self.retraction.dtau_coefficients(omega**2)
+        translation = alpha * v + beta * omega * turn(v)
+        return jnp.concatenate([translation, self.retraction.angle(xi[2:])])
+
+    def local(self, g: Pose) -> Vector:
+        """The ξ with τ(ξ) = g."""
+        rate = self.retraction.rate(g[2:])
+        omega = rate[0]
+        alpha, _ = self.retraction.dtau_inv_coefficients(omega**2)
+        v = alpha * g[:2] - 0.5 * omega * turn(g[:2])
+        return jnp.concatenate([v, rate])
+
+    def advance(self, q: Pose, xi: Vector, compensation: Pose) -> tuple[Pose, Pose]:
+        """g τ(ξ) by compensated summation."""
+        return two_sum(q, self.tangent(q, self.retract(xi)) + compensation)
+
+    def matrix(self, g: Pose) -> Float[Array, "3 3"]:
+        """The motion in homogeneous coordinates."""
+        rotation = SO2(self.retraction).matrix(g[2:])
+        return homogeneous(rotation, g[:2], 1.0)
+
+    def hat(self, xi: Vector) -> Float[Array, "3 3"]:
+        """[[ω J, v], [0, 0]]."""
+        return homogeneous(SO2(self.retraction).hat(xi[2:]), xi[:2], 0.0)
+
+    def tangent(self, g: Pose, eta: Vector) -> Pose:
+        """(R(θ) v, ω)."""
+        return jnp.concatenate([rotate(g[2], eta[:2]), eta[2:]])
+
+    def dtau(self, xi: Vector, eta: Vector) -> Vector:
+        """The formula of `SO3` for motions of the plane."""
+        v, omega = xi[:2], xi[2]
+        u, sigma = eta[:2], eta[2]
+        s = omega**2
+        alpha, beta, gamma = self.retraction.dtau_coefficients(s)
+        bracket = omega * turn(u) - sigma * turn(v)
+        linear = alpha * u - beta * bracket + gamma * omega * sigma * v
+        return jnp.concatenate([linear, (alpha + gamma * s) * eta[2:]])
+
+    def dtau_inv(self, xi: Vector, eta: Vector) -> Vector:
+        """The inverse formula of `SO3` for motions of the plane."""
+        v, omega = xi[:2], xi[2]
+        u, sigma = eta[:2], eta[2]
+        s = omega**2
+        alpha, gamma = self.retraction.dtau_inv_coefficients(s)
+        bracket = omega * turn(u) - sigma * turn(v)
+        linear = alpha * u + 0.5 * bracket + gamma * omega * sigma * v
+        return jnp.concatenate([linear, (alpha + gamma * s) * eta[2:]])
+
+    def Ad(self, g: Pose, eta: Vector) -> Vector:
+        """(R(θ) u - σ J x, σ)."""
+        linear = rotate(g[2], eta[:2]) - eta[2] * turn(g[:2])
+        return jnp.concatenate([linear, eta[2:]])
+
+    def ad(self, xi: Vector, eta: Vector) -> Vector:
+        """(ω J u - σ J v, 0)."""
+        linear = xi[2] * turn(eta[:2]) - eta[2] * turn(xi[:2])
+        return jnp.concatenate([linear, jnp.zeros_like(eta[2:])])

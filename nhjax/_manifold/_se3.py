@@ -1,0 +1,159 @@
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, DTypeLike, Float
+
+from .._compensated import two_sum
+from .._custom_types import BoolScalar, FloatScalar
+from ._abstract import AbstractLieGroup, check_shape
+from ._homogeneous import homogeneous
+from ._quaternion import cross, dot, rotate, Vector3
+from ._retraction import AbstractRetraction, Cayley, check_retraction, Exponential
+from ._so3 import SO3
+
+
+Pose = Float[Array, "7"]
+Vector = Float[Array, "6"]
+
+
+class SE3(AbstractLieGroup):
+    """The rigid motions of space: a unit quaternion q, then a translation x.
+
+    The velocity is (v, ω), both in the body: dx/dt = R(q) v, dq/dt = q ∘ (0, ω/2).
+
+    **Arguments:**
+
+    - `retraction`: `Cayley()` or `Exponential()`.
+
+    !!! example
+
+        >>> import nhjax
+        >>> nhjax.SE3().identity()
+        Array([1., 0., 0., 0., 0., 0., 0.], dtype=...)
+    """
+
+    retraction: AbstractRetraction = Cayley()
+
+    def __check_init__(self):
+        check_retraction("SE3", self.retraction)
+
+    @property
+    def dim(self) -> int:
+        """6."""
+        return 6
+
+    @property
+    def _rotations(self) -> SO3:
+        return SO3(self.retraction)
+
+    def identity(self, dtype: DTypeLike | None = None) -> Pose:
+        """(1, 0, 0, 0, 0, 0, 0)."""
+        return jnp.array([1.0] + 6 * [0.0], dtype)
+
+    def check(self, q: Pose, name: str = "q") -> Pose:
+        """`q`, or a `ShapeError` if it is not of shape (7,)."""
+        return check_shape(q, (7,), "SE3", name)
+
+    def in_chart(self, xi: Vector) -> BoolScalar:
+        """Whether the rotation of τ(ξ) is short of the end of the chart."""
+        return self._rotations.in_chart(xi[3:])
+
+    def defect(self, q: Pose) -> FloatScalar:
+        """| |quaternion| - 1 |."""
+        return self._rotations.defect(q[:4])
+
+    def normalise(self, q: Pose) -> Pose:
+        """`q` with a quaternion of norm 1."""
+        return jnp.concatenate([self._rotations.normalise(q[:4]), q[4:]])
+
+    def compose(self, g: Pose, h: Pose) -> Pose:
+        """(q ∘ q', x + R(q) x')."""
+        rotation = self._rotations.compose(g[:4], h[:4])
+        return jnp.concatenate([rotation, g[4:] + rotate(g[:4], h[4:])])
+
+    def inverse(self, g: Pose) -> Pose:
+        """(q*, -R(q)ᵀ x)."""
+        rotation = self._rotations.inverse(g[:4])
+        return jnp.concatenate([rotation, rotate(rotation, -g[4:])])
+
+    def retract(self, xi: Vector) -> Pose:
+        """τ(ξ)."""
+        rotation = self._rotations.retract(xi[3:])
+        return jnp.concatenate([rotation, self._translation(xi)])
+
+    def _translation(self, xi):
+        v, omega = xi[:3], xi[3:]
+        if isinstance(self.retraction, Exponential):
+            return self._rotations.dtau(-omega, v)
+        return self._solve(-omega, v)
+
+    def _solve(self, omega, v):
+        """(I + ω^/2)⁻¹ v, of which Cayley's map is made."""
+        alpha, _, _ = self.retraction.dtau_coefficients(dot(omega, omega))
+        return alpha * self._rotations.dtau_inv(-omega, v)
+
+    def local(self, g: Pose) -> Vector:
+        """The ξ with τ(ξ) = g and the shorter rotation vector."""
+        omega, x = self._rotations.local(g[:4]), g[4:]
+        if isinstance(self.retraction, Exponential):
+            v = self._rotations.dtau_inv(-omega, x)
+        else:
+            v = x - 0.5 * cross(omega, x)
+        return jnp.concatenate([v, omega])
+
+    def advance(self, q: Pose, xi: Vector, compensation: Pose) -> tuple[Pose, Pose]:
+        """g τ(ξ) by compensated summation, the quaternion of norm 1 to rounding."""
+        step = rotate(q[:4], self._translation(xi))
+        x, x_error = two_sum(q[4:], step + compensation[4:])
+        rotation, error = self._rotations.advance(q[:4], xi[3:], compensation[:4])
+        return jnp.concatenate([rotation, x]), jnp.concatenate([error, x_error])
+
+    def matrix(self, g: Pose) -> Float[Array, "4 4"]:
+        """The motion in homogeneous coordinates."""
+        return homogeneous(self._rotations.matrix(g[:4]), g[4:], 1.0)
+
+    def hat(self, xi: Vector) -> Float[Array, "4 4"]:
+        """[[ω^, v], [0, 0]]."""
+        return homogeneous(self._rotations.hat(xi[3:]), xi[:3], 0.0)
+
+    def tangent(self, g: Pose, eta: Vector) -> Pose:
+        """(q ∘ (0, ω/2), R(q) v)."""
+        rotation = self._rotations.tangent(g[:4], eta[3:])
+        return jnp.concatenate([rotation, rotate(g[:4], eta[:3])])
+
+    def dtau(self, xi: Vector, eta: Vector) -> Vector:
+        """dτ_ξ η."""
+        if isinstance(self.retraction, Exponential):
+            return _dual_part(self._rotations.dtau, xi, eta)
+        sigma = self._rotations.dtau(xi[3:], eta[3:])
+        u = self._solve(xi[3:], eta[:3]) + 0.5 * cross(sigma, xi[:3])
+        return jnp.concatenate([u, sigma])
+
+    def dtau_inv(self, xi: Vector, eta: Vector) -> Vector:
+        """dτ_ξ⁻¹ η."""
+        if isinstance(self.retraction, Exponential):
+            return _dual_part(self._rotations.dtau_inv, xi, eta)
+        y = eta[:3] - 0.5 * cross(eta[3:], xi[:3])
+        sigma = self._rotations.dtau_inv(xi[3:], eta[3:])
+        return jnp.concatenate([y + 0.5 * cross(xi[3:], y), sigma])
+
+    def Ad(self, g: Pose, eta: Vector) -> Vector:
+        """(R u + x × R σ, R σ)."""
+        sigma = rotate(g[:4], eta[3:])
+        u = rotate(g[:4], eta[:3]) + cross(g[4:], sigma)
+        return jnp.concatenate([u, sigma])
+
+    def ad(self, xi: Vector, eta: Vector) -> Vector:
+        """(ω × u + v × σ, ω × σ)."""
+        return _dual_part(self._rotations.ad, xi, eta)
+
+
+def _dual_part(function, xi: Vector, eta: Vector) -> Vector:
+    """A map of se(3) from the same map of so(3).
+
+    ξ is the dual number ω + ε v with ε² = 0, so that what is built from brackets alone
+    extends from so(3) by its derivative: f(ω + ε v, σ + ε u) = f + ε Df (v, u).
+    """
+    value: Vector3
+    slope: Vector3
+    value, slope = jax.jvp(function, (xi[3:], eta[3:]), (xi[:3], eta[:3]))
+    return jnp.concatenate([slope, value])

@@ -1,0 +1,116 @@
+from typing import ClassVar, Literal
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, PyTree
+
+from .._custom_types import (
+    Args,
+    FloatScalar,
+    FloatScalarLike,
+    PhaseFunction,
+    PositionFunction,
+)
+from .._manifold import AbstractLieGroup
+from .._state import State
+from ._abstract import AbstractMechanicalSystem
+
+
+class HamiltonianSystem(AbstractMechanicalSystem):
+    """A Hamiltonian system with constraints and external forces.
+
+    Its motion obeys (paper, section 3)
+
+    ṗ = ad*_v p - L_q^* D1H + F + λᵀ ♭_H D2Ψ + νᵀ L_q^* DΓ,    q̇ = q v,    v = D2H,
+
+    Ψ(t, q, p) = 0,    Γ(t, q) = 0,
+
+    where ♭_H = (D2D2H)⁻¹ turns velocities into momenta. It is integrated by the paper's
+    Hamiltonian equations, with the stage momenta as unknowns; no Legendre transform is
+    inverted on the way.
+
+    **Arguments:**
+
+    - `hamiltonian`: H, called as `hamiltonian(t, q, p, args)`, a scalar. On a group it
+        is left-trivialised: `q` is an element, `p` a covector of the Lie algebra.
+    - `nonholonomic`: Ψ, called as `nonholonomic(t, q, p, args)`, of shape () or (m,).
+    - `holonomic`: Γ, called as `holonomic(t, q, args)`, of shape () or (k,).
+    - `force`: an external covector F, called as `force(t, q, p, args)`, of shape (n,).
+    - `manifold`: the configuration manifold; R^n with the n of the state if left out.
+
+    !!! example
+
+        >>> import jax.numpy as jnp, nhjax
+        >>> oscillator = nhjax.HamiltonianSystem(
+        ...     lambda t, q, p, args: 0.5 * p @ p + 0.5 * q @ q)
+        >>> y = nhjax.initial_state(oscillator, jnp.array([1.0]), p=jnp.array([0.0]))
+        >>> float(oscillator.energy(0.0, y))
+        0.5
+    """
+
+    hamiltonian: PhaseFunction
+    nonholonomic: PhaseFunction | None = eqx.field(default=None, kw_only=True)
+    holonomic: PositionFunction | None = eqx.field(default=None, kw_only=True)
+    force: PhaseFunction | None = eqx.field(default=None, kw_only=True)
+    manifold: AbstractLieGroup | None = eqx.field(default=None, kw_only=True)
+
+    generator: ClassVar[Literal["lagrangian", "hamiltonian"]] = "hamiltonian"
+    fibre_name: ClassVar[Literal["v", "p"]] = "p"
+
+    def momentum(
+        self,
+        t: FloatScalarLike,
+        q: PyTree[Array],
+        u: Float[Array, " n"],
+        args: Args = None,
+    ) -> Float[Array, " n"]:
+        """The momentum, which is the fibre coordinate itself."""
+        return u
+
+    def velocity(
+        self,
+        t: FloatScalarLike,
+        q: PyTree[Array],
+        u: Float[Array, " n"],
+        args: Args = None,
+    ) -> Float[Array, " n"]:
+        """The velocity v = D2H."""
+        return jax.grad(self.hamiltonian, argnums=2)(t, q, u, args)
+
+    def metric(
+        self,
+        t: FloatScalarLike,
+        q: PyTree[Array],
+        u: Float[Array, " n"],
+        args: Args = None,
+    ) -> Float[Array, "n n"]:
+        """The metric D2D2H on momenta, the inverse of the mass matrix."""
+        return jax.jacfwd(self.velocity, argnums=2)(t, q, u, args)
+
+    def free_force(
+        self,
+        t: FloatScalarLike,
+        q: PyTree[Array],
+        u: Float[Array, " n"],
+        args: Args = None,
+    ) -> Float[Array, " n"]:
+        """The force without the reaction, -L_q^* D1H + F."""
+        manifold = self.manifold_of(q)
+        d1h = manifold.left_gradient(lambda g: self.hamiltonian(t, g, u, args), q)
+        return -d1h if self.force is None else self.force(t, q, u, args) - d1h
+
+    def flat(
+        self,
+        t: FloatScalarLike,
+        q: PyTree[Array],
+        u: Float[Array, " n"],
+        derivative: Float[Array, " n"],
+        args: Args = None,
+    ) -> Float[Array, " n"]:
+        """♭_H D2Ψ, the covector (D2D2H)⁻¹ D2Ψ."""
+        return jnp.linalg.solve(self.metric(t, q, u, args), derivative)
+
+    def energy(self, t: FloatScalarLike, y: State, args: Args = None) -> FloatScalar:
+        """The energy H(t, q, p) of a state; arguments as for a `LagrangianSystem`."""
+        return self.hamiltonian(t, y.q, y.p, args)

@@ -1,0 +1,136 @@
+from typing import ClassVar, Literal
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, PyTree
+
+from .._custom_types import (
+    Args,
+    FloatScalar,
+    FloatScalarLike,
+    PhaseFunction,
+    PositionFunction,
+)
+from .._manifold import AbstractLieGroup
+from .._state import State
+from ._abstract import AbstractMechanicalSystem
+
+
+class LagrangianSystem(AbstractMechanicalSystem):
+    """A Lagrangian system with constraints and external forces.
+
+    Its motion obeys, with multipliers λ, ν and Chetaev's rule for the reaction (paper,
+    sections 3 and 6),
+
+    d/dt D2L = ad*_v D2L + L_q^* D1L + F + λᵀ D2Φ + νᵀ L_q^* DΓ,
+
+    Φ(t, q, v) = 0,    Γ(t, q) = 0,    q̇ = q v,
+
+    which on R^n is the familiar d/dt D2L = D1L + F + λᵀ D2Φ + νᵀ DΓ with q̇ = v. All
+    derivatives are taken by automatic differentiation. Array leaves of the functions
+    (if they are `equinox.Module`s) are parameters that gradients reach.
+
+    **Arguments:**
+
+    - `lagrangian`: L, called as `lagrangian(t, q, v, args)`, a scalar. On a group it is
+        left-trivialised: `q` is an element, `v` the body velocity in the Lie algebra.
+    - `nonholonomic`: Φ, called as `nonholonomic(t, q, v, args)`, of shape () or (m,):
+        linear, affine or nonlinear in v, and it may depend on time.
+    - `holonomic`: Γ, called as `holonomic(t, q, args)`, of shape () or (k,).
+    - `force`: an external covector F, called as `force(t, q, v, args)`, of shape (n,);
+        on a group in left-trivialised components.
+    - `manifold`: the configuration manifold; R^n with the n of the state if left out.
+
+    !!! example
+
+        >>> import jax.numpy as jnp, nhjax
+        >>> blade = lambda t, q, v, args: -jnp.sin(q[2]) * v[0] + jnp.cos(q[2]) * v[1]
+        >>> skate = nhjax.LagrangianSystem(
+        ...     lambda t, q, v, args: 0.5 * v @ v, nonholonomic=blade)
+    """
+
+    lagrangian: PhaseFunction
+    nonholonomic: PhaseFunction | None = eqx.field(default=None, kw_only=True)
+    holonomic: PositionFunction | None = eqx.field(default=None, kw_only=True)
+    force: PhaseFunction | None = eqx.field(default=None, kw_only=True)
+    manifold: AbstractLieGroup | None = eqx.field(default=None, kw_only=True)
+
+    generator: ClassVar[Literal["lagrangian", "hamiltonian"]] = "lagrangian"
+    fibre_name: ClassVar[Literal["v", "p"]] = "v"
+
+    def momentum(
+        self,
+        t: FloatScalarLike,
+        q: PyTree[Array],
+        u: Float[Array, " n"],
+        args: Args = None,
+    ) -> Float[Array, " n"]:
+        """The momentum p = D2L (the Legendre transform)."""
+        return jax.grad(self.lagrangian, argnums=2)(t, q, u, args)
+
+    def velocity(
+        self,
+        t: FloatScalarLike,
+        q: PyTree[Array],
+        u: Float[Array, " n"],
+        args: Args = None,
+    ) -> Float[Array, " n"]:
+        """The velocity, which is the fibre coordinate itself."""
+        return u
+
+    def metric(
+        self,
+        t: FloatScalarLike,
+        q: PyTree[Array],
+        u: Float[Array, " n"],
+        args: Args = None,
+    ) -> Float[Array, "n n"]:
+        """The mass matrix M = D2D2L."""
+        return jax.jacfwd(self.momentum, argnums=2)(t, q, u, args)
+
+    def free_force(
+        self,
+        t: FloatScalarLike,
+        q: PyTree[Array],
+        u: Float[Array, " n"],
+        args: Args = None,
+    ) -> Float[Array, " n"]:
+        """The force without the reaction, L_q^* D1L + F."""
+        manifold = self.manifold_of(q)
+        d1l = manifold.left_gradient(lambda g: self.lagrangian(t, g, u, args), q)
+        return d1l if self.force is None else d1l + self.force(t, q, u, args)
+
+    def flat(
+        self,
+        t: FloatScalarLike,
+        q: PyTree[Array],
+        u: Float[Array, " n"],
+        derivative: Float[Array, " n"],
+        args: Args = None,
+    ) -> Float[Array, " n"]:
+        """The derivative D2Φ itself, which is a covector already."""
+        return derivative
+
+    def energy(self, t: FloatScalarLike, y: State, args: Args = None) -> FloatScalar:
+        """The energy E = D2L(q, v)·v - L of a state.
+
+        **Arguments:**
+
+        - `t`: the time.
+        - `y`: a state, such as an entry of `Solution.ys`. For a whole trajectory use
+            `jax.vmap(system.energy)(sol.ts, sol.ys)`.
+        - `args`: passed on to the Lagrangian.
+
+        **Returns:** a scalar.
+
+        !!! example
+
+            >>> import jax.numpy as jnp, nhjax
+            >>> free = nhjax.LagrangianSystem(lambda t, q, v, args: 0.5 * v @ v)
+            >>> y = nhjax.initial_state(free, q=jnp.zeros(2), v=jnp.array([3.0, 4.0]))
+            >>> float(free.energy(0.0, y))
+            12.5
+        """
+        p = self.momentum(t, y.q, y.v, args)
+        return jnp.sum(p * y.v) - self.lagrangian(t, y.q, y.v, args)

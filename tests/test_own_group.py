@@ -1,0 +1,163 @@
+"""A user's own group: seven methods, and everything else by differentiation."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from nhjax._errors import ShapeError
+from nhjax._manifold import AbstractLieGroup, ProductGroup, SO3
+
+
+class Heisenberg(AbstractLieGroup):
+    """R^3 with (x, y, z)(x', y', z') = (x + x', y + y', z + z' + (x y' - y x')/2)."""
+
+    @property
+    def dim(self):
+        return 3
+
+    def identity(self, dtype=None):
+        return jnp.zeros(3, dtype)
+
+    def check(self, q, name="q"):
+        if jnp.shape(q) != (3,):
+            raise ShapeError(f"`{name}` must have shape (3,)")
+        return q
+
+    def compose(self, g, h):
+        return (g + h).at[2].add(0.5 * (g[0] * h[1] - g[1] * h[0]))
+
+    def inverse(self, g):
+        return -g
+
+    def retract(self, xi):
+        return xi
+
+    def local(self, g):
+        return g
+
+
+class SL2(AbstractLieGroup):
+    """The real 2 x 2 matrices of determinant 1, with Cayley's map."""
+
+    @property
+    def dim(self):
+        return 3
+
+    def identity(self, dtype=None):
+        return jnp.eye(2, dtype=dtype)
+
+    def check(self, q, name="q"):
+        return q
+
+    def compose(self, g, h):
+        return g @ h
+
+    def inverse(self, g):
+        return jnp.array([[g[1, 1], -g[0, 1]], [-g[1, 0], g[0, 0]]])
+
+    def retract(self, xi):
+        X, one = self.hat(xi), self.identity(xi.dtype)
+        # X² is a multiple of the identity: (I - X/2)⁻¹ = (I + X/2)/(1 - X²/4).
+        square = xi[0] ** 2 + xi[1] * xi[2]
+        return (one + 0.5 * X) @ (one + 0.5 * X) / (1 - 0.25 * square)
+
+    def local(self, g):
+        scale = 2 / (2 + g[0, 0] + g[1, 1])
+        return scale * jnp.array([g[0, 0] - g[1, 1], 2 * g[0, 1], 2 * g[1, 0]])
+
+    def hat(self, xi):
+        return jnp.array([[xi[0], xi[1]], [xi[2], -xi[0]]])
+
+    def matrix(self, g):
+        return g
+
+
+XI, ETA, DELTA, MU = (
+    jnp.asarray(v) for v in np.random.default_rng(0).normal(size=(4, 3))
+)
+
+
+def close(a, b):
+    np.testing.assert_allclose(a, b, rtol=1e-13, atol=1e-14)
+
+
+def test_heisenberg_bracket_and_tangents_are_the_closed_forms():
+    group = Heisenberg()
+    bracket = jnp.array([0.0, 0.0, XI[0] * ETA[1] - XI[1] * ETA[0]])
+    close(group.ad(XI, ETA), bracket)
+    close(group.Ad(XI, ETA), ETA + bracket)
+    close(group.dtau(XI, ETA), ETA - 0.5 * bracket)
+    close(group.dtau_inv(XI, ETA), ETA + 0.5 * bracket)
+    other = jnp.array([0.0, 0.0, DELTA[0] * ETA[1] - DELTA[1] * ETA[0]])
+    close(group.ddtau(XI, ETA, DELTA), -0.5 * other)
+    close(group.tangent(XI, ETA), ETA + 0.5 * bracket)
+
+
+def test_sl2_tangents_are_those_of_matrices():
+    group = SL2()
+    X, Y, one = group.hat(XI), group.hat(ETA), jnp.eye(2)
+    g = group.act(group.retract(DELTA), XI)
+    close(jnp.linalg.det(g), 1)
+    close(group.local(group.retract(XI)), XI)
+    close(group.retract(XI), jnp.linalg.solve(one - X / 2, one + X / 2))
+    close(group.hat(group.ad(XI, ETA)), X @ Y - Y @ X)
+    close(group.hat(group.Ad(g, ETA)), g @ Y @ jnp.linalg.inv(g))
+    expected = jnp.linalg.inv(one + X / 2) @ Y @ jnp.linalg.inv(one - X / 2)
+    close(group.hat(group.dtau(XI, ETA)), expected)
+    close(group.hat(group.dtau_inv(XI, ETA)), (one + X / 2) @ Y @ (one - X / 2))
+    close(group.tangent(g, ETA), g @ Y)
+
+
+@pytest.mark.parametrize("group", [Heisenberg(), SL2()], ids=["Heisenberg", "SL2"])
+def test_second_tangents_duals_and_gradients_follow(group):
+    g = group.retract(DELTA)
+    slope = jax.jvp(lambda x: group.dtau(x, ETA), (XI,), (DELTA,))[1]
+    second = group.ddtau(XI, ETA, DELTA)
+    close(group.dtau(XI, second), slope)
+    close(group.ddtau_dual(XI, ETA, MU) @ DELTA, MU @ second)
+    close(group.dtau_dual(XI, MU) @ ETA, MU @ group.dtau(XI, ETA))
+    close(group.dtau_inv_dual(XI, MU) @ ETA, MU @ group.dtau_inv(XI, ETA))
+    close(group.Ad_dual(g, MU) @ ETA, MU @ group.Ad(g, ETA))
+    close(group.ad_dual(XI, MU) @ ETA, MU @ group.ad(XI, ETA))
+
+    def function(q):
+        return jnp.sum(jnp.sin(q))
+
+    along = jax.grad(lambda x: function(group.act(g, x)))(jnp.zeros(3))
+    close(group.left_gradient(function, g), along)
+
+
+def test_a_group_of_ones_own_advances_without_compensation():
+    group = SL2()
+    q, compensation = group.advance(
+        group.identity(), XI, group.no_compensation(jnp.eye(2))
+    )
+    close(q, group.retract(XI))
+    close(compensation, jnp.zeros((2, 2)))
+    assert not group.is_flat
+    assert group.in_chart(XI)
+    close(group.defect(q), 0)
+    close(group.normalise(q), q)
+
+
+def test_a_group_of_ones_own_is_a_factor():
+    group = ProductGroup(SO3(), SL2())
+    xi = jnp.concatenate([XI, ETA])
+    close(group.local(group.retract(xi)), xi)
+    close(group.dtau(xi, group.dtau_inv(xi, xi[::-1])), xi[::-1])
+
+
+def test_missing_matrix_says_what_to_define():
+    with pytest.raises(NotImplementedError, match=r"define `Heisenberg\.matrix`"):
+        Heisenberg().matrix(XI)
+    with pytest.raises(NotImplementedError, match=r"define `Heisenberg\.hat`"):
+        Heisenberg().hat(XI)
+
+
+def test_missing_methods_are_named():
+    class Unfinished(AbstractLieGroup):
+        pass
+
+    with pytest.raises(TypeError, match="compose"):
+        Unfinished()  # pyright: ignore[reportAbstractUsage]
