@@ -5,8 +5,20 @@ from ._chaotic import ChaoticSystem as ChaoticSystem
 from ._cvt import (
     ContinuouslyVariableTransmission as ContinuouslyVariableTransmission,
 )
+from ._double_pendulum import DoublePendulum as DoublePendulum
+from ._heavy_top import HeavyTop as HeavyTop, HeavyTopSE3 as HeavyTopSE3
 from ._knife_edge import KnifeEdge as KnifeEdge
 from ._oscillator import HarmonicOscillator as HarmonicOscillator
 from ._particle import NonholonomicParticle as NonholonomicParticle
+from ._rigid_body import FreeRigidBody as FreeRigidBody
+from ._rod_sleigh import RodSleigh as RodSleigh
 from ._rolling_disc import VerticalRollingDisc as VerticalRollingDisc
+from ._rolling_disc_on_group import RollingDisc as RollingDisc
 from ._sleigh import ChaplyginSleigh as ChaplyginSleigh
+from ._spherical_pendulum import SphericalPendulum as SphericalPendulum
+from ._suslov import Suslov as Suslov
+from ._turntable_ball import TurntableBall as TurntableBall
+from ._unicycle import (
+    Unicycle as Unicycle,
+    UnicycleInCoordinates as UnicycleInCoordinates,
+)

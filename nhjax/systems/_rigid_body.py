@@ -1,0 +1,143 @@
+"""The free rigid body."""
+
+import math
+from collections.abc import Callable
+
+import equinox as eqx
+import numpy as np
+from jaxtyping import Array
+from scipy.special import ellipj, ellipkinc
+
+from .._custom_types import Args, FloatScalarLike
+from .._manifold import AbstractRetraction, Cayley, SO3
+from .._system import LagrangianSystem
+from ._base import (
+    AbstractExample,
+    coordinates,
+    on_host,
+    require_positive,
+    require_shape,
+)
+from ._linear_flow import attitude
+
+
+class FreeRigidBody(AbstractExample):
+    """A rigid body that turns freely about its centre of mass, on SO(3), unconstrained.
+
+    ℓ = ½ (I₁ω₁² + I₂ω₂² + I₃ω₃²), with q the attitude, a quaternion, and ω the body
+    angular velocity along the principal axes.
+
+    **Parameters:** `moments` (I₁, I₂, I₃), the principal moments of inertia [kg m²];
+    `retraction`, that of SO(3).
+
+    **Source:** Euler; Landau and Lifshitz, *Mechanics*, section 37.
+
+    !!! example
+
+        >>> from nhjax.systems import FreeRigidBody
+        >>> body = FreeRigidBody(moments=(1.0, 1.0, 2.0))
+        >>> y0, (q, v, _) = body.initial_state(), body.exact(1.0)
+    """
+
+    moments: Array = eqx.field(converter=coordinates, default=(1.0, 2.0, 2.5))
+    retraction: AbstractRetraction = eqx.field(default=Cayley(), kw_only=True)
+    q0: Array = eqx.field(
+        converter=coordinates, default=(1.0, 0.0, 0.0, 0.0), kw_only=True
+    )
+    v0: Array = eqx.field(converter=coordinates, default=(0.3, 0.9, 0.5), kw_only=True)
+
+    def __check_init__(self) -> None:
+        require_shape((3,), moments=self.moments)
+        require_positive(moments=self.moments)
+
+    @property
+    def manifold(self) -> SO3:
+        """SO(3)."""
+        return SO3(self.retraction)
+
+    @property
+    def system(self) -> LagrangianSystem:
+        """The system to integrate; its leaves are the parameters."""
+        return LagrangianSystem(self.lagrangian, manifold=self.manifold)
+
+    def lagrangian(self, t: FloatScalarLike, q: Array, v: Array, args: Args) -> Array:
+        """ℓ = ½ (I₁ω₁² + I₂ω₂² + I₃ω₃²)."""
+        return 0.5 * (self.moments.astype(v.dtype) @ v**2)
+
+    def spatial_momentum(self, q: Array, v: Array) -> Array:
+        """The angular momentum in space, R Iω."""
+        return self.manifold.Ad(q, self.moments.astype(v.dtype) * v)
+
+    def invariants(self, t: FloatScalarLike, q: Array, v: Array) -> dict[str, Array]:
+        """Energy, and the spatial angular momentum."""
+        x, y, z = self.spatial_momentum(q, v)
+        return {
+            "energy": self.energy(t, q, v),
+            "spatial_momentum_x": x,
+            "spatial_momentum_y": y,
+            "spatial_momentum_z": z,
+        }
+
+    def exact(self, t: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """(q, v, λ) at `t`; λ is empty.
+
+        ω by Jacobi's elliptic functions; the attitude follows from ω by a linear
+        equation, to round-off.
+        """
+        quaternion, omega0, moments = on_host((self.q0, self.v0, self.moments))
+        angular_velocity, rate = _euler_solution(moments, omega0)
+        return (
+            attitude(quaternion, angular_velocity, t, rate),
+            angular_velocity(np.asarray(t)),
+            np.zeros(0),
+        )
+
+
+def _euler_solution(
+    moments: np.ndarray, omega0: np.ndarray
+) -> tuple[Callable[[np.ndarray], np.ndarray], float]:
+    """The solution ω(t) of Euler's equations, and a bound of its rate and size.
+
+    With 3 the axis that ω turns about in the body, the largest or the smallest one, and
+    2 the middle one, ω₁, ω₂, ω₃ are multiples of cn, sn, dn.
+    """
+    size = float(np.linalg.norm(omega0))
+    gaps = np.roll(moments, -1) - np.roll(moments, 1)
+    if not np.any(gaps * np.roll(omega0, -1) * np.roll(omega0, 1)):
+        return lambda times: np.multiply.outer(omega0, np.ones_like(times)), size
+    one, two, three = order = _cn_sn_dn_axes(moments, omega0)
+    (I1, I2, I3), (w1, w2, w3) = moments[order], omega0[order]
+    ratio21 = I2 * (I2 - I3) / (I1 * (I1 - I3))
+    ratio23 = I2 * (I2 - I1) / (I3 * (I3 - I1))
+    amplitude1 = math.sqrt(w1**2 + ratio21 * w2**2)
+    amplitude2 = amplitude1 / math.sqrt(ratio21)
+    amplitude3 = math.sqrt(w3**2 + ratio23 * w2**2)
+    sigma = math.sqrt((I3 - I2) * (I3 - I1) / (I1 * I2)) * amplitude3
+    modulus = min(ratio23 * (amplitude2 / amplitude3) ** 2, 1.0)
+    # cn and dn start positive; the direction of sn follows from Euler's equations.
+    side1, side3 = math.copysign(1.0, w1), math.copysign(1.0, w3)
+    parity = 1.0 if (two - one) % 3 == 1 else -1.0
+    side2 = parity * side1 * side3 * math.copysign(1.0, I3 - I1)
+    phase = math.atan2(side2 * w2 * math.sqrt(ratio21), side1 * w1)
+    start = ellipkinc(phase, modulus)
+
+    def angular_velocity(times):
+        sn, cn, dn, _ = ellipj(sigma * times + start, modulus)
+        omega = np.empty((3, *np.shape(times)))
+        omega[one] = side1 * amplitude1 * cn
+        omega[two] = side2 * amplitude2 * sn
+        omega[three] = side3 * amplitude3 * dn
+        return omega
+
+    return angular_velocity, size * math.sqrt(max(moments) / min(moments)) + sigma
+
+
+def _cn_sn_dn_axes(moments: np.ndarray, omega0: np.ndarray) -> list[int]:
+    """The axes 1, 2, 3 of the solution by cn, sn, dn."""
+    low, middle, high = np.argsort(moments)
+    # The sign of L² - 2E I₂ tells on which side of the separatrix ω is.
+    excess = moments * (moments - moments[middle]) * omega0**2
+    around_high = excess[high] + excess[low] > 0
+    if around_high:
+        return [low, middle, high]
+    return [high, middle, low]

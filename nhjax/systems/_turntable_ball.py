@@ -1,0 +1,221 @@
+"""The ball on a turntable."""
+
+from typing import Any, Literal
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from .._custom_types import Args, FloatScalarLike
+from .._manifold import AbstractRetraction, Cayley, Euclidean, ProductGroup, SO3
+from ._base import (
+    AbstractConstrainedGroupExample,
+    coordinates,
+    pair,
+    parameter,
+    require_nonzero,
+    require_positive,
+    require_shape,
+)
+from ._linear_flow import attitude, attitude_in_space, rotation
+
+
+class TurntableBall(AbstractConstrainedGroupExample):
+    """A ball that rolls without slipping on a turning horizontal table.
+
+    ℓ = ½ (v_x² + v_y²) + r²/2 (a ω₁² + b ω₂² + c ω₃²),
+    φ = (v_x + Ωy - r ω_η, v_y - Ωx + r ω_ξ),
+
+    on SO(3) x R²: q = (attitude, (x, y)) with the attitude R a quaternion, v = (ω₁, ω₂,
+    ω₃, v_x, v_y) with the body angular velocity ω; the centre of mass is the centre of
+    the ball, and its mass is one. The constraints are affine, so that energy is not
+    conserved, but the moving energy E - Ω(x v_y - y v_x) is.
+
+    The constraints speak of (ω_ξ, ω_η, ω_ζ), which is
+
+    - with `frame="space"` (the default) the spatial angular velocity Rω: the physical
+        ball;
+    - with `frame="body"` ω itself: the constraints of the paper as printed, with ξ, η,
+        ζ the principal axes. For a homogeneous ball, a = b = c, the motion of (x, y)
+        and of (ω_ξ, ω_η, ω_ζ) is the same in both; for unequal moments this is another
+        mechanical system.
+
+    A homogeneous ball moves on a circle, at the rate κ = Ωa/(1 + a).
+
+    **Parameters:** `radius` r [m]; `moments` (a, b, c), the principal moments of
+    inertia over (mass times r²) [1], 2/5 for a solid ball; `rate` Ω of the table
+    [1/s]; `frame`; `retraction`, that of SO(3).
+
+    **Source:** Martín de Diego and Sato Martín de Almagro, *High-order geometric
+    methods for nonholonomic mechanical systems*, fifth numerical experiment; Fassò and
+    Sansonetto, *Conservation of 'moving' energy in nonholonomic systems with affine
+    constraints* (2016).
+
+    !!! example
+
+        >>> from nhjax.systems import TurntableBall
+        >>> ball = TurntableBall(moments=(0.4, 0.4, 0.4))
+        >>> y0, (q, v, multiplier) = ball.initial_state(), ball.exact(1.0)
+    """
+
+    radius: Array = eqx.field(converter=parameter, default=0.5)
+    moments: Array = eqx.field(converter=coordinates, default=(0.4, 0.4, 0.4))
+    rate: Array = eqx.field(converter=parameter, default=1.2)
+    frame: Literal["space", "body"] = eqx.field(
+        static=True, default="space", kw_only=True
+    )
+    retraction: AbstractRetraction = eqx.field(default=Cayley(), kw_only=True)
+    q0: tuple[Array, Array] = eqx.field(
+        converter=pair, default=((1.0, 0.0, 0.0, 0.0), (0.3, -0.2)), kw_only=True
+    )
+    v0: Array = eqx.field(
+        converter=coordinates, default=(-0.08, 1.32, 0.6, 0.9, 0.4), kw_only=True
+    )
+
+    def __check_init__(self) -> None:
+        require_shape((3,), moments=self.moments)
+        require_positive(radius=self.radius, moments=self.moments)
+        if self.frame not in ("space", "body"):
+            raise ValueError(f'`frame` must be "space" or "body", got {self.frame!r}.')
+
+    @property
+    def manifold(self) -> ProductGroup:
+        """SO(3) x R²."""
+        return ProductGroup(SO3(self.retraction), Euclidean(2))
+
+    @classmethod
+    def rolling(
+        cls,
+        position: tuple[float, float] | Array,
+        velocity: tuple[float, float] | Array,
+        spin: float | Array = 0.0,
+        **parameters: Any,
+    ) -> "TurntableBall":
+        """A rolling ball at `position` (x, y) with `velocity` (v_x, v_y).
+
+        `spin` is ω_ζ; `parameters` are those of the class.
+        """
+        ball = cls(**parameters)
+        x, y = coordinates(position)
+        dx, dy = coordinates(velocity)
+        omega = jnp.stack(
+            [
+                (ball.rate * x - dy) / ball.radius,
+                (ball.rate * y + dx) / ball.radius,
+                jnp.asarray(spin, x.dtype),
+            ]
+        )
+        if ball.frame == "space":
+            omega = SO3().Ad_dual(ball.q0[0], omega)
+        q0 = (ball.q0[0], jnp.stack([x, y]))
+        v0 = jnp.concatenate([omega, jnp.stack([dx, dy])])
+        return cls(**(parameters | {"q0": q0, "v0": v0}))
+
+    def lagrangian(
+        self, t: FloatScalarLike, q: tuple[Array, Array], v: Array, args: Args
+    ) -> Array:
+        """ℓ = ½ (v_x² + v_y²) + r²/2 (a ω₁² + b ω₂² + c ω₃²)."""
+        rotation_energy = 0.5 * self.radius**2 * (self._moments(v) @ v[:3] ** 2)
+        return 0.5 * (v[3:] @ v[3:]) + rotation_energy
+
+    def constraint(
+        self, t: FloatScalarLike, q: tuple[Array, Array], v: Array, args: Args
+    ) -> Array:
+        """φ = (v_x + Ωy - r ω_η, v_y - Ωx + r ω_ξ)."""
+        x, y = q[1]
+        omega = self.rolling_velocity(q, v)
+        return jnp.stack(
+            [
+                v[3] + self.rate * y - self.radius * omega[1],
+                v[4] - self.rate * x + self.radius * omega[0],
+            ]
+        )
+
+    def rolling_velocity(self, q: tuple[Array, Array], v: Array) -> Array:
+        """(ω_ξ, ω_η, ω_ζ), the angular velocity of which the constraints speak."""
+        return self._in_frame(q, v[:3])
+
+    def invariants(
+        self, t: FloatScalarLike, q: tuple[Array, Array], v: Array
+    ) -> dict[str, Array]:
+        """The moving energy and, in the space frame, the momentum about the contact.
+
+        Of a homogeneous ball the components of that momentum are r(1 + a) times those
+        of `first_integrals` (r²a for the third).
+        """
+        x, y = q[1]
+        energy = self.energy(t, q, v)
+        invariants = {"moving_energy": energy - self.rate * (x * v[4] - y * v[3])}
+        if self.frame == "body":
+            return invariants
+        spin = self._in_frame(q, self.radius**2 * self._moments(v) * v[:3])
+        return invariants | {
+            "contact_momentum_x": spin[0] - self.radius * v[4],
+            "contact_momentum_y": spin[1] + self.radius * v[3],
+            "contact_momentum_z": spin[2],
+        }
+
+    def first_integrals(self, q: tuple[Array, Array], v: Array) -> Array:
+        """(ω_ζ, r ω_ξ - Ωx/(1 + a), r ω_η - Ωy/(1 + a)), for a = b = c."""
+        omega = self.rolling_velocity(q, v)
+        share = self.rate / (1.0 + self._moments(v)[0])
+        return jnp.stack(
+            [
+                omega[2],
+                self.radius * omega[0] - share * q[1][0],
+                self.radius * omega[1] - share * q[1][1],
+            ]
+        )
+
+    def exact(
+        self, t: float
+    ) -> tuple[tuple[np.ndarray, np.ndarray], np.ndarray, np.ndarray]:
+        """(q, v, λ) at `t`, for consistent data and a = b = c.
+
+        All but the attitude in closed form; the attitude from the known angular
+        velocity by a linear equation, to round-off.
+        """
+        (quaternion, (x0, y0)), v0 = self._consistent_data()
+        a, b, c = np.asarray(self.moments, dtype=np.float64)
+        if not a == b == c:
+            raise ValueError(
+                f"`moments` must be equal for the exact solution, got {self.moments}."
+            )
+        require_nonzero("rate", float(self.rate), "the ball moves uniformly")
+        radius, rate = float(self.radius), float(self.rate)
+        kappa = a * rate / (1 + a)
+        speed0 = complex(v0[3], v0[4])
+        spatial = self.frame == "space"
+        spin = (rotation(quaternion) @ v0[:3] if spatial else v0[:3])[2]
+
+        def rolling(times):
+            velocity = speed0 * np.exp(1j * kappa * times)
+            position = complex(x0, y0) + (velocity - speed0) / (1j * kappa)
+            omega = (rate * position + 1j * velocity) / radius
+            spins = np.full_like(omega.real, spin)
+            return position, velocity, np.stack([omega.real, omega.imag, spins])
+
+        def angular_velocity(times):
+            return rolling(times)[2]
+
+        position, velocity, omega = rolling(np.float64(t))
+        bound = (abs(rate) * (abs(complex(x0, y0)) + 2 * abs(speed0 / kappa))) / radius
+        fastest = abs(kappa) + abs(spin) + bound + abs(speed0) / radius
+        transport = attitude_in_space if spatial else attitude
+        quaternion = transport(quaternion, angular_velocity, t, fastest)
+        if spatial:
+            omega = rotation(quaternion).T @ omega
+        return (
+            (quaternion, np.array([position.real, position.imag])),
+            np.array([*omega, velocity.real, velocity.imag]),
+            kappa * np.array([-velocity.imag, velocity.real]),
+        )
+
+    def _moments(self, v: Array) -> Array:
+        return self.moments.astype(v.dtype)
+
+    def _in_frame(self, q: tuple[Array, Array], body_vector: Array) -> Array:
+        if self.frame == "body":
+            return body_vector
+        return SO3().Ad(q[0], body_vector)
