@@ -36,7 +36,7 @@ def _run(
     out: Path | None,
     json_output: bool,
     progress: bool | None,
-    num_steps: int | None = None,
+    length_in_steps: int | None = None,
     **options: Any,
 ) -> int:
     del command
@@ -45,17 +45,19 @@ def _run(
     if progress is None:
         progress = sys.stderr.isatty()
     try:
-        if num_steps is not None:
-            if num_steps < 1:
-                parser.error(f"argument --num-steps: must be at least 1: {num_steps}")
+        if length_in_steps is not None:
+            if length_in_steps < 1:
+                parser.error(
+                    f"argument --num-steps: must be at least 1: {length_in_steps}"
+                )
             dt = options.get("dt", inspect.signature(function).parameters["dt"].default)
-            options["final_time"] = num_steps * max(dt)
+            options["final_time"] = length_in_steps * max(dt)
         # Before hours of computing, not after them.
         out.mkdir(parents=True, exist_ok=True)
         result = function(progress=progress, **options)
     except ArgumentError as error:
         name = error.argument.replace("_", "-")
-        if num_steps is not None and name == "final-time":
+        if length_in_steps is not None and name == "final-time":
             name = "num-steps"
         parser.error(f"argument --{name}: {error.problem}")
     except OSError as error:
@@ -94,7 +96,11 @@ def _parser() -> argparse.ArgumentParser:
 
 def _add_options(parser: argparse.ArgumentParser, function: Callable) -> None:
     parameters = inspect.signature(function).parameters
-    length = parser.add_mutually_exclusive_group()
+    # Runs of one length in time can be told to be as long as so many steps; those of
+    # one length in steps have an option of their own for that.
+    length = (
+        parser.add_mutually_exclusive_group() if "final_time" in parameters else None
+    )
     for name, parameter in parameters.items():
         if name == "progress":
             continue
@@ -102,18 +108,20 @@ def _add_options(parser: argparse.ArgumentParser, function: Callable) -> None:
         shown = "" if default is None else f" (default: {_shown(default)})"
         keywords = dict(_OPTIONS[name])
         keywords["help"] += shown
-        group = length if name == "final_time" else parser
+        group = length if length and name == "final_time" else parser
         # The defaults stay where they are: in the study.
         group.add_argument(
             f"--{name.replace('_', '-')}", default=argparse.SUPPRESS, **keywords
         )
-    length.add_argument(
-        "--num-steps",
-        type=int,
-        metavar="N",
-        default=argparse.SUPPRESS,
-        help="instead of --final-time: as long as N steps of the largest step size",
-    )
+    if length:
+        length.add_argument(
+            "--num-steps",
+            type=int,
+            metavar="N",
+            dest="length_in_steps",
+            default=argparse.SUPPRESS,
+            help="instead of --final-time: as long as N steps of the largest step size",
+        )
     parser.add_argument(
         "--out",
         type=Path,
@@ -155,6 +163,12 @@ _OPTIONS: dict[str, dict[str, Any]] = {
         "help": "step sizes, such as 0.1 or pi/10",
     },
     "final_time": {"type": _number, "metavar": "T", "help": "the length of the runs"},
+    "num_steps": {
+        "type": int,
+        "metavar": "N",
+        "help": "the length of every run in steps",
+    },
+    "retraction": {"metavar": "NAME", "help": "cayley or exponential"},
     "members": {
         "type": int,
         "metavar": "J",

@@ -205,8 +205,8 @@ def check_found(
             lambda: NonFiniteError(
                 f"The forces {words.force}, or the derivatives of {phi}, are not "
                 f"finite at {where()}: the rate of {words.fibre} would be "
-                f"{lin.acceleration}, the multiplier {lin.multiplier}. Check the functions of the system "
-                "at this state."
+                f"{lin.acceleration}, the multiplier {lin.multiplier}. Check the "
+                "functions of the system at this state."
             ),
             "initial_state: the forces or the multiplier are not finite there.",
         ),

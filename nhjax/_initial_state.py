@@ -133,9 +133,14 @@ def violation_scale(
     u: Float[Array, " n"],
     args: Args,
 ) -> Float[Array, " l"]:
-    """Row by row the size of the terms that cancel in Φ, for an affine Φ."""
+    """Row by row the size that the terms of an affine Φ may have at such a u.
+
+    Not their size at u itself: a constraint such as v[1] has but one term, which is
+    round-off in a state that satisfies it.
+    """
     affine = jnp.nan_to_num(system.constraint(t, q, jnp.zeros_like(u), args))
-    return jnp.abs(lin.jacobian) @ jnp.abs(u) + jnp.abs(affine)
+    slopes = jnp.sum(jnp.abs(lin.jacobian), axis=1)
+    return slopes * jnp.max(jnp.abs(u)) + jnp.abs(affine)
 
 
 def position_scale(

@@ -63,7 +63,7 @@ class SimplifiedNewton(AbstractStageSolver):
         80
     """
 
-    max_iterations: int = eqx.field(static=True, default=50)
+    max_iterations: int = eqx.field(static=True, default=100)
     tolerance: FloatScalarLike = eqx.field(converter=jnp.asarray, default=0.0)
 
     def solve(

@@ -12,3 +12,11 @@ def few_compiled_programs():
     """Drop the programs of a module: they hold memory maps, which are limited."""
     yield
     jax.clear_caches()
+
+
+@pytest.fixture(scope="module")
+def quick_compilation():
+    """For modules of many programs that run once: optimising them takes longest."""
+    jax.config.update("jax_disable_most_optimizations", True)
+    yield
+    jax.config.update("jax_disable_most_optimizations", False)

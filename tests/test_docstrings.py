@@ -56,6 +56,10 @@ def test_public_objects_are_documented(name, value):
 
 def test_there_are_examples():
     tested = {test.name for test in _examples()}
-    for name in ("_integrate.integrate", "_saveat.SaveAt", "_initial_state.initial_state"):
-        assert f"nhjax.{name}" in tested
+    for module, name in (
+        ("_integrate", "integrate"),
+        ("_saveat", "SaveAt"),
+        ("_initial_state", "initial_state"),
+    ):
+        assert f"nhjax.{module}.{name}" in tested
     assert len(tested) > 20

@@ -9,6 +9,8 @@ from helpers import CLOSURES, GALLERY, recorded, SOLVERS
 import nhjax
 
 
+pytestmark = pytest.mark.usefixtures("quick_compilation")
+
 TOLERANCE = 1e-14
 
 

@@ -18,6 +18,8 @@ TINY = {
     "particle-order": "--stages 2 --dt 0.25 0.125",
     "cvt-energy": "--stages 2 --dt pi/10 --final-time 4",
     "chaotic-energy": "--stages 2 --dt 0.2 --num-steps 10 --members 2",
+    "unicycle-order": "--stages 2 --dt 0.25 0.125",
+    "ball-invariants": "--stages 2 --dt 0.4 0.2 --num-steps 20",
 }
 
 
@@ -31,6 +33,11 @@ def chaotic():
     return studies.chaotic_energy(
         stages=(2, 3), final_time=4.0, members=3, dt=(0.1, 0.2), save_every=2
     )
+
+
+@pytest.fixture(scope="module")
+def ball():
+    return studies.ball_invariants(stages=(2, 3), dt=(0.1, 0.2), num_steps=50)
 
 
 def test_list(capsys):
@@ -117,6 +124,17 @@ def test_run_prints_a_table(tmp_path, capsys):
             "--system: must be one of ['particle', 'sleigh'], got 'top'",
         ),
         ("run particle-order --dt 0.7", "--dt: 0.7 does not divide the final time 3"),
+        (
+            "run unicycle-order --retraction log",
+            "--retraction: must be one of ['cayley', 'exponential'], got 'log'",
+        ),
+        ("run ball-invariants --retraction log", "--retraction: must be one of"),
+        ("run ball-invariants --num-steps 4", "--num-steps: must be at least 5, got 4"),
+        ("run ball-invariants --final-time 1", "unrecognized arguments: --final-time"),
+        (
+            "run ball-invariants --dt 0.1 0.3 --num-steps 10",
+            "--dt: 0.3 does not divide",
+        ),
     ],
 )
 def test_bad_arguments_name_the_argument(arguments, message, tmp_path, capsys):
@@ -186,6 +204,55 @@ def test_particle_order_leaves_round_off_out():
     )
     assert np.all(np.isnan(result.orders()))
     assert "-" in result.table().splitlines()[-1]
+
+
+@pytest.mark.parametrize("retraction", ["cayley", "exponential"])
+def test_unicycle_order_finds_the_orders(retraction):
+    result = studies.unicycle_order(
+        stages=(2, 3), dt=(0.125, 0.0625), retraction=retraction
+    )
+    assert result.errors.shape == (2, 2, 5)
+    np.testing.assert_allclose(
+        result.orders(), [[2, 2, 2, 2, 2], [4, 4, 4, 2, 4]], atol=0.4
+    )
+    parameters = result.parameters()["system_parameters"]
+    assert parameters["retraction"].lower() == retraction
+    assert parameters["mass"] == 1.0
+    (figure,) = result.figures().values()
+    shown = [ax.get_ylabel() for ax in figure.axes]
+    assert shown[:2] == ["relative error of $g$", "relative error of $v$"]
+
+
+def test_ball_invariants_are_kept(ball):
+    for run in ball.runs:
+        assert run.integrals.shape == (51, 4)
+        np.testing.assert_array_less(run.largest_linear_errors(), 3e-15)
+        assert run.max_constraint_violation < 1e-14
+        assert len(run.energy_by_fifths()) == 5
+
+
+def test_ball_invariants_finds_the_orders(ball):
+    assert ball.dt == (0.2, 0.1)
+    assert ball.final_time == 5.0
+    for s, order in ((2, 2), (3, 4)):
+        assert np.isnan(ball.circle_slopes(s)[0])
+        assert float(ball.circle_slopes(s)[1]) == pytest.approx(order, abs=0.15)
+        # For even s the moving energy of a homogeneous ball is better than 2s - 2.
+        assert float(ball.energy_slopes(s)[1]) == pytest.approx(4, abs=0.15)
+
+
+def test_ball_invariants_record_and_figures(ball):
+    parameters = ball.parameters()
+    assert parameters["last_times"] == [10.0, 5.0]
+    assert parameters["system_parameters"]["frame"] == "space"
+    assert parameters["system_parameters"]["moments"] == [0.4, 0.4, 0.4]
+    assert ball.arrays()["s3_h0.1_positions"].shape == (51, 2)
+    figures = ball.figures()
+    assert list(figures) == ["ball-invariants-s2", "ball-invariants-s3"]
+    assert all(len(figure.axes) == 4 for figure in figures.values())
+    header = ball.table().splitlines()[0]
+    assert "|Δ(ω_ζ)|" in header
+    assert "|z-z_exact| t=5" in header
 
 
 def test_chaotic_energy_shapes_and_slopes(chaotic):

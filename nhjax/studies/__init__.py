@@ -4,6 +4,10 @@ from collections.abc import Callable, Mapping
 from types import MappingProxyType
 
 from ._arguments import ArgumentError as ArgumentError
+from ._ball_invariants import (
+    ball_invariants as ball_invariants,
+    BallInvariants as BallInvariants,
+)
 from ._chaotic_energy import (
     chaotic_energy as chaotic_energy,
     ChaoticEnergy as ChaoticEnergy,
@@ -14,6 +18,10 @@ from ._particle_order import (
     ParticleOrder as ParticleOrder,
 )
 from ._result import AbstractStudyResult as AbstractStudyResult, write as write
+from ._unicycle_order import (
+    unicycle_order as unicycle_order,
+    UnicycleOrder as UnicycleOrder,
+)
 
 
 # What `nhjax list` shows. The keyword arguments of a study are its options.
@@ -22,5 +30,7 @@ STUDIES: Mapping[str, Callable[..., AbstractStudyResult]] = MappingProxyType(
         "particle-order": particle_order,
         "cvt-energy": cvt_energy,
         "chaotic-energy": chaotic_energy,
+        "unicycle-order": unicycle_order,
+        "ball-invariants": ball_invariants,
     }
 )

@@ -1,7 +1,7 @@
 """The checks that studies make before they compute anything."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 
 class ArgumentError(ValueError):
@@ -22,6 +22,12 @@ def check_distinct(argument: str, values: Sequence[object]) -> None:
         raise ArgumentError(argument, "is empty")
     if len(set(values)) < len(values):
         raise ArgumentError(argument, f"holds a value twice: {list(values)}")
+
+
+def check_choice(argument: str, value: str, choices: Iterable[str]) -> None:
+    """Raise unless `value` is among `choices`."""
+    if value not in (known := list(choices)):
+        raise ArgumentError(argument, f"must be one of {known}, got {value!r}")
 
 
 def check_stages(stages: Sequence[int]) -> None:

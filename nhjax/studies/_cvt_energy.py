@@ -24,7 +24,7 @@ from ._arguments import (
 )
 from ._result import AbstractStudyResult, Timing
 from ._run import compile_and_run, meter
-from ._table import format_table
+from ._table import format_table, largest_by_fifths
 
 
 if TYPE_CHECKING:
@@ -65,8 +65,7 @@ class CVTRun:
 
     def by_fifths(self) -> list[float]:
         """Max |E - E0| over each fifth of the run."""
-        error = np.abs(self.deviations()[1:, 0])
-        return [float(np.max(part)) for part in np.array_split(error, 5)]
+        return largest_by_fifths(self.deviations()[1:, 0])
 
     def ranges(self) -> dict[str, tuple[float, float]]:
         """The least and the greatest deviation of each energy."""

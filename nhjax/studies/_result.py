@@ -11,6 +11,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, ClassVar, TYPE_CHECKING
 
+import equinox as eqx
 import jax
 import numpy as np
 
@@ -83,6 +84,28 @@ def write(result: AbstractStudyResult, directory: str | Path) -> dict[str, Any]:
     record = _plain(record)
     path.write_text(json.dumps(record, indent=2, allow_nan=False) + "\n")
     return record
+
+
+def system_parameters(example: Any) -> dict[str, Any]:
+    """The parameters of an example of the gallery, all but the initial data."""
+    values = {
+        field.name: getattr(example, field.name)
+        for field in dataclasses.fields(example)
+        if field.name not in ("q0", "v0")
+    }
+    return {
+        name: type(x).__name__ if isinstance(x, eqx.Module) else np.asarray(x).tolist()
+        for name, x in values.items()
+    }
+
+
+def initial_data(example: Any) -> dict[str, Any]:
+    """Where an example of the gallery starts."""
+    return {
+        "q0": jax.tree.map(np.asarray, example.q0),
+        "v0": np.asarray(example.v0),
+        "multiplier": "continuous, from the hidden constraint",
+    }
 
 
 def environment() -> dict[str, Any]:

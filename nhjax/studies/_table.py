@@ -1,4 +1,4 @@
-"""Tables of numbers as text, and the slopes in them."""
+"""Tables of numbers as text, and the numbers that sum up a run."""
 
 from collections.abc import Sequence
 
@@ -20,6 +20,11 @@ def format_table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
 def format_slope(x: float) -> str:
     """A slope, or a dash where there is none."""
     return f"{x:.2f}" if np.isfinite(x) else "-"
+
+
+def largest_by_fifths(error: np.ndarray) -> list[float]:
+    """Max |error| over each fifth of a run."""
+    return [float(np.max(part)) for part in np.array_split(np.abs(error), 5)]
 
 
 def slopes(

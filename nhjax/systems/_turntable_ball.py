@@ -70,7 +70,7 @@ class TurntableBall(AbstractConstrainedGroupExample):
         converter=pair, default=((1.0, 0.0, 0.0, 0.0), (0.3, -0.2)), kw_only=True
     )
     v0: Array = eqx.field(
-        converter=coordinates, default=(-0.08, 1.32, 0.6, 0.9, 0.4), kw_only=True
+        converter=coordinates, default=(0.52, -0.18, 0.6, 0.15, 0.1), kw_only=True
     )
 
     def __check_init__(self) -> None:

@@ -1,0 +1,72 @@
+"""Errors of runs of N steps over a fixed duration, and their observed orders."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import nhjax
+
+
+SLOPE_TOLERANCE = 0.3
+DURATION = 2.0
+EXACT_FLOOR, SCIPY_FLOOR = 1e-14, 4e-13
+
+
+def solver_for(stages):
+    # Large steps, for which the simplified iteration does not contract.
+    return nhjax.Newton() if stages >= 5 else nhjax.SimplifiedNewton()
+
+
+@eqx.filter_jit
+def runs_of_all_steps(system, method, y0, dts, num_steps, args, solver):
+    """One lane for each dt, with the continuous multiplier beside the state."""
+
+    def with_multiplier(t, y, args):
+        return y, system.multiplier(t, y, args)
+
+    def run(dt):
+        return nhjax.integrate(
+            system,
+            method,
+            y0,
+            dt=dt,
+            num_steps=num_steps,
+            args=args,
+            solver=solver,
+            throw=False,  # Runs of few steps go on beyond the duration.
+            saveat=nhjax.SaveAt(steps=True, fn=with_multiplier),
+        )
+
+    return jax.vmap(run)(dts)
+
+
+def trajectories(system, method, y0, counts, args=None, solver=None):
+    """Nodes of runs of N = counts[lane] steps over the duration, as one program."""
+    dts = DURATION / jnp.asarray(counts, float)
+    solver = solver_for(method.stages) if solver is None else solver
+    sol = runs_of_all_steps(system, method, y0, dts, max(counts), args, solver)
+    lanes = []
+    for lane, count in enumerate(counts):
+        assert not 0 <= sol.stats["failed_step"][lane] < count
+        y, continuous = jax.tree.map(lambda x, k=lane, n=count: x[k, :n], sol.ys)
+        lanes.append((np.asarray(sol.ts[lane, :count]), y, continuous))
+    return lanes
+
+
+def rms(error):
+    return np.sqrt(np.mean(np.max(np.abs(error), axis=-1) ** 2))
+
+
+def slopes(counts, errors):
+    """Orders of convergence from each N to the next."""
+    errors = np.asarray(errors)
+    return np.log(errors[:-1] / errors[1:]) / np.log(np.divide(counts[1:], counts[:-1]))
+
+
+def assert_order(order, counts, errors, floor=EXACT_FLOOR):
+    assert min(errors) > floor, f"errors too near those of the reference: {errors}"
+    observed = slopes(counts, errors)
+    np.testing.assert_allclose(
+        observed, order, rtol=0, atol=SLOPE_TOLERANCE, err_msg=f"errors {errors}"
+    )
