@@ -3,6 +3,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PyTree
 
+from ._compensated import two_sum
 from ._manifold import AbstractLieGroup
 
 
@@ -79,6 +80,23 @@ class Chart(eqx.Module):
         if self.manifold.is_flat:
             return covector
         return self.manifold.Ad_dual(self.manifold.retract(xi), covector)
+
+    def carry(
+        self,
+        xi: Float[Array, " n"],
+        momentum: Float[Array, " n"],
+        compensation: Float[Array, " n"],
+    ) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
+        """Ad^*_{τ(ξ)} of a compensated sum, as a compensated sum.
+
+        The rounding of plain products with Ad^* would add up over the steps as that of
+        plain sums does.
+        """
+        if self.manifold.is_flat:
+            return momentum, compensation
+        g = self.manifold.retract(xi)
+        change = self.manifold.Ad_dual_change(g, momentum)
+        return two_sum(momentum, change + self.manifold.Ad_dual(g, compensation))
 
     def base_momentum(
         self,

@@ -198,6 +198,11 @@ def _check_inputs(system, q, v, p, t):
         raise ValueError(f"Give either `v` or `p`; got {given} of them.")
     name, fibre = ("v", v) if p is None else ("p", p)
     q, fibre = configuration(q), floating(name, fibre)
+    if system.manifold is None and isinstance(q, tuple):
+        raise ShapeError(
+            f"`q` is a tuple of {len(q)}, but the system has no `manifold`. Give it "
+            "one, such as nhjax.ProductGroup(...), or make one array of `q`."
+        )
     if system.manifold is None and q.ndim != 1:
         raise ShapeError(
             f"`q` has shape {q.shape}, but a configuration has shape (n,). For many "

@@ -100,11 +100,7 @@ def step(
     )
     p_increment = h * (stages.coefficients("b") @ forces.force)
     p, p_compensation = two_sum(state.p, p_increment + node.p_compensation)
-    # Ad^* is linear: it turns the sum and its rounding error alike.
-    p, p_compensation = (
-        stages.chart.from_origin(stages.increment(x), part)
-        for part in (p, p_compensation)
-    )
+    p, p_compensation = stages.chart.carry(stages.increment(x), p, p_compensation)
     u = p if stages.hamiltonian else x.node_fibre[-1]
     lin_next = linearise(system, t + h, q, u, args)
     multiplier = lin_next.multiplier

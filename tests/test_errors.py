@@ -236,7 +236,7 @@ BY_VALUE = {
     "no velocity": (
         adjusted(rows=ROWS.at[1].set(0)),
         nhjax.DependentConstraintsError,
-        r"Φ\[1\] does not depend on v there; give a constraint on positions by its tim",
+        r"Φ\[1\] does not depend on velocities there; pass .* as `holonomic`",
         "constraints are dependent",
     ),
     "incompatible": (

@@ -195,7 +195,7 @@ def test_ball_on_a_product_of_groups_is_of_order_2s_minus_2(stages):
     # It turns by up to a radian in a step of the counts that suit the others.
     counts = {2: (32, 64), 4: (32, 64), 6: (32, 48)}[method.order]
     errors = errors_of(ball, method, counts)
-    for quantity in ("v", "multiplier"):
+    for quantity in ("q", "v"):
         assert_finest_order(method.order, errors, quantity)
 
 

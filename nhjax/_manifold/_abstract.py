@@ -151,6 +151,10 @@ class AbstractLieGroup(eqx.Module):
         """Ad_g^* μ: ⟨Ad_g^* μ, η⟩ = ⟨μ, Ad_g η⟩."""
         return transpose(lambda eta: self.Ad(g, eta), mu)(mu)
 
+    def Ad_dual_change(self, g: Element, mu: Vector) -> Vector:
+        """Ad_g^* μ - μ; a group that can do so gives it without cancellation."""
+        return self.Ad_dual(g, mu) - mu
+
     def ad_dual(self, xi: Vector, mu: Vector) -> Vector:
         """ad_ξ^* μ: ⟨ad_ξ^* μ, η⟩ = ⟨μ, ad_ξ η⟩."""
         return transpose(lambda eta: self.ad(xi, eta), mu)(mu)

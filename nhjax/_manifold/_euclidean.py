@@ -113,6 +113,10 @@ class Euclidean(AbstractLieGroup):
         """μ."""
         return mu
 
+    def Ad_dual_change(self, g: Point, mu: Vector) -> Vector:
+        """0."""
+        return jnp.zeros_like(mu)
+
     def ad(self, xi: Vector, eta: Vector) -> Vector:
         """Zero."""
         return jnp.zeros_like(eta)

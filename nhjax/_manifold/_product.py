@@ -167,6 +167,10 @@ class ProductGroup(AbstractLieGroup):
         """The factors' Ad^*."""
         return self._vector(lambda group, g, m: group.Ad_dual(g, m), g, mu)
 
+    def Ad_dual_change(self, g: Element, mu: Vector) -> Vector:
+        """The factors' Ad^* μ - μ."""
+        return self._vector(lambda group, g, m: group.Ad_dual_change(g, m), g, mu)
+
     def ad(self, xi: Vector, eta: Vector) -> Vector:
         """The factors' ad."""
         return self._vector(lambda group, x, y: group.ad(x, y), xi, eta)

@@ -38,8 +38,13 @@ def conjugate(q: Quaternion) -> Quaternion:
 
 def rotate(q: Quaternion, v: Vector3) -> Vector3:
     """R(q) v."""
+    return v + rotation_change(q, v)
+
+
+def rotation_change(q: Quaternion, v: Vector3) -> Vector3:
+    """R(q) v - v, without cancellation."""
     twice = 2 * cross(q[1:], v)
-    return v + q[:1] * twice + cross(q[1:], twice)
+    return q[:1] * twice + cross(q[1:], twice)
 
 
 def cross_matrix(v: Vector3) -> Float[Array, "3 3"]:

@@ -12,6 +12,7 @@ from ._quaternion import (
     multiply,
     Quaternion,
     rotate,
+    rotation_change,
     rotation_matrix,
     Vector3,
 )
@@ -135,6 +136,10 @@ class SO3(AbstractLieGroup):
     def Ad_dual(self, g: Quaternion, mu: Vector3) -> Vector3:
         """R(g)ᵀ μ."""
         return rotate(conjugate(g), mu)
+
+    def Ad_dual_change(self, g: Quaternion, mu: Vector3) -> Vector3:
+        """R(g)ᵀ μ - μ, without cancellation."""
+        return rotation_change(conjugate(g), mu)
 
     def ad(self, xi: Vector3, eta: Vector3) -> Vector3:
         """ξ × η."""
