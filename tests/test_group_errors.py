@@ -77,21 +77,6 @@ def test_parts_of_unlike_precision_are_refused():
         nhjax.initial_state(BALL.system, q, BALL.v0)
 
 
-@pytest.mark.parametrize("group", [nhjax.SO2, nhjax.SO3, nhjax.SE2, nhjax.SE3])
-@pytest.mark.parametrize("retraction", [nhjax.Cayley, "cayley", None])
-def test_a_retraction_must_be_one(group, retraction):
-    with pytest.raises(TypeError, match=r"`retraction`.*Cayley"):
-        group(retraction=retraction)
-
-
-def test_a_retraction_that_the_group_does_not_have():
-    methods = nhjax.AbstractRetraction.__abstractmethods__
-    body = {name: lambda self, *arguments: None for name in methods}
-    projection = type("Projection", (nhjax.AbstractRetraction,), body)
-    with pytest.raises(ValueError, match=r"SO3.*Projection.*Cayley\(\) and Exp"):
-        nhjax.SO3(retraction=projection())
-
-
 # Leaving the chart --------------------------------------------------------------------
 
 

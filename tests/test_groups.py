@@ -269,6 +269,24 @@ def test_adjoint_maps_are_those_of_matrices(group):
 
 
 @over(GROUPS)
+def test_change_of_a_covector_is_that_of_the_dual_map(group):
+    g, mu = elements(group, 3), directions(group, range(16), 4)
+    change = batched(group.Ad_dual_change)(g, mu)
+    assert distance(change, batched(group.Ad_dual)(g, mu) - mu) < 1e-14
+
+
+@pytest.mark.parametrize("retraction", [Cayley(), Exponential()], ids=name_of)
+def test_change_of_a_covector_keeps_relative_accuracy_of_tiny_rotations(retraction):
+    group = SO3(retraction)
+    xi, mu = 1e-9 * np.eye(3)[[0, 1, 2]], directions(group, range(3), 5)
+    g = batched(group.retract)(xi)
+    expected = np.cross(mu, xi)
+    np.testing.assert_allclose(
+        batched(group.Ad_dual_change)(g, mu), expected, rtol=0, atol=2e-17
+    )
+
+
+@over(GROUPS)
 def test_duals_are_the_transposed_maps(group):
     g = elements(group, 6)
     xi = vectors(group, np.linspace(0, 3, 16), 10)
