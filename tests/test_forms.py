@@ -458,3 +458,40 @@ def test_unconstrained_steps_on_groups_extremise_the_discrete_action(stages, for
         np.testing.assert_allclose(-start, taken.start.p, rtol=0, atol=1e-13)
         end = slopes(lambda d, g=g_next, S=action: S(g_next=g + g @ d), basis)
         np.testing.assert_allclose(end, taken.end.p, rtol=0, atol=1e-13)
+
+
+def rattle(q, p, h):
+    """A step of RATTLE for a unit mass on the unit sphere in the potential z."""
+    force = np.array([0.0, 0.0, -1.0])
+    free = q + h * (p + 0.5 * h * force)
+    # |free + c q| = 1, by the root nearer to zero.
+    along, defect = free @ q, free @ free - 1.0
+    c = -defect / (along + np.sqrt(along**2 - defect))
+    end = free + c * q
+    half = (end - q) / h
+    p = half + 0.5 * h * force
+    return end, p - (p @ end) * end
+
+
+@pytest.mark.parametrize("form", ["lagrangian", "hamiltonian"])
+def test_two_stages_with_a_holonomic_constraint_are_rattle(form):
+    pendulum = nhjax.systems.SphericalPendulum()
+    system = pendulum.system
+    if form == "hamiltonian":
+        system = nhjax.HamiltonianSystem(
+            lambda t, q, p, args: 0.5 * p @ p + q[2], holonomic=pendulum.holonomic
+        )
+    y0 = nhjax.initial_state(system, pendulum.q0, pendulum.v0)
+    sol = nhjax.integrate(
+        system,
+        LOBATTO[0],
+        y0,
+        dt=STEP,
+        num_steps=20,
+        saveat=nhjax.SaveAt(t0=True, steps=True),
+    )
+    q, p = np.asarray(y0.q), np.asarray(y0.p)
+    for k in range(1, 21):
+        q, p = rattle(q, p, STEP)
+        np.testing.assert_allclose(sol.ys.q[k], q, rtol=0, atol=1e-14)
+        np.testing.assert_allclose(sol.ys.p[k], p, rtol=0, atol=2e-14)

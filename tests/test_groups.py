@@ -113,12 +113,31 @@ def tau_of_matrix(group, X):
     return np.linalg.solve(identity - X / 2, identity + X / 2)
 
 
+def seeded(test):
+    """The test with drawn directions, at every scale of `INSIDE` and the edge."""
+    drawn = hypothesis.given(seed=st.integers(0, 2**20))(test)
+    return hypothesis.settings(max_examples=5, deadline=None)(drawn)
+
+
+@cache
+def compiled(group, *names):
+    """The composition of maps of a group by name, the last one first, over a batch."""
+    *outer, inner = (getattr(group, name) for name in names)
+
+    def composition(x, y):
+        y = inner(x, y)
+        for apply in reversed(outer):
+            y = apply(x, y)
+        return y
+
+    return batched(composition)
+
+
 # The group
 
 
 @over(GROUPS)
-@hypothesis.settings(max_examples=5, deadline=None)
-@hypothesis.given(seed=st.integers(0, 2**20))
+@seeded
 def test_axioms(group, seed):
     g, h, k = (elements(group, seed + i) for i in range(3))
     left, right, neutral, nothing = _axioms(group)(g, h, k)
@@ -148,8 +167,7 @@ def test_matrix_is_a_homomorphism(group):
 
 
 @over(GROUPS)
-@hypothesis.settings(max_examples=5, deadline=None)
-@hypothesis.given(seed=st.integers(0, 2**20))
+@seeded
 def test_local_inverts_the_retraction(group, seed):
     # Exponential: the shorter of two rotation vectors, hence less than π.
     xi = vectors(group, [*INSIDE, 3.1], seed)
@@ -188,51 +206,66 @@ def test_retraction_keeps_relative_accuracy_of_tiny_vectors(group):
 
 
 @over(SIMPLE)
-def test_dtau_is_the_left_trivialised_derivative_of_the_matrix(group):
-    xi = chart(group)
-    eta = directions(group, xi, 1)
-    hat = batched(group.hat)
+@seeded
+def test_dtau_is_the_left_trivialised_derivative_of_the_matrix(group, seed):
+    xi = chart(group, seed)
+    eta = directions(group, xi, seed + 1)
+    hat = _hat(group)
     step = 1e-30
     tau = [
         tau_of_matrix(group, X + 1j * step * Y)
         for X, Y in zip(np.asarray(hat(xi)), np.asarray(hat(eta)), strict=True)
     ]
     expected = [np.linalg.solve(np.real(t), np.imag(t) / step) for t in tau]
-    assert distance(hat(batched(group.dtau)(xi, eta)), np.stack(expected)) < 5e-14
+    assert distance(hat(compiled(group, "dtau")(xi, eta)), np.stack(expected)) < 5e-14
+
+
+@cache
+def _hat(group):
+    return batched(group.hat)
 
 
 @over(GROUPS)
-def test_dtau_inv_inverts_dtau(group):
-    xi = chart(group)
-    eta = directions(group, xi, 2)
-    back = batched(lambda x, y: group.dtau(x, group.dtau_inv(x, y)))(xi, eta)
+@seeded
+def test_dtau_inv_inverts_dtau(group, seed):
+    xi = chart(group, seed)
+    eta = directions(group, xi, seed + 2)
+    back = compiled(group, "dtau", "dtau_inv")(xi, eta)
     # Near the edge dτ⁻¹ is large.
     assert distance(back[: len(INSIDE)], eta[: len(INSIDE)]) < 1e-14
     assert distance(back, eta) < 1e-11
 
 
 @over(GROUPS)
-def test_dtau_at_minus_xi_is_the_right_trivialised_one(group):
-    xi = chart(group)
-    eta = directions(group, xi, 3)
+@seeded
+def test_dtau_at_minus_xi_is_the_right_trivialised_one(group, seed):
+    xi = chart(group, seed)
+    eta = directions(group, xi, seed + 3)
+    left, right = compiled(group, "dtau")(xi, eta), _right_trivialised(group)(xi, eta)
+    assert distance(left, right) < 1e-13
 
-    def right(x, y):
-        return group.Ad(group.retract(-x), group.dtau(-x, y))
 
-    assert distance(batched(group.dtau)(xi, eta), batched(right)(xi, eta)) < 1e-13
+@cache
+def _right_trivialised(group):
+    return batched(lambda x, y: group.Ad(group.retract(-x), group.dtau(-x, y)))
 
 
 @over(GROUPS)
-def test_ddtau_is_the_second_tangent(group):
-    xi = vectors(group, INSIDE, 4)
-    eta, delta = directions(group, xi, 5), directions(group, xi, 6)
+@seeded
+def test_ddtau_is_the_second_tangent(group, seed):
+    xi = vectors(group, INSIDE, seed)
+    eta, delta = directions(group, xi, seed + 5), directions(group, xi, seed + 6)
+    actual, expected = _second_tangents(group)(xi, eta, delta)
+    assert distance(actual, expected) < 2e-14
 
-    def derivative(x, y, d):
-        return jax.jvp(lambda x: group.dtau(x, y), (x,), (d,))[1]
 
-    by_definition = batched(lambda x, y, d: group.dtau(x, group.ddtau(x, y, d)))
-    actual = by_definition(xi, eta, delta)
-    assert distance(actual, batched(derivative)(xi, eta, delta)) < 1e-14
+@cache
+def _second_tangents(group):
+    def by_definition_and_by_differentiation(x, y, d):
+        derivative = jax.jvp(lambda x: group.dtau(x, y), (x,), (d,))[1]
+        return group.dtau(x, group.ddtau(x, y, d)), derivative
+
+    return batched(by_definition_and_by_differentiation)
 
 
 @over(GROUPS)
@@ -258,14 +291,20 @@ def test_left_gradient_is_the_derivative_along_the_retraction(group):
 
 
 @over([g for g in GROUPS if not isinstance(g, Euclidean)])
-def test_adjoint_maps_are_those_of_matrices(group):
-    g = elements(group, 5)
-    xi, eta = directions(group, range(16), 8), directions(group, range(16), 9)
-    hat = batched(group.hat)
-    X, Y, matrix = hat(xi), hat(eta), batched(group.matrix)(g)
+@seeded
+def test_adjoint_maps_are_those_of_matrices(group, seed):
+    g = elements(group, seed)
+    xi, eta = (directions(group, range(16), seed + k) for k in (8, 9))
+    hat = _hat(group)
+    X, Y, matrix = hat(xi), hat(eta), _matrix(group)(g)
     conjugate = matrix @ Y @ jnp.linalg.inv(matrix)
-    assert distance(hat(batched(group.Ad)(g, eta)), conjugate) < 1e-13
-    assert distance(hat(batched(group.ad)(xi, eta)), X @ Y - Y @ X) < 1e-14
+    assert distance(hat(compiled(group, "Ad")(g, eta)), conjugate) < 1e-13
+    assert distance(hat(compiled(group, "ad")(xi, eta)), X @ Y - Y @ X) < 1e-14
+
+
+@cache
+def _matrix(group):
+    return batched(group.matrix)
 
 
 @over(GROUPS)
@@ -287,11 +326,16 @@ def test_change_of_a_covector_keeps_relative_accuracy_of_tiny_rotations(retracti
 
 
 @over(GROUPS)
-def test_duals_are_the_transposed_maps(group):
-    g = elements(group, 6)
-    xi = vectors(group, np.linspace(0, 3, 16), 10)
-    eta, delta, mu = (directions(group, range(16), 11 + i) for i in range(3))
+@seeded
+def test_duals_are_the_transposed_maps(group, seed):
+    g = elements(group, seed)
+    xi = vectors(group, np.linspace(0, 3, 16), seed + 10)
+    eta, delta, mu = (directions(group, range(16), seed + 11 + i) for i in range(3))
+    assert np.max(np.abs(_dual_defects(group)(g, xi, eta, delta, mu))) < 2e-13
 
+
+@cache
+def _dual_defects(group):
     def defects(g, x, y, d, m):
         return jnp.stack([
             group.Ad_dual(g, m) @ y - m @ group.Ad(g, y),
@@ -301,7 +345,7 @@ def test_duals_are_the_transposed_maps(group):
             group.ddtau_dual(x, y, m) @ d - m @ group.ddtau(x, y, d),
         ])  # fmt: skip
 
-    assert np.max(np.abs(batched(defects)(g, xi, eta, delta, mu))) < 2e-13
+    return batched(defects)
 
 
 # Derivatives of the tangents, against 60 digits
