@@ -69,9 +69,23 @@ def floating(name: str, x: Any) -> Array:
 
 def configuration(q: Any) -> PyTree[Array]:
     """`q` as an array, or as a tuple (of tuples) of arrays on a product of groups."""
-    if isinstance(q, tuple) and any(eqx.is_array(x) or isinstance(x, tuple) for x in q):
+    if isinstance(q, tuple | list) and any(
+        isinstance(part, tuple | list) or getattr(part, "ndim", 0) > 0 for part in q
+    ):
         return tuple(configuration(part) for part in q)
     return floating("q", q)
+
+
+def require_manifold(
+    system: "AbstractMechanicalSystem", name: str, q: PyTree[Array]
+) -> None:
+    """Raise for a tuple in a system that has no manifold to say what it is."""
+    if system.manifold is None and isinstance(q, tuple):
+        raise ShapeError(
+            f"`{name}` is a tuple of {len(q)}, but the system has no `manifold`. Give "
+            "it one, such as nhjax.ProductGroup(...), or make one array of "
+            f"`{name}`."
+        )
 
 
 def real_scalar(name: str, x: FloatScalarLike, dtype: Any) -> FloatScalar:
@@ -183,6 +197,7 @@ def check_state(system: "AbstractMechanicalSystem", y0: "State", args: Args) -> 
                     f"`y0.{name}` has dtype {leaf.dtype} and `y0.p` {y0.p.dtype}: all "
                     "parts of a state must agree. Use `initial_state`."
                 )
+    require_manifold(system, "y0.q", y0.q)
     advice = (
         "For many trajectories use `jax.vmap` over `y0`; the last state of a solution "
         "is `jax.tree.map(lambda x: x[-1], sol.ys)`."

@@ -154,6 +154,15 @@ def check_found(
             f"initial_state: no {fibre} with {words.legendre} was found.",
         ),
         Check(
+            found.projected,
+            lambda: NewtonError(
+                f"The state could not be projected onto the constraints: Newton's "
+                f"method stopped at {reached()} with {phi} = {lin.violation}"
+                f"{_positions(found)}. Start nearer to them."
+            ),
+            "initial_state: the state could not be projected onto the constraints.",
+        ),
+        Check(
             all_finite(
                 (found.generator, found.regularity, lin.violation, found.positions)
             ),
@@ -180,15 +189,6 @@ def check_found(
                 "multiplier is determined there."
             ),
             "initial_state: the compatibility matrix C = D2Φ M⁻¹ D2Φᵀ is singular.",
-        ),
-        Check(
-            found.projected,
-            lambda: NewtonError(
-                f"The state could not be projected onto the constraints: Newton's "
-                f"method stopped at {reached()} with {phi} = {lin.violation}"
-                f"{_positions(found)}. Start nearer to them."
-            ),
-            "initial_state: the state could not be projected onto the constraints.",
         ),
         Check(
             jnp.all(jnp.abs(found.positions) <= found.allowed_positions),
@@ -218,19 +218,27 @@ def _positions(found: Found) -> str:
 
 
 def _dependence_error(found: Found, where: str, phi: str) -> DependentConstraintsError:
-    jacobian = found.lin.jacobian
-    kinematic = jacobian.shape[0] - found.positions.shape[0]
-    zero = [a for a in range(kinematic) if not jnp.any(jacobian[a])]
+    jacobian, k = found.lin.jacobian, found.positions.shape[0]
+    m = jacobian.shape[0] - k
+    zero = [a for a in range(m + k) if not jnp.any(jacobian[a])]
     advice = (
-        f"{phi}[{zero[0]}] does not depend on velocities there; pass a constraint on "
-        "positions as `holonomic`."
-        if zero
-        else "Remove redundant constraints, or start from a state at which they are "
+        "Remove redundant constraints, or start from a state at which they are "
         "independent."
     )
+    if zero and zero[0] < m:
+        advice = (
+            f"{phi}[{zero[0]}] does not depend on velocities there; pass a constraint "
+            "on positions as `holonomic`."
+        )
+    elif zero:
+        advice = (
+            f"Γ[{zero[0] - m}] has no gradient there; a constraint must have one where "
+            "it vanishes."
+        )
+    names = " and ".join([f"D2{phi}"] * (m > 0) + ["DΓ"] * (k > 0))
     return DependentConstraintsError(
-        f"The constraints are dependent: D2{phi} has not full rank at {where} (the "
-        f"paper's admissibility condition; D2{phi} = {jacobian.tolist()}). {advice}"
+        f"The constraints are dependent: {names} has not full rank at {where} (the "
+        f"paper's admissibility condition; {names} = {jacobian.tolist()}). {advice}"
     )
 
 

@@ -4,6 +4,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, PyTree
 
 from ._checks import (
+    all_finite,
     check_functions,
     check_type,
     configuration,
@@ -11,12 +12,14 @@ from ._checks import (
     floating,
     parameters,
     real_scalar,
+    require_manifold,
 )
-from ._custom_types import Args, BoolScalar, FloatScalar, FloatScalarLike
+from ._custom_types import Args, BoolScalar, FloatScalarLike
 from ._errors import DTypeError, require, ShapeError
 from ._initial_checks import check_found, conditioning, Found
 from ._iteration import root
-from ._linearisation import inverse, Linearisation, linearise
+from ._linearisation import inverse, linearise
+from ._scales import position_scale, violation_scale
 from ._state import State
 from ._system import AbstractMechanicalSystem, HamiltonianSystem, LagrangianSystem
 
@@ -35,14 +38,16 @@ def initial_state(
 
     The one of v and p that is not given follows by the Legendre transform p = D2L, or
     v = D2H. The multiplier is that of the continuous problem, from the hidden
-    constraint dΦ/dt = 0: an inconsistent λ_0 would lower the order of the method
-    (paper, section 4).
+    constraints dΦ/dt = 0 of nonholonomic and d²Γ/dt² = 0 of holonomic ones: an
+    inconsistent λ_0 would lower the order of the method (paper, section 4).
 
     **Arguments:**
 
     - `system`: the mechanical system.
-    - `q`: the configuration, shape (n,), floating point; on a group an element.
-    - `v`, `p`: velocity or momentum, shape (n,), of the dtype of q. Give exactly one.
+    - `q`: the configuration, shape (n,), floating point; on a group an element, on a
+        product of groups a tuple of elements.
+    - `v`, `p`: velocity or momentum, shape (n,) with n the dimension of the manifold,
+        of the dtype of q; on a group in the body frame. Give exactly one.
     - `t`, `args`: passed on to the functions of the system, as `integrate` does.
     - `project`: replace q by the nearest configuration, and then v by the nearest
         velocity, in the kinetic metric, that satisfies the constraints (one linear
@@ -57,7 +62,7 @@ def initial_state(
     - `ConstraintViolationError`: a constraint is violated, or `q` is off the group, and
         `project` is false.
     - `IrregularLagrangianError`: D2D2L (or D2D2H) is singular.
-    - `DependentConstraintsError`: D2Φ has not full rank (admissibility).
+    - `DependentConstraintsError`: D2Φ and DΓ have not full rank (admissibility).
     - `IncompatibleConstraintsError`: C^{ab} is singular (compatibility).
 
     !!! example
@@ -85,8 +90,10 @@ def _solve(system, t, q, v, p, args, project: bool) -> Found:
     legendre_solved = projected = jnp.asarray(True)
     off_group = manifold.defect(q)
     if project:
-        q = manifold.normalise(q)
-        off_group = jnp.zeros_like(off_group)
+        normal = manifold.normalise(q)
+        possible = all_finite(normal)
+        q = jax.tree.map(lambda x, y: jnp.where(possible, x, y), normal, q)
+        off_group = jnp.where(possible, 0, off_group)
         if system.holonomic is not None:
             guess = given if is_fibre else jnp.zeros_like(given)
             q, projected = _project_position(system, t, q, guess, args)
@@ -123,40 +130,6 @@ def _solve(system, t, q, v, p, args, project: bool) -> Found:
         legendre_solved=legendre_solved,
         projected=projected,
     )
-
-
-def violation_scale(
-    system: AbstractMechanicalSystem,
-    lin: Linearisation,
-    t: FloatScalar,
-    q: PyTree[Array],
-    u: Float[Array, " n"],
-    args: Args,
-) -> Float[Array, " l"]:
-    """Row by row the size that the terms of an affine Φ may have at such a u.
-
-    Not their size at u itself: a constraint such as v[1] has but one term, which is
-    round-off in a state that satisfies it.
-    """
-    affine = jnp.nan_to_num(system.constraint(t, q, jnp.zeros_like(u), args))
-    slopes = jnp.sum(jnp.abs(lin.jacobian), axis=1)
-    return slopes * jnp.max(jnp.abs(u)) + jnp.abs(affine)
-
-
-def position_scale(
-    system: AbstractMechanicalSystem, t: FloatScalar, q: PyTree[Array], args: Args
-) -> Float[Array, " k"]:
-    """Row by row the size of the terms that cancel in a holonomic Γ."""
-    if system.holonomic is None:
-        return system.position_constraint(t, q, args)
-
-    def gamma(q):
-        return system.position_constraint(t, q, args)
-
-    constant = jnp.nan_to_num(gamma(jax.tree.map(jnp.zeros_like, q)))
-    slopes = jax.jacrev(gamma)(q)
-    parts = jax.tree.map(lambda slope, x: jnp.abs(slope) @ jnp.abs(x), slopes, q)
-    return jnp.abs(constant) + sum(jax.tree.leaves(parts))
 
 
 def _project_position(system, t, q, u, args) -> tuple[PyTree[Array], BoolScalar]:
@@ -198,11 +171,7 @@ def _check_inputs(system, q, v, p, t):
         raise ValueError(f"Give either `v` or `p`; got {given} of them.")
     name, fibre = ("v", v) if p is None else ("p", p)
     q, fibre = configuration(q), floating(name, fibre)
-    if system.manifold is None and isinstance(q, tuple):
-        raise ShapeError(
-            f"`q` is a tuple of {len(q)}, but the system has no `manifold`. Give it "
-            "one, such as nhjax.ProductGroup(...), or make one array of `q`."
-        )
+    require_manifold(system, "q", q)
     if system.manifold is None and q.ndim != 1:
         raise ShapeError(
             f"`q` has shape {q.shape}, but a configuration has shape (n,). For many "

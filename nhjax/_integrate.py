@@ -17,7 +17,6 @@ from ._checks import (
 )
 from ._custom_types import Args, BoolScalar, FloatScalar, FloatScalarLike
 from ._errors import Check, require
-from ._initial_state import position_scale, violation_scale
 from ._interpolation import (
     DenseInterpolation,
     interpolate,
@@ -28,6 +27,7 @@ from ._method import AbstractMethod
 from ._newton import AbstractStageSolver, SimplifiedNewton
 from ._progress_meter import AbstractProgressMeter, NoProgressMeter
 from ._saveat import SaveAt, stack_saved
+from ._scales import position_scale, violation_scale
 from ._solution import raise_failures, RESULTS, Solution
 from ._state import State
 from ._step import first_node, largest_violation, Node, step, StepOutcome
@@ -51,9 +51,10 @@ def integrate(
 ) -> Solution:
     """Integrate a mechanical system over `num_steps` steps of size `dt`.
 
-    Each step solves the discrete nonholonomic equations of the paper (section 4) to
-    round-off, so that Φ(q_k, v_k) = 0 holds at every node to round-off as well; q and p
-    are summed with compensation. It works under `jit` and `vmap` (over `y0`, `args`,
+    Each step solves the discrete equations of the paper (its four summaries) to
+    round-off, so that the constraints on velocities and positions hold at every node to
+    round-off as well; q and p are summed with compensation, and elements of a group
+    stay on it. It works under `jit` and `vmap` (over `y0`, `args`,
     `dt`, `t0` and the array leaves of `system`).
 
     **Arguments:**

@@ -93,9 +93,11 @@ def dense_increment(
     return jnp.linalg.solve(jacobian, -r), aux
 
 
-def relative_size(increment: Array, x: Array) -> FloatScalar:
-    """max |δ| / max |x|, with a zero x measured absolutely."""
-    scale = jnp.max(jnp.abs(x))
+def relative_size(
+    increment: Array, x: Array, rest: FloatScalarLike = 0.0
+) -> FloatScalar:
+    """max |δ| / (max |x| + rest), with a zero x measured absolutely."""
+    scale = jnp.max(jnp.abs(x)) + rest
     return jnp.max(jnp.abs(increment)) / jnp.where(scale > 0, scale, 1)
 
 

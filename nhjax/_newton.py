@@ -12,6 +12,7 @@ from ._custom_types import FloatScalar, FloatScalarLike
 from ._iteration import dense_increment, iterate, relative_size, Solved
 from ._leading_structure import leading_structure, LeadingStructure
 from ._linearisation import Linearisation
+from ._scales import fibre_scale
 from ._stages import StageForces, Stages, StageSystem
 
 
@@ -71,6 +72,7 @@ class SimplifiedNewton(AbstractStageSolver):
     ) -> Solved[Stages, Evaluation]:
         """Solve the stage equations from `x0`; does nothing where `skip` is true."""
         structure = leading_structure(stages, x0, lin)
+        rest = fibre_scale(stages, lin)
 
         def sweep(x: Stages):
             # Each residual is evaluated at the newest iterate (Gauss-Seidel): it costs
@@ -81,7 +83,7 @@ class SimplifiedNewton(AbstractStageSolver):
             x_next = structure.correct_nodes(x_next, node_residual)
             if stages.constrained:
                 x_next = _constrain(stages, structure, x_next)
-            size = _increment_size(stages, x, x_next, lin)
+            size = _increment_size(stages, x, x_next, lin, rest)
             return x_next, size, Evaluation(forces, node_residual)
 
         return iterate(
@@ -135,6 +137,7 @@ class Newton(AbstractStageSolver):
     ) -> Solved[Stages, Evaluation]:
         """Solve the stage equations from `x0`; does nothing where `skip` is true."""
         _, unravel = ravel_pytree(x0)
+        rest = fibre_scale(stages, lin)
 
         def residual(z):
             x = unravel(z)
@@ -152,7 +155,7 @@ class Newton(AbstractStageSolver):
             z, _ = ravel_pytree(x)
             dz, evaluation = dense_increment(residual, z)
             x_next = unravel(z + dz)
-            return x_next, _increment_size(stages, x, x_next, lin), evaluation
+            return x_next, _increment_size(stages, x, x_next, lin, rest), evaluation
 
         return iterate(
             sweep,
@@ -164,21 +167,27 @@ class Newton(AbstractStageSolver):
 
 
 def _increment_size(
-    stages: StageSystem, x: Stages, x_next: Stages, lin: Linearisation
+    stages: StageSystem,
+    x: Stages,
+    x_next: Stages,
+    lin: Linearisation,
+    rest: FloatScalar,
 ) -> FloatScalar:
+    """The size of an increment relative to the fibre coordinates and to `rest`.
+
+    Not finite once the iterates have left the chart, from where they do not return.
+    """
     fibre = [x.node_fibre, x.momentum if stages.hamiltonian else x.velocity]
-    next_fibre = [
-        x_next.node_fibre,
-        x_next.momentum if stages.hamiltonian else x_next.velocity,
-    ]
-    changes = [after - before for after, before in zip(next_fibre, fibre, strict=True)]
+    changes = [x_next.node_fibre - x.node_fibre, x_next.velocity - x.velocity]
+    if stages.hamiltonian:
+        changes[1] = changes[1] @ lin.metric_inverse.T
+        changes.append(x_next.momentum - x.momentum)
     if stages.constrained:
         # Multipliers count by their effect on u, h N⁻¹ R δΛ, on its own: Λ can still be
         # wrong where the stages and nodes happen to be right.
         before, after = stages.multiplier_change(x), stages.multiplier_change(x_next)
         changes.append(stages.h * ((after - before) @ lin.reaction.T))
-    size = relative_size(jnp.concatenate(changes), jnp.concatenate(fibre))
-    if stages.hamiltonian:
-        dv = relative_size(x_next.velocity - x.velocity, x.velocity)
-        size = jnp.maximum(size, dv)
-    return size
+    size = relative_size(jnp.concatenate(changes), jnp.concatenate(fibre), rest)
+    if stages.chart.manifold.is_flat:
+        return size
+    return jnp.where(stages.in_chart(x_next), size, jnp.inf)

@@ -22,9 +22,9 @@ class RESULTS(eqx.Enumeration):
         "converge. Try a smaller `dt`, `solver=nhjax.Newton()`, or more iterations."
     )
     singular_stage_matrix = (
-        "The mass matrix D2D2L or the compatibility matrix C = D2Φ M⁻¹ D2Φᵀ became "
-        "singular, so that the multiplier is not determined. The system has reached "
-        "the edge of its domain."
+        "The mass matrix D2D2L (or D2D2H) or the compatibility matrix C = D2Φ M⁻¹ D2Φᵀ "
+        "became singular, so that the multiplier is not determined. The system has "
+        "reached the edge of its domain."
     )
     nonfinite_state = (
         "The state became infinite or NaN, or was so from the start. Check `y0` and "
@@ -36,8 +36,8 @@ class RESULTS(eqx.Enumeration):
     )
     inconsistent_start = (
         "The initial state violates the constraints at `t0`, its q is off the group, "
-        "or its p is not D2L(t0, q, v). Make `y0` with `nhjax.initial_state`, for the "
-        "system, args and time of the integration."
+        "or its v and p do not belong together. Make `y0` with `nhjax.initial_state`, "
+        "for the system, args and time of the integration."
     )
 
 

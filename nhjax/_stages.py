@@ -6,7 +6,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, PyTree
 
 from ._chart import Chart
-from ._custom_types import Args, FloatScalar
+from ._custom_types import Args, BoolScalar, FloatScalar
 from ._linearisation import Linearisation, motion_residual
 from ._method import AbstractMethod
 from ._system import AbstractMechanicalSystem
@@ -209,6 +209,11 @@ class StageSystem(eqx.Module):
 
     def _node_increments(self, x: Stages) -> Float[Array, "r n"]:
         return self.h * (self.node_weights @ x.velocity)
+
+    def in_chart(self, x: Stages) -> BoolScalar:
+        """Whether stages, nodes and end lie where the chart is invertible."""
+        increments = [self.stage_increments(x), self.increment(x)[None]]
+        return self.chart.in_domain(jnp.concatenate(increments))
 
     def stage_velocities(self, x: Stages) -> Float[Array, "s n"]:
         """The chart velocities dτ_Ξ⁻¹ D2H(Q^i, P^i) of a Hamiltonian system."""

@@ -8,9 +8,10 @@ class State(eqx.Module):
     - `q`: the configuration, shape (n,); on a group an element, on a product of groups
         a tuple of elements.
     - `v`: the velocity, shape (n,); on a group the body velocity.
-    - `p`: the momentum D2L(t, q, v), shape (n,).
-    - `multiplier`: λ, shape (m + k,), nonholonomic constraints first, then holonomic
-        ones; the reaction on the system is λᵀ D2Φ.
+    - `p`: the momentum, shape (n,), with p = D2L(t, q, v) or v = D2H(t, q, p).
+    - `multiplier`: shape (m + k,): λ of the m nonholonomic constraints, then ν of the k
+        holonomic ones. The reaction on the system is λᵀ D2Φ + νᵀ L_q^* DΓ, with ♭_H D2Ψ
+        in place of D2Φ for a Hamiltonian system.
 
     Make one with `nhjax.initial_state`, which sees to it that the four agree.
     """

@@ -112,7 +112,7 @@ def step(
     next_node = Node(
         State(q, v, p, multiplier), q_compensation, p_compensation, lin_next
     )
-    in_chart = stages.chart.in_domain(stages.stage_increments(x))
+    in_chart = stages.in_chart(x)
 
     residual = jnp.maximum(
         jnp.max(jnp.abs(forces.residual)), jnp.max(jnp.abs(solved.aux.node_residual))

@@ -68,7 +68,9 @@ def momentum_map(
 
     - `y`: a state, or a trajectory of them such as `sol.ys`.
     - `generator`: the vector field ξ_Q, called as `generator(q)` with one
-        configuration, of shape (n,).
+        configuration, of shape (n,). On a group it is left-trivialised like the
+        velocity: for the symmetry g -> exp(εξ) g that is
+        `manifold.Ad(manifold.inverse(q), xi)`.
 
     **Returns:** one number for each state.
 

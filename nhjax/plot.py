@@ -8,6 +8,7 @@ by the first call.
 from collections.abc import Sequence
 from typing import Any, TYPE_CHECKING
 
+import jax
 import numpy as np
 from jaxtyping import Float
 
@@ -34,7 +35,8 @@ def trajectory(
     **Arguments:**
 
     - `sol`: a `Solution` that holds states; a batch is drawn as one path for each.
-    - `coordinates`: the indices of two or three entries of q.
+    - `coordinates`: the indices of two or three entries of q; of an element of a group
+        those of its numbers, one part of a product after the other.
     - `names`: what to call them on the axes.
     - `ax`: the axes to draw into; for three coordinates, with a 3d projection.
     - `style`: passed on to `Axes.plot`.
@@ -53,7 +55,9 @@ def trajectory(
         >>> ax = nhjax.plot.trajectory(sol, names=("x", "y"))
     """
     _, ys = saved_states(sol)
-    q = np.asarray(ys.q)
+    lead = np.asarray(ys.p).shape[:-1]
+    parts = [np.asarray(leaf).reshape(*lead, -1) for leaf in jax.tree.leaves(ys.q)]
+    q = np.concatenate(parts, axis=-1)
     n = q.shape[-1]
     if len(coordinates) not in (2, 3) or not all(-n <= i < n for i in coordinates):
         raise ValueError(
@@ -111,7 +115,9 @@ def multiplier(sol: Solution, *, ax: "Axes | None" = None, **style: Any) -> "Axe
     **Raises:** `ValueError` if `sol` holds no states.
     """
     ts, ys = saved_states(sol)
-    ax = _each_constraint(ts, np.asarray(ys.multiplier), r"\lambda", ax, style)
+    values = np.asarray(ys.multiplier)
+    symbols = [rf"$\lambda_{a + 1}$" for a in range(values.shape[-1])]
+    ax = _each_constraint(ts, values, symbols, ax, style)
     ax.set_ylabel("multiplier")
     return ax
 
@@ -124,7 +130,9 @@ def constraint(
     ax: "Axes | None" = None,
     **style: Any,
 ) -> "Axes":
-    """The constraint functions Φ_a at the saved states against time.
+    """The constraint functions at the saved states against time.
+
+    Φ_a of nonholonomic constraints; dΓ_a/dt and Γ_a of holonomic ones.
 
     **Arguments:**
 
@@ -143,7 +151,13 @@ def constraint(
     violation = map_over_axes(
         ts.ndim, lambda t, y: system.constraint_violation(t, y, args)
     )
-    ax = _each_constraint(ts, np.asarray(violation(ts, ys)), r"\Phi", ax, style)
+    values = np.asarray(violation(ts, ys))
+    k = values.shape[-1] - ys.multiplier.shape[-1]
+    m = values.shape[-1] - 2 * k
+    symbols = [rf"$\Phi_{a + 1}$" for a in range(m)]
+    symbols += [rf"$d\Gamma_{a + 1}/dt$" for a in range(k)]
+    symbols += [rf"$\Gamma_{a + 1}$" for a in range(k)]
+    ax = _each_constraint(ts, values, symbols, ax, style)
     ax.set_ylabel("constraint")
     return ax
 
@@ -219,13 +233,13 @@ def _against_time(ts: Any, values: Any, ax: "Axes | None", style: Any) -> "Axes"
 
 
 def _each_constraint(
-    ts: Any, values: np.ndarray, symbol: str, ax: "Axes | None", style: Any
+    ts: Any, values: np.ndarray, symbols: list[str], ax: "Axes | None", style: Any
 ) -> "Axes":
     count = values.shape[-1]
     if count == 0:
         raise ValueError("The system has no constraints.")
     for a in range(count):
-        label = {"label": f"${symbol}_{a + 1}$"} if count > 1 else {}
+        label = {"label": symbols[a]} if count > 1 else {}
         ax = _against_time(ts, values[..., a], ax, {**label, **style})
     assert ax is not None
     if count > 1:

@@ -28,7 +28,7 @@ class Euclidean(AbstractLieGroup):
     n: int = eqx.field(static=True)
 
     def __check_init__(self):
-        if not isinstance(self.n, int) or self.n < 1:
+        if isinstance(self.n, bool) or not isinstance(self.n, int) or self.n < 1:
             raise ValueError(f"Euclidean: `n` must be an int >= 1, got {self.n!r}.")
 
     @property

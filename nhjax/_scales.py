@@ -1,0 +1,72 @@
+"""The sizes by which violations and increments are judged to be round-off."""
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, PyTree
+
+from ._custom_types import Args, FloatScalar
+from ._linearisation import Linearisation
+from ._stages import StageSystem
+from ._system import AbstractMechanicalSystem
+
+
+def violation_scale(
+    system: AbstractMechanicalSystem,
+    lin: Linearisation,
+    t: FloatScalar,
+    q: PyTree[Array],
+    u: Float[Array, " n"],
+    args: Args,
+) -> Float[Array, " l"]:
+    """Row by row the size that the terms of an affine Φ may have at such a u.
+
+    Not their size at u itself: a constraint such as v[1] has but one term, which is
+    round-off in a state that satisfies it.
+    """
+    affine = _finite_or_zero(system.constraint(t, q, jnp.zeros_like(u), args))
+    slopes = jnp.sum(jnp.abs(lin.jacobian), axis=1)
+    return slopes * jnp.max(jnp.abs(u)) + affine
+
+
+def position_scale(
+    system: AbstractMechanicalSystem, t: FloatScalar, q: PyTree[Array], args: Args
+) -> Float[Array, " k"]:
+    """Row by row the size that the terms of an affine Γ may have at such a q."""
+
+    def gamma(q):
+        return system.position_constraint(t, q, args)
+
+    constant = _finite_or_zero(gamma(jax.tree.map(jnp.zeros_like, q)))
+    if system.holonomic is None:
+        return constant
+    slopes = jax.tree.map(
+        lambda slope: jnp.sum(jnp.abs(slope), axis=tuple(range(1, slope.ndim))),
+        jax.jacrev(gamma)(q),
+    )
+    sizes = jnp.stack([jnp.max(jnp.abs(leaf)) for leaf in jax.tree.leaves(q)])
+    return sum(jax.tree.leaves(slopes)) * jnp.max(sizes) + constant
+
+
+def _finite_or_zero(x: Array) -> Array:
+    # Where a constraint is singular at zero, that value says nothing of its size.
+    return jnp.abs(jnp.nan_to_num(x, nan=0.0, posinf=0.0, neginf=0.0))
+
+
+def fibre_scale(stages: StageSystem, lin: Linearisation) -> FloatScalar:
+    """What the fibre coordinates of a step are rounded by, over the unit round-off.
+
+    Beside their own size that of the terms that cancel in them: forces and reactions
+    over the step, and what the round-off of a holonomic constraint, divided by h, makes
+    of velocities. A system at rest has nothing else.
+    """
+    h = jnp.abs(stages.h)
+    rate = jnp.max(jnp.abs(lin.acceleration))
+    if stages.constrained:
+        rate = rate + jnp.max(jnp.abs(lin.reaction) @ jnp.abs(lin.multiplier))
+    scale = h * rate
+    if stages.num_holonomic:
+        m = stages.num_nonholonomic
+        sizes = position_scale(stages.system, stages.t, stages.q, stages.args)
+        response = jnp.abs(lin.reaction) @ jnp.abs(lin.compliance_inverse[:, m:])
+        scale = scale + jnp.max(response @ sizes) / h
+    return scale
