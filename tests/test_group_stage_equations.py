@@ -196,7 +196,10 @@ def test_fibre_coordinates_belong_together(case):
             pairs = zip(elements, momenta, strict=True)
             fibre = np.stack([mechanics.d2h(g, mu) for g, mu in pairs])
         known = taken.stages.node_fibre
-        np.testing.assert_allclose(known, fibre[-len(known) :], rtol=0, atol=1e-14)
+        # An iteration ends when increments of up to 30 eps no longer fall. The state
+        # is summed from the forces and does not see the last one; interior nodes do.
+        atol = 60 * np.finfo(float).eps * np.max(np.abs(fibre))
+        np.testing.assert_allclose(known, fibre[-len(known) :], rtol=0, atol=atol)
 
 
 def test_every_pair_of_choices_is_tested():
