@@ -1,3 +1,5 @@
+from collections.abc import Callable
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -139,29 +141,32 @@ def _project_position(system, t, q, u, args) -> tuple[PyTree[Array], BoolScalar]
     if system.fibre_name == "p":
         mass = inverse(mass)
 
-    def stationarity(z):
-        xi, multiplier = z
-        gamma, pullback = jax.vjp(
-            lambda xi: system.position_constraint(t, manifold.act(q, xi), args), xi
-        )
-        return mass @ xi - pullback(multiplier)[0], gamma
+    def gamma(xi):
+        return system.position_constraint(t, manifold.act(q, xi), args)
 
-    gamma = system.position_constraint(t, q, args)
-    solved = root(stationarity, (jnp.zeros_like(u), jnp.zeros_like(gamma)))
-    return manifold.act(q, solved.x[0]), solved.converged
+    xi, converged = _nearest(mass, gamma, jnp.zeros_like(u))
+    return manifold.act(q, xi), converged
 
 
 def _project_fibre(system, t, q, u, args) -> tuple[Float[Array, " n"], BoolScalar]:
     """The stationary point of ½ (w-u)ᵀ K (w-u) on Φ(t, q, w) = 0."""
     metric = system.metric(t, q, u, args)
+    return _nearest(metric, lambda w: system.constraint(t, q, w, args), u)
+
+
+def _nearest(
+    metric: Float[Array, "n n"],
+    constraint: Callable[[Float[Array, " n"]], Float[Array, " m"]],
+    x: Float[Array, " n"],
+) -> tuple[Float[Array, " n"], BoolScalar]:
+    """The stationary point of ½ (y-x)ᵀ K (y-x) on constraint(y) = 0."""
 
     def stationarity(z):
-        w, multiplier = z
-        phi, pullback = jax.vjp(lambda w: system.constraint(t, q, w, args), w)
-        return metric @ (w - u) - pullback(multiplier)[0], phi
+        y, multiplier = z
+        value, pullback = jax.vjp(constraint, y)
+        return metric @ (y - x) - pullback(multiplier)[0], value
 
-    phi = system.constraint(t, q, u, args)
-    solved = root(stationarity, (u, jnp.zeros_like(phi)))
+    solved = root(stationarity, (x, jnp.zeros_like(constraint(x))))
     return solved.x[0], solved.converged
 
 

@@ -186,9 +186,8 @@ class _Loop(eqx.Module):
         y, lin, system = node.state, node.lin, self.system
         small = float(jnp.finfo(y.p.dtype).eps) ** 0.25
         u = system.fibre(y)
-        conjugate, given = system.conjugate(self.t0, y.q, u, self.args), y.v
-        if system.fibre_name == "v":
-            given = y.p
+        conjugate = system.conjugate(self.t0, y.q, u, self.args)
+        given = y.p if system.fibre_name == "v" else y.v
         size = jnp.max(jnp.abs(conjugate)) + jnp.max(jnp.abs(given))
         scale = violation_scale(system, lin, self.t0, y.q, u, self.args)
         positions = system.position_constraint(self.t0, y.q, self.args)

@@ -55,11 +55,7 @@ class LeadingStructure(eqx.Module):
         change = -(self.schur_inverse @ residual)
         h_dy = change[: x.closure.size].reshape(x.closure.shape)
         h_dholonomic = change[x.closure.size :].reshape(x.holonomic.shape)
-        h_dlambda = h_dholonomic
-        if stages.num_nonholonomic:
-            h_dlambda = stages.closure("E") @ h_dy
-            if stages.num_holonomic:
-                h_dlambda = jnp.concatenate([h_dlambda, h_dholonomic], axis=1)
+        h_dlambda = stages.free_multipliers(h_dy, h_dholonomic)
         # h K⁻¹ Bᵀ δΛ; h is divided out only where multipliers themselves are wanted.
         push = jnp.einsum("jnm,jm->jn", self.reaction, h_dlambda)
         a_hat, momentum = stages.coefficients("a_hat"), x.momentum

@@ -124,7 +124,7 @@ class StageSystem(eqx.Module):
         return (
             self.coefficients("a")[1:]
             if self.num_nonholonomic
-            else (self.coefficients("b")[None])
+            else self.coefficients("b")[None]
         )
 
     @property
@@ -133,7 +133,7 @@ class StageSystem(eqx.Module):
         nodes = (
             self.coefficients("c")[1:]
             if self.num_nonholonomic
-            else (jnp.ones((1,), self.p.dtype))
+            else jnp.ones((1,), self.p.dtype)
         )
         return self.t + self.h * nodes
 
@@ -180,23 +180,31 @@ class StageSystem(eqx.Module):
         change = self.multiplier_change(x)
         if not self.num_nonholonomic:
             return change
-        known = self.multiplier[: self.num_nonholonomic]
-        start = jnp.outer(self.closure("start"), known)
-        if self.num_holonomic:
-            start = jnp.concatenate([start, jnp.zeros_like(x.holonomic)], axis=1)
-        return start + change
+        return self._padded("start", self.multiplier) + change
 
     def multiplier_change(self, dx: Stages) -> Float[Array, "s l"]:
         """The part of Λ that is linear in the unknowns."""
-        if not self.num_nonholonomic:
-            return dx.holonomic
-        change = self.closure("E") @ dx.closure
+        change = self.free_multipliers(dx.closure, dx.holonomic)
         if self.symmetric:
-            end = dx.end_multiplier[: self.num_nonholonomic]
-            change = change + jnp.outer(self.closure("end"), end)
+            change = change + self._padded("end", dx.end_multiplier)
+        return change
+
+    def free_multipliers(
+        self, closure: Float[Array, "s-1 m"], holonomic: Float[Array, "s k"]
+    ) -> Float[Array, "s l"]:
+        """E y beside the holonomic multipliers."""
+        if not self.num_nonholonomic:
+            return holonomic
+        kinematic = self.closure("E") @ closure
         if not self.num_holonomic:
-            return change
-        return jnp.concatenate([change, dx.holonomic], axis=1)
+            return kinematic
+        return jnp.concatenate([kinematic, holonomic], axis=1)
+
+    def _padded(self, weights: str, multiplier: Float[Array, " l"]) -> Array:
+        """What a known multiplier adds to Λ; its holonomic part adds nothing."""
+        known = multiplier[: self.num_nonholonomic]
+        part = jnp.outer(self.closure(weights), known)
+        return jnp.pad(part, ((0, 0), (0, self.num_holonomic)))
 
     def increment(self, x: Stages) -> Float[Array, " n"]:
         """ξ = h Σ b_j H^j, which takes q_k to q_{k+1}."""

@@ -5,10 +5,11 @@ from functools import cache, partial
 from typing import NamedTuple
 
 import equinox as eqx
+import group_mechanics as by_hand
 import jax
 import jax.numpy as jnp
 import numpy as np
-import paper_group_equations as paper
+from group_mechanics import MatrixGroup
 from jaxtyping import Array
 
 import nhjax
@@ -84,7 +85,7 @@ def inverse_of_three(matrix: Array) -> Array:
 class Problem(NamedTuple):
     """A system in both forms, the same for the oracle, and a consistent state."""
 
-    mechanics: paper.Mechanics
+    mechanics: by_hand.Mechanics
     forms: dict[str, nhjax.LagrangianSystem | nhjax.HamiltonianSystem]
     y0: State
 
@@ -96,7 +97,7 @@ class Problem(NamedTuple):
 
 
 def _problem(
-    mechanics: paper.Mechanics,
+    mechanics: by_hand.Mechanics,
     manifold,
     q0,
     v0,
@@ -154,8 +155,11 @@ BODY = 1.5 * np.eye(6) + 0.2 * np.cos(np.add.outer(np.arange(6), np.arange(6)))
 def _unicycle(retraction):
     M, spring = np.diag([1.3, 1.3, 0.7]), 1.7
     return _problem(
-        paper.Unicycle(
-            paper.MatrixGroup(paper.SE2, retraction), M, np.array([[0.0, 1, 0]]), spring
+        by_hand.Unicycle(
+            MatrixGroup(by_hand.SE2, retraction),
+            M,
+            np.array([[0.0, 1, 0]]),
+            spring,
         ),
         nhjax.SE2(RETRACTIONS[retraction]),
         np.array([1.0, 0.3, 0.4]),
@@ -168,7 +172,7 @@ def _unicycle(retraction):
 
 def _rigid(retraction, rows, C, phi=None):
     return _problem(
-        paper.RigidBody(paper.MatrixGroup(paper.SO3, retraction), INERTIA, rows, C),
+        by_hand.RigidBody(MatrixGroup(by_hand.SO3, retraction), INERTIA, rows, C),
         nhjax.SO3(RETRACTIONS[retraction]),
         QUATERNION,
         [0.7, -0.4, 1.3],
@@ -191,9 +195,9 @@ def _anisotropic(retraction):
     B = np.array([[1, 0.2, 0], [0.2, -0.6, 0.1], [0, 0.1, 0.8]])
     b, F = np.array([0.3, 0.1, 0.5]), 0.2 * np.arange(9.0).reshape(3, 3) / 9
     level = 0.9
-    group = paper.MatrixGroup(paper.SO3, retraction)
+    group = MatrixGroup(by_hand.SO3, retraction)
     return _problem(
-        paper.Anisotropic(group, INERTIA, S, TORQUE, B, b, F, level),
+        by_hand.Anisotropic(group, INERTIA, S, TORQUE, B, b, F, level),
         nhjax.SO3(RETRACTIONS[retraction]),
         QUATERNION,
         [0.7, -0.4, 0.5],
@@ -214,7 +218,7 @@ def _ball(retraction):
         return jnp.stack([v[3] + Omega * y - r * w[1], v[4] - Omega * x + r * w[0]])
 
     return _problem(
-        paper.Ball(paper.MatrixGroup(paper.SO3_R2, retraction), moments, r, Omega),
+        by_hand.Ball(MatrixGroup(by_hand.SO3_R2, retraction), moments, r, Omega),
         nhjax.ProductGroup(nhjax.SO3(RETRACTIONS[retraction]), nhjax.Euclidean(2)),
         (QUATERNION, np.array([0.5, -0.2])),
         [0.5, 0.2, 0.4, 0.3, 0.6],
@@ -228,7 +232,7 @@ def _top_on_se3(retraction, rows, phi=None):
     X, weight = np.array([0.2, -0.1, 0.7]), 1.2
     omega = np.array([0.6, -0.5, 0.9])
     return _problem(
-        paper.HeavyTop(paper.MatrixGroup(paper.SE3, retraction), BODY, rows, weight, X),
+        by_hand.HeavyTop(MatrixGroup(by_hand.SE3, retraction), BODY, rows, weight, X),
         nhjax.SE3(RETRACTIONS[retraction]),
         np.concatenate([QUATERNION, ROTATION @ X]),
         [*np.cross(omega, X), *omega],
@@ -260,7 +264,7 @@ def varying_inertia(q: Array) -> Array:
 def _varying_mass(retraction):
     beta, kappa = 0.4, 0.3
     return _problem(
-        paper.VaryingMass(None, beta, kappa),
+        by_hand.VaryingMass(None, beta, kappa),
         None,
         np.array([0.5, 0.3, -0.2]),
         [0.6, 0.8, 0.0],
@@ -274,7 +278,7 @@ def _varying_mass(retraction):
 def _on_sphere(K, w, B, q0, v0, phi=None):
     mass = 1.2
     return _problem(
-        paper.Sphere(None, mass, K, w, B),
+        by_hand.Sphere(None, mass, K, w, B),
         None,
         np.array(q0),
         v0,

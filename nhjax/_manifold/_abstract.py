@@ -73,6 +73,9 @@ class AbstractLieGroup(eqx.Module):
         """The element nearest to `q`."""
         return q
 
+    # Nothing of the library needs these two, and the maps of a group do not determine
+    # them: a group of a user's own may do without.
+
     def matrix(self, g: Element) -> Float[Array, "k k"]:
         """g as a matrix."""
         raise NotImplementedError(_no_matrix(self, "matrix"))

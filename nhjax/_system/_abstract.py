@@ -116,7 +116,7 @@ class AbstractMechanicalSystem(eqx.Module):
     def position_constraint(
         self, t: FloatScalarLike, q: PyTree[Array], args: Args = None
     ) -> Float[Array, " k"]:
-        """The holonomic constraints Φ(t, q) with shape (k,), k = 0 if none."""
+        """The holonomic constraints Γ(t, q) with shape (k,), k = 0 if none."""
         if self.holonomic is None:
             return jnp.zeros((0,), jax.tree.leaves(q)[0].dtype)
         return jnp.atleast_1d(self.holonomic(t, q, args))
@@ -140,7 +140,7 @@ class AbstractMechanicalSystem(eqx.Module):
         u: Float[Array, " n"],
         args: Args = None,
     ) -> Float[Array, " k"]:
-        """d/dt Φ(t, q) of the holonomic constraints, with shape (k,)."""
+        """dΓ/dt of the holonomic constraints, with shape (k,)."""
         if self.holonomic is None:
             return jnp.zeros((0,), u.dtype)
         v = self.velocity(t, q, u, args)
@@ -202,10 +202,8 @@ class AbstractMechanicalSystem(eqx.Module):
         args: Args = None,
     ) -> Float[Array, " n"]:
         """The whole force W: free force and reaction."""
-        force = self.free_force(t, q, u, args)
-        if self.nonholonomic is None and self.holonomic is None:
-            return force
-        return force + self.reaction(t, q, u, multiplier, args)
+        free = self.free_force(t, q, u, args)
+        return free + self.reaction(t, q, u, multiplier, args)
 
     def constraint_violation(
         self, t: FloatScalarLike, y: State, args: Args = None
@@ -224,7 +222,7 @@ class AbstractMechanicalSystem(eqx.Module):
         """The continuous multiplier λ_c, from the hidden constraint dΦ/dt = 0.
 
         Nonholonomic rows first, then the holonomic ones, whose hidden constraint is
-        d²Φ/dt² = 0. Along a trajectory of a Lobatto method it is of order 2s-2, while
+        d²Γ/dt² = 0. Along a trajectory of a Lobatto method it is of order 2s-2, while
         the multiplier that the paper propagates is of order s or s-1.
         """
         t = jnp.asarray(t, y.p.dtype)
