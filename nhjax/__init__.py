@@ -1,6 +1,11 @@
 """High-order geometric integrators for nonholonomic mechanical systems, in JAX."""
 
 from . import plot as plot, systems as systems
+from ._adjoint import (
+    AbstractAdjoint as AbstractAdjoint,
+    DirectAdjoint as DirectAdjoint,
+    RecursiveCheckpointAdjoint as RecursiveCheckpointAdjoint,
+)
 from ._errors import (
     ConstraintViolationError as ConstraintViolationError,
     DependentConstraintsError as DependentConstraintsError,

@@ -18,8 +18,8 @@ from ._checks import (
 )
 from ._custom_types import Args, BoolScalar, FloatScalarLike
 from ._errors import DTypeError, require, ShapeError
+from ._implicit import root
 from ._initial_checks import check_found, conditioning, Found
-from ._iteration import root
 from ._linearisation import inverse, linearise
 from ._scales import position_scale, violation_scale
 from ._state import State

@@ -1,13 +1,12 @@
-from collections.abc import Callable
-from typing import Any, NamedTuple, TypeAlias
+from functools import partial
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int, PyTree
+from jaxtyping import Array, Int, PyTree
 
+from ._adjoint import AbstractAdjoint, DirectAdjoint
 from ._checks import (
-    all_finite,
     check_num_steps,
     check_state,
     check_type,
@@ -15,22 +14,22 @@ from ._checks import (
     parameters,
     real_scalar,
 )
-from ._custom_types import Args, BoolScalar, FloatScalar, FloatScalarLike
+from ._custom_types import Args, FloatScalar, FloatScalarLike
 from ._errors import Check, require
+from ._implicit import undefined_unless
 from ._interpolation import (
     DenseInterpolation,
     interpolate,
     require_collocation,
     step_index,
 )
+from ._loop import Loop
 from ._method import AbstractMethod
 from ._newton import AbstractStageSolver, SimplifiedNewton
 from ._progress_meter import AbstractProgressMeter, NoProgressMeter
 from ._saveat import SaveAt, stack_saved
-from ._scales import position_scale, violation_scale
 from ._solution import raise_failures, RESULTS, Solution
 from ._state import State
-from ._step import first_node, largest_violation, Node, step, StepOutcome
 from ._step_record import StepRecord
 from ._system import AbstractMechanicalSystem, HamiltonianSystem, LagrangianSystem
 
@@ -46,6 +45,7 @@ def integrate(
     args: Args = None,
     saveat: SaveAt | None = None,
     solver: AbstractStageSolver | None = None,
+    adjoint: AbstractAdjoint | None = None,
     throw: bool = True,
     progress_meter: AbstractProgressMeter | None = None,
 ) -> Solution:
@@ -98,12 +98,14 @@ def integrate(
     """
     saveat = SaveAt(t1=True) if saveat is None else saveat
     solver = SimplifiedNewton() if solver is None else solver
+    adjoint = DirectAdjoint() if adjoint is None else adjoint
     meter = NoProgressMeter() if progress_meter is None else progress_meter
     check_type("system", system, (LagrangianSystem, HamiltonianSystem))
     check_type("method", method, AbstractMethod, "Such as nhjax.LobattoIIIAB(3).")
     check_type("y0", y0, State, "Make one with nhjax.initial_state.")
     check_type("saveat", saveat, SaveAt, "Such as nhjax.SaveAt(t0=True, steps=True).")
     check_type("solver", solver, AbstractStageSolver, "Such as nhjax.Newton().")
+    check_type("adjoint", adjoint, AbstractAdjoint, "Such as nhjax.DirectAdjoint().")
     check_type("progress_meter", meter, AbstractProgressMeter)
     num_steps = check_num_steps(num_steps)
     args = parameters(args)
@@ -126,125 +128,20 @@ def integrate(
     if saveat.dense or saveat.ts is not None:
         require_collocation(method)
     saveat = saveat.within(t0, dt, num_steps)
-    sol = _integrate(system, method, solver, y0, t0, dt, num_steps, args, saveat, meter)
+    sol = _integrate(
+        system,
+        method,
+        solver,
+        adjoint,
+        y0,
+        t0,
+        dt,
+        num_steps,
+        args,
+        saveat,
+        meter,
+    )
     return raise_failures(sol) if throw else sol
-
-
-_Save: TypeAlias = Callable[[FloatScalar, State], PyTree[Array]]
-
-
-class _Carry(NamedTuple):
-    node: Node
-    result: RESULTS
-    stats: dict[str, Any]
-
-
-class _Loop(eqx.Module):
-    """The time loop's constants, and what it does with a step's outcome."""
-
-    system: AbstractMechanicalSystem
-    method: AbstractMethod = eqx.field(static=True)
-    solver: AbstractStageSolver
-    t0: FloatScalar
-    dt: FloatScalar
-    num_steps: int = eqx.field(static=True)
-    args: Args
-    meter: AbstractProgressMeter
-
-    def time(self, k: Int[Array, ""] | int) -> FloatScalar:
-        """t_k by a product: a running sum of dt would drift."""
-        return self.t0 + jnp.asarray(k, self.dt.dtype) * self.dt
-
-    def start(self, y0: State) -> _Carry:
-        """The carry before the first step."""
-        node = first_node(self.system, self.method, self.t0, y0, self.args)
-        result = RESULTS.where(
-            self._is_consistent(node),
-            RESULTS.successful,
-            RESULTS.inconsistent_start,
-        )
-        result = RESULTS.where(all_finite(y0), result, RESULTS.nonfinite_state)
-        zero, none = jnp.zeros((), self.dt.dtype), jnp.zeros((), jnp.int32)
-        stats = {
-            "num_steps": none,
-            "num_iterations": none,
-            "max_residual": zero,
-            "max_constraint_violation": largest_violation(
-                self.system, self.t0, node, self.args
-            ),
-            "max_multiplier_defect": zero,
-            "failed_step": jnp.where(result == RESULTS.successful, none - 1, none),
-        }
-        return _Carry(node, result, stats)
-
-    def _is_consistent(self, node: Node) -> BoolScalar:
-        """Whether Φ = 0 and v, p belong together at the start, but for small errors.
-
-        The bound is to find a state of another system, or one changed by hand in one
-        part; it lets pass the perturbations by which derivatives are approximated.
-        """
-        y, lin, system = node.state, node.lin, self.system
-        small = float(jnp.finfo(y.p.dtype).eps) ** 0.25
-        u = system.fibre(y)
-        conjugate = system.conjugate(self.t0, y.q, u, self.args)
-        given = y.p if system.fibre_name == "v" else y.v
-        size = jnp.max(jnp.abs(conjugate)) + jnp.max(jnp.abs(given))
-        scale = violation_scale(system, lin, self.t0, y.q, u, self.args)
-        positions = system.position_constraint(self.t0, y.q, self.args)
-        allowed = position_scale(system, self.t0, y.q, self.args)
-        return (
-            jnp.all(jnp.abs(lin.violation) <= small * scale)
-            & jnp.all(jnp.abs(positions) <= small * allowed)
-            & (system.manifold_of(y.q).defect(y.q) <= small)
-            & (jnp.max(jnp.abs(conjugate - given)) <= small * size)
-        )
-
-    def step(self, carry: _Carry, k: Int[Array, ""]) -> tuple[_Carry, StepRecord]:
-        """Step k; a failed trajectory keeps its last good node."""
-        alive = carry.result == RESULTS.successful
-        outcome = step(
-            self.system,
-            self.method,
-            self.solver,
-            self.time(k),
-            self.dt,
-            carry.node,
-            self.args,
-            skip=~alive,
-        )
-        good = alive & (outcome.result == RESULTS.successful)
-        node = jax.tree.map(
-            lambda new, old: jnp.where(good, new, old), outcome.node, carry.node
-        )
-        record = StepRecord(
-            carry.node.state,
-            # At rest after a failure, so that dense output stays where it was.
-            jnp.where(good, outcome.record.velocity, 0),
-            jnp.where(good, outcome.record.force, 0),
-            jnp.where(good, outcome.record.multiplier, carry.node.state.multiplier),
-        )
-        result = RESULTS.where(alive, outcome.result, carry.result)
-        stats = self._updated(carry.stats, outcome, alive, good, k)
-        self.meter.report(k, self.num_steps)
-        return _Carry(node, result, stats), record
-
-    def _updated(self, stats, outcome: StepOutcome, alive, good, k) -> dict[str, Any]:
-        def larger(name, value):
-            return jnp.where(good, jnp.maximum(stats[name], value), stats[name])
-
-        return {
-            "num_steps": stats["num_steps"] + good.astype(jnp.int32),
-            "num_iterations": stats["num_iterations"]
-            + jnp.where(alive, outcome.num_iterations, 0),
-            "max_residual": larger("max_residual", outcome.residual),
-            "max_constraint_violation": larger(
-                "max_constraint_violation", outcome.constraint_violation
-            ),
-            "max_multiplier_defect": larger(
-                "max_multiplier_defect", outcome.multiplier_defect
-            ),
-            "failed_step": jnp.where(alive & ~good, k, stats["failed_step"]),
-        }
 
 
 @eqx.filter_jit
@@ -252,6 +149,7 @@ def _integrate(
     system: AbstractMechanicalSystem,
     method: AbstractMethod,
     solver: AbstractStageSolver,
+    adjoint: AbstractAdjoint,
     y0: State,
     t0: FloatScalar,
     dt: FloatScalar,
@@ -260,103 +158,73 @@ def _integrate(
     saveat: SaveAt,
     meter: AbstractProgressMeter,
 ) -> Solution:
-    loop = _Loop(system, method, solver, t0, dt, num_steps, args, meter)
-
-    def save(t: FloatScalar, y: State) -> PyTree[Array]:
-        return t, jax.tree.map(jnp.asarray, saveat.fn(t, y, args))
+    # What user functions close over must be seen to be differentiated.
+    system = system.closed(t0, y0, args)
+    ts = saveat.ts
+    sampled = (
+        None if ts is None else jax.vmap(lambda t: step_index(t, t0, dt, num_steps))(ts)
+    )
+    num_records, record_slots = _record_slots(saveat.dense, sampled, num_steps)
+    loop = Loop(
+        system,
+        method,
+        solver,
+        t0,
+        dt,
+        num_steps,
+        args,
+        meter,
+        eqx.filter_closure_convert(saveat.fn, t0, y0, args),
+        saveat.steps,
+        num_records,
+        record_slots,
+    )
+    start = loop.start(y0)
+    carry, rows = adjoint.run(loop, start)
+    successful = carry.result == RESULTS.successful
+    state, rows = undefined_unless(successful, (carry.node.state, rows))
+    t1 = loop.time(num_steps)
 
     def one(saved: PyTree[Array]) -> PyTree[Array]:
         return jax.tree.map(lambda x: x[None], saved)
 
-    carry, interpolation = loop.start(y0), None
-    pieces = [one(save(t0, carry.node.state))] if saveat.t0 else []
-    if saveat.ts is not None and not saveat.dense:
-        carry, saved = _run_to_samples(loop, carry, saveat.ts, save)
-    else:
-        carry, saved, records = _run_to_strides(
-            loop, carry, saveat.steps, saveat.dense, save
-        )
-        if records is not None:
-            interpolation = DenseInterpolation(
-                system, method, num_steps, t0, dt, records, args
-            )
-            if saveat.ts is not None:
-                saved = jax.vmap(lambda t: save(t, interpolation.evaluate(t)))(
-                    saveat.ts
-                )
-    t1 = loop.time(num_steps)
-    pieces += [] if saved is None else [saved]
+    pieces = [one(loop.saved(t0, start.node.state))] if saveat.t0 else []
+    if saveat.steps:
+        pieces.append(jax.tree.map(lambda x: x[:-1], rows.saved))
+    if ts is not None and record_slots is not None:
+        at_samples = jax.tree.map(lambda x: x[record_slots[sampled]], rows.record)
+        pieces.append(jax.vmap(partial(_sample, loop))(ts, sampled, at_samples))
     if saveat.saves_end(num_steps):
-        pieces.append(one(save(t1, carry.node.state)))
-    ts, ys = stack_saved(pieces) if pieces else (None, None)
-    return Solution(t0, t1, ts, ys, carry.stats, carry.result, interpolation)
-
-
-def _run_to_strides(
-    loop: _Loop, carry: _Carry, stride: int, dense: bool, save: _Save
-) -> tuple[_Carry, PyTree[Array] | None, StepRecord | None]:
-    """All steps, saving after every `stride` of them (0: never)."""
-
-    def advance(carry, k):
-        carry, record = loop.step(carry, k)
-        return carry, record if dense else None
-
-    def chunk(carry, ks):
-        if stride == 1:
-            # One loop less to compile.
-            carry, record = advance(carry, ks[0])
-            records = jax.tree.map(lambda x: x[None], record)
-        else:
-            carry, records = jax.lax.scan(advance, carry, ks)
-        return carry, (save(loop.time(ks[-1] + 1), carry.node.state), records)
-
-    n = loop.num_steps
-    whole = n - n % stride if stride else 0
-    saved, records = None, []
-    if whole:
-        ks = jnp.arange(whole, dtype=jnp.int32).reshape(-1, stride)
-        carry, (saved, chunks) = jax.lax.scan(chunk, carry, ks)
-        records.append(jax.tree.map(lambda x: x.reshape((whole, *x.shape[2:])), chunks))
-    if whole < n:
-        carry, rest = jax.lax.scan(
-            advance, carry, jnp.arange(whole, n, dtype=jnp.int32)
+        pieces.append(one(loop.saved(t1, state)))
+    times, ys = stack_saved(pieces) if pieces else (None, None)
+    interpolation = None
+    if saveat.dense:
+        records = jax.tree.map(lambda x: x[:-1], rows.record)
+        interpolation = DenseInterpolation(
+            system, method, num_steps, t0, dt, records, args
         )
-        records.append(rest)
-    return carry, saved, stack_saved(records) if dense else None
+    return Solution(t0, t1, times, ys, carry.stats, carry.result, interpolation)
 
 
-def _run_to_samples(
-    loop: _Loop, carry: _Carry, ts: Float[Array, " k"], save: _Save
-) -> tuple[_Carry, PyTree[Array]]:
-    """All steps, interpolating in each at the samples that it contains."""
-    index = jax.vmap(lambda t: step_index(t, loop.t0, loop.dt, loop.num_steps))(ts)
-    # Beyond the last sample comes one in no step.
-    index = jnp.append(index, jnp.asarray(loop.num_steps, index.dtype))
+def _record_slots(
+    dense: bool, sampled: Int[Array, " k"] | None, num_steps: int
+) -> tuple[int, Int[Array, " num_steps+1"] | None]:
+    """How many step records are kept, and in which row that of each step is."""
+    if dense:
+        return num_steps, jnp.arange(num_steps + 1, dtype=jnp.int32)
+    if sampled is None:
+        return 0, None
+    # A row per sample, of which the first in a step is used: there may be more steps
+    # than samples, and more samples than steps.
+    num_samples = sampled.shape[0]
+    slots = jnp.full((num_steps + 1,), num_samples, jnp.int32)
+    return num_samples, slots.at[sampled].min(jnp.arange(num_samples, dtype=jnp.int32))
 
-    def advance(state, k):
-        carry, count, saved = state
-        carry, record = loop.step(carry, k)
-        start = loop.time(k)
 
-        def in_this_step(state):
-            return index[state[0]] == k
-
-        def sample(state):
-            count, saved = state
-            theta = (ts[count] - start) / loop.dt
-            y = interpolate(
-                loop.system, loop.method, record, start, loop.dt, theta, loop.args
-            )
-            new = save(ts[count], y)
-            saved = jax.tree.map(lambda x, row: x.at[count].set(row), saved, new)
-            return count + 1, saved
-
-        count, saved = jax.lax.while_loop(in_this_step, sample, (count, saved))
-        return (carry, count, saved), None
-
-    shapes = jax.eval_shape(save, loop.t0, carry.node.state)
-    saved = jax.tree.map(lambda x: jnp.zeros((*ts.shape, *x.shape), x.dtype), shapes)
-    state = (carry, jnp.zeros((), jnp.int32), saved)
-    ks = jnp.arange(loop.num_steps, dtype=jnp.int32)
-    (carry, _, saved), _ = jax.lax.scan(advance, state, ks)
-    return carry, saved
+def _sample(
+    loop: Loop, t: FloatScalar, k: Int[Array, ""], record: StepRecord
+) -> PyTree[Array]:
+    start = loop.time(k)
+    theta = (t - start) / loop.dt
+    y = interpolate(loop.system, loop.method, record, start, loop.dt, theta, loop.args)
+    return loop.saved(t, y)

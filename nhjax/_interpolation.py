@@ -9,7 +9,7 @@ from ._chart import Chart
 from ._checks import real_scalar
 from ._custom_types import Args, BoolScalar, FloatScalar, FloatScalarLike
 from ._errors import Check, require
-from ._iteration import root
+from ._implicit import root
 from ._linearisation import linearise
 from ._method import AbstractMethod
 from ._state import State

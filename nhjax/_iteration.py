@@ -1,12 +1,11 @@
-"""The loop that ends at round-off, and Newton's method for small dense problems."""
+"""The loop that ends at round-off, and the increments that it is fed."""
 
 from collections.abc import Callable
 from typing import Generic, NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
-from jax.flatten_util import ravel_pytree
-from jaxtyping import Array, Bool, Float, Int, PyTree
+from jaxtyping import Array, Bool, Float, Int
 
 from ._custom_types import BoolScalar, FloatScalar, FloatScalarLike
 
@@ -99,19 +98,3 @@ def relative_size(
     """max |δ| / (max |x| + rest), with a zero x measured absolutely."""
     scale = jnp.max(jnp.abs(x)) + rest
     return jnp.max(jnp.abs(increment)) / jnp.where(scale > 0, scale, 1)
-
-
-def root(
-    residual: Callable[[X], PyTree[Array]], x0: X, max_iterations: int = 30
-) -> Solved[X, None]:
-    """A root of `residual` near `x0`, to round-off, by Newton's method."""
-    flat, unravel = ravel_pytree(x0)
-
-    def sweep(x):
-        dx, _ = dense_increment(
-            lambda z: (ravel_pytree(residual(unravel(z)))[0], None), x
-        )
-        return x + dx, relative_size(dx, x), None
-
-    solved = iterate(sweep, flat, max_iterations=max_iterations)
-    return Solved(unravel(solved.x), None, solved.converged, solved.num_iterations)

@@ -1,9 +1,11 @@
 """The two solvers of the stage equations."""
 
 from abc import abstractmethod
-from typing import NamedTuple
+from collections.abc import Callable
+from typing import NamedTuple, TypeAlias
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
@@ -21,6 +23,11 @@ class Evaluation(NamedTuple):
 
     forces: StageForces
     node_residual: Float[Array, "r n"]
+
+
+# One iteration on the stages of a step; the equations are an argument, so that it can
+# be differentiated with respect to what is in them.
+Correction: TypeAlias = Callable[[StageSystem, Stages], Stages]
 
 
 class AbstractStageSolver(eqx.Module):
@@ -41,6 +48,16 @@ class AbstractStageSolver(eqx.Module):
         self, stages: StageSystem, x0: Stages, lin: Linearisation, skip: Array
     ) -> Solved[Stages, Evaluation]:
         """Solve the stage equations from `x0`; does nothing where `skip` is true."""
+
+    @abstractmethod
+    def correction(
+        self, stages: StageSystem, x0: Stages, lin: Linearisation, x: Stages
+    ) -> Correction:
+        """An iteration whose fixed points solve the stage equations.
+
+        Its Jacobian is frozen near the solution `x` that was found from `x0`, so that
+        it contracts there; derivatives of the solution follow from it.
+        """
 
 
 class SimplifiedNewton(AbstractStageSolver):
@@ -75,16 +92,9 @@ class SimplifiedNewton(AbstractStageSolver):
         rest = fibre_scale(stages, lin)
 
         def sweep(x: Stages):
-            # Each residual is evaluated at the newest iterate (Gauss-Seidel): it costs
-            # the same as evaluating all of them at the last one, and contracts faster.
-            forces = stages.evaluate(x)
-            x_next = structure.correct_stages(stages, x, forces.residual)
-            node_residual = stages.node_residual(x_next, forces.force)
-            x_next = structure.correct_nodes(x_next, node_residual)
-            if stages.constrained:
-                x_next = _constrain(stages, structure, x_next)
+            x_next, evaluation = _corrected(stages, structure, x)
             size = _increment_size(stages, x, x_next, lin, rest)
-            return x_next, size, Evaluation(forces, node_residual)
+            return x_next, size, evaluation
 
         return iterate(
             sweep,
@@ -93,6 +103,27 @@ class SimplifiedNewton(AbstractStageSolver):
             tolerance=self.tolerance,
             skip=skip,
         )
+
+    def correction(
+        self, stages: StageSystem, x0: Stages, lin: Linearisation, x: Stages
+    ) -> Correction:
+        """The iteration of `solve` itself."""
+        structure = leading_structure(stages, x0, lin)
+        return lambda stages, x: _corrected(stages, structure, x)[0]
+
+
+def _corrected(
+    stages: StageSystem, structure: LeadingStructure, x: Stages
+) -> tuple[Stages, Evaluation]:
+    # Each residual is evaluated at the newest iterate (Gauss-Seidel): it costs the same
+    # as evaluating all of them at the last one, and contracts faster.
+    forces = stages.evaluate(x)
+    x_next = structure.correct_stages(stages, x, forces.residual)
+    node_residual = stages.node_residual(x_next, forces.force)
+    x_next = structure.correct_nodes(x_next, node_residual)
+    if stages.constrained:
+        x_next = _constrain(stages, structure, x_next)
+    return x_next, Evaluation(forces, node_residual)
 
 
 def _constrain(stages: StageSystem, structure: LeadingStructure, x: Stages) -> Stages:
@@ -140,16 +171,7 @@ class Newton(AbstractStageSolver):
         rest = fibre_scale(stages, lin)
 
         def residual(z):
-            x = unravel(z)
-            forces = stages.evaluate(x)
-            node_residual = stages.node_residual(x, forces.force)
-            parts = [forces.residual, node_residual]
-            if stages.hamiltonian:
-                parts.append(x.velocity - stages.stage_velocities(x))
-            parts += _constraints(stages, x)
-            if stages.symmetric:
-                parts += stages.end_residual(x)
-            return ravel_pytree(parts)[0], Evaluation(forces, node_residual)
+            return _residual(stages, unravel(z))
 
         def sweep(x: Stages):
             z, _ = ravel_pytree(x)
@@ -164,6 +186,33 @@ class Newton(AbstractStageSolver):
             tolerance=self.tolerance,
             skip=skip,
         )
+
+    def correction(
+        self, stages: StageSystem, x0: Stages, lin: Linearisation, x: Stages
+    ) -> Correction:
+        """Newton's iteration with the Jacobian at the solution."""
+        z, unravel = ravel_pytree(x)
+        jacobian = jax.jacfwd(lambda z: _residual(stages, unravel(z))[0])(z)
+        jacobian_inverse = jnp.linalg.inv(jacobian)
+
+        def corrected(stages: StageSystem, x: Stages) -> Stages:
+            residual, _ = _residual(stages, x)
+            return unravel(ravel_pytree(x)[0] - jacobian_inverse @ residual)
+
+        return corrected
+
+
+def _residual(stages: StageSystem, x: Stages) -> tuple[Float[Array, " k"], Evaluation]:
+    """All equations of a step in one vector."""
+    forces = stages.evaluate(x)
+    node_residual = stages.node_residual(x, forces.force)
+    parts = [forces.residual, node_residual]
+    if stages.hamiltonian:
+        parts.append(x.velocity - stages.stage_velocities(x))
+    parts += _constraints(stages, x)
+    if stages.symmetric:
+        parts += stages.end_residual(x)
+    return ravel_pytree(parts)[0], Evaluation(forces, node_residual)
 
 
 def _increment_size(

@@ -1,6 +1,7 @@
 from typing import NamedTuple
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, PyTree
 
@@ -36,6 +37,7 @@ class StepOutcome(NamedTuple):
 
     node: Node
     record: StepRecord
+    stages: Stages
     result: RESULTS
     num_iterations: Int[Array, ""]
     residual: FloatScalar
@@ -60,7 +62,7 @@ def first_node(
         state=State(y0.q, y0.v, y0.p, y0.multiplier if carried else lin.multiplier),
         q_compensation=system.manifold_of(y0.q).no_compensation(y0.q),
         p_compensation=jnp.zeros_like(y0.p),
-        lin=lin,
+        lin=jax.lax.stop_gradient(lin),
     )
 
 
@@ -87,7 +89,7 @@ def step(
         h,
         state.q,
         state.p,
-        state.multiplier if propagated else lin.multiplier,
+        state.multiplier,
         args,
     )
     x0 = stages.starting_values(system.fibre(state), lin)
@@ -121,6 +123,7 @@ def step(
     return StepOutcome(
         node=next_node,
         record=StepRecord(state, x.velocity, forces.force, forces.multiplier),
+        stages=x,
         result=_result(solved, lin, next_node, in_chart),
         num_iterations=solved.num_iterations,
         residual=residual / jnp.where(scale > 0, scale, 1),

@@ -1,5 +1,5 @@
 from abc import abstractmethod
-from typing import Literal
+from typing import Literal, Self
 
 import equinox as eqx
 import jax
@@ -101,6 +101,27 @@ class AbstractMechanicalSystem(eqx.Module):
     def fibre(self, y: State) -> Float[Array, " n"]:
         """The fibre coordinate u of a state, its v or its p."""
         return getattr(y, self.fibre_name)
+
+    def closed(self, t: FloatScalar, y: State, args: Args) -> Self:
+        """This, with what its functions close over among its leaves.
+
+        So that derivatives reach it, wherever rules of differentiation are our own.
+        """
+        phase, position = (t, y.q, self.fibre(y), args), (t, y.q, args)
+        examples = {
+            self.generator: phase,
+            "nonholonomic": phase,
+            "holonomic": position,
+            "force": phase,
+        }
+        names = [name for name in examples if getattr(self, name) is not None]
+        functions = [
+            eqx.filter_closure_convert(getattr(self, name), *examples[name])
+            for name in names
+        ]
+        return eqx.tree_at(
+            lambda system: [getattr(system, name) for name in names], self, functions
+        )
 
     def conjugate(
         self, t: FloatScalarLike, q: PyTree[Array], u: Float[Array, " n"], args: Args

@@ -1,0 +1,152 @@
+"""How a trajectory is differentiated in reverse mode: what is kept of it, and where."""
+
+import math
+from abc import abstractmethod
+from collections.abc import Callable
+from functools import partial
+from typing import TypeAlias
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Int
+
+from ._loop import Carry, Loop, Rows
+
+
+_Run: TypeAlias = tuple[Carry, Rows]
+_Advance: TypeAlias = Callable[[_Run, Int[Array, ""]], _Run]
+
+
+class AbstractAdjoint(eqx.Module):
+    """How `integrate` is differentiated in reverse mode."""
+
+    @abstractmethod
+    def run(self, loop: Loop, carry: Carry) -> _Run:
+        """All steps of the loop from `carry`: its end, and the rows saved."""
+
+
+def _advance(loop: Loop, state: _Run, k: Int[Array, ""]) -> _Run:
+    carry, buffers = state
+    carry, rows = loop.step(carry, k)
+    return carry, loop.write(buffers, rows, k)
+
+
+class DirectAdjoint(AbstractAdjoint):
+    """Keep the stages of every step: memory O(num_steps), the least time.
+
+    Forward mode (`jax.jvp`, `jax.jacfwd`, `jax.linearize`) and derivatives of any order
+    work as well.
+
+    !!! example
+
+        >>> import jax, nhjax
+        >>> disc = nhjax.systems.VerticalRollingDisc()
+        >>> def end(dt):
+        ...     return nhjax.integrate(disc.system, nhjax.LobattoIIIAB(2),
+        ...         disc.initial_state(), dt=dt, num_steps=10).ys.q[-1, 3]
+        >>> round(float(jax.grad(end)(0.1)), 6)
+        10.0
+    """
+
+    def run(self, loop: Loop, carry: Carry) -> _Run:
+        """All steps of the loop from `carry`: its end, and the rows saved."""
+        ks = jnp.arange(loop.num_steps, dtype=jnp.int32)
+        state, _ = jax.lax.scan(
+            lambda state, k: (_advance(loop, state, k), None),
+            (carry, loop.empty_rows(carry)),
+            ks,
+        )
+        return state
+
+
+class RecursiveCheckpointAdjoint(AbstractAdjoint):
+    """Keep some states on the way and recompute the rest: memory O(sqrt(num_steps)).
+
+    The steps are cut into `checkpoints` blocks, and these again, until a block has no
+    more steps than that; a reverse pass keeps the state at the start of each block of
+    the level that it is in, and the stages of one block of the last level. By default
+    there are two levels. Each level beyond the first costs another forward run: with L
+    levels and num_steps = checkpoints^L memory is O(L checkpoints).
+
+    Forward mode and derivatives of any order work as well.
+
+    **Arguments:**
+
+    - `checkpoints`: how many states to keep on each level, an int >= 2;
+        sqrt(num_steps) by default.
+
+    !!! example
+
+        >>> import nhjax
+        >>> nhjax.RecursiveCheckpointAdjoint(checkpoints=50).checkpoints
+        50
+    """
+
+    checkpoints: int | None = eqx.field(static=True, default=None)
+
+    def __check_init__(self):
+        number = self.checkpoints
+        if number is not None and (not isinstance(number, int) or number < 2):
+            raise ValueError(
+                "RecursiveCheckpointAdjoint: `checkpoints` must be an int >= 2 or "
+                f"None, got {number!r}."
+            )
+
+    def run(self, loop: Loop, carry: Carry) -> _Run:
+        """All steps of the loop from `carry`: its end, and the rows saved."""
+        lengths = self._block_lengths(loop.num_steps)
+
+        advance: _Advance = partial(_advance, loop)
+        if math.prod(lengths) > loop.num_steps:
+            advance = _idle_after_the_end(loop)
+        for level, length in enumerate(reversed(lengths)):
+            stride = math.prod(lengths[len(lengths) - level :])
+            advance = _block(advance, length, stride, keep_all=level == 0)
+        state = (carry, loop.empty_rows(carry))
+        return advance(state, jnp.zeros((), jnp.int32))
+
+    def _block_lengths(self, num_steps: int) -> list[int]:
+        """How many blocks there are on each level, the outermost first."""
+        number = self.checkpoints
+        number = math.isqrt(num_steps - 1) + 1 if number is None else number
+        lengths, steps = [], num_steps
+        while steps > max(number, 1):
+            steps = -(-steps // number)
+            lengths.append(number)
+        lengths.append(steps)
+        # Rounding up may have left whole blocks idle.
+        lengths[0] = -(-num_steps // math.prod(lengths[1:]))
+        return lengths
+
+
+def _block(advance: _Advance, length: int, stride: int, *, keep_all: bool) -> _Advance:
+    """`length` calls of `advance`, `stride` steps apart."""
+    one = advance if keep_all else jax.checkpoint(advance, prevent_cse=False)
+
+    def block(state, k):
+        ks = k + stride * jnp.arange(length, dtype=jnp.int32)
+        return jax.lax.scan(lambda state, k: (one(state, k), None), state, ks)[0]
+
+    return block
+
+
+def _idle_after_the_end(loop: Loop) -> _Advance:
+    """`_advance`, but nothing where the last block is longer than the run."""
+
+    def advance_or_idle(state, k):
+        # The buffers stay outside of the branches, which would copy them.
+        carry, buffers = state
+        nothing = jax.tree.map(
+            lambda x: jnp.zeros(x.shape, x.dtype),
+            jax.eval_shape(lambda: loop.step(carry, k)[1]),
+        )
+        carry, rows = jax.lax.cond(
+            k < loop.num_steps,
+            lambda carry: loop.step(carry, k),
+            lambda carry: (carry, nothing),
+            carry,
+        )
+        return carry, loop.write(buffers, rows, k)
+
+    return advance_or_idle
