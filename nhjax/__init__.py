@@ -49,6 +49,7 @@ from ._progress_meter import (
     TextProgressMeter as TextProgressMeter,
     TqdmProgressMeter as TqdmProgressMeter,
 )
+from ._reversible import ReversibleAdjoint as ReversibleAdjoint
 from ._saveat import SaveAt as SaveAt
 from ._solution import RESULTS as RESULTS, Solution as Solution
 from ._state import State as State

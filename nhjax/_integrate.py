@@ -191,7 +191,7 @@ def _integrate(
     pieces = [one(loop.saved(t0, start.node.state))] if saveat.t0 else []
     if saveat.steps:
         pieces.append(jax.tree.map(lambda x: x[:-1], rows.saved))
-    if ts is not None and record_slots is not None:
+    if ts is not None and sampled is not None and record_slots is not None:
         at_samples = jax.tree.map(lambda x: x[record_slots[sampled]], rows.record)
         pieces.append(jax.vmap(partial(_sample, loop))(ts, sampled, at_samples))
     if saveat.saves_end(num_steps):

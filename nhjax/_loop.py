@@ -194,6 +194,19 @@ class Loop(eqx.Module):
             records = put(records, rows.record, slot)
         return Rows(saved, records)
 
+    def read(self, buffers: Rows, k: Int[Array, ""]) -> Rows:
+        """The rows of step k in buffers of all rows, where `write` puts them."""
+
+        def get(buffer, slot):
+            return jax.tree.map(lambda x: x[slot], buffer)
+
+        saved, records = buffers
+        if self.stride:
+            saved = get(saved, self._slot(k))
+        if self.record_slots is not None:
+            records = get(records, self.record_slots[k])
+        return Rows(saved, records)
+
     def _updated(self, stats, outcome: StepOutcome, alive, good, k) -> dict[str, Any]:
         def larger(name, value):
             return jnp.where(good, jnp.maximum(stats[name], value), stats[name])

@@ -5,7 +5,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, PyTree
+from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from ._custom_types import FloatScalarLike
 from ._errors import IntegrationError, is_traced
@@ -136,13 +136,11 @@ def _verdict(codes: Any, steps: Any) -> np.ndarray:
     return np.ones(np.shape(codes), bool)
 
 
-# Compiled, since an eager `vmap` would compile the call-back anew at each call.
-@eqx.filter_jit
-def _raise_later(sol: Solution) -> Solution:
-    codes, steps = sol.result._value, sol.stats["failed_step"]
+@jax.custom_jvp
+def _passed(codes: Int[Array, ""], steps: Int[Array, ""]) -> Bool[Array, ""]:
     # Only the host can put numbers into a message, and only a call-back of our own
     # sees the lanes of a batch.
-    passed = jax.lax.cond(
+    return jax.lax.cond(
         codes != _messages().index(""),
         lambda: jax.pure_callback(
             _verdict,
@@ -153,6 +151,22 @@ def _raise_later(sol: Solution) -> Solution:
         ),
         lambda: jnp.asarray(True),
     )
+
+
+@_passed.defjvp
+def _passed_jvp(primals, tangents):
+    # Integers have tangents of no meaning, which a call-back would not take.
+    del tangents
+    passed = _passed(*primals)
+    zero: Any = np.zeros(passed.shape, jax.dtypes.float0)
+    return passed, zero
+
+
+# Compiled, since an eager `vmap` would compile the call-back anew at each call.
+@eqx.filter_jit
+def _raise_later(sol: Solution) -> Solution:
+    codes, steps = sol.result._value, sol.stats["failed_step"]
+    passed = _passed(codes, steps)
     # Whatever part of the solution is used must wait for the verdict.
     dynamic, static = eqx.partition(sol, eqx.is_array)
     dynamic = jax.tree.map(lambda x: jnp.where(passed, x, jnp.zeros_like(x)), dynamic)
