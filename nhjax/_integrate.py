@@ -54,8 +54,11 @@ def integrate(
     Each step solves the discrete equations of the paper (its four summaries) to
     round-off, so that the constraints on velocities and positions hold at every node to
     round-off as well; q and p are summed with compensation, and elements of a group
-    stay on it. It works under `jit` and `vmap` (over `y0`, `args`,
-    `dt`, `t0` and the array leaves of `system`).
+    stay on it. It works under `jit`, `vmap`, `grad`, `jvp` and `hessian`, with respect
+    to `y0`, `args`, `dt`, `t0` and the array leaves of `system`; stage equations are
+    differentiated by the implicit function theorem. Perturb a state through
+    `initial_state`: the equations of a step read q and p, and only the first multiplier
+    v too.
 
     **Arguments:**
 
@@ -74,9 +77,12 @@ def integrate(
 
     - `saveat`: what to save, the final state by default; see `nhjax.SaveAt`.
     - `solver`: `nhjax.SimplifiedNewton()` by default, or `nhjax.Newton()`.
+    - `adjoint`: what reverse mode keeps of the trajectory: `nhjax.DirectAdjoint()` by
+        default, `nhjax.RecursiveCheckpointAdjoint()`, or `nhjax.ReversibleAdjoint()`.
     - `throw`: raise if a step cannot be solved. Otherwise the trajectory stays at its
-        last good state from there on, and `result` and `stats` say so; other members
-        of a batch are not touched.
+        last good state from there on, and `result` and `stats` say so; its derivatives
+        are NaN (zero where nothing depends on it). Other members of a batch are not
+        touched.
     - `progress_meter`: such as `nhjax.TqdmProgressMeter()`.
 
     **Returns:** a `Solution`.

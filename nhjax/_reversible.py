@@ -37,7 +37,7 @@ class ReversibleAdjoint(AbstractAdjoint):
         ...         disc.initial_state(), dt=dt, num_steps=10,
         ...         adjoint=nhjax.ReversibleAdjoint()).ys.q[-1, 3]
         >>> round(float(jax.grad(end)(0.1)), 6)
-        10.0
+        7.0
     """
 
     def run(self, loop: Loop, carry: Carry) -> tuple[Carry, Rows]:

@@ -34,8 +34,8 @@ class SaveAt(eqx.Module):
     - `fn`: save `fn(t, y, args)` instead of y.
 
     The output has exactly as many entries as are saved. Thinned saving (`steps=k`) and
-    `ts` keep no buffer of the length of the run, unless `dense` does. Differentiating
-    in reverse mode with respect to samples at `ts` needs `dense=True` beside it.
+    `ts` keep no buffer of the length of the run, unless `dense` does; samples are taken
+    after the run, from the records of the steps that contain them.
 
     **Raises:** `ValueError` if nothing is saved, a flag is not a bool, `steps` is not a
     bool or an int >= 1, `ts` is not a sorted vector, or `ts` and `steps` are given

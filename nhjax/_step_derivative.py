@@ -134,14 +134,16 @@ def _end(
     q = system.manifold_of(parameters.state.q).act(
         parameters.state.q, stages.increment(x)
     )
+    m, carried = stages.num_nonholonomic, method.multiplier == "propagated"
     if stages.symmetric:
         multiplier = x.end_multiplier
+    elif carried and not stages.num_holonomic:
+        multiplier = stages.multipliers(x)[-1]
     else:
         multiplier = linearise(system, t, q, u, args).multiplier
-    if method.multiplier == "propagated":
-        m = stages.num_nonholonomic
-        carried = stages.multipliers(x)[-1, :m]
-        multiplier = jnp.concatenate([carried, multiplier[m:]])
+        if carried:
+            nonholonomic = stages.multipliers(x)[-1, :m]
+            multiplier = jnp.concatenate([nonholonomic, multiplier[m:]])
     v, p = system.velocity(t, q, u, args), system.momentum(t, q, u, args)
     forces = stages.evaluate(x)
     record = StepRecord(parameters.state, x.velocity, forces.force, forces.multiplier)
