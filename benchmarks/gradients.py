@@ -1,0 +1,398 @@
+"""What a gradient costs: time, memory and compile time of every adjoint.
+
+A scalar of the final state is differentiated with respect to the initial state, dt and
+the system's parameters. Times are over those of the run alone, in one process and
+interleaved: medians of seven, of one run beyond 10⁴ steps; processor time, that of
+all threads, depends less on what else runs. Each system and number of
+steps has a process of its own. `temp` is what the compiled program allocates,
+`resident` by how much the peak of resident memory lies above that before the run
+(Linux alone). `--smoke` takes a minute, everything some ten.
+"""
+
+import argparse
+import gc
+import json
+import os
+import statistics
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+from matplotlib.figure import Figure
+
+import nhjax
+from nhjax import systems
+
+from ._report import markdown_table, number, RESULTS, write
+
+
+DT, REPEATS, LONG = 0.1, 7, 10**4
+# So that freed memory goes back at once, and is not taken for what a run needs.
+MALLOC = {"MALLOC_MMAP_THRESHOLD_": "65536", "MALLOC_TRIM_THRESHOLD_": "65536"}
+
+EXAMPLES = {
+    "chaotic": systems.ChaoticSystem,
+    "sleigh": systems.ChaplyginSleigh,
+    "CVT": systems.ContinuouslyVariableTransmission,
+    "Suslov": systems.Suslov,
+}
+ADJOINTS = {
+    "direct": nhjax.DirectAdjoint(),
+    "checkpoints": nhjax.RecursiveCheckpointAdjoint(),
+    "reversible": nhjax.ReversibleAdjoint(),
+}
+
+
+def problem(
+    name: str, stages: int, num_steps: int, adjoint: str = "direct"
+) -> tuple[Callable[..., Array], tuple]:
+    """A loss, and the state, step and parameters that it is a function of."""
+    example = EXAMPLES[name]()
+    parameters, fixed = eqx.partition(example.system, eqx.is_inexact_array)
+
+    def loss(y0, dt, parameters):
+        sol = nhjax.integrate(
+            eqx.combine(parameters, fixed),
+            nhjax.LobattoIIIAB(stages),
+            y0,
+            dt=dt,
+            num_steps=num_steps,
+            adjoint=ADJOINTS[adjoint],
+            throw=False,
+        )
+        ends = [sol.ys.v[-1], *(leaf[-1] for leaf in jax.tree.leaves(sol.ys.q))]
+        return jnp.sum(jnp.concatenate(ends) ** 2)
+
+    return loss, (example.initial_state(), jnp.asarray(DT), parameters)
+
+
+def gradient(loss: Callable[..., Array]) -> Callable:
+    """Value and gradient with respect to everything."""
+    return jax.value_and_grad(loss, argnums=(0, 1, 2))
+
+
+def compiled(function: Callable, args: tuple) -> tuple[Any, float]:
+    """The compiled function and the seconds that it took to trace and compile."""
+    jax.clear_caches()
+    start = time.perf_counter()
+    program = jax.jit(function).lower(*args).compile()
+    return program, time.perf_counter() - start
+
+
+def seconds(function: Callable, args: tuple) -> tuple[float, float]:
+    """Seconds of one run by the clock, and of all processors together."""
+    start, processors = time.perf_counter(), time.process_time()
+    jax.block_until_ready(function(*args))
+    return time.perf_counter() - start, time.process_time() - processors
+
+
+def both_medians(
+    runs: dict[str, tuple[Callable, tuple]], repeats: int
+) -> dict[str, tuple[float, ...]]:
+    """Both kinds of seconds of each, interleaved."""
+    times = {name: [] for name in runs}
+    for _ in range(repeats):
+        for name, run in runs.items():
+            times[name].append(seconds(*run))
+    return {
+        name: tuple(statistics.median(kind) for kind in zip(*values, strict=True))
+        for name, values in times.items()
+    }
+
+
+def medians(runs: dict[str, tuple[Callable, tuple]], repeats: int) -> dict[str, float]:
+    """Seconds of each by the clock, interleaved."""
+    return {name: both[0] for name, both in both_medians(runs, repeats).items()}
+
+
+def resident(function: Callable, args: tuple) -> int | None:
+    """Bytes by which resident memory rises while the function runs, if known."""
+    status = Path("/proc/self/status")
+    if not status.exists():
+        return None
+    gc.collect()
+
+    def kilobytes(name: str) -> int:
+        lines = status.read_text().splitlines()
+        return int(next(x for x in lines if x.startswith(name)).split()[1])
+
+    Path("/proc/self/clear_refs").write_text("5")  # The peak starts anew.
+    before = kilobytes("VmRSS")
+    jax.block_until_ready(function(*args))
+    return 1024 * max(kilobytes("VmHWM") - before, 0)
+
+
+def case(name: str, stages: int, num_steps: int, adjoints: list[str]) -> dict[str, Any]:
+    """Every figure of one system and number of steps."""
+    loss, args = problem(name, stages, num_steps)
+    functions = {"forward": loss}
+    for adjoint in adjoints:
+        functions[adjoint] = gradient(problem(name, stages, num_steps, adjoint)[0])
+    # The first compilation of a process pays for starting the compiler.
+    compiled(jnp.sin, (args[1],))
+    rows, runs, gradients = {}, {}, {}
+    for key, function in functions.items():
+        program, compile_seconds = compiled(function, args)
+        runs[key] = (program, args)
+        rows[key] = {
+            "compile": compile_seconds,
+            "temp": program.memory_analysis().temp_size_in_bytes,
+        }
+    for key, (program, _) in runs.items():
+        # A first run, during which memory of the compiler may still be given back.
+        outcome = jax.block_until_ready(program(*args))
+        rows[key]["resident"] = resident(program, args)
+        if key != "forward":
+            gradients[key] = outcome[1][0]
+    repeats = REPEATS if num_steps <= LONG else 1
+    for key, (by_clock, by_processors) in both_medians(runs, repeats).items():
+        rows[key] |= {"seconds": by_clock, "processor_seconds": by_processors}
+    for key, value in gradients.items():
+        rows[key]["error"] = difference(value, gradients["direct"])
+    return {"system": name, "num_steps": num_steps, "stages": stages, "rows": rows}
+
+
+def difference(tree, reference) -> float:
+    """The largest difference over the largest entry."""
+    a, b = (
+        np.concatenate([np.ravel(x) for x in jax.tree.leaves(tree)])
+        for tree in (tree, reference)
+    )
+    return float(np.max(np.abs(a - b)) / np.max(np.abs(b)))
+
+
+def apart(kind: str, *args: Any) -> Any:
+    """The outcome of `kind`, one of PARTS, in a process of its own."""
+    command = [sys.executable, "-m", "benchmarks.gradients", "--part"]
+    done = subprocess.run(
+        [*command, json.dumps([kind, *args])],
+        stdout=subprocess.PIPE,
+        check=True,
+        text=True,
+        env=os.environ | MALLOC,
+    )
+    return json.loads(done.stdout.splitlines()[-1])
+
+
+def compilation(name: str, stages: list[int]) -> list[tuple[int, float, float]]:
+    """Seconds to compile the run and the gradient for each s."""
+    compiled(gradient(problem(name, 2, 2)[0]), problem(name, 2, 2)[1])
+    rows = []
+    for s in stages:
+        loss, args = problem(name, s, 1000)
+        rows.append((s, compiled(loss, args)[1], compiled(gradient(loss), args)[1]))
+    return rows
+
+
+def modes(name: str, stages: int, num_steps: int) -> dict[str, float]:
+    """Times of forward mode and of reverse mode over that of the run.
+
+    The derivative is that of (q, v) at the end with respect to v0, and for reverse mode
+    that of the loss.
+    """
+    example = EXAMPLES[name]()
+    y0 = example.initial_state()
+
+    def end(v, dt):
+        sol = nhjax.integrate(
+            example.system,
+            nhjax.LobattoIIIAB(stages),
+            eqx.tree_at(
+                lambda y: (y.v, y.p),
+                y0,
+                (v, example.system.momentum(0.0, y0.q, v, None)),
+            ),
+            dt=dt,
+            num_steps=num_steps,
+            throw=False,
+        )
+        return jnp.concatenate([sol.ys.q[-1], sol.ys.v[-1]])
+
+    def push(v, dt, *tangents):
+        return jax.jvp(end, (v, dt), tangents)
+
+    def push_five(v, dt, *tangents):
+        return jax.vmap(lambda *tangents: push(v, dt, *tangents))(*tangents)
+
+    point = (y0.v, jnp.asarray(DT))
+    n = y0.v.shape[0]
+    one = (jnp.ones(n), jnp.asarray(1.0))
+    rng = np.random.default_rng(0)
+    five = (jnp.asarray(rng.normal(size=(5, n))), jnp.ones(5))
+
+    def loss(v, dt):
+        return jnp.sum(end(v, dt) ** 2)
+
+    _, linear = jax.linearize(jax.jit(end), *point)
+    runs = {
+        "run": (jax.jit(end), point),
+        "jvp": (jax.jit(push), point + one),
+        "jvp of 5 tangents": (jax.jit(push_five), point + five),
+        f"jacfwd, {n} inputs": (jax.jit(jax.jacfwd(end)), point),
+        f"jacrev, {2 * n} outputs": (jax.jit(jax.jacrev(end)), point),
+        "reverse gradient": (jax.jit(jax.value_and_grad(loss)), point),
+        "a product with jax.linearize's map": (jax.jit(linear), one),
+    }
+    for run in runs.values():
+        seconds(*run)
+    times = medians(runs, REPEATS)
+    return {key: value / times["run"] for key, value in times.items()}
+
+
+def batch(stages: int, num_steps: int, members: int) -> dict[str, float]:
+    """Times of a batch over one, of the run and of the gradient."""
+    loss, (_, dt, parameters) = problem("chaotic", stages, num_steps)
+    q, v = systems.ChaoticSystem().ensemble(members - 1)
+    system = systems.ChaoticSystem().system
+    every = jax.vmap(lambda q, v: nhjax.initial_state(system, q, v))(q, v)
+    first = jax.tree.map(lambda x: x[0], every)
+    runs = {}
+    for key, function in {"run": loss, "gradient": gradient(loss)}.items():
+        batched = jax.vmap(function, in_axes=(0, None, None))
+        runs[key] = (jax.jit(function), (first, dt, parameters))
+        runs[f"batch of {key}s"] = (jax.jit(batched), (every, dt, parameters))
+    for run in runs.values():
+        seconds(*run)
+    times = medians(runs, REPEATS)
+    times["members"] = members
+    return times
+
+
+PARTS = {"case": case, "compilation": compilation, "modes": modes, "batch": batch}
+
+
+def case_table(cases: list[dict[str, Any]]) -> str:
+    """Time over the run's and memory, for each system and number of steps."""
+    rows = []
+    for entry in cases:
+        forward = entry["rows"]["forward"]
+        for key, row in entry["rows"].items():
+            if key == "forward":
+                continue
+            rows.append(
+                [
+                    entry["system"],
+                    str(entry["num_steps"]),
+                    key,
+                    f"{1e6 * forward['seconds'] / entry['num_steps']:.1f}",
+                    f"{row['seconds'] / forward['seconds']:.2f}",
+                    f"{row['processor_seconds'] / forward['processor_seconds']:.2f}",
+                    f"{row['compile'] / forward['compile']:.2f}",
+                    megabytes(row["temp"]),
+                    megabytes(row["resident"]),
+                    number(row["error"]),
+                ]
+            )
+    header = ["system", "N", "adjoint", "run [µs/step]", "gradient / run"]
+    header += ["processor time / run's"]
+    header += ["compile / run's", "temp [MB]", "resident [MB]", "difference"]
+    return markdown_table(header, rows)
+
+
+def megabytes(size: int | None) -> str:
+    """In MB, as far as it is known."""
+    return "" if size is None else f"{size / 1e6:.2f}"
+
+
+def draw(cases: list[dict[str, Any]], path: Path) -> None:
+    """Time and memory against the number of steps."""
+    figure = Figure(figsize=(9, 3.8), layout="constrained")
+    left, right = figure.subplots(1, 2)
+    names = list(dict.fromkeys(entry["system"] for entry in cases))
+    markers = dict(zip(names, "osd^vx", strict=False))
+    keys = list(cases[0]["rows"])
+    steps = np.array(sorted({entry["num_steps"] for entry in cases}), float)
+    for k, key in enumerate(keys):
+        for name in names:
+            mine = [entry for entry in cases if entry["system"] == name]
+            x = [entry["num_steps"] for entry in mine]
+            style = {"color": f"C{k}", "marker": markers[name], "markersize": 4}
+            label = key if name == names[0] else None
+            times = [entry["rows"][key]["seconds"] for entry in mine]
+            left.loglog(x, times, label=label, linewidth=1, **style)
+            memory = [entry["rows"][key]["temp"] / 1e6 for entry in mine]
+            right.loglog(x, memory, linewidth=1, **style)
+    first = cases[0]["rows"]
+    for power, key, name in ((1, "direct", "N"), (0.5, "checkpoints", "√N")):
+        if key in first:
+            line = 2 * first[key]["temp"] / 1e6 * (steps / steps[0]) ** power
+            right.loglog(steps, line, "k:", linewidth=1)
+            right.annotate(name, (steps[-1], line[-1]))
+    for name in names:
+        right.plot([], [], color="0.4", marker=markers[name], label=name)
+    for ax, label in ((left, "seconds"), (right, "temporary memory [MB]")):
+        ax.set_xlabel("number of steps N")
+        ax.set_ylabel(label)
+        ax.legend(fontsize="small")
+    figure.savefig(path, dpi=110)
+
+
+def main() -> None:
+    """Print and save the tables and the figure."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--systems", nargs="+", default=list(EXAMPLES))
+    parser.add_argument("--stages", type=int, default=3)
+    parser.add_argument("--num-steps", type=int, nargs="+", default=[100, 10**3, 10**4])
+    parser.add_argument("--longest", type=int, default=10**5, help="first system alone")
+    parser.add_argument("--adjoints", nargs="+", default=list(ADJOINTS))
+    parser.add_argument("--members", type=int, default=101)
+    parser.add_argument("--smoke", action="store_true", help="little, and not saved")
+    parser.add_argument("--part", help=argparse.SUPPRESS)
+    options = parser.parse_args()
+    jax.config.update("jax_enable_x64", True)
+    if options.part is not None:
+        kind, *args = json.loads(options.part)
+        print(json.dumps(PARTS[kind](*args)))
+        return
+    s, compile_stages, steps = options.stages, list(range(2, 9)), 1000
+    pairs = [(name, n) for name in options.systems for n in options.num_steps]
+    pairs.insert(len(options.num_steps), (options.systems[0], options.longest))
+    if options.smoke:
+        pairs, compile_stages, steps = [("CVT", 20)], [2, 3], 20
+    cases = []
+    for name, num_steps in pairs:
+        cases.append(apart("case", name, s, num_steps, options.adjoints))
+        print(*case_table(cases[-1:]).splitlines()[2:], sep="\n", flush=True)
+    first = pairs[0][0]
+    compilations = apart("compilation", first, compile_stages)
+    ratios = apart("modes", first, s, steps)
+    batches = apart("batch", s, min(steps, 200), options.members)
+    sections = [f"s = {s}, dt = {DT}.", case_table(cases)]
+    rows = [
+        [str(k), f"{a:.2f}", f"{b:.2f}", f"{b / a:.2f}"] for k, a, b in compilations
+    ]
+    header = ["s", "compile run [s]", "compile gradient [s]", "ratio"]
+    sections += [f"{first}, direct:", markdown_table(header, rows)]
+    rows = [[key, f"{value:.2f}"] for key, value in ratios.items()]
+    title = f"{first}, direct, N = {steps}: time over that of the run"
+    sections += [title, markdown_table(["what", "ratio"], rows)]
+    rows = [
+        [key, f"{batches[f'batch of {key}s'] / batches[key]:.1f}"]
+        for key in ("run", "gradient")
+    ]
+    title = f"chaotic, direct: a batch of {options.members} over one"
+    sections += [title, markdown_table(["what", "ratio"], rows)]
+    data = {
+        "cases": cases,
+        "compilation": compilations,
+        "modes": ratios,
+        "batch": batches,
+    }
+    text = "\n\n".join(sections)
+    if options.smoke:
+        print(text)
+        return
+    write("gradients", "Cost of gradients", text, data)
+    draw(cases, RESULTS / "gradients.png")
+
+
+if __name__ == "__main__":
+    main()

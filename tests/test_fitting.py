@@ -1,0 +1,73 @@
+"""The notebooks that fit find the truth, within their error bars, at small size."""
+
+import json
+from functools import cache
+
+import numpy as np
+import pytest
+from notebook_runs import run_notebook
+
+
+FITS = {"fitting", "learning_potential", "steering_unicycle"}
+
+
+@pytest.fixture(scope="module")
+def results_of(tmp_path_factory):
+    """What the last cell of a notebook prints, in JSON; each notebook runs once."""
+
+    @cache
+    def results(name):
+        assert name in FITS
+        return json.loads(run_notebook(name, tmp_path_factory.mktemp(name))[-1]["text"])
+
+    return results
+
+
+@pytest.mark.parametrize("fit", ["sleigh", "ball"])
+def test_fit_recovers_the_truth_from_every_start(results_of, fit):
+    results = results_of("fitting")[fit]
+    truth, estimates, bars = (
+        np.array(results[key]) for key in ("truth", "estimates", "bars")
+    )
+    # Bars that say something: a few percent of the parameter.
+    assert np.all(bars < 0.05 * truth)
+    deviations = np.array(results["deviations_in_bars"])
+    np.testing.assert_array_less(np.abs(estimates - truth), 3 * bars)
+    np.testing.assert_array_less(np.abs(deviations), 3)
+    # |r|² is distributed as χ², of variance twice its mean.
+    freedom = results["degrees_of_freedom"]
+    loss = np.array(results["loss"])
+    np.testing.assert_array_less(np.abs(loss - freedom), 3 * np.sqrt(2 * freedom))
+    # Starts of one experiment end at one minimum.
+    starts = results["starts_per_experiment"]
+    assert starts > 1
+    of_one_experiment = estimates.reshape(-1, starts, truth.size)
+    assert np.all(np.ptp(of_one_experiment, axis=1) < 1e-3 * bars.min(axis=0))
+
+
+def test_network_learns_the_potential_to_what_noise_allows(results_of):
+    results = results_of("learning_potential")
+    loss = np.array(results["loss"])
+    spread = np.sqrt(2 / results["num_data"])
+    assert np.all(loss < 1 + 4 * spread)
+    # A fit of all weights to all data, were it linear, errs by σ √(P/n).
+    assert np.all(np.array(results["held_out_errors"]) < 3 * results["expected_error"])
+    bar = results["potential_bar"]
+    assert bar < 0.1 * results["potential_size"]
+    assert np.all(np.array(results["potential_errors"]) < 3 * bar)
+
+
+def test_learned_system_conserves_its_energy(results_of):
+    results = results_of("learning_potential")
+    first, second = (results[f"energy_error_{x}_half"] for x in ("first", "second"))
+    # Energies are of order one, and h⁴ = 4e-3.
+    assert first < 1e-2
+    assert second < 2 * first
+
+
+def test_steering_reaches_the_pose_with_stationary_effort(results_of):
+    results = results_of("steering_unicycle")
+    assert np.all(np.array(results["misses"]) < 1e-6)
+    assert np.all(np.array(results["fine_misses"]) < 1e-6)
+    # A step that ends the search is what the null space still has of the controls.
+    assert np.all(np.array(results["last_steps"]) < 1e-3)
