@@ -1,10 +1,11 @@
 """Derivatives by the implicit function theorem, and where they are not defined."""
 
 from collections.abc import Callable
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import equinox as eqx
 import jax
+import jax.extend
 import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, PyTree
@@ -79,36 +80,79 @@ def root(
     return Solved(unravel(x), None, converged, num_iterations)
 
 
-def undefined_unless(ok: BoolScalar, tree: X) -> X:
+def undefined_unless(ok: BoolScalar, tree: X, parameters: PyTree[Any]) -> X:
     """The same values, with NaN for derivatives where `ok` is false.
 
-    A derivative that is exactly zero stays so: a loss that leaves out a failed lane has
-    a derivative. The identity is written as a linear equation, because a rule of
+    Those with respect to all that is among the `parameters`, whether or not the values
+    came to depend on it. A derivative of nothing stays zero: a loss that leaves out a
+    failed lane has one. The rule is written as a linear equation, because a rule of
     forward mode is transposed to that of reverse mode, and this one is not linear.
     """
+    parameters = eqx.filter(parameters, eqx.is_inexact_array)
     return jax.tree.map(
-        lambda x: _identity(x, ok) if jnp.issubdtype(x.dtype, jnp.inexact) else x, tree
+        lambda x: (
+            _identity(x, ok, parameters) if jnp.issubdtype(x.dtype, jnp.inexact) else x
+        ),
+        tree,
     )
 
 
 @eqx.filter_custom_jvp
-def _identity(x: Array, ok: BoolScalar) -> Array:
-    del ok
+def _identity(x: Array, ok: BoolScalar, parameters: PyTree[Array]) -> Array:
+    del ok, parameters
     return x
 
 
 @_identity.def_jvp
 def _identity_jvp(primals, tangents):
-    (x, ok), (dx, _) = primals, tangents
+    (x, ok, _), (dx, _, rates) = primals, tangents
 
     def pass_on(_, b):
         return jnp.where(ok | (b == 0), b, jnp.nan)
 
-    if dx is not None:
-        dx = jax.lax.custom_linear_solve(
-            lambda x: x, dx, solve=pass_on, transpose_solve=pass_on
-        )
-    return _identity(x, ok), dx
+    change = sum(jnp.sum(rate) for rate in jax.tree.leaves(rates))
+    if dx is None and not jax.tree.leaves(rates):
+        return _identity(*primals), None
+    dx = jnp.zeros_like(x) if dx is None else dx
+    dx = dx + jnp.where(ok, 0, change).astype(x.dtype)
+    dx = jax.lax.custom_linear_solve(
+        lambda x: x, dx, solve=pass_on, transpose_solve=pass_on
+    )
+    return _identity(*primals), dx
+
+
+class Closed(eqx.Module):
+    """A function and what it closes over, the arrays in this among the leaves.
+
+    So that derivatives reach it where rules of differentiation are our own, which must
+    be given all that is differentiated. As `equinox.filter_closure_convert`, but it
+    takes arrays of any sharding, as there are inside and outside of `jax.shard_map`.
+    """
+
+    consts: list[Array]
+    jaxpr: Any = eqx.field(static=True)
+    treedef: Any = eqx.field(static=True)
+
+    def __init__(self, function: Callable[..., PyTree[Array]], *example: Any):
+        dynamic, static = eqx.partition(example, eqx.is_array)
+        closed, shape = jax.make_jaxpr(
+            lambda dynamic: function(*eqx.combine(dynamic, static)), return_shape=True
+        )(dynamic)
+        self.consts, self.jaxpr = list(closed.consts), closed.jaxpr
+        self.treedef = jax.tree.structure(shape)
+
+    def __call__(self, *args: Any) -> PyTree[Array]:
+        arrays = jax.tree.leaves(eqx.filter(args, eqx.is_array))
+        closed = jax.extend.core.ClosedJaxpr(self.jaxpr, self.consts)
+        out = jax.extend.core.jaxpr_as_fun(closed)(*arrays)
+        return jax.tree.unflatten(self.treedef, out)
+
+
+def is_given(tangents: PyTree[Any]) -> PyTree[bool]:
+    """Which leaves of a tree of tangents are not the `None` of a symbolic zero."""
+    return jax.tree.map(
+        lambda leaf: leaf is not None, tangents, is_leaf=lambda leaf: leaf is None
+    )
 
 
 def masked(ok: BoolScalar, tree: X) -> X:

@@ -16,7 +16,7 @@ from ._checks import (
 )
 from ._custom_types import Args, FloatScalar, FloatScalarLike
 from ._errors import Check, require
-from ._implicit import undefined_unless
+from ._implicit import Closed, undefined_unless
 from ._interpolation import (
     DenseInterpolation,
     interpolate,
@@ -180,7 +180,7 @@ def _integrate(
         num_steps,
         args,
         meter,
-        eqx.filter_closure_convert(saveat.fn, t0, y0, args),
+        Closed(saveat.fn, t0, y0, args),
         saveat.steps,
         num_records,
         record_slots,
@@ -188,7 +188,8 @@ def _integrate(
     start = loop.start(y0)
     carry, rows = adjoint.run(loop, start)
     successful = carry.result == RESULTS.successful
-    state, rows = undefined_unless(successful, (carry.node.state, rows))
+    given = (system, y0, t0, dt, args)
+    state, rows = undefined_unless(successful, (carry.node.state, rows), given)
     t1 = loop.time(num_steps)
 
     def one(saved: PyTree[Array]) -> PyTree[Array]:

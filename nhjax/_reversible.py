@@ -53,7 +53,8 @@ def _run(arguments: tuple[Loop, Carry]) -> tuple[Carry, Rows]:
 @_run.def_fwd
 def _run_fwd(perturbed, arguments):
     del perturbed
-    carry, rows = _run(arguments)
+    # Not `_run`, which would refuse forward mode over this reverse mode.
+    carry, rows = DirectAdjoint().run(*arguments)
     # Buffers stand for their shapes alone, and are not kept.
     shapes = jax.eval_shape(lambda: rows)
     return (carry, rows), (carry, shapes)

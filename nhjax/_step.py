@@ -1,4 +1,4 @@
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -8,6 +8,7 @@ from jaxtyping import Array, Float, Int, PyTree
 from ._checks import all_finite
 from ._compensated import two_sum
 from ._custom_types import Args, BoolScalar, FloatScalar
+from ._implicit import frozen, is_given, masked
 from ._iteration import Solved
 from ._linearisation import Linearisation, linearise
 from ._method import AbstractMethod
@@ -57,13 +58,35 @@ def first_node(
     Closures that do not carry the multiplier report λ_c from the first node on.
     """
     lin = linearise(system, t, y0.q, system.fibre(y0), args)
+    multiplier = _continuous_multiplier((system, t, y0.q, system.fibre(y0), args))
     carried = method.multiplier == "propagated"
     return Node(
-        state=State(y0.q, y0.v, y0.p, y0.multiplier if carried else lin.multiplier),
+        state=State(y0.q, y0.v, y0.p, y0.multiplier if carried else multiplier),
         q_compensation=system.manifold_of(y0.q).no_compensation(y0.q),
         p_compensation=jnp.zeros_like(y0.p),
-        lin=jax.lax.stop_gradient(lin),
+        lin=frozen(lin),
     )
+
+
+@eqx.filter_custom_jvp
+def _continuous_multiplier(arguments: tuple[Any, ...]) -> Float[Array, " l"]:
+    return linearise(*arguments).multiplier
+
+
+@_continuous_multiplier.def_jvp
+def _continuous_multiplier_jvp(primals, tangents):
+    # No derivative where there is no multiplier: NaN times zero would be NaN even for a
+    # lane that nothing asks for.
+    (arguments,), (rates,) = primals, tangents
+    multiplier = _continuous_multiplier(arguments)
+    ok = jnp.all(jnp.isfinite(multiplier))
+    perturbed, fixed = eqx.partition(arguments, is_given(rates))
+    _, change = jax.jvp(
+        lambda perturbed: linearise(*eqx.combine(perturbed, fixed)).multiplier,
+        (perturbed,),
+        (masked(ok, rates),),
+    )
+    return multiplier, masked(ok, change)
 
 
 def step(

@@ -1,15 +1,13 @@
 """A step with its derivative: the implicit function theorem at the converged stages."""
 
 from functools import partial
-from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import PyTree
 
 from ._custom_types import Args, BoolScalar, FloatScalar
-from ._implicit import frozen, masked, solve_contraction
+from ._implicit import frozen, is_given, masked, solve_contraction
 from ._linearisation import linearise
 from ._method import AbstractMethod
 from ._newton import AbstractStageSolver
@@ -67,7 +65,7 @@ def _differentiable_step_jvp(primals, tangents):
     parameters, method, solver, node, skip = primals
     outcome = differentiable_step(*primals)
     x, ok = outcome.stages, ~skip & (outcome.result == RESULTS.successful)
-    perturbed, fixed = eqx.partition(parameters, _is_given(tangents[0]))
+    perturbed, fixed = eqx.partition(parameters, is_given(tangents[0]))
 
     stages = _stage_system(parameters, method)
     x0 = stages.starting_values(parameters.system.fibre(parameters.state), node.lin)
@@ -87,7 +85,9 @@ def _differentiable_step_jvp(primals, tangents):
 
         _, b = jax.jvp(lambda theta: corrected(theta, x), (perturbed,), (rates,))
         _, contraction = jax.linearize(lambda x: corrected(perturbed, x), x)
-        dx = solve_contraction(contraction, b, max_iterations=solver.max_iterations)
+        # From nothing, where the iteration of the step started from a good guess.
+        limit = 2 * solver.max_iterations
+        dx = solve_contraction(contraction, b, max_iterations=limit)
         _, dend = jax.jvp(end, (perturbed, x), (rates, masked(ok, dx)))
         return masked(ok, (dx, *dend))
 
@@ -97,12 +97,6 @@ def _differentiable_step_jvp(primals, tangents):
         none,
         change(perturbed, x, tangents[0]),
         is_leaf=lambda leaf: leaf is None,
-    )
-
-
-def _is_given(tangents: PyTree[Any]) -> PyTree[bool]:
-    return jax.tree.map(
-        lambda leaf: leaf is not None, tangents, is_leaf=lambda leaf: leaf is None
     )
 
 

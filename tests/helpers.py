@@ -145,3 +145,44 @@ def recorded(name, stages, closure, solver):
     """The run of a problem from its initial state."""
     y0 = problem(name)[1]
     return integrate_recorded(name, stages, closure, solver, y0, RECORDED_STEP)
+
+
+def direction(tree, seed=0):
+    """A random direction in the space of `tree`, each leaf by its own size."""
+    rng = np.random.default_rng(seed)
+
+    def leaf(x):
+        size = max(float(jnp.max(jnp.abs(x), initial=0.0)), 0.3)
+        signs = rng.choice([-1.0, 1.0], x.shape)
+        return jnp.asarray(size * signs * rng.uniform(0.3, 1.0, x.shape), x.dtype)
+
+    return jax.tree.map(leaf, tree)
+
+
+def moved(tree, along, epsilon):
+    """The tree, `epsilon` along a direction."""
+    return jax.tree.map(lambda x, d: x + epsilon * d, tree, along)
+
+
+def dot(first, second):
+    """The scalar product of two trees."""
+    products = jax.tree.map(lambda x, y: jnp.sum(x * y), first, second)
+    return sum(jax.tree.leaves(products))
+
+
+def central_difference(function, epsilon):
+    """The derivative at 0 of a function of a float, to order 6."""
+    odd = [
+        np.asarray(function(k * epsilon)) - np.asarray(function(-k * epsilon))
+        for k in (1, 2, 3)
+    ]
+    return (45 * odd[0] - 9 * odd[1] + odd[2]) / (60 * epsilon)
+
+
+def scalar(tree, seed=1):
+    """A smooth scalar that depends on every number in a tree."""
+    rng = np.random.default_rng(seed)
+    return sum(
+        jnp.sum(jnp.asarray(rng.uniform(0.5, 1.5, x.shape), x.dtype) * jnp.sin(x))
+        for x in jax.tree.leaves(tree)
+    )

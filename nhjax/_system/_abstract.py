@@ -13,6 +13,7 @@ from .._custom_types import (
     PhaseFunction,
     PositionFunction,
 )
+from .._implicit import Closed
 from .._linearisation import linearise
 from .._manifold import AbstractLieGroup, Euclidean
 from .._state import State
@@ -103,10 +104,7 @@ class AbstractMechanicalSystem(eqx.Module):
         return getattr(y, self.fibre_name)
 
     def closed(self, t: FloatScalar, y: State, args: Args) -> Self:
-        """This, with what its functions close over among its leaves.
-
-        So that derivatives reach it, wherever rules of differentiation are our own.
-        """
+        """This, with what its functions close over among its leaves."""
         phase, position = (t, y.q, self.fibre(y), args), (t, y.q, args)
         examples = {
             self.generator: phase,
@@ -115,10 +113,7 @@ class AbstractMechanicalSystem(eqx.Module):
             "force": phase,
         }
         names = [name for name in examples if getattr(self, name) is not None]
-        functions = [
-            eqx.filter_closure_convert(getattr(self, name), *examples[name])
-            for name in names
-        ]
+        functions = [Closed(getattr(self, name), *examples[name]) for name in names]
         return eqx.tree_at(
             lambda system: [getattr(system, name) for name in names], self, functions
         )
