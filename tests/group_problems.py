@@ -4,7 +4,6 @@ from collections.abc import Callable
 from functools import cache, partial
 from typing import NamedTuple
 
-import equinox as eqx
 import group_mechanics as by_hand
 import jax
 import jax.numpy as jnp
@@ -13,10 +12,7 @@ from group_mechanics import MatrixGroup
 from jaxtyping import Array
 
 import nhjax
-from nhjax._iteration import Solved
-from nhjax._linearisation import Linearisation
-from nhjax._newton import AbstractStageSolver, Evaluation
-from nhjax._stages import Stages, StageSystem
+from nhjax._stages import Stages
 from nhjax._state import State
 from nhjax._step import first_node, step
 
@@ -339,22 +335,6 @@ class SolvedStep(NamedTuple):
     multiplier: Array
 
 
-class _Spy(AbstractStageSolver):
-    """Another solver, whose solution is kept for whoever runs the step."""
-
-    solver: AbstractStageSolver
-    seen: list = eqx.field(static=True)
-    max_iterations: int = eqx.field(static=True, default=1)
-    tolerance: float = 0.0
-
-    def solve(
-        self, stages: StageSystem, x0: Stages, lin: Linearisation, skip: Array
-    ) -> Solved[Stages, Evaluation]:
-        solved = self.solver.solve(stages, x0, lin, skip)
-        self.seen.append((solved.x, solved.converged))
-        return solved
-
-
 def solved_steps(
     system, method, solver, y0: State, h: float, num_steps: int = 3
 ) -> list[SolvedStep]:
@@ -362,15 +342,12 @@ def solved_steps(
     never = jnp.asarray(False)
 
     def advance(node, t):
-        seen = []
-        spy = _Spy(solver=solver, seen=seen)
-        outcome = step(system, method, spy, t, jnp.asarray(h), node, None, never)
-        [(x, converged)] = seen
-        record = outcome.record
+        outcome = step(system, method, solver, t, jnp.asarray(h), node, None, never)
+        x, record = outcome.stages, outcome.record
         taken = SolvedStep(
             node.state, outcome.node.state, x, record.force, record.multiplier
         )
-        return outcome.node, (taken, converged)
+        return outcome.node, (taken, outcome.result == nhjax.RESULTS.successful)
 
     # Compiling without optimisation takes half the time.
     @partial(jax.jit, compiler_options={"xla_backend_optimization_level": 0})
