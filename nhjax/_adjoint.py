@@ -35,8 +35,8 @@ def _advance(loop: Loop, state: _Run, k: Int[Array, ""]) -> _Run:
 class DirectAdjoint(AbstractAdjoint):
     """Keep the stages of every step: memory O(num_steps), the least time.
 
-    Forward mode (`jax.jvp`, `jax.jacfwd`, `jax.linearize`) and derivatives of any order
-    work as well.
+    Forward mode (`jax.jvp`, `jax.jacfwd`, `jax.linearize`) and second derivatives
+    (`jax.hessian`, forward over reverse, reverse over forward) work as well.
 
     !!! example
 
@@ -69,7 +69,7 @@ class RecursiveCheckpointAdjoint(AbstractAdjoint):
     there are two levels. Each level beyond the first costs another forward run: with L
     levels and num_steps = checkpoints^L memory is O(L checkpoints).
 
-    Forward mode and derivatives of any order work as well.
+    Forward mode and second derivatives work as with `DirectAdjoint`.
 
     **Arguments:**
 
