@@ -118,7 +118,6 @@ ELSEWHERE = {
     "unicycle": (systems.Unicycle(), LobattoIIIAB(2)),
     "ball": (systems.TurntableBall(), LobattoIIIAB(2, "propagated")),
     "Suslov": (systems.Suslov(), LobattoIIIAB(2, "consistent")),
-    "heavy top": (systems.HeavyTop(), LobattoIIIAB(2)),
     "rod sleigh": (systems.RodSleigh(), LobattoIIIAB(2)),
 }
 
