@@ -60,6 +60,36 @@ def test_gradients_of_a_batch_are_those_of_its_lanes(axes, single):
             np.testing.assert_allclose(got[k], expected, rtol=1e-12, atol=1e-13)
 
 
+def test_gradients_of_a_batch_compiled_within_where_some_results_are_of_no_lane():
+    """The times of nodes are those of all lanes, whichever of them failed."""
+
+    def ends(mass, q):
+        example = eqx.tree_at(lambda e: e.mass, PARTICLE, mass)
+
+        def end(q):
+            y0 = nhjax.initial_state(example.system, q, PARTICLE.v0, project=True)
+            return nhjax.integrate(
+                example.system,
+                LobattoIIIAB(2),
+                y0,
+                dt=0.1,
+                num_steps=3,
+                saveat=nhjax.SaveAt(steps=True, fn=lambda t, y, args: (t, y.q)),
+            ).ys
+
+        return jax.vmap(end)(q)
+
+    def loss(mass, q):
+        ts, positions = ends(mass, q)
+        return jnp.sum(positions**2) + jnp.sum(ts)
+
+    masses = jnp.array([1.0, 1.5])
+    got = jax.jit(jax.vmap(jax.grad(loss), in_axes=(0, None)))(masses, LANES[0])
+    lane = jax.jit(jax.grad(loss))
+    expected = [sum(lane(mass, q[None]) for q in LANES[0]) for mass in masses]
+    np.testing.assert_allclose(got, jnp.stack(expected), rtol=1e-12)
+
+
 def test_gradients_of_an_ensemble_are_those_of_its_members():
     chaotic = systems.ChaoticSystem()
 
