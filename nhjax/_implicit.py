@@ -10,6 +10,7 @@ import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, PyTree
 
+from ._contraction import with_small_products
 from ._custom_types import BoolScalar
 from ._iteration import dense_increment, iterate, relative_size, Solved
 
@@ -141,6 +142,7 @@ class Closed(eqx.Module):
         closed, shape = jax.make_jaxpr(
             lambda dynamic: function(*eqx.combine(dynamic, static)), return_shape=True
         )(dynamic)
+        closed = jax.make_jaxpr(with_small_products(closed))(*jax.tree.leaves(dynamic))
         self.consts, self.jaxpr = list(closed.consts), closed.jaxpr
         self.treedef = jax.tree.structure(shape)
 

@@ -16,11 +16,12 @@ from ._checks import (
     real_scalar,
     require_manifold,
 )
+from ._contraction import inverse
 from ._custom_types import Args, BoolScalar, FloatScalarLike
 from ._errors import DTypeError, require, ShapeError
 from ._implicit import root
 from ._initial_checks import check_found, conditioning, Found
-from ._linearisation import inverse, linearise
+from ._linearisation import linearise
 from ._scales import position_scale, violation_scale
 from ._state import State
 from ._system import AbstractMechanicalSystem, HamiltonianSystem, LagrangianSystem

@@ -23,6 +23,7 @@ from ._interpolation import (
     require_collocation,
     step_index,
 )
+from ._kernel import in_one_kernel
 from ._loop import Loop
 from ._method import AbstractMethod
 from ._newton import AbstractStageSolver, SimplifiedNewton
@@ -185,8 +186,12 @@ def _integrate(
         num_records,
         record_slots,
     )
-    start = loop.start(y0)
-    carry, rows = adjoint.run(loop, start)
+
+    def run(loop: Loop, y0: State):
+        start = loop.start(y0)
+        return start.node.state, *adjoint.run(loop, start)
+
+    start, carry, rows = in_one_kernel(run, loop, y0)
     successful = carry.result == RESULTS.successful
     given = (system, y0, t0, dt, args)
     state, rows = undefined_unless(successful, (carry.node.state, rows), given)
@@ -195,7 +200,7 @@ def _integrate(
     def one(saved: PyTree[Array]) -> PyTree[Array]:
         return jax.tree.map(lambda x: x[None], saved)
 
-    pieces = [one(loop.saved(t0, start.node.state))] if saveat.t0 else []
+    pieces = [one(loop.saved(t0, start))] if saveat.t0 else []
     if saveat.steps:
         pieces.append(jax.tree.map(lambda x: x[:-1], rows.saved))
     if ts is not None and sampled is not None and record_slots is not None:

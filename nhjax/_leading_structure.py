@@ -2,7 +2,8 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from ._linearisation import inverse, Linearisation
+from ._contraction import contract, inverse
+from ._linearisation import Linearisation
 from ._stages import Stages, StageSystem
 
 
@@ -32,7 +33,7 @@ class LeadingStructure(eqx.Module):
         self, stages: StageSystem, x: Stages, residual: Float[Array, "s n"]
     ) -> Stages:
         """u - N⁻¹ r_u for the stages, and the velocities that belong to them."""
-        change = residual @ self.momentum_inverse.T
+        change = contract("rn,kn->rk", residual, self.momentum_inverse)
         if not stages.hamiltonian:
             return eqx.tree_at(lambda z: z.velocity, x, x.velocity - change)
         x = eqx.tree_at(lambda z: z.momentum, x, x.momentum - change)
@@ -40,7 +41,9 @@ class LeadingStructure(eqx.Module):
 
     def correct_nodes(self, x: Stages, residual: Float[Array, "r n"]) -> Stages:
         """u - N⁻¹ r_v for the nodes."""
-        node_fibre = x.node_fibre - residual @ self.momentum_inverse.T
+        node_fibre = x.node_fibre - contract(
+            "rn,kn->rk", residual, self.momentum_inverse
+        )
         return eqx.tree_at(lambda z: z.node_fibre, x, node_fibre)
 
     def correct_multipliers(
@@ -52,21 +55,21 @@ class LeadingStructure(eqx.Module):
     ) -> Stages:
         """Change the free multipliers so that the constraints hold."""
         residual = jnp.concatenate([kinematic.reshape(-1), holonomic.reshape(-1)])
-        change = -(self.schur_inverse @ residual)
+        change = -contract("cd,d->c", self.schur_inverse, residual)
         h_dy = change[: x.closure.size].reshape(x.closure.shape)
         h_dholonomic = change[x.closure.size :].reshape(x.holonomic.shape)
         h_dlambda = stages.free_multipliers(h_dy, h_dholonomic)
         # h K⁻¹ Bᵀ δΛ; h is divided out only where multipliers themselves are wanted.
-        push = jnp.einsum("jnm,jm->jn", self.reaction, h_dlambda)
+        push = contract("jnm,jm->jn", self.reaction, h_dlambda)
         a_hat, momentum = stages.coefficients("a_hat"), x.momentum
         velocity_push = push
         if stages.hamiltonian:
-            velocity_push = jnp.einsum("jnm,jm->jn", self.velocity_reaction, h_dlambda)
-            momentum = momentum + a_hat @ push
+            velocity_push = contract("jnm,jm->jn", self.velocity_reaction, h_dlambda)
+            momentum = momentum + contract("ij,jn->in", a_hat, push)
         return Stages(
-            velocity=x.velocity + a_hat @ velocity_push,
+            velocity=x.velocity + contract("ij,jn->in", a_hat, velocity_push),
             momentum=momentum,
-            node_fibre=x.node_fibre + stages.node_weights @ push,
+            node_fibre=x.node_fibre + contract("ij,jn->in", stages.node_weights, push),
             closure=x.closure + h_dy / stages.h,
             holonomic=x.holonomic + h_dholonomic / stages.h,
             end_acceleration=x.end_acceleration,
@@ -95,8 +98,8 @@ def leading_structure(
         reaction = jnp.zeros((stages.method.stages, n, 0), stages.p.dtype)
         return LeadingStructure(lin.momentum_inverse, reaction, reaction, nothing, lin)
     jacobian = jnp.concatenate([lin.jacobian[None], stages.constraint_jacobian(x0)])
-    reaction = jnp.einsum("kn,jmn->jkm", lin.metric_inverse, jacobian)
-    blocks = jnp.einsum("ian,jnb->ijab", jacobian[1:], reaction)
+    reaction = contract("kn,jmn->jkm", lin.metric_inverse, jacobian)
+    blocks = contract("ian,jnb->ijab", jacobian[1:], reaction)
     end = eqx.tree_at(
         lambda z: (z.jacobian, z.reaction, z.compliance_inverse),
         lin,
@@ -121,16 +124,18 @@ def _schur(
     a, a_hat, b = (stages.coefficients(name) for name in ("a", "a_hat", "b"))
     rows = []
     if m:
-        nodes = jnp.einsum("ij,ijab->iajb", a[1:], blocks[:, :, :m])
+        nodes = contract("ij,ijab->iajb", a[1:], blocks[:, :, :m])
         rows.append(nodes.reshape((s - 1) * m, s, m + k))
     if k:
-        positions = jnp.einsum("ij,ijab->iajb", a[1:] @ a_hat, blocks[:, :, m:])
+        positions = contract(
+            "ij,ijab->iajb", contract("ik,kj->ij", a[1:], a_hat), blocks[:, :, m:]
+        )
         rows.append(positions.reshape((s - 1) * k, s, m + k))
-        rows.append(jnp.einsum("j,jab->ajb", b, blocks[-1, :, m:]))
+        rows.append(contract("j,jab->ajb", b, blocks[-1, :, m:]))
     change = jnp.concatenate(rows)
     columns = []
     if m:
-        closure = jnp.einsum("cjb,jl->clb", change[:, :, :m], stages.closure("E"))
+        closure = contract("cjb,jl->clb", change[:, :, :m], stages.closure("E"))
         columns.append(closure.reshape(change.shape[0], -1))
     if k:
         columns.append(change[:, :, m:].reshape(change.shape[0], -1))

@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, PyTree
 
+from ._contraction import contract, inverse
 from ._custom_types import Args, FloatScalar
 
 
@@ -59,9 +60,10 @@ class Linearisation(eqx.Module):
         self, momentum_residual: Float[Array, " n"], hidden_residual: Float[Array, " l"]
     ) -> tuple[Float[Array, " n"], Float[Array, " l"]]:
         """(u̇, λ) with N u̇ - R λ = `momentum_residual`, B u̇ = `hidden_residual`."""
-        free = self.momentum_inverse @ momentum_residual
-        multiplier = self.compliance_inverse @ (hidden_residual - self.jacobian @ free)
-        return free + self.reaction @ multiplier, multiplier
+        free = contract("kn,n->k", self.momentum_inverse, momentum_residual)
+        hidden = hidden_residual - contract("ln,n->l", self.jacobian, free)
+        multiplier = contract("kl,l->k", self.compliance_inverse, hidden)
+        return free + contract("nl,l->n", self.reaction, multiplier), multiplier
 
 
 def _momentum_and_constraint(
@@ -129,8 +131,8 @@ def linearise(
         momentum_by_fibre if system.fibre_name == "v" else system.metric(t, q, u, args)
     )
     metric_inverse = inverse(metric)
-    reaction = metric_inverse @ jacobian_t
-    compliance = jacobian_t.T @ reaction
+    reaction = contract("kn,nl->kl", metric_inverse, jacobian_t)
+    compliance = contract("nk,nl->kl", jacobian_t, reaction)
     lin = Linearisation(
         metric_inverse=metric_inverse,
         jacobian=jacobian_t.T,
@@ -146,13 +148,3 @@ def linearise(
     return eqx.tree_at(
         lambda x: (x.acceleration, x.multiplier), lin, (acceleration, multiplier)
     )
-
-
-def inverse(matrix: Float[Array, "m m"]) -> Float[Array, "m m"]:
-    """The inverse of a tiny matrix; not finite where there is none."""
-    # One constraint is by far the commonest case, none the cheapest.
-    if matrix.shape[0] == 0:
-        return matrix
-    if matrix.shape[0] == 1:
-        return 1 / matrix
-    return jnp.linalg.inv(matrix)

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
+from ._contraction import contract
 from ._custom_types import FloatScalar, FloatScalarLike
 from ._iteration import dense_increment, iterate, relative_size, Solved
 from ._leading_structure import leading_structure, LeadingStructure
@@ -229,13 +230,14 @@ def _increment_size(
     fibre = [x.node_fibre, x.momentum if stages.hamiltonian else x.velocity]
     changes = [x_next.node_fibre - x.node_fibre, x_next.velocity - x.velocity]
     if stages.hamiltonian:
-        changes[1] = changes[1] @ lin.metric_inverse.T
+        changes[1] = contract("sn,kn->sk", changes[1], lin.metric_inverse)
         changes.append(x_next.momentum - x.momentum)
     if stages.constrained:
         # Multipliers count by their effect on u, h N⁻¹ R δΛ, on its own: Λ can still be
         # wrong where the stages and nodes happen to be right.
         before, after = stages.multiplier_change(x), stages.multiplier_change(x_next)
-        changes.append(stages.h * ((after - before) @ lin.reaction.T))
+        change = contract("sl,nl->sn", after - before, lin.reaction)
+        changes.append(stages.h * change)
     size = relative_size(jnp.concatenate(changes), jnp.concatenate(fibre), rest)
     if stages.chart.manifold.is_flat:
         return size

@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PyTree
 
+from ._contraction import contract
 from ._custom_types import Args, FloatScalar
 from ._linearisation import Linearisation
 from ._stages import StageSystem
@@ -62,11 +63,17 @@ def fibre_scale(stages: StageSystem, lin: Linearisation) -> FloatScalar:
     h = jnp.abs(stages.h)
     rate = jnp.max(jnp.abs(lin.acceleration))
     if stages.constrained:
-        rate = rate + jnp.max(jnp.abs(lin.reaction) @ jnp.abs(lin.multiplier))
+        rate = rate + jnp.max(
+            contract("nl,l->n", jnp.abs(lin.reaction), jnp.abs(lin.multiplier))
+        )
     scale = h * rate
     if stages.num_holonomic:
         m = stages.num_nonholonomic
         sizes = position_scale(stages.system, stages.t, stages.q, stages.args)
-        response = jnp.abs(lin.reaction) @ jnp.abs(lin.compliance_inverse[:, m:])
-        scale = scale + jnp.max(response @ sizes) / h
+        response = contract(
+            "nl,lk->nk",
+            jnp.abs(lin.reaction),
+            jnp.abs(lin.compliance_inverse[:, m:]),
+        )
+        scale = scale + jnp.max(contract("nk,k->n", response, sizes)) / h
     return scale

@@ -6,6 +6,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, PyTree
 
 from ._chart import Chart
+from ._contraction import contract
 from ._custom_types import Args, BoolScalar, FloatScalar
 from ._linearisation import Linearisation, motion_residual
 from ._method import AbstractMethod
@@ -146,9 +147,8 @@ class StageSystem(eqx.Module):
         push = self.h * lin.acceleration
         stage_times = jnp.sum(self.coefficients("a_hat"), axis=1)
         node_times = jnp.sum(self.node_weights, axis=1)
-        free = jnp.ones((s - 1,), u.dtype)
-        if self.symmetric:
-            free = free.at[0].set(0)  # ν vanishes with h, the others are multipliers
+        # ν of the symmetric closure vanishes with h, all others are multipliers.
+        free = (jnp.arange(s - 1) >= int(self.symmetric)).astype(u.dtype)
         nothing = jnp.zeros((0,), u.dtype)
         fibre = u[None] + jnp.outer(stage_times, push)
         velocity, momentum = fibre, jnp.zeros((s, 0), u.dtype)
@@ -195,7 +195,7 @@ class StageSystem(eqx.Module):
         """E y beside the holonomic multipliers."""
         if not self.num_nonholonomic:
             return holonomic
-        kinematic = self.closure("E") @ closure
+        kinematic = contract("sr,rm->sm", self.closure("E"), closure)
         if not self.num_holonomic:
             return kinematic
         return jnp.concatenate([kinematic, holonomic], axis=1)
@@ -209,14 +209,14 @@ class StageSystem(eqx.Module):
     def increment(self, x: Stages) -> Float[Array, " n"]:
         """ξ = h Σ b_j H^j, which takes q_k to q_{k+1}."""
         # h * (b @ H): rounding h b_j once and for all would bias every step.
-        return self.h * (self.coefficients("b") @ x.velocity)
+        return self.h * contract("s,sn->n", self.coefficients("b"), x.velocity)
 
     def stage_increments(self, x: Stages) -> Float[Array, "s n"]:
         """Ξ^i = h Σ a_ij H^j."""
-        return self.h * (self.coefficients("a") @ x.velocity)
+        return self.h * contract("ij,jn->in", self.coefficients("a"), x.velocity)
 
     def _node_increments(self, x: Stages) -> Float[Array, "r n"]:
-        return self.h * (self.node_weights @ x.velocity)
+        return self.h * contract("ij,jn->in", self.node_weights, x.velocity)
 
     def in_chart(self, x: Stages) -> BoolScalar:
         """Whether stages, nodes and end lie where the chart is invertible."""
@@ -251,9 +251,14 @@ class StageSystem(eqx.Module):
         momentum, chart_force = self.chart.to_chart(xi, x.velocity, momentum, force)
         transported = self.chart.to_origin(xi, force)
         base = self.chart.base_momentum(
-            self.increment(x), self.p, h * (b @ transported), h * (b @ chart_force)
+            self.increment(x),
+            self.p,
+            h * contract("s,sn->n", b, transported),
+            h * contract("s,sn->n", b, chart_force),
         )
-        residual = momentum - (base[None] + h * (a_hat @ chart_force))
+        residual = momentum - (
+            base[None] + h * contract("ij,jn->in", a_hat, chart_force)
+        )
         scale = jnp.max(jnp.abs(momentum)) + jnp.max(jnp.abs(h * chart_force))
         return StageForces(transported, multiplier, residual, scale)
 
@@ -268,7 +273,7 @@ class StageSystem(eqx.Module):
         momentum = jax.vmap(lambda t, q, u: self.system.momentum(t, q, u, self.args))(
             self.node_times, self.node_positions(x), x.node_fibre
         )
-        known = self.p[None] + self.h * (self.node_weights @ force)
+        known = self.p[None] + self.h * contract("ij,jn->in", self.node_weights, force)
         carried = jax.vmap(self.chart.from_origin)(self._node_increments(x), known)
         return momentum - carried
 

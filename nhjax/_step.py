@@ -7,6 +7,7 @@ from jaxtyping import Array, Float, Int, PyTree
 
 from ._checks import all_finite
 from ._compensated import two_sum
+from ._contraction import contract
 from ._custom_types import Args, BoolScalar, FloatScalar
 from ._implicit import frozen, is_given, masked
 from ._iteration import Solved
@@ -123,7 +124,7 @@ def step(
     q, q_compensation = manifold.advance(
         state.q, stages.increment(x), node.q_compensation
     )
-    p_increment = h * (stages.coefficients("b") @ forces.force)
+    p_increment = h * contract("s,sn->n", stages.coefficients("b"), forces.force)
     p, p_compensation = two_sum(state.p, p_increment + node.p_compensation)
     p, p_compensation = stages.chart.carry(stages.increment(x), p, p_compensation)
     u = p if stages.hamiltonian else x.node_fibre[-1]

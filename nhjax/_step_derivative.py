@@ -8,6 +8,7 @@ import jax.numpy as jnp
 
 from ._custom_types import Args, BoolScalar, FloatScalar
 from ._implicit import frozen, is_given, masked, solve_contraction
+from ._kernel import in_one_kernel
 from ._linearisation import linearise
 from ._method import AbstractMethod
 from ._newton import AbstractStageSolver
@@ -63,7 +64,7 @@ def differentiable_step(
 @differentiable_step.def_jvp
 def _differentiable_step_jvp(primals, tangents):
     parameters, method, solver, node, skip = primals
-    outcome = differentiable_step(*primals)
+    outcome = compiled_step(*primals)
     x, ok = outcome.stages, ~skip & (outcome.result == RESULTS.successful)
     perturbed, fixed = eqx.partition(parameters, is_given(tangents[0]))
 
@@ -98,6 +99,12 @@ def _differentiable_step_jvp(primals, tangents):
         change(perturbed, x, tangents[0]),
         is_leaf=lambda leaf: leaf is None,
     )
+
+
+# Where JAX splits a scan into what is known and what is linear, it drops the rules of
+# functions, but not those of primitives. Without its rule a step could be
+# differentiated in reverse mode once, and not again.
+compiled_step = partial(in_one_kernel, differentiable_step)
 
 
 def _stage_system(parameters: Parameters, method: AbstractMethod) -> StageSystem:

@@ -1,3 +1,20 @@
+# ruff: noqa: E402 -- libraries read the environment when they are loaded.
+import gc
+import os
+
+
+# Matrices of some 50 rows are solved in less time than threads take to meet, and the
+# workers of pytest-xdist leave no core to wait on.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
+# Nearly all the time goes into tracing and compiling programs that run once, hence the
+# compiler's older and quicker code generator, in one piece rather than in 32. The
+# backend reads this when it starts; what the environment says comes last and wins.
+QUICK_FLAGS = (
+    "--xla_cpu_use_fusion_emitters=false --xla_cpu_parallel_codegen_split_count=1"
+)
+os.environ["XLA_FLAGS"] = f"{QUICK_FLAGS} {os.environ.get('XLA_FLAGS', '')}".strip()
+
 import jax
 import pytest
 
@@ -7,16 +24,25 @@ jax.config.update("jax_numpy_dtype_promotion", "strict")
 jax.config.update("jax_numpy_rank_promotion", "raise")
 
 
+@pytest.fixture(autouse=True, scope="session")
+def rare_garbage_collection():
+    """Tracing makes a great many objects, most of which live: looking costs a tenth."""
+    gc.collect()
+    gc.freeze()
+    gc.set_threshold(100_000, 20, 20)
+
+
+@pytest.fixture(autouse=True, scope="module")
+def quick_compilation():
+    """Most programs run once, and optimising them takes longer than running them."""
+    jax.config.update("jax_disable_most_optimizations", True)
+    yield
+    jax.config.update("jax_disable_most_optimizations", False)
+
+
 @pytest.fixture(autouse=True, scope="module")
 def few_compiled_programs():
     """Drop the programs of a module: they hold memory maps, which are limited."""
     yield
     jax.clear_caches()
-
-
-@pytest.fixture(scope="module")
-def quick_compilation():
-    """For modules of many programs that run once: optimising them takes longest."""
-    jax.config.update("jax_disable_most_optimizations", True)
-    yield
-    jax.config.update("jax_disable_most_optimizations", False)
+    gc.collect()

@@ -2,6 +2,7 @@
 
 from functools import cache
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -108,6 +109,80 @@ def side_by_side_state():
     """The consistent states of `BESIDE` and of the driven system, one after another."""
     states = [gallery_state(name)[1] for name in BESIDE] + [driven_state()]
     return jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *states)
+
+
+class SideBySide(eqx.Module):
+    """Examples that do not know of one another, as one program on a product."""
+
+    examples: tuple
+
+    @property
+    def manifold(self):
+        """The product of the examples' manifolds."""
+        return nhjax.ProductGroup(*(e.system.manifold_of(e.q0) for e in self.examples))
+
+    def parts(self, x):
+        """What of the last axis of velocities or momenta belongs to each example."""
+        ends = np.cumsum([example.v0.size for example in self.examples])
+        return jnp.split(x, ends[:-1], axis=-1)
+
+    def lagrangian(self, t, q, v, args):
+        """The sum of the Lagrangians."""
+        terms = zip(self.examples, q, self.parts(v), strict=True)
+        return sum(example.lagrangian(t, g, u, args) for example, g, u in terms)
+
+    def nonholonomic(self, t, q, v, args):
+        """The nonholonomic constraints one after another."""
+        terms = zip(self.examples, q, self.parts(v), strict=True)
+        return jnp.concatenate(
+            [
+                jnp.atleast_1d(example.system.nonholonomic(t, g, u, args))
+                for example, g, u in terms
+                if example.system.nonholonomic is not None
+            ]
+        )
+
+    def holonomic(self, t, q, args):
+        """The holonomic constraints one after another."""
+        return jnp.concatenate(
+            [
+                jnp.atleast_1d(example.system.holonomic(t, g, args))
+                for example, g in zip(self.examples, q, strict=True)
+                if example.system.holonomic is not None
+            ]
+        )
+
+    def multipliers(self, x):
+        """What of the last axis of multipliers belongs to each example.
+
+        Those of all nonholonomic constraints come before those of the holonomic ones.
+        """
+        rows, end = [[] for _ in self.examples], 0
+        for kind in ("nonholonomic", "holonomic"):
+            for mine, example in zip(rows, self.examples, strict=True):
+                if (function := getattr(example.system, kind)) is not None:
+                    velocity = [example.v0] if kind == "nonholonomic" else []
+                    size = jnp.size(function(0.0, example.q0, *velocity, None))
+                    mine.extend(range(end, end + size))
+                    end += size
+        return [x[..., np.array(mine, int)] for mine in rows]
+
+    def system(self, force=None):
+        """The system of all, with the kinds of constraints that occur."""
+        kinds = {
+            kind: getattr(self, kind)
+            for kind in ("nonholonomic", "holonomic")
+            if any(getattr(e.system, kind) is not None for e in self.examples)
+        }
+        return nhjax.LagrangianSystem(
+            self.lagrangian, manifold=self.manifold, force=force, **kinds
+        )
+
+    def initial_state(self, system, **others):
+        """The initial states of all."""
+        q = tuple(example.q0 for example in self.examples)
+        v = jnp.concatenate([example.v0 for example in self.examples])
+        return nhjax.initial_state(system, q, v, **others)
 
 
 @cache

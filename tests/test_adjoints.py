@@ -13,8 +13,6 @@ import nhjax
 from nhjax import LobattoIIIAB, SaveAt, systems
 
 
-pytestmark = pytest.mark.usefixtures("quick_compilation")
-
 DIRECT = nhjax.DirectAdjoint()
 CHECKPOINTS = nhjax.RecursiveCheckpointAdjoint()
 REVERSIBLE = nhjax.ReversibleAdjoint()
@@ -180,6 +178,7 @@ def curved(x, adjoint):
 ORDERS = {
     "hessian": jax.hessian,
     "reverse over forward": lambda f: jax.jacrev(jax.jacfwd(f)),
+    "reverse over reverse": lambda f: jax.jacrev(jax.jacrev(f)),
 }
 
 
@@ -187,10 +186,11 @@ ORDERS = {
     ("adjoint", "order"),
     [
         (DIRECT, "hessian"),
+        (DIRECT, "reverse over reverse"),
         (CHECKPOINTS, "reverse over forward"),
         (REVERSIBLE, "hessian"),
     ],
-    ids=["direct", "blocks", "reversible"],
+    ids=["direct", "direct in reverse", "blocks", "reversible"],
 )
 def test_second_derivatives(adjoint, order):
     x, along = jnp.array([0.3, 0.1, -0.2]), jnp.array([1.0, -0.7, 0.5])

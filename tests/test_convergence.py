@@ -23,8 +23,6 @@ import nhjax
 from nhjax.systems import ChaplyginSleigh, NonholonomicParticle
 
 
-pytestmark = pytest.mark.usefixtures("quick_compilation")
-
 PARTICLE, SLEIGH = NonholonomicParticle(), ChaplyginSleigh()
 PARTS = {"particle": (PARTICLE, slice(0, 3), 0), "sleigh": (SLEIGH, slice(3, 6), 1)}
 MECHANICS = {

@@ -9,8 +9,6 @@ import nhjax
 from nhjax import LobattoIIIAB, SaveAt, systems
 
 
-pytestmark = pytest.mark.usefixtures("quick_compilation")
-
 ADJOINTS = {
     "direct": nhjax.DirectAdjoint(),
     "checkpoints": nhjax.RecursiveCheckpointAdjoint(3),

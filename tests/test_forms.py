@@ -31,8 +31,6 @@ from nhjax._state import State
 from nhjax._step import first_node
 
 
-pytestmark = pytest.mark.usefixtures("quick_compilation")
-
 STEP = 0.1
 LOBATTO = [nhjax.LobattoIIIAB(stages) for stages in (2, 3, 4)]
 GAUSS = nhjax.Gauss(2)

@@ -13,8 +13,6 @@ import nhjax
 from nhjax import SaveAt, systems
 
 
-pytestmark = pytest.mark.usefixtures("quick_compilation")
-
 BALL = systems.TurntableBall()
 METHOD = nhjax.LobattoIIIAB(3)
 EVERY = SaveAt(t0=True, steps=True)

@@ -10,8 +10,6 @@ import nhjax
 from nhjax import systems
 
 
-pytestmark = pytest.mark.usefixtures("quick_compilation")
-
 METHOD = nhjax.LobattoIIIAB(3)
 SOLVERS = [nhjax.SimplifiedNewton(), nhjax.Newton()]
 PULL = (1.3, -4.1, 8.7)

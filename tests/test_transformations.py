@@ -15,8 +15,6 @@ import nhjax
 from nhjax import LobattoIIIAB, systems
 
 
-pytestmark = pytest.mark.usefixtures("quick_compilation")
-
 PARTICLE = systems.NonholonomicParticle()
 
 

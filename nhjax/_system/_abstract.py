@@ -205,7 +205,10 @@ class AbstractMechanicalSystem(eqx.Module):
             total = self.flat(t, q, u, pullback(multiplier[:m])[0], args)
         if self.holonomic is not None:
             total = total + self.manifold_of(q).left_gradient(
-                lambda g: multiplier[m:] @ self.position_constraint(t, g, args), q
+                lambda g: jnp.sum(
+                    multiplier[m:] * self.position_constraint(t, g, args)
+                ),
+                q,
             )
         return total
 

@@ -2,9 +2,9 @@ from typing import ClassVar, Literal
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 from jaxtyping import Array, Float, PyTree
 
+from .._contraction import contract, inverse
 from .._custom_types import (
     Args,
     FloatScalar,
@@ -109,7 +109,7 @@ class HamiltonianSystem(AbstractMechanicalSystem):
         args: Args = None,
     ) -> Float[Array, " n"]:
         """♭_H D2Ψ, the covector (D2D2H)⁻¹ D2Ψ."""
-        return jnp.linalg.solve(self.metric(t, q, u, args), derivative)
+        return contract("kn,n->k", inverse(self.metric(t, q, u, args)), derivative)
 
     def energy(self, t: FloatScalarLike, y: State, args: Args = None) -> FloatScalar:
         """The energy H(t, q, p) of a state; arguments as for a `LagrangianSystem`."""

@@ -1,0 +1,141 @@
+"""Products and inverses of tiny matrices, in elementary operations.
+
+Libraries of linear algebra are called at a price that matrices of a few rows are not
+worth: inside a time loop the calls cost more than the arithmetic, they cannot be
+compiled into one kernel with what surrounds them, and batches of them run one by one.
+"""
+
+import string
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.extend
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+
+# Beyond this many rows a library is faster (measured).
+LARGEST = 16
+
+
+def contract(subscripts: str, a: Array, b: Array) -> Array:
+    """`jnp.einsum(subscripts, a, b)`, written out as products and sums if small."""
+    if max((*a.shape, *b.shape), default=0) > LARGEST:
+        return jnp.einsum(subscripts, a, b)
+    operands, result = subscripts.split("->")
+    first, second = operands.split(",")
+    summed = [index for index in dict.fromkeys(first + second) if index not in result]
+    order = [*result, *summed]
+    product = _aligned(a, first, order) * _aligned(b, second, order)
+    return jnp.sum(product, axis=tuple(range(len(result), len(order))))
+
+
+def _aligned(x: Array, indices: str, order: list[str]) -> Array:
+    """x with its axes in the given order, and axes of length one for the others."""
+    present = [index for index in order if index in indices]
+    x = jnp.transpose(x, [indices.index(index) for index in present])
+    return jnp.expand_dims(
+        x, [k for k, index in enumerate(order) if index not in indices]
+    )
+
+
+def _contract_axes(dimension_numbers, a: Array, b: Array) -> Array:
+    """`jax.lax.dot_general` with these dimension numbers, by `contract`."""
+    (summed_a, summed_b), (batch_a, batch_b) = dimension_numbers
+    letters = iter(string.ascii_letters)
+    first = [next(letters) for _ in a.shape]
+    second = [next(letters) for _ in b.shape]
+    for i, j in zip((*batch_a, *summed_a), (*batch_b, *summed_b), strict=True):
+        second[j] = first[i]
+    batch = [first[i] for i in batch_a]
+    free = [first[i] for i in range(a.ndim) if i not in (*batch_a, *summed_a)]
+    free += [second[j] for j in range(b.ndim) if j not in (*batch_b, *summed_b)]
+    subscripts = f"{''.join(first)},{''.join(second)}->{''.join(batch + free)}"
+    return contract(subscripts, a, b)
+
+
+@jax.custom_jvp
+def inverse(matrix: Float[Array, "m m"]) -> Float[Array, "m m"]:
+    """The inverse of a small matrix; not finite where there is none."""
+    size = matrix.shape[0]
+    if size == 0:
+        return matrix
+    # One constraint is by far the commonest case.
+    if size == 1:
+        return 1 / matrix
+    if size > LARGEST:
+        return jnp.linalg.inv(matrix)
+    return _eliminated(matrix)
+
+
+@inverse.defjvp
+def _inverse_jvp(primals, tangents):
+    (matrix,), (rate,) = primals, tangents
+    x = inverse(matrix)
+    return x, -contract("ij,jk->ik", contract("ij,jk->ik", x, rate), x)
+
+
+def _eliminated(matrix: Float[Array, "m m"]) -> Float[Array, "m m"]:
+    """The inverse by elimination of Gauss and Jordan with partial pivoting."""
+    size = matrix.shape[0]
+    rows = jnp.arange(size)
+
+    def eliminate(k, table):
+        column = jnp.sum(jnp.where(rows[None] == k, table[:, :size], 0), axis=1)
+        pivot = jnp.argmax(jnp.where(rows >= k, jnp.abs(column), -1))
+        # By masks: an index that varies over a batch would gather and scatter.
+        low = jnp.sum(jnp.where((rows == pivot)[:, None], table, 0), axis=0)
+        top = jnp.sum(jnp.where((rows == k)[:, None], table, 0), axis=0)
+        scaled = low / jnp.sum(jnp.where(rows == pivot, column, 0))
+        table = jnp.where((rows == pivot)[:, None], top[None], table)
+        column = jnp.sum(jnp.where(rows[None] == k, table[:, :size], 0), axis=1)
+        others = table - column[:, None] * scaled[None]
+        return jnp.where((rows == k)[:, None], scaled[None], others)
+
+    table = jnp.concatenate([matrix, jnp.eye(size, dtype=matrix.dtype)], axis=1)
+    return jax.lax.fori_loop(0, size, eliminate, table)[:, size:]
+
+
+def with_small_products(program: Any) -> Callable[..., list[Any]]:
+    """A closed program as a function, its small products of matrices written out."""
+
+    def run(*args):
+        return _evaluated(program.jaxpr, program.consts, args)
+
+    return run
+
+
+def _evaluated(program, consts, args):
+    values = dict(zip(program.constvars, consts, strict=True))
+    values |= zip(program.invars, args, strict=True)
+
+    def read(variable):
+        is_literal = isinstance(variable, jax.extend.core.Literal)
+        return variable.val if is_literal else values[variable]
+
+    for equation in program.eqns:
+        name, params = equation.primitive.name, equation.params
+        inputs = [read(variable) for variable in equation.invars]
+        if name == "dot_general" and _is_plain(equation):
+            out = [
+                _contract_axes(params["dimension_numbers"], *map(jnp.asarray, inputs))
+            ]
+        elif name == "jit":
+            inner = params["jaxpr"]
+            out = _evaluated(inner.jaxpr, inner.consts, inputs)
+        else:
+            primitive = equation.primitive
+            bound = primitive.get_bind_params(params)
+            # Earlier releases of JAX give functions apart from the other parameters.
+            functions, params = bound if isinstance(bound, tuple) else ((), bound)
+            out = primitive.bind(*functions, *inputs, **params)
+            out = out if primitive.multiple_results else [out]
+        values |= zip(equation.outvars, out, strict=True)
+    return [read(variable) for variable in program.outvars]
+
+
+def _is_plain(equation) -> bool:
+    """Whether a product is of matrices of the type of its result."""
+    types = {variable.aval.dtype for variable in (*equation.invars, *equation.outvars)}
+    return len(types) == 1

@@ -1,0 +1,67 @@
+"""Which programs can go into one kernel of the CPU (see `_kernel`)."""
+
+import math
+from collections.abc import Iterator
+from typing import Any
+
+import jax
+from jaxtyping import PyTree
+
+
+# What the CPU's emitter of such kernels knows, by the names of JAX. Calls into
+# libraries (products of matrices, factorisations, transforms), sorting, scattering and
+# callbacks are not among it.
+_ARITHMETIC = """
+    abs acos acosh add add_any and argmax argmin asin asinh atan atan2 atanh
+    cbrt ceil clamp convert_element_type cos cosh div eq erf exp exp2 expm1
+    floor ge gt integer_pow is_finite le log log1p logistic lt max min mul ne
+    neg not or pow reduce_and reduce_max reduce_min reduce_or reduce_prod
+    reduce_sum rem round rsqrt select_n sign sin sinh sqrt square stop_gradient
+    sub tan tanh xor zeros_like
+""".split()  # noqa: SIM905
+_SHAPING = """
+    concatenate copy copy_p expand_dims pad rev slice split squeeze stack
+    transpose unstack
+""".split()  # noqa: SIM905
+# What may be large, such as the rows that are saved: it is moved in part.
+_MOVING = """
+    broadcast_in_dim dynamic_slice dynamic_update_slice empty empty2 iota
+    reshape
+""".split()  # noqa: SIM905
+# Those that contain programs, which are looked into.
+_CONTAINING = """
+    checkpoint closed_call cond custom_jvp_call custom_linear_solve
+    custom_vjp_call jit one_kernel remat2 scan while
+""".split()  # noqa: SIM905
+# Numbers of elements: larger reductions are given to a library, and work on larger
+# arrays to several threads, which a kernel cannot start.
+LARGEST_REDUCTION = 1024
+LARGEST_ARRAY = 4096
+
+
+def is_elementary(program: Any) -> bool:
+    """Whether all operations of a program can go into one kernel."""
+    return all(map(_is_elementary, program.eqns))
+
+
+def _is_elementary(equation: Any) -> bool:
+    name = equation.primitive.name
+    if name in _CONTAINING:
+        return all(map(is_elementary, _programs(equation.params)))
+    if name in _MOVING:
+        return True
+    if name.startswith("reduce_") and _size(equation.invars[0]) > LARGEST_REDUCTION:
+        return False
+    small = all(_size(x) <= LARGEST_ARRAY for x in equation.outvars)
+    return small and (name in _ARITHMETIC or name in _SHAPING)
+
+
+def _size(variable: Any) -> int:
+    return math.prod(variable.aval.shape)
+
+
+def _programs(params: PyTree[Any]) -> Iterator[Any]:
+    for leaf in jax.tree.leaves(params):
+        leaf = getattr(leaf, "jaxpr", leaf)
+        if hasattr(leaf, "eqns"):
+            yield leaf

@@ -1,0 +1,271 @@
+"""A program compiled into one kernel of the CPU, where its operations allow it.
+
+XLA runs a program on the CPU as a sequence of kernels, and each costs some 50 ns to
+start, which is as long as the arithmetic of tens of numbers takes. An iteration on the
+stages of a step is some fifty such kernels. A called computation that is marked as
+small is compiled to a single kernel instead, its loops included; on the gallery's
+systems that is three to five times faster.
+
+The mark is the compiler's own and may change its meaning. Without it, as on other
+devices, all works as before; `NHJAX_ONE_KERNEL=0` in the environment leaves it out.
+"""
+
+import os
+from collections.abc import Callable
+from contextvars import ContextVar
+from functools import partial
+from typing import Any, TypeVar
+
+import equinox as eqx
+import jax
+import jax.core
+import jax.extend
+import jax.numpy as jnp
+from jax.interpreters import ad, batching, mlir
+from jaxlib.mlir import ir
+
+from ._elementary import is_elementary, LARGEST_REDUCTION
+
+
+T = TypeVar("T")
+
+
+def in_one_kernel(function: Callable[..., T], *args: Any) -> T:
+    """`function(*args)`, in one kernel if that is possible.
+
+    It can be transformed as the function itself. What derivatives make of it, forward
+    and transposed, goes into kernels too. Members of a batch run one after the other,
+    each as long as it needs: that is faster than to run them in step, kernel by kernel.
+    """
+    dynamic, static = eqx.partition(args, eqx.is_array)
+    leaves, treedef = jax.tree.flatten(dynamic)
+    kept = []
+
+    def flat(*leaves):
+        args = eqx.combine(jax.tree.unflatten(treedef, leaves), static)
+        arrays, rest = eqx.partition(function(*args), eqx.is_array)
+        kept.append((jax.tree.structure(arrays), rest))
+        return jax.tree.leaves(arrays)
+
+    out = _call(flat, leaves)
+    structure, rest = kept[0]
+    return eqx.combine(jax.tree.unflatten(structure, out), rest)
+
+
+def _call(flat: Callable[..., list[Any]], leaves: list[Any]) -> list[Any]:
+    program = jax.make_jaxpr(flat)(*leaves)
+    # A primitive must be given all that is traced, and has no effects such as printing.
+    captured = any(isinstance(const, jax.core.Tracer) for const in program.consts)
+    if program.effects or captured:
+        return jax.extend.core.jaxpr_as_fun(program)(*leaves)
+    return _kernel.bind(*leaves, program=program)
+
+
+_kernel = jax.extend.core.Primitive("one_kernel")
+_kernel.multiple_results = True
+
+
+@_kernel.def_impl
+def _run(*operands, program):
+    return jax.jit(lambda *x: _kernel.bind(*x, program=program))(*operands)
+
+
+@_kernel.def_abstract_eval
+def _shapes(*operands, program):
+    del operands
+    return program.out_avals
+
+
+def _is_possible(program) -> bool:
+    # Random keys have no kind.
+    kinds = {getattr(aval.dtype, "kind", None) for aval in program.in_avals}
+    plain = kinds <= set("fiub")
+    wanted = os.environ.get("NHJAX_ONE_KERNEL") != "0"
+    return wanted and plain and is_elementary(program.jaxpr)
+
+
+# Whether a kernel is being lowered, in which others are not kernels of their own.
+_within = ContextVar("within", default=False)
+
+
+def _marked(ctx, *operands, program):
+    if _within.get() or not _is_possible(program):
+        return mlir.lower_fun(_unmarked, multiple_results=True)(
+            ctx, *operands, program=program
+        )
+    run = jax.extend.core.jaxpr_as_fun(program)
+
+    def call(*operands):
+        # Operands without elements would vanish.
+        full = [x for x in operands if x.size]
+
+        def kernel(*full):
+            full = iter(_tied(full))
+            return run(
+                *(
+                    next(full) if x.size else jnp.zeros(x.shape, x.dtype)
+                    for x in operands
+                )
+            )
+
+        return jax.jit(kernel)(*jax.lax.optimization_barrier(full))
+
+    token = _within.set(True)
+    try:
+        results = mlir.lower_fun(call, multiple_results=True)(ctx, *operands)
+    finally:
+        _within.reset(token)
+    attributes = {"xla_cpu_small_call": "true", "inlineable": "false"}
+    results[0].owner.attributes["mhlo.frontend_attributes"] = ir.DictAttr.get(
+        {key: ir.StringAttr.get(value) for key, value in attributes.items()}
+    )
+    return results
+
+
+def _tied(operands: tuple[Any, ...]) -> list[Any]:
+    """The same operands, of which the compiler cannot know that any is not used.
+
+    It would abort on a parameter of a marked call that is not used, be it after all
+    simplification. So all small ones are made to seem to depend on all others.
+    """
+    firsts = [x.reshape(-1)[0] for x in operands]
+    signs = [(x != jnp.zeros_like(x)).astype(jnp.int32) for x in firsts]
+    never = jnp.sum(jnp.stack(signs)) < 0
+    return [
+        jnp.where(never, jnp.zeros_like(x), x) if x.size <= LARGEST_REDUCTION else x
+        for x in operands
+    ]
+
+
+def _unmarked(*operands, program):
+    return jax.extend.core.jaxpr_as_fun(program)(*operands)
+
+
+mlir.register_lowering(
+    _kernel, mlir.lower_fun(_unmarked, multiple_results=True), cacheable=False
+)
+mlir.register_lowering(_kernel, _marked, platform="cpu", cacheable=False)
+
+
+def _batched(operands, axes, *, program):
+    """Members one by one on the CPU, where a kernel is for one; else all in step."""
+    run = partial(_kernel.bind, program=program)
+    if jax.default_backend() != "cpu" or not _is_possible(program):
+        run = jax.extend.core.jaxpr_as_fun(program)
+        out = jax.vmap(run, in_axes=axes)(*operands)
+        return out, [0] * len(out)
+    batched = [
+        jnp.moveaxis(x, axis, 0)
+        for x, axis in zip(operands, axes, strict=True)
+        if axis is not None
+    ]
+
+    def member(xs):
+        xs = iter(xs)
+        return run(
+            *(
+                x if axis is None else next(xs)
+                for x, axis in zip(operands, axes, strict=True)
+            )
+        )
+
+    out = jax.lax.map(member, batched)
+    return out, [0] * len(out)
+
+
+batching.primitive_batchers[_kernel] = _batched
+
+
+def _differentiated(operands, tangents, *, program):
+    """The values and what is linear in the tangents, each a kernel of its own.
+
+    In two, so that reverse mode can keep the first and transpose the second.
+    """
+    run = jax.extend.core.jaxpr_as_fun(program)
+    moving = [not isinstance(tangent, ad.Zero) for tangent in tangents]
+    moving = [
+        is_moving and jnp.issubdtype(x.dtype, jnp.inexact)
+        for x, is_moving in zip(operands, moving, strict=True)
+    ]
+    kept = []
+
+    def linearised(*operands):
+        moved = [x for x, is_moving in zip(operands, moving, strict=True) if is_moving]
+
+        def values(*moved):
+            moved = iter(moved)
+            out = run(
+                *(
+                    next(moved) if is_moving else x
+                    for x, is_moving in zip(operands, moving, strict=True)
+                )
+            )
+            smooth = [x for x in out if jnp.issubdtype(x.dtype, jnp.inexact)]
+            rest = [x for x in out if not jnp.issubdtype(x.dtype, jnp.inexact)]
+            return smooth, rest
+
+        smooth, push, rest = jax.linearize(values, *moved, has_aux=True)
+        residuals, treedef = jax.tree.flatten(push)
+        kept.append(treedef)
+        smooth, rest = iter(smooth), iter(rest)
+        out = [
+            next(smooth if jnp.issubdtype(aval.dtype, jnp.inexact) else rest)
+            for aval in program.out_avals
+        ]
+        return [*out, *residuals]
+
+    try:
+        results = _call(linearised, list(operands))
+    except ValueError:
+        # What JAX cannot linearise, a while loop in a second derivative, it may still
+        # push forward.
+        rates = [ad.instantiate_zeros(tangent) for tangent in tangents]
+        return jax.jvp(run, operands, rates)
+    size = len(program.out_avals)
+    out, residuals = results[:size], results[size:]
+    treedef = kept[0]
+
+    def push(*given):
+        residuals, rates = given[: len(given) - sum(moving)], given[-sum(moving) :]
+        return list(jax.tree.unflatten(treedef, residuals)(*rates))
+
+    rates = [t for t, is_moving in zip(tangents, moving, strict=True) if is_moving]
+    changes = iter(_call(push, [*residuals, *rates]))
+    return out, [
+        next(changes)
+        if jnp.issubdtype(aval.dtype, jnp.inexact)
+        else ad.Zero(aval.to_tangent_aval())
+        for aval in program.out_avals
+    ]
+
+
+ad.primitive_jvps[_kernel] = _differentiated
+
+
+def _transposed(cotangents, *operands, program):
+    run = jax.extend.core.jaxpr_as_fun(program)
+    linear = [ad.is_undefined_primal(x) for x in operands]
+    known = [x for x, is_linear in zip(operands, linear, strict=True) if not is_linear]
+    avals = [x.aval for x, is_linear in zip(operands, linear, strict=True) if is_linear]
+    asked = [not isinstance(cotangent, ad.Zero) for cotangent in cotangents]
+
+    def pull(*given):
+        known, cotangents = iter(given[: -sum(asked)]), iter(given[-sum(asked) :])
+        known = list(known)
+
+        def push(*rates):
+            rates, rest = iter(rates), iter(known)
+            return run(*(next(rates if is_linear else rest) for is_linear in linear))
+
+        full = [
+            next(cotangents) if is_asked else jnp.zeros(aval.shape, aval.dtype)
+            for aval, is_asked in zip(program.out_avals, asked, strict=True)
+        ]
+        return list(jax.linear_transpose(push, *avals)(full))
+
+    given = [x for x, is_asked in zip(cotangents, asked, strict=True) if is_asked]
+    pulled = iter(_call(pull, [*known, *given]))
+    return [next(pulled) if is_linear else None for is_linear in linear]
+
+
+ad.primitive_transposes[_kernel] = _transposed
