@@ -277,8 +277,8 @@ def report(rows: list[dict[str, Any]]) -> str:
         "`C++, k`: k trajectories at once, one in each lane of a vector, which iterate "
         "until the slowest of the k has converged; nhjax runs a batch one by one. "
         "`most in a batch` is the mean over the steps of the iterations of the slowest "
-        "of all. `ratio` is that of the medians, `fastest` that of the fastest of seven, "
-        "which what else runs on the machine disturbs less."
+        "of all. `ratio` is that of the medians, `fastest` that of the fastest of "
+        "seven, which what else runs on the machine disturbs less."
     )
     return "\n\n".join(sections)
 
