@@ -3,6 +3,7 @@
 import datetime
 import json
 import math
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -41,7 +42,7 @@ def write(name: str, title: str, text: str, data: dict[str, Any]) -> None:
         "device": jax.devices()[0].device_kind,
         "jax": jax.__version__,
         "nhjax": nhjax.__version__,
-        "command": f"python -m benchmarks.{name}",
+        "command": " ".join([f"python -m benchmarks.{name}", *sys.argv[1:]]),
     }
     heading = f"# {title}\n\n" + ", ".join(f"{k}: {v}" for k, v in about.items())
     report = f"{heading}\n\n{text}\n"

@@ -36,7 +36,7 @@ class DirectAdjoint(AbstractAdjoint):
     """Keep the stages of every step: memory O(num_steps), the least time.
 
     Forward mode (`jax.jvp`, `jax.jacfwd`, `jax.linearize`) and second derivatives
-    (`jax.hessian`, forward over reverse, reverse over forward) work as well.
+    (`jax.hessian`, and either mode over either) work as well.
 
     !!! example
 

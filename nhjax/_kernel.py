@@ -11,7 +11,7 @@ devices, all works as before; `NHJAX_ONE_KERNEL=0` in the environment leaves it 
 """
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from contextvars import ContextVar
 from functools import partial
 from typing import Any, TypeVar
@@ -61,6 +61,20 @@ def _call(flat: Callable[..., list[Any]], leaves: list[Any]) -> list[Any]:
     return _kernel.bind(*leaves, program=program)
 
 
+def _split(marks: Iterable[bool], xs: Iterable[Any]) -> tuple[list[Any], list[Any]]:
+    """Those that are marked, and the others."""
+    pairs = list(zip(marks, xs, strict=True))
+    return [x for mark, x in pairs if mark], [x for mark, x in pairs if not mark]
+
+
+def _merged(
+    marks: Iterable[bool], marked: Iterable[Any], others: Iterable[Any]
+) -> list[Any]:
+    """What `_split` took apart."""
+    marked, others = iter(marked), iter(others)
+    return [next(marked) if mark else next(others) for mark in marks]
+
+
 _kernel = jax.extend.core.Primitive("one_kernel")
 _kernel.multiple_results = True
 
@@ -97,17 +111,13 @@ def _marked(ctx, *operands, program):
 
     def call(*operands):
         # Operands without elements would vanish.
-        full = [x for x in operands if x.size]
+        is_full = [x.size > 0 for x in operands]
+        full, empty = _split(is_full, operands)
 
         def kernel(*full):
-            full = iter(_tied(full))
-            return run(
-                *(
-                    next(full) if x.size else jnp.zeros(x.shape, x.dtype)
-                    for x in operands
-                )
-            )
+            return run(*_merged(is_full, _tied(full), map(jnp.zeros_like, empty)))
 
+        # Nor may it be seen here which of them are constants.
         return jax.jit(kernel)(*jax.lax.optimization_barrier(full))
 
     token = _within.set(True)
@@ -154,20 +164,15 @@ def _batched(operands, axes, *, program):
         run = jax.extend.core.jaxpr_as_fun(program)
         out = jax.vmap(run, in_axes=axes)(*operands)
         return out, [0] * len(out)
+    is_batched = [axis is not None for axis in axes]
+    batched, shared = _split(is_batched, operands)
     batched = [
         jnp.moveaxis(x, axis, 0)
-        for x, axis in zip(operands, axes, strict=True)
-        if axis is not None
+        for x, axis in zip(batched, _split(is_batched, axes)[0], strict=True)
     ]
 
-    def member(xs):
-        xs = iter(xs)
-        return run(
-            *(
-                x if axis is None else next(xs)
-                for x, axis in zip(operands, axes, strict=True)
-            )
-        )
+    def member(batched):
+        return run(*_merged(is_batched, batched, shared))
 
     out = jax.lax.map(member, batched)
     return out, [0] * len(out)
@@ -182,61 +187,38 @@ def _differentiated(operands, tangents, *, program):
     In two, so that reverse mode can keep the first and transpose the second.
     """
     run = jax.extend.core.jaxpr_as_fun(program)
-    moving = [not isinstance(tangent, ad.Zero) for tangent in tangents]
-    moving = [
-        is_moving and jnp.issubdtype(x.dtype, jnp.inexact)
-        for x, is_moving in zip(operands, moving, strict=True)
-    ]
-    kept = []
+    is_moving = [not isinstance(tangent, ad.Zero) for tangent in tangents]
+    rates, _ = _split(is_moving, tangents)
+    is_smooth = [jnp.issubdtype(x.dtype, jnp.inexact) for x in program.out_avals]
+    treedef = None
 
     def linearised(*operands):
-        moved = [x for x, is_moving in zip(operands, moving, strict=True) if is_moving]
+        nonlocal treedef
+        moving, fixed = _split(is_moving, operands)
 
-        def values(*moved):
-            moved = iter(moved)
-            out = run(
-                *(
-                    next(moved) if is_moving else x
-                    for x, is_moving in zip(operands, moving, strict=True)
-                )
-            )
-            smooth = [x for x in out if jnp.issubdtype(x.dtype, jnp.inexact)]
-            rest = [x for x in out if not jnp.issubdtype(x.dtype, jnp.inexact)]
-            return smooth, rest
+        def values(*moving):
+            return _split(is_smooth, run(*_merged(is_moving, moving, fixed)))
 
-        smooth, push, rest = jax.linearize(values, *moved, has_aux=True)
+        smooth, push, rest = jax.linearize(values, *moving, has_aux=True)
         residuals, treedef = jax.tree.flatten(push)
-        kept.append(treedef)
-        smooth, rest = iter(smooth), iter(rest)
-        out = [
-            next(smooth if jnp.issubdtype(aval.dtype, jnp.inexact) else rest)
-            for aval in program.out_avals
-        ]
-        return [*out, *residuals]
+        return [*_merged(is_smooth, smooth, rest), *residuals]
 
     try:
         results = _call(linearised, list(operands))
     except ValueError:
-        # What JAX cannot linearise, a while loop in a second derivative, it may still
-        # push forward.
-        rates = [ad.instantiate_zeros(tangent) for tangent in tangents]
-        return jax.jvp(run, operands, rates)
+        # What JAX cannot linearise, such as a while loop, it may still push forward.
+        all_rates = [ad.instantiate_zeros(tangent) for tangent in tangents]
+        return jax.jvp(run, operands, all_rates)
     size = len(program.out_avals)
     out, residuals = results[:size], results[size:]
-    treedef = kept[0]
 
     def push(*given):
-        residuals, rates = given[: len(given) - sum(moving)], given[-sum(moving) :]
+        residuals, rates = given[: -sum(is_moving)], given[-sum(is_moving) :]
         return list(jax.tree.unflatten(treedef, residuals)(*rates))
 
-    rates = [t for t, is_moving in zip(tangents, moving, strict=True) if is_moving]
-    changes = iter(_call(push, [*residuals, *rates]))
-    return out, [
-        next(changes)
-        if jnp.issubdtype(aval.dtype, jnp.inexact)
-        else ad.Zero(aval.to_tangent_aval())
-        for aval in program.out_avals
-    ]
+    changes = _call(push, [*residuals, *rates])
+    zeros = [ad.Zero(aval.to_tangent_aval()) for aval in program.out_avals]
+    return out, _merged(is_smooth, changes, _split(is_smooth, zeros)[1])
 
 
 ad.primitive_jvps[_kernel] = _differentiated
@@ -244,28 +226,24 @@ ad.primitive_jvps[_kernel] = _differentiated
 
 def _transposed(cotangents, *operands, program):
     run = jax.extend.core.jaxpr_as_fun(program)
-    linear = [ad.is_undefined_primal(x) for x in operands]
-    known = [x for x, is_linear in zip(operands, linear, strict=True) if not is_linear]
-    avals = [x.aval for x, is_linear in zip(operands, linear, strict=True) if is_linear]
-    asked = [not isinstance(cotangent, ad.Zero) for cotangent in cotangents]
+    is_linear = [ad.is_undefined_primal(x) for x in operands]
+    linear, known = _split(is_linear, operands)
+    is_asked = [not isinstance(cotangent, ad.Zero) for cotangent in cotangents]
+    asked, _ = _split(is_asked, cotangents)
+    _, unasked = _split(is_asked, program.out_avals)
 
     def pull(*given):
-        known, cotangents = iter(given[: -sum(asked)]), iter(given[-sum(asked) :])
-        known = list(known)
+        known, asked = given[: -sum(is_asked)], given[-sum(is_asked) :]
+        zeros = [jnp.zeros(aval.shape, aval.dtype) for aval in unasked]
 
         def push(*rates):
-            rates, rest = iter(rates), iter(known)
-            return run(*(next(rates if is_linear else rest) for is_linear in linear))
+            return run(*_merged(is_linear, rates, known))
 
-        full = [
-            next(cotangents) if is_asked else jnp.zeros(aval.shape, aval.dtype)
-            for aval, is_asked in zip(program.out_avals, asked, strict=True)
-        ]
-        return list(jax.linear_transpose(push, *avals)(full))
+        transpose = jax.linear_transpose(push, *(x.aval for x in linear))
+        return list(transpose(_merged(is_asked, asked, zeros)))
 
-    given = [x for x, is_asked in zip(cotangents, asked, strict=True) if is_asked]
-    pulled = iter(_call(pull, [*known, *given]))
-    return [next(pulled) if is_linear else None for is_linear in linear]
+    pulled = _call(pull, [*known, *asked])
+    return _merged(is_linear, pulled, [None] * len(known))
 
 
 ad.primitive_transposes[_kernel] = _transposed

@@ -17,7 +17,7 @@ from ._scales import position_scale, violation_scale
 from ._solution import RESULTS
 from ._state import State
 from ._step import first_node, largest_violation, Node, StepOutcome
-from ._step_derivative import compiled_step, Parameters
+from ._step_derivative import Parameters, primitive_step
 from ._step_record import StepRecord
 from ._system import AbstractMechanicalSystem
 
@@ -110,7 +110,7 @@ class Loop(eqx.Module):
         """Step k; a failed trajectory keeps its last good node."""
         alive = carry.result == RESULTS.successful
         start = carry.node.state
-        outcome = compiled_step(
+        outcome = primitive_step(
             Parameters(self.system, self.time(k), self.dt, start, self.args),
             self.method,
             self.solver,

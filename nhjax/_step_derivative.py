@@ -64,7 +64,7 @@ def differentiable_step(
 @differentiable_step.def_jvp
 def _differentiable_step_jvp(primals, tangents):
     parameters, method, solver, node, skip = primals
-    outcome = compiled_step(*primals)
+    outcome = primitive_step(*primals)
     x, ok = outcome.stages, ~skip & (outcome.result == RESULTS.successful)
     perturbed, fixed = eqx.partition(parameters, is_given(tangents[0]))
 
@@ -104,7 +104,7 @@ def _differentiable_step_jvp(primals, tangents):
 # Where JAX splits a scan into what is known and what is linear, it drops the rules of
 # functions, but not those of primitives. Without its rule a step could be
 # differentiated in reverse mode once, and not again.
-compiled_step = partial(in_one_kernel, differentiable_step)
+primitive_step = partial(in_one_kernel, differentiable_step)
 
 
 def _stage_system(parameters: Parameters, method: AbstractMethod) -> StageSystem:

@@ -100,6 +100,14 @@ def test_derivatives_of_a_kernel(transform):
     assert_same(got, transform(height(pendulum))(*point))
 
 
+def test_a_loop_of_unknown_length_is_pushed_forward():
+    def grown(x):
+        return jax.lax.while_loop(lambda x: x < 10, lambda x: x * x, x)
+
+    got = jax.jit(lambda x: jax.jvp(lambda x: in_one_kernel(grown, x), (x,), (x,)))(2.0)
+    assert_same(got, jax.jvp(grown, (2.0,), (2.0,)))
+
+
 @pytest.mark.parametrize("axes", [(0, None), (None, 1), (0, 1)])
 def test_batches_of_kernels(axes):
     g, x = jnp.array([9.0, 10.0, 11.0]), jnp.arange(6.0).reshape(2, 3) / 10
