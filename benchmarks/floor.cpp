@@ -202,12 +202,14 @@ inline T step(State<T>& y, double h) {
     T inv_det = 1. / (schur[0][0] * schur[1][1] - schur[0][1] * schur[1][0]);
     T inv_c = 1. / compliance(B[2], B[2]);
 
-    // The size of what is rounded in a velocity, and of B.
+    // The size of velocities and of what is rounded in them, and of B.
     T size_b = larger(T(y.lambda * 0. + 1.), absolute(y.q[M + 1]));
     T rate = absolute(y.acceleration[0]);
     for (int k = M + 2; k < N; ++k) size_b = larger(size_b, absolute(y.q[k]));
     for (int k = 1; k < N; ++k) rate = larger(rate, absolute(y.acceleration[k]));
-    T rest = h * (rate + absolute(y.lambda) * size_b);
+    T scale = h * (rate + absolute(y.lambda) * size_b), size_v = absolute(H[0][0]);
+    for (int i = 0; i < S; ++i) EACH(k) size_v = larger(size_v, absolute(H[i][k]));
+    scale += size_v;  // the starting values at the nodes are among those of the stages
 
     Vector<T> f[S];  // free forces at the stages; that of the first never changes
     f[0] = y.force;
@@ -224,7 +226,7 @@ inline T step(State<T>& y, double h) {
         add_reaction(y.q, T(y.lambda + nu), F[0]);
         add_reaction(q[1], middle, F[1]);
         add_reaction(q[2], T(end - nu), F[2]);
-        T scale = absolute(H[0][0]), change = y.lambda * 0.;
+        T change = y.lambda * 0.;
         Vector<T> H_next[S], u_next[S - 1], p_change;
         for (int i = 0; i < S; ++i)
             EACH(k) H_next[i][k] = y.p[k] + h * combined(A_HAT[i], F, k);
@@ -270,18 +272,12 @@ inline T step(State<T>& y, double h) {
 
         // The size of the increment, and whether to stop.
         for (int i = 0; i < S; ++i)
-            EACH(k) {
-                scale = larger(scale, absolute(H[i][k]));
-                change = larger(change, absolute(T(H_next[i][k] - H[i][k])));
-            }
+            EACH(k) change = larger(change, absolute(T(H_next[i][k] - H[i][k])));
         for (int i = 0; i < S - 1; ++i)
-            EACH(k) {
-                scale = larger(scale, absolute(u[i][k]));
-                change = larger(change, absolute(T(u_next[i][k] - u[i][k])));
-            }
+            EACH(k) change = larger(change, absolute(T(u_next[i][k] - u[i][k])));
         T d_lambda = larger(absolute(d_nu), absolute(d_middle));
         d_lambda = larger(d_lambda, absolute(T(d_end - d_nu)));
-        T size = larger(change, T(h * d_lambda * size_b)) / (scale + rest);
+        T size = larger(change, T(h * d_lambda * size_b)) / scale;
         for (int i = 0; i < S; ++i) H[i] = H_next[i];
         for (int i = 0; i < S - 1; ++i) u[i] = u_next[i];
         nu += d_nu;

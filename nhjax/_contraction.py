@@ -7,7 +7,7 @@ compiled into one kernel with what surrounds them, and batches of them run one b
 
 import string
 from collections.abc import Callable
-from typing import Any
+from typing import Any, TypeAlias
 
 import jax
 import jax.extend
@@ -20,6 +20,10 @@ from jaxtyping import Array, Float
 LARGEST = 16
 
 
+# A square matrix, or its diagonal if it has no other entries.
+Matrix: TypeAlias = Float[Array, "n n"] | Float[Array, " n"]
+
+
 def contract(subscripts: str, a: Array, b: Array) -> Array:
     """`jnp.einsum(subscripts, a, b)`, written out as products and sums if small."""
     if max((*a.shape, *b.shape), default=0) > LARGEST:
@@ -30,6 +34,19 @@ def contract(subscripts: str, a: Array, b: Array) -> Array:
     order = [*result, *summed]
     product = _aligned(a, first, order) * _aligned(b, second, order)
     return jnp.sum(product, axis=tuple(range(len(result), len(order))))
+
+
+def apply(matrix: Matrix, x: Float[Array, "... n"]) -> Float[Array, "... n"]:
+    """The matrix times the vectors along the last axis of x, which has at most four."""
+    if matrix.ndim == 1:
+        return jnp.expand_dims(matrix, range(x.ndim - 1)) * x
+    rows = "abc"[: x.ndim - 1]
+    return contract(f"kn,{rows}n->{rows}k", matrix, x)
+
+
+def dense(matrix: Matrix) -> Float[Array, "n n"]:
+    """All entries of a matrix."""
+    return matrix if matrix.ndim == 2 else jnp.diag(matrix)
 
 
 def _aligned(x: Array, indices: str, order: list[str]) -> Array:
@@ -57,8 +74,10 @@ def _contract_axes(dimension_numbers, a: Array, b: Array) -> Array:
 
 
 @jax.custom_jvp
-def inverse(matrix: Float[Array, "m m"]) -> Float[Array, "m m"]:
+def inverse(matrix: Matrix) -> Matrix:
     """The inverse of a small matrix; not finite where there is none."""
+    if matrix.ndim == 1:
+        return 1 / matrix
     size = matrix.shape[0]
     if size == 0:
         return matrix
@@ -74,6 +93,8 @@ def inverse(matrix: Float[Array, "m m"]) -> Float[Array, "m m"]:
 def _inverse_jvp(primals, tangents):
     (matrix,), (rate,) = primals, tangents
     x = inverse(matrix)
+    if matrix.ndim == 1:
+        return x, -x * rate * x
     return x, -contract("ij,jk->ik", contract("ij,jk->ik", x, rate), x)
 
 

@@ -11,13 +11,16 @@ from jaxtyping import PyTree
 # What the CPU's emitter of such kernels knows, by the names of JAX. Calls into
 # libraries (products of matrices, factorisations, transforms), sorting, scattering and
 # callbacks are not among it.
-_ARITHMETIC = """
-    abs acos acosh add add_any and argmax argmin asin asinh atan atan2 atanh
-    cbrt ceil clamp convert_element_type cos cosh div eq erf exp exp2 expm1
-    floor ge gt integer_pow is_finite le log log1p logistic lt max min mul ne
-    neg not or pow reduce_and reduce_max reduce_min reduce_or reduce_prod
-    reduce_sum rem round rsqrt select_n sign sin sinh sqrt square stop_gradient
-    sub tan tanh xor zeros_like
+ELEMENTWISE = """
+    abs acos acosh add add_any and asin asinh atan atan2 atanh
+    bitcast_convert_type cbrt ceil clamp convert_element_type cos cosh div eq erf
+    exp exp2 expm1 floor ge gt integer_pow is_finite le log log1p logistic lt max
+    min mul ne neg not or pow rem round rsqrt select_n sign sin sinh sqrt square
+    stop_gradient sub tan tanh xor zeros_like
+""".split()  # noqa: SIM905
+_REDUCING = """
+    argmax argmin reduce_and reduce_max reduce_min reduce_or reduce_prod
+    reduce_sum
 """.split()  # noqa: SIM905
 _SHAPING = """
     concatenate copy copy_p expand_dims pad rev slice split squeeze stack
@@ -29,10 +32,10 @@ _MOVING = """
     reshape
 """.split()  # noqa: SIM905
 # Those that contain programs, which are looked into.
-_CONTAINING = """
-    checkpoint closed_call cond custom_jvp_call custom_linear_solve
-    custom_vjp_call jit one_kernel remat2 scan while
+CALLING = """
+    checkpoint closed_call custom_jvp_call custom_vjp_call jit remat2
 """.split()  # noqa: SIM905
+_CONTAINING = [*CALLING, "cond", "custom_linear_solve", "one_kernel", "scan", "while"]
 # Numbers of elements: larger reductions are given to a library, and work on larger
 # arrays to several threads, which a kernel cannot start.
 LARGEST_REDUCTION = 1024
@@ -53,7 +56,7 @@ def _is_elementary(equation: Any) -> bool:
     if name.startswith("reduce_") and _size(equation.invars[0]) > LARGEST_REDUCTION:
         return False
     small = all(_size(x) <= LARGEST_ARRAY for x in equation.outvars)
-    return small and (name in _ARITHMETIC or name in _SHAPING)
+    return small and name in (*ELEMENTWISE, *_REDUCING, *_SHAPING)
 
 
 def _size(variable: Any) -> int:

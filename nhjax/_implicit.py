@@ -13,6 +13,7 @@ from jaxtyping import Array, PyTree
 from ._contraction import with_small_products
 from ._custom_types import BoolScalar
 from ._iteration import dense_increment, iterate, relative_size, Solved
+from ._largest import largest
 
 
 T = TypeVar("T")
@@ -37,7 +38,7 @@ def solve_contraction(contraction: Callable[[X], X], b: X, *, max_iterations: in
     def refine(matvec, b):
         def sweep(x):
             increment = b - matvec(x)
-            return x + increment, relative_size(increment, x), None
+            return x + increment, relative_size([increment], largest(x)), None
 
         solved = iterate(sweep, b, max_iterations=max_iterations)
         return jnp.where(solved.converged, solved.x, jnp.nan)
@@ -63,7 +64,7 @@ def root(
 
     def sweep(x):
         dx, _ = dense_increment(lambda z: (flat_residual(z), None), x)
-        return x + dx, relative_size(dx, x), None
+        return x + dx, relative_size([dx], largest(x)), None
 
     def newton(_, x):
         solved = iterate(sweep, x, max_iterations=max_iterations)

@@ -1,6 +1,6 @@
 """The loop that ends at round-off, and the increments that it is fed."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Generic, NamedTuple, TypeVar
 
 import jax
@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from ._custom_types import BoolScalar, FloatScalar, FloatScalarLike
+from ._largest import largest
 
 
 X = TypeVar("X")
@@ -92,9 +93,6 @@ def dense_increment(
     return jnp.linalg.solve(jacobian, -r), aux
 
 
-def relative_size(
-    increment: Array, x: Array, rest: FloatScalarLike = 0.0
-) -> FloatScalar:
-    """max |δ| / (max |x| + rest), with a zero x measured absolutely."""
-    scale = jnp.max(jnp.abs(x)) + rest
-    return jnp.max(jnp.abs(increment)) / jnp.where(scale > 0, scale, 1)
+def relative_size(increments: Sequence[Array], scale: FloatScalarLike) -> FloatScalar:
+    """max |δ| over the scale, which does not count if it is zero."""
+    return largest(*increments) / jnp.where(scale > 0, scale, 1)

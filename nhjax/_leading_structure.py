@@ -2,7 +2,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from ._contraction import contract, inverse
+from ._contraction import apply, contract, inverse, Matrix
 from ._linearisation import Linearisation
 from ._stages import Stages, StageSystem
 
@@ -23,7 +23,7 @@ class LeadingStructure(eqx.Module):
     compatibility condition.
     """
 
-    momentum_inverse: Float[Array, "n n"]
+    momentum_inverse: Matrix
     reaction: Float[Array, "s n l"]
     velocity_reaction: Float[Array, "s n l"]
     schur_inverse: Float[Array, "c c"]
@@ -33,7 +33,7 @@ class LeadingStructure(eqx.Module):
         self, stages: StageSystem, x: Stages, residual: Float[Array, "s n"]
     ) -> Stages:
         """u - N⁻¹ r_u for the stages, and the velocities that belong to them."""
-        change = contract("rn,kn->rk", residual, self.momentum_inverse)
+        change = apply(self.momentum_inverse, residual)
         if not stages.hamiltonian:
             return eqx.tree_at(lambda z: z.velocity, x, x.velocity - change)
         x = eqx.tree_at(lambda z: z.momentum, x, x.momentum - change)
@@ -41,9 +41,7 @@ class LeadingStructure(eqx.Module):
 
     def correct_nodes(self, x: Stages, residual: Float[Array, "r n"]) -> Stages:
         """u - N⁻¹ r_v for the nodes."""
-        node_fibre = x.node_fibre - contract(
-            "rn,kn->rk", residual, self.momentum_inverse
-        )
+        node_fibre = x.node_fibre - apply(self.momentum_inverse, residual)
         return eqx.tree_at(lambda z: z.node_fibre, x, node_fibre)
 
     def correct_multipliers(
@@ -98,7 +96,7 @@ def leading_structure(
         reaction = jnp.zeros((stages.method.stages, n, 0), stages.p.dtype)
         return LeadingStructure(lin.momentum_inverse, reaction, reaction, nothing, lin)
     jacobian = jnp.concatenate([lin.jacobian[None], stages.constraint_jacobian(x0)])
-    reaction = contract("kn,jmn->jkm", lin.metric_inverse, jacobian)
+    reaction = jnp.swapaxes(apply(lin.metric_inverse, jacobian), 1, 2)
     blocks = contract("ian,jnb->ijab", jacobian[1:], reaction)
     end = eqx.tree_at(
         lambda z: (z.jacobian, z.reaction, z.compliance_inverse),

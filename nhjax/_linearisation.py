@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, PyTree
 
-from ._contraction import contract, inverse
+from ._contraction import apply, contract, inverse, Matrix
 from ._custom_types import Args, FloatScalar
 
 
@@ -32,7 +32,7 @@ class Linearisation(eqx.Module):
     inside an iteration costs far more than a product.
     """
 
-    metric_inverse: Float[Array, "n n"]  # K⁻¹
+    metric_inverse: Matrix  # K⁻¹
     jacobian: Float[Array, "l n"]  # B
     reaction: Float[Array, "n l"]  # N⁻¹ R
     compliance_inverse: Float[Array, "l l"]  # C⁻¹
@@ -42,11 +42,11 @@ class Linearisation(eqx.Module):
     fibre_name: Literal["v", "p"] = eqx.field(static=True)
 
     @property
-    def momentum_inverse(self) -> Float[Array, "n n"]:
+    def momentum_inverse(self) -> Matrix:
         """N⁻¹: the inverse mass matrix, or the identity of a Hamiltonian system."""
         if self.fibre_name == "v":
             return self.metric_inverse
-        return jnp.eye(self.metric_inverse.shape[0], dtype=self.metric_inverse.dtype)
+        return jnp.ones_like(self.acceleration)
 
     @property
     def is_singular(self) -> Bool[Array, ""]:
@@ -60,7 +60,7 @@ class Linearisation(eqx.Module):
         self, momentum_residual: Float[Array, " n"], hidden_residual: Float[Array, " l"]
     ) -> tuple[Float[Array, " n"], Float[Array, " l"]]:
         """(u̇, λ) with N u̇ - R λ = `momentum_residual`, B u̇ = `hidden_residual`."""
-        free = contract("kn,n->k", self.momentum_inverse, momentum_residual)
+        free = apply(self.momentum_inverse, momentum_residual)
         hidden = hidden_residual - contract("ln,n->l", self.jacobian, free)
         multiplier = contract("kl,l->k", self.compliance_inverse, hidden)
         return free + contract("nl,l->n", self.reaction, multiplier), multiplier
@@ -121,17 +121,13 @@ def linearise(
     (p, violation), push = jax.linearize(
         _momentum_and_constraint(system, q, args), t, zero, u
     )
-    momentum_by_fibre, jacobian_t = jax.vmap(lambda e: push(zero_t, zero, e))(
+    jacobian_t = jax.vmap(lambda e: push(zero_t, zero, e)[1])(
         jnp.eye(u.shape[0], dtype=u.dtype)
     )
     v = system.velocity(t, q, u, args)
     p_dot, phi_dot = push(jnp.ones_like(t), v, zero)
-    # Row i of `momentum_by_fibre` is N e_i; for a Lagrangian system N is the metric.
-    metric = (
-        momentum_by_fibre if system.fibre_name == "v" else system.metric(t, q, u, args)
-    )
-    metric_inverse = inverse(metric)
-    reaction = contract("kn,nl->kl", metric_inverse, jacobian_t)
+    metric_inverse = inverse(system.metric(t, q, u, args))
+    reaction = apply(metric_inverse, jacobian_t.T).T
     compliance = contract("nk,nl->kl", jacobian_t, reaction)
     lin = Linearisation(
         metric_inverse=metric_inverse,

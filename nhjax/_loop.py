@@ -10,6 +10,7 @@ from jaxtyping import Array, Int, PyTree
 
 from ._checks import all_finite
 from ._custom_types import Args, BoolScalar, FloatScalar
+from ._largest import largest
 from ._method import AbstractMethod
 from ._newton import AbstractStageSolver
 from ._progress_meter import AbstractProgressMeter
@@ -95,7 +96,7 @@ class Loop(eqx.Module):
         u = system.fibre(y)
         conjugate = system.conjugate(self.t0, y.q, u, self.args)
         given = y.p if system.fibre_name == "v" else y.v
-        size = jnp.max(jnp.abs(conjugate)) + jnp.max(jnp.abs(given))
+        size = largest(conjugate) + largest(given)
         scale = violation_scale(system, lin, self.t0, y.q, u, self.args)
         positions = system.position_constraint(self.t0, y.q, self.args)
         allowed = position_scale(system, self.t0, y.q, self.args)
@@ -103,7 +104,7 @@ class Loop(eqx.Module):
             jnp.all(jnp.abs(lin.violation) <= small * scale)
             & jnp.all(jnp.abs(positions) <= small * allowed)
             & (system.manifold_of(y.q).defect(y.q) <= small)
-            & (jnp.max(jnp.abs(conjugate - given)) <= small * size)
+            & (largest(conjugate - given) <= small * size)
         )
 
     def step(self, carry: Carry, k: Int[Array, ""]) -> tuple[Carry, Rows]:

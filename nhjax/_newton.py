@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
-from ._contraction import contract
+from ._contraction import apply, contract
 from ._custom_types import FloatScalar, FloatScalarLike
 from ._iteration import dense_increment, iterate, relative_size, Solved
 from ._leading_structure import leading_structure, LeadingStructure
@@ -90,12 +90,11 @@ class SimplifiedNewton(AbstractStageSolver):
     ) -> Solved[Stages, Evaluation]:
         """Solve the stage equations from `x0`; does nothing where `skip` is true."""
         structure = leading_structure(stages, x0, lin)
-        rest = fibre_scale(stages, lin)
+        size = _increment_size(stages, x0, lin)
 
         def sweep(x: Stages):
             x_next, evaluation = _corrected(stages, structure, x)
-            size = _increment_size(stages, x, x_next, lin, rest)
-            return x_next, size, evaluation
+            return x_next, size(x, x_next), evaluation
 
         return iterate(
             sweep,
@@ -169,7 +168,7 @@ class Newton(AbstractStageSolver):
     ) -> Solved[Stages, Evaluation]:
         """Solve the stage equations from `x0`; does nothing where `skip` is true."""
         _, unravel = ravel_pytree(x0)
-        rest = fibre_scale(stages, lin)
+        size = _increment_size(stages, x0, lin)
 
         def residual(z):
             return _residual(stages, unravel(z))
@@ -178,7 +177,7 @@ class Newton(AbstractStageSolver):
             z, _ = ravel_pytree(x)
             dz, evaluation = dense_increment(residual, z)
             x_next = unravel(z + dz)
-            return x_next, _increment_size(stages, x, x_next, lin, rest), evaluation
+            return x_next, size(x, x_next), evaluation
 
         return iterate(
             sweep,
@@ -217,28 +216,32 @@ def _residual(stages: StageSystem, x: Stages) -> tuple[Float[Array, " k"], Evalu
 
 
 def _increment_size(
-    stages: StageSystem,
-    x: Stages,
-    x_next: Stages,
-    lin: Linearisation,
-    rest: FloatScalar,
-) -> FloatScalar:
-    """The size of an increment relative to the fibre coordinates and to `rest`.
+    stages: StageSystem, x0: Stages, lin: Linearisation
+) -> Callable[[Stages, Stages], FloatScalar]:
+    """How large an increment of the stages is, relative to fibre coordinates.
 
     Not finite once the iterates have left the chart, from where they do not return.
     """
-    fibre = [x.node_fibre, x.momentum if stages.hamiltonian else x.velocity]
-    changes = [x_next.node_fibre - x.node_fibre, x_next.velocity - x.velocity]
-    if stages.hamiltonian:
-        changes[1] = contract("sn,kn->sk", changes[1], lin.metric_inverse)
-        changes.append(x_next.momentum - x.momentum)
-    if stages.constrained:
-        # Multipliers count by their effect on u, h N⁻¹ R δΛ, on its own: Λ can still be
-        # wrong where the stages and nodes happen to be right.
-        before, after = stages.multiplier_change(x), stages.multiplier_change(x_next)
-        change = contract("sl,nl->sn", after - before, lin.reaction)
-        changes.append(stages.h * change)
-    size = relative_size(jnp.concatenate(changes), jnp.concatenate(fibre), rest)
-    if stages.chart.manifold.is_flat:
-        return size
-    return jnp.where(stages.in_chart(x_next), size, jnp.inf)
+    scale = fibre_scale(stages, x0, lin)
+    reaction_sizes = jnp.max(jnp.abs(lin.reaction), axis=0, initial=0)
+
+    def size(x: Stages, x_next: Stages) -> FloatScalar:
+        changes = [x_next.node_fibre - x.node_fibre, x_next.velocity - x.velocity]
+        if stages.hamiltonian:
+            changes[1] = apply(lin.metric_inverse, changes[1])
+            changes.append(x_next.momentum - x.momentum)
+        if stages.constrained:
+            # Multipliers count by their effect on u, h N⁻¹ R δΛ, on its own: Λ can
+            # still be wrong where the stages and nodes happen to be right.
+            before, after = (
+                stages.multiplier_change(x),
+                stages.multiplier_change(x_next),
+            )
+            effect = contract("sl,l->s", jnp.abs(after - before), reaction_sizes)
+            changes.append(stages.h * effect)
+        size = relative_size(changes, scale)
+        if stages.chart.manifold.is_flat:
+            return size
+        return jnp.where(stages.in_chart(x_next), size, jnp.inf)
+
+    return size

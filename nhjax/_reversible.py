@@ -9,6 +9,7 @@ from jaxtyping import Array, Int, PyTree
 from ._adjoint import AbstractAdjoint, DirectAdjoint
 from ._custom_types import BoolScalar
 from ._iteration import iterate, relative_size
+from ._largest import largest
 from ._loop import Carry, Loop, Rows
 from ._progress_meter import NoProgressMeter
 from ._solution import RESULTS
@@ -120,10 +121,9 @@ def _if_retraced(
     """The gradient; NaN if the run failed or was not retraced, zero if nothing asks."""
     manifold = loop.system.manifold_of(start.q)
     xi = manifold.local(manifold.compose(manifold.inverse(start.q), reached.q))
-    sizes = [jnp.max(jnp.abs(leaf)) for leaf in jax.tree.leaves(start.q)]
     small = float(jnp.finfo(start.p.dtype).eps) ** 0.375
-    retraced = (jnp.max(jnp.abs(xi)) <= small * (1 + jnp.max(jnp.stack(sizes)))) & (
-        relative_size(reached.p - start.p, start.p) <= small
+    retraced = (largest(xi) <= small * (1 + largest(*jax.tree.leaves(start.q)))) & (
+        relative_size([reached.p - start.p], largest(start.p)) <= small
     )
     asked = [jnp.any(leaf != 0) for leaf in jax.tree.leaves(cotangents)]
     asked = jnp.any(jnp.stack(asked))
@@ -175,8 +175,7 @@ def step_back(loop: Loop, node: Node, k: Int[Array, ""]) -> Node:
             miss = target.multiplier - reached.multiplier
             misses.append(loop.dt * miss)
             multiplier = multiplier + miss
-        size = jnp.max(jnp.abs(jnp.concatenate(misses)))
-        size = size / (1 + jnp.max(jnp.abs(target.p)))
+        size = largest(*misses) / (1 + largest(target.p))
         z = State(manifold.act(z.q, xi), z.v, z.p + misses[1], multiplier)
         return z, size, y
 

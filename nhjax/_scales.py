@@ -6,8 +6,9 @@ from jaxtyping import Array, Float, PyTree
 
 from ._contraction import contract
 from ._custom_types import Args, FloatScalar
+from ._largest import largest
 from ._linearisation import Linearisation
-from ._stages import StageSystem
+from ._stages import Stages, StageSystem
 from ._system import AbstractMechanicalSystem
 
 
@@ -26,7 +27,7 @@ def violation_scale(
     """
     affine = _finite_or_zero(system.constraint(t, q, jnp.zeros_like(u), args))
     slopes = jnp.sum(jnp.abs(lin.jacobian), axis=1)
-    return slopes * jnp.max(jnp.abs(u)) + affine
+    return slopes * largest(u) + affine
 
 
 def position_scale(
@@ -44,8 +45,7 @@ def position_scale(
         lambda slope: jnp.sum(jnp.abs(slope), axis=tuple(range(1, slope.ndim))),
         jax.jacrev(gamma)(q),
     )
-    sizes = jnp.stack([jnp.max(jnp.abs(leaf)) for leaf in jax.tree.leaves(q)])
-    return sum(jax.tree.leaves(slopes)) * jnp.max(sizes) + constant
+    return sum(jax.tree.leaves(slopes)) * largest(*jax.tree.leaves(q)) + constant
 
 
 def _finite_or_zero(x: Array) -> Array:
@@ -53,20 +53,22 @@ def _finite_or_zero(x: Array) -> Array:
     return jnp.abs(jnp.nan_to_num(x, nan=0.0, posinf=0.0, neginf=0.0))
 
 
-def fibre_scale(stages: StageSystem, lin: Linearisation) -> FloatScalar:
+def fibre_scale(stages: StageSystem, x0: Stages, lin: Linearisation) -> FloatScalar:
     """What the fibre coordinates of a step are rounded by, over the unit round-off.
 
-    Beside their own size that of the terms that cancel in them: forces and reactions
-    over the step, and what the round-off of a holonomic constraint, divided by h, makes
-    of velocities. A system at rest has nothing else.
+    Beside their own size, at the starting values x0, that of the terms that cancel in
+    them: forces and reactions over the step, and what the round-off of a holonomic
+    constraint, divided by h, makes of velocities. A system at rest has nothing else.
     """
     h = jnp.abs(stages.h)
-    rate = jnp.max(jnp.abs(lin.acceleration))
+    rate = largest(lin.acceleration)
     if stages.constrained:
-        rate = rate + jnp.max(
+        rate = rate + largest(
             contract("nl,l->n", jnp.abs(lin.reaction), jnp.abs(lin.multiplier))
         )
-    scale = h * rate
+    scale = h * rate + largest(
+        x0.node_fibre, x0.momentum if stages.hamiltonian else x0.velocity
+    )
     if stages.num_holonomic:
         m = stages.num_nonholonomic
         sizes = position_scale(stages.system, stages.t, stages.q, stages.args)
@@ -75,5 +77,5 @@ def fibre_scale(stages: StageSystem, lin: Linearisation) -> FloatScalar:
             jnp.abs(lin.reaction),
             jnp.abs(lin.compliance_inverse[:, m:]),
         )
-        scale = scale + jnp.max(contract("nk,k->n", response, sizes)) / h
+        scale = scale + largest(contract("nk,k->n", response, sizes)) / h
     return scale

@@ -43,7 +43,7 @@ class StageForces(NamedTuple):
     force: Float[Array, "s n"]  # n^i, the force W^i carried to the start of the step
     multiplier: Float[Array, "s l"]  # Λ^i
     residual: Float[Array, "s n"]  # Π^i - base - h Σ â_ij F^j
-    momentum_scale: FloatScalar  # the size of momenta, to judge residuals by
+    momentum: Float[Array, "s n"]  # Π^i, by whose size residuals are judged
 
 
 class StageSystem(eqx.Module):
@@ -259,8 +259,7 @@ class StageSystem(eqx.Module):
         residual = momentum - (
             base[None] + h * contract("ij,jn->in", a_hat, chart_force)
         )
-        scale = jnp.max(jnp.abs(momentum)) + jnp.max(jnp.abs(h * chart_force))
-        return StageForces(transported, multiplier, residual, scale)
+        return StageForces(transported, multiplier, residual, momentum)
 
     def node_positions(self, x: Stages) -> PyTree[Array]:
         """q^i at the nodes; the last is q_{k+1}."""

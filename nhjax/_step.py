@@ -11,6 +11,7 @@ from ._contraction import contract
 from ._custom_types import Args, BoolScalar, FloatScalar
 from ._implicit import frozen, is_given, masked
 from ._iteration import Solved
+from ._largest import largest
 from ._linearisation import Linearisation, linearise
 from ._method import AbstractMethod
 from ._newton import AbstractStageSolver, Evaluation
@@ -140,10 +141,8 @@ def step(
     )
     in_chart = stages.in_chart(x)
 
-    residual = jnp.maximum(
-        jnp.max(jnp.abs(forces.residual)), jnp.max(jnp.abs(solved.aux.node_residual))
-    )
-    scale = forces.momentum_scale
+    residual = largest(forces.residual, solved.aux.node_residual)
+    scale = largest(forces.momentum) + largest(h * forces.force)
     return StepOutcome(
         node=next_node,
         record=StepRecord(state, x.velocity, forces.force, forces.multiplier),
@@ -152,7 +151,7 @@ def step(
         num_iterations=solved.num_iterations,
         residual=residual / jnp.where(scale > 0, scale, 1),
         constraint_violation=largest_violation(system, t + h, next_node, args),
-        multiplier_defect=_largest(forces.multiplier[-1] - lin_next.multiplier),
+        multiplier_defect=largest(forces.multiplier[-1] - lin_next.multiplier),
     )
 
 
@@ -182,8 +181,4 @@ def largest_violation(
 ) -> FloatScalar:
     """The largest violation of any constraint at a node."""
     on_positions = system.position_constraint(t, node.state.q, args)
-    return jnp.maximum(_largest(node.lin.violation), _largest(on_positions))
-
-
-def _largest(x: Float[Array, " m"]) -> FloatScalar:
-    return jnp.max(jnp.abs(x), initial=0.0)
+    return largest(node.lin.violation, on_positions)

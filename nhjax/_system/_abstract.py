@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PyTree
 
+from .._contraction import Matrix
 from .._custom_types import (
     Args,
     FloatScalar,
@@ -75,8 +76,8 @@ class AbstractMechanicalSystem(eqx.Module):
     @abstractmethod
     def metric(
         self, t: FloatScalarLike, q: PyTree[Array], u: Float[Array, " n"], args: Args
-    ) -> Float[Array, "n n"]:
-        """The metric K on the fibre, D2D2L or D2D2H."""
+    ) -> Matrix:
+        """The metric K on the fibre, D2D2L or D2D2H, or its diagonal."""
 
     @abstractmethod
     def free_force(

@@ -1,0 +1,109 @@
+"""Diagonal mass matrices are recognised, and only those."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import nhjax
+from nhjax._contraction import apply, dense, inverse
+from nhjax._diagonal import jacobian
+from nhjax._largest import largest
+
+
+U = jnp.array([0.3, -0.4, 0.5, 1.1])
+M = jnp.array([1.0, 2.0, 3.0, 4.0])
+
+SEPARATE = {
+    "square": lambda v: 0.5 * v @ v,
+    "sum": lambda v: 0.5 * jnp.sum(M * v * v),
+    "product": lambda v: 0.5 * jnp.dot(v, M * v),
+    "named": lambda v: 0.5 * (v[0] ** 2 + 2 * v[1] ** 2) + v[2] ** 4 + v[-1] ** 2,
+    "parts": lambda v: jnp.sum(v[:2] ** 2) + 3 * jnp.sum(v[2:] ** 2),
+    "relativistic": lambda v: -jnp.sum(jnp.sqrt(1 - 0.1 * v**2)),
+    "unused": lambda v: v[1] ** 2 + v[2] ** 2,
+    "jit": jax.jit(lambda v: 0.5 * v @ v),
+    "checkpoint": jax.checkpoint(lambda v: jnp.sum(v**2)),
+    "joined": lambda v: jnp.sum(jnp.concatenate([v[:1], v[1:]]) ** 2),
+}
+COUPLED = {
+    "matrix": lambda v: 0.5 * v @ (jnp.eye(4) + 0.1) @ v,
+    "neighbours": lambda v: v[0] * v[1] + jnp.sum(v**2),
+    "shifted": lambda v: jnp.sum(v[1:] * v[:-1]),
+    "rolled": lambda v: jnp.sum(v * jnp.roll(v, 1)),
+    "reversed": lambda v: v[::-1] @ v,
+    "strided": lambda v: jnp.sum(v[::2] * v[1::2]),
+    "norm": lambda v: jnp.sqrt(1 + v @ v),
+    "mean": lambda v: jnp.sum(v) ** 2,
+    "swapped": lambda v: jnp.concatenate([v[2:], v[:2]]) @ v,
+    "reshaped": lambda v: jnp.sum(v.reshape(2, 2) @ v.reshape(2, 2)),
+    "scan": lambda v: jax.lax.scan(lambda c, x: (c * x + x, c), 1.0, v)[0],
+}
+
+
+@pytest.mark.parametrize("name", SEPARATE)
+def test_separate_terms_give_a_diagonal(name):
+    momentum = jax.grad(SEPARATE[name])
+    found = jacobian(momentum, U)
+    assert found.shape == U.shape
+    np.testing.assert_allclose(dense(found), jax.jacfwd(momentum)(U), rtol=1e-15)
+
+
+@pytest.mark.parametrize("name", COUPLED)
+def test_coupled_terms_give_a_matrix(name):
+    momentum = jax.grad(COUPLED[name])
+    found = jacobian(momentum, U)
+    assert found.shape == (4, 4)
+    np.testing.assert_allclose(found, jax.jacfwd(momentum)(U), rtol=1e-15)
+
+
+def test_values_of_a_function_may_be_fewer_or_the_same_for_all():
+    assert jacobian(lambda u: u[:2], U).shape == (2, 4)
+    assert jacobian(lambda u: jnp.full((4,), u[0]), U).shape == (4, 4)
+    np.testing.assert_array_equal(jacobian(lambda u: M, U), jnp.zeros(4))
+
+
+def test_a_diagonal_acts_as_its_matrix_does():
+    x = jnp.arange(24.0).reshape(2, 3, 4)
+    full = jnp.diag(M)
+    for vectors in (x[0, 0], x[0], x):
+        np.testing.assert_allclose(apply(M, vectors), apply(full, vectors))
+    np.testing.assert_allclose(dense(inverse(M)), inverse(full), rtol=1e-15)
+    rate = jax.jvp(inverse, (M,), (U,))[1]
+    full_rate = jax.jvp(inverse, (full,), (jnp.diag(U),))[1]
+    np.testing.assert_allclose(dense(rate), full_rate, atol=1e-16)
+
+
+@pytest.mark.parametrize("multiplier", ["propagated", "symmetric"])
+def test_a_diagonal_written_as_a_matrix_gives_the_same_motion(multiplier):
+    def phi(t, q, v, args):
+        return v[2] - q[1] * v[0]
+
+    def lagrangian(kinetic):
+        return lambda t, q, v, args: kinetic(v) - 0.5 * q @ q - q[0] * q[1]
+
+    m = M[:3]
+    runs = []
+    for kinetic in (lambda v: 0.5 * m @ v**2, lambda v: 0.5 * v @ jnp.diag(m) @ v):
+        system = nhjax.LagrangianSystem(lagrangian(kinetic), nonholonomic=phi)
+        y0 = nhjax.initial_state(
+            system, q=jnp.array([0.1, 0.5, 0.2]), v=jnp.array([1.0, -0.3, 0.5])
+        )
+        method = nhjax.LobattoIIIAB(3, multiplier=multiplier)
+        runs.append(nhjax.integrate(system, method, y0, dt=0.1, num_steps=50).ys)
+    for leaf, other in zip(*map(jax.tree.leaves, runs), strict=True):
+        np.testing.assert_allclose(leaf, other, atol=1e-13)
+
+
+@pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
+def test_the_largest_number_is_that_of_floats(dtype):
+    x = jnp.array([[0.5, -3.0, -0.0], [1.0, 2.0, 1e-310]], dtype)
+    assert largest(x) == 3
+    assert largest(x).dtype == dtype
+    assert largest(x, 4 * x[:, :1]) == 4
+    assert largest(-x[0, 2:]) == 0
+    assert largest(jnp.zeros((0,), dtype)) == 0
+    assert largest(x, jnp.zeros((2, 0), dtype)) == 3
+    assert largest(x, jnp.array([-jnp.inf], dtype)) == jnp.inf
+    for nan in (jnp.nan, -jnp.nan):
+        assert jnp.isnan(largest(x, jnp.array([jnp.inf, nan], dtype)))
