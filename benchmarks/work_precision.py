@@ -202,7 +202,7 @@ def diffrax_runs(case: Case, limit: int) -> Iterator[Run]:
         for solver, fixed in methods:
             rungs = STEPS if fixed else TOLERANCES[solver]
             function = diffrax_run(case.problem, solver, layout, fixed, case.t)
-            program, seconds = compiled(function, (state, 0.1))
+            program, seconds = compiled(function, (state, rungs[0]))
             name = f"diffrax {solver}" + (" fixed" if fixed else "")
             name += "" if layout == "array" else f" {layout}"
             for rung in thinned(rungs, limit):

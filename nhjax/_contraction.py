@@ -5,8 +5,11 @@ worth: inside a time loop the calls cost more than the arithmetic, they cannot b
 compiled into one kernel with what surrounds them, and batches of them run one by one.
 """
 
+import itertools
+import math
 import string
 from collections.abc import Callable
+from functools import reduce
 from typing import Any, TypeAlias
 
 import jax
@@ -14,10 +17,12 @@ import jax.extend
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from ._elementary import LARGEST_ARRAY, LARGEST_REDUCTION
 
-# More rows are left to a library. Chosen to keep what is written out small; where the
-# library overtakes was not measured.
-LARGEST = 16
+
+# More rows are left to a library: a kernel may not sum more numbers than such a matrix
+# has.
+LARGEST = math.isqrt(LARGEST_REDUCTION)
 
 
 # A square matrix, or its diagonal if it has no other entries.
@@ -26,14 +31,29 @@ Matrix: TypeAlias = Float[Array, "n n"] | Float[Array, " n"]
 
 def contract(subscripts: str, a: Array, b: Array) -> Array:
     """`jnp.einsum(subscripts, a, b)`, written out as products and sums if small."""
-    if max((*a.shape, *b.shape), default=0) > LARGEST:
-        return jnp.einsum(subscripts, a, b)
     operands, result = subscripts.split("->")
     first, second = operands.split(",")
     summed = [index for index in dict.fromkeys(first + second) if index not in result]
     order = [*result, *summed]
-    product = _aligned(a, first, order) * _aligned(b, second, order)
-    return jnp.sum(product, axis=tuple(range(len(result), len(order))))
+    x, y = _aligned(a, first, order), _aligned(b, second, order)
+    shape = jnp.broadcast_shapes(x.shape, y.shape)
+    kept_shape, summed_shape = shape[: len(result)], shape[len(result) :]
+    if math.prod(shape) <= LARGEST_REDUCTION:
+        return jnp.sum(x * y, axis=tuple(range(len(result), len(order))))
+    if math.prod(summed_shape) > LARGEST or math.prod(kept_shape) > LARGEST_ARRAY:
+        return jnp.einsum(subscripts, a, b)
+    # Term by term: what is larger is summed by a library.
+    terms = (
+        _term(x, index) * _term(y, index)
+        for index in itertools.product(*map(range, summed_shape))
+    )
+    return reduce(jnp.add, terms)
+
+
+def _term(x: Array, index: tuple[int, ...]) -> Array:
+    """x at an index of its last axes; those of length one have but one term."""
+    lengths = x.shape[x.ndim - len(index) :]
+    return x[(..., *(k if n > 1 else 0 for k, n in zip(index, lengths, strict=True)))]
 
 
 def apply(matrix: Matrix, x: Float[Array, "... n"]) -> Float[Array, "... n"]:
@@ -99,24 +119,34 @@ def _inverse_jvp(primals, tangents):
 
 
 def _eliminated(matrix: Float[Array, "m m"]) -> Float[Array, "m m"]:
-    """The inverse by elimination of Gauss and Jordan with partial pivoting."""
-    size = matrix.shape[0]
-    rows = jnp.arange(size)
+    """The inverse by elimination of Gauss and Jordan, in place, with row pivoting."""
+    rows = jnp.arange(matrix.shape[0])
 
-    def eliminate(k, table):
-        column = jnp.sum(jnp.where(rows[None] == k, table[:, :size], 0), axis=1)
-        pivot = jnp.argmax(jnp.where(rows >= k, jnp.abs(column), -1))
+    def at(x, k):
+        return jax.lax.dynamic_index_in_dim(x, k, keepdims=False)
+
+    def eliminate(k, carry):
+        table, order = carry
+        column, row = at(table.T, k), at(table, k)
+        largest = jnp.argmax(jnp.where(rows >= k, jnp.abs(column), -1))
         # By masks: an index that varies over a batch would gather and scatter.
-        low = jnp.sum(jnp.where((rows == pivot)[:, None], table, 0), axis=0)
-        top = jnp.sum(jnp.where((rows == k)[:, None], table, 0), axis=0)
-        scaled = low / jnp.sum(jnp.where(rows == pivot, column, 0))
-        table = jnp.where((rows == pivot)[:, None], top[None], table)
-        column = jnp.sum(jnp.where(rows[None] == k, table[:, :size], 0), axis=1)
-        others = table - column[:, None] * scaled[None]
-        return jnp.where((rows == k)[:, None], scaled[None], others)
+        is_k, is_pivot = rows == k, rows == largest
+        pivot_row = jnp.sum(jnp.where(is_pivot[:, None], table, 0), axis=0)
+        pivot = at(pivot_row, k)
+        scaled = jnp.where(is_k, 1 / pivot, pivot_row / pivot)
+        # Rows k and `largest` change places.
+        column = jnp.where(is_pivot, at(column, k), column)
+        table = jnp.where(is_pivot[:, None], row[None], table)
+        place = jnp.sum(jnp.where(is_pivot, order, 0))
+        order = jnp.where(is_pivot, at(order, k), order)
+        # Column k makes room for that of the inverse.
+        table = jnp.where(is_k[None], 0, table) - column[:, None] * scaled[None]
+        table = jnp.where(is_k[:, None], scaled[None], table)
+        return table, jnp.where(is_k, place, order)
 
-    table = jnp.concatenate([matrix, jnp.eye(size, dtype=matrix.dtype)], axis=1)
-    return jax.lax.fori_loop(0, size, eliminate, table)[:, size:]
+    table, order = jax.lax.fori_loop(0, len(rows), eliminate, (matrix, rows))
+    places = (order[:, None] == rows[None]).astype(matrix.dtype)
+    return contract("ij,jk->ik", table, places)
 
 
 def with_small_products(program: Any) -> Callable[..., list[Any]]:

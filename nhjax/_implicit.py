@@ -29,25 +29,52 @@ def solve_contraction(contraction: Callable[[X], X], b: X, *, max_iterations: in
     the nonlinear iteration did. Derivatives of every order follow from the equation,
     not from the iterations.
     """
-    # One vector: a part of b that happened to be constant could not be transposed.
-    flat_b, unravel = ravel_pytree(b)
+    given, treedef = jax.tree.flatten(b)
+
+    def full(leaves):
+        rest = iter(leaves)
+        return treedef.unflatten(
+            [next(rest) if x.size else jnp.zeros(x.shape, x.dtype) for x in given]
+        )
 
     def operator(x):
-        return x - ravel_pytree(contraction(unravel(x)))[0]
+        return _minus(x, _not_empty(contraction(full(x))))
 
     def refine(matvec, b):
+        scale = largest(*b)
+
         def sweep(x):
-            increment = b - matvec(x)
-            return x + increment, relative_size([increment], largest(x)), None
+            increment = _minus(b, matvec(x))
+            x = [x + dx for x, dx in zip(x, increment, strict=True)]
+            return x, relative_size(increment, scale), None
 
-        solved = iterate(sweep, b, max_iterations=max_iterations)
-        return jnp.where(solved.converged, solved.x, jnp.nan)
+        # What is still missing then is smaller by the rate at which G contracts.
+        tolerance = 256 * float(jnp.finfo(scale.dtype).eps)
+        solved = iterate(sweep, b, max_iterations=max_iterations, tolerance=tolerance)
+        return [jnp.where(solved.converged, x, jnp.nan) for x in solved.x]
 
-    return unravel(
-        jax.lax.custom_linear_solve(
-            operator, flat_b, solve=refine, transpose_solve=refine
-        )
+    x = jax.lax.custom_linear_solve(
+        operator, _mixed(_not_empty(b)), solve=refine, transpose_solve=refine
     )
+    return full(_mixed(x))
+
+
+def _not_empty(tree: PyTree[Array]) -> list[Array]:
+    """The leaves that have elements."""
+    return [leaf for leaf in jax.tree.leaves(tree) if leaf.size]
+
+
+def _minus(xs: list[Array], ys: list[Array]) -> list[Array]:
+    return [x - y for x, y in zip(xs, ys, strict=True)]
+
+
+def _mixed(xs: list[Array]) -> list[Array]:
+    """The same, of which none is constant unless all are.
+
+    A linear equation with a constant on one side could not be transposed.
+    """
+    nothing = 0 * sum(x.reshape(-1)[0] for x in xs)
+    return [x + nothing for x in xs]
 
 
 def root(

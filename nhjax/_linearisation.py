@@ -117,21 +117,19 @@ def linearise(
     args: Args,
 ) -> Linearisation:
     """The matrices, the acceleration and the continuous multiplier at (t, q, u)."""
-    zero_t, zero = jnp.zeros_like(t), jnp.zeros_like(u)
-    (p, violation), push = jax.linearize(
-        _momentum_and_constraint(system, q, args), t, zero, u
+    zero, v = jnp.zeros_like(u), system.velocity(t, q, u, args)
+    (p, violation), (p_dot, phi_dot) = jax.jvp(
+        _momentum_and_constraint(system, q, args),
+        (t, zero, u),
+        (jnp.ones_like(t), v, zero),
     )
-    jacobian_t = jax.vmap(lambda e: push(zero_t, zero, e)[1])(
-        jnp.eye(u.shape[0], dtype=u.dtype)
-    )
-    v = system.velocity(t, q, u, args)
-    p_dot, phi_dot = push(jnp.ones_like(t), v, zero)
+    jacobian = jax.jacrev(system.constraint, argnums=2)(t, q, u, args)
     metric_inverse = inverse(system.metric(t, q, u, args))
-    reaction = apply(metric_inverse, jacobian_t.T).T
-    compliance = contract("nk,nl->kl", jacobian_t, reaction)
+    reaction = apply(metric_inverse, jacobian).T
+    compliance = contract("kn,nl->kl", jacobian, reaction)
     lin = Linearisation(
         metric_inverse=metric_inverse,
-        jacobian=jacobian_t.T,
+        jacobian=jacobian,
         reaction=reaction,
         compliance_inverse=inverse(compliance),
         acceleration=zero,
