@@ -277,7 +277,9 @@ inline T step(State<T>& y, double h) {
             EACH(k) change = larger(change, absolute(T(u_next[i][k] - u[i][k])));
         T d_lambda = larger(absolute(d_nu), absolute(d_middle));
         d_lambda = larger(d_lambda, absolute(T(d_end - d_nu)));
-        T size = larger(change, T(h * d_lambda * size_b)) / scale;
+        T size = larger(change, T(h * d_lambda * size_b));
+        if (sweep == 0) scale += size;
+        size /= scale;
         for (int i = 0; i < S; ++i) H[i] = H_next[i];
         for (int i = 0; i < S - 1; ++i) u[i] = u_next[i];
         nu += d_nu;

@@ -17,12 +17,15 @@ import jax.extend
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from ._elementary import LARGEST_ARRAY, LARGEST_REDUCTION
+from ._elementary import LARGEST_REDUCTION
 
 
-# More rows are left to a library: a kernel may not sum more numbers than such a matrix
-# has.
+# More rows are inverted by a library: a kernel may not sum more numbers than such a
+# matrix has.
 LARGEST = math.isqrt(LARGEST_REDUCTION)
+# Longer sums and larger products are left to one too: what is written out is to stay
+# short, and from some 10⁵ terms on the library was the faster (measured).
+LONGEST_SUM, LARGEST_PRODUCT = 128, 2**15
 
 
 # A square matrix, or its diagonal if it has no other entries.
@@ -37,10 +40,10 @@ def contract(subscripts: str, a: Array, b: Array) -> Array:
     order = [*result, *summed]
     x, y = _aligned(a, first, order), _aligned(b, second, order)
     shape = jnp.broadcast_shapes(x.shape, y.shape)
-    kept_shape, summed_shape = shape[: len(result)], shape[len(result) :]
+    summed_shape = shape[len(result) :]
     if math.prod(shape) <= LARGEST_REDUCTION:
         return jnp.sum(x * y, axis=tuple(range(len(result), len(order))))
-    if math.prod(summed_shape) > LARGEST or math.prod(kept_shape) > LARGEST_ARRAY:
+    if math.prod(summed_shape) > LONGEST_SUM or math.prod(shape) > LARGEST_PRODUCT:
         return jnp.einsum(subscripts, a, b)
     # Term by term: what is larger is summed by a library.
     terms = (
@@ -62,11 +65,6 @@ def apply(matrix: Matrix, x: Float[Array, "... n"]) -> Float[Array, "... n"]:
         return jnp.expand_dims(matrix, range(x.ndim - 1)) * x
     rows = "abc"[: x.ndim - 1]
     return contract(f"kn,{rows}n->{rows}k", matrix, x)
-
-
-def dense(matrix: Matrix) -> Float[Array, "n n"]:
-    """All entries of a matrix."""
-    return matrix if matrix.ndim == 2 else jnp.diag(matrix)
 
 
 def _aligned(x: Array, indices: str, order: list[str]) -> Array:

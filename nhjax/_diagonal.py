@@ -32,29 +32,32 @@ def jacobian(function: Callable[[Array], Array], u: Float[Array, " n"]) -> Matri
     """∂f_i/∂u_j, or its diagonal alone if no f_i depends on any but u_i.
 
     The mass matrices of most Lagrangians that one writes down are diagonal, and cost n
-    instead of n² then. It is decided from the operations, not from values, when the
-    function is traced: what it does not see through counts as dense.
+    instead of n² then. It is decided from the operations of the derivative, not from
+    values, when the function is traced: what it does not see through counts as dense.
     """
-    if not _is_diagonal(function, u):
-        return jax.jacfwd(function)(u)
-    return jax.jvp(function, (u,), (jnp.ones_like(u),))[1]
 
+    def push(u, du):
+        return jax.jvp(function, (u,), (du,))[1]
 
-def _is_diagonal(function: Callable[[Array], Array], u: Array) -> bool:
-    program = jax.make_jaxpr(function)(u)
-    if program.out_avals[0].shape != u.shape:
-        return False
-    (found,) = _followed(program.jaxpr, [_Aligned(0)])
-    return found is None or found == _Aligned(0)
+    ones = jnp.ones_like(u)
+    program = jax.make_jaxpr(push)(u, ones)
+    if program.out_avals[0].shape == u.shape and not program.effects:
+        (found,) = _followed(program.jaxpr, [_Aligned(0), _Aligned(0)])
+        if found is None or found == _Aligned(0):
+            return jax.extend.core.jaxpr_as_fun(program)(u, ones)[0]
+    return jax.vmap(push, in_axes=(None, 0), out_axes=1)(
+        u, jnp.eye(u.shape[0], dtype=u.dtype)
+    )
 
 
 def _followed(program: Any, inputs: Sequence[_Dependence]) -> list[_Dependence]:
     """What the results of a program depend on."""
-    known = dict(zip(program.invars, inputs, strict=True))
+    known = dict.fromkeys(program.constvars)
+    known |= zip(program.invars, inputs, strict=True)
 
     def read(variable):
         is_literal = isinstance(variable, jax.extend.core.Literal)
-        return None if is_literal else known.get(variable)
+        return None if is_literal else known[variable]
 
     for equation in program.eqns:
         found = _dependences(equation, [read(x) for x in equation.invars])
@@ -64,6 +67,8 @@ def _followed(program: Any, inputs: Sequence[_Dependence]) -> list[_Dependence]:
 
 def _dependences(equation: Any, inputs: list[_Dependence]) -> list[_Dependence]:
     outputs = equation.outvars
+    if equation.effects:
+        return [_Unknown()] * len(outputs)
     if all(x is None for x in inputs):
         return [None] * len(outputs)
     name, params = equation.primitive.name, equation.params
@@ -83,6 +88,8 @@ def _dependence(name: str, equation: Any, inputs: list[_Dependence]) -> _Depende
     moving = [k for k, x in enumerate(inputs) if x is not None]
     found = {inputs[k] for k in moving}
     if _Unknown() in found or len(shape) > 1:
+        return _Unknown()
+    if not shape and name in ("slice", "pad"):
         return _Unknown()
     (first, *others) = (x for x in inputs if isinstance(x, _Aligned))
     is_same = not any(x != first for x in others)

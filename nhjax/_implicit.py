@@ -12,9 +12,12 @@ from jaxtyping import Array, PyTree
 
 from ._contraction import with_small_products
 from ._custom_types import BoolScalar
-from ._iteration import dense_increment, iterate, relative_size, Solved
+from ._iteration import dense_increment, iterate, Solved
 from ._largest import largest
 
+
+# Round-off units below which terms of the Neumann series are left out.
+_UNITS_LEFT = 256
 
 T = TypeVar("T")
 X = TypeVar("X", bound=PyTree[Array])
@@ -24,10 +27,11 @@ def solve_contraction(contraction: Callable[[X], X], b: X, *, max_iterations: in
     """x with x = G x + b, for a linear G that contracts; NaN if it does not.
 
     Both x and the solution of the transposed equation are sums of the Neumann series,
-    to round-off. Where x -> G x + b is a simplified Newton iteration, linearised, this
-    is iterative refinement with its factors, and costs about as many evaluations as
-    the nonlinear iteration did. Derivatives of every order follow from the equation,
-    not from the iterations.
+    until its terms are below 256 units of round-off; those that are left out sum up to
+    ρ / (1 - ρ) of that where G contracts by ρ. Where x -> G x + b is a simplified
+    Newton iteration, linearised, this is iterative refinement with its factors, and
+    costs about as many evaluations as the nonlinear iteration did. Derivatives of every
+    order follow from the equation, not from the iterations.
     """
     given, treedef = jax.tree.flatten(b)
 
@@ -41,16 +45,17 @@ def solve_contraction(contraction: Callable[[X], X], b: X, *, max_iterations: in
         return _minus(x, _not_empty(contraction(full(x))))
 
     def refine(matvec, b):
-        scale = largest(*b)
 
         def sweep(x):
             increment = _minus(b, matvec(x))
             x = [x + dx for x, dx in zip(x, increment, strict=True)]
-            return x, relative_size(increment, scale), None
+            return x, largest(*increment), None
 
-        # What is still missing then is smaller by the rate at which G contracts.
-        tolerance = 256 * float(jnp.finfo(scale.dtype).eps)
-        solved = iterate(sweep, b, max_iterations=max_iterations, tolerance=tolerance)
+        scale = largest(*b)
+        tolerance = _UNITS_LEFT * float(jnp.finfo(scale.dtype).eps)
+        solved = iterate(
+            sweep, b, scale, max_iterations=max_iterations, tolerance=tolerance
+        )
         return [jnp.where(solved.converged, x, jnp.nan) for x in solved.x]
 
     x = jax.lax.custom_linear_solve(
@@ -91,10 +96,10 @@ def root(
 
     def sweep(x):
         dx, _ = dense_increment(lambda z: (flat_residual(z), None), x)
-        return x + dx, relative_size([dx], largest(x)), None
+        return x + dx, largest(dx), None
 
     def newton(_, x):
-        solved = iterate(sweep, x, max_iterations=max_iterations)
+        solved = iterate(sweep, x, largest(x), max_iterations=max_iterations)
         # As numbers: `custom_root` takes the tangents of `aux` for such.
         outcome = (solved.converged, solved.num_iterations)
         return solved.x, jax.tree.map(lambda z: z.astype(x.dtype), outcome)

@@ -16,7 +16,7 @@ from ._checks import (
     real_scalar,
     require_manifold,
 )
-from ._contraction import apply, dense, inverse, Matrix
+from ._contraction import inverse
 from ._custom_types import Args, BoolScalar, FloatScalarLike
 from ._errors import DTypeError, require, ShapeError
 from ._implicit import root
@@ -124,7 +124,7 @@ def _solve(system, t, q, v, p, args, project: bool) -> Found:
         generator=getattr(system, system.generator)(t, q, u, args),
         positions=system.position_constraint(t, q, args),
         off_group=off_group,
-        regularity=conditioning(dense(metric)),
+        regularity=conditioning(metric),
         admissibility=conditioning(lin.jacobian),
         compatibility=conditioning(lin.jacobian @ lin.reaction),
         allowed=tolerance * violation_scale(system, lin, t, q, u, args),
@@ -156,7 +156,7 @@ def _project_fibre(system, t, q, u, args) -> tuple[Float[Array, " n"], BoolScala
 
 
 def _nearest(
-    metric: Matrix,
+    metric: Float[Array, "n n"],
     constraint: Callable[[Float[Array, " n"]], Float[Array, " m"]],
     x: Float[Array, " n"],
 ) -> tuple[Float[Array, " n"], BoolScalar]:
@@ -165,7 +165,7 @@ def _nearest(
     def stationarity(z):
         y, multiplier = z
         value, pullback = jax.vjp(constraint, y)
-        return apply(metric, y - x) - pullback(multiplier)[0], value
+        return metric @ (y - x) - pullback(multiplier)[0], value
 
     solved = root(stationarity, (x, jnp.zeros_like(constraint(x))))
     return solved.x[0], solved.converged

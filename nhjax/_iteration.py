@@ -1,6 +1,6 @@
 """The loop that ends at round-off, and the increments that it is fed."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Generic, NamedTuple, TypeVar
 
 import jax
@@ -8,7 +8,6 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from ._custom_types import BoolScalar, FloatScalar, FloatScalarLike
-from ._largest import largest
 
 
 X = TypeVar("X")
@@ -25,6 +24,7 @@ class Solved(NamedTuple, Generic[X, Aux]):
 
 
 class _Progress(NamedTuple):
+    scale: FloatScalar
     smallest: FloatScalar
     stalls: Int[Array, ""]
     iterations: Int[Array, ""]
@@ -35,6 +35,7 @@ class _Progress(NamedTuple):
 def iterate(
     sweep: Callable[[X], tuple[X, FloatScalar, Aux]],
     x: X,
+    scale: FloatScalar,
     *,
     max_iterations: int,
     tolerance: FloatScalarLike = 0.0,
@@ -42,13 +43,14 @@ def iterate(
 ) -> Solved[X, Aux]:
     """Repeat `sweep` until its increments no longer fall.
 
-    `sweep(x)` returns the next iterate, the relative size of the increment, and
-    whatever was evaluated at x. An increment below the unit round-off (or `tolerance`)
-    ends the iteration; so do small increments that have ceased to fall, since that is
-    round-off speaking. The floor of round-off depends on the conditioning of the
-    problem, so that one absolute threshold would be either too coarse or never met
-    (Hairer, Lubich, Wanner, GNI, section VIII.6): the more often increments fail to
-    fall, the larger a floor is believed.
+    `sweep(x)` returns the next iterate, the size of the increment, and whatever was
+    evaluated at x. Sizes count relative to `scale`, the size of x, to which that of the
+    first increment is added: x may start from nothing. An increment below the unit
+    round-off (or `tolerance`) ends the iteration; so do small increments that have
+    ceased to fall, since that is round-off speaking. The floor of round-off depends on
+    the conditioning of the problem, so that one absolute threshold would be either too
+    coarse or never met (Hairer, Lubich, Wanner, GNI, section VIII.6): the more often
+    increments fail to fall, the larger a floor is believed.
     """
     aux_shape = jax.eval_shape(lambda x: sweep(x)[2], x)
     aux = jax.tree.map(lambda s: jnp.zeros(s.shape, s.dtype), aux_shape)
@@ -59,7 +61,10 @@ def iterate(
 
     def body(carry):
         x, _, progress = carry
-        x_next, size, aux = sweep(x)
+        x_next, increment, aux = sweep(x)
+        first = jnp.where(progress.iterations == 0, increment, 0)
+        scale = progress.scale + first
+        size = increment / jnp.where(scale > 0, scale, 1)
         finite = jnp.isfinite(size)
         stalls = progress.stalls + (size >= progress.smallest).astype(jnp.int32)
         smallest = jnp.minimum(size, progress.smallest)
@@ -68,11 +73,12 @@ def iterate(
         stagnant = (stalls >= 1) & (progress.smallest <= believed)
         converged = finite & ((size <= floor) | stagnant)
         done = converged | ~finite | (count >= max_iterations)
-        return x_next, aux, _Progress(smallest, stalls, count, done, converged)
+        return x_next, aux, _Progress(scale, smallest, stalls, count, done, converged)
 
     zero = jnp.zeros((), jnp.int32)
     skip = jnp.asarray(skip)
-    start = _Progress(jnp.asarray(jnp.inf, dtype), zero, zero, skip, skip)
+    scale = jnp.asarray(scale, dtype)
+    start = _Progress(scale, jnp.asarray(jnp.inf, dtype), zero, zero, skip, skip)
     x, aux, progress = jax.lax.while_loop(
         lambda carry: ~carry[2].done, body, (x, aux, start)
     )
@@ -91,8 +97,3 @@ def dense_increment(
 
     jacobian, (r, aux) = jax.jacfwd(evaluated_twice_is_once, has_aux=True)(x)
     return jnp.linalg.solve(jacobian, -r), aux
-
-
-def relative_size(increments: Sequence[Array], scale: FloatScalarLike) -> FloatScalar:
-    """max |δ| over the scale, which does not count if it is zero."""
-    return largest(*increments) / jnp.where(scale > 0, scale, 1)

@@ -204,21 +204,59 @@ def _differentiated(operands, tangents, *, program):
         return [*_merged(is_smooth, smooth, rest), *residuals]
 
     try:
-        results = _call(linearised, list(operands))
+        whole = jax.make_jaxpr(linearised)(*operands)
     except ValueError:
         # What JAX cannot linearise, such as a while loop, it may still push forward.
         all_rates = [ad.instantiate_zeros(tangent) for tangent in tangents]
         return jax.jvp(run, operands, all_rates)
     size = len(program.out_avals)
+    # A loop would keep what is the same in each of its rounds as often as there are.
+    is_kept = [True] * size + _fixed_part(whole)[1][size:]
+    results = _call(
+        lambda *operands: _split(
+            is_kept, jax.extend.core.jaxpr_as_fun(whole)(*operands)
+        )[0],
+        list(operands),
+    )
     out, residuals = results[:size], results[size:]
 
     def push(*given):
         residuals, rates = given[: -sum(is_moving)], given[-sum(is_moving) :]
-        return list(jax.tree.unflatten(treedef, residuals)(*rates))
+        everything = _merged(is_kept[size:], residuals, _constants(whole, is_kept))
+        return list(jax.tree.unflatten(treedef, everything)(*rates))
 
     changes = _call(push, [*residuals, *rates])
     zeros = [ad.Zero(aval.to_tangent_aval()) for aval in program.out_avals]
     return out, _merged(is_smooth, changes, _split(is_smooth, zeros)[1])
+
+
+def _fixed_part(program) -> tuple[list[Any], list[bool]]:
+    """The operations that depend on no operand, and which results do."""
+    traced = [isinstance(const, jax.core.Tracer) for const in program.consts]
+    varying = {*program.jaxpr.invars, *_split(traced, program.jaxpr.constvars)[0]}
+
+    def varies(x) -> bool:
+        return not isinstance(x, jax.extend.core.Literal) and x in varying
+
+    fixed = []
+    for equation in program.eqns:
+        if equation.effects or any(map(varies, equation.invars)):
+            varying.update(equation.outvars)
+        else:
+            fixed.append(equation)
+    return fixed, list(map(varies, program.jaxpr.outvars))
+
+
+def _constants(program, is_kept: list[bool]) -> list[Any]:
+    """The results of a program that are not kept, which do not depend on operands."""
+    jaxpr = program.jaxpr
+    fixed = jaxpr.replace(
+        invars=[],
+        eqns=_fixed_part(program)[0],
+        outvars=_split(is_kept, jaxpr.outvars)[1],
+        debug_info=jaxpr.debug_info.with_unknown_names(),
+    )
+    return jax.core.eval_jaxpr(fixed, program.consts)
 
 
 ad.primitive_jvps[_kernel] = _differentiated

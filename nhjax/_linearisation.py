@@ -8,6 +8,7 @@ from jaxtyping import Array, Bool, Float, PyTree
 
 from ._contraction import apply, contract, inverse, Matrix
 from ._custom_types import Args, FloatScalar
+from ._diagonal import jacobian
 
 
 if TYPE_CHECKING:
@@ -123,13 +124,14 @@ def linearise(
         (t, zero, u),
         (jnp.ones_like(t), v, zero),
     )
-    jacobian = jax.jacrev(system.constraint, argnums=2)(t, q, u, args)
-    metric_inverse = inverse(system.metric(t, q, u, args))
-    reaction = apply(metric_inverse, jacobian).T
-    compliance = contract("kn,nl->kl", jacobian, reaction)
+    slopes = jax.jacrev(system.constraint, argnums=2)(t, q, u, args)
+    metric = jacobian(lambda u: system.conjugate(t, q, u, args), u)
+    metric_inverse = inverse(metric)
+    reaction = apply(metric_inverse, slopes).T
+    compliance = contract("kn,nl->kl", slopes, reaction)
     lin = Linearisation(
         metric_inverse=metric_inverse,
-        jacobian=jacobian,
+        jacobian=slopes,
         reaction=reaction,
         compliance_inverse=inverse(compliance),
         acceleration=zero,

@@ -12,7 +12,8 @@ from jaxtyping import Array, Float
 
 from ._contraction import apply, contract
 from ._custom_types import FloatScalar, FloatScalarLike
-from ._iteration import dense_increment, iterate, relative_size, Solved
+from ._iteration import dense_increment, iterate, Solved
+from ._largest import largest
 from ._leading_structure import leading_structure, LeadingStructure
 from ._linearisation import Linearisation
 from ._scales import fibre_scale
@@ -90,15 +91,16 @@ class SimplifiedNewton(AbstractStageSolver):
     ) -> Solved[Stages, Evaluation]:
         """Solve the stage equations from `x0`; does nothing where `skip` is true."""
         structure = leading_structure(stages, x0, lin)
-        size = _increment_size(stages, x0, lin)
+        scale = fibre_scale(stages, x0, lin)
 
         def sweep(x: Stages):
             x_next, evaluation = _corrected(stages, structure, x)
-            return x_next, size(x, x_next), evaluation
+            return x_next, _increment_size(stages, x, x_next, lin), evaluation
 
         return iterate(
             sweep,
             x0,
+            scale,
             max_iterations=self.max_iterations,
             tolerance=self.tolerance,
             skip=skip,
@@ -168,7 +170,7 @@ class Newton(AbstractStageSolver):
     ) -> Solved[Stages, Evaluation]:
         """Solve the stage equations from `x0`; does nothing where `skip` is true."""
         _, unravel = ravel_pytree(x0)
-        size = _increment_size(stages, x0, lin)
+        scale = fibre_scale(stages, x0, lin)
 
         def residual(z):
             return _residual(stages, unravel(z))
@@ -177,11 +179,12 @@ class Newton(AbstractStageSolver):
             z, _ = ravel_pytree(x)
             dz, evaluation = dense_increment(residual, z)
             x_next = unravel(z + dz)
-            return x_next, size(x, x_next), evaluation
+            return x_next, _increment_size(stages, x, x_next, lin), evaluation
 
         return iterate(
             sweep,
             x0,
+            scale,
             max_iterations=self.max_iterations,
             tolerance=self.tolerance,
             skip=skip,
@@ -216,32 +219,27 @@ def _residual(stages: StageSystem, x: Stages) -> tuple[Float[Array, " k"], Evalu
 
 
 def _increment_size(
-    stages: StageSystem, x0: Stages, lin: Linearisation
-) -> Callable[[Stages, Stages], FloatScalar]:
-    """How large an increment of the stages is, relative to fibre coordinates.
+    stages: StageSystem, x: Stages, x_next: Stages, lin: Linearisation
+) -> FloatScalar:
+    """The size of an increment in fibre coordinates.
 
     Not finite once the iterates have left the chart, from where they do not return.
     """
-    scale = fibre_scale(stages, x0, lin)
-    reaction_sizes = jnp.max(jnp.abs(lin.reaction), axis=0, initial=0)
-
-    def size(x: Stages, x_next: Stages) -> FloatScalar:
-        changes = [x_next.node_fibre - x.node_fibre, x_next.velocity - x.velocity]
-        if stages.hamiltonian:
-            changes[1] = apply(lin.metric_inverse, changes[1])
-            changes.append(x_next.momentum - x.momentum)
-        if stages.constrained:
-            # Multipliers count by their effect on u, h N⁻¹ R δΛ, on its own: Λ can
-            # still be wrong where the stages and nodes happen to be right.
-            before, after = (
-                stages.multiplier_change(x),
-                stages.multiplier_change(x_next),
-            )
-            effect = contract("sl,l->s", jnp.abs(after - before), reaction_sizes)
-            changes.append(stages.h * effect)
-        size = relative_size(changes, scale)
-        if stages.chart.manifold.is_flat:
-            return size
-        return jnp.where(stages.in_chart(x_next), size, jnp.inf)
-
-    return size
+    changes = [x_next.node_fibre - x.node_fibre, x_next.velocity - x.velocity]
+    if stages.hamiltonian:
+        changes[1] = apply(lin.metric_inverse, changes[1])
+        changes.append(x_next.momentum - x.momentum)
+    if stages.constrained:
+        # Multipliers count by their effect on u, h N⁻¹ R δΛ, on its own: Λ can still be
+        # wrong where the stages and nodes happen to be right.
+        before, after = map(stages.multiplier_change, (x, x_next))
+        reaction = lin.reaction
+        if reaction.shape[1] == 1:
+            # The largest entry of the column decides; it is the same for all iterates.
+            reaction = largest(reaction).reshape(1, 1)
+        change = contract("sl,nl->sn", after - before, reaction)
+        changes.append(stages.h * change)
+    size = largest(*changes)
+    if stages.chart.manifold.is_flat:
+        return size
+    return jnp.where(stages.in_chart(x_next), size, jnp.inf)

@@ -8,7 +8,7 @@ from jaxtyping import Array, Int, PyTree
 
 from ._adjoint import AbstractAdjoint, DirectAdjoint
 from ._custom_types import BoolScalar
-from ._iteration import iterate, relative_size
+from ._iteration import iterate
 from ._largest import largest
 from ._loop import Carry, Loop, Rows
 from ._progress_meter import NoProgressMeter
@@ -123,7 +123,8 @@ def _if_retraced(
     xi = manifold.local(manifold.compose(manifold.inverse(start.q), reached.q))
     small = float(jnp.finfo(start.p.dtype).eps) ** 0.375
     retraced = (largest(xi) <= small * (1 + largest(*jax.tree.leaves(start.q)))) & (
-        relative_size([reached.p - start.p], largest(start.p)) <= small
+        largest(reached.p - start.p)
+        <= small * jnp.where(largest(start.p) > 0, largest(start.p), 1)
     )
     asked = [jnp.any(leaf != 0) for leaf in jax.tree.leaves(cotangents)]
     asked = jnp.any(jnp.stack(asked))
@@ -175,11 +176,13 @@ def step_back(loop: Loop, node: Node, k: Int[Array, ""]) -> Node:
             miss = target.multiplier - reached.multiplier
             misses.append(loop.dt * miss)
             multiplier = multiplier + miss
-        size = largest(*misses) / (1 + largest(target.p))
+        size = largest(*misses)
         z = State(manifold.act(z.q, xi), z.v, z.p + misses[1], multiplier)
         return z, size, y
 
-    return iterate(sweep, target, max_iterations=loop.solver.max_iterations).aux
+    scale = 1 + largest(target.p)
+    limit = loop.solver.max_iterations
+    return iterate(sweep, target, scale, max_iterations=limit).aux
 
 
 def _retraces(loop: Loop, node: Node) -> bool:

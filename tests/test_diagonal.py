@@ -6,9 +6,14 @@ import numpy as np
 import pytest
 
 import nhjax
-from nhjax._contraction import apply, dense, inverse
+from nhjax._contraction import apply, inverse
 from nhjax._diagonal import jacobian
 from nhjax._largest import largest
+from nhjax._linearisation import linearise
+
+
+def dense(diagonal):
+    return jnp.diag(diagonal)
 
 
 U = jnp.array([0.3, -0.4, 0.5, 1.1])
@@ -55,6 +60,46 @@ def test_coupled_terms_give_a_matrix(name):
     found = jacobian(momentum, U)
     assert found.shape == (4, 4)
     np.testing.assert_allclose(found, jax.jacfwd(momentum)(U), rtol=1e-15)
+
+
+def test_what_a_derivative_is_made_of_decides():
+    matrix = jnp.arange(16.0).reshape(4, 4)
+
+    @jax.custom_jvp
+    def squared(v):
+        return v**2
+
+    squared.defjvp(lambda primals, tangents: (squared(*primals), matrix @ tangents[0]))
+    np.testing.assert_array_equal(jacobian(squared, U), matrix)
+
+    def by_reference(v):
+        reference = jax.new_ref(jnp.zeros(4))
+        reference[...] = v
+        return matrix @ reference[...]
+
+    np.testing.assert_array_equal(jacobian(by_reference, U), matrix)
+    assert jacobian(lambda u: jax.lax.slice(u[0], (), ()) * u, U).shape == (4, 4)
+
+
+@pytest.mark.parametrize("flip", [False, True])
+def test_both_forms_recognise_a_diagonal(flip):
+    m = M[:3]
+
+    def kinetic(u):
+        return 0.5 * jnp.sum(u**2 / m if flip else m * u**2)
+
+    def generator(t, q, u, args):
+        return kinetic(u) + 0.5 * (q @ q) * (1 if flip else -1)
+
+    make = nhjax.HamiltonianSystem if flip else nhjax.LagrangianSystem
+    system = make(generator, nonholonomic=lambda t, q, u, args: u[2] - q[1] * u[0])
+    q, v = jnp.array([0.1, 0.5, 0.2]), jnp.array([1.0, -0.3, 0.5])
+    y0 = nhjax.initial_state(system, q=q, v=v, project=True)
+    lin = linearise(system, jnp.asarray(0.0), q, system.fibre(y0), None)
+    assert lin.metric_inverse.shape == (3,)
+    assert system.metric(0.0, q, system.fibre(y0)).shape == (3, 3)
+    full = system.metric(0.0, q, system.fibre(y0))
+    np.testing.assert_allclose(dense(1 / lin.metric_inverse), full, rtol=1e-15)
 
 
 def test_values_of_a_function_may_be_fewer_or_the_same_for_all():

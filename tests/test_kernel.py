@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import nhjax
-from nhjax import LobattoIIIAB
+from nhjax import LobattoIIIAB, systems
 from nhjax._contraction import contract, inverse, with_small_products
 from nhjax._kernel import in_one_kernel
 
@@ -98,6 +98,22 @@ def test_derivatives_of_a_kernel(transform):
     point = OPERANDS[0]["g"], OPERANDS[1]
     got = jax.jit(transform(height(in_kernel)))(*point)
     assert_same(got, transform(height(pendulum))(*point))
+
+
+def test_derivatives_keep_no_constants():
+    matrix = jnp.arange(16.0).reshape(4, 4)
+
+    def f(x):
+        return jnp.sin(jnp.sum(2 * matrix.T * x[None], axis=1))
+
+    def pulled(x):
+        return jax.vjp(lambda x: in_one_kernel(f, x), x)[1](x)
+
+    program = jax.make_jaxpr(pulled)(jnp.ones(4))
+    kernels = [x for x in program.eqns if x.primitive.name == "one_kernel"]
+    assert len(kernels) == 2
+    assert all(x.aval.shape != matrix.shape for x in kernels[0].outvars)
+    assert_same(jax.jit(pulled)(jnp.ones(4)), (jax.vjp(f, jnp.ones(4))[1](jnp.ones(4))))
 
 
 def test_a_loop_of_unknown_length_is_pushed_forward():
@@ -213,6 +229,26 @@ def test_a_run_is_one_kernel_and_one_with_a_factorisation_is_none():
     assert MARK not in lowered(nhjax.LagrangianSystem(factorised))
 
 
+@pytest.mark.parametrize(
+    ("example", "stages"),
+    [
+        (systems.TurntableBall(), 8),
+        (systems.HeavyTopSE3(), 8),
+        (systems.ChaoticSystem(50), 3),
+        (systems.ChaoticSystem(20), 8),
+    ],
+    ids=["ball", "top", "101 coordinates", "41 coordinates"],
+)
+def test_high_orders_and_many_coordinates_are_one_kernel(example, stages):
+    def run(y0):
+        method = LobattoIIIAB(stages)
+        return nhjax.integrate(
+            example.system, method, y0, dt=0.05, num_steps=3, throw=False
+        ).ys
+
+    assert MARK in jax.jit(run).lower(example.initial_state()).as_text()
+
+
 # The compiler of kernels aborts the process rather than raise, on parameters that turn
 # out to be unused or constant; and it depends on flags, of which the tests set some.
 USERS_PROGRAM = """
@@ -267,7 +303,7 @@ def test_products_of_a_program_are_written_out():
     assert_same(written(jnp.asarray(x), jnp.asarray(y)), list(function(x, y)))
 
 
-@pytest.mark.parametrize("size", [0, 1, 2, 7, 16, 20])
+@pytest.mark.parametrize("size", [0, 1, 2, 7, 16, 32, 33])
 def test_inverses(size):
     matrix = np.random.default_rng(size).normal(size=(size, size))
     got = inverse(jnp.asarray(matrix))

@@ -174,3 +174,17 @@ def test_a_constraint_without_a_gradient_is_named():
         nhjax.DependentConstraintsError, match=r"DΓ has not.*Γ\[0\] has no gradient"
     ):
         nhjax.initial_state(system, jnp.array([1.0, 0.0]), jnp.array([0.0, 1.0]))
+
+
+@pytest.mark.parametrize(("dtype", "size"), [(jnp.float32, 1e-3), (jnp.float64, 1e-10)])
+def test_motion_from_rest_is_solved_to_its_own_round_off(dtype, size):
+    # At rest under a force that grows from zero: nothing at the start has a size.
+    def lagrangian(t, q, v, args):
+        potential = size**2 * jnp.sum(jnp.cosh(q / size) - 1)
+        return 0.5 * jnp.sum(v**2) - potential + size * jnp.sum(q) * t
+
+    system = nhjax.LagrangianSystem(lagrangian)
+    zero = jnp.zeros(1, dtype)
+    y0 = nhjax.initial_state(system, q=zero, v=zero)
+    sol = nhjax.integrate(system, nhjax.LobattoIIIAB(3), y0, dt=0.2, num_steps=1)
+    assert sol.stats["max_residual"] <= 4 * jnp.finfo(dtype).eps

@@ -6,7 +6,6 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PyTree
 
-from .._contraction import Matrix
 from .._custom_types import (
     Args,
     FloatScalar,
@@ -76,8 +75,8 @@ class AbstractMechanicalSystem(eqx.Module):
     @abstractmethod
     def metric(
         self, t: FloatScalarLike, q: PyTree[Array], u: Float[Array, " n"], args: Args
-    ) -> Matrix:
-        """The metric K on the fibre, D2D2L or D2D2H, or its diagonal."""
+    ) -> Float[Array, "n n"]:
+        """The metric K on the fibre, D2D2L or D2D2H."""
 
     @abstractmethod
     def free_force(

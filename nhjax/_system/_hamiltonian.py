@@ -4,7 +4,7 @@ import equinox as eqx
 import jax
 from jaxtyping import Array, Float, PyTree
 
-from .._contraction import apply, inverse, Matrix
+from .._contraction import apply, inverse
 from .._custom_types import (
     Args,
     FloatScalar,
@@ -85,12 +85,9 @@ class HamiltonianSystem(AbstractMechanicalSystem):
         q: PyTree[Array],
         u: Float[Array, " n"],
         args: Args = None,
-    ) -> Matrix:
-        """The metric D2D2H on momenta, the inverse of the mass matrix.
-
-        Its diagonal alone if the operations of H show that there is no more.
-        """
-        return jacobian(lambda u: self.velocity(t, q, u, args), u)
+    ) -> Float[Array, "n n"]:
+        """The metric D2D2H on momenta, the inverse of the mass matrix."""
+        return jax.jacfwd(self.velocity, argnums=2)(t, q, u, args)
 
     def free_force(
         self,
@@ -113,7 +110,9 @@ class HamiltonianSystem(AbstractMechanicalSystem):
         args: Args = None,
     ) -> Float[Array, " n"]:
         """♭_H D2Ψ, the covector (D2D2H)⁻¹ D2Ψ."""
-        return apply(inverse(self.metric(t, q, u, args)), derivative)
+        return apply(
+            inverse(jacobian(lambda u: self.velocity(t, q, u, args), u)), derivative
+        )
 
     def energy(self, t: FloatScalarLike, y: State, args: Args = None) -> FloatScalar:
         """The energy H(t, q, p) of a state; arguments as for a `LagrangianSystem`."""

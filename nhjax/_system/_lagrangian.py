@@ -5,7 +5,6 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PyTree
 
-from .._contraction import Matrix
 from .._custom_types import (
     Args,
     FloatScalar,
@@ -13,7 +12,6 @@ from .._custom_types import (
     PhaseFunction,
     PositionFunction,
 )
-from .._diagonal import jacobian
 from .._manifold import AbstractLieGroup
 from .._state import State
 from ._abstract import AbstractMechanicalSystem
@@ -87,12 +85,9 @@ class LagrangianSystem(AbstractMechanicalSystem):
         q: PyTree[Array],
         u: Float[Array, " n"],
         args: Args = None,
-    ) -> Matrix:
-        """The mass matrix M = D2D2L.
-
-        Its diagonal alone if the operations of L show that there is no more.
-        """
-        return jacobian(lambda u: self.momentum(t, q, u, args), u)
+    ) -> Float[Array, "n n"]:
+        """The mass matrix M = D2D2L."""
+        return jax.jacfwd(self.momentum, argnums=2)(t, q, u, args)
 
     def free_force(
         self,
