@@ -278,8 +278,9 @@ inline T step(State<T>& y, double h) {
         T d_lambda = larger(absolute(d_nu), absolute(d_middle));
         d_lambda = larger(d_lambda, absolute(T(d_end - d_nu)));
         T size = larger(change, T(h * d_lambda * size_b));
-        if (sweep == 0) scale += size;
+        T first = sweep == 0 ? size : size * 0.;
         size /= scale;
+        scale = larger(scale, first);
         for (int i = 0; i < S; ++i) H[i] = H_next[i];
         for (int i = 0; i < S - 1; ++i) u[i] = u_next[i];
         nu += d_nu;

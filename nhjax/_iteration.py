@@ -44,8 +44,9 @@ def iterate(
     """Repeat `sweep` until its increments no longer fall.
 
     `sweep(x)` returns the next iterate, the size of the increment, and whatever was
-    evaluated at x. Sizes count relative to `scale`, the size of x, to which that of the
-    first increment is added: x may start from nothing. An increment below the unit
+    evaluated at x. Sizes count relative to `scale`, the size of x, and from the second
+    on to that of the first increment, if it is larger: x may start from nothing, where
+    the first increment counts as it is. An increment below the unit
     round-off (or `tolerance`) ends the iteration; so do small increments that have
     ceased to fall, since that is round-off speaking. The floor of round-off depends on
     the conditioning of the problem, so that one absolute threshold would be either too
@@ -63,11 +64,11 @@ def iterate(
         x, _, progress = carry
         x_next, increment, aux = sweep(x)
         first = jnp.where(progress.iterations == 0, increment, 0)
-        scale = progress.scale + first
-        size = increment / jnp.where(scale > 0, scale, 1)
+        scale = jnp.maximum(progress.scale, first)
+        size = _over(increment, progress.scale)
         finite = jnp.isfinite(size)
         stalls = progress.stalls + (size >= progress.smallest).astype(jnp.int32)
-        smallest = jnp.minimum(size, progress.smallest)
+        smallest = jnp.minimum(_over(increment, scale), progress.smallest)
         count = progress.iterations + 1
         believed = jnp.minimum(eps * patience ** stalls.astype(dtype), eps**0.5)
         stagnant = (stalls >= 1) & (progress.smallest <= believed)
@@ -83,6 +84,10 @@ def iterate(
         lambda carry: ~carry[2].done, body, (x, aux, start)
     )
     return Solved(x, aux, progress.converged, progress.iterations)
+
+
+def _over(size: FloatScalar, scale: FloatScalar) -> FloatScalar:
+    return size / jnp.where(scale > 0, scale, 1)
 
 
 def dense_increment(

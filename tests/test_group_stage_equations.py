@@ -196,9 +196,11 @@ def test_fibre_coordinates_belong_together(case):
             pairs = zip(elements, momenta, strict=True)
             fibre = np.stack([mechanics.d2h(g, mu) for g, mu in pairs])
         known = taken.stages.node_fibre
-        # An iteration ends when increments of up to 30 eps no longer fall. The state
-        # is summed from the forces and does not see the last one; interior nodes do.
-        atol = 60 * np.finfo(float).eps * np.max(np.abs(fibre))
+        # An iteration ends when increments of up to 30 eps no longer fall, relative to
+        # momenta and to what forces add to them in a step. The state is summed from
+        # the forces and does not see the last increment; interior nodes do.
+        size = np.max(np.abs(fibre)) + STEP * np.max(np.abs(taken.force))
+        atol = 60 * np.finfo(float).eps * size
         np.testing.assert_allclose(known, fibre[-len(known) :], rtol=0, atol=atol)
 
 
