@@ -94,14 +94,12 @@ def _contract_axes(dimension_numbers, a: Array, b: Array) -> Array:
 @jax.custom_jvp
 def inverse(matrix: Matrix) -> Matrix:
     """The inverse of a small matrix; not finite where there is none."""
-    if matrix.ndim == 1:
-        return 1 / matrix
     size = matrix.shape[0]
+    # One constraint is by far the commonest case.
+    if matrix.ndim == 1 or size == 1:
+        return 1 / matrix
     if size == 0:
         return matrix
-    # One constraint is by far the commonest case.
-    if size == 1:
-        return 1 / matrix
     if size > LARGEST:
         return jnp.linalg.inv(matrix)
     return _eliminated(matrix)
@@ -126,13 +124,13 @@ def _eliminated(matrix: Float[Array, "m m"]) -> Float[Array, "m m"]:
     def eliminate(k, carry):
         table, order = carry
         column, row = at(table.T, k), at(table, k)
-        largest = jnp.argmax(jnp.where(rows >= k, jnp.abs(column), -1))
+        best = jnp.argmax(jnp.where(rows >= k, jnp.abs(column), -1))
         # By masks: an index that varies over a batch would gather and scatter.
-        is_k, is_pivot = rows == k, rows == largest
+        is_k, is_pivot = rows == k, rows == best
         pivot_row = jnp.sum(jnp.where(is_pivot[:, None], table, 0), axis=0)
         pivot = at(pivot_row, k)
         scaled = jnp.where(is_k, 1 / pivot, pivot_row / pivot)
-        # Rows k and `largest` change places.
+        # Rows k and `best` change places.
         column = jnp.where(is_pivot, at(column, k), column)
         table = jnp.where(is_pivot[:, None], row[None], table)
         place = jnp.sum(jnp.where(is_pivot, order, 0))

@@ -1,4 +1,4 @@
-"""Which programs can go into one kernel of the CPU (see `_kernel`)."""
+"""The kinds of operations, and which programs can go into one kernel of the CPU."""
 
 import math
 from collections.abc import Iterator
@@ -11,6 +11,8 @@ from jaxtyping import PyTree
 # What the CPU's emitter of such kernels knows, by the names of JAX. Calls into
 # libraries (products of matrices, factorisations, transforms), sorting, scattering and
 # callbacks are not among it.
+#
+# Element by element, which `_diagonal` relies on: nothing else may be listed here.
 ELEMENTWISE = """
     abs acos acosh add add_any and asin asinh atan atan2 atanh
     bitcast_convert_type cbrt ceil clamp convert_element_type cos cosh div eq erf

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from ._custom_types import BoolScalar, FloatScalar, FloatScalarLike
+from ._largest import relative
 
 
 X = TypeVar("X")
@@ -65,10 +66,10 @@ def iterate(
         x_next, increment, aux = sweep(x)
         first = jnp.where(progress.iterations == 0, increment, 0)
         scale = jnp.maximum(progress.scale, first)
-        size = _over(increment, progress.scale)
+        size = relative(increment, progress.scale)
         finite = jnp.isfinite(size)
         stalls = progress.stalls + (size >= progress.smallest).astype(jnp.int32)
-        smallest = jnp.minimum(_over(increment, scale), progress.smallest)
+        smallest = jnp.minimum(relative(increment, scale), progress.smallest)
         count = progress.iterations + 1
         believed = jnp.minimum(eps * patience ** stalls.astype(dtype), eps**0.5)
         stagnant = (stalls >= 1) & (progress.smallest <= believed)
@@ -84,10 +85,6 @@ def iterate(
         lambda carry: ~carry[2].done, body, (x, aux, start)
     )
     return Solved(x, aux, progress.converged, progress.iterations)
-
-
-def _over(size: FloatScalar, scale: FloatScalar) -> FloatScalar:
-    return size / jnp.where(scale > 0, scale, 1)
 
 
 def dense_increment(

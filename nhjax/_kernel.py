@@ -211,7 +211,8 @@ def _differentiated(operands, tangents, *, program):
         return jax.jvp(run, operands, all_rates)
     size = len(program.out_avals)
     # A loop would keep what is the same in each of its rounds as often as there are.
-    is_kept = [True] * size + _fixed_part(whole)[1][size:]
+    fixed, is_varying = _fixed_part(whole)
+    is_kept = [True] * size + is_varying[size:]
     results = _call(
         lambda *operands: _split(
             is_kept, jax.extend.core.jaxpr_as_fun(whole)(*operands)
@@ -222,7 +223,9 @@ def _differentiated(operands, tangents, *, program):
 
     def push(*given):
         residuals, rates = given[: -sum(is_moving)], given[-sum(is_moving) :]
-        everything = _merged(is_kept[size:], residuals, _constants(whole, is_kept))
+        everything = _merged(
+            is_kept[size:], residuals, _constants(whole, fixed, is_kept)
+        )
         return list(jax.tree.unflatten(treedef, everything)(*rates))
 
     changes = _call(push, [*residuals, *rates])
@@ -231,7 +234,7 @@ def _differentiated(operands, tangents, *, program):
 
 
 def _fixed_part(program) -> tuple[list[Any], list[bool]]:
-    """The operations that depend on no operand, and which results do."""
+    """The operations that depend on no operand, and which results depend on one."""
     traced = [isinstance(const, jax.core.Tracer) for const in program.consts]
     varying = {*program.jaxpr.invars, *_split(traced, program.jaxpr.constvars)[0]}
 
@@ -247,16 +250,16 @@ def _fixed_part(program) -> tuple[list[Any], list[bool]]:
     return fixed, list(map(varies, program.jaxpr.outvars))
 
 
-def _constants(program, is_kept: list[bool]) -> list[Any]:
-    """The results of a program that are not kept, which do not depend on operands."""
+def _constants(program, fixed: list[Any], is_kept: list[bool]) -> list[Any]:
+    """The results of a program that are not kept, by its fixed operations."""
     jaxpr = program.jaxpr
-    fixed = jaxpr.replace(
+    part = jaxpr.replace(
         invars=[],
-        eqns=_fixed_part(program)[0],
+        eqns=fixed,
         outvars=_split(is_kept, jaxpr.outvars)[1],
         debug_info=jaxpr.debug_info.with_unknown_names(),
     )
-    return jax.core.eval_jaxpr(fixed, program.consts)
+    return jax.core.eval_jaxpr(part, program.consts)
 
 
 ad.primitive_jvps[_kernel] = _differentiated

@@ -1,4 +1,4 @@
-"""The largest number of some arrays, in integers."""
+"""The sizes of arrays: their largest number, and relative to another size."""
 
 from functools import reduce
 
@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from ._custom_types import FloatScalar
+from ._custom_types import FloatScalar, FloatScalarLike
 
 
 def largest(*arrays: Array) -> FloatScalar:
@@ -27,3 +27,8 @@ def largest(*arrays: Array) -> FloatScalar:
     return jax.lax.bitcast_convert_type(
         reduce(jnp.maximum, map(pattern, arrays)), dtype
     )
+
+
+def relative(size: FloatScalar, scale: FloatScalarLike) -> FloatScalar:
+    """size / scale; the size itself where there is no scale, because it is zero."""
+    return size / jnp.where(scale > 0, scale, 1)

@@ -9,7 +9,7 @@ from jaxtyping import Array, Int, PyTree
 from ._adjoint import AbstractAdjoint, DirectAdjoint
 from ._custom_types import BoolScalar
 from ._iteration import iterate
-from ._largest import largest
+from ._largest import largest, relative
 from ._loop import Carry, Loop, Rows
 from ._progress_meter import NoProgressMeter
 from ._solution import RESULTS
@@ -123,8 +123,7 @@ def _if_retraced(
     xi = manifold.local(manifold.compose(manifold.inverse(start.q), reached.q))
     small = float(jnp.finfo(start.p.dtype).eps) ** 0.375
     retraced = (largest(xi) <= small * (1 + largest(*jax.tree.leaves(start.q)))) & (
-        largest(reached.p - start.p)
-        <= small * jnp.where(largest(start.p) > 0, largest(start.p), 1)
+        relative(largest(reached.p - start.p), largest(start.p)) <= small
     )
     asked = [jnp.any(leaf != 0) for leaf in jax.tree.leaves(cotangents)]
     asked = jnp.any(jnp.stack(asked))

@@ -11,7 +11,7 @@ from ._contraction import contract
 from ._custom_types import Args, BoolScalar, FloatScalar
 from ._implicit import frozen, is_given, masked
 from ._iteration import Solved
-from ._largest import largest
+from ._largest import largest, relative
 from ._linearisation import Linearisation, linearise
 from ._method import AbstractMethod
 from ._newton import AbstractStageSolver, Evaluation
@@ -149,7 +149,7 @@ def step(
         stages=x,
         result=_result(solved, lin, next_node, in_chart),
         num_iterations=solved.num_iterations,
-        residual=residual / jnp.where(scale > 0, scale, 1),
+        residual=relative(residual, scale),
         constraint_violation=largest_violation(system, t + h, next_node, args),
         multiplier_defect=largest(forces.multiplier[-1] - lin_next.multiplier),
     )

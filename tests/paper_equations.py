@@ -503,13 +503,6 @@ class Run:
         array[(-1,) * array.ndim] += size * (1 + abs(array[(-1,) * array.ndim]))
         return replace(self, **{name: array})
 
-    def first(self, steps: int) -> "Run":
-        """The first of its steps."""
-        nodes = ("t", "q", "v", "p", "multiplier")
-        ends = {name: getattr(self, name)[: steps + 1] for name in nodes}
-        stages = {name: getattr(self, name)[:steps] for name in ("V", "W", "Lambda")}
-        return replace(self, **ends, **stages)
-
 
 def _relative(*terms, total=None):
     """The largest |Σ terms| over all points, relative to the largest Σ |terms| there.
