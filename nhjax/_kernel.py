@@ -271,17 +271,15 @@ def _transposed(cotangents, *operands, program):
     linear, known = _split(is_linear, operands)
     is_asked = [not isinstance(cotangent, ad.Zero) for cotangent in cotangents]
     asked, _ = _split(is_asked, cotangents)
-    _, unasked = _split(is_asked, program.out_avals)
 
     def pull(*given):
         known, asked = given[: -sum(is_asked)], given[-sum(is_asked) :]
-        zeros = [jnp.zeros(aval.shape, aval.dtype) for aval in unasked]
 
         def push(*rates):
-            return run(*_merged(is_linear, rates, known))
+            return _split(is_asked, run(*_merged(is_linear, rates, known)))[0]
 
         transpose = jax.linear_transpose(push, *(x.aval for x in linear))
-        return list(transpose(_merged(is_asked, asked, zeros)))
+        return list(transpose(list(asked)))
 
     pulled = _call(pull, [*known, *asked])
     return _merged(is_linear, pulled, [None] * len(known))

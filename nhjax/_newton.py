@@ -53,12 +53,12 @@ class AbstractStageSolver(eqx.Module):
 
     @abstractmethod
     def correction(
-        self, stages: StageSystem, x0: Stages, lin: Linearisation, x: Stages
+        self, stages: StageSystem, lin: Linearisation, x: Stages
     ) -> Correction:
         """An iteration whose fixed points solve the stage equations.
 
-        Its Jacobian is frozen near the solution `x` that was found from `x0`, so that
-        it contracts there; derivatives of the solution follow from it.
+        Its Jacobian is frozen at the solution `x`, so that it contracts there;
+        derivatives of the solution follow from it.
         """
 
 
@@ -107,10 +107,10 @@ class SimplifiedNewton(AbstractStageSolver):
         )
 
     def correction(
-        self, stages: StageSystem, x0: Stages, lin: Linearisation, x: Stages
+        self, stages: StageSystem, lin: Linearisation, x: Stages
     ) -> Correction:
-        """The iteration of `solve` itself."""
-        structure = leading_structure(stages, x0, lin)
+        """The iteration of `solve`, with the leading structure at the solution."""
+        structure = leading_structure(stages, x, lin)
         return lambda stages, x: _corrected(stages, structure, x)[0]
 
 
@@ -191,7 +191,7 @@ class Newton(AbstractStageSolver):
         )
 
     def correction(
-        self, stages: StageSystem, x0: Stages, lin: Linearisation, x: Stages
+        self, stages: StageSystem, lin: Linearisation, x: Stages
     ) -> Correction:
         """Newton's iteration with the Jacobian at the solution."""
         z, unravel = ravel_pytree(x)

@@ -10,6 +10,7 @@ from ._contraction import contract
 from ._custom_types import Args, BoolScalar, FloatScalar
 from ._linearisation import Linearisation, motion_residual
 from ._method import AbstractMethod
+from ._state import State
 from ._system import AbstractMechanicalSystem
 
 
@@ -69,6 +70,19 @@ class StageSystem(eqx.Module):
     p: Float[Array, " n"]
     multiplier: Float[Array, " l"]
     args: Args
+
+    @classmethod
+    def at(
+        cls,
+        system: AbstractMechanicalSystem,
+        method: AbstractMethod,
+        t: FloatScalar,
+        h: FloatScalar,
+        y: State,
+        args: Args,
+    ) -> "StageSystem":
+        """The equations of a step of size h from the state y at t."""
+        return cls(system, method, t, h, y.q, y.p, y.multiplier, args)
 
     @property
     def num_holonomic(self) -> int:

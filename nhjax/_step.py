@@ -107,16 +107,7 @@ def step(
     """
     state, lin = node.state, node.lin
     propagated = method.multiplier == "propagated"
-    stages = StageSystem(
-        system,
-        method,
-        t,
-        h,
-        state.q,
-        state.p,
-        state.multiplier,
-        args,
-    )
+    stages = StageSystem.at(system, method, t, h, state, args)
     x0 = stages.starting_values(system.fibre(state), lin)
     solved = solver.solve(stages, x0, lin, skip)
     x, forces = solved.x, solved.aux.forces

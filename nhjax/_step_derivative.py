@@ -69,8 +69,7 @@ def _differentiable_step_jvp(primals, tangents):
     perturbed, fixed = eqx.partition(parameters, is_given(tangents[0]))
 
     stages = _stage_system(parameters, method)
-    x0 = stages.starting_values(parameters.system.fibre(parameters.state), node.lin)
-    correction = solver.correction(*frozen((stages, x0, node.lin, x)))
+    correction = solver.correction(*frozen((stages, node.lin, x)))
 
     # Nothing but states and stages is kept for a reverse pass.
     @partial(jax.checkpoint, prevent_cse=False)
@@ -108,16 +107,9 @@ primitive_step = partial(in_one_kernel, differentiable_step)
 
 
 def _stage_system(parameters: Parameters, method: AbstractMethod) -> StageSystem:
-    y = parameters.state
-    return StageSystem(
-        parameters.system,
-        method,
-        parameters.t,
-        parameters.h,
-        y.q,
-        y.p,
-        y.multiplier,
-        parameters.args,
+    y, args = parameters.state, parameters.args
+    return StageSystem.at(
+        parameters.system, method, parameters.t, parameters.h, y, args
     )
 
 
