@@ -49,7 +49,7 @@ def split(example):
 def assert_gradients_of_examples(examples, method):
     """Of each of them in its own parameters, state and friction; of all in dt."""
     given, joined = zip(*map(split, examples), strict=True)
-    given = [part | {"friction": jnp.asarray(0.05)} for part in given]
+    given = [part | {"friction": jnp.asarray(0.0)} for part in given]
 
     def losses(given, dt):
         pairs = zip(joined, given, strict=True)
@@ -71,8 +71,10 @@ def assert_gradients_of_examples(examples, method):
     dt, along = jnp.asarray(0.05), direction(given)
     program = jax.jit(jax.value_and_grad(losses, argnums=(0, 1), has_aux=True))
     _, (gradients, in_dt) = program(given, dt)
+    # Rounding errors of propagated multipliers grow where the motion does not decay:
+    # smaller differences than this are lost in them.
     expected = central_difference(
-        lambda eps: program(moved(given, along, eps), dt)[0][1], 1e-4
+        lambda eps: program(moved(given, along, eps), dt)[0][1], 5e-4
     )
     assert np.all(np.abs(expected) > 1e-2)
     got = [dot(g, d) for g, d in zip(gradients, along, strict=True)]
