@@ -121,8 +121,8 @@ def seconds_at(
 
 def kind(method: str) -> str:
     """What competes as one: a package, for ensembles with each layout apart."""
-    words = method.split()
-    return " ".join([words[0], *(x for x in words if x in ("vmap", "stacked"))])
+    words, layouts = method.split(), ("vmap", "stacked", "devices")
+    return " ".join([words[0], *(x for x in words if x in layouts)])
 
 
 def contests(case: Measured) -> list[dict[str, Any]]:

@@ -4,7 +4,9 @@ The competitors integrate the index-reduced equations, written by hand (see
 `_competitors`); IDA the constrained ones. Every run of a case is timed in turn with all
 the others, so that noise hits all of them. Its time is the median of seven; in
 brackets is the ratio of the fastest of seven, which says more on a busy machine.
-Compile times are apart; the preparation of initial states is not timed.
+Compile times are apart; the preparation of initial states is not timed. Under `vmap` a
+batch of nhjax runs on one core; with `--devices k` it runs also spread over as many
+devices of the CPU (`nhjax devices`).
 
 Errors are the largest of (q, v) at the end over the members, against the exact solution
 or an extrapolation of order 20 in long double. |Φ| is over the size its terms may have,
@@ -19,11 +21,13 @@ import statistics
 import time
 from collections.abc import Callable, Iterator
 from functools import partial
+from itertools import product
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.sharding import Mesh, PartitionSpec
 
 import nhjax
 
@@ -53,7 +57,7 @@ LADDERS = {
     5: (32, 50, 80, 120, 200),
     6: (28, 40, 56, 80, 120),
     7: (25, 34, 45, 60, 80),
-    8: (20, 28, 36, 45, 60),
+    8: (20, 24, 28, 32, 36, 45, 60),
 }
 TOLERANCES = {
     "Tsit5": (1e-4, 1e-6, 1e-8, 1e-10, 1e-12, 1e-13),
@@ -64,7 +68,7 @@ TOLERANCES = {
     "IDA": (1e-5, 1e-7, 1e-9, 1e-11),
 }
 # Of the increments of nhjax's simplified Newton iteration; 0 is to round-off.
-NEWTON_TOLERANCES = (0.0, 1e-6, 1e-9, 1e-12)
+NEWTON_TOLERANCES = (0.0, 1e-6, 1e-7, 1e-9, 1e-10, 1e-12)
 STEPS = (0.4, 0.2, 0.1, 0.05, 0.025)
 # The system, t, members, s and the longest ladder of each case of the default command.
 FEW = (4, 6, 8)
@@ -175,18 +179,50 @@ def nhjax_runs(case: Case, stages: tuple[int, ...], limit: int) -> Iterator[Run]
                 return sol.ys.q[-1], sol.ys.v[-1], *stats
 
             function = one if case.members == 1 else jax.vmap(one, in_axes=(0, None))
-            program, seconds = compiled(function, (y0, 0.0))
-            for tolerance in NEWTON_TOLERANCES:
+            layouts = {"": function}
+            if case.members > 1 and jax.device_count() > 1:
+                layouts[" devices"] = spread(function)
+            programs = {
+                layout: compiled(function, (y0, 0.0))
+                for layout, function in layouts.items()
+            }
+            for tolerance, layout in product(NEWTON_TOLERANCES, layouts):
+                program, seconds = programs[layout]
                 call = partial(_blocked, program, y0, tolerance)
                 q, v, iterations, done = (np.asarray(x) for x in call())
                 if np.any(done < num_steps):
                     continue
-                name = f"nhjax s={s}" + (f", {tolerance:.0e}" if tolerance else "")
+                name = f"nhjax{layout} s={s}"
+                name += f", {tolerance:.0e}" if tolerance else ""
                 run = Run(name, case.t / num_steps, call, seconds)
                 n = case.q.shape[-1]
                 case.judge(run, q.reshape(-1, n), v.reshape(-1, n))
                 run.iterations = float(np.mean(iterations)) / num_steps
                 yield run
+
+
+def spread(function: Callable[..., Any]) -> Callable[..., Any]:
+    """A function of an ensemble and of a tolerance, its members over all devices."""
+    mesh = Mesh(np.asarray(jax.devices()), ("members",))
+    members, everywhere = PartitionSpec("members"), PartitionSpec()
+    shared = jax.shard_map(
+        function,
+        mesh=mesh,
+        in_specs=(members, everywhere),
+        out_specs=members,
+        check_vma=False,
+    )
+
+    def run(y0, tolerance):
+        count = jax.tree.leaves(y0)[0].shape[0]
+        more = -count % jax.device_count()
+        filled = jax.tree.map(
+            lambda x: jnp.concatenate([x, jnp.repeat(x[-1:], more, axis=0)]), y0
+        )
+        out = shared(filled, jnp.asarray(tolerance))
+        return jax.tree.map(lambda x: x[:count], out)
+
+    return run
 
 
 def diffrax_runs(case: Case, limit: int) -> Iterator[Run]:
@@ -286,9 +322,14 @@ def main() -> None:
         "--longest", type=float, default=1.0, help="seconds on the host"
     )
     parser.add_argument("--no-host", action="store_true", help="neither SciPy nor IDA")
+    parser.add_argument(
+        "--devices", type=int, default=1, help="of the CPU, for ensembles of nhjax"
+    )
     parser.add_argument("--smoke", action="store_true", help="little, and not saved")
     options = parser.parse_args()
     jax.config.update("jax_enable_x64", True)
+    if options.devices > 1:
+        jax.config.update("jax_num_cpu_devices", options.devices)
     cases = [case for case in CASES if case[0] in options.systems]
     if options.times or options.members:
         cases = [
