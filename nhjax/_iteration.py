@@ -8,7 +8,6 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from ._custom_types import BoolScalar, FloatScalar, FloatScalarLike
-from ._largest import relative
 
 
 X = TypeVar("X")
@@ -27,7 +26,7 @@ class Solved(NamedTuple, Generic[X, Aux]):
 class _Progress(NamedTuple):
     scale: FloatScalar
     smallest: FloatScalar
-    stalls: Int[Array, ""]
+    believed: FloatScalar
     iterations: Int[Array, ""]
     done: BoolScalar
     converged: BoolScalar
@@ -64,23 +63,31 @@ def iterate(
     def body(carry):
         x, _, progress = carry
         x_next, increment, aux = sweep(x)
-        first = jnp.where(progress.iterations == 0, increment, 0)
-        scale = jnp.maximum(progress.scale, first)
-        size = relative(increment, progress.scale)
-        finite = jnp.isfinite(size)
-        stalls = progress.stalls + (size >= progress.smallest).astype(jnp.int32)
-        smallest = jnp.minimum(relative(increment, scale), progress.smallest)
+        # No quotients, which would wait for each other: sizes are compared as they are.
+        unit = jnp.where(progress.scale > 0, progress.scale, 1)
+        stalls = increment >= progress.smallest
+        more = jnp.minimum(patience * progress.believed, eps**0.5)
+        believed = jnp.where(stalls, more, progress.believed)
+        stagnant = (believed > eps) & (progress.smallest <= believed * unit)
+        finite = jnp.isfinite(increment)
+        converged = finite & ((increment <= floor * unit) | stagnant)
         count = progress.iterations + 1
-        believed = jnp.minimum(eps * patience ** stalls.astype(dtype), eps**0.5)
-        stagnant = (stalls >= 1) & (progress.smallest <= believed)
-        converged = finite & ((size <= floor) | stagnant)
-        done = converged | ~finite | (count >= max_iterations)
-        return x_next, aux, _Progress(scale, smallest, stalls, count, done, converged)
+        first = jnp.where(progress.iterations == 0, increment, 0)
+        progress = _Progress(
+            scale=jnp.maximum(progress.scale, first),
+            smallest=jnp.minimum(increment, progress.smallest),
+            believed=believed,
+            iterations=count,
+            done=converged | ~finite | (count >= max_iterations),
+            converged=converged,
+        )
+        return x_next, aux, progress
 
     zero = jnp.zeros((), jnp.int32)
     skip = jnp.asarray(skip)
     scale = jnp.asarray(scale, dtype)
-    start = _Progress(scale, jnp.asarray(jnp.inf, dtype), zero, zero, skip, skip)
+    infinite, least = jnp.asarray(jnp.inf, dtype), jnp.asarray(eps, dtype)
+    start = _Progress(scale, infinite, least, zero, skip, skip)
     x, aux, progress = jax.lax.while_loop(
         lambda carry: ~carry[2].done, body, (x, aux, start)
     )
