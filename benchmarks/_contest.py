@@ -103,12 +103,14 @@ def seconds_at(
     """Time of an error, between rungs by powers, and the rung next to it.
 
     Infinite where no rung is as accurate; a ladder that starts more accurate counts
-    with its first rung.
+    with its first rung. A rung that is accurate by chance, while finer ones are not,
+    does not count: errors are the largest of the rung and of all finer ones.
     """
     best = (math.inf, math.nan)
     coarser = None
-    for run in ladder:
-        error, seconds = getattr(run, quality), getattr(run, of)
+    errors = np.maximum.accumulate([getattr(run, quality) for run in ladder[::-1]])
+    for run, error in zip(ladder, errors[::-1].tolist(), strict=True):
+        seconds = getattr(run, of)
         if error <= accuracy:
             found = seconds
             if coarser is not None and coarser[0] > accuracy and error > 0:
@@ -158,12 +160,13 @@ def contest_table(case: Measured) -> str:
             reached = math.isfinite(entry["seconds"])
             method = entry["method"].removeprefix(name.split()[0] + " ")
             method = method.removesuffix(" vmap").removesuffix(" stacked")
+            method = method.removeprefix("devices ")
             header += [name, "[ms]"]
-            if name == "nhjax":
+            if name.startswith("nhjax"):
                 method += f", h = {entry['rung']:.3g}"
             row += [method if reached else "", ms(entry["seconds"])]
             if name != "nhjax":
-                header.append("ratio")
+                header.append("nhjax over it")
                 ratio, other = entry["ratio_seconds"], entry["ratio_fastest"]
                 row.append("" if math.isnan(ratio) else f"{ratio:.2f} ({other:.2f})")
         if "target" in outcome:
@@ -211,7 +214,7 @@ def draw(cases: list[Measured], path: Path) -> None:
     """Error against time, a panel for each case; energy error where there is none."""
     columns = min(3, len(cases))
     lines = -(-len(cases) // columns)
-    figure = Figure(figsize=(5.4 * columns, 4.2 * lines), layout="constrained")
+    figure = Figure(figsize=(7.2 * columns, 4.2 * lines), layout="constrained")
     axes = figure.subplots(lines, columns, squeeze=False).ravel()
     for ax in axes[len(cases) :]:
         ax.set_visible(False)
@@ -230,9 +233,10 @@ def draw(cases: list[Measured], path: Path) -> None:
                 shade = str(0.75 - 0.1 * (stages - 2))
             style = {"color": shade if mine else colours[method], "linewidth": 1}
             style |= {"marker": "o" if mine else "x", "markersize": 4}
+            style |= {"linestyle": ":" if "devices" in method else "-"}
             ax.loglog(x, np.maximum(y, 1e-17), label=method, **style)
         ax.set_title(case.title, fontsize="medium")
         ax.set_xlabel("run [ms]")
         ax.set_ylabel(case.quality.replace("_", " "))
-        ax.legend(fontsize=6)
+        ax.legend(fontsize=5, loc="center left", bbox_to_anchor=(1, 0.5))
     figure.savefig(path, dpi=110)

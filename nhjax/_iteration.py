@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from ._custom_types import BoolScalar, FloatScalar, FloatScalarLike
+from ._largest import unit
 
 
 X = TypeVar("X")
@@ -46,12 +47,14 @@ def iterate(
     `sweep(x)` returns the next iterate, the size of the increment, and whatever was
     evaluated at x. Sizes count relative to `scale`, the size of x, and from the second
     on to that of the first increment, if it is larger: x may start from nothing, where
-    the first increment counts as it is. An increment below the unit
-    round-off (or `tolerance`) ends the iteration; so do small increments that have
-    ceased to fall, since that is round-off speaking. The floor of round-off depends on
-    the conditioning of the problem, so that one absolute threshold would be either too
-    coarse or never met (Hairer, Lubich, Wanner, GNI, section VIII.6): the more often
-    increments fail to fall, the larger a floor is believed.
+    the first increment counts as it is.
+
+    An increment below the unit round-off (or `tolerance`) ends the iteration; so do
+    small increments that have ceased to fall, since that is round-off speaking. The
+    floor of round-off depends on the conditioning of the problem, so that one absolute
+    threshold would be either too coarse or never met (Hairer, Lubich, Wanner, GNI,
+    section VIII.6): the more often increments fail to fall, the larger a floor is
+    believed.
     """
     aux_shape = jax.eval_shape(lambda x: sweep(x)[2], x)
     aux = jax.tree.map(lambda s: jnp.zeros(s.shape, s.dtype), aux_shape)
@@ -64,13 +67,13 @@ def iterate(
         x, _, progress = carry
         x_next, increment, aux = sweep(x)
         # No quotients, which would wait for each other: sizes are compared as they are.
-        unit = jnp.where(progress.scale > 0, progress.scale, 1)
+        scale = unit(progress.scale)
         stalls = increment >= progress.smallest
         more = jnp.minimum(patience * progress.believed, eps**0.5)
         believed = jnp.where(stalls, more, progress.believed)
-        stagnant = (believed > eps) & (progress.smallest <= believed * unit)
+        stagnant = (believed > eps) & (progress.smallest <= believed * scale)
         finite = jnp.isfinite(increment)
-        converged = finite & ((increment <= floor * unit) | stagnant)
+        converged = finite & ((increment <= floor * scale) | stagnant)
         count = progress.iterations + 1
         first = jnp.where(progress.iterations == 0, increment, 0)
         progress = _Progress(

@@ -29,6 +29,11 @@ def largest(*arrays: Array) -> FloatScalar:
     )
 
 
+def unit(scale: FloatScalarLike) -> FloatScalar:
+    """What sizes are measured in: the scale, or one where it is zero."""
+    return jnp.where(scale > 0, scale, 1)
+
+
 def relative(size: FloatScalar, scale: FloatScalarLike) -> FloatScalar:
-    """size / scale; the size itself where there is no scale, because it is zero."""
-    return size / jnp.where(scale > 0, scale, 1)
+    """A size over what it is measured in."""
+    return size / unit(scale)

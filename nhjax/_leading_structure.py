@@ -10,7 +10,7 @@ from ._stages import Stages, StageSystem
 class LeadingStructure(eqx.Module):
     """The leading structure of the linearised stage equations of one step.
 
-    With N and K at the start of the step, B_i at the nodes as they are foreseen there,
+    With N and K at the start of the step, B_i at the nodes of given stages,
     R the node rows of a_ij and δΛ the change of all multipliers,
 
     δu_i = -N⁻¹ r_u + h Σ_j â_ij K⁻¹ B_jᵀ δΛ_j        (stages),
@@ -88,14 +88,14 @@ class LeadingStructure(eqx.Module):
 
 
 def leading_structure(
-    stages: StageSystem, x0: Stages, lin: Linearisation
+    stages: StageSystem, x: Stages, lin: Linearisation
 ) -> LeadingStructure:
-    """Factorise the leading structure at the starting values of a step."""
+    """Factorise the leading structure: N and K at the start of a step, B_i at x."""
     if not stages.constrained:
         n, nothing = stages.p.shape[0], jnp.zeros((0, 0), stages.p.dtype)
         reaction = jnp.zeros((stages.method.stages, n, 0), stages.p.dtype)
         return LeadingStructure(lin.momentum_inverse, reaction, reaction, nothing, lin)
-    jacobian = jnp.concatenate([lin.jacobian[None], stages.constraint_jacobian(x0)])
+    jacobian = jnp.concatenate([lin.jacobian[None], stages.constraint_jacobian(x)])
     reaction = jnp.swapaxes(apply(lin.metric_inverse, jacobian), 1, 2)
     blocks = contract("ian,jnb->ijab", jacobian[1:], reaction)
     end = eqx.tree_at(

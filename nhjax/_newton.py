@@ -57,8 +57,8 @@ class AbstractStageSolver(eqx.Module):
     ) -> Correction:
         """An iteration whose fixed points solve the stage equations.
 
-        Its Jacobian is frozen at the solution `x`, so that it contracts there;
-        derivatives of the solution follow from it.
+        Its Jacobian is frozen, and it contracts at the solution `x`; derivatives of the
+        solution follow from it.
         """
 
 
@@ -109,7 +109,7 @@ class SimplifiedNewton(AbstractStageSolver):
     def correction(
         self, stages: StageSystem, lin: Linearisation, x: Stages
     ) -> Correction:
-        """The iteration of `solve`, with the leading structure at the solution."""
+        """The iteration of `solve`, with the constraints' slopes at the solution."""
         structure = leading_structure(stages, x, lin)
         return lambda stages, x: _corrected(stages, structure, x)[0]
 
