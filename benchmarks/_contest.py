@@ -158,9 +158,8 @@ def contest_table(case: Measured) -> str:
         header, row = [case.quality.replace("_", " ")], [f"{outcome['accuracy']:.0e}"]
         for name, entry in outcome["best"].items():
             reached = math.isfinite(entry["seconds"])
-            method = entry["method"].removeprefix(name.split()[0] + " ")
-            method = method.removesuffix(" vmap").removesuffix(" stacked")
-            method = method.removeprefix("devices ")
+            words = entry["method"].split()
+            method = " ".join(word for word in words if word not in name.split())
             header += [name, "[ms]"]
             if name.startswith("nhjax"):
                 method += f", h = {entry['rung']:.3g}"
@@ -222,6 +221,7 @@ def draw(cases: list[Measured], path: Path) -> None:
     others = [method for method in methods if not method.startswith("nhjax")]
     colours = {method: f"C{k % 10}" for k, method in enumerate(others)}
     for ax, case in zip(axes, cases, strict=False):
+        named: set[str] = set()
         for method, ladder in by_method(case.runs).items():
             x = [1e3 * run.seconds for run in ladder]
             y = [getattr(run, case.quality) for run in ladder]
@@ -233,10 +233,15 @@ def draw(cases: list[Measured], path: Path) -> None:
                 shade = str(0.75 - 0.1 * (stages - 2))
             style = {"color": shade if mine else colours[method], "linewidth": 1}
             style |= {"marker": "o" if mine else "x", "markersize": 4}
-            style |= {"linestyle": ":" if "devices" in method else "-"}
-            ax.loglog(x, np.maximum(y, 1e-17), label=method, **style)
+            spread = "devices" in method
+            style |= {"linestyle": ":" if spread else "-"}
+            # One name for all tolerances of an s, and one for all that is spread.
+            label = kind(method) if spread else method.split(",")[0]
+            style |= {"label": None if label in named else label}
+            named.add(label)
+            ax.loglog(x, np.maximum(y, 1e-17), **style)
         ax.set_title(case.title, fontsize="medium")
         ax.set_xlabel("run [ms]")
         ax.set_ylabel(case.quality.replace("_", " "))
-        ax.legend(fontsize=5, loc="center left", bbox_to_anchor=(1, 0.5))
+        ax.legend(fontsize=6, loc="center left", bbox_to_anchor=(1, 0.5))
     figure.savefig(path, dpi=110)
