@@ -67,11 +67,7 @@ class Chart(eqx.Module):
         if self.manifold.is_flat:
             return covector
 
-        def one(xi, covector):
-            back = self.manifold.inverse(self.manifold.retract(xi))
-            return self.manifold.Ad_dual(back, covector)
-
-        return jax.vmap(one)(xi, covector)
+        return jax.vmap(self.manifold.to_start)(xi, covector)
 
     def from_origin(
         self, xi: Float[Array, " n"], covector: Float[Array, " n"]
@@ -79,7 +75,7 @@ class Chart(eqx.Module):
         """Ad^*_{τ(Ξ)} μ, a body covector at g_k as a body covector at g_k τ(Ξ)."""
         if self.manifold.is_flat:
             return covector
-        return self.manifold.Ad_dual(self.manifold.retract(xi), covector)
+        return self.manifold.to_end(xi, covector)
 
     def carry(
         self,
@@ -94,9 +90,8 @@ class Chart(eqx.Module):
         """
         if self.manifold.is_flat:
             return momentum, compensation
-        g = self.manifold.retract(xi)
-        change = self.manifold.Ad_dual_change(g, momentum)
-        return two_sum(momentum, change + self.manifold.Ad_dual(g, compensation))
+        change = self.manifold.to_end_change(xi, momentum)
+        return two_sum(momentum, change + self.manifold.to_end(xi, compensation))
 
     def base_momentum(
         self,

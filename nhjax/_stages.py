@@ -325,11 +325,10 @@ class StageSystem(eqx.Module):
 
     def end_residual(self, x: Stages) -> tuple[Float[Array, " n"], Float[Array, " l"]]:
         """Residuals of the equations of motion at the end, whose root is λ_c there."""
-        end = jax.tree.map(lambda leaf: leaf[-1], self.node_positions(x))
         return motion_residual(
             self.system,
             self.t + self.h,
-            end,
+            self.chart.manifold.act(self.q, self.increment(x)),
             x.node_fibre[-1],
             x.end_acceleration,
             x.end_multiplier,

@@ -154,9 +154,17 @@ class AbstractLieGroup(eqx.Module):
         """Ad_g^* μ: ⟨Ad_g^* μ, η⟩ = ⟨μ, Ad_g η⟩."""
         return transpose(lambda eta: self.Ad(g, eta), mu)(mu)
 
-    def Ad_dual_change(self, g: Element, mu: Vector) -> Vector:
-        """Ad_g^* μ - μ; a group that can do so gives it without cancellation."""
-        return self.Ad_dual(g, mu) - mu
+    def to_end(self, xi: Vector, mu: Vector) -> Vector:
+        """Ad_{τ(ξ)}^* μ: a covector at g, seen at g τ(ξ)."""
+        return self.Ad_dual(self.retract(xi), mu)
+
+    def to_end_change(self, xi: Vector, mu: Vector) -> Vector:
+        """Ad_{τ(ξ)}^* μ - μ; a group that can do so gives it without cancellation."""
+        return self.to_end(xi, mu) - mu
+
+    def to_start(self, xi: Vector, mu: Vector) -> Vector:
+        """Ad_{τ(ξ)⁻¹}^* μ: a covector at g τ(ξ), seen at g."""
+        return self.Ad_dual(self.inverse(self.retract(xi)), mu)
 
     def ad_dual(self, xi: Vector, mu: Vector) -> Vector:
         """ad_ξ^* μ: ⟨ad_ξ^* μ, η⟩ = ⟨μ, ad_ξ η⟩."""

@@ -113,7 +113,7 @@ class Euclidean(AbstractLieGroup):
         """μ."""
         return mu
 
-    def Ad_dual_change(self, g: Point, mu: Vector) -> Vector:
+    def to_end_change(self, xi: Vector, mu: Vector) -> Vector:
         """0."""
         return jnp.zeros_like(mu)
 

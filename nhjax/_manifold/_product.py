@@ -167,9 +167,17 @@ class ProductGroup(AbstractLieGroup):
         """The factors' Ad^*."""
         return self._vector(lambda group, g, m: group.Ad_dual(g, m), g, mu)
 
-    def Ad_dual_change(self, g: Element, mu: Vector) -> Vector:
-        """The factors' Ad^* μ - μ."""
-        return self._vector(lambda group, g, m: group.Ad_dual_change(g, m), g, mu)
+    def to_end(self, xi: Vector, mu: Vector) -> Vector:
+        """The factors' Ad_{τ(ξ)}^*."""
+        return self._vector(lambda group, x, m: group.to_end(x, m), xi, mu)
+
+    def to_end_change(self, xi: Vector, mu: Vector) -> Vector:
+        """The factors' Ad_{τ(ξ)}^* μ - μ."""
+        return self._vector(lambda group, x, m: group.to_end_change(x, m), xi, mu)
+
+    def to_start(self, xi: Vector, mu: Vector) -> Vector:
+        """The factors' Ad_{τ(ξ)⁻¹}^*."""
+        return self._vector(lambda group, x, m: group.to_start(x, m), xi, mu)
 
     def ad(self, xi: Vector, eta: Vector) -> Vector:
         """The factors' ad."""

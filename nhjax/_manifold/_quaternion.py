@@ -2,7 +2,10 @@
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
+
+from ._bilinear import bilinear, matrix_of
 
 
 Quaternion = Float[Array, "4"]
@@ -15,25 +18,43 @@ def dot(a: Float[Array, " n"], b: Float[Array, " n"]) -> Float[Array, ""]:
     return jnp.sum(a * b)
 
 
+# (e_j × e_k)_i.
+_CROSS = np.cross(np.eye(3)[:, None], np.eye(3)[None]).transpose(2, 0, 1)
+
+
+def _product_tensor() -> np.ndarray:
+    """(1_j ∘ 1_k)_i of the quaternions 1, i, j, k."""
+    tensor = np.zeros((4, 4, 4))
+    tensor[0] = np.diag([1.0, -1.0, -1.0, -1.0])
+    tensor[1:, 0, 1:] = tensor[1:, 1:, 0] = np.eye(3)
+    tensor[1:, 1:, 1:] = _CROSS
+    return tensor
+
+
+_PRODUCT = _product_tensor()
+# (w, x) -> w v + x × v, and 2 x × v.
+_SCALED_AND_TURNED = _PRODUCT[1:, :, 1:]
+_TURNED_TWICE = 2 * _SCALED_AND_TURNED * (np.arange(4) > 0)[:, None]
+
+
 def cross(a: Vector3, b: Vector3) -> Vector3:
     """a × b."""
-    # Shifts of whole vectors make a third of the operations of nine scalars.
-    return _shift(a * _shift(b) - _shift(a) * b)
-
-
-def _shift(v):
-    return jnp.concatenate([v[1:], v[:1]])
+    return bilinear(_CROSS, a, b)
 
 
 def multiply(p: Quaternion, q: Quaternion) -> Quaternion:
     """The product p ∘ q."""
-    vector = p[:1] * q[1:] + q[:1] * p[1:] + cross(p[1:], q[1:])
-    return jnp.concatenate([p[:1] * q[:1] - dot(p[1:], q[1:]), vector])
+    return bilinear(_PRODUCT, p, q)
+
+
+def multiply_vector(q: Quaternion, v: Vector3) -> Quaternion:
+    """The product q ∘ (0, v)."""
+    return bilinear(_PRODUCT[:, :, 1:], q, v)
 
 
 def conjugate(q: Quaternion) -> Quaternion:
     """The inverse of a unit quaternion."""
-    return jnp.concatenate([q[:1], -q[1:]])
+    return jnp.array([1.0, -1.0, -1.0, -1.0], q.dtype) * q
 
 
 def rotate(q: Quaternion, v: Vector3) -> Vector3:
@@ -43,13 +64,12 @@ def rotate(q: Quaternion, v: Vector3) -> Vector3:
 
 def rotation_change(q: Quaternion, v: Vector3) -> Vector3:
     """R(q) v - v, without cancellation."""
-    twice = 2 * cross(q[1:], v)
-    return q[:1] * twice + cross(q[1:], twice)
+    return bilinear(_SCALED_AND_TURNED, q, bilinear(_TURNED_TWICE, q, v))
 
 
 def cross_matrix(v: Vector3) -> Float[Array, "3 3"]:
     """The matrix of v ×."""
-    return jax.vmap(lambda e: cross(v, e), out_axes=1)(jnp.eye(3, dtype=v.dtype))
+    return matrix_of(_CROSS, v)
 
 
 def rotation_matrix(q: Quaternion) -> Float[Array, "3 3"]:

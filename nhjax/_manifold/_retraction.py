@@ -20,7 +20,8 @@ class AbstractRetraction(eqx.Module):
     s = |ω|². The groups' formulas are made of them, so that those of the plane are
     those of space.
 
-    - the rotation by τ(ω): `angle`, `rate`, `half_rotation`, `rotation_vector`;
+    - the rotation by τ(ω): `angle`, `rate`, `cos_sin`, `half_rotation`,
+      `rotation_vector`;
     - dτ_ω η = α η - β ω × η + γ (ω·η) ω: `dtau_coefficients`;
     - dτ_ω⁻¹ η = α η + ½ ω × η + γ (ω·η) ω: `dtau_inv_coefficients`.
     """
@@ -32,6 +33,10 @@ class AbstractRetraction(eqx.Module):
     @abstractmethod
     def rate(self, angle: Array) -> Array:
         """The ω whose plane rotation has this angle."""
+
+    @abstractmethod
+    def cos_sin(self, omega: FloatScalar) -> tuple[FloatScalar, FloatScalar]:
+        """cos - 1, without cancellation, and sin of the angle of τ(ω)."""
 
     @abstractmethod
     def half_rotation(self, s: FloatScalar) -> tuple[FloatScalar, FloatScalar]:
@@ -81,6 +86,11 @@ class Cayley(AbstractRetraction):
         """2 tan(θ/2)."""
         return 2 * jnp.tan(0.5 * angle)
 
+    def cos_sin(self, omega: FloatScalar) -> tuple[FloatScalar, FloatScalar]:
+        """-ω²/2 and ω, both over 1 + ω²/4."""
+        sin = omega / (1 + 0.25 * omega**2)
+        return -0.5 * omega * sin, sin
+
     def half_rotation(self, s: FloatScalar) -> tuple[FloatScalar, FloatScalar]:
         """1/r - 1 and 1/(2r) with r² = 1 + s/4."""
         r = jnp.sqrt(1 + 0.25 * s)
@@ -129,6 +139,10 @@ class Exponential(AbstractRetraction):
     def rate(self, angle: Array) -> Array:
         """θ."""
         return angle
+
+    def cos_sin(self, omega: FloatScalar) -> tuple[FloatScalar, FloatScalar]:
+        """-2 sin²(ω/2) and sin ω."""
+        return -2 * jnp.sin(0.5 * omega) ** 2, jnp.sin(omega)
 
     def half_rotation(self, s: FloatScalar) -> tuple[FloatScalar, FloatScalar]:
         """cos(√s/2) - 1 and sin(√s/2)/√s."""

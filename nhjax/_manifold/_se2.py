@@ -62,10 +62,12 @@ class SE2(AbstractLieGroup):
 
     def retract(self, xi: Vector) -> Pose:
         """τ(ξ)."""
+        return jnp.concatenate([self._translation(xi), self.retraction.angle(xi[2:])])
+
+    def _translation(self, xi: Vector) -> Float[Array, "2"]:
         v, omega = xi[:2], xi[2]
         alpha, beta, _ = self.retraction.dtau_coefficients(omega**2)
-        translation = alpha * v + beta * omega * turn(v)
-        return jnp.concatenate([translation, self.retraction.angle(xi[2:])])
+        return alpha * v + beta * omega * turn(v)
 
     def local(self, g: Pose) -> Vector:
         """The ξ with τ(ξ) = g."""
@@ -116,6 +118,23 @@ class SE2(AbstractLieGroup):
         """(R(θ) u - σ J x, σ)."""
         linear = rotate(g[2], eta[:2]) - eta[2] * turn(g[:2])
         return jnp.concatenate([linear, eta[2:]])
+
+    # Along a retraction neither an angle nor its functions are needed.
+
+    def to_end(self, xi: Vector, mu: Vector) -> Vector:
+        """(R(θ)ᵀ m, σ - m·J x) of μ = (m, σ), with (x, θ) = τ(ξ)."""
+        return mu + self.to_end_change(xi, mu)
+
+    def to_end_change(self, xi: Vector, mu: Vector) -> Vector:
+        """Ad_{τ(ξ)}^* μ - μ, without cancellation."""
+        less, sin = self.retraction.cos_sin(xi[2])
+        moment = jnp.sum(turn(self._translation(xi)) * mu[:2])
+        turned = less * mu[:2] - sin * turn(mu[:2])
+        return jnp.concatenate([turned, -moment[None]])
+
+    def to_start(self, xi: Vector, mu: Vector) -> Vector:
+        """The same with τ(-ξ) = τ(ξ)⁻¹."""
+        return self.to_end(-xi, mu)
 
     def ad(self, xi: Vector, eta: Vector) -> Vector:
         """(ω J u - σ J v, 0)."""

@@ -10,6 +10,7 @@ from ._quaternion import (
     cross_matrix,
     dot,
     multiply,
+    multiply_vector,
     Quaternion,
     rotate,
     rotation_change,
@@ -108,8 +109,7 @@ class SO3(AbstractLieGroup):
 
     def tangent(self, g: Quaternion, eta: Vector3) -> Quaternion:
         """q ∘ (0, η/2)."""
-        vector = g[:1] * eta + cross(g[1:], eta)
-        return 0.5 * jnp.concatenate([-dot(g[1:], eta)[None], vector])
+        return 0.5 * multiply_vector(g, eta)
 
     def dtau(self, xi: Vector3, eta: Vector3) -> Vector3:
         """dτ_ω η = α η - β ω × η + γ (ω·η) ω."""
@@ -137,9 +137,9 @@ class SO3(AbstractLieGroup):
         """R(g)ᵀ μ."""
         return rotate(conjugate(g), mu)
 
-    def Ad_dual_change(self, g: Quaternion, mu: Vector3) -> Vector3:
-        """R(g)ᵀ μ - μ, without cancellation."""
-        return rotation_change(conjugate(g), mu)
+    def to_end_change(self, xi: Vector3, mu: Vector3) -> Vector3:
+        """R(τ(ξ))ᵀ μ - μ, without cancellation."""
+        return rotation_change(conjugate(self.retract(xi)), mu)
 
     def ad(self, xi: Vector3, eta: Vector3) -> Vector3:
         """ξ × η."""
