@@ -2,7 +2,7 @@
 
 A scalar of the final state is differentiated with respect to the initial state, dt and
 the system's parameters. Times are over those of the run alone, in one process and
-interleaved: medians of seven, of one run beyond 10⁴ steps; processor time, that of
+interleaved: medians of seven, of three beyond 10⁴ steps; processor time, that of
 all threads, depends less on what else runs. Each system and number of
 steps has a process of its own. `temp` is what the compiled program allocates,
 `resident` by how much the peak of resident memory lies above that before the run
@@ -34,7 +34,7 @@ from nhjax import systems
 from ._report import markdown_table, number, RESULTS, write
 
 
-DT, REPEATS, LONG = 0.1, 7, 10**4
+DT, REPEATS, LONG, REPEATS_OF_LONG = 0.1, 7, 10**4, 3
 # So that freed memory goes back at once, and is not taken for what a run needs.
 MALLOC = {"MALLOC_MMAP_THRESHOLD_": "65536", "MALLOC_TRIM_THRESHOLD_": "65536"}
 
@@ -152,7 +152,7 @@ def case(name: str, stages: int, num_steps: int, adjoints: list[str]) -> dict[st
         rows[key]["resident"] = resident(program, args)
         if key != "forward":
             gradients[key] = outcome[1][0]
-    repeats = REPEATS if num_steps <= LONG else 1
+    repeats = REPEATS if num_steps <= LONG else REPEATS_OF_LONG
     for key, (by_clock, by_processors) in both_medians(runs, repeats).items():
         rows[key] |= {"seconds": by_clock, "processor_seconds": by_processors}
     for key, value in gradients.items():
