@@ -4,7 +4,7 @@ import math
 from abc import abstractmethod
 from collections.abc import Callable
 from functools import partial
-from typing import TypeAlias
+from typing import TypeAlias, TypeVar
 
 import equinox as eqx
 import jax
@@ -15,6 +15,7 @@ from ._loop import Carry, Loop, Rows
 
 
 _Run: TypeAlias = tuple[Carry, Rows]
+_State = TypeVar("_State")
 _Advance: TypeAlias = Callable[[_Run, Int[Array, ""]], _Run]
 
 
@@ -30,6 +31,27 @@ def _advance(loop: Loop, state: _Run, k: Int[Array, ""]) -> _Run:
     carry, buffers = state
     carry, rows = loop.step(carry, k)
     return carry, loop.write(buffers, rows, k)
+
+
+def steps(
+    advance: Callable[[_State, Int[Array, ""]], _State],
+    state: _State,
+    length: int,
+    first: Int[Array, ""] | int = 0,
+    stride: int = 1,
+) -> _State:
+    """`advance(state, k)` for `length` values of k, from `first`, `stride` apart.
+
+    They are counted on the way: an array of them would grow with the number of steps.
+    """
+
+    def body(counted, _):
+        state, k = counted
+        return (advance(state, k), k + stride), None
+
+    counted = (state, jnp.asarray(first, jnp.int32))
+    (state, _), _ = jax.lax.scan(body, counted, length=length)
+    return state
 
 
 class DirectAdjoint(AbstractAdjoint):
@@ -51,13 +73,8 @@ class DirectAdjoint(AbstractAdjoint):
 
     def run(self, loop: Loop, carry: Carry) -> _Run:
         """All steps of the loop from `carry`: its end, and the rows saved."""
-        ks = jnp.arange(loop.num_steps, dtype=jnp.int32)
-        state, _ = jax.lax.scan(
-            lambda state, k: (_advance(loop, state, k), None),
-            (carry, loop.empty_rows(carry)),
-            ks,
-        )
-        return state
+        state = (carry, loop.empty_rows(carry))
+        return steps(partial(_advance, loop), state, loop.num_steps)
 
 
 class RecursiveCheckpointAdjoint(AbstractAdjoint):
@@ -124,11 +141,7 @@ def _block(advance: _Advance, length: int, stride: int, *, keep_all: bool) -> _A
     """`length` calls of `advance`, `stride` steps apart."""
     one = advance if keep_all else jax.checkpoint(advance, prevent_cse=False)
 
-    def block(state, k):
-        ks = k + stride * jnp.arange(length, dtype=jnp.int32)
-        return jax.lax.scan(lambda state, k: (one(state, k), None), state, ks)[0]
-
-    return block
+    return lambda state, k: steps(one, state, length, k, stride)
 
 
 def _idle_after_the_end(loop: Loop) -> _Advance:

@@ -60,7 +60,7 @@ class Chart(eqx.Module):
 
         return jax.vmap(one)(xi, velocity, momentum, force)
 
-    def to_origin(
+    def to_start(
         self, xi: Float[Array, "r n"], covector: Float[Array, "r n"]
     ) -> Float[Array, "r n"]:
         """Ad^*_{τ(Ξ)⁻¹} w, body covectors at g_k τ(Ξ) as body covectors at g_k."""
@@ -69,7 +69,7 @@ class Chart(eqx.Module):
 
         return jax.vmap(self.manifold.to_start)(xi, covector)
 
-    def from_origin(
+    def to_end(
         self, xi: Float[Array, " n"], covector: Float[Array, " n"]
     ) -> Float[Array, " n"]:
         """Ad^*_{τ(Ξ)} μ, a body covector at g_k as a body covector at g_k τ(Ξ)."""
@@ -107,7 +107,7 @@ class Chart(eqx.Module):
         """
         if self.manifold.is_flat:
             return momentum
-        end = self.from_origin(xi, momentum + transported)
+        end = self.to_end(xi, momentum + transported)
         return self.manifold.dtau_dual(xi, end) - chart_force
 
     def in_domain(self, xi: Float[Array, "r n"]) -> Array:

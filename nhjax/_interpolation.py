@@ -36,7 +36,7 @@ def interpolate(
     chart = Chart(system.manifold_of(start.q), start.q)
     xi = h * (weights @ record.velocity)
     q = chart.manifold.act(start.q, xi)
-    p = chart.from_origin(xi, start.p + h * (weights @ record.force))
+    p = chart.to_end(xi, start.p + h * (weights @ record.force))
     u = p
     if system.fibre_name == "v":
         u = root(lambda u: system.momentum(time, q, u, args) - p, start.v).x

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Int, PyTree
 
-from ._adjoint import AbstractAdjoint, DirectAdjoint
+from ._adjoint import AbstractAdjoint, DirectAdjoint, steps
 from ._custom_types import BoolScalar
 from ._iteration import iterate
 from ._largest import largest, relative
@@ -86,12 +86,10 @@ def _run_bwd(residuals, cotangents, perturbed, arguments):
         _, pullback = jax.vjp(forward, parameters, node.state)
         row = eqx.filter(loop.read(row_cotangents, k), eqx.is_inexact_array)
         change, cotangent = pullback((cotangent, row))
-        return (node, cotangent, jax.tree.map(jnp.add, total, change)), None
+        return node, cotangent, jax.tree.map(jnp.add, total, change)
 
-    ks = jnp.arange(loop.num_steps, dtype=jnp.int32)
-    (first, cotangents, total), _ = jax.lax.scan(
-        retrace, (end.node, cotangent, nothing), ks, reverse=True
-    )
+    last, state = loop.num_steps - 1, (end.node, cotangent, nothing)
+    first, cotangents, total = steps(retrace, state, loop.num_steps, last, -1)
     total, cotangent = _if_retraced(
         end.result == RESULTS.successful,
         loop,

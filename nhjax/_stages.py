@@ -263,7 +263,7 @@ class StageSystem(eqx.Module):
             )
         )(self.stage_times, q, u, multiplier)
         momentum, chart_force = self.chart.to_chart(xi, x.velocity, momentum, force)
-        transported = self.chart.to_origin(xi, force)
+        transported = self.chart.to_start(xi, force)
         base = self.chart.base_momentum(
             self.increment(x),
             self.p,
@@ -287,7 +287,7 @@ class StageSystem(eqx.Module):
             self.node_times, self.node_positions(x), x.node_fibre
         )
         known = self.p[None] + self.h * contract("ij,jn->in", self.node_weights, force)
-        carried = jax.vmap(self.chart.from_origin)(self._node_increments(x), known)
+        carried = jax.vmap(self.chart.to_end)(self._node_increments(x), known)
         return momentum - carried
 
     def node_constraint(self, x: Stages) -> Float[Array, "r m"]:

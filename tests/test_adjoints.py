@@ -223,3 +223,31 @@ def test_the_number_of_checkpoints_must_be_one(checkpoints):
 def test_the_reversible_adjoint_has_no_forward_mode():
     with pytest.raises(TypeError, match=r"forward|jvp"):
         jax.jvp(lambda dt: swing(dt, 2, REVERSIBLE), (0.1,), (1.0,))
+
+
+# Memory -------------------------------------------------------------------------------
+
+
+def test_memory_grows_as_each_adjoint_promises():
+    example = systems.NonholonomicParticle()
+    y0 = example.initial_state()
+
+    def temporary(adjoint, num_steps):
+        def loss(y0):
+            sol = nhjax.integrate(
+                example.system,
+                LobattoIIIAB(2),
+                y0,
+                dt=0.1,
+                num_steps=num_steps,
+                adjoint=adjoint,
+            )
+            return jnp.sum(sol.ys.q**2)
+
+        program = jax.jit(jax.grad(loss)).lower(y0).compile()
+        return program.memory_analysis().temp_size_in_bytes
+
+    # A part of each does not grow at all.
+    assert temporary(REVERSIBLE, 10_000) == temporary(REVERSIBLE, 100)
+    assert temporary(CHECKPOINTS, 10_000) <= 10 * temporary(CHECKPOINTS, 100)
+    assert 50 * temporary(DIRECT, 100) < temporary(DIRECT, 10_000)

@@ -126,10 +126,12 @@ BESIDE = {
         ("rod sleigh", 2, "propagated"),
         ("unicycle", 2, "symmetric"),
         ("unicycle", 2, "propagated"),
+        ("disc", 2, "symmetric"),
         ("disc", 2, "propagated"),
         ("ball", 2, "symmetric"),
         ("ball", 2, "propagated"),
         ("Suslov", 2, "symmetric"),
+        ("Suslov", 2, "propagated"),
         ("Suslov", 2, "consistent"),
         # Without nonholonomic constraints there is nothing to close.
         ("oscillator and pendulums", 2, "symmetric"),

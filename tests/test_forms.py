@@ -174,7 +174,7 @@ def residual_of(stages, x):
 def end_of(stages, x):
     """(q_{k+1}, p_{k+1})."""
     xi, n = stages.increment(x), stages.evaluate(x).force
-    p = stages.chart.from_origin(xi, stages.p + stages.h * (stages.method.b @ n))
+    p = stages.chart.to_end(xi, stages.p + stages.h * (stages.method.b @ n))
     return stages.chart.manifold.act(stages.q, xi), p
 
 

@@ -120,6 +120,10 @@ def test_second_tangents_duals_and_gradients_follow(group):
     close(group.dtau_inv_dual(XI, MU) @ ETA, MU @ group.dtau_inv(XI, ETA))
     close(group.Ad_dual(g, MU) @ ETA, MU @ group.Ad(g, ETA))
     close(group.ad_dual(XI, MU) @ ETA, MU @ group.ad(XI, ETA))
+    at_end = group.to_end(DELTA, MU)
+    close(at_end @ ETA, MU @ group.Ad(g, ETA))
+    close(group.to_end_change(DELTA, MU), at_end - MU)
+    close(group.to_start(DELTA, at_end), MU)
 
     def function(q):
         return jnp.sum(jnp.sin(q))

@@ -119,7 +119,7 @@ class SE2(AbstractLieGroup):
         linear = rotate(g[2], eta[:2]) - eta[2] * turn(g[:2])
         return jnp.concatenate([linear, eta[2:]])
 
-    # Along a retraction neither an angle nor its functions are needed.
+    # Along Cayley's retraction neither an angle nor its functions are needed.
 
     def to_end(self, xi: Vector, mu: Vector) -> Vector:
         """(R(θ)ᵀ m, σ - m·J x) of μ = (m, σ), with (x, θ) = τ(ξ)."""

@@ -6,7 +6,7 @@ from .._compensated import two_sum
 from .._custom_types import BoolScalar, FloatScalar
 from ._abstract import AbstractLieGroup, check_shape
 from ._homogeneous import homogeneous
-from ._quaternion import cross, dot, rotate, Vector3
+from ._quaternion import cross, dot, rotate, rotation_change, Vector3
 from ._retraction import AbstractRetraction, Cayley, check_retraction, Exponential
 from ._so3 import SO3
 
@@ -141,6 +141,22 @@ class SE3(AbstractLieGroup):
         sigma = rotate(g[:4], eta[3:])
         u = rotate(g[:4], eta[:3]) + cross(g[4:], sigma)
         return jnp.concatenate([u, sigma])
+
+    def to_end(self, xi: Vector, mu: Vector) -> Vector:
+        """(R(q)ᵀ m, R(q)ᵀ (σ + m × x)) of μ = (m, σ), with (q, x) = τ(ξ)."""
+        return mu + self.to_end_change(xi, mu)
+
+    def to_end_change(self, xi: Vector, mu: Vector) -> Vector:
+        """Ad_{τ(ξ)}^* μ - μ, without cancellation."""
+        m, sigma = mu[:3], mu[3:]
+        back = self._rotations.inverse(self._rotations.retract(xi[3:]))
+        moment = rotate(back, cross(m, self._translation(xi)))
+        turned = rotation_change(back, sigma)
+        return jnp.concatenate([rotation_change(back, m), turned + moment])
+
+    def to_start(self, xi: Vector, mu: Vector) -> Vector:
+        """The same with τ(-ξ) = τ(ξ)⁻¹."""
+        return self.to_end(-xi, mu)
 
     def ad(self, xi: Vector, eta: Vector) -> Vector:
         """(ω × u + v × σ, ω × σ)."""
