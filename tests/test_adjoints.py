@@ -244,8 +244,9 @@ def test_memory_grows_as_each_adjoint_promises():
             )
             return jnp.sum(sol.ys.q**2)
 
-        program = jax.jit(jax.grad(loss)).lower(y0).compile()
-        return program.memory_analysis().temp_size_in_bytes
+        memory = jax.jit(jax.grad(loss)).lower(y0).compile().memory_analysis()
+        assert memory is not None
+        return memory.temp_size_in_bytes
 
     # A part of each does not grow at all.
     assert temporary(REVERSIBLE, 10_000) == temporary(REVERSIBLE, 100)
