@@ -354,7 +354,8 @@ def main() -> None:
         return
     s, compile_stages, steps = options.stages, list(range(2, 9)), 1000
     pairs = [(name, n) for name in options.systems for n in options.num_steps]
-    pairs.insert(len(options.num_steps), (options.systems[0], options.longest))
+    if options.longest not in options.num_steps:
+        pairs.insert(len(options.num_steps), (options.systems[0], options.longest))
     if options.smoke:
         pairs, compile_stages, steps = [("CVT", 20)], [2, 3], 20
     cases = []

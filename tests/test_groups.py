@@ -659,7 +659,8 @@ def test_a_class_as_retraction_is_named_as_such():
 
 def test_unknown_retraction_is_refused_with_advice():
     class Mine(AbstractRetraction):
-        angle = rate = cos_sin = half_rotation = rotation_vector = None  # pyright: ignore
+        angle = rate = plane_rotation = half_rotation = None  # pyright: ignore
+        rotation_vector = None  # pyright: ignore
         dtau_coefficients = dtau_inv_coefficients = in_chart = None  # pyright: ignore
 
     with pytest.raises(ValueError, match=r"`retraction` is .*subclass `AbstractLie"):

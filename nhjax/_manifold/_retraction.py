@@ -20,7 +20,7 @@ class AbstractRetraction(eqx.Module):
     s = |ω|². The groups' formulas are made of them, so that those of the plane are
     those of space.
 
-    - the rotation by τ(ω): `angle`, `rate`, `cos_sin`, `half_rotation`,
+    - the rotation by τ(ω): `angle`, `rate`, `plane_rotation`, `half_rotation`,
       `rotation_vector`;
     - dτ_ω η = α η - β ω × η + γ (ω·η) ω: `dtau_coefficients`;
     - dτ_ω⁻¹ η = α η + ½ ω × η + γ (ω·η) ω: `dtau_inv_coefficients`.
@@ -35,8 +35,8 @@ class AbstractRetraction(eqx.Module):
         """The ω whose plane rotation has this angle."""
 
     @abstractmethod
-    def cos_sin(self, omega: FloatScalar) -> tuple[FloatScalar, FloatScalar]:
-        """cos - 1, without cancellation, and sin of the angle of τ(ω)."""
+    def plane_rotation(self, omega: FloatScalar) -> tuple[FloatScalar, FloatScalar]:
+        """cos φ - 1, without cancellation, and sin φ of the angle φ of τ(ω)."""
 
     @abstractmethod
     def half_rotation(self, s: FloatScalar) -> tuple[FloatScalar, FloatScalar]:
@@ -86,7 +86,7 @@ class Cayley(AbstractRetraction):
         """2 tan(θ/2)."""
         return 2 * jnp.tan(0.5 * angle)
 
-    def cos_sin(self, omega: FloatScalar) -> tuple[FloatScalar, FloatScalar]:
+    def plane_rotation(self, omega: FloatScalar) -> tuple[FloatScalar, FloatScalar]:
         """-ω²/2 and ω, both over 1 + ω²/4."""
         sin = omega / (1 + 0.25 * omega**2)
         return -0.5 * omega * sin, sin
@@ -140,7 +140,7 @@ class Exponential(AbstractRetraction):
         """θ."""
         return angle
 
-    def cos_sin(self, omega: FloatScalar) -> tuple[FloatScalar, FloatScalar]:
+    def plane_rotation(self, omega: FloatScalar) -> tuple[FloatScalar, FloatScalar]:
         """-2 sin²(ω/2) and sin ω."""
         return -2 * jnp.sin(0.5 * omega) ** 2, jnp.sin(omega)
 

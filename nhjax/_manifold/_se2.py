@@ -3,8 +3,9 @@ from jaxtyping import Array, DTypeLike, Float
 
 from .._compensated import two_sum
 from .._custom_types import BoolScalar
-from ._abstract import AbstractLieGroup, check_shape
+from ._abstract import check_shape
 from ._homogeneous import homogeneous
+from ._motions import AbstractMotionGroup
 from ._plane import rotate, turn
 from ._retraction import AbstractRetraction, Cayley, check_retraction
 from ._so2 import SO2
@@ -14,7 +15,7 @@ Pose = Float[Array, "3"]
 Vector = Float[Array, "3"]
 
 
-class SE2(AbstractLieGroup):
+class SE2(AbstractMotionGroup):
     """The rigid motions of the plane: (x, y, θ), with body velocity (v1, v2, ω).
 
     d(x, y)/dt = R(θ) (v1, v2) and dθ/dt = ω. The angle is a lift, as on `SO2`.
@@ -119,22 +120,13 @@ class SE2(AbstractLieGroup):
         linear = rotate(g[2], eta[:2]) - eta[2] * turn(g[:2])
         return jnp.concatenate([linear, eta[2:]])
 
-    # Along Cayley's retraction neither an angle nor its functions are needed.
-
-    def to_end(self, xi: Vector, mu: Vector) -> Vector:
-        """(R(θ)ᵀ m, σ - m·J x) of μ = (m, σ), with (x, θ) = τ(ξ)."""
-        return mu + self.to_end_change(xi, mu)
-
     def to_end_change(self, xi: Vector, mu: Vector) -> Vector:
-        """Ad_{τ(ξ)}^* μ - μ, without cancellation."""
-        less, sin = self.retraction.cos_sin(xi[2])
+        """(R(θ)ᵀ m - m, -m·J x) of μ = (m, σ), with (x, θ) = τ(ξ)."""
+        # With Cayley's map neither the angle nor its functions are needed.
+        less, sin = self.retraction.plane_rotation(xi[2])
         moment = jnp.sum(turn(self._translation(xi)) * mu[:2])
         turned = less * mu[:2] - sin * turn(mu[:2])
         return jnp.concatenate([turned, -moment[None]])
-
-    def to_start(self, xi: Vector, mu: Vector) -> Vector:
-        """The same with τ(-ξ) = τ(ξ)⁻¹."""
-        return self.to_end(-xi, mu)
 
     def ad(self, xi: Vector, eta: Vector) -> Vector:
         """(ω J u - σ J v, 0)."""

@@ -4,8 +4,9 @@ from jaxtyping import Array, DTypeLike, Float
 
 from .._compensated import two_sum
 from .._custom_types import BoolScalar, FloatScalar
-from ._abstract import AbstractLieGroup, check_shape
+from ._abstract import check_shape
 from ._homogeneous import homogeneous
+from ._motions import AbstractMotionGroup
 from ._quaternion import cross, dot, rotate, rotation_change, Vector3
 from ._retraction import AbstractRetraction, Cayley, check_retraction, Exponential
 from ._so3 import SO3
@@ -15,7 +16,7 @@ Pose = Float[Array, "7"]
 Vector = Float[Array, "6"]
 
 
-class SE3(AbstractLieGroup):
+class SE3(AbstractMotionGroup):
     """The rigid motions of space: a unit quaternion q, then a translation x.
 
     The velocity is (v, ω), both in the body: dx/dt = R(q) v, dq/dt = q ∘ (0, ω/2).
@@ -142,21 +143,13 @@ class SE3(AbstractLieGroup):
         u = rotate(g[:4], eta[:3]) + cross(g[4:], sigma)
         return jnp.concatenate([u, sigma])
 
-    def to_end(self, xi: Vector, mu: Vector) -> Vector:
-        """(R(q)ᵀ m, R(q)ᵀ (σ + m × x)) of μ = (m, σ), with (q, x) = τ(ξ)."""
-        return mu + self.to_end_change(xi, mu)
-
     def to_end_change(self, xi: Vector, mu: Vector) -> Vector:
-        """Ad_{τ(ξ)}^* μ - μ, without cancellation."""
+        """(Rᵀ m, Rᵀ (σ + m × x)) - μ of μ = (m, σ), with (R, x) = τ(ξ)."""
         m, sigma = mu[:3], mu[3:]
         back = self._rotations.inverse(self._rotations.retract(xi[3:]))
         moment = rotate(back, cross(m, self._translation(xi)))
         turned = rotation_change(back, sigma)
         return jnp.concatenate([rotation_change(back, m), turned + moment])
-
-    def to_start(self, xi: Vector, mu: Vector) -> Vector:
-        """The same with τ(-ξ) = τ(ξ)⁻¹."""
-        return self.to_end(-xi, mu)
 
     def ad(self, xi: Vector, eta: Vector) -> Vector:
         """(ω × u + v × σ, ω × σ)."""

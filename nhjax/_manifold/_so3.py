@@ -3,7 +3,8 @@ from jaxtyping import Array, DTypeLike, Float
 
 from .._compensated import two_sum
 from .._custom_types import BoolScalar, FloatScalar
-from ._abstract import AbstractLieGroup, check_shape
+from ._abstract import check_shape
+from ._motions import AbstractMotionGroup
 from ._quaternion import (
     conjugate,
     cross,
@@ -20,7 +21,7 @@ from ._quaternion import (
 from ._retraction import AbstractRetraction, Cayley, check_retraction
 
 
-class SO3(AbstractLieGroup):
+class SO3(AbstractMotionGroup):
     """The rotations of space: a unit quaternion, with the body angular velocity ω.
 
     dq/dt = q ∘ (0, ω/2); `matrix(q)` takes body to space coordinates. The quaternion
