@@ -101,17 +101,17 @@ def root(
     def newton(_, x):
         solved = iterate(sweep, x, largest(x), max_iterations=max_iterations)
         # As numbers: `custom_root` takes the tangents of `aux` for such.
-        outcome = (solved.converged, solved.num_iterations)
+        outcome = (solved.converged, solved.exhausted, solved.num_iterations)
         return solved.x, jax.tree.map(lambda z: z.astype(x.dtype), outcome)
 
     def solve_linear(operator, b):
         return jnp.linalg.solve(jax.jacfwd(operator)(jnp.zeros_like(b)), b)
 
-    x, (converged, num_iterations) = jax.lax.custom_root(
+    x, (converged, exhausted, num_iterations) = jax.lax.custom_root(
         flat_residual, flat, newton, solve_linear, has_aux=True
     )
-    converged, num_iterations = converged > 0, num_iterations.astype(jnp.int32)
-    return Solved(unravel(x), None, converged, num_iterations)
+    num_iterations = num_iterations.astype(jnp.int32)
+    return Solved(unravel(x), None, converged > 0, exhausted > 0, num_iterations)
 
 
 def undefined_unless(ok: BoolScalar, tree: X, parameters: PyTree[Any]) -> X:

@@ -76,6 +76,7 @@ class Loop(eqx.Module):
         stats = {
             "num_steps": none,
             "num_iterations": none,
+            "num_newton_steps": none,
             "max_residual": zero,
             "max_constraint_violation": largest_violation(
                 self.system, self.t0, node, self.args
@@ -216,6 +217,8 @@ class Loop(eqx.Module):
             "num_steps": stats["num_steps"] + good.astype(jnp.int32),
             "num_iterations": stats["num_iterations"]
             + jnp.where(alive, outcome.num_iterations, 0),
+            "num_newton_steps": stats["num_newton_steps"]
+            + (good & outcome.newton).astype(jnp.int32),
             "max_residual": larger("max_residual", outcome.residual),
             "max_constraint_violation": larger(
                 "max_constraint_violation", outcome.constraint_violation

@@ -11,8 +11,8 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
 from ._contraction import apply, contract
-from ._custom_types import FloatScalar, FloatScalarLike
-from ._iteration import dense_increment, iterate, Solved
+from ._custom_types import BoolScalar, FloatScalar, FloatScalarLike
+from ._iteration import iterate, jacobian_and_value, NOISE_UNITS, Solved
 from ._largest import largest
 from ._leading_structure import leading_structure, LeadingStructure
 from ._linearisation import Linearisation
@@ -21,10 +21,14 @@ from ._stages import StageForces, Stages, StageSystem
 
 
 class Evaluation(NamedTuple):
-    """What a solver leaves behind: the equations at the last iterate."""
+    """What a solver leaves behind: the equations at the last iterate.
+
+    `newton` is whether Newton's method had to solve what another solver could not.
+    """
 
     forces: StageForces
     node_residual: Float[Array, "r n"]
+    newton: BoolScalar
 
 
 # One iteration on the stages of a step; the equations are an argument, so that it can
@@ -43,6 +47,12 @@ class AbstractStageSolver(eqx.Module):
             raise ValueError(
                 f"{type(self).__name__}: `max_iterations` must be an int >= 1, got "
                 f"{self.max_iterations!r}."
+            )
+        fallback = getattr(self, "fallback", False)
+        if not isinstance(fallback, bool):
+            raise TypeError(
+                f"{type(self).__name__}: `fallback` must be True or False, got "
+                f"{fallback!r}."
             )
 
     @abstractmethod
@@ -70,11 +80,17 @@ class SimplifiedNewton(AbstractStageSolver):
     few small products. The error falls by a factor O(h²) where M is constant and the
     constraints are linear in v, O(h) elsewhere.
 
+    Where it does not converge, Newton's method with the exact Jacobian may: with
+    `fallback`, it takes over for such a step, and `Solution.stats["num_newton_steps"]`
+    counts them. A program that has it in itself compiles about twice as long, and runs
+    slower even if it is not needed, so that it is left out by default.
+
     **Arguments:**
 
     - `max_iterations`: the number of iterations after which a step counts as failed.
     - `tolerance`: the size of the increment, relative to the velocities, at which to
         stop; 0, the default, iterates to round-off. Changing it recompiles nothing.
+    - `fallback`: whether `nhjax.Newton()` takes over a step that is not solved.
 
     !!! example
 
@@ -85,6 +101,7 @@ class SimplifiedNewton(AbstractStageSolver):
 
     max_iterations: int = eqx.field(static=True, default=100)
     tolerance: FloatScalarLike = eqx.field(converter=jnp.asarray, default=0.0)
+    fallback: bool = eqx.field(static=True, default=False)
 
     def solve(
         self, stages: StageSystem, x0: Stages, lin: Linearisation, skip: Array
@@ -97,19 +114,41 @@ class SimplifiedNewton(AbstractStageSolver):
             x_next, evaluation = _corrected(stages, structure, x)
             return x_next, _increment_size(stages, x, x_next, lin), evaluation
 
-        return iterate(
+        solved = iterate(
             sweep,
             x0,
             scale,
             max_iterations=self.max_iterations,
             tolerance=self.tolerance,
+            noise_units=NOISE_UNITS,
             skip=skip,
         )
+        if not self.fallback:
+            return solved
+        # What is not finite after one iteration is so at the state itself.
+        ends = solved.converged | (~solved.exhausted & (solved.num_iterations <= 1))
+
+        def by_newton():
+            newton = self._newton.solve(stages, x0, lin, ends)
+            count = solved.num_iterations + newton.num_iterations
+            aux = newton.aux._replace(newton=jnp.ones_like(ends))
+            return newton._replace(num_iterations=count, aux=aux)
+
+        return jax.lax.cond(ends, lambda: solved, by_newton)
+
+    @property
+    def _newton(self) -> "Newton":
+        return Newton(tolerance=self.tolerance)
 
     def correction(
         self, stages: StageSystem, lin: Linearisation, x: Stages
     ) -> Correction:
-        """The iteration of `solve`, with the constraints' slopes at the solution."""
+        """The iteration of `solve`, with the constraints' slopes at the solution.
+
+        It need not contract where Newton's method took over, whose iteration does.
+        """
+        if self.fallback:
+            return self._newton.correction(stages, lin, x)
         structure = leading_structure(stages, x, lin)
         return lambda stages, x: _corrected(stages, structure, x)[0]
 
@@ -125,7 +164,7 @@ def _corrected(
     x_next = structure.correct_nodes(x_next, node_residual)
     if stages.constrained:
         x_next = _constrain(stages, structure, x_next)
-    return x_next, Evaluation(forces, node_residual)
+    return x_next, Evaluation(forces, node_residual, jnp.asarray(False))
 
 
 def _constrain(stages: StageSystem, structure: LeadingStructure, x: Stages) -> Stages:
@@ -151,9 +190,10 @@ class Newton(AbstractStageSolver):
     """Newton's method on the stage system with the exact dense Jacobian.
 
     Dearer per iteration than `SimplifiedNewton`, but it converges for larger steps and
-    for stiff forces. Both give the same trajectory to round-off.
+    for stiff forces, and tells the round-off of these from an iteration that has not
+    converged. Both give the same trajectory to round-off.
 
-    **Arguments:** as for `SimplifiedNewton`.
+    **Arguments:** `max_iterations` and `tolerance`, as for `SimplifiedNewton`.
 
     !!! example
 
@@ -172,14 +212,24 @@ class Newton(AbstractStageSolver):
         _, unravel = ravel_pytree(x0)
         scale = fibre_scale(stages, x0, lin)
 
+        nudge = float(jnp.finfo(stages.p.dtype).eps) ** 0.5
+        nudged = stages.nudged(jnp.asarray(nudge, stages.p.dtype))
+
         def residual(z):
-            return _residual(stages, unravel(z))
+            return stage_residual(stages, unravel(z))
 
         def sweep(x: Stages):
             z, _ = ravel_pytree(x)
-            dz, evaluation = dense_increment(residual, z)
+            jacobian, r, evaluation = jacobian_and_value(residual, z)
+            change = stage_residual(nudged, x)[0] - r
+            dz, noise = jnp.linalg.solve(jacobian, -jnp.stack([r, change], axis=1)).T
             x_next = unravel(z + dz)
-            return x_next, _increment_size(stages, x, x_next, lin), evaluation
+            size = _increment_size(stages, x, x_next, lin)
+            # What round-off of the positions makes of the stages counts as a scale too,
+            # if it is larger: stiff forces magnify it.
+            noise = _increment_size(stages, x, unravel(z + noise), lin) / nudge
+            share = jnp.where(noise > scale, scale / noise, 1)
+            return x_next, size * share, evaluation
 
         return iterate(
             sweep,
@@ -187,6 +237,7 @@ class Newton(AbstractStageSolver):
             scale,
             max_iterations=self.max_iterations,
             tolerance=self.tolerance,
+            noise_units=NOISE_UNITS,
             skip=skip,
         )
 
@@ -195,17 +246,19 @@ class Newton(AbstractStageSolver):
     ) -> Correction:
         """Newton's iteration with the Jacobian at the solution."""
         z, unravel = ravel_pytree(x)
-        jacobian = jax.jacfwd(lambda z: _residual(stages, unravel(z))[0])(z)
+        jacobian = jax.jacfwd(lambda z: stage_residual(stages, unravel(z))[0])(z)
         jacobian_inverse = jnp.linalg.inv(jacobian)
 
         def corrected(stages: StageSystem, x: Stages) -> Stages:
-            residual, _ = _residual(stages, x)
+            residual, _ = stage_residual(stages, x)
             return unravel(ravel_pytree(x)[0] - jacobian_inverse @ residual)
 
         return corrected
 
 
-def _residual(stages: StageSystem, x: Stages) -> tuple[Float[Array, " k"], Evaluation]:
+def stage_residual(
+    stages: StageSystem, x: Stages
+) -> tuple[Float[Array, " k"], Evaluation]:
     """All equations of a step in one vector."""
     forces = stages.evaluate(x)
     node_residual = stages.node_residual(x, forces.force)
@@ -215,7 +268,10 @@ def _residual(stages: StageSystem, x: Stages) -> tuple[Float[Array, " k"], Evalu
     parts += _constraints(stages, x)
     if stages.symmetric:
         parts += stages.end_residual(x)
-    return ravel_pytree(parts)[0], Evaluation(forces, node_residual)
+    return (
+        ravel_pytree(parts)[0],
+        Evaluation(forces, node_residual, jnp.asarray(False)),
+    )
 
 
 def _increment_size(

@@ -18,8 +18,14 @@ class RESULTS(eqx.Enumeration):
 
     successful = ""
     nonlinear_divergence = (
-        "The stage equations of a step could not be solved: Newton's iteration did not "
-        "converge. Try a smaller `dt`, `solver=nhjax.Newton()`, or more iterations."
+        "The stage equations of a step could not be solved: Newton's iteration "
+        "diverged. Try a smaller `dt`."
+    )
+    nonlinear_max_iterations = (
+        "The stage equations of a step were not solved to round-off within the "
+        "`max_iterations` of the solver: Newton's iteration converges too slowly, or "
+        "wanders about. Try a smaller `dt`, or more iterations; where the system is so "
+        "stiff or ill-conditioned that round-off is large, a `tolerance` of the solver."
     )
     singular_stage_matrix = (
         "The mass matrix D2D2L (or D2D2H) or the compatibility matrix C = D2Φ M⁻¹ D2Φᵀ "
@@ -49,7 +55,9 @@ class Solution(eqx.Module):
     - `ys`: the saved states, a `State` with leading axis k, or whatever
         `SaveAt(fn=...)` returned, stacked; None if nothing was.
     - `stats`: `num_steps` (steps completed), `num_iterations` (of the nonlinear solver,
-        in all), `max_residual` (of the stage equations, relative to the momenta),
+        in all), `num_newton_steps` (steps that the solver's own iteration did not solve
+        and Newton's method had to), `max_residual` (of the stage equations, relative
+        to the momenta),
         `max_constraint_violation` (|Φ| at the nodes, the first included),
         `max_multiplier_defect` (|Λ^s - λ_c|, how far the last stage multiplier of a
         step is from the continuous one), `failed_step` (index of the step that
@@ -205,6 +213,7 @@ def _messages() -> list[str]:
     items = [
         RESULTS.successful,
         RESULTS.nonlinear_divergence,
+        RESULTS.nonlinear_max_iterations,
         RESULTS.singular_stage_matrix,
         RESULTS.nonfinite_state,
         RESULTS.left_chart,

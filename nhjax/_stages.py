@@ -8,6 +8,7 @@ from jaxtyping import Array, Float, PyTree
 from ._chart import Chart
 from ._contraction import contract
 from ._custom_types import Args, BoolScalar, FloatScalar
+from ._largest import largest
 from ._linearisation import Linearisation, motion_residual
 from ._method import AbstractMethod
 from ._state import State
@@ -83,6 +84,23 @@ class StageSystem(eqx.Module):
     ) -> "StageSystem":
         """The equations of a step of size h from the state y at t."""
         return cls(system, method, t, h, y.q, y.p, y.multiplier, args)
+
+    def nudged(self, nudge: FloatScalar) -> "StageSystem":
+        """The equations with q_k moved by about `nudge` times its size.
+
+        What that changes, over `nudge`, is what the round-off of positions may change,
+        over the unit round-off. The moves differ between coordinates, so that they do
+        not cancel in the distance of two.
+        """
+        manifold, n = self.chart.manifold, self.p.shape[0]
+        size = largest(*jax.tree.leaves(self.q))
+        if manifold.is_flat:
+            size = jnp.abs(self.q)
+        k = jnp.arange(n)
+        sign = 1 - 2 * (k % 2)
+        move = sign * (1 - 0.5 * jnp.mod(0.618 * k, 1.0))
+        xi = nudge * size * move.astype(self.p.dtype)
+        return eqx.tree_at(lambda z: z.q, self, manifold.act(self.q, xi))
 
     @property
     def num_holonomic(self) -> int:

@@ -46,6 +46,7 @@ class StepOutcome(NamedTuple):
     residual: FloatScalar
     constraint_violation: FloatScalar
     multiplier_defect: FloatScalar
+    newton: BoolScalar  # whether Newton's method had to take over
 
 
 def first_node(
@@ -143,6 +144,7 @@ def step(
         residual=relative(residual, scale),
         constraint_violation=largest_violation(system, t + h, next_node, args),
         multiplier_defect=largest(forces.multiplier[-1] - lin_next.multiplier),
+        newton=solved.aux.newton,
     )
 
 
@@ -159,6 +161,7 @@ def _result(
         RESULTS.nonlinear_divergence,
         RESULTS.nonfinite_state,
     )
+    failed = RESULTS.where(solved.exhausted, RESULTS.nonlinear_max_iterations, failed)
     converged = RESULTS.where(finite, RESULTS.successful, RESULTS.nonfinite_state)
     result = RESULTS.where(solved.converged, converged, failed)
     result = RESULTS.where(in_chart, result, RESULTS.left_chart)

@@ -1,0 +1,294 @@
+"""A search for steps that are accepted though they are not solved.
+
+Every system of the gallery and ten random ones, over steps from h = 0.004 up to
+failure, by `SimplifiedNewton` and by `Newton` from the same states. A step that a solver accepts
+is judged by figures that are computed here: the residual of the stage equations at the
+stages found, relative to the size of its terms; the violation of the constraints at the
+end, relative to the size of theirs; and the distance of the two solvers' ends.
+
+The terms of an equation r(x; q) = 0 have the size |∂r/∂x| |x| + |∂r/∂q| |q|: nothing
+smaller than the unit round-off times that can be asked of r (Oettli and Prager, 1964).
+"""
+
+import argparse
+from collections.abc import Callable
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.flatten_util import ravel_pytree
+from jaxtyping import Array, Float
+
+import nhjax
+from nhjax import systems
+from nhjax._newton import stage_residual
+from nhjax._scales import position_scale, violation_scale
+from nhjax._stages import Stages, StageSystem
+from nhjax._step import first_node, Node, step, StepOutcome
+
+from ._random_systems import random_systems
+from ._report import markdown_table, number, write
+
+
+SMALLEST, LARGEST, SIZES = 0.004, 4.0, 10
+ALLOWED, SAME = 1e-13, 1e-11
+NUDGE = 2.0**-26
+
+
+def gallery() -> dict[str, Callable]:
+    """The systems of the gallery by their names, each with a state to start from."""
+
+    def of(example):
+        return lambda: (example().system, example().initial_state())
+
+    cvt = systems.ContinuouslyVariableTransmission
+    named = {"CVT low": cvt.low, "CVT high": cvt.high}
+    others = [
+        systems.Appell,
+        systems.ChaoticSystem,
+        systems.ChaplyginSleigh,
+        systems.DoublePendulum,
+        systems.FreeRigidBody,
+        systems.HarmonicOscillator,
+        systems.HeavyTop,
+        systems.HeavyTopSE3,
+        systems.KnifeEdge,
+        systems.NonholonomicParticle,
+        systems.RodSleigh,
+        systems.RollingDisc,
+        systems.SphericalPendulum,
+        systems.Suslov,
+        systems.TurntableBall,
+        systems.Unicycle,
+        systems.UnicycleInCoordinates,
+        systems.VerticalRollingDisc,
+    ]
+    named |= {example.__name__: example for example in others}
+    return {name: of(example) for name, example in named.items()}
+
+
+class Judged(NamedTuple):
+    """A step of one solver: its result, and how well it is solved."""
+
+    result: Array
+    num_iterations: Array
+    residual: Array
+    violation: Array
+
+
+class Row(NamedTuple):
+    """Both solvers on one step, and how far apart their ends are."""
+
+    simplified: Judged
+    newton: Judged
+    distance: Array
+
+
+def judge(stages: StageSystem, outcome: StepOutcome) -> Judged:
+    """The figures of a step, from the stages and the state that were found."""
+    return Judged(
+        outcome.result._value,
+        outcome.num_iterations,
+        relative_residual(stages, outcome.stages),
+        relative_violation(stages, outcome.node),
+    )
+
+
+def relative_residual(stages: StageSystem, x: Stages) -> Float[Array, ""]:
+    """The largest residual of the stage equations over the size of its terms."""
+    z, unravel = ravel_pytree(x)
+
+    def equations(z, stages):
+        return stage_residual(stages, unravel(z))[0]
+
+    r = equations(z, stages)
+    jacobian = jax.jacfwd(equations)(z, stages)
+    moved = equations(z, stages.nudged(jnp.asarray(NUDGE)))
+    terms = jnp.abs(jacobian) @ jnp.abs(z) + jnp.abs(moved - r) / NUDGE
+    return largest_ratio(r, terms)
+
+
+def relative_violation(stages: StageSystem, node: Node) -> Float[Array, ""]:
+    """The largest violation of a constraint at the end over the size of its terms."""
+    system, t, args = stages.system, stages.t + stages.h, stages.args
+    q, u = node.state.q, system.fibre(node.state)
+    manifold = system.manifold_of(q)
+
+    def on_velocities(q):
+        return system.constraint(t, q, u, args)
+
+    _, rates = jax.vmap(
+        lambda xi: jax.jvp(
+            lambda xi: on_velocities(manifold.act(q, xi)), (jnp.zeros_like(u),), (xi,)
+        )
+    )(jnp.eye(u.size))
+    size = jnp.max(jnp.abs(ravel_pytree(q)[0]))
+    terms = violation_scale(system, node.lin, t, q, u, args)
+    terms = terms + jnp.sum(jnp.abs(rates), axis=0) * size
+    positions = system.position_constraint(t, q, args)
+    return jnp.maximum(
+        largest_ratio(on_velocities(q), terms),
+        largest_ratio(positions, position_scale(system, t, q, args)),
+    )
+
+
+def largest_ratio(x: Array, scale: Array) -> Float[Array, ""]:
+    """max |x| / scale, in which nothing over nothing is nothing."""
+    return jnp.max(jnp.abs(x) / jnp.where(x == 0, 1, scale), initial=0)
+
+
+@eqx.filter_jit
+def run(
+    system: nhjax.LagrangianSystem,
+    method: nhjax.AbstractMethod,
+    y0: nhjax.State,
+    sizes: Float[Array, " k"],
+    num_steps: int,
+) -> tuple[Row, Array]:
+    """`num_steps` steps of each size, and whether the run was alive before each."""
+    solvers = nhjax.SimplifiedNewton(), nhjax.Newton()
+    go_on = jnp.asarray(False)
+
+    def of_size(h):
+        def advance(carry, k):
+            node, alive = carry
+            t = k * h
+            stages = StageSystem.at(system, method, t, h, node.state, None)
+            first, second = (
+                step(system, method, solver, t, h, node, None, go_on)
+                for solver in solvers
+            )
+            row = Row(judge(stages, first), judge(stages, second), apart(first, second))
+            good = first.result == nhjax.RESULTS.successful
+            # Where the faster solver fails, the run goes on with the other one.
+            other = second.result == nhjax.RESULTS.successful
+            node = jax.tree.map(
+                lambda old, a, b: jnp.where(good, a, jnp.where(other, b, old)),
+                node,
+                first.node,
+                second.node,
+            )
+            return (node, alive & (good | other)), (row, alive)
+
+        start = first_node(system, method, jnp.zeros_like(h), y0, None)
+        steps = jnp.arange(num_steps, dtype=h.dtype)
+        _, rows = jax.lax.scan(advance, (start, jnp.asarray(True)), steps)
+        return rows
+
+    return jax.lax.map(of_size, sizes)
+
+
+def apart(first: StepOutcome, second: StepOutcome) -> Float[Array, ""]:
+    """The distance of two ends, relative to their size."""
+    parts = []
+    for name in ("q", "p"):
+        a, b = (ravel_pytree(getattr(x.node.state, name))[0] for x in (first, second))
+        parts.append(jnp.max(jnp.abs(a - b)) / (1 + jnp.max(jnp.abs(b))))
+    return jnp.max(jnp.stack(parts))
+
+
+def table_row(rows: Row, alive: np.ndarray) -> dict[str, float | int]:
+    """Counts of what became of the steps, and the worst figures of accepted ones."""
+    good, slow = (
+        int(result._value)
+        for result in (
+            nhjax.RESULTS.successful,
+            nhjax.RESULTS.nonlinear_max_iterations,
+        )
+    )
+    figures: dict[str, float | int] = {}
+    for name, judged in (("simplified", rows.simplified), ("newton", rows.newton)):
+        result = np.asarray(judged.result)[alive]
+        accepted = result == good
+        figures[f"{name} accepted"] = int(np.sum(accepted))
+        figures[f"{name} slow"] = int(np.sum(result == slow))
+        figures[f"{name} other"] = int(np.sum((result != good) & (result != slow)))
+        for figure in ("residual", "violation"):
+            values = np.asarray(getattr(judged, figure))[alive][accepted]
+            figures[f"{name} {figure}"] = float(np.max(values, initial=0))
+    both = (np.asarray(rows.simplified.result) == good) & alive
+    both &= np.asarray(rows.newton.result) == good
+    distance = np.asarray(rows.distance)[both]
+    figures["distance"] = float(np.max(distance, initial=0))
+    figures["apart"] = int(np.sum(distance > SAME))
+    return figures
+
+
+def measure(name: str, stages: int, make: Callable, num_steps: int) -> dict:
+    """The figures of one system and one number of stages."""
+    system, y0 = make()
+    sizes = jnp.asarray(np.geomspace(SMALLEST, LARGEST, SIZES))
+    rows, alive = run(system, nhjax.LobattoIIIAB(stages), y0, sizes, num_steps)
+    return {"system": name, "stages": stages} | table_row(rows, np.asarray(alive))
+
+
+COLUMNS = {
+    "steps": "simplified accepted",
+    "slow": "simplified slow",
+    "failed": "simplified other",
+    "residual": "simplified residual",
+    "violation": "simplified violation",
+    "Newton": "newton accepted",
+    "slow ": "newton slow",
+    "failed ": "newton other",
+    "residual ": "newton residual",
+    "violation ": "newton violation",
+    "distance": "distance",
+    "apart": "apart",
+}
+
+
+def main() -> None:
+    """Print and save the table."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--systems", nargs="+", help="names, or parts of names")
+    parser.add_argument("--stages", type=int, nargs="+", default=[2, 3, 4, 5, 6])
+    parser.add_argument("--num-steps", type=int, default=200, help="of each size")
+    options = parser.parse_args()
+    jax.config.update("jax_enable_x64", True)
+    # The programs run for seconds and would be optimised for minutes.
+    jax.config.update("jax_disable_most_optimizations", True)
+    wanted = options.systems or [""]
+    makers = {
+        name: make
+        for name, make in (gallery() | random_systems()).items()
+        if any(part in name for part in wanted)
+    }
+    data = []
+    for name, make in makers.items():
+        for stages in options.stages:
+            data.append(measure(name, stages, make, options.num_steps))
+            print(data[-1], flush=True)
+            jax.clear_caches()
+    rows = []
+    for row in data:
+        figures = [row[key] for key in COLUMNS.values()]
+        cells = [number(x) if isinstance(x, float) else str(x) for x in figures]
+        rows.append([row["system"], str(row["stages"]), *cells])
+    header = ["system", "s", *COLUMNS]
+    text = "\n\n".join([(__doc__ or "").strip(), summary(data)])
+    text += "\n\n" + markdown_table(header, rows)
+    write("acceptance", "Are accepted steps solved?", text, {"rows": data})
+
+
+def summary(data: list[dict]) -> str:
+    """What the table comes to."""
+    worst = max(
+        row[f"{solver} {figure}"]
+        for row in data
+        for solver in ("simplified", "newton")
+        for figure in ("residual", "violation")
+    )
+    total = {key: sum(row[key] for row in data) for key in COLUMNS.values()}
+    return (
+        f"{total['simplified accepted']} steps accepted by `SimplifiedNewton`, "
+        f"{total['newton accepted']} by `Newton`; the largest relative residual or "
+        f"violation of any is {number(worst)} (asked: {number(ALLOWED)}). The ends of "
+        f"the two solvers differ by more than {number(SAME)} in {total['apart']} steps."
+    )
+
+
+if __name__ == "__main__":
+    main()
