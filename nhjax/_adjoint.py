@@ -9,6 +9,7 @@ from typing import TypeAlias, TypeVar
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Int
 
 from ._loop import Carry, Loop, Rows
@@ -36,22 +37,24 @@ def _advance(loop: Loop, state: _Run, k: Int[Array, ""]) -> _Run:
 def steps(
     advance: Callable[[_State, Int[Array, ""]], _State],
     state: _State,
-    length: int,
+    length: int | Int[Array, ""],
     first: Int[Array, ""] | int = 0,
     stride: int = 1,
 ) -> _State:
     """`advance(state, k)` for `length` values of k, from `first`, `stride` apart.
 
     They are counted on the way: an array of them would grow with the number of steps.
+    With a traced length JAX has no reverse mode for it.
     """
 
-    def body(counted, _):
+    def body(_, counted):
         state, k = counted
-        return (advance(state, k), k + stride), None
+        return advance(state, k), k + stride
 
     counted = (state, jnp.asarray(first, jnp.int32))
-    (state, _), _ = jax.lax.scan(body, counted, length=length)
-    return state
+    if isinstance(length, int):
+        length = np.int32(length)
+    return jax.lax.fori_loop(np.int32(0), length, body, counted)[0]
 
 
 class DirectAdjoint(AbstractAdjoint):
@@ -112,8 +115,10 @@ class RecursiveCheckpointAdjoint(AbstractAdjoint):
 
     def run(self, loop: Loop, carry: Carry) -> _Run:
         """All steps of the loop from `carry`: its end, and the rows saved."""
+        if not isinstance(loop.num_steps, int):
+            # Blocks are for reverse mode, which there is none of.
+            return DirectAdjoint().run(loop, carry)
         lengths = self._block_lengths(loop.num_steps)
-
         advance: _Advance = partial(_advance, loop)
         if math.prod(lengths) > loop.num_steps:
             advance = _idle_after_the_end(loop)

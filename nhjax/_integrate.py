@@ -1,20 +1,18 @@
 from functools import partial
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Int, PyTree
 
 from ._adjoint import AbstractAdjoint, DirectAdjoint
 from ._checks import (
-    check_num_steps,
     check_state,
     check_type,
     finite,
     parameters,
     real_scalar,
 )
-from ._custom_types import Args, FloatScalar, FloatScalarLike
+from ._custom_types import Args, FloatScalar, FloatScalarLike, IntScalar
 from ._errors import Check, require
 from ._implicit import Closed, undefined_unless
 from ._interpolation import (
@@ -28,11 +26,20 @@ from ._loop import Loop
 from ._method import AbstractMethod
 from ._newton import AbstractStageSolver, SimplifiedNewton
 from ._progress_meter import AbstractProgressMeter, NoProgressMeter
+from ._run_checks import (
+    advancing,
+    check_flag,
+    check_num_steps,
+    check_saved,
+    countable,
+    is_tracing,
+)
 from ._saveat import SaveAt, stack_saved
 from ._solution import raise_failures, RESULTS, Solution
 from ._state import State
 from ._step_record import StepRecord
 from ._system import AbstractMechanicalSystem, HamiltonianSystem, LagrangianSystem
+from ._tracked_jit import tracked_jit
 
 
 def integrate(
@@ -41,7 +48,7 @@ def integrate(
     y0: State,
     *,
     dt: FloatScalarLike,
-    num_steps: int,
+    num_steps: int | IntScalar,
     t0: FloatScalarLike = 0.0,
     args: Args = None,
     saveat: SaveAt | None = None,
@@ -114,7 +121,9 @@ def integrate(
     check_type("solver", solver, AbstractStageSolver, "Such as nhjax.Newton().")
     check_type("adjoint", adjoint, AbstractAdjoint, "Such as nhjax.DirectAdjoint().")
     check_type("progress_meter", meter, AbstractProgressMeter)
-    num_steps = check_num_steps(num_steps)
+    throw = check_flag("throw", throw)
+    needed_by = _what_needs_the_length(saveat, meter)
+    num_steps = check_num_steps(num_steps, needed_by)
     args = parameters(args)
     check_state(system, y0, args)
     dtype = y0.p.dtype
@@ -129,12 +138,17 @@ def integrate(
             lambda: ValueError("`dt` is zero; give a positive or negative step size."),
             "`dt` is zero.",
         ),
+        *countable(num_steps),
+        advancing(t0, dt, num_steps),
     )
     if y0.multiplier.shape[0] > 0:
         method.require_constraint_hypotheses()
     if saveat.dense or saveat.ts is not None:
         require_collocation(method)
     saveat = saveat.within(t0, dt, num_steps)
+    # A plain call has no use for a length that is known, but for one that changes.
+    if not isinstance(num_steps, int) or (needed_by is None and not is_tracing()):
+        num_steps = jnp.asarray(num_steps, jnp.int32)
     sol = _integrate(
         system,
         method,
@@ -151,7 +165,7 @@ def integrate(
     return raise_failures(sol) if throw else sol
 
 
-@eqx.filter_jit
+@tracked_jit("system", "args", "saveat")
 def _integrate(
     system: AbstractMechanicalSystem,
     method: AbstractMethod,
@@ -160,11 +174,12 @@ def _integrate(
     y0: State,
     t0: FloatScalar,
     dt: FloatScalar,
-    num_steps: int,
+    num_steps: int | IntScalar,
     args: Args,
     saveat: SaveAt,
     meter: AbstractProgressMeter,
 ) -> Solution:
+    check_saved(saveat.fn, t0, y0, args)
     # What user functions close over must be seen to be differentiated.
     system = system.closed(t0, y0, args)
     ts = saveat.ts
@@ -216,6 +231,17 @@ def _integrate(
             system, method, num_steps, t0, dt, records, args
         )
     return Solution(t0, t1, times, ys, carry.stats, carry.result, interpolation)
+
+
+def _what_needs_the_length(saveat: SaveAt, meter: AbstractProgressMeter) -> str | None:
+    """The option because of which the number of steps must be known when tracing."""
+    needs = {
+        "the output of `SaveAt(steps=...)`": bool(saveat.steps),
+        "the output of `SaveAt(dense=True)`": saveat.dense,
+        "the output of `SaveAt(ts=...)`": saveat.ts is not None,
+        "the `progress_meter`": not meter.silent,
+    }
+    return next((name for name, needed in needs.items() if needed), None)
 
 
 def _record_slots(

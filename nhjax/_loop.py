@@ -51,7 +51,7 @@ class Loop(eqx.Module):
     solver: AbstractStageSolver
     t0: FloatScalar
     dt: FloatScalar
-    num_steps: int = eqx.field(static=True)
+    num_steps: int | Int[Array, ""]
     args: Args
     meter: AbstractProgressMeter
     fn: Callable[[FloatScalar, State, Args], PyTree[Array]]

@@ -16,6 +16,7 @@ from ._iteration import dense_increment, iterate, Solved
 from ._largest import largest
 from ._leading_structure import leading_structure, LeadingStructure
 from ._linearisation import Linearisation
+from ._run_checks import check_tolerance, tolerance_array
 from ._scales import fibre_scale
 from ._stages import StageForces, Stages, StageSystem
 
@@ -44,6 +45,7 @@ class AbstractStageSolver(eqx.Module):
                 f"{type(self).__name__}: `max_iterations` must be an int >= 1, got "
                 f"{self.max_iterations!r}."
             )
+        check_tolerance(self.tolerance)
 
     @abstractmethod
     def solve(
@@ -84,7 +86,7 @@ class SimplifiedNewton(AbstractStageSolver):
     """
 
     max_iterations: int = eqx.field(static=True, default=100)
-    tolerance: FloatScalarLike = eqx.field(converter=jnp.asarray, default=0.0)
+    tolerance: FloatScalarLike = eqx.field(converter=tolerance_array, default=0.0)
 
     def solve(
         self, stages: StageSystem, x0: Stages, lin: Linearisation, skip: Array
@@ -163,7 +165,7 @@ class Newton(AbstractStageSolver):
     """
 
     max_iterations: int = eqx.field(static=True, default=30)
-    tolerance: FloatScalarLike = eqx.field(converter=jnp.asarray, default=0.0)
+    tolerance: FloatScalarLike = eqx.field(converter=tolerance_array, default=0.0)
 
     def solve(
         self, stages: StageSystem, x0: Stages, lin: Linearisation, skip: Array

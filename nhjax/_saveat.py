@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PyTree
 
-from ._custom_types import FloatScalar
+from ._custom_types import FloatScalar, IntScalar
 from ._errors import Check, DTypeError, is_traced, NonFiniteError, require
 from ._interpolation import step_position
 from ._state import State
@@ -93,7 +93,7 @@ class SaveAt(eqx.Module):
         self.steps = int(steps)
         self.ts = None if ts is None else _times(ts)
 
-    def within(self, t0: FloatScalar, dt: FloatScalar, num_steps: int) -> "SaveAt":
+    def within(self, t0: FloatScalar, dt: FloatScalar, num_steps: int | IntScalar) -> "SaveAt":
         """This, checked against the run that it is for, with `ts` of its dtype."""
         if self.num_saved(num_steps) == 0 and not self.dense:
             raise ValueError(
@@ -127,13 +127,13 @@ class SaveAt(eqx.Module):
         )
         return eqx.tree_at(lambda s: s.ts, self, ts)
 
-    def num_saved(self, num_steps: int) -> int:
+    def num_saved(self, num_steps: int | IntScalar) -> int:
         """The length of the output for a run of `num_steps` steps."""
         sampled = 0 if self.ts is None else self.ts.shape[0]
         strided = num_steps // self.steps if self.steps else 0
         return self.t0 + sampled + strided + self.saves_end(num_steps)
 
-    def saves_end(self, num_steps: int) -> bool:
+    def saves_end(self, num_steps: int | IntScalar) -> bool:
         """Whether the final state is saved on its own."""
         last_is_saved = bool(self.steps) and num_steps % self.steps == 0
         return self.t1 and not last_is_saved
