@@ -5,32 +5,22 @@ was traced. The entries found here differ as soon as such a value does, so that 
 of compiled programs can take them as a key.
 """
 
-import argparse
-import enum
 import hashlib
 import types
-from collections import deque
 from collections.abc import Collection, Hashable
-from functools import partial
+from functools import lru_cache
 from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax
 import numpy as np
 
+from ._kinds import Kind, kind_of
 from ._names import is_installed, names, Path
 
 
-# Of a function that reads more than this the rest is not looked at: it would take
+# Of a function that reads more than this the rest is not looked at: that would take
 # longer than a short run.
 MOST_ENTRIES = 2000
-
-_PLAIN = bool | int | str | bytes | None | types.EllipsisType | np.dtype
-_SEQUENCES = list | tuple | deque | set | frozenset
-_MAPPINGS = dict | types.MappingProxyType
-# Of a class that is not the user's, but made to hold what is.
-_WITH_PARTS = types.MethodType | partial | _MAPPINGS | _SEQUENCES
-_HOLDERS = types.SimpleNamespace | argparse.Namespace | eqx.Module
 
 
 class Place(NamedTuple):
@@ -101,18 +91,20 @@ class _Walk:
     def arguments(self, tree: Any) -> None:
         """Note the leaves of a tree that are no arrays, and the code of its classes."""
         nodes = []
-        leaves = jax.tree.leaves(tree, is_leaf=lambda node: nodes.append(node))
-        is_leaf = set(map(id, leaves))
+        leaves = jax.tree.leaves(tree, is_leaf=nodes.append)
+        leaf_ids = set(map(id, leaves))
         for index, node in enumerate(nodes):
-            if isinstance(node, jax.Array):
+            kind = kind_of(type(node))
+            if kind is Kind.ARRAY or kind is Kind.TRACER:
                 continue
-            if id(node) in is_leaf:
+            if id(node) in leaf_ids:
                 self.read(tree, index, node)
-                continue
-            self.methods(type(node))
-            if isinstance(node, eqx.Module):
-                for name in _static_fields(node):
-                    self.read(node, name, vars(node)[name])
+            elif kind is Kind.OPEN:
+                self.methods(type(node))
+                variables = _variables(node)
+                for name in _static_fields(type(node)):
+                    if name in variables:
+                        self.read(node, name, variables[name])
 
     def read(self, owner: object, name: Hashable, value: Any) -> None:
         """Note one value, and what is in it."""
@@ -121,50 +113,53 @@ class _Walk:
             return
         if self.ignored and (place in self.ignored or all_of(owner) in self.ignored):
             return
-        atom, is_new = _atom(value), False
+        kind, is_new = kind_of(type(value)), False
+        atom = _atom(value, kind)
         if atom is None:
             is_new = id(value) not in self.numbers
             number = self.numbers.setdefault(id(value), len(self.numbers))
-            atom = _kind(value), number
+            atom = _name(value, kind), number
         key = (self.numbers.get(id(owner), -1), name, atom)
         self.entries.append(Entry(key, place, owner))
         if is_new:
-            self.contents(value)
+            self.contents(value, kind)
 
-    def contents(self, value: Any) -> None:
+    def contents(self, value: Any, kind: Kind) -> None:
         """Note what is in a value that has parts."""
-        if isinstance(value, types.FunctionType):
+        if kind is Kind.FUNCTION:
             self.function(value)
-        elif isinstance(value, types.MethodType):
-            self.read(value, "__self__", value.__self__)
-            self.read(value, "__func__", value.__func__)
-        elif isinstance(value, partial):
-            for name in ("func", "args", "keywords"):
-                self.read(value, name, getattr(value, name))
-        elif isinstance(value, _MAPPINGS):
+        elif kind is Kind.MAPPING:
             for key, item in list(value.items()):
-                name = key if isinstance(key, _PLAIN) else Identity(key)
+                name = key if kind_of(type(key)) is Kind.PLAIN else Identity(key)
                 self.read(value, name, item)
-        elif isinstance(value, _SEQUENCES):
+        elif kind is Kind.SEQUENCE or kind is Kind.NUMPY:
             for index, item in enumerate(list(value)):
                 self.read(value, index, item)
-        elif isinstance(value, type):
+        elif kind is Kind.METHOD:
+            self.named(value, ("__self__", "__func__"))
+        elif kind is Kind.PARTIAL:
+            self.named(value, ("func", "args", "keywords"))
+        elif kind is Kind.CLASS:
             self.methods(value)
-        elif _is_open(value):
+        elif kind is Kind.OPEN:
             self.attributes(value)
             self.methods(type(value))
-        if hasattr(value, "__wrapped__"):
-            self.read(value, "__wrapped__", value.__wrapped__)
+        if kind is Kind.FUNCTION or kind is Kind.OPAQUE:
+            self.named(value, ("__wrapped__",))
+
+    def named(self, value: Any, attributes: Collection[str]) -> None:
+        """Note those attributes that there are."""
+        for name in attributes:
+            if hasattr(value, name):
+                self.read(value, name, getattr(value, name))
 
     def attributes(self, value: Any) -> None:
         """Note the attributes of an object."""
-        for name, item in list(getattr(value, "__dict__", {}).items()):
+        for name, item in list(_variables(value).items()):
             self.read(value, name, item)
         for base in type(value).__mro__:
             slots = vars(base).get("__slots__", ())
-            for name in (slots,) if isinstance(slots, str) else slots:
-                if hasattr(value, name):
-                    self.read(value, name, getattr(value, name))
+            self.named(value, (slots,) if isinstance(slots, str) else tuple(slots))
 
     def methods(self, kind: type) -> None:
         """Note the attributes of a class of the user's and what its methods read."""
@@ -188,17 +183,19 @@ class _Walk:
         """Note what a function closes over, its defaults, and the globals it reads."""
         code, variables = function.__code__, function.__globals__
         found = names(code)
-        for name, cell in zip(
-            code.co_freevars, function.__closure__ or (), strict=True
-        ):
+        cells = function.__closure__ or ()
+        for name, cell in zip(code.co_freevars, cells, strict=True):
             for path in found.closed_over.get(name, ()):
                 try:
-                    self.chain(cell, "content", cell.cell_contents, path)
+                    content = cell.cell_contents
                 except ValueError:
                     # It has no value yet.
                     break
-        self.read(function, "defaults", function.__defaults__)
-        self.read(function, "kwdefaults", function.__kwdefaults__)
+                self.chain(cell, "content", content, path)
+        if function.__defaults__:
+            self.read(function, "defaults", function.__defaults__)
+        if function.__kwdefaults__:
+            self.read(function, "kwdefaults", function.__kwdefaults__)
         # The globals of a library are its own, and stay.
         if is_installed(str(variables.get("__name__", ""))):
             return
@@ -218,48 +215,46 @@ class _Walk:
             self.read(owner, attribute, value)
 
 
-def _kind(value: Any) -> Hashable:
-    """What tells values with parts apart, beside their parts."""
-    if isinstance(value, types.FunctionType):
-        return value.__code__
-    is_known = isinstance(value, _WITH_PARTS) or _is_open(value)
-    return type(value) if is_known else Identity(value)
-
-
-def _atom(value: Any) -> Hashable | None:
+def _atom(value: Any, kind: Kind) -> Hashable | None:
     """A value that has no parts, with its type; None if it may have some."""
-    if isinstance(value, enum.Enum):
-        return Identity(value)
-    if isinstance(value, _PLAIN):
+    if kind is Kind.PLAIN:
         return type(value), value
-    if isinstance(value, float):
+    if kind is Kind.FLOAT:
         # Zeros of both signs differ, and not a number equals itself.
         return type(value), float.hex(value)
-    if isinstance(value, complex):
+    if kind is Kind.COMPLEX:
         return type(value), repr(value)
-    if isinstance(value, jax.core.Tracer):
+    if kind is Kind.TRACER:
         return Unrepeatable()
-    if isinstance(value, np.generic | np.ndarray) and not value.dtype.hasobject:
+    if kind is Kind.NUMPY and not value.dtype.hasobject:
         # Such an array can be changed in place; one of JAX's cannot.
         digest = hashlib.blake2b(value.tobytes(), digest_size=16).digest()
         return type(value), value.dtype, value.shape, digest
-    if isinstance(value, type):
-        return Identity(value) if is_installed(value.__module__) else None
-    if isinstance(value, types.FunctionType | _WITH_PARTS) or _is_open(value):
-        return None
-    return None if hasattr(value, "__wrapped__") else Identity(value)
+    is_closed = kind is Kind.OPAQUE and not hasattr(value, "__wrapped__")
+    is_library = kind is Kind.CLASS and is_installed(value.__module__)
+    if kind is Kind.ARRAY or is_closed or is_library:
+        return Identity(value)
+    return None
 
 
-def _is_open(value: Any) -> bool:
-    """Whether the attributes of an object are looked at: not those of libraries'."""
-    if isinstance(value, jax.Array | types.ModuleType | type):
-        return False
-    return isinstance(value, _HOLDERS) or not is_installed(type(value).__module__)
+def _name(value: Any, kind: Kind) -> Hashable:
+    """What tells values with parts apart, beside their parts."""
+    if kind is Kind.FUNCTION:
+        return value.__code__
+    if kind is Kind.NUMPY:
+        return value.shape
+    return Identity(value) if kind in (Kind.CLASS, Kind.OPAQUE) else type(value)
 
 
-def _static_fields(module: eqx.Module) -> list[str]:
-    return [
-        name
-        for name, field in module.__dataclass_fields__.items()
-        if field.metadata.get("static", False) and name in vars(module)
-    ]
+@lru_cache(maxsize=4096)
+def _static_fields(cls: type) -> list[str]:
+    fields = getattr(cls, "__dataclass_fields__", {}).items()
+    return [name for name, field in fields if field.metadata.get("static", False)]
+
+
+def _variables(value: Any) -> dict[str, Any]:
+    """The attributes of an object, by the way that no class can make slow."""
+    try:
+        return object.__getattribute__(value, "__dict__")
+    except AttributeError:
+        return {}

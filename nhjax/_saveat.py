@@ -1,3 +1,4 @@
+import reprlib
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -147,7 +148,13 @@ def stack_saved(pieces: list[PyTree[Array]]) -> PyTree[Array]:
 
 
 def _times(ts: Any) -> Float[Array, " k"]:
-    ts = jnp.asarray(ts)
+    try:
+        ts = jnp.asarray(ts)
+    except (TypeError, ValueError):
+        raise DTypeError(
+            f"SaveAt: `ts` must be a vector of real numbers, got {reprlib.repr(ts)} of "
+            f"type {type(ts).__name__}."
+        ) from None
     if jnp.issubdtype(ts.dtype, jnp.integer):
         ts = ts.astype(jnp.result_type(float))
     if not jnp.issubdtype(ts.dtype, jnp.floating):

@@ -14,7 +14,7 @@ from .._custom_types import (
 )
 from .._diagonal import jacobian
 from .._manifold import AbstractLieGroup
-from .._state import State
+from .._state import check_time_and_state, State
 from ._abstract import AbstractMechanicalSystem
 
 
@@ -116,4 +116,5 @@ class HamiltonianSystem(AbstractMechanicalSystem):
 
     def energy(self, t: FloatScalarLike, y: State, args: Args = None) -> FloatScalar:
         """The energy H(t, q, p) of a state; arguments as for a `LagrangianSystem`."""
+        check_time_and_state("energy", t, y)
         return self.hamiltonian(t, y.q, y.p, args)

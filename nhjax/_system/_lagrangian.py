@@ -13,7 +13,7 @@ from .._custom_types import (
     PositionFunction,
 )
 from .._manifold import AbstractLieGroup
-from .._state import State
+from .._state import check_time_and_state, State
 from ._abstract import AbstractMechanicalSystem
 
 
@@ -132,5 +132,6 @@ class LagrangianSystem(AbstractMechanicalSystem):
             >>> float(free.energy(0.0, y))
             12.5
         """
+        check_time_and_state("energy", t, y)
         p = self.momentum(t, y.q, y.v, args)
         return jnp.sum(p * y.v) - self.lagrangian(t, y.q, y.v, args)
