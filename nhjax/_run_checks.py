@@ -144,10 +144,11 @@ def check_saved(
     ]
     if leaves and not wrong:
         return
-    got = f"{reprlib.repr(wrong[0])} of type {type(wrong[0]).__name__}"
+    got = "nothing: does it lack a `return`?"
+    if wrong:
+        got = f"{reprlib.repr(wrong[0])} of type {type(wrong[0]).__name__}."
     raise TypeError(
-        "SaveAt: `fn(t, y, args)` must return an array, or a tree of arrays, got "
-        f"{got if wrong else 'nothing: does it lack a `return`?'}."
+        f"SaveAt: `fn(t, y, args)` must return an array, or a tree of arrays, got {got}"
     )
 
 
