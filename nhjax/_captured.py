@@ -12,7 +12,6 @@ from functools import lru_cache
 from typing import Any, NamedTuple
 
 import jax
-import numpy as np
 
 from ._kinds import Kind, kind_of
 from ._names import is_installed, names, Path

@@ -94,7 +94,9 @@ class SaveAt(eqx.Module):
         self.steps = int(steps)
         self.ts = None if ts is None else _times(ts)
 
-    def within(self, t0: FloatScalar, dt: FloatScalar, num_steps: int | IntScalar) -> "SaveAt":
+    def within(
+        self, t0: FloatScalar, dt: FloatScalar, num_steps: int | IntScalar
+    ) -> "SaveAt":
         """This, checked against the run that it is for, with `ts` of its dtype."""
         if self.num_saved(num_steps) == 0 and not self.dense:
             raise ValueError(

@@ -117,11 +117,11 @@ def test_a_chunk_from_state_to_state_saves_at_any_number_of_them():
         sol = run(4, y0, t0=t0, saveat=SaveAt(steps=True))
         return jax.tree.map(lambda x: x[-1], sol.ys), sol.t1, sol.ys.q
 
-    y, t, pieces = PARTICLE.initial_state(), 0.0, []
-    for _ in range(3):
+    y, t, q = chunk(PARTICLE.initial_state(), 0.0)
+    pieces, count = [q], len(traces)
+    for _ in range(2):
         y, t, q = chunk(y, t)
         pieces.append(q)
-        count = len(traces)
     assert len(traces) == count
     whole = run(12, saveat=SaveAt(steps=True)).ys.q
     np.testing.assert_allclose(np.concatenate(pieces), whole, rtol=1e-13)

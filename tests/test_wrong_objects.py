@@ -162,11 +162,11 @@ def test_diagnostics_of_wrong_objects(sol, y):
     system = OSCILLATOR.system
     with pytest.raises(TypeError, match=r"`system`.*pass its attribute `\.system`"):
         nhjax.energy_error(OSCILLATOR, sol)
-    with pytest.raises(TypeError, match="`system` must be an .*got Solution"):
+    with pytest.raises(TypeError, match=r"`system` must be an .*got Solution"):
         nhjax.energy_error(sol, system)
-    with pytest.raises(TypeError, match="`sol` must be an nhjax.Solution, got State"):
+    with pytest.raises(TypeError, match=r"`sol` must be an nhjax\.Solution, got State"):
         nhjax.energy_error(system, sol.ys)
-    with pytest.raises(TypeError, match="`y` must be an nhjax.State, got Solution"):
+    with pytest.raises(TypeError, match=r"`y` must be an nhjax\.State, got Solution"):
         nhjax.momentum_map(sol, lambda q: q)
     with pytest.raises(TypeError, match="`generator` must be a function of q, got "):
         nhjax.momentum_map(y, y.q)
@@ -178,12 +178,12 @@ def test_diagnostics_of_wrong_objects(sol, y):
 def test_plots_of_wrong_objects(sol):
     system: Any = OSCILLATOR.system
     for name in ("trajectory", "multiplier"):
-        with pytest.raises(TypeError, match="`sol` must be an nhjax.Solution"):
+        with pytest.raises(TypeError, match=r"`sol` must be an nhjax\.Solution"):
             getattr(plot, name)(sol.ys)
     for name in ("energy", "constraint"):
-        with pytest.raises(TypeError, match="`system` must be an nhjax.Lagrangian"):
+        with pytest.raises(TypeError, match=r"`system` must be an nhjax\.Lagrangian"):
             getattr(plot, name)(sol, system)
-        with pytest.raises(TypeError, match="`sol` must be an nhjax.Solution, got 3"):
+        with pytest.raises(TypeError, match=r"`sol` must be an nhjax\.Solution, got 3"):
             getattr(plot, name)(system, 3)
     wrong: Any
     for wrong in (3, "xy", (0, 1.5), None):
@@ -193,6 +193,6 @@ def test_plots_of_wrong_objects(sol):
         plot.energy(system, sol, ax=system)
     with pytest.raises(TypeError, match="`errors` must be an array of real numbers"):
         plot.convergence([0.1, 0.2], sol)
+    wrong = "4"
     with pytest.raises(TypeError, match="`order` must be a number or None, got '4'"):
-        wrong = "4"
         plot.convergence([0.1, 0.2], [1e-3, 1e-4], order=wrong)

@@ -37,8 +37,8 @@ class LobattoIIIAB(AbstractMethod):
 
         **Raises:**
 
-        A `TypeError` if `stages` is no integer; a `ValueError` if it is out of range, or
-        if `multiplier` is not one of the three.
+        A `TypeError` if `stages` is no integer; a `ValueError` if it is out of range,
+        or if `multiplier` is not one of the three.
         """
         self.stages = check_stages(stages, 2, "LobattoIIIAB")
         self.multiplier = check_multiplier(multiplier)
