@@ -52,16 +52,16 @@ def steps(
         return advance(state, k), k + stride
 
     counted = (state, jnp.asarray(first, jnp.int32))
-    if isinstance(length, int):
-        length = np.int32(length)
-    return jax.lax.fori_loop(np.int32(0), length, body, counted)[0]
+    end = np.int32(length) if isinstance(length, int) else length
+    return jax.lax.fori_loop(np.int32(0), end, body, counted)[0]
 
 
 class DirectAdjoint(AbstractAdjoint):
     """Keep the stages of every step: memory O(num_steps), the least time.
 
     Forward mode (`jax.jvp`, `jax.jacfwd`, `jax.linearize`) and second derivatives
-    (`jax.hessian`, and either mode over either) work as well.
+    (`jax.hessian`, and either mode over either) work as well. If `num_steps` is an
+    array, there is forward mode alone.
 
     !!! example
 
@@ -89,7 +89,8 @@ class RecursiveCheckpointAdjoint(AbstractAdjoint):
     there are two levels. Each level beyond the first costs another forward run: with L
     levels and num_steps = checkpoints^L memory is O(L checkpoints).
 
-    Forward mode and second derivatives work as with `DirectAdjoint`.
+    Forward mode, second derivatives and `num_steps` as an array are as with
+    `DirectAdjoint`.
 
     **Arguments:**
 
@@ -116,7 +117,7 @@ class RecursiveCheckpointAdjoint(AbstractAdjoint):
     def run(self, loop: Loop, carry: Carry) -> _Run:
         """All steps of the loop from `carry`: its end, and the rows saved."""
         if not isinstance(loop.num_steps, int):
-            # Blocks are for reverse mode, which there is none of.
+            # Blocks are for reverse mode, and there is none.
             return DirectAdjoint().run(loop, carry)
         lengths = self._block_lengths(loop.num_steps)
         advance: _Advance = partial(_advance, loop)

@@ -90,7 +90,12 @@ class _Walk:
     def arguments(self, tree: Any) -> None:
         """Note the leaves of a tree that are no arrays, and the code of its classes."""
         nodes = []
-        leaves = jax.tree.leaves(tree, is_leaf=nodes.append)
+
+        def note(node: Any) -> bool:
+            nodes.append(node)
+            return False
+
+        leaves = jax.tree.leaves(tree, is_leaf=note)
         leaf_ids = set(map(id, leaves))
         for index, node in enumerate(nodes):
             kind = kind_of(type(node))
@@ -143,6 +148,7 @@ class _Walk:
         elif kind is Kind.OPEN:
             self.attributes(value)
             self.methods(type(value))
+        # What a decorator keeps; `jax.jit` makes an object of a library's class.
         if kind is Kind.FUNCTION or kind is Kind.OPAQUE:
             self.named(value, ("__wrapped__",))
 

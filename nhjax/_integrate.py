@@ -33,6 +33,7 @@ from ._run_checks import (
     check_saved,
     countable,
     is_tracing,
+    known,
 )
 from ._saveat import SaveAt, stack_saved
 from ._solution import raise_failures, RESULTS, Solution
@@ -76,7 +77,7 @@ def integrate(
     - `y0`: a consistent state, from `nhjax.initial_state` or an earlier `Solution`. Its
         multiplier matters to the propagated closure alone.
     - `dt`: the step size, a scalar, in units of time; negative to go back.
-    - `num_steps`: how many steps, an int >= 1.
+    - `num_steps`: how many steps, an int >= 1; see below for arrays.
     - `t0`: the time of `y0`.
     - `args`: passed on to the functions of the system. Arrays and floats in it are
         traced, so that other values recompile nothing; anything else is static.
@@ -100,6 +101,33 @@ def integrate(
     `TypeError` and `ValueError` for arguments that cannot be right; a `ValueError` that
     names the failing hypothesis (H1, H2, H3) if the method cannot integrate constrained
     systems.
+
+    !!! note
+
+        If what is saved has the same shape for any number of steps (`SaveAt` with `t0`,
+        `t1` and `fn` alone) and there is no progress meter, another `num_steps`
+        recompiles nothing in a plain call. Under `jit` an int is static; an integer
+        array is traced, and under `vmap` each member may have its own. Reverse mode
+        needs an int, or `ReversibleAdjoint`.
+
+        With `steps`, `ts` or `dense` another `num_steps` recompiles everything. For
+        runs of many lengths compile a chunk that leads from state to state, and join
+        what it saves:
+
+            @jax.jit
+            def chunk(y, t):
+                return nhjax.integrate(system, method, y, t0=t, dt=dt, num_steps=100,
+                    saveat=nhjax.SaveAt(steps=True))
+
+            sol = chunk(y, t)
+            y, t = jax.tree.map(lambda x: x[-1], sol.ys), sol.t1
+
+    !!! note
+
+        Globals and variables of enclosing functions that the functions of `system` and
+        `saveat` read are compiled in. A plain call traces them anew if one of them has
+        changed; see `nhjax.LagrangianSystem` for what is tracked, and for the cure
+        under a `jax.jit` of your own.
 
     !!! example
 
@@ -183,10 +211,12 @@ def _integrate(
     # What user functions close over must be seen to be differentiated.
     system = system.closed(t0, y0, args)
     ts = saveat.ts
-    sampled = (
-        None if ts is None else jax.vmap(lambda t: step_index(t, t0, dt, num_steps))(ts)
-    )
-    num_records, record_slots = _record_slots(saveat.dense, sampled, num_steps)
+    num_records, sampled, record_slots = 0, None, None
+    if saveat.dense or ts is not None:
+        length = known(num_steps)
+        if ts is not None:
+            sampled = jax.vmap(lambda t: step_index(t, t0, dt, length))(ts)
+        num_records, record_slots = _record_slots(saveat.dense, sampled, length)
     loop = Loop(
         system,
         method,
@@ -228,7 +258,7 @@ def _integrate(
     if saveat.dense:
         records = jax.tree.map(lambda x: x[:-1], rows.record)
         interpolation = DenseInterpolation(
-            system, method, num_steps, t0, dt, records, args
+            system, method, known(num_steps), t0, dt, records, args
         )
     return Solution(t0, t1, times, ys, carry.stats, carry.result, interpolation)
 

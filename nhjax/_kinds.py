@@ -8,6 +8,7 @@ from functools import lru_cache, partial
 
 import equinox as eqx
 import jax
+import jax.core
 import numpy as np
 
 from ._names import is_installed

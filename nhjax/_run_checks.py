@@ -75,9 +75,15 @@ def _require_count(num_steps: int) -> None:
         raise ValueError(f"`num_steps` must be in 1..2^31 - 1, got {num_steps}.")
 
 
+def known(num_steps: int | IntScalar) -> int:
+    """A number of steps that is an int, where `check_num_steps` has seen to that."""
+    assert isinstance(num_steps, int)
+    return num_steps
+
+
 def countable(num_steps: int | IntScalar) -> list[Check]:
     """The check of a traced number of steps; that of an int is done already."""
-    if not is_traced(num_steps):
+    if isinstance(num_steps, int) or not is_traced(num_steps):
         return []
     ok = num_steps >= 1
     if jnp.iinfo(num_steps.dtype).max > _MOST_STEPS:
@@ -89,18 +95,19 @@ def countable(num_steps: int | IntScalar) -> list[Check]:
 def advancing(t0: FloatScalar, dt: FloatScalar, num_steps: int | IntScalar) -> Check:
     """The check that t changes with every step, the first and the last."""
     # On the host where it is known: an operation there takes a tenth of the time.
-    numpy = np if not is_traced(t0, dt, num_steps) else jnp
-    t0, dt = numpy.asarray(t0), numpy.asarray(dt)
+    numpy: Any = jnp if is_traced(t0, dt, num_steps) else np
+    first, h = numpy.asarray(t0), numpy.asarray(dt)
     # What is infinite has a check of its own.
     with np.errstate(over="ignore", invalid="ignore"):
-        end = t0 + numpy.asarray(num_steps, dt.dtype) * dt
-        ok = (t0 + dt != t0) & (end + dt != end)
+        last = first + numpy.asarray(num_steps, h.dtype) * h
+        ok = (first + h != first) & (last + h != last)
 
     def error() -> Exception:
-        name, t = ("`t0`", t0) if t0 + dt == t0 else ("the end of the run,", end)
+        at_start = first + h == first
+        name, t = ("`t0`", first) if at_start else ("the end of the run,", last)
         return ValueError(
-            f"`dt` = {dt} is below the round-off of the time {name} = {t} in "
-            f"{dt.dtype}: t + dt equals t, and time would not advance. Measure time "
+            f"`dt` = {h} is below the round-off of the time {name} = {t} in "
+            f"{h.dtype}: t + dt equals t, and time would not advance. Measure time "
             "from a later origin, or take larger or fewer steps."
         )
 

@@ -11,6 +11,7 @@ from jaxtyping import Array, Float, PyTree
 from ._custom_types import FloatScalar, IntScalar
 from ._errors import Check, DTypeError, is_traced, NonFiniteError, require
 from ._interpolation import step_position
+from ._run_checks import known
 from ._state import State
 
 
@@ -40,7 +41,8 @@ class SaveAt(eqx.Module):
 
     **Raises:** `ValueError` if nothing is saved, a flag is not a bool, `steps` is not a
     bool or an int >= 1, `ts` is not a sorted vector, or `ts` and `steps` are given
-    together.
+    together; `DTypeError` if `ts` is not real. `integrate` raises a `TypeError` if
+    `fn` returns what is no array.
 
     !!! example
 
@@ -107,7 +109,7 @@ class SaveAt(eqx.Module):
             return self
         ts = self.ts.astype(dt.dtype)
         # In units of steps, so that direction and dtype need no cases.
-        position, inside = step_position(ts, t0, dt, num_steps)
+        position, inside = step_position(ts, t0, dt, known(num_steps))
         ts = require(
             ts,
             Check(
@@ -133,12 +135,12 @@ class SaveAt(eqx.Module):
     def num_saved(self, num_steps: int | IntScalar) -> int:
         """The length of the output for a run of `num_steps` steps."""
         sampled = 0 if self.ts is None else self.ts.shape[0]
-        strided = num_steps // self.steps if self.steps else 0
+        strided = known(num_steps) // self.steps if self.steps else 0
         return self.t0 + sampled + strided + self.saves_end(num_steps)
 
     def saves_end(self, num_steps: int | IntScalar) -> bool:
         """Whether the final state is saved on its own."""
-        last_is_saved = bool(self.steps) and num_steps % self.steps == 0
+        last_is_saved = bool(self.steps) and known(num_steps) % self.steps == 0
         return self.t1 and not last_is_saved
 
 

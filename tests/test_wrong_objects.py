@@ -159,9 +159,10 @@ def test_a_time_and_a_state_in_the_wrong_order(system, name, y):
 
 
 def test_diagnostics_of_wrong_objects(sol, y):
-    system = OSCILLATOR.system
+    system: Any = OSCILLATOR.system
+    example: Any = OSCILLATOR
     with pytest.raises(TypeError, match=r"`system`.*pass its attribute `\.system`"):
-        nhjax.energy_error(OSCILLATOR, sol)
+        nhjax.energy_error(example, sol)
     with pytest.raises(TypeError, match=r"`system` must be an .*got Solution"):
         nhjax.energy_error(sol, system)
     with pytest.raises(TypeError, match=r"`sol` must be an nhjax\.Solution, got State"):

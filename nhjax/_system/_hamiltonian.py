@@ -29,7 +29,8 @@ class HamiltonianSystem(AbstractMechanicalSystem):
 
     where ♭_H = (D2D2H)⁻¹ turns velocities into momenta. It is integrated by the paper's
     Hamiltonian equations, with the stage momenta as unknowns; no Legendre transform is
-    inverted on the way.
+    inverted on the way. What the functions read beside their arguments is compiled in,
+    as for a `LagrangianSystem`.
 
     **Arguments:**
 

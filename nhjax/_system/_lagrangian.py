@@ -31,6 +31,12 @@ class LagrangianSystem(AbstractMechanicalSystem):
     derivatives are taken by automatic differentiation. Array leaves of the functions
     (if they are `equinox.Module`s) are parameters that gradients reach.
 
+    What the functions read beside their arguments (globals, variables of enclosing
+    functions, attributes of objects) is compiled in. `integrate` and `initial_state`
+    compare it from call to call and compile anew if it has changed. A `jax.jit` of your
+    own does not; give what is to change as `args`, or as an array field of an
+    `equinox.Module`, which never compiles anew. `docs/systems.md` has the details.
+
     **Arguments:**
 
     - `lagrangian`: L, called as `lagrangian(t, q, v, args)`, a scalar. On a group it is
