@@ -9,6 +9,7 @@ from typing import TypeAlias, TypeVar
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Int
 
 from ._loop import Carry, Loop, Rows
@@ -36,29 +37,31 @@ def _advance(loop: Loop, state: _Run, k: Int[Array, ""]) -> _Run:
 def steps(
     advance: Callable[[_State, Int[Array, ""]], _State],
     state: _State,
-    length: int,
+    length: int | Int[Array, ""],
     first: Int[Array, ""] | int = 0,
     stride: int = 1,
 ) -> _State:
     """`advance(state, k)` for `length` values of k, from `first`, `stride` apart.
 
     They are counted on the way: an array of them would grow with the number of steps.
+    With a traced length JAX has no reverse mode for it.
     """
 
-    def body(counted, _):
+    def body(_, counted):
         state, k = counted
-        return (advance(state, k), k + stride), None
+        return advance(state, k), k + stride
 
     counted = (state, jnp.asarray(first, jnp.int32))
-    (state, _), _ = jax.lax.scan(body, counted, length=length)
-    return state
+    end = np.int32(length) if isinstance(length, int) else length
+    return jax.lax.fori_loop(np.int32(0), end, body, counted)[0]
 
 
 class DirectAdjoint(AbstractAdjoint):
     """Keep the stages of every step: memory O(num_steps), the least time.
 
     Forward mode (`jax.jvp`, `jax.jacfwd`, `jax.linearize`) and second derivatives
-    (`jax.hessian`, and either mode over either) work as well.
+    (`jax.hessian`, and either mode over either) work as well. If `num_steps` is an
+    array, there is forward mode alone.
 
     !!! example
 
@@ -86,7 +89,8 @@ class RecursiveCheckpointAdjoint(AbstractAdjoint):
     there are two levels. Each level beyond the first costs another forward run: with L
     levels and num_steps = checkpoints^L memory is O(L checkpoints).
 
-    Forward mode and second derivatives work as with `DirectAdjoint`.
+    Forward mode, second derivatives and `num_steps` as an array are as with
+    `DirectAdjoint`.
 
     **Arguments:**
 
@@ -112,8 +116,10 @@ class RecursiveCheckpointAdjoint(AbstractAdjoint):
 
     def run(self, loop: Loop, carry: Carry) -> _Run:
         """All steps of the loop from `carry`: its end, and the rows saved."""
+        if not isinstance(loop.num_steps, int):
+            # Blocks are for reverse mode, and there is none.
+            return DirectAdjoint().run(loop, carry)
         lengths = self._block_lengths(loop.num_steps)
-
         advance: _Advance = partial(_advance, loop)
         if math.prod(lengths) > loop.num_steps:
             advance = _idle_after_the_end(loop)

@@ -6,7 +6,6 @@ from typing import Any, TYPE_CHECKING, TypeAlias
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, PyTree
 
 from ._custom_types import Args, FloatScalar, FloatScalarLike
@@ -35,19 +34,6 @@ def check_type(name: str, x: object, kind: Kind, advice: str = "") -> None:
     kinds = kind if isinstance(kind, tuple) else (kind,)
     names = " or ".join(f"nhjax.{kind.__name__}" for kind in kinds)
     raise TypeError(f"`{name}` must be an {names}, got {got}.{advice}")
-
-
-def check_num_steps(num_steps: Any) -> int:
-    """`num_steps` as an int >= 1."""
-    if isinstance(num_steps, bool) or not isinstance(num_steps, int | np.integer):
-        raise TypeError(
-            "`num_steps` must be an int known when tracing (under `jax.jit` a static "
-            f"argument), got {num_steps!r} of type {type(num_steps).__name__}."
-        )
-    # Steps are counted in int32.
-    if not 1 <= num_steps < 2**31:
-        raise ValueError(f"`num_steps` must be in 1..2^31 - 1, got {num_steps}.")
-    return int(num_steps)
 
 
 def floating(name: str, x: Any) -> Array:

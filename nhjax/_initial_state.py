@@ -1,6 +1,5 @@
 from collections.abc import Callable
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PyTree
@@ -25,6 +24,7 @@ from ._linearisation import linearise
 from ._scales import position_scale, violation_scale
 from ._state import State
 from ._system import AbstractMechanicalSystem, HamiltonianSystem, LagrangianSystem
+from ._tracked_jit import tracked_jit
 
 
 def initial_state(
@@ -85,7 +85,7 @@ def initial_state(
     return check_found(system, found, name, given, project)
 
 
-@eqx.filter_jit
+@tracked_jit("system", "args")
 def _solve(system, t, q, v, p, args, project: bool) -> Found:
     manifold = system.manifold_of(q)
     given = p if v is None else v

@@ -1,20 +1,18 @@
 from functools import partial
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Int, PyTree
 
 from ._adjoint import AbstractAdjoint, DirectAdjoint
 from ._checks import (
-    check_num_steps,
     check_state,
     check_type,
     finite,
     parameters,
     real_scalar,
 )
-from ._custom_types import Args, FloatScalar, FloatScalarLike
+from ._custom_types import Args, FloatScalar, FloatScalarLike, IntScalar
 from ._errors import Check, require
 from ._implicit import Closed, undefined_unless
 from ._interpolation import (
@@ -28,11 +26,21 @@ from ._loop import Loop
 from ._method import AbstractMethod
 from ._newton import AbstractStageSolver, SimplifiedNewton
 from ._progress_meter import AbstractProgressMeter, NoProgressMeter
+from ._run_checks import (
+    advancing,
+    check_flag,
+    check_num_steps,
+    check_saved,
+    countable,
+    is_tracing,
+    known,
+)
 from ._saveat import SaveAt, stack_saved
 from ._solution import raise_failures, RESULTS, Solution
 from ._state import State
 from ._step_record import StepRecord
 from ._system import AbstractMechanicalSystem, HamiltonianSystem, LagrangianSystem
+from ._tracked_jit import tracked_jit
 
 
 def integrate(
@@ -41,7 +49,7 @@ def integrate(
     y0: State,
     *,
     dt: FloatScalarLike,
-    num_steps: int,
+    num_steps: int | IntScalar,
     t0: FloatScalarLike = 0.0,
     args: Args = None,
     saveat: SaveAt | None = None,
@@ -69,7 +77,7 @@ def integrate(
     - `y0`: a consistent state, from `nhjax.initial_state` or an earlier `Solution`. Its
         multiplier matters to the propagated closure alone.
     - `dt`: the step size, a scalar, in units of time; negative to go back.
-    - `num_steps`: how many steps, an int >= 1.
+    - `num_steps`: how many steps, an int >= 1; see below for arrays.
     - `t0`: the time of `y0`.
     - `args`: passed on to the functions of the system. Arrays and floats in it are
         traced, so that other values recompile nothing; anything else is static.
@@ -94,6 +102,33 @@ def integrate(
     names the failing hypothesis (H1, H2, H3) if the method cannot integrate constrained
     systems.
 
+    !!! note
+
+        If what is saved has the same shape for any number of steps (`SaveAt` with `t0`,
+        `t1` and `fn` alone) and there is no progress meter, another `num_steps`
+        recompiles nothing in a plain call. Under `jit` an int is static; an integer
+        array is traced, and under `vmap` each member may have its own. Reverse mode
+        needs an int, or `ReversibleAdjoint`.
+
+        With `steps`, `ts` or `dense` another `num_steps` recompiles everything. For
+        runs of many lengths compile a chunk that leads from state to state, and join
+        what it saves:
+
+            @jax.jit
+            def chunk(y, t):
+                return nhjax.integrate(system, method, y, t0=t, dt=dt, num_steps=100,
+                    saveat=nhjax.SaveAt(steps=True))
+
+            sol = chunk(y, t)
+            y, t = jax.tree.map(lambda x: x[-1], sol.ys), sol.t1
+
+    !!! note
+
+        Globals and variables of enclosing functions that the functions of `system` and
+        `saveat` read are compiled in. A plain call traces them anew if one of them has
+        changed; see `nhjax.LagrangianSystem` for what is tracked, and for the cure
+        under a `jax.jit` of your own.
+
     !!! example
 
         >>> import nhjax
@@ -114,7 +149,9 @@ def integrate(
     check_type("solver", solver, AbstractStageSolver, "Such as nhjax.Newton().")
     check_type("adjoint", adjoint, AbstractAdjoint, "Such as nhjax.DirectAdjoint().")
     check_type("progress_meter", meter, AbstractProgressMeter)
-    num_steps = check_num_steps(num_steps)
+    throw = check_flag("throw", throw)
+    needed_by = _what_needs_the_length(saveat, meter)
+    num_steps = check_num_steps(num_steps, needed_by)
     args = parameters(args)
     check_state(system, y0, args)
     dtype = y0.p.dtype
@@ -129,12 +166,17 @@ def integrate(
             lambda: ValueError("`dt` is zero; give a positive or negative step size."),
             "`dt` is zero.",
         ),
+        *countable(num_steps),
+        advancing(t0, dt, num_steps),
     )
     if y0.multiplier.shape[0] > 0:
         method.require_constraint_hypotheses()
     if saveat.dense or saveat.ts is not None:
         require_collocation(method)
     saveat = saveat.within(t0, dt, num_steps)
+    # A plain call has no use for a length that is known, but for one that changes.
+    if not isinstance(num_steps, int) or (needed_by is None and not is_tracing()):
+        num_steps = jnp.asarray(num_steps, jnp.int32)
     sol = _integrate(
         system,
         method,
@@ -151,7 +193,7 @@ def integrate(
     return raise_failures(sol) if throw else sol
 
 
-@eqx.filter_jit
+@tracked_jit("system", "args", "saveat")
 def _integrate(
     system: AbstractMechanicalSystem,
     method: AbstractMethod,
@@ -160,18 +202,21 @@ def _integrate(
     y0: State,
     t0: FloatScalar,
     dt: FloatScalar,
-    num_steps: int,
+    num_steps: int | IntScalar,
     args: Args,
     saveat: SaveAt,
     meter: AbstractProgressMeter,
 ) -> Solution:
+    check_saved(saveat.fn, t0, y0, args)
     # What user functions close over must be seen to be differentiated.
     system = system.closed(t0, y0, args)
     ts = saveat.ts
-    sampled = (
-        None if ts is None else jax.vmap(lambda t: step_index(t, t0, dt, num_steps))(ts)
-    )
-    num_records, record_slots = _record_slots(saveat.dense, sampled, num_steps)
+    num_records, sampled, record_slots = 0, None, None
+    if saveat.dense or ts is not None:
+        length = known(num_steps)
+        if ts is not None:
+            sampled = jax.vmap(lambda t: step_index(t, t0, dt, length))(ts)
+        num_records, record_slots = _record_slots(saveat.dense, sampled, length)
     loop = Loop(
         system,
         method,
@@ -213,9 +258,20 @@ def _integrate(
     if saveat.dense:
         records = jax.tree.map(lambda x: x[:-1], rows.record)
         interpolation = DenseInterpolation(
-            system, method, num_steps, t0, dt, records, args
+            system, method, known(num_steps), t0, dt, records, args
         )
     return Solution(t0, t1, times, ys, carry.stats, carry.result, interpolation)
+
+
+def _what_needs_the_length(saveat: SaveAt, meter: AbstractProgressMeter) -> str | None:
+    """The option because of which the number of steps must be known when tracing."""
+    needs = {
+        "the output of `SaveAt(steps=...)`": bool(saveat.steps),
+        "the output of `SaveAt(dense=True)`": saveat.dense,
+        "the output of `SaveAt(ts=...)`": saveat.ts is not None,
+        "the `progress_meter`": not meter.silent,
+    }
+    return next((name for name, needed in needs.items() if needed), None)
 
 
 def _record_slots(

@@ -14,6 +14,7 @@ from ._largest import largest
 from ._method import AbstractMethod
 from ._newton import AbstractStageSolver
 from ._progress_meter import AbstractProgressMeter
+from ._run_checks import known
 from ._scales import position_scale, violation_scale
 from ._solution import RESULTS
 from ._state import State
@@ -51,7 +52,7 @@ class Loop(eqx.Module):
     solver: AbstractStageSolver
     t0: FloatScalar
     dt: FloatScalar
-    num_steps: int = eqx.field(static=True)
+    num_steps: int | Int[Array, ""]
     args: Args
     meter: AbstractProgressMeter
     fn: Callable[[FloatScalar, State, Args], PyTree[Array]]
@@ -125,7 +126,8 @@ class Loop(eqx.Module):
         )
         result = RESULTS.where(alive, outcome.result, carry.result)
         stats = self._updated(carry.stats, outcome, alive, good, k)
-        self.meter.report(k, self.num_steps)
+        if not self.meter.silent:
+            self.meter.report(k, known(self.num_steps))
         carry = Carry(node, result, jax.lax.stop_gradient(stats))
         return carry, self._rows(carry, outcome.record, good, k)
 
@@ -158,7 +160,7 @@ class Loop(eqx.Module):
 
     @property
     def _num_saved(self) -> int:
-        return self.num_steps // self.stride if self.stride else 0
+        return known(self.num_steps) // self.stride if self.stride else 0
 
     def _slot(self, k: Int[Array, ""]) -> Int[Array, ""]:
         kept = ((k + 1) % self.stride == 0) & (k < self.num_steps)

@@ -2,6 +2,7 @@
 
 from abc import abstractmethod
 from collections.abc import Callable
+from functools import partial
 from typing import NamedTuple, TypeAlias
 
 import equinox as eqx
@@ -16,6 +17,7 @@ from ._iteration import iterate, jacobian_and_value, NOISE_UNITS, Solved
 from ._largest import largest
 from ._leading_structure import leading_structure, LeadingStructure
 from ._linearisation import Linearisation
+from ._run_checks import check_flag, check_tolerance, tolerance_array
 from ._scales import fibre_scale
 from ._stages import StageForces, Stages, StageSystem
 
@@ -48,12 +50,7 @@ class AbstractStageSolver(eqx.Module):
                 f"{type(self).__name__}: `max_iterations` must be an int >= 1, got "
                 f"{self.max_iterations!r}."
             )
-        fallback = getattr(self, "fallback", False)
-        if not isinstance(fallback, bool):
-            raise TypeError(
-                f"{type(self).__name__}: `fallback` must be True or False, got "
-                f"{fallback!r}."
-            )
+        check_tolerance(self.tolerance)
 
     @abstractmethod
     def solve(
@@ -100,8 +97,10 @@ class SimplifiedNewton(AbstractStageSolver):
     """
 
     max_iterations: int = eqx.field(static=True, default=100)
-    tolerance: FloatScalarLike = eqx.field(converter=jnp.asarray, default=0.0)
-    fallback: bool = eqx.field(static=True, default=False)
+    tolerance: FloatScalarLike = eqx.field(converter=tolerance_array, default=0.0)
+    fallback: bool = eqx.field(
+        static=True, default=False, converter=partial(check_flag, "fallback")
+    )
 
     def solve(
         self, stages: StageSystem, x0: Stages, lin: Linearisation, skip: Array
@@ -203,7 +202,7 @@ class Newton(AbstractStageSolver):
     """
 
     max_iterations: int = eqx.field(static=True, default=30)
-    tolerance: FloatScalarLike = eqx.field(converter=jnp.asarray, default=0.0)
+    tolerance: FloatScalarLike = eqx.field(converter=tolerance_array, default=0.0)
 
     def solve(
         self, stages: StageSystem, x0: Stages, lin: Linearisation, skip: Array

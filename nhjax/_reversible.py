@@ -27,7 +27,8 @@ class ReversibleAdjoint(AbstractAdjoint):
     What is retraced differs from what was run by round-off. Where the motion is
     attracted, as that of a sleigh is, time reversed repels, and the differences grow as
     fast as the motion decays; prefer `RecursiveCheckpointAdjoint` there. Reverse mode
-    only (and forward over reverse): `jax.jvp` needs one of the other two.
+    only (and forward over reverse): `jax.jvp` needs one of the other two. It has
+    gradients also if `num_steps` is an array.
 
     !!! example
 

@@ -1,3 +1,4 @@
+import reprlib
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -7,9 +8,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PyTree
 
-from ._custom_types import FloatScalar
+from ._custom_types import FloatScalar, IntScalar
 from ._errors import Check, DTypeError, is_traced, NonFiniteError, require
 from ._interpolation import step_position
+from ._run_checks import known
 from ._state import State
 
 
@@ -39,7 +41,8 @@ class SaveAt(eqx.Module):
 
     **Raises:** `ValueError` if nothing is saved, a flag is not a bool, `steps` is not a
     bool or an int >= 1, `ts` is not a sorted vector, or `ts` and `steps` are given
-    together.
+    together; `DTypeError` if `ts` is not real. `integrate` raises a `TypeError` if
+    `fn` returns what is no array.
 
     !!! example
 
@@ -93,7 +96,9 @@ class SaveAt(eqx.Module):
         self.steps = int(steps)
         self.ts = None if ts is None else _times(ts)
 
-    def within(self, t0: FloatScalar, dt: FloatScalar, num_steps: int) -> "SaveAt":
+    def within(
+        self, t0: FloatScalar, dt: FloatScalar, num_steps: int | IntScalar
+    ) -> "SaveAt":
         """This, checked against the run that it is for, with `ts` of its dtype."""
         if self.num_saved(num_steps) == 0 and not self.dense:
             raise ValueError(
@@ -104,7 +109,7 @@ class SaveAt(eqx.Module):
             return self
         ts = self.ts.astype(dt.dtype)
         # In units of steps, so that direction and dtype need no cases.
-        position, inside = step_position(ts, t0, dt, num_steps)
+        position, inside = step_position(ts, t0, dt, known(num_steps))
         ts = require(
             ts,
             Check(
@@ -127,15 +132,15 @@ class SaveAt(eqx.Module):
         )
         return eqx.tree_at(lambda s: s.ts, self, ts)
 
-    def num_saved(self, num_steps: int) -> int:
+    def num_saved(self, num_steps: int | IntScalar) -> int:
         """The length of the output for a run of `num_steps` steps."""
         sampled = 0 if self.ts is None else self.ts.shape[0]
-        strided = num_steps // self.steps if self.steps else 0
+        strided = known(num_steps) // self.steps if self.steps else 0
         return self.t0 + sampled + strided + self.saves_end(num_steps)
 
-    def saves_end(self, num_steps: int) -> bool:
+    def saves_end(self, num_steps: int | IntScalar) -> bool:
         """Whether the final state is saved on its own."""
-        last_is_saved = bool(self.steps) and num_steps % self.steps == 0
+        last_is_saved = bool(self.steps) and known(num_steps) % self.steps == 0
         return self.t1 and not last_is_saved
 
 
@@ -147,7 +152,13 @@ def stack_saved(pieces: list[PyTree[Array]]) -> PyTree[Array]:
 
 
 def _times(ts: Any) -> Float[Array, " k"]:
-    ts = jnp.asarray(ts)
+    try:
+        ts = jnp.asarray(ts)
+    except (TypeError, ValueError):
+        raise DTypeError(
+            f"SaveAt: `ts` must be a vector of real numbers, got {reprlib.repr(ts)} of "
+            f"type {type(ts).__name__}."
+        ) from None
     if jnp.issubdtype(ts.dtype, jnp.integer):
         ts = ts.astype(jnp.result_type(float))
     if not jnp.issubdtype(ts.dtype, jnp.floating):

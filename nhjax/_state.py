@@ -1,5 +1,9 @@
+from typing import Any
+
 import equinox as eqx
 from jaxtyping import Array, Float, PyTree
+
+from ._checks import check_type
 
 
 class State(eqx.Module):
@@ -20,3 +24,11 @@ class State(eqx.Module):
     v: Float[Array, " n"]
     p: Float[Array, " n"]
     multiplier: Float[Array, " l"]
+
+
+def check_time_and_state(function: str, t: Any, y: Any) -> None:
+    """Raise a `TypeError` unless `y` is a state, and `t` is none."""
+    advice = f"Call it as `{function}(t, y, args)`."
+    if isinstance(t, State):
+        raise TypeError(f"`t` must be a time, got an nhjax.State. {advice}")
+    check_type("y", y, State, advice)

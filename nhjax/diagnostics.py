@@ -1,5 +1,6 @@
 """What a physicist asks of a computed trajectory."""
 
+import reprlib
 from collections.abc import Callable
 from typing import Any
 
@@ -8,11 +9,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from ._checks import check_type
 from ._custom_types import Args
 from ._errors import is_traced, ShapeError
 from ._solution import Solution
 from ._state import State
-from ._system import AbstractMechanicalSystem
+from ._system import AbstractMechanicalSystem, HamiltonianSystem, LagrangianSystem
 
 
 def energy_error(
@@ -32,7 +34,8 @@ def energy_error(
 
     **Returns:** an array of the shape of `sol.ts`.
 
-    **Raises:** `ValueError` if `sol` holds no states, or not the initial one.
+    **Raises:** `ValueError` if `sol` holds no states, or not the initial one;
+    `TypeError` if an argument is no system or no solution.
 
     !!! example
 
@@ -44,6 +47,7 @@ def energy_error(
         >>> nhjax.energy_error(disc.system, sol).shape
         (11,)
     """
+    check_system(system)
     ts, ys = saved_states(sol)
     first = ts[..., 0]
     if not is_traced(first, sol.t0) and np.any(np.asarray(first != sol.t0)):
@@ -74,7 +78,8 @@ def momentum_map(
 
     **Returns:** one number for each state.
 
-    **Raises:** `ShapeError` if `generator` returns something of another shape.
+    **Raises:** `ShapeError` if `generator` returns something of another shape,
+    `TypeError` if `y` is no state or `generator` no function.
 
     !!! example
 
@@ -86,6 +91,12 @@ def momentum_map(
         >>> round(float(nhjax.momentum_map(y0, turn)), 6)
         0.175
     """
+    check_type("y", y, State, "Such as `sol.ys` or an entry of it.")
+    if not callable(generator):
+        raise TypeError(
+            f"`generator` must be a function of q, got {reprlib.repr(generator)} of "
+            f"type {type(generator).__name__}."
+        )
 
     def pairing(q, p):
         direction = jnp.asarray(generator(q))
@@ -112,7 +123,8 @@ def convergence_order(
 
     **Returns:** a NumPy array of shape (k - 1, ...).
 
-    **Raises:** `ValueError` for sizes or errors that have no slope between them.
+    **Raises:** `ValueError` for sizes or errors that have no slope between them,
+    `TypeError` for what is no number.
 
     !!! example
 
@@ -120,8 +132,8 @@ def convergence_order(
         >>> nhjax.convergence_order([0.2, 0.1, 0.05], [1.6e-3, 1e-4, 6.25e-6])
         array([4., 4.])
     """
-    h = np.abs(np.asarray(step_sizes, dtype=np.float64))
-    e = np.asarray(errors, dtype=np.float64)
+    h = np.abs(numbers("step_sizes", step_sizes))
+    e = numbers("errors", errors)
     if h.ndim != 1 or h.shape[0] < 2:
         raise ValueError(
             f"`step_sizes` must be a vector of at least two, got shape {h.shape}."
@@ -148,8 +160,25 @@ def convergence_order(
     return np.diff(np.log(e), axis=0) / widths
 
 
+def numbers(name: str, x: Any) -> np.ndarray:
+    """`x` as a float64 array on the host, or a `TypeError`."""
+    try:
+        return np.asarray(x, dtype=np.float64)
+    except (TypeError, ValueError):
+        raise TypeError(
+            f"`{name}` must be an array of real numbers, got {reprlib.repr(x)} of type "
+            f"{type(x).__name__}."
+        ) from None
+
+
+def check_system(system: Any) -> None:
+    """Raise a `TypeError` unless `system` is one."""
+    check_type("system", system, (LagrangianSystem, HamiltonianSystem))
+
+
 def saved_states(sol: Solution) -> tuple[Float[Array, "... k"], State]:
     """The times and states that `sol` holds, or an error that says how to save them."""
+    check_type("sol", sol, Solution, "It is what `nhjax.integrate` returns.")
     if sol.ts is None or not isinstance(sol.ys, State):
         held = "nothing" if sol.ts is None else f"values of type {type(sol.ys)}"
         raise ValueError(

@@ -5,6 +5,7 @@ otherwise, returns the axes, and never shows or saves anything. Matplotlib is im
 by the first call.
 """
 
+import reprlib
 from collections.abc import Sequence
 from typing import Any, TYPE_CHECKING
 
@@ -15,7 +16,13 @@ from jaxtyping import Float
 from ._custom_types import Args
 from ._solution import Solution
 from ._system import AbstractMechanicalSystem
-from .diagnostics import energy_error, map_over_axes, saved_states
+from .diagnostics import (
+    check_system,
+    energy_error,
+    map_over_axes,
+    numbers,
+    saved_states,
+)
 
 
 if TYPE_CHECKING:
@@ -59,6 +66,12 @@ def trajectory(
     parts = [np.asarray(leaf).reshape(*lead, -1) for leaf in jax.tree.leaves(ys.q)]
     q = np.concatenate(parts, axis=-1)
     n = q.shape[-1]
+    if not isinstance(coordinates, Sequence | np.ndarray) or not all(
+        isinstance(i, int | np.integer) for i in coordinates
+    ):
+        raise TypeError(
+            f"`coordinates` must be a sequence of ints, got {coordinates!r}."
+        )
     if len(coordinates) not in (2, 3) or not all(-n <= i < n for i in coordinates):
         raise ValueError(
             f"`coordinates` must be two or three indices into the {n} coordinates of "
@@ -96,7 +109,8 @@ def energy(
 
     **Raises:** what `nhjax.energy_error` raises.
     """
-    ax = _against_time(sol.ts, energy_error(system, sol, args), ax, style)
+    errors = energy_error(system, sol, args)
+    ax = _against_time(sol.ts, errors, ax, style)
     ax.set_ylabel("$E(t) - E(t_0)$")
     return ax
 
@@ -146,6 +160,7 @@ def constraint(
 
     **Raises:** `ValueError` if `sol` holds no states.
     """
+    check_system(system)
     ts, ys = saved_states(sol)
 
     violation = map_over_axes(
@@ -189,7 +204,7 @@ def convergence(
         >>> import nhjax
         >>> ax = nhjax.plot.convergence([0.2, 0.1], [1.6e-3, 1e-4], order=4)
     """
-    h, e = np.abs(np.asarray(step_sizes)), np.asarray(errors)
+    h, e = np.abs(numbers("step_sizes", step_sizes)), numbers("errors", errors)
     if h.ndim != 1 or h.shape != e.shape:
         raise ValueError(
             "`step_sizes` and `errors` must be vectors of one length, got shapes "
@@ -201,6 +216,8 @@ def convergence(
     h, e = h[shown], e[shown]
     ax = _axes(ax)
     (line,) = ax.plot(h, e, **{"marker": "o", "markersize": 4, **style})
+    if order is not None and not isinstance(order, int | float | np.number):
+        raise TypeError(f"`order` must be a number or None, got {order!r}.")
     if order is not None:
         # The largest step need not be asymptotic yet, the smallest may be round-off.
         middle = np.argsort(h)[len(h) // 2]
@@ -215,6 +232,12 @@ def convergence(
 
 def _axes(ax: "Axes | None", projection: str | None = None) -> "Axes":
     if ax is not None:
+        if not hasattr(ax, "plot"):
+            raise TypeError(
+                "`ax` must be axes of matplotlib, such as those of "
+                f"`matplotlib.pyplot.subplots()`, got {reprlib.repr(ax)} of type "
+                f"{type(ax).__name__}."
+            )
         return ax
     # Only here: drawing into given axes must not choose a backend.
     from matplotlib import pyplot as plt

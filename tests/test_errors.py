@@ -473,7 +473,7 @@ def test_integrate_refuses(arguments, exception, message, y0):
 
 def test_a_traced_number_of_steps(y0):
     with pytest.raises(TypeError, match=r"known when tracing.*static argument.*Tracer"):
-        jax.jit(lambda n: run(y0, num_steps=n))(4)
+        jax.jit(lambda n: run(y0, num_steps=n, saveat=SaveAt(steps=True)))(4)
 
 
 @pytest.mark.parametrize("saveat", [SaveAt(dense=True), SaveAt(ts=[0.1])])

@@ -16,7 +16,7 @@ from .._custom_types import (
 from .._implicit import Closed
 from .._linearisation import linearise
 from .._manifold import AbstractLieGroup, Euclidean
-from .._state import State
+from .._state import check_time_and_state, State
 
 
 class AbstractMechanicalSystem(eqx.Module):
@@ -232,6 +232,7 @@ class AbstractMechanicalSystem(eqx.Module):
         The values of the m nonholonomic constraints, of the time derivatives of the k
         holonomic ones, and of the holonomic ones themselves.
         """
+        check_time_and_state("constraint_violation", t, y)
         on_velocities = self.constraint(t, y.q, self.fibre(y), args)
         return jnp.concatenate([on_velocities, self.position_constraint(t, y.q, args)])
 
@@ -244,5 +245,6 @@ class AbstractMechanicalSystem(eqx.Module):
         d²Γ/dt² = 0. Along a trajectory of a Lobatto method it is of order 2s-2, while
         the multiplier that the paper propagates is of order s or s-1.
         """
+        check_time_and_state("multiplier", t, y)
         t = jnp.asarray(t, y.p.dtype)
         return linearise(self, t, y.q, self.fibre(y), args).multiplier

@@ -14,7 +14,7 @@ from .._custom_types import (
 )
 from .._diagonal import jacobian
 from .._manifold import AbstractLieGroup
-from .._state import State
+from .._state import check_time_and_state, State
 from ._abstract import AbstractMechanicalSystem
 
 
@@ -29,7 +29,8 @@ class HamiltonianSystem(AbstractMechanicalSystem):
 
     where ♭_H = (D2D2H)⁻¹ turns velocities into momenta. It is integrated by the paper's
     Hamiltonian equations, with the stage momenta as unknowns; no Legendre transform is
-    inverted on the way.
+    inverted on the way. What the functions read beside their arguments is compiled in,
+    as for a `LagrangianSystem`.
 
     **Arguments:**
 
@@ -116,4 +117,5 @@ class HamiltonianSystem(AbstractMechanicalSystem):
 
     def energy(self, t: FloatScalarLike, y: State, args: Args = None) -> FloatScalar:
         """The energy H(t, q, p) of a state; arguments as for a `LagrangianSystem`."""
+        check_time_and_state("energy", t, y)
         return self.hamiltonian(t, y.q, y.p, args)

@@ -13,7 +13,7 @@ from .._custom_types import (
     PositionFunction,
 )
 from .._manifold import AbstractLieGroup
-from .._state import State
+from .._state import check_time_and_state, State
 from ._abstract import AbstractMechanicalSystem
 
 
@@ -30,6 +30,12 @@ class LagrangianSystem(AbstractMechanicalSystem):
     which on R^n is the familiar d/dt D2L = D1L + F + λᵀ D2Φ + νᵀ DΓ with q̇ = v. All
     derivatives are taken by automatic differentiation. Array leaves of the functions
     (if they are `equinox.Module`s) are parameters that gradients reach.
+
+    What the functions read beside their arguments (globals, variables of enclosing
+    functions, attributes of objects) is compiled in. `integrate` and `initial_state`
+    compare it from call to call and compile anew if it has changed. A `jax.jit` of your
+    own does not; give what is to change as `args`, or as an array field of an
+    `equinox.Module`, which never compiles anew. `docs/systems.md` has the details.
 
     **Arguments:**
 
@@ -132,5 +138,6 @@ class LagrangianSystem(AbstractMechanicalSystem):
             >>> float(free.energy(0.0, y))
             12.5
         """
+        check_time_and_state("energy", t, y)
         p = self.momentum(t, y.q, y.v, args)
         return jnp.sum(p * y.v) - self.lagrangian(t, y.q, y.v, args)
