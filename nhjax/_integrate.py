@@ -124,11 +124,7 @@ def integrate(
         dt,
         finite("dt", dt),
         finite("t0", t0),
-        Check(
-            dt != 0,
-            lambda: ValueError("`dt` is zero; give a positive or negative step size."),
-            "`dt` is zero.",
-        ),
+        Check(dt != 0, _zero_step),
     )
     if y0.multiplier.shape[0] > 0:
         method.require_constraint_hypotheses()
@@ -149,6 +145,10 @@ def integrate(
         meter,
     )
     return raise_failures(sol) if throw else sol
+
+
+def _zero_step() -> ValueError:
+    return ValueError("`dt` is zero; give a positive or negative step size.")
 
 
 @eqx.filter_jit
