@@ -195,79 +195,68 @@ def adjusted(**args):
     return {"args": GOOD["args"] | args}
 
 
-# What is wrong; the exception; its message; the message of the compiled program.
+# What is wrong; the exception; its message, which a compiled program gives as well.
 BY_VALUE = {
     "q": (
         {"q": jnp.array([jnp.inf, 2.0, 3.0])},
         nhjax.NonFiniteError,
         r"`q` is not finite: \[inf",
-        "`q` is not finite",
     ),
     "v": (
         {"v": jnp.array([jnp.nan, 0.0, 0.0])},
         nhjax.NonFiniteError,
         r"`v` is not finite: \[nan",
-        "`v` is not finite",
     ),
     "t": (
         {"t": jnp.asarray(jnp.nan)},
         nhjax.NonFiniteError,
         "`t` is not finite: nan",
-        "`t` is not finite",
     ),
     "second of two constraints": (
         {"v": jnp.array([0.5, 0.25, -0.5])},
         nhjax.ConstraintViolationError,
         r"1 of 2 nonholonomic.*: Φ\[1\] = 0\.25 \(allowed .*`project=True`",
-        "constraints are violated; pass `project=True`",
     ),
     "both constraints": (
         {"v": jnp.array([0.5, 0.25, 0.0])},
         nhjax.ConstraintViolationError,
         r"2 of 2 .*Φ\[0\] = 0\.5 .*Φ\[1\] = 0\.25 ",
-        "constraints are violated",
     ),
     "dependent": (
         adjusted(rows=jnp.stack([ROWS[0], 2 * ROWS[0]])),
         nhjax.DependentConstraintsError,
-        r"D2Φ has not full rank.*admissibility.*D2Φ = \[\[1\.0, .*Remove redundant",
-        "constraints are dependent",
+        r"D2Φ has not full rank at q = \[1\. 2\. 3\.\].*admissibility.*fails for "
+        r"Φ\[0\] and Φ\[1\]\)\. Remove redundant",
     ),
     "no velocity": (
         adjusted(rows=ROWS.at[1].set(0)),
         nhjax.DependentConstraintsError,
         r"Φ\[1\] does not depend on velocities there; pass .* as `holonomic`",
-        "constraints are dependent",
     ),
     "incompatible": (
         adjusted(mass=jnp.array([1.0, 1.0, -1.0])),
         nhjax.IncompatibleConstraintsError,
         r"C = D2Φ M⁻¹ D2Φᵀ is singular at q = .*compatibility condition",
-        "compatibility matrix C = D2Φ M⁻¹ D2Φᵀ is singular",
     ),
     "irregular": (
         adjusted(mass=jnp.array([1.0, 1.0, 0.0])),
         nhjax.IrregularLagrangianError,
         "mass matrix D2D2L is singular at q = .*Give every coordinate a kinetic energy",
-        "Lagrangian is not regular",
     ),
     "Lagrangian": (
         {"q": jnp.array([1.0, 2.0, -3.0])},
         nhjax.NonFiniteError,
         "Lagrangian.* not finite at q = .*L = nan",
-        "Lagrangian or the constraint is not finite",
     ),
     "mass": (
         adjusted(mass=jnp.array([1.0, 1.0, jnp.nan])),
         nhjax.NonFiniteError,
         "Lagrangian, its second derivatives in v.* not finite at q = ",
-        "Lagrangian or the constraint is not finite",
     ),
     "force": (
         adjusted(force=jnp.array([0.0, jnp.inf, 0.0])),
         nhjax.NonFiniteError,
         r"forces D1L \+ F.* not finite at q = ",
-        "forces or the multiplier are not finite",
     ),
 }
 by_value = pytest.mark.parametrize("case", BY_VALUE.values(), ids=BY_VALUE.keys())
@@ -286,21 +275,22 @@ def started():
 
 @by_value
 def test_initial_state_refuses_values(case):
-    wrong, exception, message, _ = case
+    wrong, exception, message = case
     with pytest.raises(exception, match=message):
         start_adjustable(**(GOOD | wrong))
 
 
 @by_value
 def test_initial_state_refuses_values_under_jit(case, started):
-    wrong, _, _, message = case
-    with pytest.raises(RuntimeError, match=message):
+    wrong, exception, message = case
+    with pytest.raises(RuntimeError, match=f"{exception.__name__}: .*{message}"):
         jax.block_until_ready(started[0](**(GOOD | wrong)))
 
 
 @by_value
 def test_initial_state_refuses_one_lane_under_vmap(case, started):
-    wrong, _, _, message = case
+    wrong, exception, message = case
+    message = f"{exception.__name__}: lane 1: .*{message}"
     lanes = jax.tree.map(lambda *x: jnp.stack(x), GOOD, GOOD | wrong, GOOD)
     with pytest.raises(RuntimeError, match=message):
         jax.block_until_ready(started[1](lanes))
@@ -570,12 +560,21 @@ def test_a_start_at_another_time():
 
 GIVEN = {"dt": 0.1, "t0": 0.0, "ts": jnp.array([0.1, 0.2, 0.25])}
 AT_RUN_TIME = {
-    "dt zero": ({"dt": 0.0}, "`dt` is zero"),
-    "dt nan": ({"dt": np.nan}, "`dt` is not finite"),
-    "t0 nan": ({"t0": np.nan}, "`t0` is not finite"),
-    "ts outside": ({"ts": jnp.array([0.1, 0.2, 0.9])}, "`ts` lies outside the run"),
-    "ts nan": ({"ts": jnp.array([0.1, 0.2, np.nan])}, "`ts` lies outside the run"),
-    "ts unsorted": ({"ts": jnp.array([0.2, 0.1, 0.3])}, "`ts` must be sorted in the"),
+    "dt zero": ({"dt": 0.0}, "`dt` is zero; give a positive or negative step size"),
+    "dt nan": ({"dt": np.nan}, "`dt` is not finite: nan"),
+    "t0 nan": ({"t0": np.nan}, "`t0` is not finite: nan"),
+    "ts outside": (
+        {"ts": jnp.array([0.1, 0.2, 0.9])},
+        r"SaveAt: `ts` reaches from 0\.1 to 0\.9, outside the run from 0\.0 to 0\.4",
+    ),
+    "ts nan": (
+        {"ts": jnp.array([0.1, 0.2, np.nan])},
+        r"SaveAt: `ts` reaches from nan to nan, outside the run from 0\.0 to 0\.4",
+    ),
+    "ts unsorted": (
+        {"ts": jnp.array([0.2, 0.1, 0.3])},
+        "SaveAt: `ts` must be sorted in the direction of time, which runs forward here",
+    ),
     **{
         f"y0.{part} nan": ({part: np.nan}, "step 0: The state became .* from the start")
         for part in ("q", "v", "p", "multiplier")
@@ -615,7 +614,10 @@ def test_integrate_refuses_one_lane_under_vmap(case, compiled):
     _, batch, good = compiled
     bad = good | jax.tree.map(jnp.asarray, wrong)
     lanes = jax.tree.map(lambda *x: jnp.stack(x), good, bad)
-    message = message.replace("step 0", "lane 1, step 0")
+    if message.startswith("step"):
+        message = f"Integration failed in lane 1, {message}"
+    else:
+        message = f"Error: lane 1: {message}"
     with pytest.raises(RuntimeError, match=message):
         jax.block_until_ready(batch(lanes))
 
@@ -709,9 +711,10 @@ def test_evaluate_without_dense_output(y0):
 
 
 def test_evaluate_outside_under_jit_and_vmap(dense):
-    with pytest.raises(RuntimeError, match="`t` lies outside the run"):
+    outside = r"`t` = 0\.5 lies outside the run, from 0\.0 to 0\.4"
+    with pytest.raises(RuntimeError, match=outside):
         jax.block_until_ready(jax.jit(lambda t: dense.evaluate(t))(0.5))
-    with pytest.raises(RuntimeError, match="`t` lies outside the run"):
+    with pytest.raises(RuntimeError, match=f"lane 1: Solution.evaluate: {outside}"):
         jax.block_until_ready(jax.vmap(dense.evaluate)(jnp.array([0.1, 0.5])))
 
 

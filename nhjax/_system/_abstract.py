@@ -28,14 +28,24 @@ def _signature(function: Callable[..., Any]) -> inspect.Signature | None:
     Not that of a function that it wraps, whose arguments need not be the same, unless
     it has none of its own, such as the outcome of `jax.jit`.
     """
-    if hasattr(function, "__func__") and hasattr(function, "__self__"):
+    method, of = (
+        getattr(function, "__func__", None),
+        getattr(function, "__self__", None),
+    )
+    if method is not None and of is not None:
         # A method of an `equinox.Module` has a type of its own that takes anything.
-        function = MethodType(function.__func__, function.__self__)
+        function = MethodType(method, of)
     for follow in (False, True):
         try:
-            return inspect.signature(function, follow_wrapped=follow)
+            signature = inspect.signature(function, follow_wrapped=follow)
         except (TypeError, ValueError):
             continue
+        # Types would make a message long.
+        bare = [
+            parameter.replace(annotation=inspect.Parameter.empty)
+            for parameter in signature.parameters.values()
+        ]
+        return inspect.Signature(bare)
     return None
 
 
