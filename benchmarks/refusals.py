@@ -76,7 +76,7 @@ def refused(start: Callable[[Any, Any], Any], q: Any, v: Any) -> bool:
     try:
         y = start(q, v)
         return not all(bool(jnp.all(jnp.isfinite(x))) for x in jax.tree.leaves(y))
-    except RuntimeError:
+    except (RuntimeError, ValueError):  # which of them is up to JAX
         return True
 
 

@@ -66,7 +66,9 @@ def conditioning(matrix: Float[Array, "k l"]) -> FloatScalar:
     rows = jnp.max(jnp.abs(matrix), axis=1)
     rows = jnp.where(rows > 0, rows, 1)
     if matrix.shape[0] == matrix.shape[1]:
-        scaled = matrix / jnp.sqrt(rows[:, None] * rows[None, :])
+        # Each root on its own: a product could overflow.
+        roots = jnp.sqrt(rows)
+        scaled = matrix / roots[:, None] / roots[None, :]
     else:
         scaled = matrix / rows[:, None]
     if matrix.shape[0] > matrix.shape[1]:

@@ -4,6 +4,7 @@ Shapes, dtypes and types are known when tracing. Values are known only at run ti
 `jit` and `vmap`, where the message comes in a runtime error of the compiled program.
 """
 
+import functools
 from typing import Any
 
 import equinox as eqx
@@ -89,6 +90,13 @@ def system_with(**functions: Any):
         ({"q": "rest"}, nhjax.DTypeError, "`q`.*got 'rest' of type str"),
         ({"t": None}, nhjax.DTypeError, "`t` must be a real number, got None"),
         ({"t": 1j}, nhjax.DTypeError, "`t` must be a real number, got 1j"),
+        ({"project": "yes"}, TypeError, "`project` must be True or False.*got 'yes'"),
+        ({"project": 1}, TypeError, "`project` must be True or False.*got 1 of.*int"),
+        (
+            {"args": {"mass": 1.0, "names": [2, {"a", "b"}]}},
+            TypeError,
+            r"`args\['names'\]\[1\]` is .*of type set: .*must be hashable",
+        ),
         ({"v": None}, ValueError, "Give either `v` or `p`; got neither"),
         ({"p": V}, ValueError, "Give either `v` or `p`; got both"),
         (
@@ -296,6 +304,54 @@ def test_initial_state_refuses_one_lane_under_vmap(case, started):
         jax.block_until_ready(started[1](lanes))
 
 
+def test_a_failure_of_a_compiled_program_is_told_in_few_lines(started, caplog):
+    wrong = GOOD | {"v": jnp.array([0.5, 0.25, -0.5])}
+    with pytest.raises(nhjax.ConstraintViolationError) as eager:
+        start_adjustable(**wrong)
+    with pytest.raises((RuntimeError, ValueError)) as compiled:
+        jax.block_until_ready(started[0](**wrong))
+    line = f"ConstraintViolationError: {eager.value}"
+    text = str(compiled.value)
+    assert f"{line}\n" in f"{text}\n"
+    # The frames of Python from the main program to the call-back are left out.
+    before = text[: text.index(line)].splitlines()
+    assert len(before) == 2
+    assert "_within_a_compiled_program" in before[1]
+    # What JAX logs of it is that line, without a traceback.
+    (record,) = caplog.records
+    assert record.getMessage() == line
+    assert record.exc_info is None
+
+
+@pytest.mark.parametrize(
+    "transform",
+    [
+        lambda f: f(Q),
+        lambda f: jax.vmap(f)(jnp.stack([Q, Q])),
+        lambda f: jax.vmap(jax.jacfwd(f))(jnp.stack([Q, Q])),
+        lambda f: jax.jacrev(f)(Q),
+    ],
+    ids=["plain", "vmap", "vmap of jacfwd", "jacrev"],
+)
+def test_checks_that_hold_do_not_call_the_host(transform, monkeypatch):
+    pure_callback, traced, called = jax.pure_callback, [], []
+
+    def observed(function, *others, **options):
+        def call(*arguments):
+            called.append(function)
+            return function(*arguments)
+
+        traced.append(function)
+        return pure_callback(call, *others, **options)
+
+    monkeypatch.setattr(jax, "pure_callback", observed)
+    # What was traced before is traced again.
+    jax.clear_caches()
+    jax.block_until_ready(jax.jit(lambda: transform(lambda q: start(q=q + 0.0).v))())
+    assert traced
+    assert not called
+
+
 def test_initial_state_accepts_the_others(started):
     expected = start_adjustable(**GOOD)
     for got in (
@@ -342,6 +398,83 @@ def test_a_projection_that_cannot_succeed():
 def test_functions_must_be_functions(name):
     with pytest.raises(TypeError, match=rf"`{name}`.*\(t, q, v, args\), got 3"):
         system_with(**{name: 3})
+
+
+class Methods(eqx.Module):
+    """A function of a system may be a method, or the module itself."""
+
+    def short(self, t, q, v):
+        return 0.5 * v @ v
+
+    def __call__(self, t, q, v, args, more):
+        return 0.5 * v @ v
+
+
+@pytest.mark.parametrize(
+    ("name", "function", "message"),
+    [
+        ("lagrangian", lambda t, q, v: 0.5 * v @ v, r"\(t, q, v, args\).*\(t, q, v\)`"),
+        (
+            "nonholonomic",
+            lambda t, q, args: q,
+            r"\(t, q, v, args\), but `<lambda>\(t, q, args\)`",
+        ),
+        (
+            "holonomic",
+            lambda t, q, v, a: q @ q,
+            r"\(t, q, args\), but `<lambda>\(t, q, v, a\)` does not",
+        ),
+        ("force", lambda v: v, r"\(t, q, v, args\), but `<lambda>\(v\)` does not"),
+        ("force", jax.jit(lambda t, q, v: v), r".*but `<lambda>\(t, q, v\)` does not"),
+        ("lagrangian", Methods().short, r".*but `short\(t, q, v\)` does not"),
+        ("lagrangian", Methods(), r".*but `Methods\(t, q, v, args, more\)` does not"),
+        (
+            "force",
+            lambda t, q, v, args, *, gain: v,
+            r".*but `<lambda>\(t, q, v, args, \*, gain\)` does not",
+        ),
+    ],
+)
+def test_functions_must_take_the_arguments_they_are_called_with(
+    name, function, message
+):
+    with pytest.raises(
+        TypeError, match=rf"LagrangianSystem: `{name}` must take {message}"
+    ):
+        system_with(**{name: function})
+
+
+def test_functions_of_momenta_must_take_the_arguments_they_are_called_with():
+    message = (
+        r"HamiltonianSystem: `hamiltonian` must take \(t, q, p, args\), but .*p\)`"
+    )
+    with pytest.raises(TypeError, match=message):
+        nhjax.HamiltonianSystem(lambda t, q, p: 0.5 * p @ p)  # pyright: ignore
+
+
+def test_functions_whose_arguments_cannot_be_known_are_accepted():
+    def without_args(function):
+        @functools.wraps(function)
+        def called(t, q, v, args):
+            return function(t, q, v)
+
+        return called
+
+    for lagrangian in (
+        without_args(lambda t, q, v: 0.5 * v @ v),
+        functools.partial(lambda mass, t, q, v, args: mass * v @ v, 2.0),
+        lambda *anything: kinetic(*anything),
+        max,
+    ):
+        system_with(lagrangian=lagrangian)
+
+
+def test_an_error_inside_a_function_is_its_own():
+    def lagrangian(t, q, v, args):
+        return kinetic(t, q, v)  # pyright: ignore[reportCallIssue]
+
+    with pytest.raises(TypeError, match=r"^kinetic\(\) missing 1 required positional"):
+        start(system_with(lagrangian=lagrangian))
 
 
 def test_manifold_must_be_one():
@@ -459,6 +592,11 @@ def run(y0, system: Any = SYSTEM, method: Any = METHOD, **others):
 def test_integrate_refuses(arguments, exception, message, y0):
     with pytest.raises(exception, match=message):
         run(y0, **arguments)
+
+
+def test_integrate_refuses_args_that_cannot_be_compiled_in(y0):
+    with pytest.raises(TypeError, match=r"`args\[0\]` is \{3\} of type set"):
+        run(y0, args=({3},))
 
 
 def test_a_traced_number_of_steps(y0):
