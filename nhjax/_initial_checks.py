@@ -2,6 +2,7 @@
 
 from typing import NamedTuple, TYPE_CHECKING
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PyTree
@@ -36,6 +37,7 @@ class Found(NamedTuple):
     off_group: FloatScalar
     regularity: FloatScalar
     ranks: list["Rank"]
+    deficient: list[BoolScalar]
     compatibility: FloatScalar
     allowed: Float[Array, " l"]
     allowed_positions: Float[Array, " k"]
@@ -54,6 +56,27 @@ class Rank(NamedTuple):
     jacobian: Float[Array, "l n"]
     q: PyTree[Array]
     counts: BoolScalar
+
+    @property
+    def deficient(self) -> BoolScalar:
+        """Whether it counts and is not of full rank."""
+        n, eps = self.jacobian.shape[1], jnp.finfo(self.jacobian.dtype).eps
+        return self.counts & (conditioning(self.jacobian) <= 10 * n * eps)
+
+
+def those_that_count(ranks: list[Rank]) -> list[Rank]:
+    """At most one of each shape: of several, the one that counts.
+
+    Singular values are what costs most here.
+    """
+    merged: dict[tuple[int, ...], Rank] = {}
+    for rank in ranks:
+        other = merged.setdefault(rank.jacobian.shape, rank)
+        if other is not rank:
+            merged[rank.jacobian.shape] = jax.tree.map(
+                lambda x, y, counts=rank.counts: jnp.where(counts, x, y), rank, other
+            )
+    return list(merged.values())
 
 
 def conditioning(matrix: Float[Array, "k l"]) -> FloatScalar:
@@ -168,12 +191,8 @@ def check_found(
         Check(~(found.regularity <= singular), _regularity_error, case),
         Check(found.legendre_solved, _legendre_error, case),
         *[
-            Check(
-                ~(rank.counts & (conditioning(rank.jacobian) <= singular)),
-                _dependence_error,
-                (*case, rank),
-            )
-            for rank in found.ranks
+            Check(~deficient, _dependence_error, (*case, rank))
+            for rank, deficient in zip(found.ranks, found.deficient, strict=True)
         ],
         Check(found.projected, _projection_error, case),
         Check(

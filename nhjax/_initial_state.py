@@ -22,7 +22,13 @@ from ._contraction import inverse
 from ._custom_types import Args, BoolScalar, FloatScalar, FloatScalarLike
 from ._errors import DTypeError, require, ShapeError
 from ._implicit import root
-from ._initial_checks import check_found, conditioning, Found, Rank
+from ._initial_checks import (
+    check_found,
+    conditioning,
+    Found,
+    Rank,
+    those_that_count,
+)
 from ._largest import largest
 from ._linearisation import linearise
 from ._scales import position_scale, velocity_scale, violation_scale
@@ -61,8 +67,8 @@ def initial_state(
 
     **Returns:** a `State`.
 
-    **Raises:** (what depends on values, under `jit` as a runtime error of JAX with the
-    same message)
+    **Raises:** (what depends on values, under `jit` with the same message in an error
+    of JAX, a `JaxRuntimeError` or a `ValueError`)
 
     - `TypeError`: `system`, `project` or a part of `args` is of a wrong type.
     - `ShapeError`, `DTypeError`, `NonFiniteError`: an argument, or the value of one of
@@ -126,6 +132,7 @@ def _solve(system, t, q, v, p, args, project: bool) -> Found:
         found_v = found_v if v is None else v
         found_p = found_p if p is None else p
     metric = system.metric(t, q, u, args)
+    ranks = those_that_count([*starts, Rank(lin.jacobian, q, projected)])
     tolerance = jnp.asarray(1e3 * float(jnp.finfo(u.dtype).eps), u.dtype)
     return Found(
         state=State(q, found_v, found_p, lin.multiplier),
@@ -134,7 +141,8 @@ def _solve(system, t, q, v, p, args, project: bool) -> Found:
         positions=system.position_constraint(t, q, args),
         off_group=off_group,
         regularity=conditioning(metric),
-        ranks=[*starts, Rank(lin.jacobian, q, projected)],
+        ranks=ranks,
+        deficient=[rank.deficient for rank in ranks],
         compatibility=conditioning(lin.jacobian @ lin.reaction),
         allowed=tolerance * violation_scale(system, lin, t, q, u, args),
         allowed_positions=tolerance * position_scale(system, t, q, args),
