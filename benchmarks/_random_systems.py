@@ -85,7 +85,7 @@ def random_system(
 
     q = manifold.act(start, jnp.asarray(0.3 * generator.standard_normal(n)))
     # The constraint is the level of the start.
-    height = level(q) if k else None
+    height = level(q) if k else 0.0
     system = nhjax.LagrangianSystem(
         lagrangian,
         nonholonomic=nonholonomic if m else None,

@@ -1,10 +1,11 @@
 """A search for steps that are accepted though they are not solved.
 
 Every system of the gallery and ten random ones, over steps from h = 0.004 up to
-failure, by `SimplifiedNewton` and by `Newton` from the same states. A step that a solver accepts
-is judged by figures that are computed here: the residual of the stage equations at the
-stages found, relative to the size of its terms; the violation of the constraints at the
-end, relative to the size of theirs; and the distance of the two solvers' ends.
+failure, by `SimplifiedNewton` and by `Newton` from the same states. A step that a
+solver accepts is judged by figures that are computed here: the residual of the stage
+equations at the stages found, relative to the size of its terms; the violation of the
+constraints at the end, relative to the size of theirs; and the distance of the two
+solvers' ends.
 
 The terms of an equation r(x; q) = 0 have the size |∂r/∂x| |x| + |∂r/∂q| |q|: nothing
 smaller than the unit round-off times that can be asked of r (Oettli and Prager, 1964).
@@ -89,7 +90,7 @@ class Row(NamedTuple):
 def judge(stages: StageSystem, outcome: StepOutcome) -> Judged:
     """The figures of a step, from the stages and the state that were found."""
     return Judged(
-        outcome.result._value,
+        jnp.asarray(outcome.result._value),
         outcome.num_iterations,
         relative_residual(stages, outcome.stages),
         relative_violation(stages, outcome.node),

@@ -6,6 +6,7 @@ from typing import Any, TYPE_CHECKING, TypeAlias
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, PyTree
 
 from ._custom_types import Args, FloatScalar, FloatScalarLike
@@ -34,6 +35,16 @@ def check_type(name: str, x: object, kind: Kind, advice: str = "") -> None:
     kinds = kind if isinstance(kind, tuple) else (kind,)
     names = " or ".join(f"nhjax.{kind.__name__}" for kind in kinds)
     raise TypeError(f"`{name}` must be an {names}, got {got}.{advice}")
+
+
+def check_flag(name: str, x: object) -> bool:
+    """`x` as a bool; a string such as "no" would count as true."""
+    if not isinstance(x, bool | np.bool_):
+        raise TypeError(
+            f"`{name}` must be True or False, known when tracing, got "
+            f"{reprlib.repr(x)} of type {type(x).__name__}."
+        )
+    return bool(x)
 
 
 def floating(name: str, x: Any) -> Array:
@@ -95,22 +106,35 @@ def real_scalar(name: str, x: FloatScalarLike, dtype: Any) -> FloatScalar:
 
 def finite(name: str, x: Any) -> Check:
     """The check that every number in `x` is finite."""
-    return Check(
-        all_finite(x),
-        lambda: NonFiniteError(f"`{name}` is not finite: {x}."),
-        f"`{name}` is not finite.",
-    )
+    return Check(all_finite(x), _not_finite, (name, x))
+
+
+def _not_finite(name: str, x: Any) -> NonFiniteError:
+    return NonFiniteError(f"`{name}` is not finite: {x}.")
 
 
 def parameters(args: Args) -> Args:
     """`args` with its floats as arrays, so that changing one recompiles nothing."""
 
-    def leaf(x):
+    def leaf(path, x):
+        if eqx.is_array(x):
+            return x
         # Through `float`: a weakly-typed scalar takes part in float32 and float64
         # arithmetic alike.
-        return jnp.asarray(float(x)) if isinstance(x, float) else x
+        if isinstance(x, float):
+            return jnp.asarray(float(x))
+        try:
+            hash(x)
+        except TypeError:
+            raise TypeError(
+                f"`args{jax.tree_util.keystr(path)}` is {reprlib.repr(x)} of type "
+                f"{type(x).__name__}: what is no array is compiled in, and must be "
+                "hashable for that. Use arrays in a tuple, a list, a dict or an "
+                "equinox.Module."
+            ) from None
+        return x
 
-    return jax.tree.map(leaf, args)
+    return jax.tree_util.tree_map_with_path(leaf, args)
 
 
 def all_finite(tree: Any) -> Array:
@@ -129,26 +153,21 @@ def check_functions(
     def few(shape):
         return shape == () or (len(shape) == 1 and 1 <= shape[0] <= n)
 
-    of_phase = f"(t, q, {system.fibre_name}, args)"
     expected = {
-        system.generator: (of_phase, "shape (), a scalar", lambda shape: shape == ()),
+        system.generator: ("shape (), a scalar", lambda shape: shape == ()),
         "nonholonomic": (
-            of_phase,
             f"shape () or (m,) with 1 <= m <= {n}, the number of coordinates",
             few,
         ),
         "holonomic": (
-            "(t, q, args)",
             f"shape () or (k,) with 1 <= k <= {n}, the number of coordinates",
             few,
         ),
-        "force": (of_phase, f"shape ({n},)", lambda shape: shape == (n,)),
+        "force": (f"shape ({n},)", lambda shape: shape == (n,)),
     }
-    for name, (signature, wanted, fits) in expected.items():
-        function = getattr(system, name)
-        if function is None:
-            continue
-        arguments = (t, q, args) if name == "holonomic" else (t, q, u, args)
+    for name, (function, arguments) in system.functions(t, q, u, args).items():
+        wanted, fits = expected[name]
+        signature = f"({', '.join(system.signatures()[name])})"
         out = eqx.filter_eval_shape(function, *arguments)
         shape = getattr(out, "shape", None)
         if shape is None:

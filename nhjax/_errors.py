@@ -1,13 +1,17 @@
 """The exceptions that nhjax raises, and the one place where a condition is enforced."""
 
-from collections.abc import Callable
-from typing import NamedTuple, TypeVar
+import logging
+from collections.abc import Callable, Iterator
+from types import TracebackType
+from typing import Any, NamedTuple, TypeVar
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
-from jaxtyping import Array, Bool
+from jax.custom_batching import custom_vmap
+from jaxtyping import Array, Bool, PyTree
 
 
 T = TypeVar("T")
@@ -55,28 +59,186 @@ def is_traced(*arrays: object) -> bool:
 
 
 class Check(NamedTuple):
-    """A condition, the exception if it fails, and the message if only at run time."""
+    """A condition, and the exception that says what is wrong where it fails.
+
+    `error(*values)` makes the exception from values as NumPy arrays, also in a compiled
+    program. It should be a function of a module: one made on the spot would have an
+    eager `vmap` compile anew at each call.
+    """
 
     ok: Bool[Array, ""] | np.bool_ | bool
-    error: Callable[[], Exception]
-    under_jit: str
+    error: Callable[..., Exception]
+    values: tuple[Any, ...] = ()
 
 
 def require(tree: T, *checks: Check) -> T:
     """Return `tree` if all checks hold; otherwise raise for the first that fails.
 
-    With a concrete condition the exception made by `error` is raised here and now, with
-    the offending values in its message. With a traced one they are not known yet: the
-    message `under_jit` is raised when the compiled program runs.
+    With concrete values the exception is raised here and now. With traced ones it is
+    raised when the compiled program runs, as a runtime error of JAX with the same
+    message, which under `vmap` begins with the first lane that fails. All of this hangs
+    on `tree`, which must be used.
     """
-    for check in checks:
-        if not is_traced(check.ok) and not check.ok:
-            raise check.error()
-    traced = [check for check in checks if is_traced(check.ok)]
-    if not traced:
-        return tree
-    # One call-back for all of them: each costs as much to compile as the arithmetic.
-    bad = ~jnp.stack([jnp.asarray(check.ok) for check in traced])
-    return eqx.branched_error_if(
-        tree, jnp.any(bad), jnp.argmax(bad), [check.under_jit for check in traced]
+    # The message is about values, whatever is being differentiated.
+    checks = tuple(
+        Check(check.ok, check.error, _without_tangents(check.values))
+        for check in checks
     )
+    later = []
+    for check in checks:
+        if is_traced(check.ok, *jax.tree.leaves(check.values)):
+            later.append(check)
+        elif not check.ok:
+            raise check.error(*_on_host(check.values))
+    later = [check for check in later if is_traced(check.ok) or not check.ok]
+    if not later:
+        return tree
+    failed = ~jnp.stack([jnp.asarray(check.ok) for check in later])
+    details = [(check.error, check.values) for check in later]
+    return raise_where(tree, jnp.any(failed), _first_error, (failed, details))
+
+
+def _without_tangents(values: PyTree[Any]) -> PyTree[Any]:
+    return jax.tree.map(
+        lambda x: jax.lax.stop_gradient(x) if is_traced(x) else x, values
+    )
+
+
+def _on_host(values: PyTree[Any]) -> PyTree[Any]:
+    return jax.tree.map(lambda x: np.asarray(x) if eqx.is_array(x) else x, values)
+
+
+def _first_error(bad: np.ndarray, values: tuple[np.ndarray, list]) -> Exception:
+    """The exception of the first check that fails in the first lane where one does."""
+    lane = next(index for index in np.ndindex(bad.shape) if bad[index])
+    failed, details = jax.tree.map(
+        lambda x: x[lane] if isinstance(x, np.ndarray) else x, values
+    )
+    error, values = details[int(np.argmax(failed))]
+    exception = error(*values)
+    if lane:
+        exception.args = (f"lane {lane_name(lane)}: {exception}",)
+    return exception
+
+
+def lane_name(index: tuple[int, ...]) -> int | tuple[int, ...] | None:
+    """An index into a batch, as users would write it; None without a batch."""
+    return index if len(index) > 1 else (index[0] if index else None)
+
+
+# Compiled, since an eager `vmap` would compile the call-back anew at each call.
+@eqx.filter_jit
+def raise_where(
+    tree: T,
+    bad: Bool[Array, ""],
+    error: Callable[[np.ndarray, Any], Exception],
+    values: PyTree[Any],
+) -> T:
+    """Return `tree`; where `bad` holds, raise when the compiled program runs.
+
+    The exception is `error(bad, values)`, called with NumPy arrays on the host; under
+    `vmap` all of them have the batch as leading axes. Only a call-back can put numbers
+    into a message, and only one of our own sees the lanes of a batch.
+    """
+    # The same array often belongs to several checks.
+    leaves, treedef = jax.tree.flatten(values)
+    arrays = list({id(x): x for x in leaves if eqx.is_array(x)}.values())
+    place = {id(x): i for i, x in enumerate(arrays)}
+    places = [place.get(id(leaf)) for leaf in leaves]
+
+    def on_host(bad, *arrays):
+        known = [
+            leaf if place is None else np.asarray(arrays[place])
+            for leaf, place in zip(rest, places, strict=True)
+        ]
+        exception = error(np.asarray(bad), treedef.unflatten(known))
+        raise exception.with_traceback(_short_traceback())
+
+    rest = [None if eqx.is_array(leaf) else leaf for leaf in leaves]
+    passed = _passes(on_host)(bad, *arrays)
+    # Whatever part of the tree is used must wait for the verdict.
+    dynamic, static = eqx.partition(tree, eqx.is_array)
+    dynamic = jax.tree.map(lambda x: jnp.where(passed, x, jnp.zeros_like(x)), dynamic)
+    return eqx.combine(dynamic, static)
+
+
+def _passes(on_host: Callable[..., Any]) -> Callable[..., Bool[Array, ""]]:
+    """Of (bad, *arrays): True, unless any is bad, where `on_host` raises."""
+
+    @jax.custom_jvp
+    def passes(bad, *arrays):
+        return _lanes(on_host)(bad, *arrays)
+
+    @passes.defjvp
+    def _(primals, tangents):
+        # A call-back would take no tangents.
+        del tangents
+        passed = passes(*primals)
+        zero: Any = np.zeros(passed.shape, jax.dtypes.float0)
+        return passed, zero
+
+    return passes
+
+
+def _lanes(on_host: Callable[..., Any]) -> Callable[..., Bool[Array, ""]]:
+    """The same on a batch: one verdict on all lanes.
+
+    Where each lane had its own, `vmap` would have the host called in good cases too.
+    """
+
+    @custom_vmap
+    def passes(bad, *arrays):
+        return jax.lax.cond(
+            jnp.any(bad),
+            lambda: jax.pure_callback(
+                on_host, jax.ShapeDtypeStruct((), bool), bad, *arrays
+            ),
+            lambda: jnp.asarray(True),
+        )
+
+    @passes.def_vmap
+    def _(axis_size, in_batched, *arrays):
+        full = [
+            x if batched else jnp.broadcast_to(x, (axis_size, *x.shape))
+            for x, batched in zip(arrays, in_batched, strict=True)
+        ]
+        return _lanes(on_host)(*full), False
+
+    return passes
+
+
+def _within_a_compiled_program() -> Iterator[None]:
+    """Where exceptions of compiled programs seem to be raised; see below."""
+    yield
+
+
+# XLA prints the frames of Python from that of the deepest entry of a traceback outwards
+# to the main program, some twenty of JAX. A generator that waits has none outside.
+_NOWHERE: Any = _within_a_compiled_program()
+next(_NOWHERE)
+
+
+def _short_traceback() -> TracebackType:
+    """A traceback of one entry."""
+    frame = _NOWHERE.gi_frame
+    return TracebackType(None, frame, frame.f_lasti, frame.f_lineno)
+
+
+class _OneLine(logging.Filter):
+    """Makes one line of what JAX logs of a call-back that raised one of our exceptions.
+
+    JAX logs them with two tracebacks before it raises them.
+    """
+
+    def filter(self, record: logging.LogRecord) -> bool:
+        exception = record.exc_info[1] if record.exc_info else None
+        entry = exception.__traceback__ if exception else None
+        while entry and entry.tb_next:
+            entry = entry.tb_next
+        if entry and entry.tb_frame is _NOWHERE.gi_frame:
+            record.msg = f"{type(exception).__name__}: {exception}"
+            record.args, record.exc_info, record.exc_text = (), None, None
+        return True
+
+
+logging.getLogger("jax._src.callback").addFilter(_OneLine())

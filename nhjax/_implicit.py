@@ -11,7 +11,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, PyTree
 
 from ._contraction import with_small_products
-from ._custom_types import BoolScalar
+from ._custom_types import BoolScalar, FloatScalar
 from ._iteration import dense_increment, iterate, Solved
 from ._largest import largest
 
@@ -83,23 +83,34 @@ def _mixed(xs: list[Array]) -> list[Array]:
 
 
 def root(
-    residual: Callable[[X], PyTree[Array]], x0: X, max_iterations: int = 30
+    residual: Callable[[X], PyTree[Array]],
+    x0: X,
+    scale: FloatScalar,
+    *,
+    judged: Callable[[X], PyTree[Array]] = lambda x: x,
+    max_iterations: int = 30,
 ) -> Solved[X, None]:
     """A root of `residual` near `x0`, to round-off, by Newton's method.
 
-    Its derivative is that of the root, by a dense solve with the Jacobian there.
+    `scale` is the size that the `judged` part of x is rounded by: not that of x0 where
+    this is an increment to something larger. Multipliers, which have units of their
+    own and follow from the rest, need not be judged. The derivative is that of the
+    root, by a dense solve with the Jacobian there.
     """
     flat, unravel = ravel_pytree(x0)
+    scale = jax.lax.stop_gradient(scale)
 
     def flat_residual(x):
         return ravel_pytree(residual(unravel(x)))[0]
 
     def sweep(x):
         dx, _ = dense_increment(lambda z: (flat_residual(z), None), x)
-        return x + dx, largest(dx), None
+        # What is not judged may still not be NaN.
+        rest = jnp.where(jnp.all(jnp.isfinite(dx)), 0, jnp.inf).astype(dx.dtype)
+        return x + dx, rest + largest(*jax.tree.leaves(judged(unravel(dx)))), None
 
     def newton(_, x):
-        solved = iterate(sweep, x, largest(x), max_iterations=max_iterations)
+        solved = iterate(sweep, x, scale, max_iterations=max_iterations)
         # As numbers: `custom_root` takes the tangents of `aux` for such.
         outcome = (solved.converged, solved.exhausted, solved.num_iterations)
         return solved.x, jax.tree.map(lambda z: z.astype(x.dtype), outcome)

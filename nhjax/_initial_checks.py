@@ -2,8 +2,10 @@
 
 from typing import NamedTuple, TYPE_CHECKING
 
+import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+import numpy as np
+from jaxtyping import Array, Float, PyTree
 
 from ._checks import all_finite
 from ._custom_types import BoolScalar, FloatScalar
@@ -34,13 +36,47 @@ class Found(NamedTuple):
     positions: Float[Array, " k"]  # the holonomic constraints
     off_group: FloatScalar
     regularity: FloatScalar
-    admissibility: FloatScalar
+    ranks: list["Rank"]
+    deficient: list[BoolScalar]
     compatibility: FloatScalar
     allowed: Float[Array, " l"]
     allowed_positions: Float[Array, " k"]
     allowed_off_group: FloatScalar
     legendre_solved: BoolScalar
     projected: BoolScalar
+
+
+class Rank(NamedTuple):
+    """The derivatives of constraints at some configuration, which must have full rank.
+
+    They have k rows of DΓ, or m + k of D2Φ and DΓ. Where Newton's method starts they
+    `count` only if it fails: it may leave the place.
+    """
+
+    jacobian: Float[Array, "l n"]
+    q: PyTree[Array]
+    counts: BoolScalar
+
+    @property
+    def deficient(self) -> BoolScalar:
+        """Whether it counts and is not of full rank."""
+        n, eps = self.jacobian.shape[1], jnp.finfo(self.jacobian.dtype).eps
+        return self.counts & (conditioning(self.jacobian) <= 10 * n * eps)
+
+
+def those_that_count(ranks: list[Rank]) -> list[Rank]:
+    """At most one of each shape: of several, the one that counts.
+
+    Singular values are what costs most here.
+    """
+    merged: dict[tuple[int, ...], Rank] = {}
+    for rank in ranks:
+        other = merged.setdefault(rank.jacobian.shape, rank)
+        if other is not rank:
+            merged[rank.jacobian.shape] = jax.tree.map(
+                lambda x, y, counts=rank.counts: jnp.where(counts, x, y), rank, other
+            )
+    return list(merged.values())
 
 
 def conditioning(matrix: Float[Array, "k l"]) -> FloatScalar:
@@ -53,7 +89,9 @@ def conditioning(matrix: Float[Array, "k l"]) -> FloatScalar:
     rows = jnp.max(jnp.abs(matrix), axis=1)
     rows = jnp.where(rows > 0, rows, 1)
     if matrix.shape[0] == matrix.shape[1]:
-        scaled = matrix / jnp.sqrt(rows[:, None] * rows[None, :])
+        # Each root on its own: a product could overflow.
+        roots = jnp.sqrt(rows)
+        scaled = matrix / roots[:, None] / roots[None, :]
     else:
         scaled = matrix / rows[:, None]
     if matrix.shape[0] > matrix.shape[1]:
@@ -100,146 +138,186 @@ _WORDS = {
 }
 
 
+class _Case(NamedTuple):
+    """What a message may speak of."""
+
+    found: Found
+    q: PyTree[Array]
+    given_name: str
+    given: Float[Array, " n"] | None
+    project: bool
+    words: _Words
+    group: str
+
+    @property
+    def where(self) -> str:
+        # What was given, not what was found from it: that would be a riddle.
+        return f"q = {self.q}, {self.given_name} = {self.given}"
+
+    @property
+    def reached(self) -> str:
+        fibre = self.words.fibre
+        return f"{fibre} = {getattr(self.found.state, fibre)}"
+
+    @property
+    def fibre(self) -> str:
+        return "velocity" if self.words.fibre == "v" else "momentum"
+
+    @property
+    def violations(self) -> str:
+        found = self.found
+        positions = f", Γ = {found.positions}" if found.positions.shape[0] else ""
+        return f"{self.words.constraint} = {found.lin.violation}{positions}"
+
+
 def check_found(
     system: "AbstractMechanicalSystem",
     found: Found,
-    given_name: str,
-    given: Float[Array, " n"] | None,
+    q: PyTree[Array],
+    v: Float[Array, " n"] | None,
+    p: Float[Array, " n"] | None,
     project: bool,
 ) -> State:
     """The state, or an exception that says what is wrong with it."""
     state, lin = found.state, found.lin
-    n, eps = state.v.shape[0], jnp.finfo(state.v.dtype).eps
-    singular = 10 * n * eps
-    words = _WORDS[system.generator]
-    name, phi = words.generator, words.constraint
-    fibre = "velocity" if words.fibre == "v" else "momentum"
-
-    def where():
-        # What was given, not what was found from it: that would be a riddle.
-        return f"q = {state.q}, {given_name} = {given}"
-
-    def reached():
-        return f"{words.fibre} = {getattr(state, words.fibre)}"
-
+    singular = 10 * state.v.shape[0] * jnp.finfo(state.v.dtype).eps
+    name, given = ("p", p) if v is None else ("v", v)
+    words, group = _WORDS[system.generator], f"{system.manifold_of(q)}"
+    case = (_Case(found, q, name, given, project, words, group),)
     return require(
         state,
-        Check(
-            found.off_group <= found.allowed_off_group,
-            lambda: ConstraintViolationError(
-                f"`q` = {state.q} is no element of the group "
-                f"{system.manifold_of(state.q)}: it is off by "
-                f"{float(found.off_group):.3g}. Pass `project=True`, or "
-                "`manifold.normalise(q)`."
-            ),
-            "initial_state: `q` is no element of the group; pass `project=True`.",
-        ),
+        Check(found.off_group <= found.allowed_off_group, _group_error, case),
         # Not ">": a matrix that is not finite is no singular matrix.
-        Check(
-            ~(found.regularity <= singular),
-            lambda: IrregularLagrangianError(
-                f"The {name} is not regular: the {words.hessian} is singular "
-                f"at {where()} (reciprocal condition number "
-                f"{float(found.regularity):.1e}). Give every coordinate a kinetic "
-                "energy, or remove those without."
-            ),
-            f"initial_state: the {name} is not regular ({words.hessian} is singular).",
-        ),
-        Check(
-            found.legendre_solved,
-            lambda: NewtonError(
-                f"No {fibre} with {words.legendre} was found for {where()}. Give "
-                f"`{words.fibre}` instead of `{words.conjugate}`."
-            ),
-            f"initial_state: no {fibre} with {words.legendre} was found.",
-        ),
-        Check(
-            found.projected,
-            lambda: NewtonError(
-                f"The state could not be projected onto the constraints: Newton's "
-                f"method stopped at {reached()} with {phi} = {lin.violation}"
-                f"{_positions(found)}. Start nearer to them."
-            ),
-            "initial_state: the state could not be projected onto the constraints.",
-        ),
+        Check(~(found.regularity <= singular), _regularity_error, case),
+        Check(found.legendre_solved, _legendre_error, case),
+        *[
+            Check(~deficient, _dependence_error, (*case, rank))
+            for rank, deficient in zip(found.ranks, found.deficient, strict=True)
+        ],
+        Check(found.projected, _projection_error, case),
         Check(
             all_finite(
                 (found.generator, found.regularity, lin.violation, found.positions)
             ),
-            lambda: NonFiniteError(
-                f"The {name}, its second derivatives in {words.fibre}, or the "
-                f"constraint is not finite at {where()}: {words.letter} = "
-                f"{found.generator}, {phi} = {lin.violation}"
-                f"{_positions(found)}. Check the functions of the system at this state."
-            ),
-            f"initial_state: the {name} or the constraint is not finite there.",
+            _value_error,
+            case,
         ),
-        Check(
-            ~(found.admissibility <= singular),
-            lambda: _dependence_error(found, where(), phi),
-            f"initial_state: the constraints are dependent (D2{phi} has not full "
-            "rank).",
-        ),
-        Check(
-            ~(found.compatibility <= singular),
-            lambda: IncompatibleConstraintsError(
-                f"The constraints are not compatible with the {name}: C = D2Φ M⁻¹ "
-                f"D2Φᵀ is singular at {where()} (the paper's compatibility condition; "
-                f"reciprocal condition number {float(found.compatibility):.1e}). No "
-                "multiplier is determined there."
-            ),
-            "initial_state: the compatibility matrix C = D2Φ M⁻¹ D2Φᵀ is singular.",
-        ),
+        Check(~(found.compatibility <= singular), _compatibility_error, case),
         Check(
             jnp.all(jnp.abs(found.positions) <= found.allowed_positions),
-            lambda: _position_error(found, project),
-            "initial_state: a holonomic constraint is violated; pass `project=True`.",
+            _position_error,
+            case,
         ),
-        Check(
-            jnp.all(jnp.abs(lin.violation) <= found.allowed),
-            lambda: _violation_error(found, reached(), phi, project),
-            "initial_state: the constraints are violated; pass `project=True`.",
-        ),
-        Check(
-            all_finite((lin.acceleration, lin.multiplier)),
-            lambda: NonFiniteError(
-                f"The forces {words.force}, or the derivatives of {phi}, are not "
-                f"finite at {where()}: the rate of {words.fibre} would be "
-                f"{lin.acceleration}, the multiplier {lin.multiplier}. Check the "
-                "functions of the system at this state."
-            ),
-            "initial_state: the forces or the multiplier are not finite there.",
-        ),
+        Check(jnp.all(jnp.abs(lin.violation) <= found.allowed), _violation_error, case),
+        Check(all_finite((lin.acceleration, lin.multiplier)), _force_error, case),
     )
 
 
-def _positions(found: Found) -> str:
-    return f", Γ = {found.positions}" if found.positions.shape[0] else ""
-
-
-def _dependence_error(found: Found, where: str, phi: str) -> DependentConstraintsError:
-    jacobian, k = found.lin.jacobian, found.positions.shape[0]
-    m = jacobian.shape[0] - k
-    zero = [a for a in range(m + k) if not jnp.any(jacobian[a])]
-    advice = (
-        "Remove redundant constraints, or start from a state at which they are "
-        "independent."
+def _group_error(case: _Case) -> ConstraintViolationError:
+    return ConstraintViolationError(
+        f"`q` = {case.q} is no element of the group {case.group}: it is off by "
+        f"{float(case.found.off_group):.3g}. Pass `project=True`, or "
+        "`manifold.normalise(q)`."
     )
+
+
+def _regularity_error(case: _Case) -> IrregularLagrangianError:
+    return IrregularLagrangianError(
+        f"The {case.words.generator} is not regular: the {case.words.hessian} is "
+        f"singular at {case.where} (reciprocal condition number "
+        f"{float(case.found.regularity):.1e}). Give every coordinate a kinetic energy, "
+        "or remove those without."
+    )
+
+
+def _legendre_error(case: _Case) -> NewtonError:
+    return NewtonError(
+        f"No {case.fibre} with {case.words.legendre} was found for {case.where}. Give "
+        f"`{case.words.fibre}` instead of `{case.words.conjugate}`."
+    )
+
+
+def _projection_error(case: _Case) -> NewtonError:
+    return NewtonError(
+        f"The state could not be projected onto the constraints from {case.where}: "
+        f"Newton's method stopped at q = {case.found.state.q}, {case.reached} with "
+        f"{case.violations}. Start nearer to them."
+    )
+
+
+def _value_error(case: _Case) -> NonFiniteError:
+    words = case.words
+    return NonFiniteError(
+        f"The {words.generator}, its second derivatives in {words.fibre}, or the "
+        f"constraint is not finite at {case.where}: {words.letter} = "
+        f"{case.found.generator}, {case.violations}. Check the functions of the system "
+        "at this state."
+    )
+
+
+def _compatibility_error(case: _Case) -> IncompatibleConstraintsError:
+    return IncompatibleConstraintsError(
+        f"The constraints are not compatible with the {case.words.generator}: C = D2Φ "
+        f"M⁻¹ D2Φᵀ is singular at {case.where} (the paper's compatibility condition; "
+        f"reciprocal condition number {float(case.found.compatibility):.1e}). No "
+        "multiplier is determined there."
+    )
+
+
+def _force_error(case: _Case) -> NonFiniteError:
+    words, lin = case.words, case.found.lin
+    return NonFiniteError(
+        f"The forces {words.force}, or the derivatives of {words.constraint}, are not "
+        f"finite at {case.where}: the rate of {words.fibre} would be "
+        f"{lin.acceleration}, the multiplier {lin.multiplier}. Check the functions of "
+        "the system at this state."
+    )
+
+
+def _dependence_error(case: _Case, rank: Rank) -> DependentConstraintsError:
+    phi, k = case.words.constraint, case.found.positions.shape[0]
+    m = rank.jacobian.shape[0] - k
+    letters = [f"{phi}[{a}]" for a in range(m)] + [f"Γ[{a}]" for a in range(k)]
+    zero = [a for a in range(m + k) if not np.any(rank.jacobian[a])]
     if zero and zero[0] < m:
         advice = (
-            f"{phi}[{zero[0]}] does not depend on velocities there; pass a constraint "
-            "on positions as `holonomic`."
+            f"{letters[zero[0]]} does not depend on velocities there; pass a "
+            "constraint on positions as `holonomic`."
         )
     elif zero:
         advice = (
-            f"Γ[{zero[0] - m}] has no gradient there; a constraint must have one where "
-            "it vanishes."
+            f"{letters[zero[0]]} has no gradient there; a constraint must have one "
+            "where it vanishes."
+        )
+    else:
+        advice = (
+            "Remove redundant constraints, or start from a state at which they are "
+            "independent."
         )
     names = " and ".join([f"D2{phi}"] * (m > 0) + ["DΓ"] * (k > 0))
-    return DependentConstraintsError(
-        f"The constraints are dependent: {names} has not full rank at {where} (the "
-        f"paper's admissibility condition; {names} = {jacobian.tolist()}). {advice}"
+    have = "have" if m > 0 and k > 0 else "has"
+    which = _enumerated(
+        [letters[a] for a in _dependent_rows(np.asarray(rank.jacobian))]
     )
+    return DependentConstraintsError(
+        f"The constraints are dependent: {names} {have} not full rank at q = {rank.q}, "
+        f"{case.given_name} = {case.given} (the paper's admissibility condition fails "
+        f"for {which}). {advice}"
+    )
+
+
+def _dependent_rows(jacobian: np.ndarray) -> list[int]:
+    """The rows that take part in a vanishing combination of rows."""
+    rows = np.max(np.abs(jacobian), axis=1, keepdims=True)
+    left, singular, _ = np.linalg.svd(jacobian / np.where(rows > 0, rows, 1))
+    singular = np.append(singular, np.zeros(len(jacobian) - len(singular)))
+    tolerance = np.sqrt(np.finfo(jacobian.dtype).eps)
+    null = left[:, singular <= tolerance * np.max(singular)]
+    return [a for a, row in enumerate(null) if np.any(np.abs(row) > tolerance)]
+
+
+def _enumerated(names: list[str]) -> str:
+    return " and ".join([", ".join(names[:-1])] * bool(names[1:]) + names[-1:])
 
 
 def _listed(
@@ -252,31 +330,31 @@ def _listed(
     ]
 
 
-def _violation_error(
-    found: Found, reached: str, phi: str, project: bool
-) -> ConstraintViolationError:
+def _violation_error(case: _Case) -> ConstraintViolationError:
+    found, phi = case.found, case.words.constraint
     violation, k = found.lin.violation, found.positions.shape[0]
     m = violation.shape[0] - k
     letters = [f"{phi}[{a}]" for a in range(m)] + [f"dΓ[{a}]/dt" for a in range(k)]
     bad = _listed(letters, violation, found.allowed)
     advice = (
         "the projection did not reach them"
-        if project
+        if case.project
         else "choose a velocity on the constraints, or pass `project=True`"
     )
     kind = "nonholonomic constraints" if k == 0 else "constraints on velocities"
     return ConstraintViolationError(
         f"{len(bad)} of {violation.shape[0]} {kind} violated at q = {found.state.q}, "
-        f"{reached}: {'; '.join(bad)}; {advice}."
+        f"{case.reached}: {'; '.join(bad)}; {advice}."
     )
 
 
-def _position_error(found: Found, project: bool) -> ConstraintViolationError:
+def _position_error(case: _Case) -> ConstraintViolationError:
+    found = case.found
     letters = [f"Γ[{a}]" for a in range(found.positions.shape[0])]
     bad = _listed(letters, found.positions, found.allowed_positions)
     advice = (
         "the projection did not reach them"
-        if project
+        if case.project
         else "choose a configuration on the constraints, or pass `project=True`"
     )
     return ConstraintViolationError(

@@ -1,4 +1,5 @@
 from collections.abc import Callable
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -6,6 +7,7 @@ from jaxtyping import Array, Float, PyTree
 
 from ._checks import (
     all_finite,
+    check_flag,
     check_functions,
     check_type,
     configuration,
@@ -16,12 +18,19 @@ from ._checks import (
     require_manifold,
 )
 from ._contraction import inverse
-from ._custom_types import Args, BoolScalar, FloatScalarLike
+from ._custom_types import Args, BoolScalar, FloatScalar, FloatScalarLike
 from ._errors import DTypeError, require, ShapeError
 from ._implicit import root
-from ._initial_checks import check_found, conditioning, Found
+from ._initial_checks import (
+    check_found,
+    conditioning,
+    Found,
+    Rank,
+    those_that_count,
+)
+from ._largest import largest
 from ._linearisation import linearise
-from ._scales import position_scale, violation_scale
+from ._scales import position_scale, velocity_scale, violation_scale
 from ._state import State
 from ._system import AbstractMechanicalSystem, HamiltonianSystem, LagrangianSystem
 from ._tracked_jit import tracked_jit
@@ -58,8 +67,10 @@ def initial_state(
 
     **Returns:** a `State`.
 
-    **Raises:** under `jit` as a runtime error of the compiled program,
+    **Raises:** (what depends on values, under `jit` with the same message in an error
+    of JAX, a `JaxRuntimeError` or a `ValueError`)
 
+    - `TypeError`: `system`, `project` or a part of `args` is of a wrong type.
     - `ShapeError`, `DTypeError`, `NonFiniteError`: an argument, or the value of one of
         the system's functions, is not what it should be.
     - `ConstraintViolationError`: a constraint is violated, or `q` is off the group, and
@@ -67,6 +78,8 @@ def initial_state(
     - `IrregularLagrangianError`: D2D2L (or D2D2H) is singular.
     - `DependentConstraintsError`: D2Φ and DΓ have not full rank (admissibility).
     - `IncompatibleConstraintsError`: C^{ab} is singular (compatibility).
+    - `NewtonError`: no velocity belongs to the momentum (or the reverse), or Newton's
+        method found no state on the constraints from the one to be projected.
 
     !!! example
 
@@ -77,12 +90,12 @@ def initial_state(
         [1.0, 1.0, 0.0]
     """
     check_type("system", system, (LagrangianSystem, HamiltonianSystem))
+    check_flag("project", project)
     q, v, p, t = _check_inputs(system, q, v, p, t)
     args = parameters(args)
     check_functions(system, t, q, args)
-    found = _solve(system, t, q, v, p, args, project)
-    name, given = ("p", p) if v is None else ("v", v)
-    return check_found(system, found, name, given, project)
+    found = _solve(system, t, q, v, p, args, bool(project))
+    return check_found(system, found, q, v, p, bool(project))
 
 
 @tracked_jit("system", "args")
@@ -92,6 +105,7 @@ def _solve(system, t, q, v, p, args, project: bool) -> Found:
     is_fibre = (v is None) == (system.fibre_name == "p")
     legendre_solved = projected = jnp.asarray(True)
     off_group = manifold.defect(q)
+    starts = []
     if project:
         normal = manifold.normalise(q)
         possible = all_finite(normal)
@@ -99,16 +113,17 @@ def _solve(system, t, q, v, p, args, project: bool) -> Found:
         off_group = jnp.where(possible, 0, off_group)
         if system.holonomic is not None:
             guess = given if is_fibre else jnp.zeros_like(given)
-            q, projected = _project_position(system, t, q, guess, args)
+            start = q
+            nearest = _project_position(system, t, q, guess, args)
+            q, projected = manifold.act(q, nearest.x), nearest.found
+            starts.append(Rank(nearest.jacobian, start, ~projected))
     u = given
     if not is_fibre:
-        solved = root(
-            lambda u: system.conjugate(t, q, u, args) - given, jnp.zeros_like(given)
-        )
-        u, legendre_solved = solved.x, solved.converged
+        u, legendre_solved = _inverse_legendre(system, t, q, given, args)
     if project and (system.nonholonomic is not None or system.holonomic is not None):
-        u, on_velocities = _project_fibre(system, t, q, u, args)
-        projected = projected & on_velocities
+        nearest = _project_fibre(system, t, q, u, args)
+        starts.append(Rank(nearest.jacobian, q, projected & ~nearest.found))
+        u, projected = nearest.x, projected & nearest.found
     lin = linearise(system, t, q, u, args)
     found_v = system.velocity(t, q, u, args)
     found_p = system.momentum(t, q, u, args)
@@ -117,6 +132,7 @@ def _solve(system, t, q, v, p, args, project: bool) -> Found:
         found_v = found_v if v is None else v
         found_p = found_p if p is None else p
     metric = system.metric(t, q, u, args)
+    ranks = those_that_count([*starts, Rank(lin.jacobian, q, projected)])
     tolerance = jnp.asarray(1e3 * float(jnp.finfo(u.dtype).eps), u.dtype)
     return Found(
         state=State(q, found_v, found_p, lin.multiplier),
@@ -125,7 +141,8 @@ def _solve(system, t, q, v, p, args, project: bool) -> Found:
         positions=system.position_constraint(t, q, args),
         off_group=off_group,
         regularity=conditioning(metric),
-        admissibility=conditioning(lin.jacobian),
+        ranks=ranks,
+        deficient=[rank.deficient for rank in ranks],
         compatibility=conditioning(lin.jacobian @ lin.reaction),
         allowed=tolerance * violation_scale(system, lin, t, q, u, args),
         allowed_positions=tolerance * position_scale(system, t, q, args),
@@ -135,7 +152,32 @@ def _solve(system, t, q, v, p, args, project: bool) -> Found:
     )
 
 
-def _project_position(system, t, q, u, args) -> tuple[PyTree[Array], BoolScalar]:
+def _inverse_legendre(
+    system, t, q, given: Float[Array, " n"], args
+) -> tuple[Float[Array, " n"], BoolScalar]:
+    """The u whose conjugate is the given one of v and p."""
+    zero = jnp.zeros_like(given)
+    # Where the terms of the equation cancel, as at rest in a magnetic field, u is
+    # rounded by what they amount to, and not by its own size.
+    terms = jnp.abs(given) + jnp.abs(system.conjugate(t, q, zero, args))
+    scale = largest(jnp.abs(inverse(system.metric(t, q, zero, args))) @ terms)
+    solved = root(
+        lambda u: system.conjugate(t, q, u, args) - given,
+        zero,
+        jnp.where(jnp.isfinite(scale), scale, 0),
+    )
+    return solved.x, solved.converged
+
+
+class _Nearest(NamedTuple):
+    """The nearest point of a constraint, and the Jacobian where the search starts."""
+
+    x: Float[Array, " n"]
+    found: BoolScalar
+    jacobian: Float[Array, "m n"]
+
+
+def _project_position(system, t, q, u, args) -> _Nearest:
     """The stationary point of ½ ξᵀ M ξ on Γ(t, q τ(ξ)) = 0."""
     manifold = system.manifold_of(q)
     mass = system.metric(t, q, u, args)
@@ -145,30 +187,53 @@ def _project_position(system, t, q, u, args) -> tuple[PyTree[Array], BoolScalar]
     def gamma(xi):
         return system.position_constraint(t, manifold.act(q, xi), args)
 
-    xi, converged = _nearest(mass, gamma, jnp.zeros_like(u))
-    return manifold.act(q, xi), converged
+    def sizes(_):
+        return largest(*jax.tree.leaves(q)), position_scale(system, t, q, args)
+
+    return _nearest(mass, gamma, jnp.zeros_like(u), sizes)
 
 
-def _project_fibre(system, t, q, u, args) -> tuple[Float[Array, " n"], BoolScalar]:
+def _project_fibre(system, t, q, u, args) -> _Nearest:
     """The stationary point of ½ (w-u)ᵀ K (w-u) on Φ(t, q, w) = 0."""
-    metric = system.metric(t, q, u, args)
-    return _nearest(metric, lambda w: system.constraint(t, q, w, args), u)
+
+    def phi(w):
+        return system.constraint(t, q, w, args)
+
+    def sizes(jacobian):
+        return largest(u), velocity_scale(system, jacobian, t, q, u, args)
+
+    return _nearest(system.metric(t, q, u, args), phi, u, sizes)
 
 
 def _nearest(
     metric: Float[Array, "n n"],
     constraint: Callable[[Float[Array, " n"]], Float[Array, " m"]],
     x: Float[Array, " n"],
-) -> tuple[Float[Array, " n"], BoolScalar]:
-    """The stationary point of ½ (y-x)ᵀ K (y-x) on constraint(y) = 0."""
+    sizes: Callable[[Float[Array, "m n"]], tuple[FloatScalar, Float[Array, " m"]]],
+) -> _Nearest:
+    """The stationary point of ½ (y-x)ᵀ K (y-x) on constraint(y) = 0.
+
+    `sizes(jacobian)`: what y and the constraint are rounded by.
+    """
+    jacobian = jax.jacrev(constraint)(x)
+    size, terms = sizes(jacobian)
+    # The round-off of the constraint moves y too: from rest, nothing else does.
+    reaction = inverse(metric) @ jacobian.T
+    response = reaction @ inverse(jacobian @ reaction)
+    scale = size + largest(jnp.abs(response) @ terms)
 
     def stationarity(z):
         y, multiplier = z
         value, pullback = jax.vjp(constraint, y)
         return metric @ (y - x) - pullback(multiplier)[0], value
 
-    solved = root(stationarity, (x, jnp.zeros_like(constraint(x))))
-    return solved.x[0], solved.converged
+    solved = root(
+        stationarity,
+        (x, jnp.zeros_like(constraint(x))),
+        jnp.where(jnp.isfinite(scale), scale, size),
+        judged=lambda z: z[0],
+    )
+    return _Nearest(solved.x[0], solved.converged, jacobian)
 
 
 def _check_inputs(system, q, v, p, t):

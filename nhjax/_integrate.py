@@ -6,6 +6,7 @@ from jaxtyping import Array, Int, PyTree
 
 from ._adjoint import AbstractAdjoint, DirectAdjoint
 from ._checks import (
+    check_flag,
     check_state,
     check_type,
     finite,
@@ -28,7 +29,6 @@ from ._newton import AbstractStageSolver, SimplifiedNewton
 from ._progress_meter import AbstractProgressMeter, NoProgressMeter
 from ._run_checks import (
     advancing,
-    check_flag,
     check_num_steps,
     check_saved,
     countable,
@@ -161,11 +161,7 @@ def integrate(
         dt,
         finite("dt", dt),
         finite("t0", t0),
-        Check(
-            dt != 0,
-            lambda: ValueError("`dt` is zero; give a positive or negative step size."),
-            "`dt` is zero.",
-        ),
+        Check(dt != 0, _zero_step),
         *countable(num_steps),
         advancing(t0, dt, num_steps),
     )
@@ -191,6 +187,10 @@ def integrate(
         meter,
     )
     return raise_failures(sol) if throw else sol
+
+
+def _zero_step() -> ValueError:
+    return ValueError("`dt` is zero; give a positive or negative step size.")
 
 
 @tracked_jit("system", "args", "saveat")

@@ -3,6 +3,7 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Int
 
 from ._chart import Chart
@@ -10,6 +11,7 @@ from ._checks import real_scalar
 from ._custom_types import Args, BoolScalar, FloatScalar, FloatScalarLike
 from ._errors import Check, require
 from ._implicit import root
+from ._largest import largest
 from ._linearisation import linearise
 from ._method import AbstractMethod
 from ._state import State
@@ -39,7 +41,9 @@ def interpolate(
     p = chart.to_end(xi, start.p + h * (weights @ record.force))
     u = p
     if system.fibre_name == "v":
-        u = root(lambda u: system.momentum(time, q, u, args) - p, start.v).x
+        u = root(
+            lambda u: system.momentum(time, q, u, args) - p, start.v, largest(start.v)
+        ).x
     v = system.velocity(time, q, u, args)
     if method.multiplier == "propagated":
         multiplier = method.basis(theta) @ record.multiplier
@@ -97,18 +101,18 @@ class DenseInterpolation(eqx.Module):
             )
         t = real_scalar("t", t, self.t0.dtype)
         _, inside = step_position(t, self.t0, self.dt, self.num_steps)
-        t = require(
-            t,
-            Check(
-                inside,
-                lambda: ValueError(
-                    f"`t` = {float(t)} lies outside the run, from {float(self.t0)} to "
-                    f"{float(self.t0 + self.num_steps * self.dt)}."
-                ),
-                "Solution.evaluate: `t` lies outside the run.",
-            ),
-        )
+        run = (t, self.t0, self.dt, self.num_steps)
+        t = require(t, Check(inside, _outside, run))
         return _evaluate(self, t)
+
+
+def _outside(
+    t: np.ndarray, t0: np.ndarray, dt: np.ndarray, num_steps: int
+) -> ValueError:
+    return ValueError(
+        f"Solution.evaluate: `t` = {float(t)} lies outside the run, from {float(t0)} "
+        f"to {float(t0 + num_steps * dt)}."
+    )
 
 
 def step_position(

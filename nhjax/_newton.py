@@ -11,13 +11,14 @@ import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
+from ._checks import check_flag
 from ._contraction import apply, contract
 from ._custom_types import BoolScalar, FloatScalar, FloatScalarLike
 from ._iteration import iterate, jacobian_and_value, NOISE_UNITS, Solved
 from ._largest import largest
 from ._leading_structure import leading_structure, LeadingStructure
 from ._linearisation import Linearisation
-from ._run_checks import check_flag, check_tolerance, tolerance_array
+from ._run_checks import check_tolerance, tolerance_array
 from ._scales import fibre_scale
 from ._stages import StageForces, Stages, StageSystem
 

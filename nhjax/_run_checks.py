@@ -19,16 +19,6 @@ from ._errors import Check, DTypeError, is_traced, ShapeError
 _MOST_STEPS = 2**31 - 1
 
 
-def check_flag(name: str, x: Any) -> bool:
-    """`x` as a bool; a string such as "no" would count as true."""
-    if not isinstance(x, bool | np.bool_):
-        raise TypeError(
-            f"`{name}` must be True or False, got {reprlib.repr(x)} of type "
-            f"{type(x).__name__}."
-        )
-    return bool(x)
-
-
 def check_num_steps(num_steps: Any, needed_by: str | None) -> int | IntScalar:
     """`num_steps` as an int >= 1, or as an array if nothing needs to know it.
 
@@ -72,7 +62,11 @@ def _traced_count(num_steps: Array | np.ndarray, needed_by: str | None) -> IntSc
 
 def _require_count(num_steps: int) -> None:
     if not 1 <= num_steps <= _MOST_STEPS:
-        raise ValueError(f"`num_steps` must be in 1..2^31 - 1, got {num_steps}.")
+        raise _count_error(num_steps)
+
+
+def _count_error(num_steps: Any) -> ValueError:
+    return ValueError(f"`num_steps` must be in 1..2^31 - 1, got {num_steps}.")
 
 
 def known(num_steps: int | IntScalar) -> int:
@@ -88,8 +82,7 @@ def countable(num_steps: int | IntScalar) -> list[Check]:
     ok = num_steps >= 1
     if jnp.iinfo(num_steps.dtype).max > _MOST_STEPS:
         ok = ok & (num_steps <= _MOST_STEPS)
-    message = "`num_steps` must be in 1..2^31 - 1."
-    return [Check(ok, lambda: ValueError(message), message)]
+    return [Check(ok, _count_error, (num_steps,))]
 
 
 def advancing(t0: FloatScalar, dt: FloatScalar, num_steps: int | IntScalar) -> Check:
@@ -102,16 +95,17 @@ def advancing(t0: FloatScalar, dt: FloatScalar, num_steps: int | IntScalar) -> C
         last = first + numpy.asarray(num_steps, h.dtype) * h
         ok = (first + h != first) & (last + h != last)
 
-    def error() -> Exception:
-        at_start = first + h == first
-        name, t = ("`t0`", first) if at_start else ("the end of the run,", last)
-        return ValueError(
-            f"`dt` = {h} is below the round-off of the time {name} = {t} in "
-            f"{h.dtype}: t + dt equals t, and time would not advance. Measure time "
-            "from a later origin, or take larger or fewer steps."
-        )
+    return Check(ok, _standstill_error, (first, h, last))
 
-    return Check(ok, error, "`dt` is below the round-off of the time `t0` or t1.")
+
+def _standstill_error(first: Any, h: Any, last: Any) -> ValueError:
+    at_start = first + h == first
+    name, t = ("`t0`", first) if at_start else ("the end of the run,", last)
+    return ValueError(
+        f"`dt` = {h} is below the round-off of the time {name} = {t} in {h.dtype}: "
+        "t + dt equals t, and time would not advance. Measure time from a later "
+        "origin, or take larger or fewer steps."
+    )
 
 
 def check_tolerance(tolerance: Any) -> None:

@@ -112,23 +112,8 @@ class SaveAt(eqx.Module):
         position, inside = step_position(ts, t0, dt, known(num_steps))
         ts = require(
             ts,
-            Check(
-                jnp.all(inside),
-                lambda: ValueError(
-                    f"SaveAt: `ts` reaches from {float(jnp.min(ts))} to "
-                    f"{float(jnp.max(ts))}, outside the run from {float(t0)} to "
-                    f"{float(t0 + num_steps * dt)}."
-                ),
-                "SaveAt: `ts` lies outside the run.",
-            ),
-            Check(
-                jnp.all(jnp.diff(position) >= 0),
-                lambda: ValueError(
-                    "SaveAt: `ts` must be sorted in the direction of time, which runs "
-                    f"{'forward' if dt > 0 else 'backward'} here."
-                ),
-                "SaveAt: `ts` must be sorted in the direction of time.",
-            ),
+            Check(jnp.all(inside), _outside, (ts, t0, dt, num_steps)),
+            Check(jnp.all(jnp.diff(position) >= 0), _unsorted, (dt,)),
         )
         return eqx.tree_at(lambda s: s.ts, self, ts)
 
@@ -149,6 +134,22 @@ def stack_saved(pieces: list[PyTree[Array]]) -> PyTree[Array]:
     if len(pieces) == 1:
         return pieces[0]
     return jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *pieces)
+
+
+def _outside(
+    ts: np.ndarray, t0: np.ndarray, dt: np.ndarray, num_steps: int
+) -> ValueError:
+    return ValueError(
+        f"SaveAt: `ts` reaches from {float(np.min(ts))} to {float(np.max(ts))}, "
+        f"outside the run from {float(t0)} to {float(t0 + num_steps * dt)}."
+    )
+
+
+def _unsorted(dt: np.ndarray) -> ValueError:
+    return ValueError(
+        "SaveAt: `ts` must be sorted in the direction of time, which runs "
+        f"{'forward' if dt > 0 else 'backward'} here."
+    )
 
 
 def _times(ts: Any) -> Float[Array, " k"]:

@@ -25,8 +25,20 @@ def violation_scale(
     Not their size at u itself: a constraint such as v[1] has but one term, which is
     round-off in a state that satisfies it.
     """
+    return velocity_scale(system, lin.jacobian, t, q, u, args)
+
+
+def velocity_scale(
+    system: AbstractMechanicalSystem,
+    jacobian: Float[Array, "l n"],
+    t: FloatScalar,
+    q: PyTree[Array],
+    u: Float[Array, " n"],
+    args: Args,
+) -> Float[Array, " l"]:
+    """The same from the derivatives of Φ in u alone."""
     affine = _finite_or_zero(system.constraint(t, q, jnp.zeros_like(u), args))
-    slopes = jnp.sum(jnp.abs(lin.jacobian), axis=1)
+    slopes = jnp.sum(jnp.abs(jacobian), axis=1)
     return slopes * largest(u) + affine
 
 

@@ -3,12 +3,11 @@ from typing import Any
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int, PyTree
+from jaxtyping import Array, Float, PyTree
 
 from ._custom_types import FloatScalarLike
-from ._errors import IntegrationError, is_traced
+from ._errors import IntegrationError, is_traced, lane_name, raise_where
 from ._interpolation import DenseInterpolation
 from ._state import State
 
@@ -131,54 +130,17 @@ class Solution(eqx.Module):
 def raise_failures(sol: Solution) -> Solution:
     """`sol`, or an `IntegrationError` that names lane, step and reason."""
     codes, steps = sol.result._value, sol.stats["failed_step"]
+    bad = codes != _messages().index("")
     if is_traced(codes, steps):
-        return _raise_later(sol)
-    _verdict(codes, steps)
+        return raise_where(sol, bad, _failure, (codes, steps))
+    if np.any(bad):
+        raise _failure(bad, (codes, steps))
     return sol
 
 
-def _verdict(codes: Any, steps: Any) -> np.ndarray:
-    failures = _failures(codes, steps)
-    if failures:
-        raise IntegrationError(_failure_message(failures))
-    return np.ones(np.shape(codes), bool)
-
-
-@jax.custom_jvp
-def _passed(codes: Int[Array, ""], steps: Int[Array, ""]) -> Bool[Array, ""]:
-    # Only the host can put numbers into a message, and only a call-back of our own
-    # sees the lanes of a batch.
-    return jax.lax.cond(
-        codes != _messages().index(""),
-        lambda: jax.pure_callback(
-            _verdict,
-            jax.ShapeDtypeStruct((), bool),
-            codes,
-            steps,
-            vmap_method="broadcast_all",
-        ),
-        lambda: jnp.asarray(True),
-    )
-
-
-@_passed.defjvp
-def _passed_jvp(primals, tangents):
-    # Integers have tangents of no meaning, which a call-back would not take.
-    del tangents
-    passed = _passed(*primals)
-    zero: Any = np.zeros(passed.shape, jax.dtypes.float0)
-    return passed, zero
-
-
-# Compiled, since an eager `vmap` would compile the call-back anew at each call.
-@eqx.filter_jit
-def _raise_later(sol: Solution) -> Solution:
-    codes, steps = sol.result._value, sol.stats["failed_step"]
-    passed = _passed(codes, steps)
-    # Whatever part of the solution is used must wait for the verdict.
-    dynamic, static = eqx.partition(sol, eqx.is_array)
-    dynamic = jax.tree.map(lambda x: jnp.where(passed, x, jnp.zeros_like(x)), dynamic)
-    return eqx.combine(dynamic, static)
+def _failure(bad: Any, values: tuple[Any, Any]) -> IntegrationError:
+    del bad
+    return IntegrationError(_failure_message(_failures(*values)))
 
 
 def _failures(
@@ -189,8 +151,7 @@ def _failures(
     for index in np.ndindex(codes.shape):
         message = messages[int(codes[index])]
         if message:
-            lane = index if len(index) > 1 else (index[0] if index else None)
-            failures.append((lane, int(steps[index]), message))
+            failures.append((lane_name(index), int(steps[index]), message))
     return failures
 
 

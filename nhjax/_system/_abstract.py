@@ -1,5 +1,8 @@
+import inspect
 from abc import abstractmethod
-from typing import Literal, Self
+from collections.abc import Callable
+from types import MethodType
+from typing import Any, Literal, Self
 
 import equinox as eqx
 import jax
@@ -17,6 +20,45 @@ from .._implicit import Closed
 from .._linearisation import linearise
 from .._manifold import AbstractLieGroup, Euclidean
 from .._state import check_time_and_state, State
+
+
+def _signature(function: Callable[..., Any]) -> inspect.Signature | None:
+    """The signature by which a function is called, None where it cannot be known.
+
+    Not that of a function that it wraps, whose arguments need not be the same, unless
+    it has none of its own, such as the outcome of `jax.jit`.
+    """
+    method, of = (
+        getattr(function, "__func__", None),
+        getattr(function, "__self__", None),
+    )
+    if method is not None and of is not None:
+        # A method of an `equinox.Module` has a type of its own that takes anything.
+        function = MethodType(method, of)
+    for follow in (False, True):
+        try:
+            signature = inspect.signature(function, follow_wrapped=follow)
+        except (TypeError, ValueError):
+            continue
+        # Types would make a message long.
+        bare = [
+            parameter.replace(annotation=inspect.Parameter.empty)
+            for parameter in signature.parameters.values()
+        ]
+        return inspect.Signature(bare)
+    return None
+
+
+def _takes(signature: inspect.Signature, arguments: tuple[str, ...]) -> bool:
+    try:
+        signature.bind(*arguments)
+    except TypeError:
+        return False
+    return True
+
+
+def _name(function: Callable[..., Any]) -> str:
+    return getattr(function, "__name__", type(function).__name__)
 
 
 class AbstractMechanicalSystem(eqx.Module):
@@ -39,20 +81,21 @@ class AbstractMechanicalSystem(eqx.Module):
     fibre_name: eqx.AbstractClassVar[Literal["v", "p"]]
 
     def __check_init__(self):
-        of_phase = f"(t, q, {self.fibre_name}, args)"
-        signatures = {
-            self.generator: of_phase,
-            "nonholonomic": of_phase,
-            "holonomic": "(t, q, args)",
-            "force": of_phase,
-        }
-        for name, signature in signatures.items():
+        for name, arguments in self.signatures().items():
             function = getattr(self, name)
-            may_be_left_out = name != self.generator and function is None
-            if not (callable(function) or may_be_left_out):
+            if function is None and name != self.generator:
+                continue
+            expected = f"({', '.join(arguments)})"
+            if not callable(function):
                 raise TypeError(
                     f"{type(self).__name__}: `{name}` must be a function of "
-                    f"{signature}, got {function!r}."
+                    f"{expected}, got {function!r}."
+                )
+            signature = _signature(function)
+            if signature is not None and not _takes(signature, arguments):
+                raise TypeError(
+                    f"{type(self).__name__}: `{name}` must take {expected}, but "
+                    f"`{_name(function)}{signature}` does not."
                 )
         if not isinstance(self.manifold, AbstractLieGroup | None):
             raise TypeError(
@@ -99,23 +142,39 @@ class AbstractMechanicalSystem(eqx.Module):
     def energy(self, t: FloatScalarLike, y: State, args: Args = None) -> FloatScalar:
         """The energy of a state."""
 
+    @classmethod
+    def signatures(cls) -> dict[str, tuple[str, ...]]:
+        """The arguments of each function of the system, by position."""
+        of_phase = ("t", "q", cls.fibre_name, "args")
+        return {
+            cls.generator: of_phase,
+            "nonholonomic": of_phase,
+            "holonomic": ("t", "q", "args"),
+            "force": of_phase,
+        }
+
+    def functions(
+        self, t: Any, q: PyTree[Any], u: Any, args: Args
+    ) -> dict[str, tuple[Callable[..., Any], tuple[Any, ...]]]:
+        """The functions that the system has, with the arguments to call them with."""
+        values = {"t": t, "q": q, self.fibre_name: u, "args": args}
+        return {
+            name: (getattr(self, name), tuple(values[x] for x in arguments))
+            for name, arguments in self.signatures().items()
+            if getattr(self, name) is not None
+        }
+
     def fibre(self, y: State) -> Float[Array, " n"]:
         """The fibre coordinate u of a state, its v or its p."""
         return getattr(y, self.fibre_name)
 
     def closed(self, t: FloatScalar, y: State, args: Args) -> Self:
         """This, with what its functions close over among its leaves."""
-        phase, position = (t, y.q, self.fibre(y), args), (t, y.q, args)
-        examples = {
-            self.generator: phase,
-            "nonholonomic": phase,
-            "holonomic": position,
-            "force": phase,
-        }
-        names = [name for name in examples if getattr(self, name) is not None]
-        functions = [Closed(getattr(self, name), *examples[name]) for name in names]
+        functions = self.functions(t, y.q, self.fibre(y), args)
         return eqx.tree_at(
-            lambda system: [getattr(system, name) for name in names], self, functions
+            lambda system: [getattr(system, name) for name in functions],
+            self,
+            [Closed(function, *example) for function, example in functions.values()],
         )
 
     def conjugate(
