@@ -24,8 +24,8 @@ from jaxtyping import Array, Float
 
 import nhjax
 from nhjax import systems
-from nhjax._newton import stage_residual
 from nhjax._scales import position_scale, violation_scale
+from nhjax._stage_iteration import stage_residual
 from nhjax._stages import Stages, StageSystem
 from nhjax._step import first_node, Node, step, StepOutcome
 

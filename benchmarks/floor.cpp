@@ -27,7 +27,7 @@ constexpr double A_HAT[S][S] = {
     {1. / 6, -1. / 6, 0}, {1. / 6, 1. / 3, 0}, {1. / 6, 5. / 6, 0}};
 constexpr double EPS = std::numeric_limits<double>::epsilon();
 constexpr double PATIENCE = 30;
-const double ROOT_EPS = std::sqrt(EPS);
+constexpr double NOISIEST = 400 * EPS;
 
 // The two number types: a double, and a vector with a trajectory in each lane.
 
@@ -218,7 +218,7 @@ inline T step(State<T>& y, double h) {
     Vector<T> q_increment, p_increment, v_next;
     T iterations = y.lambda * 0., believed = iterations + EPS;
     T smallest = iterations + std::numeric_limits<double>::infinity();
-    Mask<T> running = iterations == 0., stalled = iterations != 0.;
+    Mask<T> running = iterations == 0.;
     for (int sweep = 0; sweep < MAX_ITERATIONS; ++sweep) {
         // Forces at the stages, then stage and node velocities.
         free_force(q[1], f[1]);
@@ -288,10 +288,9 @@ inline T step(State<T>& y, double h) {
         end += d_end;
 
         Mask<T> stalls = size >= smallest;
-        stalled = stalled | stalls;
-        believed = stalls ? smaller(T(believed * PATIENCE), T(believed * 0. + ROOT_EPS))
+        believed = stalls ? smaller(T(believed * PATIENCE), T(believed * 0. + NOISIEST))
                           : believed;
-        Mask<T> stop = (size <= EPS) | (stalled & (smallest <= believed));
+        Mask<T> stop = (size <= EPS) | (stalls & (size <= believed));
         smallest = smaller(size, smallest);
         iterations = running ? iterations + 1. : iterations;
         // A lane's outcome is that of the iterate at which it stops; what its iterates

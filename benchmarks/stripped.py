@@ -170,11 +170,9 @@ def stripped(s: int) -> Run:
             ]
             size = reduce(jnp.maximum, sizes)
             stalls = size >= smallest
-            more = jnp.minimum(30.0 * believed, eps**0.5)
+            more = jnp.minimum(30.0 * believed, 400 * eps)
             believed = jnp.where(stalls, more, believed)
-            small = (size <= floor * scale) | (
-                (believed > eps) & (smallest <= believed * scale)
-            )
+            small = (size <= floor * scale) | (stalls & (size <= believed * scale))
             count = count + ~done
             progress = jnp.minimum(size, smallest), believed, done | small, count
             return (

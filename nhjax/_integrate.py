@@ -1,3 +1,4 @@
+from dataclasses import replace
 from functools import partial
 
 import jax
@@ -25,7 +26,7 @@ from ._interpolation import (
 from ._kernel import in_one_kernel
 from ._loop import Loop
 from ._method import AbstractMethod
-from ._newton import AbstractStageSolver, SimplifiedNewton
+from ._newton import AbstractStageSolver, leaves_steps_to_newton, SimplifiedNewton
 from ._progress_meter import AbstractProgressMeter, NoProgressMeter
 from ._run_checks import (
     advancing,
@@ -173,20 +174,21 @@ def integrate(
     # A plain call has no use for a length that is known, but for one that changes.
     if not isinstance(num_steps, int) or (needed_by is None and not is_tracing()):
         num_steps = jnp.asarray(num_steps, jnp.int32)
-    sol = _integrate(
-        system,
-        method,
-        solver,
-        adjoint,
-        y0,
-        t0,
-        dt,
-        num_steps,
-        args,
-        saveat,
-        meter,
-    )
+
+    def run(solver: AbstractStageSolver) -> Solution:
+        given = (adjoint, y0, t0, dt, num_steps, args, saveat, meter)
+        return _integrate(system, method, solver, *given)
+
+    sol = run(solver)
+    if not is_tracing() and leaves_steps_to_newton(solver) and _is_unsolved(sol):
+        sol = run(replace(solver, fallback=True))
     return raise_failures(sol) if throw else sol
+
+
+def _is_unsolved(sol: Solution) -> bool:
+    """Whether a run has ended because a step could not be solved."""
+    unsolved = RESULTS.nonlinear_divergence, RESULTS.nonlinear_max_iterations
+    return any(bool(sol.result == result) for result in unsolved)
 
 
 def _zero_step() -> ValueError:

@@ -2,36 +2,23 @@
 
 from abc import abstractmethod
 from collections.abc import Callable
-from functools import partial
-from typing import NamedTuple, TypeAlias
+from typing import TypeAlias
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
-from jaxtyping import Array, Float
+from jaxtyping import Array
 
 from ._checks import check_flag
-from ._contraction import apply, contract
-from ._custom_types import BoolScalar, FloatScalar, FloatScalarLike
+from ._custom_types import FloatScalarLike
 from ._iteration import iterate, jacobian_and_value, NOISE_UNITS, Solved
-from ._largest import largest
-from ._leading_structure import leading_structure, LeadingStructure
+from ._leading_structure import leading_structure
 from ._linearisation import Linearisation
 from ._run_checks import check_tolerance, tolerance_array
 from ._scales import fibre_scale
-from ._stages import StageForces, Stages, StageSystem
-
-
-class Evaluation(NamedTuple):
-    """What a solver leaves behind: the equations at the last iterate.
-
-    `newton` is whether Newton's method had to solve what another solver could not.
-    """
-
-    forces: StageForces
-    node_residual: Float[Array, "r n"]
-    newton: BoolScalar
+from ._stage_iteration import corrected, Evaluation, increment_size, stage_residual
+from ._stages import Stages, StageSystem
 
 
 # One iteration on the stages of a step; the equations are an argument, so that it can
@@ -78,17 +65,21 @@ class SimplifiedNewton(AbstractStageSolver):
     few small products. The error falls by a factor O(h²) where M is constant and the
     constraints are linear in v, O(h) elsewhere.
 
-    Where it does not converge, Newton's method with the exact Jacobian may: with
-    `fallback`, it takes over for such a step, and `Solution.stats["num_newton_steps"]`
-    counts them. A program that has it in itself compiles about twice as long, and runs
-    slower even if it is not needed, so that it is left out by default.
+    Where it does not converge, Newton's method with the exact Jacobian may. It takes
+    over for such a step, and `Solution.stats["num_newton_steps"]` counts them. A
+    program with both in it takes several times as long to compile, and runs slower also
+    where one would do. So a plain call of `integrate` is repeated with it if it has
+    failed; in a program of your own (`jax.jit`, `jax.vmap`, `jax.grad`) a step that is
+    not solved ends the run, unless you ask for the fallback.
 
     **Arguments:**
 
     - `max_iterations`: the number of iterations after which a step counts as failed.
     - `tolerance`: the size of the increment, relative to the velocities, at which to
         stop; 0, the default, iterates to round-off. Changing it recompiles nothing.
-    - `fallback`: whether `nhjax.Newton()` takes over a step that is not solved.
+    - `fallback`: whether `nhjax.Newton()` takes over a step that is not solved: True,
+        False, or None, the default, for plain calls alone. Derivatives of a run with it
+        use the exact Jacobian as those of `nhjax.Newton()` do.
 
     !!! example
 
@@ -99,9 +90,11 @@ class SimplifiedNewton(AbstractStageSolver):
 
     max_iterations: int = eqx.field(static=True, default=100)
     tolerance: FloatScalarLike = eqx.field(converter=tolerance_array, default=0.0)
-    fallback: bool = eqx.field(
-        static=True, default=False, converter=partial(check_flag, "fallback")
-    )
+    fallback: bool | None = eqx.field(static=True, default=None)
+
+    def __check_init__(self):
+        if self.fallback is not None:
+            check_flag("fallback", self.fallback)
 
     def solve(
         self, stages: StageSystem, x0: Stages, lin: Linearisation, skip: Array
@@ -111,8 +104,8 @@ class SimplifiedNewton(AbstractStageSolver):
         scale = fibre_scale(stages, x0, lin)
 
         def sweep(x: Stages):
-            x_next, evaluation = _corrected(stages, structure, x)
-            return x_next, _increment_size(stages, x, x_next, lin), evaluation
+            x_next, evaluation = corrected(stages, structure, x)
+            return x_next, increment_size(stages, x, x_next, lin), evaluation
 
         solved = iterate(
             sweep,
@@ -150,40 +143,12 @@ class SimplifiedNewton(AbstractStageSolver):
         if self.fallback:
             return self._newton.correction(stages, lin, x)
         structure = leading_structure(stages, x, lin)
-        return lambda stages, x: _corrected(stages, structure, x)[0]
+        return lambda stages, x: corrected(stages, structure, x)[0]
 
 
-def _corrected(
-    stages: StageSystem, structure: LeadingStructure, x: Stages
-) -> tuple[Stages, Evaluation]:
-    # Each residual is evaluated at the newest iterate (Gauss-Seidel): it costs the same
-    # as evaluating all of them at the last one, and contracts faster.
-    forces = stages.evaluate(x)
-    x_next = structure.correct_stages(stages, x, forces.residual)
-    node_residual = stages.node_residual(x_next, forces.force)
-    x_next = structure.correct_nodes(x_next, node_residual)
-    if stages.constrained:
-        x_next = _constrain(stages, structure, x_next)
-    return x_next, Evaluation(forces, node_residual, jnp.asarray(False))
-
-
-def _constrain(stages: StageSystem, structure: LeadingStructure, x: Stages) -> Stages:
-    kinematic, holonomic = _constraints(stages, x)
-    x = structure.correct_multipliers(stages, x, kinematic, holonomic)
-    if stages.symmetric:
-        # λ_c depends on v_{k+1} at zeroth order: it must see the new velocity, or the
-        # two errors would feed each other and contract only as the root of the rate.
-        x = structure.correct_end(x, stages.end_residual(x))
-    return x
-
-
-def _constraints(stages: StageSystem, x: Stages) -> tuple[Array, Array]:
-    """The nonholonomic constraints at the nodes and the holonomic ones, if any."""
-    none = jnp.zeros((0,), stages.p.dtype)
-    return (
-        stages.node_constraint(x) if stages.num_nonholonomic else none,
-        stages.holonomic_constraint(x) if stages.num_holonomic else none,
-    )
+def leaves_steps_to_newton(solver: AbstractStageSolver) -> bool:
+    """Whether a plain call is to be repeated with a fallback if it fails."""
+    return isinstance(solver, SimplifiedNewton) and solver.fallback is None
 
 
 class Newton(AbstractStageSolver):
@@ -224,10 +189,10 @@ class Newton(AbstractStageSolver):
             change = stage_residual(nudged, x)[0] - r
             dz, noise = jnp.linalg.solve(jacobian, -jnp.stack([r, change], axis=1)).T
             x_next = unravel(z + dz)
-            size = _increment_size(stages, x, x_next, lin)
+            size = increment_size(stages, x, x_next, lin)
             # What round-off of the positions makes of the stages counts as a scale too,
             # if it is larger: stiff forces magnify it.
-            noise = _increment_size(stages, x, unravel(z + noise), lin) / nudge
+            noise = increment_size(stages, x, unravel(z + noise), lin) / nudge
             share = jnp.where(noise > scale, scale / noise, 1)
             return x_next, size * share, evaluation
 
@@ -254,48 +219,3 @@ class Newton(AbstractStageSolver):
             return unravel(ravel_pytree(x)[0] - jacobian_inverse @ residual)
 
         return corrected
-
-
-def stage_residual(
-    stages: StageSystem, x: Stages
-) -> tuple[Float[Array, " k"], Evaluation]:
-    """All equations of a step in one vector."""
-    forces = stages.evaluate(x)
-    node_residual = stages.node_residual(x, forces.force)
-    parts = [forces.residual, node_residual]
-    if stages.hamiltonian:
-        parts.append(x.velocity - stages.stage_velocities(x))
-    parts += _constraints(stages, x)
-    if stages.symmetric:
-        parts += stages.end_residual(x)
-    return (
-        ravel_pytree(parts)[0],
-        Evaluation(forces, node_residual, jnp.asarray(False)),
-    )
-
-
-def _increment_size(
-    stages: StageSystem, x: Stages, x_next: Stages, lin: Linearisation
-) -> FloatScalar:
-    """The size of an increment in fibre coordinates.
-
-    Not finite once the iterates have left the chart, from where they do not return.
-    """
-    changes = [x_next.node_fibre - x.node_fibre, x_next.velocity - x.velocity]
-    if stages.hamiltonian:
-        changes[1] = apply(lin.metric_inverse, changes[1])
-        changes.append(x_next.momentum - x.momentum)
-    if stages.constrained:
-        # Multipliers count by their effect on u, h N⁻¹ R δΛ, on its own: Λ can still be
-        # wrong where the stages and nodes happen to be right.
-        before, after = map(stages.multiplier_change, (x, x_next))
-        reaction = lin.reaction
-        if reaction.shape[1] == 1:
-            # The largest entry of the column decides; it is the same for all iterates.
-            reaction = largest(reaction).reshape(1, 1)
-        change = contract("sl,nl->sn", after - before, reaction)
-        changes.append(stages.h * change)
-    size = largest(*changes)
-    if stages.chart.manifold.is_flat:
-        return size
-    return jnp.where(stages.in_chart(x_next), size, jnp.inf)

@@ -18,13 +18,13 @@ class RESULTS(eqx.Enumeration):
     successful = ""
     nonlinear_divergence = (
         "The stage equations of a step could not be solved: Newton's iteration "
-        "diverged. Try a smaller `dt`."
+        "diverged. Try a smaller `dt`, or `solver=nhjax.Newton()`."
     )
     nonlinear_max_iterations = (
         "The stage equations of a step were not solved to round-off within the "
-        "`max_iterations` of the solver: Newton's iteration converges too slowly, or "
-        "wanders about. Try a smaller `dt`, or more iterations; where the system is so "
-        "stiff or ill-conditioned that round-off is large, a `tolerance` of the solver."
+        "`max_iterations` of the solver: its iteration converges too slowly, or not at "
+        "all. Try a smaller `dt`, `solver=nhjax.Newton()`, or more iterations; where "
+        "stiff forces magnify round-off, a `tolerance` of the solver."
     )
     singular_stage_matrix = (
         "The mass matrix D2D2L (or D2D2H) or the compatibility matrix C = D2Φ M⁻¹ D2Φᵀ "

@@ -3,6 +3,7 @@ from typing import NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float, PyTree
 
 from ._chart import Chart
@@ -96,10 +97,9 @@ class StageSystem(eqx.Module):
         size = largest(*jax.tree.leaves(self.q))
         if manifold.is_flat:
             size = jnp.abs(self.q)
-        k = jnp.arange(n)
-        sign = 1 - 2 * (k % 2)
-        move = sign * (1 - 0.5 * jnp.mod(0.618 * k, 1.0))
-        xi = nudge * size * move.astype(self.p.dtype)
+        k = np.arange(n)
+        moves = (-1.0) ** k * (1 - 0.5 * (0.618 * k % 1))
+        xi = nudge * size * jnp.asarray(moves, self.p.dtype)
         return eqx.tree_at(lambda z: z.q, self, manifold.act(self.q, xi))
 
     @property

@@ -14,8 +14,9 @@ from ._iteration import Solved
 from ._largest import largest, relative
 from ._linearisation import Linearisation, linearise
 from ._method import AbstractMethod
-from ._newton import AbstractStageSolver, Evaluation
+from ._newton import AbstractStageSolver
 from ._solution import RESULTS
+from ._stage_iteration import Evaluation
 from ._stages import Stages, StageSystem
 from ._state import State
 from ._step_record import StepRecord
