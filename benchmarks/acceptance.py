@@ -7,8 +7,9 @@ equations at the stages found, relative to the size of its terms; the violation 
 constraints at the end, relative to the size of theirs; and the distance of the two
 solvers' ends.
 
-The terms of an equation r(x; q) = 0 have the size |∂r/∂x| |x| + |∂r/∂q| |q|: nothing
-smaller than the unit round-off times that can be asked of r (Oettli and Prager, 1964).
+The terms of an equation r(x; q) = 0 have the size |∂r/∂x| |x| + |∂r/∂q| |q|, in which
+|x| is the largest of the velocities, of the multipliers and so on: nothing smaller than
+the unit round-off times that can be asked of r (Oettli and Prager, 1964).
 """
 
 import argparse
@@ -24,6 +25,7 @@ from jaxtyping import Array, Float
 
 import nhjax
 from nhjax import systems
+from nhjax._largest import largest
 from nhjax._scales import position_scale, violation_scale
 from nhjax._stage_iteration import stage_residual
 from nhjax._stages import Stages, StageSystem
@@ -107,7 +109,8 @@ def relative_residual(stages: StageSystem, x: Stages) -> Float[Array, ""]:
     r = equations(z, stages)
     jacobian = jax.jacfwd(equations)(z, stages)
     moved = equations(z, stages.nudged(jnp.asarray(NUDGE)))
-    terms = jnp.abs(jacobian) @ jnp.abs(z) + jnp.abs(moved - r) / NUDGE
+    sizes, _ = ravel_pytree(jax.tree.map(lambda x: jnp.full_like(x, largest(x)), x))
+    terms = jnp.abs(jacobian) @ sizes + jnp.abs(moved - r) / NUDGE
     return largest_ratio(r, terms)
 
 

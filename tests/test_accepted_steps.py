@@ -1,0 +1,134 @@
+"""A step is accepted if its equations are solved, and not because it took long."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import nhjax
+from benchmarks._random_systems import random_systems
+from benchmarks.acceptance import ALLOWED, gallery, measure, SAME
+from nhjax import RESULTS
+
+
+ROUND_OFF = 1e-13
+WITH_NEWTON = nhjax.SimplifiedNewton(fallback=True)
+
+
+def double_pendulum():
+    """Two rods from rest, in Cartesian coordinates."""
+
+    def rods(t, q, args):
+        second = q[2:] - q[:2]
+        return jnp.stack([q[:2] @ q[:2] - 1, second @ second - 1])
+
+    system = nhjax.LagrangianSystem(
+        lambda t, q, v, args: 0.5 * v @ v - 9.81 * (q[1] + q[3]), holonomic=rods
+    )
+    start = jnp.array([0.6, -0.8, 1.2, -1.6])
+    return system, nhjax.initial_state(system, start, jnp.zeros(4))
+
+
+def swing(num_steps=9, **options):
+    system, y0 = double_pendulum()
+    options = {"dt": 0.5, "throw": False} | options
+    return nhjax.integrate(
+        system, nhjax.LobattoIIIAB(3), y0, num_steps=num_steps, **options
+    )
+
+
+def test_a_slow_iteration_is_not_taken_for_a_solution():
+    sol = jax.jit(swing)()
+    assert sol.result == RESULTS.nonlinear_max_iterations
+    assert float(sol.stats["max_constraint_violation"]) < ROUND_OFF
+    assert float(sol.stats["max_residual"]) < ROUND_OFF
+    with pytest.raises(nhjax.IntegrationError, match=r"step 1: .*`max_iterations`"):
+        swing(solver=nhjax.SimplifiedNewton(fallback=False), throw=True)
+
+
+def test_a_diverging_iteration_is_told_from_a_slow_one():
+    sol = swing(dt=3.0, solver=nhjax.SimplifiedNewton(fallback=False))
+    assert sol.result == RESULTS.nonlinear_divergence
+    assert int(sol.stats["num_iterations"]) < 100
+
+
+@pytest.mark.parametrize("compiled", [False, True], ids=["plain", "jit"])
+def test_newtons_method_takes_over_steps_that_need_it(compiled):
+    run = jax.jit(lambda: swing(solver=WITH_NEWTON)) if compiled else swing
+    sol, expected = run(), swing(solver=nhjax.Newton())
+    assert sol.result == expected.result == RESULTS.successful
+    assert 0 < int(sol.stats["num_newton_steps"]) < 9
+    assert int(expected.stats["num_newton_steps"]) == 0
+    assert float(sol.stats["max_constraint_violation"]) < ROUND_OFF
+    for name in ("q", "p"):
+        np.testing.assert_allclose(
+            getattr(sol.ys, name), getattr(expected.ys, name), rtol=1e-9
+        )
+
+
+def test_a_plain_call_that_needs_no_newton_step_counts_none():
+    assert int(swing(dt=0.1).stats["num_newton_steps"]) == 0
+
+
+def test_members_of_a_batch_take_newtons_method_one_by_one():
+    sizes = jnp.array([0.1, 0.5])
+    sol = jax.vmap(lambda dt: swing(dt=dt, solver=WITH_NEWTON))(sizes)
+    assert [int(x) for x in sol.stats["num_steps"]] == [9, 9]
+    easy, hard = sol.stats["num_newton_steps"]
+    assert int(easy) == 0
+    assert int(hard) > 0
+
+
+def test_a_gradient_passes_through_steps_of_newtons_method():
+    system, y0 = double_pendulum()
+
+    def height(dt, solver):
+        end = nhjax.integrate(
+            system, nhjax.LobattoIIIAB(3), y0, dt=dt, num_steps=4, solver=solver
+        )
+        return end.ys.q[-1, 3]
+
+    slopes = [jax.grad(height)(0.5, solver) for solver in (WITH_NEWTON, nhjax.Newton())]
+    np.testing.assert_allclose(slopes[0], slopes[1], rtol=1e-8)
+
+
+def test_round_off_that_stiff_forces_magnify_is_no_failure():
+    # Vibrations of 1e-5 about a length of 1, by forces of 1e10 times the length.
+    def lagrangian(t, q, v, args):
+        return 0.5 * v @ v - 0.5e10 * jnp.sum((q - 1.0) ** 2)
+
+    system = nhjax.LagrangianSystem(lagrangian)
+    y0 = nhjax.initial_state(system, jnp.array([1.00001, 0.99999]), jnp.zeros(2))
+    for solver in (nhjax.SimplifiedNewton(), nhjax.Newton()):
+        sol = nhjax.integrate(
+            system, nhjax.LobattoIIIAB(3), y0, dt=5e-6, num_steps=200, solver=solver
+        )
+        phase = 1e5 * 5e-6 * 200
+        np.testing.assert_allclose(sol.ys.q[0, 0] - 1, 1e-5 * np.cos(phase), atol=1e-6)
+
+
+def test_fallback_must_be_a_flag():
+    with pytest.raises(TypeError, match="`fallback` must be True or False"):
+        nhjax.SimplifiedNewton(fallback="no")
+
+
+SYSTEMS = gallery() | random_systems()
+# Both kinds of constraints, alone and together, and a group.
+SEARCHED = [
+    ("DoublePendulum", 3),
+    ("Suslov", 4),
+    ("random 5, m = 2", 3),
+    ("random 6, m = k = 1", 2),
+]
+
+
+@pytest.mark.parametrize(("name", "stages"), SEARCHED)
+def test_no_accepted_step_is_unsolved(name, stages):
+    figures = measure(name, stages, SYSTEMS[name], num_steps=20)
+    for solver in ("simplified", "newton"):
+        assert figures[f"{solver} accepted"] > 100
+        assert figures[f"{solver} residual"] <= ALLOWED
+        assert figures[f"{solver} violation"] <= ALLOWED
+    # The search goes up to failure.
+    assert figures["simplified accepted"] < 200
+    assert figures["distance"] <= SAME
