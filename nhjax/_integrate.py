@@ -97,11 +97,11 @@ def integrate(
 
     **Returns:** a `Solution`.
 
-    **Raises:** `IntegrationError` as described (under `jit` or `vmap` its message comes
-    in a runtime error of JAX), `ShapeError`, `DTypeError`, `NonFiniteError`,
-    `TypeError` and `ValueError` for arguments that cannot be right; a `ValueError` that
-    names the failing hypothesis (H1, H2, H3) if the method cannot integrate constrained
-    systems.
+    **Raises:** `IntegrationError` as described (under `jit` its message comes in an
+    error of JAX, a `JaxRuntimeError` or a `ValueError`), `ShapeError`, `DTypeError`,
+    `NonFiniteError`, `TypeError` and `ValueError` for arguments that cannot be right; a
+    `ValueError` that names the failing hypothesis (H1, H2, H3) if the method cannot
+    integrate constrained systems.
 
     !!! note
 
