@@ -33,12 +33,14 @@ class Entry(NamedTuple):
     """A value that a function reads, and where; the owner is held with it.
 
     `key` is for comparison between calls: with the owner by its number in the order of
-    the visit, or -1, where `place` has its identity.
+    the visit, or -1, where `place` has its identity. `content` is for comparison within
+    a call: a value that has parts is itself, whatever its number.
     """
 
     key: tuple[int, Hashable, Hashable]
     place: Place
     owner: object
+    content: Hashable
 
     @property
     def atom(self) -> Hashable:
@@ -118,13 +120,14 @@ class _Walk:
         if self.ignored and (place in self.ignored or all_of(owner) in self.ignored):
             return
         kind, is_new = kind_of(type(value)), False
-        atom = _atom(value, kind)
+        atom = content = _atom(value, kind)
         if atom is None:
+            content = Identity(value)
             is_new = id(value) not in self.numbers
             number = self.numbers.setdefault(id(value), len(self.numbers))
             atom = _name(value, kind), number
         key = (self.numbers.get(id(owner), -1), name, atom)
-        self.entries.append(Entry(key, place, owner))
+        self.entries.append(Entry(key, place, owner, content))
         if is_new:
             self.contents(value, kind)
 

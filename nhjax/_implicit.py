@@ -12,12 +12,15 @@ from jaxtyping import Array, PyTree
 
 from ._contraction import with_small_products
 from ._custom_types import BoolScalar, FloatScalar
-from ._iteration import dense_increment, iterate, Solved
+from ._iteration import dense_increment, iterate, Sizes, Solved
 from ._largest import largest
 
 
 # Round-off units below which terms of the Neumann series are left out.
 _UNITS_LEFT = 256
+# Terms that have ceased to fall above as many units are not those of a series that
+# converges: there is no derivative then, rather than a wrong one.
+_NOISIEST = 1e4
 
 T = TypeVar("T")
 X = TypeVar("X", bound=PyTree[Array])
@@ -49,12 +52,17 @@ def solve_contraction(contraction: Callable[[X], X], b: X, *, max_iterations: in
         def sweep(x):
             increment = _minus(b, matvec(x))
             x = [x + dx for x, dx in zip(x, increment, strict=True)]
-            return x, largest(*increment), None
+            return x, Sizes(largest(*increment), largest(*x)), None
 
         scale = largest(*b)
         tolerance = _UNITS_LEFT * float(jnp.finfo(scale.dtype).eps)
         solved = iterate(
-            sweep, b, scale, max_iterations=max_iterations, tolerance=tolerance
+            sweep,
+            b,
+            scale,
+            max_iterations=max_iterations,
+            tolerance=tolerance,
+            noise_units=_NOISIEST,
         )
         return [jnp.where(solved.converged, x, jnp.nan) for x in solved.x]
 
@@ -107,7 +115,8 @@ def root(
         dx, _ = dense_increment(lambda z: (flat_residual(z), None), x)
         # What is not judged may still not be NaN.
         rest = jnp.where(jnp.all(jnp.isfinite(dx)), 0, jnp.inf).astype(dx.dtype)
-        return x + dx, rest + largest(*jax.tree.leaves(judged(unravel(dx)))), None
+        size = rest + largest(*jax.tree.leaves(judged(unravel(dx))))
+        return x + dx, Sizes(size), None
 
     def newton(_, x):
         solved = iterate(sweep, x, scale, max_iterations=max_iterations)

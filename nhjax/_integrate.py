@@ -164,7 +164,7 @@ def integrate(
         finite("t0", t0),
         Check(dt != 0, _zero_step),
         *countable(num_steps),
-        advancing(t0, dt, num_steps),
+        advancing(t0, dt),
     )
     if y0.multiplier.shape[0] > 0:
         method.require_constraint_hypotheses()
@@ -187,7 +187,11 @@ def integrate(
 
 def _is_unsolved(sol: Solution) -> bool:
     """Whether a run has ended because a step could not be solved."""
-    unsolved = RESULTS.nonlinear_divergence, RESULTS.nonlinear_max_iterations
+    unsolved = (
+        RESULTS.nonlinear_divergence,
+        RESULTS.nonlinear_max_iterations,
+        RESULTS.left_chart,
+    )
     return any(bool(sol.result == result) for result in unsolved)
 
 

@@ -19,9 +19,25 @@ Aux = TypeVar("Aux")
 # noise where an iteration may be slow. Above it they may as well be those of a slow
 # iteration that comes near in circles.
 NOISE_UNITS = 400
-# By how much more noise is believed in where an increment fails to fall, and how far
-# increments may grow over all that there is to be found before they diverge.
-_IMPATIENCE, _HOPELESS = 30.0, 1e6
+# Each increment that fails to fall makes as many times more noise believable.
+_IMPATIENCE = 30.0
+# An increment that is larger by this than x and the first increment is of an iteration
+# that diverges.
+_HOPELESS = 1e6
+# No more magnification of round-off than this is believed in.
+_LARGEST_NOISE = 1e5
+
+
+class Sizes(NamedTuple):
+    """The sizes of an increment and of the iterate that it leads to, in one unit.
+
+    `noise` is how much the iterate would change if what is given were changed by its
+    own size, where that is known: round-off does so in units of round-off.
+    """
+
+    increment: FloatScalar
+    iterate: FloatScalar | float = 0.0
+    noise: FloatScalar | None = None
 
 
 class Solved(NamedTuple, Generic[X, Aux]):
@@ -39,7 +55,7 @@ class Solved(NamedTuple, Generic[X, Aux]):
 
 
 class _Progress(NamedTuple):
-    scale: FloatScalar
+    first: FloatScalar
     smallest: FloatScalar
     believed: FloatScalar
     iterations: Int[Array, ""]
@@ -49,7 +65,7 @@ class _Progress(NamedTuple):
 
 
 def iterate(
-    sweep: Callable[[X], tuple[X, FloatScalar, Aux]],
+    sweep: Callable[[X], tuple[X, Sizes, Aux]],
     x: X,
     scale: FloatScalar,
     *,
@@ -60,10 +76,11 @@ def iterate(
 ) -> Solved[X, Aux]:
     """Repeat `sweep` until its increments no longer fall.
 
-    `sweep(x)` returns the next iterate, the size of the increment, and whatever was
-    evaluated at x. Sizes count relative to `scale`, the size of x, and from the second
-    on to that of the first increment, if it is larger: x may start from nothing, where
-    the first increment counts as it is.
+    `sweep(x)` returns the next iterate, the sizes of the increment and of the iterate,
+    and whatever was evaluated at x. Increments count relative to `scale`, what x is
+    rounded by, or to the size of the iterate, if it is larger: x may start from
+    nothing. Where neither is known to be more than nothing they count relative to the
+    first, which counts as it is.
 
     An increment below the unit round-off (or `tolerance`) ends the iteration; so do
     small increments that have ceased to fall, since that is round-off speaking. The
@@ -72,7 +89,8 @@ def iterate(
     section VIII.6): the more often increments fail to fall, the larger a floor is
     believed, up to `noise_units` of round-off. By default that is its square root, for
     iterations that converge so fast that nothing but noise can be in their way.
-    Increments that grow far beyond all there is to be found end the iteration too.
+    An increment that is not finite, or far larger than the first and the iterate, ends
+    the iteration too.
     """
     aux_shape = jax.eval_shape(lambda x: sweep(x)[2], x)
     aux = jax.tree.map(lambda s: jnp.zeros(s.shape, s.dtype), aux_shape)
@@ -83,22 +101,27 @@ def iterate(
 
     def body(carry):
         x, _, progress = carry
-        x_next, increment, aux = sweep(x)
+        x_next, sizes, aux = sweep(x)
+        increment = sizes.increment
+        first = jnp.where(progress.iterations == 0, increment, progress.first)
+        size = jnp.maximum(scale, sizes.iterate)
         # No quotients, which would wait for each other: sizes are compared as they are.
-        scale = unit(progress.scale)
+        measure = jnp.where(size > 0, size, progress.first)
         stalls = increment >= progress.smallest
         more = jnp.minimum(_IMPATIENCE * progress.believed, noisiest)
         believed = jnp.where(stalls, more, progress.believed)
-        stagnant = stalls & (increment <= believed * scale)
-        converged = (increment <= floor * scale) | stagnant
+        magnified = measure
+        if sizes.noise is not None:
+            noise = jnp.minimum(sizes.noise, _LARGEST_NOISE * measure)
+            magnified = jnp.maximum(measure, noise)
+        stagnant = stalls & (increment <= believed * magnified)
+        converged = (increment <= floor * measure) | stagnant
         count = progress.iterations + 1
-        first = jnp.where(progress.iterations == 0, increment, 0)
-        scale = jnp.maximum(progress.scale, first)
-        # Not ">", which what is not a number would pass.
-        bounded = increment <= _HOPELESS * scale
+        # False for what is not finite.
+        bounded = increment < _HOPELESS * (measure + first)
         exhausted = bounded & ~converged & (count >= max_iterations)
         progress = _Progress(
-            scale=scale,
+            first=unit(first),
             smallest=jnp.minimum(increment, progress.smallest),
             believed=believed,
             iterations=count,
@@ -111,9 +134,9 @@ def iterate(
     zero = jnp.zeros((), jnp.int32)
     skip = jnp.asarray(skip)
     scale = jnp.asarray(scale, dtype)
-    infinite, least = jnp.asarray(jnp.inf, dtype), jnp.asarray(eps, dtype)
+    one, infinite, least = (jnp.asarray(x, dtype) for x in (1, jnp.inf, eps))
     never = jnp.zeros_like(skip)
-    start = _Progress(scale, infinite, least, zero, skip, skip, never)
+    start = _Progress(one, infinite, least, zero, skip, skip, never)
     x, aux, progress = jax.lax.while_loop(
         lambda carry: ~carry[2].done, body, (x, aux, start)
     )

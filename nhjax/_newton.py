@@ -10,14 +10,20 @@ import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array
 
-from ._checks import check_flag
+from ._checks import all_finite, check_flag
 from ._custom_types import FloatScalarLike
 from ._iteration import iterate, jacobian_and_value, NOISE_UNITS, Solved
 from ._leading_structure import leading_structure
 from ._linearisation import Linearisation
 from ._run_checks import check_tolerance, tolerance_array
 from ._scales import fibre_scale
-from ._stage_iteration import corrected, Evaluation, increment_size, stage_residual
+from ._stage_iteration import (
+    corrected,
+    Evaluation,
+    increment_size,
+    sizes,
+    stage_residual,
+)
 from ._stages import Stages, StageSystem
 
 
@@ -105,7 +111,7 @@ class SimplifiedNewton(AbstractStageSolver):
 
         def sweep(x: Stages):
             x_next, evaluation = corrected(stages, structure, x)
-            return x_next, increment_size(stages, x, x_next, lin), evaluation
+            return x_next, sizes(stages, x, x_next, lin), evaluation
 
         solved = iterate(
             sweep,
@@ -119,7 +125,8 @@ class SimplifiedNewton(AbstractStageSolver):
         if not self.fallback:
             return solved
         # What is not finite after one iteration is so at the state itself.
-        ends = solved.converged | (~solved.exhausted & (solved.num_iterations <= 1))
+        hopeless = (solved.num_iterations <= 1) & ~all_finite(solved.x)
+        ends = solved.converged | hopeless
 
         def by_newton():
             newton = self._newton.solve(stages, x0, lin, ends)
@@ -189,12 +196,11 @@ class Newton(AbstractStageSolver):
             change = stage_residual(nudged, x)[0] - r
             dz, noise = jnp.linalg.solve(jacobian, -jnp.stack([r, change], axis=1)).T
             x_next = unravel(z + dz)
-            size = increment_size(stages, x, x_next, lin)
-            # What round-off of the positions makes of the stages counts as a scale too,
-            # if it is larger: stiff forces magnify it.
+            found = sizes(stages, x, x_next, lin)
+            # What round-off of the positions makes of the stages: stiff forces magnify
+            # it.
             noise = increment_size(stages, x, unravel(z + noise), lin) / nudge
-            share = jnp.where(noise > scale, scale / noise, 1)
-            return x_next, size * share, evaluation
+            return x_next, found._replace(noise=noise), evaluation
 
         return iterate(
             sweep,

@@ -8,7 +8,7 @@ from jaxtyping import Array, Int, PyTree
 
 from ._adjoint import AbstractAdjoint, DirectAdjoint, steps
 from ._custom_types import BoolScalar
-from ._iteration import iterate
+from ._iteration import iterate, Sizes
 from ._largest import largest, relative
 from ._loop import Carry, Loop, Rows
 from ._progress_meter import NoProgressMeter
@@ -176,7 +176,7 @@ def step_back(loop: Loop, node: Node, k: Int[Array, ""]) -> Node:
             multiplier = multiplier + miss
         size = largest(*misses)
         z = State(manifold.act(z.q, xi), z.v, z.p + misses[1], multiplier)
-        return z, size, y
+        return z, Sizes(size), y
 
     scale = 1 + largest(target.p)
     limit = loop.solver.max_iterations

@@ -8,6 +8,7 @@ from jaxtyping import Array, Float
 
 from ._contraction import apply, contract
 from ._custom_types import BoolScalar, FloatScalar
+from ._iteration import Sizes
 from ._largest import largest
 from ._leading_structure import LeadingStructure
 from ._linearisation import Linearisation
@@ -77,12 +78,24 @@ def stage_residual(
     )
 
 
+def sizes(
+    stages: StageSystem, x: Stages, x_next: Stages, lin: Linearisation
+) -> Sizes:
+    """The sizes of an increment and of the fibre coordinates that it leads to.
+
+    Of the latter those at the end of the step tell enough: it costs time to look at
+    all of them.
+    """
+    increment = increment_size(stages, x, x_next, lin)
+    return Sizes(increment, largest(x_next.node_fibre[-1]))
+
+
 def increment_size(
     stages: StageSystem, x: Stages, x_next: Stages, lin: Linearisation
 ) -> FloatScalar:
     """The size of an increment in fibre coordinates.
 
-    Not finite once the iterates have left the chart, from where they do not return.
+    Not finite once the iterates have left the chart.
     """
     changes = [x_next.node_fibre - x.node_fibre, x_next.velocity - x.velocity]
     if stages.hamiltonian:

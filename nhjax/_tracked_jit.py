@@ -99,11 +99,11 @@ def _changed(before: list[Entry], after: list[Entry]) -> dict[Place, object]:
     for one, other in (atoms, atoms[::-1]):
         for place, entry in one.items():
             there = other.get(place)
-            if isinstance(entry.atom, Unrepeatable):
+            if isinstance(entry.content, Unrepeatable):
                 continue
             if there is None and isinstance(entry.owner, list | set | deque):
                 # Of what grows, the next element would be unknown again.
                 place = all_of(entry.owner)
-            if there is None or there.atom != entry.atom:
+            if there is None or there.content != entry.content:
                 changed[place] = entry.owner
     return changed
