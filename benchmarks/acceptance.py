@@ -1,7 +1,9 @@
 """A search for steps that are accepted though they are not solved.
 
 Every system of the gallery and ten random ones, over steps from h = 0.004 up to
-failure, by `SimplifiedNewton` and by `Newton` from the same states. A step that a
+failure, by `SimplifiedNewton` and by `Newton` from the same states; then single steps
+from many states of systems with steep potentials, and of a body in a chart that it may
+leave. A step that a
 solver accepts is judged by figures that are computed here: the residual of the stage
 equations at the stages found, relative to the size of its terms; the violation of the
 constraints at the end, relative to the size of theirs; and the distance of the two
@@ -184,6 +186,74 @@ def run(
     return jax.lax.map(of_size, sizes)
 
 
+@eqx.filter_jit
+def single_steps(
+    system: nhjax.LagrangianSystem,
+    method: nhjax.AbstractMethod,
+    starts: nhjax.State,
+    sizes: Float[Array, " k"],
+) -> Row:
+    """A step of its own size from each of the states, by both solvers."""
+    go_on = jnp.asarray(False)
+    solvers = nhjax.SimplifiedNewton(), nhjax.Newton()
+
+    def one(given):
+        y0, h = given
+        t = jnp.zeros_like(h)
+        node = first_node(system, method, t, y0, None)
+        stages = StageSystem.at(system, method, t, h, node.state, None)
+        first, second = (
+            step(system, method, solver, t, h, node, None, go_on) for solver in solvers
+        )
+        return Row(judge(stages, first), judge(stages, second), apart(first, second))
+
+    return jax.lax.map(one, (starts, sizes))
+
+
+def steep_systems() -> dict[str, tuple[nhjax.LagrangianSystem, Callable]]:
+    """Systems that lead iterations astray, each with a draw of configurations."""
+
+    def particle(potential):
+        return nhjax.LagrangianSystem(lambda t, q, v, args: 0.5 * v @ v - potential(q))
+
+    def away_from_zero(generator, k):
+        return jnp.asarray(generator.uniform(0.4, 2.0, (k, 2)))
+
+    body = nhjax.LagrangianSystem(
+        lambda t, q, v, args: (
+            0.5 * v @ (jnp.array([1.0, 2.0, 2.5]) * v) - nhjax.SO3().matrix(q)[0, 0]
+        ),
+        manifold=nhjax.SO3(retraction=nhjax.Exponential()),
+    )
+
+    def at_rest(generator, k):
+        return jnp.tile(jnp.array([1.0, 0.0, 0.0, 0.0]), (k, 1))
+
+    return {
+        "wall": (particle(lambda q: jnp.sum(q**-12.0)), away_from_zero),
+        "Morse": (
+            particle(lambda q: jnp.sum((1 - jnp.exp(-4 * (q - 1))) ** 2)),
+            away_from_zero,
+        ),
+        "Kepler": (particle(lambda q: -1 / jnp.sqrt(q @ q + 1e-4)), away_from_zero),
+        "body, exponential": (body, at_rest),
+    }
+
+
+def measure_starts(name: str, stages: int, number: int, seed: int = 0) -> dict:
+    """The figures of single steps from many states, h from 1e-3 to 3."""
+    system, draw = steep_systems()[name]
+    generator = np.random.default_rng(seed)
+    q = draw(generator, number)
+    n = system.manifold_of(q[0]).dim
+    v = jnp.asarray(2 * generator.standard_normal((number, n)))
+    sizes = jnp.asarray(10 ** generator.uniform(-3, 0.5, number))
+    starts = jax.vmap(lambda q, v: nhjax.initial_state(system, q, v))(q, v)
+    rows = single_steps(system, nhjax.LobattoIIIAB(stages), starts, sizes)
+    alive = np.ones(number, bool)
+    return {"system": name, "stages": stages} | table_row(rows, alive)
+
+
 def apart(first: StepOutcome, second: StepOutcome) -> Float[Array, ""]:
     """The distance of two ends, relative to their size."""
     parts = []
@@ -250,6 +320,7 @@ def main() -> None:
     parser.add_argument("--systems", nargs="+", help="names, or parts of names")
     parser.add_argument("--stages", type=int, nargs="+", default=[2, 3, 4, 5, 6])
     parser.add_argument("--num-steps", type=int, default=200, help="of each size")
+    parser.add_argument("--starts", type=int, default=3000, help="of steep systems")
     options = parser.parse_args()
     jax.config.update("jax_enable_x64", True)
     # The programs run for seconds and would be optimised for minutes.
@@ -266,6 +337,11 @@ def main() -> None:
             data.append(measure(name, stages, make, options.num_steps))
             print(data[-1], flush=True)
             jax.clear_caches()
+    for name in steep_systems():
+        if any(part in name for part in wanted):
+            for stages in options.stages:
+                data.append(measure_starts(name, stages, options.starts))
+                print(data[-1], flush=True)
     rows = []
     for row in data:
         figures = [row[key] for key in COLUMNS.values()]

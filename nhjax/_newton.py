@@ -11,8 +11,10 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array
 
 from ._checks import all_finite, check_flag
+from ._contraction import apply
 from ._custom_types import FloatScalarLike
 from ._iteration import iterate, jacobian_and_value, NOISE_UNITS, Solved
+from ._largest import largest
 from ._leading_structure import leading_structure
 from ._linearisation import Linearisation
 from ._run_checks import check_tolerance, tolerance_array
@@ -30,6 +32,10 @@ from ._stages import Stages, StageSystem
 # One iteration on the stages of a step; the equations are an argument, so that it can
 # be differentiated with respect to what is in them.
 Correction: TypeAlias = Callable[[StageSystem, Stages], Stages]
+
+
+# A residual of more than this, relative to the momenta, is that of no solution.
+_GROSS = 1e-6
 
 
 class AbstractStageSolver(eqx.Module):
@@ -202,7 +208,7 @@ class Newton(AbstractStageSolver):
             noise = increment_size(stages, x, unravel(z + noise), lin) / nudge
             return x_next, found._replace(noise=noise), evaluation
 
-        return iterate(
+        solved = iterate(
             sweep,
             x0,
             scale,
@@ -210,6 +216,15 @@ class Newton(AbstractStageSolver):
             tolerance=self.tolerance,
             noise_units=NOISE_UNITS,
             skip=skip,
+        )
+        # Where forces grow without bound, increments are small far from any solution.
+        residual = apply(lin.momentum_inverse, solved.aux.forces.residual)
+        allowed = jnp.maximum(_GROSS, 1e3 * self.tolerance).astype(scale.dtype)
+        size = jnp.maximum(scale, largest(solved.x.node_fibre))
+        is_near = skip | (largest(residual) <= allowed * size)
+        return solved._replace(
+            converged=solved.converged & is_near,
+            exhausted=solved.exhausted | (solved.converged & ~is_near),
         )
 
     def correction(

@@ -78,9 +78,7 @@ def stage_residual(
     )
 
 
-def sizes(
-    stages: StageSystem, x: Stages, x_next: Stages, lin: Linearisation
-) -> Sizes:
+def sizes(stages: StageSystem, x: Stages, x_next: Stages, lin: Linearisation) -> Sizes:
     """The sizes of an increment and of the fibre coordinates that it leads to.
 
     Of the latter those at the end of the step tell enough: it costs time to look at

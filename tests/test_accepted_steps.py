@@ -7,7 +7,7 @@ import pytest
 
 import nhjax
 from benchmarks._random_systems import random_systems
-from benchmarks.acceptance import ALLOWED, gallery, measure, SAME
+from benchmarks.acceptance import ALLOWED, gallery, measure, measure_starts, SAME
 from nhjax import RESULTS
 
 
@@ -132,3 +132,12 @@ def test_no_accepted_step_is_unsolved(name, stages):
     # The search goes up to failure.
     assert figures["simplified accepted"] < 200
     assert figures["distance"] <= SAME
+
+
+@pytest.mark.parametrize("name", ["Morse", "body, exponential"])
+def test_no_start_leads_to_an_unsolved_step(name):
+    figures = measure_starts(name, 3, number=1500)
+    for solver in ("simplified", "newton"):
+        assert figures[f"{solver} accepted"] > 300
+        assert figures[f"{solver} accepted"] < 1500
+        assert figures[f"{solver} residual"] <= ALLOWED
