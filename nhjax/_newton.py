@@ -22,6 +22,7 @@ from ._scales import fibre_scale
 from ._stage_iteration import (
     corrected,
     Evaluation,
+    fibre_size,
     increment_size,
     sizes,
     stage_residual,
@@ -206,7 +207,8 @@ class Newton(AbstractStageSolver):
             # What round-off of the positions makes of the stages: stiff forces magnify
             # it.
             noise = increment_size(stages, x, unravel(z + noise), lin) / nudge
-            return x_next, found._replace(noise=noise), evaluation
+            found = found._replace(iterate=fibre_size(stages, x_next), noise=noise)
+            return x_next, found, evaluation
 
         solved = iterate(
             sweep,
@@ -218,10 +220,10 @@ class Newton(AbstractStageSolver):
             skip=skip,
         )
         # Where forces grow without bound, increments are small far from any solution.
-        residual = apply(lin.momentum_inverse, solved.aux.forces.residual)
+        gross = apply(lin.momentum_inverse, solved.aux.forces.residual)
         allowed = jnp.maximum(_GROSS, 1e3 * self.tolerance).astype(scale.dtype)
-        size = jnp.maximum(scale, largest(solved.x.node_fibre))
-        is_near = skip | (largest(residual) <= allowed * size)
+        size = jnp.maximum(scale, fibre_size(stages, solved.x))
+        is_near = skip | (largest(gross) <= allowed * size)
         return solved._replace(
             converged=solved.converged & is_near,
             exhausted=solved.exhausted | (solved.converged & ~is_near),

@@ -88,6 +88,16 @@ def sizes(stages: StageSystem, x: Stages, x_next: Stages, lin: Linearisation) ->
     return Sizes(increment, largest(x_next.node_fibre[-1]))
 
 
+def fibre_size(stages: StageSystem, x: Stages) -> FloatScalar:
+    """The size of the fibre coordinates, of the stages or of the nodes.
+
+    The smaller of the two: while an iteration is far from a solution, one of them can
+    be larger than anything that the other has to do with.
+    """
+    fibre = x.momentum if stages.hamiltonian else x.velocity
+    return jnp.minimum(largest(fibre), largest(x.node_fibre))
+
+
 def increment_size(
     stages: StageSystem, x: Stages, x_next: Stages, lin: Linearisation
 ) -> FloatScalar:

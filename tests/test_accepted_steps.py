@@ -109,7 +109,7 @@ def test_round_off_that_stiff_forces_magnify_is_no_failure():
 
 def test_fallback_must_be_a_flag():
     with pytest.raises(TypeError, match="`fallback` must be True or False"):
-        nhjax.SimplifiedNewton(fallback="no")
+        nhjax.SimplifiedNewton(fallback="no")  # pyright: ignore[reportArgumentType]
 
 
 SYSTEMS = gallery() | random_systems()

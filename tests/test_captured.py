@@ -445,3 +445,22 @@ def test_no_library_is_looked_into():
 
     # The function itself and four modules.
     assert len(captured(function)) <= 6
+
+
+def test_a_list_that_tracing_fills_does_not_hide_what_comes_after_it():
+    log, constants = [], {"g": 9.81}
+
+    def lagrangian(t, q, v, args):
+        log.append((q.shape, v.dtype))
+        return 0.5 * v @ v - constants["g"] * q[0]
+
+    system = nhjax.LagrangianSystem(lagrangian)
+
+    def height():
+        y0 = nhjax.initial_state(system, jnp.zeros(1), jnp.zeros(1))
+        sol = nhjax.integrate(system, nhjax.LobattoIIIAB(2), y0, dt=0.1, num_steps=10)
+        return float(sol.ys.q[0, 0])
+
+    assert height() == pytest.approx(-0.5 * 9.81)
+    constants["g"] = 1.0
+    assert height() == pytest.approx(-0.5)
