@@ -298,20 +298,12 @@ def measure(name: str, stages: int, make: Callable, num_steps: int) -> dict:
     return {"system": name, "stages": stages} | table_row(rows, np.asarray(alive))
 
 
+FIGURES = ("accepted", "slow", "other", "residual", "violation")
 COLUMNS = {
-    "steps": "simplified accepted",
-    "slow": "simplified slow",
-    "failed": "simplified other",
-    "residual": "simplified residual",
-    "violation": "simplified violation",
-    "Newton": "newton accepted",
-    "slow ": "newton slow",
-    "failed ": "newton other",
-    "residual ": "newton residual",
-    "violation ": "newton violation",
-    "distance": "distance",
-    "apart": "apart",
-}
+    f"{name}: {figure}": f"{solver} {figure}"
+    for name, solver in (("simplified", "simplified"), ("Newton", "newton"))
+    for figure in FIGURES
+} | {"distance": "distance", "apart": "apart"}
 
 
 def main() -> None:

@@ -37,7 +37,7 @@ from ._run_checks import (
     known,
 )
 from ._saveat import SaveAt, stack_saved
-from ._solution import raise_failures, RESULTS, Solution
+from ._solution import is_unsolved, raise_failures, RESULTS, Solution
 from ._state import State
 from ._step_record import StepRecord
 from ._system import AbstractMechanicalSystem, HamiltonianSystem, LagrangianSystem
@@ -175,24 +175,15 @@ def integrate(
     if not isinstance(num_steps, int) or (needed_by is None and not is_tracing()):
         num_steps = jnp.asarray(num_steps, jnp.int32)
 
-    def run(solver: AbstractStageSolver) -> Solution:
+    def run(solver: AbstractStageSolver, meter: AbstractProgressMeter) -> Solution:
         given = (adjoint, y0, t0, dt, num_steps, args, saveat, meter)
         return _integrate(system, method, solver, *given)
 
-    sol = run(solver)
-    if not is_tracing() and leaves_steps_to_newton(solver) and _is_unsolved(sol):
-        sol = run(replace(solver, fallback=True))
+    sol = run(solver, meter)
+    if not is_tracing() and leaves_steps_to_newton(solver) and is_unsolved(sol):
+        # Silently: the meter has shown its run already.
+        sol = run(replace(solver, fallback=True), NoProgressMeter())
     return raise_failures(sol) if throw else sol
-
-
-def _is_unsolved(sol: Solution) -> bool:
-    """Whether a run has ended because a step could not be solved."""
-    unsolved = (
-        RESULTS.nonlinear_divergence,
-        RESULTS.nonlinear_max_iterations,
-        RESULTS.left_chart,
-    )
-    return any(bool(sol.result == result) for result in unsolved)
 
 
 def _zero_step() -> ValueError:

@@ -126,6 +126,11 @@ def tolerance_array(tolerance: FloatScalarLike) -> Array:
             f"`tolerance` must be a real number, got {reprlib.repr(tolerance)} of type "
             f"{type(tolerance).__name__}."
         )
+    if array.shape != ():
+        raise ShapeError(
+            f"`tolerance` has shape {array.shape}, but a scalar is needed; for several "
+            "values use `jax.vmap`."
+        )
     return array
 
 

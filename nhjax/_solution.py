@@ -127,6 +127,16 @@ class Solution(eqx.Module):
         return _failures(codes, steps)
 
 
+def is_unsolved(sol: Solution) -> bool:
+    """Whether a single run has ended because a step could not be solved."""
+    unsolved = (
+        RESULTS.nonlinear_divergence,
+        RESULTS.nonlinear_max_iterations,
+        RESULTS.left_chart,
+    )
+    return any(bool(sol.result == result) for result in unsolved)
+
+
 def raise_failures(sol: Solution) -> Solution:
     """`sol`, or an `IntegrationError` that names lane, step and reason."""
     codes, steps = sol.result._value, sol.stats["failed_step"]
