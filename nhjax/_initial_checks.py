@@ -2,7 +2,6 @@
 
 from typing import NamedTuple, TYPE_CHECKING
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PyTree
@@ -20,6 +19,7 @@ from ._errors import (
     require,
 )
 from ._linearisation import Linearisation
+from ._rank import dependent_rows, Rank
 from ._state import State
 
 
@@ -36,7 +36,7 @@ class Found(NamedTuple):
     positions: Float[Array, " k"]  # the holonomic constraints
     off_group: FloatScalar
     regularity: FloatScalar
-    ranks: list["Rank"]
+    ranks: list[Rank]
     deficient: list[BoolScalar]
     compatibility: FloatScalar
     allowed: Float[Array, " l"]
@@ -44,61 +44,6 @@ class Found(NamedTuple):
     allowed_off_group: FloatScalar
     legendre_solved: BoolScalar
     projected: BoolScalar
-
-
-class Rank(NamedTuple):
-    """The derivatives of constraints at some configuration, which must have full rank.
-
-    They have k rows of DΓ, or m + k of D2Φ and DΓ. Where Newton's method starts they
-    `count` only if it fails: it may leave the place.
-    """
-
-    jacobian: Float[Array, "l n"]
-    q: PyTree[Array]
-    counts: BoolScalar
-
-    @property
-    def deficient(self) -> BoolScalar:
-        """Whether it counts and is not of full rank."""
-        n, eps = self.jacobian.shape[1], jnp.finfo(self.jacobian.dtype).eps
-        return self.counts & (conditioning(self.jacobian) <= 10 * n * eps)
-
-
-def those_that_count(ranks: list[Rank]) -> list[Rank]:
-    """At most one of each shape: of several, the one that counts.
-
-    Singular values are what costs most here.
-    """
-    merged: dict[tuple[int, ...], Rank] = {}
-    for rank in ranks:
-        other = merged.setdefault(rank.jacobian.shape, rank)
-        if other is not rank:
-            merged[rank.jacobian.shape] = jax.tree.map(
-                lambda x, y, counts=rank.counts: jnp.where(counts, x, y), rank, other
-            )
-    return list(merged.values())
-
-
-def conditioning(matrix: Float[Array, "k l"]) -> FloatScalar:
-    """Smallest over largest singular value, after scaling rows (and columns) to one.
-
-    The scaling makes it blind to the units of single coordinates and constraints.
-    """
-    if matrix.shape[0] == 0:
-        return jnp.ones((), matrix.dtype)
-    rows = jnp.max(jnp.abs(matrix), axis=1)
-    rows = jnp.where(rows > 0, rows, 1)
-    if matrix.shape[0] == matrix.shape[1]:
-        # Each root on its own: a product could overflow.
-        roots = jnp.sqrt(rows)
-        scaled = matrix / roots[:, None] / roots[None, :]
-    else:
-        scaled = matrix / rows[:, None]
-    if matrix.shape[0] > matrix.shape[1]:
-        return jnp.zeros((), matrix.dtype)
-    singular = jnp.linalg.svd(scaled, compute_uv=False)
-    # Not "> 0": what is not a number must not pass for singular.
-    return jnp.where(singular[0] == 0, 0, singular[-1] / singular[0])
 
 
 class _Words(NamedTuple):
@@ -296,24 +241,12 @@ def _dependence_error(case: _Case, rank: Rank) -> DependentConstraintsError:
         )
     names = " and ".join([f"D2{phi}"] * (m > 0) + ["DΓ"] * (k > 0))
     have = "have" if m > 0 and k > 0 else "has"
-    which = _enumerated(
-        [letters[a] for a in _dependent_rows(np.asarray(rank.jacobian))]
-    )
+    which = _enumerated([letters[a] for a in dependent_rows(np.asarray(rank.jacobian))])
     return DependentConstraintsError(
         f"The constraints are dependent: {names} {have} not full rank at q = {rank.q}, "
         f"{case.given_name} = {case.given} (the paper's admissibility condition fails "
         f"for {which}). {advice}"
     )
-
-
-def _dependent_rows(jacobian: np.ndarray) -> list[int]:
-    """The rows that take part in a vanishing combination of rows."""
-    rows = np.max(np.abs(jacobian), axis=1, keepdims=True)
-    left, singular, _ = np.linalg.svd(jacobian / np.where(rows > 0, rows, 1))
-    singular = np.append(singular, np.zeros(len(jacobian) - len(singular)))
-    tolerance = np.sqrt(np.finfo(jacobian.dtype).eps)
-    null = left[:, singular <= tolerance * np.max(singular)]
-    return [a for a, row in enumerate(null) if np.any(np.abs(row) > tolerance)]
 
 
 def _enumerated(names: list[str]) -> str:

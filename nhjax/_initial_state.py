@@ -21,15 +21,10 @@ from ._contraction import inverse
 from ._custom_types import Args, BoolScalar, FloatScalar, FloatScalarLike
 from ._errors import DTypeError, require, ShapeError
 from ._implicit import root
-from ._initial_checks import (
-    check_found,
-    conditioning,
-    Found,
-    Rank,
-    those_that_count,
-)
+from ._initial_checks import check_found, Found
 from ._largest import largest
 from ._linearisation import linearise
+from ._rank import conditioning, Rank, those_that_count
 from ._scales import position_scale, velocity_scale, violation_scale
 from ._state import State
 from ._system import AbstractMechanicalSystem, HamiltonianSystem, LagrangianSystem
