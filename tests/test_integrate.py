@@ -249,6 +249,7 @@ def test_stats():
     assert set(stats) == {
         "num_steps",
         "num_iterations",
+        "num_newton_steps",
         "max_residual",
         "max_constraint_violation",
         "max_multiplier_defect",

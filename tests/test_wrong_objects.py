@@ -41,7 +41,7 @@ def y():
 
 @pytest.mark.parametrize("throw", ["no", "yes", None, 0, 1.0])
 def test_throw_must_be_a_bool(throw):
-    with pytest.raises(TypeError, match="`throw` must be True or False, got "):
+    with pytest.raises(TypeError, match="`throw` must be True or False, .*got "):
         run(throw=throw)
 
 
@@ -88,10 +88,6 @@ def test_coefficients_of_the_most_stages_are_those_of_collocation(method):
         ({"t0": 1e20}, r"`dt` = 0\.1 is below the round-off of the time `t0` = 1e\+20"),
         ({"t0": -1e20}, r"the time `t0` = -1e\+20 in float64"),
         ({"t0": 1.0, "dt": 1e-17}, r"`dt` = 1e-17 is below .* `t0` = 1\.0"),
-        (
-            {"t0": 1.0 - 2e-14, "dt": 1.1e-16, "num_steps": 1000},
-            r"the end of the run, = 1\.0",
-        ),
     ],
 )
 def test_time_must_advance(arguments, message):
@@ -102,8 +98,8 @@ def test_time_must_advance(arguments, message):
 def test_time_must_advance_in_single_precision():
     y0 = OSCILLATOR.initial_state(jnp.float32)
     assert run(y0=y0, dt=1e-3).ts.dtype == jnp.float32
-    with pytest.raises(ValueError, match=r"the end of the run.*in float32"):
-        run(y0=y0, dt=1e-3, num_steps=100_000_000)
+    with pytest.raises(ValueError, match=r"`t0` = 1e\+05 in float32|100000.* float32"):
+        run(y0=y0, t0=1e5, dt=1e-3)
 
 
 def test_time_must_advance_under_jit():
