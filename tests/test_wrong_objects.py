@@ -41,7 +41,7 @@ def y():
 
 @pytest.mark.parametrize("throw", ["no", "yes", None, 0, 1.0])
 def test_throw_must_be_a_bool(throw):
-    with pytest.raises(TypeError, match="`throw` must be True or False, .*got "):
+    with pytest.raises(TypeError, match=r"`throw` must be True or False, .*got "):
         run(throw=throw)
 
 
