@@ -11,8 +11,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, PyTree
 
+from ._checks import real_scalar
 from ._custom_types import Args, FloatScalar, FloatScalarLike, IntScalar
-from ._errors import Check, DTypeError, is_traced, ShapeError
+from ._errors import Check, is_traced, ShapeError
 
 
 # Steps are counted in int32.
@@ -115,23 +116,9 @@ def check_tolerance(tolerance: Any) -> None:
         )
 
 
-def tolerance_array(tolerance: FloatScalarLike) -> Array:
+def tolerance_array(tolerance: FloatScalarLike) -> FloatScalar:
     """The `tolerance` of a solver as an array."""
-    array = jnp.asarray(tolerance) if eqx.is_array_like(tolerance) else None
-    if array is None or not (
-        jnp.issubdtype(array.dtype, jnp.floating)
-        or jnp.issubdtype(array.dtype, jnp.integer)
-    ):
-        raise DTypeError(
-            f"`tolerance` must be a real number, got {reprlib.repr(tolerance)} of type "
-            f"{type(tolerance).__name__}."
-        )
-    if array.shape != ():
-        raise ShapeError(
-            f"`tolerance` has shape {array.shape}, but a scalar is needed; for several "
-            "values use `jax.vmap`."
-        )
-    return array
+    return real_scalar("tolerance", tolerance, jnp.result_type(float))
 
 
 def check_saved(
