@@ -80,8 +80,8 @@ class SimplifiedNewton(AbstractStageSolver):
 
     Where it does not converge, Newton's method with the exact Jacobian may. It takes
     over for such a step, and `Solution.stats["num_newton_steps"]` counts them. A
-    program with both in it takes several times as long to compile, and runs slower also
-    where one would do. So a plain call of `integrate` is repeated with it if it has
+    program with both in it takes longer to compile, and runs slower also where one
+    would do. So a plain call of `integrate` is repeated with it if it has
     failed; in a program of your own (`jax.jit`, `jax.vmap`, `jax.grad`) a step that is
     not solved ends the run, unless you ask for the fallback.
 
