@@ -3,15 +3,16 @@
 Every system of the gallery and ten random ones, over steps from h = 0.004 up to
 failure, by `SimplifiedNewton` and by `Newton` from the same states; then single steps
 from many states of systems with steep potentials, and of a body in a chart that it may
-leave. A step that a
-solver accepts is judged by figures that are computed here: the residual of the stage
-equations at the stages found, relative to the size of its terms; the violation of the
-constraints at the end, relative to the size of theirs; and the distance of the two
-solvers' ends.
+leave. A step that a solver accepts is judged by figures that are computed here: the
+residual of the stage equations at the stages found, relative to the size of its terms;
+the violation of the constraints at the end, relative to the size of theirs; and the
+distance of the two solvers' ends. Where one solver alone accepts a step, the distance
+is that of its stages from where one more iteration of Newton's method takes them.
 
 The terms of an equation r(x; q) = 0 have the size |∂r/∂x| |x| + |∂r/∂q| |q|, in which
 |x| is the largest of the velocities, of the multipliers and so on: nothing smaller than
-the unit round-off times that can be asked of r (Oettli and Prager, 1964).
+the unit round-off times that can be asked of r (Oettli and Prager, 1964). Accelerations
+count by what they do in a step: |u̇| is at least |u| / h.
 """
 
 import argparse
@@ -80,6 +81,7 @@ class Judged(NamedTuple):
     result: Array
     num_iterations: Array
     residual: Array
+    correction: Array
     violation: Array
 
 
@@ -93,16 +95,22 @@ class Row(NamedTuple):
 
 def judge(stages: StageSystem, outcome: StepOutcome) -> Judged:
     """The figures of a step, from the stages and the state that were found."""
+    residual, correction = residual_and_correction(stages, outcome.stages)
     return Judged(
         jnp.asarray(outcome.result._value),
         outcome.num_iterations,
-        relative_residual(stages, outcome.stages),
+        residual,
+        correction,
         relative_violation(stages, outcome.node),
     )
 
 
-def relative_residual(stages: StageSystem, x: Stages) -> Float[Array, ""]:
-    """The largest residual of the stage equations over the size of its terms."""
+def residual_and_correction(
+    stages: StageSystem, x: Stages
+) -> tuple[Float[Array, ""], Float[Array, ""]]:
+    """The largest residual of the stage equations over the size of its terms, and how
+    far Newton's method would move the velocities, relative to their size.
+    """
     z, unravel = ravel_pytree(x)
 
     def equations(z, stages):
@@ -111,9 +119,24 @@ def relative_residual(stages: StageSystem, x: Stages) -> Float[Array, ""]:
     r = equations(z, stages)
     jacobian = jax.jacfwd(equations)(z, stages)
     moved = equations(z, stages.nudged(jnp.asarray(NUDGE)))
-    sizes, _ = ravel_pytree(jax.tree.map(lambda x: jnp.full_like(x, largest(x)), x))
-    terms = jnp.abs(jacobian) @ sizes + jnp.abs(moved - r) / NUDGE
-    return largest_ratio(r, terms)
+    terms = jnp.abs(jacobian) @ block_sizes(stages, x) + jnp.abs(moved - r) / NUDGE
+    change = unravel(jnp.linalg.solve(jacobian, -r))
+    correction = largest(change.velocity, change.node_fibre) / (
+        1 + largest(x.velocity, x.node_fibre)
+    )
+    return largest_ratio(r, terms), correction
+
+
+def block_sizes(stages: StageSystem, x: Stages) -> Float[Array, " k"]:
+    """For each unknown the size of the largest of its kind."""
+    sizes = jax.tree.map(largest, x)
+    slowest = sizes.node_fibre / jnp.abs(stages.h)
+    sizes = eqx.tree_at(
+        lambda sizes: sizes.end_acceleration,
+        sizes,
+        jnp.maximum(sizes.end_acceleration, slowest),
+    )
+    return ravel_pytree(jax.tree.map(jnp.full_like, x, sizes))[0]
 
 
 def relative_violation(stages: StageSystem, node: Node) -> Float[Array, ""]:
@@ -263,30 +286,39 @@ def apart(first: StepOutcome, second: StepOutcome) -> Float[Array, ""]:
     return jnp.max(jnp.stack(parts))
 
 
+FAILURES = {
+    "slow": nhjax.RESULTS.nonlinear_max_iterations,
+    "diverged": nhjax.RESULTS.nonlinear_divergence,
+    "left chart": nhjax.RESULTS.left_chart,
+}
+
+
 def table_row(rows: Row, alive: np.ndarray) -> dict[str, float | int]:
     """Counts of what became of the steps, and the worst figures of accepted ones."""
-    good, slow = (
-        int(result._value)
-        for result in (
-            nhjax.RESULTS.successful,
-            nhjax.RESULTS.nonlinear_max_iterations,
-        )
-    )
     figures: dict[str, float | int] = {}
+    accepted = []
     for name, judged in (("simplified", rows.simplified), ("newton", rows.newton)):
-        result = np.asarray(judged.result)[alive]
-        accepted = result == good
-        figures[f"{name} accepted"] = int(np.sum(accepted))
-        figures[f"{name} slow"] = int(np.sum(result == slow))
-        figures[f"{name} other"] = int(np.sum((result != good) & (result != slow)))
+        result = np.asarray(judged.result)
+        good = alive & (result == int(nhjax.RESULTS.successful._value))
+        figures[f"{name} accepted"] = int(np.sum(good))
+        for failure, code in FAILURES.items():
+            count = np.sum(alive & (result == int(code._value)))
+            figures[f"{name} {failure}"] = int(count)
+        counted = sum(figures[f"{name} {key}"] for key in ("accepted", *FAILURES))
+        figures[f"{name} other"] = int(np.sum(alive) - counted)
         for figure in ("residual", "violation"):
-            values = np.asarray(getattr(judged, figure))[alive][accepted]
+            values = np.asarray(getattr(judged, figure))[good]
             figures[f"{name} {figure}"] = float(np.max(values, initial=0))
-    both = (np.asarray(rows.simplified.result) == good) & alive
-    both &= np.asarray(rows.newton.result) == good
-    distance = np.asarray(rows.distance)[both]
+        accepted.append(good)
+    first, second = accepted
+    distance = np.where(
+        first & second,
+        rows.distance,
+        np.where(first, rows.simplified.correction, rows.newton.correction),
+    )[first | second]
     figures["distance"] = float(np.max(distance, initial=0))
-    figures["apart"] = int(np.sum(distance > SAME))
+    # What is not a number is not the same either.
+    figures["apart"] = int(np.sum(~(distance <= SAME)))
     return figures
 
 
@@ -298,7 +330,7 @@ def measure(name: str, stages: int, make: Callable, num_steps: int) -> dict:
     return {"system": name, "stages": stages} | table_row(rows, np.asarray(alive))
 
 
-FIGURES = ("accepted", "slow", "other", "residual", "violation")
+FIGURES = ("accepted", *FAILURES, "other", "residual", "violation")
 COLUMNS = {
     f"{name}: {figure}": f"{solver} {figure}"
     for name, solver in (("simplified", "simplified"), ("Newton", "newton"))
