@@ -28,11 +28,11 @@ from jaxtyping import Array, Float
 
 import nhjax
 from nhjax import systems
-from nhjax._largest import largest
-from nhjax._scales import position_scale, violation_scale
-from nhjax._stage_iteration import stage_residual
-from nhjax._stages import Stages, StageSystem
-from nhjax._step import first_node, Node, step, StepOutcome
+from nhjax._numerics import max_norm
+from nhjax._step import first_step_state, step, StepOutcome, StepState
+from nhjax._step._stage_iteration import stage_residual
+from nhjax._step._stages import Stages, StageSystem
+from nhjax._system import position_scale, violation_scale
 
 from ._random_systems import random_systems
 from ._report import markdown_table, number, write
@@ -101,7 +101,7 @@ def judge(stages: StageSystem, outcome: StepOutcome) -> Judged:
         outcome.num_iterations,
         residual,
         correction,
-        relative_violation(stages, outcome.node),
+        relative_violation(stages, outcome.step_state),
     )
 
 
@@ -121,16 +121,16 @@ def residual_and_correction(
     moved = equations(z, stages.nudged(jnp.asarray(NUDGE)))
     terms = jnp.abs(jacobian) @ block_sizes(stages, x) + jnp.abs(moved - r) / NUDGE
     change = unravel(jnp.linalg.solve(jacobian, -r))
-    correction = largest(change.velocity, change.node_fibre) / (
-        1 + largest(x.velocity, x.node_fibre)
+    correction = max_norm(change.velocity, change.node_fibre_coordinate) / (
+        1 + max_norm(x.velocity, x.node_fibre_coordinate)
     )
     return largest_ratio(r, terms), correction
 
 
 def block_sizes(stages: StageSystem, x: Stages) -> Float[Array, " k"]:
     """For each unknown the size of the largest of its kind."""
-    sizes = jax.tree.map(largest, x)
-    slowest = sizes.node_fibre / jnp.abs(stages.h)
+    sizes = jax.tree.map(max_norm, x)
+    slowest = sizes.node_fibre_coordinate / jnp.abs(stages.h)
     sizes = eqx.tree_at(
         lambda sizes: sizes.end_acceleration,
         sizes,
@@ -139,10 +139,10 @@ def block_sizes(stages: StageSystem, x: Stages) -> Float[Array, " k"]:
     return ravel_pytree(jax.tree.map(jnp.full_like, x, sizes))[0]
 
 
-def relative_violation(stages: StageSystem, node: Node) -> Float[Array, ""]:
+def relative_violation(stages: StageSystem, step_state: StepState) -> Float[Array, ""]:
     """The largest violation of a constraint at the end over the size of its terms."""
     system, t, args = stages.system, stages.t + stages.h, stages.args
-    q, u = node.state.q, system.fibre(node.state)
+    q, u = step_state.state.q, system.fibre_coordinate(step_state.state)
     manifold = system.manifold_of(q)
 
     def on_velocities(q):
@@ -154,7 +154,7 @@ def relative_violation(stages: StageSystem, node: Node) -> Float[Array, ""]:
         )
     )(jnp.eye(u.size))
     size = jnp.max(jnp.abs(ravel_pytree(q)[0]))
-    terms = violation_scale(system, node.lin, t, q, u, args)
+    terms = violation_scale(system, step_state.lin, t, q, u, args)
     terms = terms + jnp.sum(jnp.abs(rates), axis=0) * size
     positions = system.position_constraint(t, q, args)
     return jnp.maximum(
@@ -182,26 +182,26 @@ def run(
 
     def of_size(h):
         def advance(carry, k):
-            node, alive = carry
+            step_state, alive = carry
             t = k * h
-            stages = StageSystem.at(system, method, t, h, node.state, None)
+            stages = StageSystem.at(system, method, t, h, step_state.state, None)
             first, second = (
-                step(system, method, solver, t, h, node, None, go_on)
+                step(system, method, solver, t, h, step_state, None, go_on)
                 for solver in solvers
             )
             row = Row(judge(stages, first), judge(stages, second), apart(first, second))
             good = first.result == nhjax.RESULTS.successful
             # Where the faster solver fails, the run goes on with the other one.
             other = second.result == nhjax.RESULTS.successful
-            node = jax.tree.map(
+            step_state = jax.tree.map(
                 lambda old, a, b: jnp.where(good, a, jnp.where(other, b, old)),
-                node,
-                first.node,
-                second.node,
+                step_state,
+                first.step_state,
+                second.step_state,
             )
-            return (node, alive & (good | other)), (row, alive)
+            return (step_state, alive & (good | other)), (row, alive)
 
-        start = first_node(system, method, jnp.zeros_like(h), y0, None)
+        start = first_step_state(system, method, jnp.zeros_like(h), y0, None)
         steps = jnp.arange(num_steps, dtype=h.dtype)
         _, rows = jax.lax.scan(advance, (start, jnp.asarray(True)), steps)
         return rows
@@ -223,10 +223,11 @@ def single_steps(
     def one(given):
         y0, h = given
         t = jnp.zeros_like(h)
-        node = first_node(system, method, t, y0, None)
-        stages = StageSystem.at(system, method, t, h, node.state, None)
+        step_state = first_step_state(system, method, t, y0, None)
+        stages = StageSystem.at(system, method, t, h, step_state.state, None)
         first, second = (
-            step(system, method, solver, t, h, node, None, go_on) for solver in solvers
+            step(system, method, solver, t, h, step_state, None, go_on)
+            for solver in solvers
         )
         return Row(judge(stages, first), judge(stages, second), apart(first, second))
 
@@ -281,7 +282,9 @@ def apart(first: StepOutcome, second: StepOutcome) -> Float[Array, ""]:
     """The distance of two ends, relative to their size."""
     parts = []
     for name in ("q", "p"):
-        a, b = (ravel_pytree(getattr(x.node.state, name))[0] for x in (first, second))
+        a, b = (
+            ravel_pytree(getattr(x.step_state.state, name))[0] for x in (first, second)
+        )
         parts.append(jnp.max(jnp.abs(a - b)) / (1 + jnp.max(jnp.abs(b))))
     return jnp.max(jnp.stack(parts))
 

@@ -72,7 +72,7 @@ def main() -> None:
     for name, example, method, dt in cases:
         rms = energy_rms(example, method, dt, counts, options.members)
         slope = float(np.polyfit(np.log(counts[2:]), np.log(rms[2:]), 1)[0])
-        label = f"{type(method).__name__}({method.stages}), {method.multiplier}"
+        label = f"{type(method).__name__}({method.stages}), {method.closure}"
         rows.append([name, label, f"{slope:.2f}"])
         rows[-1] += [number(x) for x in rms[[0, len(rms) // 2, -1]]]
         data.append(

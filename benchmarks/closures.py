@@ -94,7 +94,7 @@ def _order(case, system, method, y0) -> tuple[float, float]:
             dt=dt,
             num_steps=counts[-1],
             saveat=nhjax.SaveAt(steps=True),
-            solver=nhjax.Newton(),
+            stage_solver=nhjax.Newton(),
             throw=False,
         ).ys
 

@@ -53,7 +53,7 @@ def measure(
             y0,
             dt=0.1,
             num_steps=num_steps,
-            solver=solver,
+            stage_solver=solver,
             throw=False,
         )
 

@@ -25,8 +25,8 @@ import numpy as np
 from jaxtyping import Array
 
 import nhjax
-from nhjax._elementary import is_elementary
-from nhjax._kernel import in_one_kernel
+from nhjax._compile import as_cpu_kernel
+from nhjax._compile._elementary import is_elementary
 
 from ._report import markdown_table, number, write
 from .floor import initial_data, one_core
@@ -84,7 +84,7 @@ def eliminated(matrix: Array) -> Array:
     return jax.lax.fori_loop(0, size, eliminate, matrix)
 
 
-def largest(x: Array) -> Array:
+def max_norm(x: Array) -> Array:
     """max |x| over all but the members, in integers as nhjax finds it."""
     bits = jax.lax.bitcast_convert_type(jnp.abs(x), jnp.int64)
     return jax.lax.bitcast_convert_type(jnp.max(bits, axis=(0, 1)), x.dtype)
@@ -96,7 +96,7 @@ def stripped(s: int) -> Run:
     q and v may have one more axis, the last, of members.
     """
     method = nhjax.LobattoIIIAB(s)
-    a, a_hat, b, E = method.a, method.a_hat, method.b, method.closure.E
+    a, a_hat, b, E = method.a, method.a_hat, method.b, method.closure_weights.E
     eps = float(np.finfo(float).eps)
 
     def hidden(q: Array, v: Array, acceleration: Array) -> Array:
@@ -137,9 +137,9 @@ def stripped(s: int) -> Run:
         schur_inverse = eliminated(jnp.swapaxes(schur, 0, 1))
         last = normals[-1]
         compliance = 1 / jnp.sum(last * last, axis=0)
-        scale = largest(velocity) + h * largest(acceleration[None])
+        scale = max_norm(velocity) + h * max_norm(acceleration[None])
         floor = jnp.maximum(tolerance, eps)
-        reach = largest(normals)
+        reach = max_norm(normals)
 
         def sweep(now: tuple[Array, ...]) -> tuple[Array, ...]:
             velocity, node, y, end, end_acceleration, *progress, _ = now
@@ -164,9 +164,9 @@ def stripped(s: int) -> Run:
             y_next, end_next = y + h_dy / h, end + d_end
             change = multipliers(y_next, end_next) - lam
             sizes = [
-                largest(velocity_next - velocity),
-                largest(node_next - node),
-                h * largest(change[:, None]) * reach,
+                max_norm(velocity_next - velocity),
+                max_norm(node_next - node),
+                h * max_norm(change[:, None]) * reach,
             ]
             size = reduce(jnp.maximum, sizes)
             stalls = size >= smallest
@@ -222,7 +222,7 @@ def nhjax_run(s: int, num_steps: int, tolerance: float) -> Callable[..., Any]:
             y0,
             dt=T / num_steps,
             num_steps=num_steps,
-            solver=solver,
+            stage_solver=solver,
             throw=False,
         )
         return sol.ys.q[-1], sol.stats["num_iterations"]
@@ -241,7 +241,7 @@ def stripped_run(
 
     def kernel(q: Array, v: Array) -> tuple[Array, ...]:
         assert is_elementary(jax.make_jaxpr(whole_run)(q, v).jaxpr), "not one kernel"
-        return in_one_kernel(whole_run, q, v)
+        return as_cpu_kernel(whole_run, q, v)
 
     def block(start: tuple[Array, Array]) -> tuple[Array, Array]:
         if lanes == 1:

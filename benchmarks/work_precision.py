@@ -172,7 +172,7 @@ def nhjax_runs(case: Case, stages: tuple[int, ...], limit: int) -> Iterator[Run]
                     y0,
                     dt=case.t / num_steps,
                     num_steps=num_steps,
-                    solver=nhjax.SimplifiedNewton(tolerance=tolerance),
+                    stage_solver=nhjax.SimplifiedNewton(tolerance=tolerance),
                     throw=False,
                 )
                 stats = sol.stats["num_iterations"], sol.stats["num_steps"]

@@ -1,11 +1,6 @@
 """High-order geometric integrators for nonholonomic mechanical systems, in JAX."""
 
 from . import plot as plot, systems as systems
-from ._adjoint import (
-    AbstractAdjoint as AbstractAdjoint,
-    DirectAdjoint as DirectAdjoint,
-    RecursiveCheckpointAdjoint as RecursiveCheckpointAdjoint,
-)
 from ._errors import (
     ConstraintViolationError as ConstraintViolationError,
     DependentConstraintsError as DependentConstraintsError,
@@ -17,9 +12,21 @@ from ._errors import (
     NonFiniteError as NonFiniteError,
     ShapeError as ShapeError,
 )
-from ._initial_state import initial_state as initial_state
-from ._integrate import integrate as integrate
-from ._interpolation import DenseInterpolation as DenseInterpolation
+from ._initial import initial_state as initial_state
+from ._integrate import (
+    AbstractAdjoint as AbstractAdjoint,
+    AbstractProgressMeter as AbstractProgressMeter,
+    DenseInterpolation as DenseInterpolation,
+    DirectAdjoint as DirectAdjoint,
+    integrate as integrate,
+    NoProgressMeter as NoProgressMeter,
+    RecursiveCheckpointAdjoint as RecursiveCheckpointAdjoint,
+    ReversibleAdjoint as ReversibleAdjoint,
+    SaveAt as SaveAt,
+    Solution as Solution,
+    TextProgressMeter as TextProgressMeter,
+    TqdmProgressMeter as TqdmProgressMeter,
+)
 from ._manifold import (
     AbstractLieGroup as AbstractLieGroup,
     AbstractRetraction as AbstractRetraction,
@@ -38,25 +45,18 @@ from ._method import (
     LobattoIIIAB as LobattoIIIAB,
     PartitionedRungeKutta as PartitionedRungeKutta,
 )
-from ._newton import (
+from ._results import RESULTS as RESULTS
+from ._step import (
     AbstractStageSolver as AbstractStageSolver,
     Newton as Newton,
     SimplifiedNewton as SimplifiedNewton,
 )
-from ._progress_meter import (
-    AbstractProgressMeter as AbstractProgressMeter,
-    NoProgressMeter as NoProgressMeter,
-    TextProgressMeter as TextProgressMeter,
-    TqdmProgressMeter as TqdmProgressMeter,
-)
-from ._reversible import ReversibleAdjoint as ReversibleAdjoint
-from ._saveat import SaveAt as SaveAt
-from ._solution import RESULTS as RESULTS, Solution as Solution
-from ._state import State as State
 from ._system import (
     AbstractMechanicalSystem as AbstractMechanicalSystem,
+    continuous_multiplier as continuous_multiplier,
     HamiltonianSystem as HamiltonianSystem,
     LagrangianSystem as LagrangianSystem,
+    State as State,
 )
 from .diagnostics import (
     convergence_order as convergence_order,

@@ -13,7 +13,7 @@ import jax
 
 from . import __version__
 from ._errors import IntegrationError
-from ._method._abstract import MULTIPLIERS
+from ._method import CLOSURES
 from .studies import ArgumentError, STUDIES, write
 
 
@@ -174,8 +174,8 @@ _OPTIONS: dict[str, dict[str, Any]] = {
         "metavar": "J",
         "help": "the ensemble holds the members 0..J",
     },
-    "multiplier": {
-        "choices": MULTIPLIERS,
+    "closure": {
+        "choices": CLOSURES,
         "help": "how the multiplier is closed from step to step",
     },
     "times": {

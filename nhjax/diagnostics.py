@@ -9,12 +9,16 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ._checks import check_type
 from ._custom_types import Args
 from ._errors import is_traced, ShapeError
-from ._solution import Solution
-from ._state import State
-from ._system import AbstractMechanicalSystem, HamiltonianSystem, LagrangianSystem
+from ._integrate import Solution
+from ._system import (
+    AbstractMechanicalSystem,
+    check_type,
+    HamiltonianSystem,
+    LagrangianSystem,
+    State,
+)
 
 
 def energy_error(

@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ._custom_types import Args
-from ._solution import Solution
+from ._integrate import Solution
 from ._system import AbstractMechanicalSystem
 from .diagnostics import (
     check_system,

@@ -12,9 +12,9 @@ from group_mechanics import MatrixGroup
 from jaxtyping import Array
 
 import nhjax
-from nhjax._stages import Stages
-from nhjax._state import State
-from nhjax._step import first_node, step
+from nhjax._step import first_step_state, step
+from nhjax._step._stages import Stages
+from nhjax._system import State
 
 
 FORMS = ("lagrangian", "hamiltonian")
@@ -341,19 +341,25 @@ def solved_steps(
     """Consecutive steps from a state at t = 0, as NumPy arrays."""
     never = jnp.asarray(False)
 
-    def advance(node, t):
-        outcome = step(system, method, solver, t, jnp.asarray(h), node, None, never)
+    def advance(step_state, t):
+        outcome = step(
+            system, method, solver, t, jnp.asarray(h), step_state, None, never
+        )
         x, record = outcome.stages, outcome.record
         taken = SolvedStep(
-            node.state, outcome.node.state, x, record.force, record.multiplier
+            step_state.state,
+            outcome.step_state.state,
+            x,
+            record.force,
+            record.multiplier,
         )
-        return outcome.node, (taken, outcome.result == nhjax.RESULTS.successful)
+        return outcome.step_state, (taken, outcome.result == nhjax.RESULTS.successful)
 
     # Compiling without optimisation takes half the time.
     @partial(jax.jit, compiler_options={"xla_backend_optimization_level": 0})
     def run(y0):
-        node = first_node(system, method, jnp.zeros(()), y0, None)
-        return jax.lax.scan(advance, node, h * jnp.arange(float(num_steps)))[1]
+        step_state = first_step_state(system, method, jnp.zeros(()), y0, None)
+        return jax.lax.scan(advance, step_state, h * jnp.arange(float(num_steps)))[1]
 
     steps, converged = run(y0)
     assert np.all(converged)

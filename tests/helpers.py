@@ -209,7 +209,7 @@ def integrate_recorded(name, stages, closure, solver, y0, dt, t0=0.0, throw=True
         num_steps=RECORDED_STEPS,
         t0=t0,
         args=args,
-        solver=SOLVERS[solver],
+        stage_solver=SOLVERS[solver],
         throw=throw,
         saveat=nhjax.SaveAt(t0=True, steps=True, dense=True),
     )

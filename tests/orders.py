@@ -23,7 +23,7 @@ def runs_of_all_steps(system, method, y0, dts, num_steps, args, solver):
     """One lane for each dt, with the continuous multiplier beside the state."""
 
     def with_multiplier(t, y, args):
-        return y, system.multiplier(t, y, args)
+        return y, nhjax.continuous_multiplier(system, t, y, args)
 
     def run(dt):
         return nhjax.integrate(
@@ -33,7 +33,7 @@ def runs_of_all_steps(system, method, y0, dts, num_steps, args, solver):
             dt=dt,
             num_steps=num_steps,
             args=args,
-            solver=solver,
+            stage_solver=solver,
             throw=False,  # Runs of few steps go on beyond the duration.
             saveat=nhjax.SaveAt(steps=True, fn=with_multiplier),
         )
@@ -41,11 +41,12 @@ def runs_of_all_steps(system, method, y0, dts, num_steps, args, solver):
     return jax.vmap(run)(dts)
 
 
-def trajectories(system, method, y0, counts, args=None, solver=None):
+def trajectories(system, method, y0, counts, args=None, stage_solver=None):
     """Nodes of runs of N = counts[lane] steps over the duration, as one program."""
     dts = DURATION / jnp.asarray(counts, float)
-    solver = solver_for(method.stages) if solver is None else solver
-    sol = runs_of_all_steps(system, method, y0, dts, max(counts), args, solver)
+    if stage_solver is None:
+        stage_solver = solver_for(method.stages)
+    sol = runs_of_all_steps(system, method, y0, dts, max(counts), args, stage_solver)
     lanes = []
     for lane, count in enumerate(counts):
         assert not 0 <= sol.stats["failed_step"][lane] < count

@@ -43,19 +43,19 @@ def test_a_slow_iteration_is_not_taken_for_a_solution():
     assert float(sol.stats["max_constraint_violation"]) < ROUND_OFF
     assert float(sol.stats["max_residual"]) < ROUND_OFF
     with pytest.raises(nhjax.IntegrationError, match=r"step 1: .*`max_iterations`"):
-        swing(solver=nhjax.SimplifiedNewton(fallback=False), throw=True)
+        swing(stage_solver=nhjax.SimplifiedNewton(fallback=False), throw=True)
 
 
 def test_a_diverging_iteration_is_told_from_a_slow_one():
-    sol = swing(dt=3.0, solver=nhjax.SimplifiedNewton(fallback=False))
+    sol = swing(dt=3.0, stage_solver=nhjax.SimplifiedNewton(fallback=False))
     assert sol.result == RESULTS.nonlinear_divergence
     assert int(sol.stats["num_iterations"]) < 100
 
 
 @pytest.mark.parametrize("compiled", [False, True], ids=["plain", "jit"])
 def test_newtons_method_takes_over_steps_that_need_it(compiled):
-    run = jax.jit(lambda: swing(solver=WITH_NEWTON)) if compiled else swing
-    sol, expected = run(), swing(solver=nhjax.Newton())
+    run = jax.jit(lambda: swing(stage_solver=WITH_NEWTON)) if compiled else swing
+    sol, expected = run(), swing(stage_solver=nhjax.Newton())
     assert sol.result == expected.result == RESULTS.successful
     assert 0 < int(sol.stats["num_newton_steps"]) < 9
     assert int(expected.stats["num_newton_steps"]) == 0
@@ -72,7 +72,7 @@ def test_a_plain_call_that_needs_no_newton_step_counts_none():
 
 def test_members_of_a_batch_take_newtons_method_one_by_one():
     sizes = jnp.array([0.1, 0.5])
-    sol = jax.vmap(lambda dt: swing(dt=dt, solver=WITH_NEWTON))(sizes)
+    sol = jax.vmap(lambda dt: swing(dt=dt, stage_solver=WITH_NEWTON))(sizes)
     assert [int(x) for x in sol.stats["num_steps"]] == [9, 9]
     easy, hard = sol.stats["num_newton_steps"]
     assert int(easy) == 0
@@ -84,7 +84,7 @@ def test_a_gradient_passes_through_steps_of_newtons_method():
 
     def height(dt, solver):
         end = nhjax.integrate(
-            system, nhjax.LobattoIIIAB(3), y0, dt=dt, num_steps=4, solver=solver
+            system, nhjax.LobattoIIIAB(3), y0, dt=dt, num_steps=4, stage_solver=solver
         )
         return end.ys.q[-1, 3]
 
@@ -101,7 +101,12 @@ def test_round_off_that_stiff_forces_magnify_is_no_failure():
     y0 = nhjax.initial_state(system, jnp.array([1.00001, 0.99999]), jnp.zeros(2))
     for solver in (nhjax.SimplifiedNewton(), nhjax.Newton()):
         sol = nhjax.integrate(
-            system, nhjax.LobattoIIIAB(3), y0, dt=5e-6, num_steps=200, solver=solver
+            system,
+            nhjax.LobattoIIIAB(3),
+            y0,
+            dt=5e-6,
+            num_steps=200,
+            stage_solver=solver,
         )
         phase = 1e5 * 5e-6 * 200
         np.testing.assert_allclose(sol.ys.q[0, 0] - 1, 1e-5 * np.cos(phase), atol=1e-6)

@@ -93,7 +93,7 @@ def driven(given, adjoint, method, num_steps=10, samples=False, **options):
     ("method", "options"),
     [
         (LobattoIIIAB(2), {"samples": True}),
-        (LobattoIIIAB(2, "consistent"), {"solver": nhjax.Newton()}),
+        (LobattoIIIAB(2, "consistent"), {"stage_solver": nhjax.Newton()}),
         (LobattoIIIAB(2, "propagated"), {}),
     ],
     ids=["samples", "Newton", "propagated"],

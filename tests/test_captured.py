@@ -12,7 +12,7 @@ import pytest
 
 import nhjax
 from nhjax import SaveAt
-from nhjax._captured import captured, MOST_ENTRIES
+from nhjax._compile._captured import captured, MOST_ENTRIES
 
 
 traces: list[int] = []

@@ -133,7 +133,9 @@ def test_the_parts_of_a_state_agree(sol):
     np.testing.assert_allclose(state.p, PARTICLE.system.momentum(t, state.q, state.v))
     np.testing.assert_allclose(rate.q, state.v, atol=1e-4)
     np.testing.assert_allclose(
-        state.multiplier, PARTICLE.system.multiplier(t, state), rtol=1e-13
+        state.multiplier,
+        nhjax.continuous_multiplier(PARTICLE.system, t, state),
+        rtol=1e-13,
     )
     # The constraint is imposed at the nodes alone.
     violation = jnp.abs(PARTICLE.system.constraint_violation(t, state))[0]

@@ -134,7 +134,7 @@ def give_up(dt, adjoint):
             particle.initial_state(),
             dt=dt,
             num_steps=2,
-            solver=nhjax.SimplifiedNewton(max_iterations=2),
+            stage_solver=nhjax.SimplifiedNewton(max_iterations=2),
             adjoint=adjoint,
         ).ys.q
     )

@@ -57,9 +57,9 @@ def test_public_objects_are_documented(name, value):
 def test_there_are_examples():
     tested = {test.name for test in _examples()}
     for module, name in (
-        ("_integrate", "integrate"),
-        ("_saveat", "SaveAt"),
-        ("_initial_state", "initial_state"),
+        ("_integrate._integrate", "integrate"),
+        ("_integrate._saveat", "SaveAt"),
+        ("_initial._initial_state", "initial_state"),
     ):
         assert f"nhjax.{module}.{name}" in tested
     assert len(tested) > 20

@@ -558,7 +558,11 @@ def run(y0, system: Any = SYSTEM, method: Any = METHOD, **others):
             TypeError,
             r"`method`.*the class itself; write LobattoIIIAB\(\.\.\.\)",
         ),
-        ({"solver": "newton"}, TypeError, r"`solver`.*got 'newton'.*nhjax\.Newton\(\)"),
+        (
+            {"stage_solver": "newton"},
+            TypeError,
+            r"`stage_solver`.*got 'newton'.*nhjax\.Newton\(\)",
+        ),
         ({"saveat": True}, TypeError, "`saveat` must be an nhjax.SaveAt, got True"),
         (
             {"progress_meter": True},

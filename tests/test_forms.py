@@ -26,9 +26,9 @@ from group_problems import (
 from jax.flatten_util import ravel_pytree
 
 import nhjax
-from nhjax._stages import StageSystem
-from nhjax._state import State
-from nhjax._step import first_node
+from nhjax._step import first_step_state
+from nhjax._step._stages import StageSystem
+from nhjax._system import State
 
 
 STEP = 0.1
@@ -189,9 +189,9 @@ def one_step(system, method, y0):
     @jax.jit
     def run(y0):
         t, h = jnp.zeros(()), jnp.asarray(STEP)
-        lin = first_node(system, method, t, y0, None).lin
+        lin = first_step_state(system, method, t, y0, None).lin
         stages = StageSystem(system, method, t, h, y0.q, y0.p, lin.multiplier, None)
-        x0 = stages.starting_values(system.fibre(y0), lin)
+        x0 = stages.starting_values(system.fibre_coordinate(y0), lin)
         solver = nhjax.SimplifiedNewton()
         solved = solver.solve(stages, x0, lin, jnp.asarray(False)).x
         z, unravel = ravel_pytree(solved)

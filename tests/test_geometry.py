@@ -185,7 +185,7 @@ def long_run(name, closure, solver):
         dt=0.1,
         num_steps=200,
         args=args,
-        solver=helpers.SOLVERS[solver],
+        stage_solver=helpers.SOLVERS[solver],
         saveat=nhjax.SaveAt(steps=True),
     )
 

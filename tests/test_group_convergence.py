@@ -76,7 +76,7 @@ def errors_on_groups(retraction, stages, closure):
     system = beside.system()
     y0 = beside.initial_state(system)
     method = nhjax.LobattoIIIAB(stages, closure)
-    runs = trajectories(system, method, y0, COUNTS[stages], solver=SOLVER)
+    runs = trajectories(system, method, y0, COUNTS[stages], stage_solver=SOLVER)
     return errors_by_part(beside, runs, ([0], [1]))
 
 
@@ -116,7 +116,7 @@ def errors_of(example, method, counts):
     """Errors of q, v and λ of one example by number of steps."""
     group, errors = example.manifold, {}
     y0 = example.initial_state()
-    runs = trajectories(example.system, method, y0, counts, solver=SOLVER)
+    runs = trajectories(example.system, method, y0, counts, stage_solver=SOLVER)
     for ts, y, _ in runs:
         q, v, multiplier = exact_nodes(example, ts)
         errors[len(ts)] = {
@@ -196,7 +196,7 @@ def holonomic_errors(stages, closure):
     system = beside.system()
     y0 = beside.initial_state(system)
     method = nhjax.LobattoIIIAB(stages, closure)
-    runs = trajectories(system, method, y0, COUNTS[stages], solver=SOLVER)
+    runs = trajectories(system, method, y0, COUNTS[stages], stage_solver=SOLVER)
     return errors_by_part(beside, runs, ([0, 1], [2]))
 
 

@@ -108,7 +108,7 @@ def test_a_step_that_turns_too_far_names_its_index(retraction, largest):
         y0,
         dt=h,
         num_steps=40,
-        solver=nhjax.Newton(),
+        stage_solver=nhjax.Newton(),
     )
     sol = run(throw=False, saveat=nhjax.SaveAt(t0=True, steps=True))
     step = int(sol.stats["failed_step"])

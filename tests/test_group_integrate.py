@@ -103,7 +103,7 @@ def test_a_step_back_on_a_group_does_not_retrace_the_step():
 
 def test_ten_thousand_steps_stay_on_the_group_and_keep_the_linear_integrals():
     def integrals(t, y, args):
-        return BALL.first_integrals(y.q, y.v), BALL.manifold.defect(y.q)
+        return BALL.first_integrals(y.q, y.v), BALL.manifold.distance_to_group(y.q)
 
     sol = run(
         BALL,

@@ -114,7 +114,7 @@ def node_velocities(case, taken):
         case.problem.mechanics.d2h(g, mu)
         for g, mu in zip(*at_nodes(case, taken), strict=True)
     ]
-    known = taken.stages.node_fibre
+    known = taken.stages.node_fibre_coordinate
     velocities[len(velocities) - len(known) :] = known
     return np.stack(velocities)
 
@@ -195,7 +195,7 @@ def test_fibre_coordinates_belong_together(case):
         if case.form == "lagrangian":
             pairs = zip(elements, momenta, strict=True)
             fibre = np.stack([mechanics.d2h(g, mu) for g, mu in pairs])
-        known = taken.stages.node_fibre
+        known = taken.stages.node_fibre_coordinate
         # An iteration ends when increments of up to 30 eps no longer fall, relative to
         # momenta and to what forces add to them in a step. The state is summed from
         # the forces and does not see the last increment; interior nodes do.

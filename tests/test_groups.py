@@ -490,7 +490,7 @@ def test_a_million_steps_stay_on_the_group(group):
         q, compensation, worst = carry
         xi = 0.1 * jnp.sin(k.astype(float) + direction)
         q, compensation = group.advance(q, xi, compensation)
-        return q, compensation, jnp.maximum(worst, group.defect(q))
+        return q, compensation, jnp.maximum(worst, group.distance_to_group(q))
 
     q = group.identity()
     start = (q, group.no_compensation(q), jnp.zeros(()))
@@ -549,7 +549,12 @@ def test_single_precision_is_kept(group):
         vectors += [group.ddtau(x, x, x), group.ddtau_dual(x, x, x), group.Ad(g, x)]
         vectors += [group.dtau_dual(x, x), group.Ad_dual(g, x), group.ad(x, x)]
         vectors += [group.to_end(x, x), group.to_end_change(x, x), group.to_start(x, x)]
-        other = [group.tangent(g, x), group.matrix(g), group.hat(x), group.defect(g)]
+        other = [
+            group.tangent(g, x),
+            group.matrix(g),
+            group.hat(x),
+            group.distance_to_group(g),
+        ]
         other += [group.inverse(g), group.identity(x.dtype), group.normalise(g)]
         return advanced, vectors, other
 
@@ -626,8 +631,8 @@ def test_defect_is_the_error_of_the_norm_and_normalise_removes_it():
     pose = jnp.concatenate([q, jnp.ones(3)])
     group = ProductGroup(SO3(), Euclidean(1), SE3())
     element = (q, jnp.ones(1), pose)
-    assert group.defect(element) == pytest.approx(0.25)
-    assert group.defect(group.normalise(element)) < 1e-15
+    assert group.distance_to_group(element) == pytest.approx(0.25)
+    assert group.distance_to_group(group.normalise(element)) < 1e-15
     assert distance(group.normalise(element)[2][4:], np.ones(3)) == 0
 
 

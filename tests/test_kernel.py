@@ -12,8 +12,8 @@ import pytest
 
 import nhjax
 from nhjax import LobattoIIIAB, systems
-from nhjax._contraction import contract, inverse, with_small_products
-from nhjax._kernel import in_one_kernel
+from nhjax._compile import as_cpu_kernel
+from nhjax._numerics._contraction import inverse, small_einsum, with_small_products
 
 
 MARK = 'xla_cpu_small_call = "true"'
@@ -41,7 +41,7 @@ OPERANDS = (
 
 
 def in_kernel(*operands):
-    return in_one_kernel(pendulum, *operands)
+    return as_cpu_kernel(pendulum, *operands)
 
 
 def height(function):
@@ -107,7 +107,7 @@ def test_derivatives_keep_no_constants():
         return jnp.sin(jnp.sum(2 * matrix.T * x[None], axis=1))
 
     def pulled(x):
-        return jax.vjp(lambda x: in_one_kernel(f, x), x)[1](x)
+        return jax.vjp(lambda x: as_cpu_kernel(f, x), x)[1](x)
 
     program = jax.make_jaxpr(pulled)(jnp.ones(4))
     kernels = [x for x in program.eqns if x.primitive.name == "one_kernel"]
@@ -120,7 +120,7 @@ def test_a_loop_of_unknown_length_is_pushed_forward():
     def grown(x):
         return jax.lax.while_loop(lambda x: x < 10, lambda x: x * x, x)
 
-    got = jax.jit(lambda x: jax.jvp(lambda x: in_one_kernel(grown, x), (x,), (x,)))(2.0)
+    got = jax.jit(lambda x: jax.jvp(lambda x: as_cpu_kernel(grown, x), (x,), (x,)))(2.0)
     assert_same(got, jax.jvp(grown, (2.0,), (2.0,)))
 
 
@@ -175,7 +175,7 @@ def is_large(x):
 )
 def test_what_no_kernel_can_do_is_done_without(function):
     x = jnp.linspace(0.0, 1.0, 7)
-    program = jax.jit(lambda x: in_one_kernel(function, x))
+    program = jax.jit(lambda x: as_cpu_kernel(function, x))
     assert MARK not in program.lower(x).as_text()
     assert_same(program(x), function(x))
     xs = jnp.stack([x, x + 1, x + 2])
@@ -184,7 +184,7 @@ def test_what_no_kernel_can_do_is_done_without(function):
 
 def test_random_keys_are_no_operands_of_a_kernel():
     key = jax.random.key(0)
-    got = jax.jit(lambda key: in_one_kernel(lambda key: key, key))(key)
+    got = jax.jit(lambda key: as_cpu_kernel(lambda key: key, key))(key)
     assert_same(jax.random.key_data(got), jax.random.key_data(key))
 
 
@@ -193,7 +193,7 @@ def test_printing_stays(capfd):
         jax.debug.print("x = {}", x)
         return 2 * x
 
-    assert in_one_kernel(loud, jnp.asarray(1.5)) == 3
+    assert as_cpu_kernel(loud, jnp.asarray(1.5)) == 3
     jax.effects_barrier()
     assert "x = 1.5" in capfd.readouterr().out
 
@@ -202,7 +202,7 @@ def test_printing_stays(capfd):
 def test_kernels_can_be_switched_off(monkeypatch, variable):
     if variable is not None:
         monkeypatch.setenv("NHJAX_ONE_KERNEL", variable)
-    text = jax.jit(lambda *x: in_one_kernel(pendulum, *x)).lower(*OPERANDS).as_text()
+    text = jax.jit(lambda *x: as_cpu_kernel(pendulum, *x)).lower(*OPERANDS).as_text()
     assert (MARK in text) == (variable is None)
 
 
@@ -284,7 +284,7 @@ def test_contractions_are_those_of_einsum(subscripts, size):
         )
         for k, indices in enumerate(subscripts.split("->")[0].split(","))
     ]
-    got = contract(subscripts, *map(jnp.asarray, operands))
+    got = small_einsum(subscripts, *map(jnp.asarray, operands))
     expected = np.einsum(subscripts, *operands)
     np.testing.assert_allclose(got, expected, rtol=1e-12, atol=1e-13)
 

@@ -21,7 +21,7 @@ from nhjax._method._tableau import gauss_tableau, lobatto_tableau
 
 STAGES = range(2, 9)
 TWO_ULP = Fraction(2, 2**52)
-MULTIPLIERS = ("propagated", "consistent", "symmetric")
+CLOSURES = ("propagated", "consistent", "symmetric")
 
 RK4 = PartitionedRungeKutta(
     [[0, 0, 0, 0], [0.5, 0, 0, 0], [0, 0.5, 0, 0], [0, 0, 1, 0]],
@@ -287,7 +287,7 @@ def test_a_tableau_rounded_to_float64_keeps_its_properties(s: int):
     assert method.stability_at_infinity == pytest.approx((-1) ** (s - 1), abs=1e-12)
     np.testing.assert_allclose(method.c, built_in.c, rtol=0, atol=2**-52)
     np.testing.assert_allclose(method.a_hat, built_in.a_hat, rtol=0, atol=2**-51)
-    np.testing.assert_array_equal(method.closure.E, built_in.closure.E)
+    np.testing.assert_array_equal(method.closure_weights.E, built_in.closure_weights.E)
 
 
 def test_orders_of_classical_tableaux():
@@ -351,7 +351,7 @@ def test_order_of_the_multiplier(s: int):
 def test_carried_closures_give_the_first_multiplier_and_solve_for_the_rest(
     s: int, multiplier: str
 ):
-    closure = LobattoIIIAB(s, multiplier).closure
+    closure = LobattoIIIAB(s, multiplier).closure_weights
     np.testing.assert_array_equal(closure.E, np.eye(s)[:, 1:])
     np.testing.assert_array_equal(closure.start, np.eye(s)[0])
     np.testing.assert_array_equal(closure.end, np.zeros(s))
@@ -359,7 +359,7 @@ def test_carried_closures_give_the_first_multiplier_and_solve_for_the_rest(
 
 @pytest.mark.parametrize("s", STAGES)
 def test_symmetric_closure_shifts_both_ends_by_one_unknown(s: int):
-    closure = LobattoIIIAB(s, "symmetric").closure
+    closure = LobattoIIIAB(s, "symmetric").closure_weights
     expected = np.eye(s)[:, : s - 1]
     expected[-1, 0] = (-1) ** s
     np.testing.assert_array_equal(closure.E, expected)
@@ -370,7 +370,7 @@ def test_symmetric_closure_shifts_both_ends_by_one_unknown(s: int):
 @pytest.mark.parametrize("s", STAGES)
 def test_symmetric_closure_is_its_own_reverse(s: int):
     # Reversed in time, the unknowns are σν and the inner multipliers in reverse order.
-    closure = LobattoIIIAB(s, "symmetric").closure
+    closure = LobattoIIIAB(s, "symmetric").closure_weights
     reverse = np.zeros((s - 1, s - 1))
     reverse[0, 0] = (-1) ** s
     reverse[1:, 1:] = np.eye(s - 2)[::-1]
@@ -387,7 +387,7 @@ def test_symmetric_closure_is_the_better_conditioned(
 ):
     for multiplier, expected in (("symmetric", symmetric), ("propagated", carried)):
         method = LobattoIIIAB(s, multiplier)
-        condition = np.linalg.cond(method.a[1:] @ method.closure.E)
+        condition = np.linalg.cond(method.a[1:] @ method.closure_weights.E)
         assert condition == pytest.approx(expected, rel=0.02)
 
 
@@ -396,11 +396,14 @@ def test_the_other_sign_of_the_symmetric_closure_is_singular(s: int):
     # The solution of Σ_j a_ij Λ^j = 0, i >= 2, has Λ^s = R_A(∞) Λ^1: a closure of that
     # sign contains it and cannot determine the multipliers.
     method = LobattoIIIAB(s)
-    other = method.closure.E.copy()
+    other = method.closure_weights.E.copy()
     other[-1, 0] *= -1
     smallest = np.linalg.svd(method.a[1:] @ other, compute_uv=False)[-1]
     assert smallest < 1e-15
-    assert np.linalg.svd(method.a[1:] @ method.closure.E, compute_uv=False)[-1] > 1e-2
+    assert (
+        np.linalg.svd(method.a[1:] @ method.closure_weights.E, compute_uv=False)[-1]
+        > 1e-2
+    )
 
 
 @pytest.mark.parametrize("s", STAGES)
@@ -414,11 +417,11 @@ def test_a_multiplier_error_is_orthogonal_to_smooth_reactions(s: int):
     assert abs(moments[-1]) > 1e-6
 
 
-@pytest.mark.parametrize("multiplier", MULTIPLIERS)
+@pytest.mark.parametrize("multiplier", CLOSURES)
 def test_closure_is_cached_hashable_and_read_only(multiplier: str):
-    closure = LobattoIIIAB(4, multiplier).closure
-    assert closure is LobattoIIIAB(4, multiplier).closure
-    assert hash(closure) == hash(LobattoIIIAB(4, multiplier).closure)
+    closure = LobattoIIIAB(4, multiplier).closure_weights
+    assert closure is LobattoIIIAB(4, multiplier).closure_weights
+    assert hash(closure) == hash(LobattoIIIAB(4, multiplier).closure_weights)
     for array in (closure.E, closure.start, closure.end):
         assert array.dtype == np.float64
         assert not array.flags.writeable
@@ -443,7 +446,7 @@ def test_constraints_are_refused_naming_the_first_hypothesis_that_fails():
         with pytest.raises(ValueError, match=reason):
             method.require_constraint_hypotheses()
         with pytest.raises(ValueError, match=reason):
-            _ = method.closure
+            _ = method.closure_weights
         with pytest.raises(ValueError, match=reason):
             _ = method.multiplier_order
     lobatto.require_constraint_hypotheses()
@@ -499,9 +502,9 @@ def test_an_unknown_multiplier_is_refused_with_the_choices():
         "^multiplier must be one of 'propagated', 'consistent', 'symmetric', got 'x'$"
     )
     with pytest.raises(ValueError, match=message):
-        LobattoIIIAB(3, multiplier="x")
+        LobattoIIIAB(3, closure="x")
     with pytest.raises(ValueError, match=message):
-        PartitionedRungeKutta([[0.5]], [1.0], multiplier="x")
+        PartitionedRungeKutta([[0.5]], [1.0], closure="x")
 
 
 @pytest.mark.parametrize(
@@ -604,7 +607,7 @@ def test_basis_needs_distinct_nodes():
 def test_methods_compare_and_hash_by_value():
     lobatto = LobattoIIIAB(3)
     user = PartitionedRungeKutta(lobatto.a, lobatto.b)
-    assert lobatto == LobattoIIIAB(stages=3, multiplier="symmetric")
+    assert lobatto == LobattoIIIAB(stages=3, closure="symmetric")
     assert hash(lobatto) == hash(LobattoIIIAB(3))
     assert user == PartitionedRungeKutta(lobatto.a.tolist(), lobatto.b.tolist())
     assert hash(user) == hash(PartitionedRungeKutta(lobatto.a, lobatto.b))

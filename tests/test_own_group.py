@@ -141,7 +141,7 @@ def test_a_group_of_ones_own_advances_without_compensation():
     close(compensation, jnp.zeros((2, 2)))
     assert not group.is_flat
     assert group.in_chart(XI)
-    close(group.defect(q), 0)
+    close(group.distance_to_group(q), 0)
     close(group.normalise(q), q)
 
 

@@ -49,7 +49,7 @@ def below():
 def test_a_pendulum_at_rest_stays_at_rest(form, solver):
     system = on_sphere(form)
     y0 = nhjax.initial_state(system, below(), jnp.zeros(3))
-    sol = nhjax.integrate(system, METHOD, y0, dt=0.1, num_steps=20, solver=solver)
+    sol = nhjax.integrate(system, METHOD, y0, dt=0.1, num_steps=20, stage_solver=solver)
     assert float(jnp.max(jnp.abs(final(sol).v))) < 1e-13
     assert float(sol.stats["max_constraint_violation"]) < 1e-13
 

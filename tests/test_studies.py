@@ -61,9 +61,16 @@ def test_run_writes_figures_data_and_record(study, tmp_path, capsys, monkeypatch
     assert record["environment"]["precision"] == "float64"
     assert record["environment"]["device"]["platform"]
     parameters = record["parameters"]
-    for name in ("stages", "dt", "final_time", "multiplier", "initial_data", "solver"):
+    for name in (
+        "stages",
+        "dt",
+        "final_time",
+        "closure",
+        "initial_data",
+        "stage_solver",
+    ):
         assert parameters[name]
-    assert parameters["multiplier"] == "propagated"
+    assert parameters["closure"] == "propagated"
     for run in record["results"]["runs"]:
         assert run["compile_seconds"] > 0
         assert run["run_seconds"] > 0
@@ -79,7 +86,7 @@ def test_run_writes_figures_data_and_record(study, tmp_path, capsys, monkeypatch
 def test_run_prints_a_table(tmp_path, capsys):
     out = tmp_path / "deep" / "er"
     arguments = "--regimes high --stages 3 --dt 0.1 --num-steps 20 --epsilon 0.25"
-    arguments += " --multiplier symmetric --short-time 1"
+    arguments += " --closure symmetric --short-time 1"
     assert main(["run", "cvt-energy", *arguments.split(), "--out", str(out)]) == 0
     shown = capsys.readouterr()
     assert shown.err == ""
@@ -92,7 +99,7 @@ def test_run_prints_a_table(tmp_path, capsys):
     parameters = json.loads((out / "cvt-energy.json").read_text())["parameters"]
     assert parameters["regimes"] == ["high"]
     assert parameters["epsilon"] == 0.25
-    assert parameters["multiplier"] == "symmetric"
+    assert parameters["closure"] == "symmetric"
     assert parameters["final_time"] == 2.0
     assert parameters["short_time"] == 1.0
 
@@ -115,7 +122,7 @@ def test_run_prints_a_table(tmp_path, capsys):
         ("run chaotic-energy --num-steps 5 --final-time 1", "not allowed with"),
         ("run chaotic-energy --times 300", "--times: must lie within the run, got 300"),
         ("run chaotic-energy --save-every 90", "--save-every: must leave samples"),
-        ("run chaotic-energy --multiplier free", "--multiplier: invalid choice"),
+        ("run chaotic-energy --closure free", "--closure: invalid choice"),
         ("run cvt-energy --regimes middle", "--regimes: must be among"),
         ("run cvt-energy --epsilon -1", "--epsilon: must be at least 0"),
         ("run cvt-energy --dt 1 --num-steps 3", "--num-steps: must hold 5 steps"),
@@ -197,7 +204,7 @@ def test_particle_order_leaves_round_off_out():
         stages=(6,),
         dt=(0.4, 0.2, 0.1),
         final_time=1.0,
-        multiplier="propagated",
+        closure="propagated",
         example=NonholonomicParticle(),
         errors=errors,
         timings=[],

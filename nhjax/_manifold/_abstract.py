@@ -65,7 +65,7 @@ class AbstractLieGroup(eqx.Module):
         """Whether τ is invertible around ξ, with a margin."""
         return jnp.asarray(True)
 
-    def defect(self, q: Element) -> FloatScalar:
+    def distance_to_group(self, q: Element) -> FloatScalar:
         """How far the array `q` is from the group."""
         return jnp.zeros((), _dtype(q))
 

@@ -11,16 +11,16 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from .._contraction import contract
+from .._numerics import small_einsum
 
 
 def bilinear(
     tensor: np.ndarray, a: Float[Array, " n"], b: Float[Array, " k"]
 ) -> Float[Array, " m"]:
     """Σ T_ijk a_j b_k."""
-    return contract("ik,k->i", matrix_of(tensor, a), b)
+    return small_einsum("ik,k->i", matrix_of(tensor, a), b)
 
 
 def matrix_of(tensor: np.ndarray, a: Float[Array, " n"]) -> Float[Array, "m k"]:
     """Σ T_ijk a_j, the matrix of b -> Σ T_ijk a_j b_k."""
-    return contract("ijk,j->ik", jnp.asarray(tensor, a.dtype), a)
+    return small_einsum("ijk,j->ik", jnp.asarray(tensor, a.dtype), a)

@@ -2,7 +2,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, DTypeLike, Float
 
-from .._compensated import two_sum
+from .._numerics import two_sum
 from ._abstract import AbstractLieGroup, check_shape
 from ._homogeneous import homogeneous
 

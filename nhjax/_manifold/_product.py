@@ -80,9 +80,11 @@ class ProductGroup(AbstractLieGroup):
             jnp.logical_and, self._each(lambda group, x: group.in_chart(x), xi)
         )
 
-    def defect(self, q: Element) -> FloatScalar:
+    def distance_to_group(self, q: Element) -> FloatScalar:
         """The largest of the factors' defects."""
-        return reduce(jnp.maximum, self._each(lambda group, g: group.defect(g), q))
+        return reduce(
+            jnp.maximum, self._each(lambda group, g: group.distance_to_group(g), q)
+        )
 
     def normalise(self, q: Element) -> Element:
         """Every factor normalised."""

@@ -1,8 +1,8 @@
 import jax.numpy as jnp
 from jaxtyping import Array, DTypeLike, Float
 
-from .._compensated import two_sum
 from .._custom_types import BoolScalar
+from .._numerics import two_sum
 from ._abstract import check_shape
 from ._homogeneous import homogeneous
 from ._motions import AbstractMotionGroup

@@ -2,8 +2,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, DTypeLike, Float
 
-from .._compensated import two_sum
 from .._custom_types import BoolScalar, FloatScalar
+from .._numerics import two_sum
 from ._abstract import check_shape
 from ._homogeneous import homogeneous
 from ._motions import AbstractMotionGroup
@@ -58,9 +58,9 @@ class SE3(AbstractMotionGroup):
         """Whether the rotation of τ(ξ) is short of the end of the chart."""
         return self._rotations.in_chart(xi[3:])
 
-    def defect(self, q: Pose) -> FloatScalar:
+    def distance_to_group(self, q: Pose) -> FloatScalar:
         """| |quaternion| - 1 |."""
-        return self._rotations.defect(q[:4])
+        return self._rotations.distance_to_group(q[:4])
 
     def normalise(self, q: Pose) -> Pose:
         """`q` with a quaternion of norm 1."""

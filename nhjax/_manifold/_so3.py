@@ -1,8 +1,8 @@
 import jax.numpy as jnp
 from jaxtyping import Array, DTypeLike, Float
 
-from .._compensated import two_sum
 from .._custom_types import BoolScalar, FloatScalar
+from .._numerics import two_sum
 from ._abstract import check_shape
 from ._motions import AbstractMotionGroup
 from ._quaternion import (
@@ -61,7 +61,7 @@ class SO3(AbstractMotionGroup):
         """Whether the rotation τ(ω) is short of the end of the chart."""
         return self.retraction.in_chart(dot(xi, xi))
 
-    def defect(self, q: Quaternion) -> FloatScalar:
+    def distance_to_group(self, q: Quaternion) -> FloatScalar:
         """| |q| - 1 |."""
         return jnp.abs(jnp.sqrt(dot(q, q)) - 1)
 

@@ -9,13 +9,13 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
-from nhjax._method import _basis, _conditions
-from nhjax._method._closure import Closure, make_closure
-from nhjax._method._conditions import Hypotheses, SimplifyingAssumptions
-from nhjax._method._tableau import Tableau
+from . import _basis, _conditions
+from ._closure import ClosureWeights, make_closure_weights
+from ._conditions import Hypotheses, SimplifyingAssumptions
+from ._tableau import Tableau
 
 
-MULTIPLIERS = ("propagated", "consistent", "symmetric")
+CLOSURES = ("propagated", "consistent", "symmetric")
 
 _STATEMENTS = {
     "H1": "H1 (a_1j = 0, first stage at t_k)",
@@ -39,12 +39,12 @@ class AbstractMethod(eqx.Module):
 
     All of its data is static: a method is hashable, has no array leaves, can be a
     static argument of `jax.jit`, and equals any other with the same data. Coefficients
-    are computed in 60 digits and rounded once. A subclass has `stages`, `multiplier`
+    are computed in 60 digits and rounded once. A subclass has `stages`, `closure`
     and `_tableau`, and is final.
     """
 
     stages: eqx.AbstractVar[int]
-    multiplier: eqx.AbstractVar[str]
+    closure: eqx.AbstractVar[str | None]
 
     @abc.abstractmethod
     def _tableau(self) -> Tableau:
@@ -107,19 +107,19 @@ class AbstractMethod(eqx.Module):
         **Raises:** a `ValueError` as `require_constraint_hypotheses` does.
         """
         self.require_constraint_hypotheses()
-        if self.multiplier != "propagated":
+        if self.closure != "propagated":
             return self.order
         accumulates = abs(self.stability_at_infinity - 1) <= _UNIT_TOLERANCE
         return self.orders.C - int(accumulates)
 
     @property
-    def closure(self) -> Closure:
-        """How the multipliers of a step follow from its unknowns; see `Closure`.
+    def closure_weights(self) -> ClosureWeights:
+        """How the multipliers of a step follow from its unknowns; see `ClosureWeights`.
 
         **Raises:** a `ValueError` as `require_constraint_hypotheses` does.
         """
         self.require_constraint_hypotheses()
-        return make_closure(self._tableau(), self.multiplier == "symmetric")
+        return make_closure_weights(self._tableau(), self.closure == "symmetric")
 
     def basis(self, theta: ArrayLike) -> Float[Array, "*batch s"]:
         """The Lagrange basis ℓ_1(θ), ..., ℓ_s(θ) on the nodes c.
@@ -164,23 +164,23 @@ class AbstractMethod(eqx.Module):
             if not holds:
                 self._reject(f"hypothesis {_STATEMENTS[name]} fails; use LobattoIIIAB")
         size = abs(self.stability_at_infinity)
-        if self.multiplier == "propagated" and size > 1 + _UNIT_TOLERANCE:
+        if self.closure == "propagated" and size > 1 + _UNIT_TOLERANCE:
             self._reject(
-                "multiplier='propagated' needs |R_A(∞)| <= 1, the factor that a step "
+                "closure='propagated' needs |R_A(∞)| <= 1, the factor that a step "
                 f"applies to an error in the multiplier, and it is {size:.6g}; "
-                "use multiplier='consistent'"
+                "use closure='consistent'"
             )
-        if self.multiplier != "symmetric":
+        if self.closure != "symmetric":
             return
-        alternatives = "use multiplier='propagated' or 'consistent'"
+        alternatives = "use closure='propagated' or 'consistent'"
         if not math.isclose(size, 1, rel_tol=_UNIT_TOLERANCE):
             self._reject(
-                f"multiplier='symmetric' needs |R_A(∞)| = 1, and it is {size:.6g}; "
+                f"closure='symmetric' needs |R_A(∞)| = 1, and it is {size:.6g}; "
                 + alternatives
             )
         if not self.is_symmetric:
             self._reject(
-                "multiplier='symmetric' needs a symmetric tableau "
+                "closure='symmetric' needs a symmetric tableau "
                 "(a_{s+1-i,s+1-j} + a_ij = b_j); " + alternatives
             )
 
@@ -225,14 +225,14 @@ def check_stages(stages: int, minimum: int, method: str) -> int:
     return count
 
 
-def check_multiplier(multiplier: str) -> str:
-    """`multiplier` if it is one of `MULTIPLIERS`.
+def check_closure(closure: str) -> str:
+    """`closure` if it is one of `MULTIPLIERS`.
 
     **Raises:**
 
     A `ValueError` that lists the choices.
     """
-    if multiplier not in MULTIPLIERS:
-        choices = ", ".join(repr(m) for m in MULTIPLIERS)
-        raise ValueError(f"multiplier must be one of {choices}, got {multiplier!r}")
-    return multiplier
+    if closure not in CLOSURES:
+        choices = ", ".join(repr(m) for m in CLOSURES)
+        raise ValueError(f"closure must be one of {choices}, got {closure!r}")
+    return closure

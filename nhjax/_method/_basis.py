@@ -17,8 +17,8 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
-from nhjax._method._precision import CONTEXT, to_float64
-from nhjax._method._tableau import lagrange_in_legendre, Tableau
+from ._precision import CONTEXT, to_float64
+from ._tableau import lagrange_in_legendre, Tableau
 
 
 @lru_cache(maxsize=128)

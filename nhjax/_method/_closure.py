@@ -13,13 +13,13 @@ from functools import lru_cache
 
 import numpy as np
 
-from nhjax._method._conditions import stability_at_infinity
-from nhjax._method._precision import CONTEXT, to_float64
-from nhjax._method._tableau import Tableau
+from ._conditions import stability_at_infinity
+from ._precision import CONTEXT, to_float64
+from ._tableau import Tableau
 
 
 @dataclass(frozen=True, eq=False)
-class Closure:
+class ClosureWeights:
     """The closure of the multipliers; read-only float64 arrays, compared by identity.
 
     **Fields:**
@@ -35,7 +35,7 @@ class Closure:
 
 
 @lru_cache(maxsize=128)
-def make_closure(t: Tableau, symmetric: bool) -> Closure:
+def make_closure_weights(t: Tableau, symmetric: bool) -> ClosureWeights:
     """The closure of a tableau that satisfies H1, H2 and H3.
 
     Unless symmetric, Λ^1 = λ_k and y = (Λ^2, ..., Λ^s): the equations of the paper. The
@@ -51,12 +51,12 @@ def make_closure(t: Tableau, symmetric: bool) -> Closure:
 
     **Returns:**
 
-    A `Closure`, the same object at every call.
+    A `ClosureWeights`, the same object at every call.
 
     !!! example
 
         >>> from nhjax._method._tableau import lobatto_tableau
-        >>> make_closure(lobatto_tableau(3), symmetric=True).E.tolist()
+        >>> make_closure_weights(lobatto_tableau(3), symmetric=True).E.tolist()
         [[1.0, 0.0], [0.0, 1.0], [-1.0, 0.0]]
     """
     s = t.stages
@@ -71,7 +71,7 @@ def make_closure(t: Tableau, symmetric: bool) -> Closure:
     else:
         for i in range(1, s):
             e[i, i - 1] = CONTEXT.one
-    return Closure(
+    return ClosureWeights(
         E=to_float64(e),
         start=to_float64([CONTEXT.one] + [CONTEXT.mpf(0)] * (s - 1)),
         end=to_float64(end),

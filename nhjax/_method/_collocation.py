@@ -2,8 +2,8 @@
 
 import equinox as eqx
 
-from nhjax._method._abstract import AbstractMethod, check_multiplier, check_stages
-from nhjax._method._tableau import gauss_tableau, lobatto_tableau, Tableau
+from ._abstract import AbstractMethod, check_closure, check_stages
+from ._tableau import gauss_tableau, lobatto_tableau, Tableau
 
 
 class LobattoIIIAB(AbstractMethod):
@@ -21,15 +21,15 @@ class LobattoIIIAB(AbstractMethod):
     """
 
     stages: int = eqx.field(static=True)
-    multiplier: str = eqx.field(static=True)
+    closure: str = eqx.field(static=True)
 
-    def __init__(self, stages: int, multiplier: str = "symmetric"):
+    def __init__(self, stages: int, closure: str = "symmetric"):
         """
         **Arguments:**
 
         - `stages`: s from 2 to 32, beyond which coefficients take minutes to find
             and nothing is gained in float64.
-        - `multiplier`: how the constraints' multipliers are closed from step to step.
+        - `closure`: how the constraints' multipliers are closed from step to step.
             `"propagated"` carries Λ^s to the next step as its Λ^1 (the paper's);
             `"consistent"` starts each step from the continuous multiplier of the state;
             `"symmetric"` does so at both ends, up to one unknown that makes the step
@@ -38,10 +38,10 @@ class LobattoIIIAB(AbstractMethod):
         **Raises:**
 
         A `TypeError` if `stages` is no integer; a `ValueError` if it is out of range,
-        or if `multiplier` is not one of the three.
+        or if `closure` is not one of the three.
         """
         self.stages = check_stages(stages, 2, "LobattoIIIAB")
-        self.multiplier = check_multiplier(multiplier)
+        self.closure = check_closure(closure)
 
     def _tableau(self) -> Tableau:
         return lobatto_tableau(self.stages)
@@ -76,9 +76,9 @@ class Gauss(AbstractMethod):
         self.stages = check_stages(stages, 1, "Gauss")
 
     @property
-    def multiplier(self) -> str:
-        """`"symmetric"`, as is every method's default; Gauss never has constraints."""
-        return "symmetric"
+    def closure(self) -> None:
+        """None: the methods take no constraints, whose multipliers a closure gives."""
+        return None
 
     def _tableau(self) -> Tableau:
         return gauss_tableau(self.stages)

@@ -16,8 +16,8 @@ from collections.abc import Callable
 from functools import lru_cache
 from typing import NamedTuple
 
-from nhjax._method._precision import CONTEXT, Matrix, Number
-from nhjax._method._tableau import Tableau
+from ._precision import CONTEXT, Matrix, Number
+from ._tableau import Tableau
 
 
 class SimplifyingAssumptions(NamedTuple):

@@ -3,7 +3,7 @@
 import math
 from collections.abc import Callable
 
-from nhjax._method._precision import CONTEXT, Number
+from ._precision import CONTEXT, Number
 
 
 def legendre(degree: int, x: Number) -> list[Number]:

@@ -4,8 +4,8 @@ import equinox as eqx
 import numpy as np
 from numpy.typing import ArrayLike
 
-from nhjax._method._abstract import AbstractMethod, check_multiplier
-from nhjax._method._tableau import Tableau, user_tableau
+from ._abstract import AbstractMethod, check_closure
+from ._tableau import Tableau, user_tableau
 
 
 class PartitionedRungeKutta(AbstractMethod):
@@ -24,22 +24,22 @@ class PartitionedRungeKutta(AbstractMethod):
     """
 
     stages: int = eqx.field(static=True)
-    multiplier: str = eqx.field(static=True)
+    closure: str = eqx.field(static=True)
     _coefficients: tuple[tuple[float, ...], ...] = eqx.field(static=True)
     _weights: tuple[float, ...] = eqx.field(static=True)
 
-    def __init__(self, a: ArrayLike, b: ArrayLike, multiplier: str = "symmetric"):
+    def __init__(self, a: ArrayLike, b: ArrayLike, closure: str = "symmetric"):
         """
         **Arguments:**
 
         - `a`: the coefficients a_ij, shape (s, s), not traced.
         - `b`: the weights b_j, shape (s,), none of them zero and of sum 1.
-        - `multiplier`: as for `LobattoIIIAB`.
+        - `closure`: as for `LobattoIIIAB`.
 
         **Raises:**
 
         A `ValueError` if a shape is wrong, an entry is not finite, a weight is zero,
-        the weights do not sum to 1, or `multiplier` is not one of the three.
+        the weights do not sum to 1, or `closure` is not one of the three.
         """
         a = np.asarray(a, dtype=np.float64)
         b = np.asarray(b, dtype=np.float64)
@@ -60,7 +60,7 @@ class PartitionedRungeKutta(AbstractMethod):
         if abs(b.sum() - 1) > 1e-13:
             raise ValueError(f"b must sum to 1, got {float(b.sum())!r}")
         self.stages = b.size
-        self.multiplier = check_multiplier(multiplier)
+        self.closure = check_closure(closure)
         self._coefficients = tuple(tuple(row) for row in a.tolist())
         self._weights = tuple(b.tolist())
 

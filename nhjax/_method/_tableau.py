@@ -14,8 +14,8 @@ from functools import cache, cached_property, lru_cache
 
 import numpy as np
 
-from nhjax._method._nodes import gauss_points, legendre, lobatto_points
-from nhjax._method._precision import CONTEXT, Matrix, Number, to_float64
+from ._nodes import gauss_points, legendre, lobatto_points
+from ._precision import CONTEXT, Matrix, Number, to_float64
 
 
 BUILT_IN_TOLERANCE = CONTEXT.mpf("1e-40")

@@ -1,3 +1,32 @@
+"""Lagrangian and Hamiltonian systems, their states and their linearised motion."""
+
 from ._abstract import AbstractMechanicalSystem as AbstractMechanicalSystem
+from ._arguments import (
+    all_finite as all_finite,
+    check_flag as check_flag,
+    check_type as check_type,
+    configuration as configuration,
+    finite as finite,
+    floating as floating,
+    parameters as parameters,
+    real_scalar as real_scalar,
+)
+from ._checks import (
+    check_functions as check_functions,
+    check_state as check_state,
+    require_manifold as require_manifold,
+)
 from ._hamiltonian import HamiltonianSystem as HamiltonianSystem
 from ._lagrangian import LagrangianSystem as LagrangianSystem
+from ._linearisation import (
+    continuous_multiplier as continuous_multiplier,
+    Linearisation as Linearisation,
+    linearise as linearise,
+    motion_residual as motion_residual,
+)
+from ._scales import (
+    position_scale as position_scale,
+    velocity_scale as velocity_scale,
+    violation_scale as violation_scale,
+)
+from ._state import check_time_and_state as check_time_and_state, State as State

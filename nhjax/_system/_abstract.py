@@ -16,10 +16,9 @@ from .._custom_types import (
     PhaseFunction,
     PositionFunction,
 )
-from .._implicit import Closed
-from .._linearisation import linearise
 from .._manifold import AbstractLieGroup, Euclidean
-from .._state import check_time_and_state, State
+from .._numerics import ClosureConverted
+from ._state import check_time_and_state, State
 
 
 def _signature(function: Callable[..., Any]) -> inspect.Signature | None:
@@ -78,7 +77,7 @@ class AbstractMechanicalSystem(eqx.Module):
 
     # The name of the generating function, and the letter of the fibre coordinate.
     generator: eqx.AbstractClassVar[Literal["lagrangian", "hamiltonian"]]
-    fibre_name: eqx.AbstractClassVar[Literal["v", "p"]]
+    fibre_coordinate_name: eqx.AbstractClassVar[Literal["v", "p"]]
 
     def __check_init__(self):
         for name, arguments in self.signatures().items():
@@ -145,7 +144,7 @@ class AbstractMechanicalSystem(eqx.Module):
     @classmethod
     def signatures(cls) -> dict[str, tuple[str, ...]]:
         """The arguments of each function of the system, by position."""
-        of_phase = ("t", "q", cls.fibre_name, "args")
+        of_phase = ("t", "q", cls.fibre_coordinate_name, "args")
         return {
             cls.generator: of_phase,
             "nonholonomic": of_phase,
@@ -157,31 +156,34 @@ class AbstractMechanicalSystem(eqx.Module):
         self, t: Any, q: PyTree[Any], u: Any, args: Args
     ) -> dict[str, tuple[Callable[..., Any], tuple[Any, ...]]]:
         """The functions that the system has, with the arguments to call them with."""
-        values = {"t": t, "q": q, self.fibre_name: u, "args": args}
+        values = {"t": t, "q": q, self.fibre_coordinate_name: u, "args": args}
         return {
             name: (getattr(self, name), tuple(values[x] for x in arguments))
             for name, arguments in self.signatures().items()
             if getattr(self, name) is not None
         }
 
-    def fibre(self, y: State) -> Float[Array, " n"]:
+    def fibre_coordinate(self, y: State) -> Float[Array, " n"]:
         """The fibre coordinate u of a state, its v or its p."""
-        return getattr(y, self.fibre_name)
+        return getattr(y, self.fibre_coordinate_name)
 
-    def closed(self, t: FloatScalar, y: State, args: Args) -> Self:
+    def closure_converted(self, t: FloatScalar, y: State, args: Args) -> Self:
         """This, with what its functions close over among its leaves."""
-        functions = self.functions(t, y.q, self.fibre(y), args)
+        functions = self.functions(t, y.q, self.fibre_coordinate(y), args)
         return eqx.tree_at(
             lambda system: [getattr(system, name) for name in functions],
             self,
-            [Closed(function, *example) for function, example in functions.values()],
+            [
+                ClosureConverted(function, *example)
+                for function, example in functions.values()
+            ],
         )
 
-    def conjugate(
+    def fibre_derivative(
         self, t: FloatScalarLike, q: PyTree[Array], u: Float[Array, " n"], args: Args
     ) -> Float[Array, " n"]:
         """The fibre derivative D2L or D2H, which is the other one of v and p."""
-        other = self.momentum if self.fibre_name == "v" else self.velocity
+        other = self.momentum if self.fibre_coordinate_name == "v" else self.velocity
         return other(t, q, u, args)
 
     def manifold_of(self, q: PyTree[Array]) -> AbstractLieGroup:
@@ -292,18 +294,5 @@ class AbstractMechanicalSystem(eqx.Module):
         holonomic ones, and of the holonomic ones themselves.
         """
         check_time_and_state("constraint_violation", t, y)
-        on_velocities = self.constraint(t, y.q, self.fibre(y), args)
+        on_velocities = self.constraint(t, y.q, self.fibre_coordinate(y), args)
         return jnp.concatenate([on_velocities, self.position_constraint(t, y.q, args)])
-
-    def multiplier(
-        self, t: FloatScalarLike, y: State, args: Args = None
-    ) -> Float[Array, " l"]:
-        """The continuous multiplier λ_c, from the hidden constraint dΦ/dt = 0.
-
-        Nonholonomic rows first, then the holonomic ones, whose hidden constraint is
-        d²Γ/dt² = 0. Along a trajectory of a Lobatto method it is of order 2s-2, while
-        the multiplier that the paper propagates is of order s or s-1.
-        """
-        check_time_and_state("multiplier", t, y)
-        t = jnp.asarray(t, y.p.dtype)
-        return linearise(self, t, y.q, self.fibre(y), args).multiplier

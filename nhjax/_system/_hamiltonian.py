@@ -4,7 +4,6 @@ import equinox as eqx
 import jax
 from jaxtyping import Array, Float, PyTree
 
-from .._contraction import apply, inverse
 from .._custom_types import (
     Args,
     FloatScalar,
@@ -12,10 +11,10 @@ from .._custom_types import (
     PhaseFunction,
     PositionFunction,
 )
-from .._diagonal import jacobian
 from .._manifold import AbstractLieGroup
-from .._state import check_time_and_state, State
+from .._numerics import inverse, jacobian, matvec
 from ._abstract import AbstractMechanicalSystem
+from ._state import check_time_and_state, State
 
 
 class HamiltonianSystem(AbstractMechanicalSystem):
@@ -58,7 +57,7 @@ class HamiltonianSystem(AbstractMechanicalSystem):
     manifold: AbstractLieGroup | None = eqx.field(default=None, kw_only=True)
 
     generator: ClassVar[Literal["lagrangian", "hamiltonian"]] = "hamiltonian"
-    fibre_name: ClassVar[Literal["v", "p"]] = "p"
+    fibre_coordinate_name: ClassVar[Literal["v", "p"]] = "p"
 
     def momentum(
         self,
@@ -111,7 +110,7 @@ class HamiltonianSystem(AbstractMechanicalSystem):
         args: Args = None,
     ) -> Float[Array, " n"]:
         """♭_H D2Ψ, the covector (D2D2H)⁻¹ D2Ψ."""
-        return apply(
+        return matvec(
             inverse(jacobian(lambda u: self.velocity(t, q, u, args), u)), derivative
         )
 

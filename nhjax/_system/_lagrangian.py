@@ -13,8 +13,8 @@ from .._custom_types import (
     PositionFunction,
 )
 from .._manifold import AbstractLieGroup
-from .._state import check_time_and_state, State
 from ._abstract import AbstractMechanicalSystem
+from ._state import check_time_and_state, State
 
 
 class LagrangianSystem(AbstractMechanicalSystem):
@@ -63,7 +63,7 @@ class LagrangianSystem(AbstractMechanicalSystem):
     manifold: AbstractLieGroup | None = eqx.field(default=None, kw_only=True)
 
     generator: ClassVar[Literal["lagrangian", "hamiltonian"]] = "lagrangian"
-    fibre_name: ClassVar[Literal["v", "p"]] = "v"
+    fibre_coordinate_name: ClassVar[Literal["v", "p"]] = "v"
 
     def momentum(
         self,

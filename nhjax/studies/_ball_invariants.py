@@ -8,11 +8,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from .._integrate import integrate
+from .._integrate import integrate, raise_failures, SaveAt
 from .._method import LobattoIIIAB
-from .._newton import Newton
-from .._saveat import SaveAt
-from .._solution import raise_failures
+from .._step import Newton
 from ..systems import TurntableBall
 from ._arguments import (
     ArgumentError,
@@ -87,7 +85,7 @@ class BallInvariants(AbstractStudyResult):
     stages: tuple[int, ...]
     dt: tuple[float, ...]
     num_steps: int
-    multiplier: str
+    closure: str
     example: TurntableBall
     runs: list[BallRun]
 
@@ -118,8 +116,8 @@ class BallInvariants(AbstractStudyResult):
             "num_steps": self.num_steps,
             "final_time": self.final_time,
             "last_times": [self.num_steps * h for h in self.dt],
-            "multiplier": self.multiplier,
-            "solver": "Newton",
+            "closure": self.closure,
+            "stage_solver": "Newton",
             "system": "TurntableBall",
             "system_parameters": system_parameters(self.example),
             "initial_data": initial_data(self.example),
@@ -213,7 +211,7 @@ class BallInvariants(AbstractStudyResult):
             *axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=6
         )
         figure.suptitle(
-            f"Homogeneous ball on a turntable, s = {s}, {self.multiplier} multiplier, "
+            f"Homogeneous ball on a turntable, s = {s}, {self.closure} closure, "
             f"{type(self.example.retraction).__name__} retraction"
         )
         return figure
@@ -224,7 +222,7 @@ def ball_invariants(
     stages: Sequence[int] = (2, 3, 4),
     dt: Sequence[float] = (0.4, 0.3, 0.2, 0.1),
     num_steps: int = 1200,
-    multiplier: str = "propagated",
+    closure: str = "propagated",
     retraction: str = "cayley",
     progress: bool = False,
 ) -> BallInvariants:
@@ -246,7 +244,8 @@ def ball_invariants(
     - `num_steps`: the length of every run in steps, at least 5. The place on the circle
         is compared where the runs with the smallest step end, which the others must
         meet.
-    - `multiplier`: the closure, as for `nhjax.LobattoIIIAB`; the paper's by default.
+    - `closure`: of the multipliers, as for `nhjax.LobattoIIIAB`; the paper's by
+        default.
     - `retraction`: `"cayley"`, the paper's, or `"exponential"`.
     - `progress`: show a bar for each s on the standard error stream.
 
@@ -267,13 +266,13 @@ def ball_invariants(
     (_, position), _, _ = ball.exact(final_time)
     runs = []
     for s in stages:
-        method = LobattoIIIAB(s, multiplier)
+        method = LobattoIIIAB(s, closure)
         runs += _runs(ball, method, dt, num_steps, compared, position, progress)
     return BallInvariants(
         stages=tuple(stages),
         dt=dt,
         num_steps=num_steps,
-        multiplier=multiplier,
+        closure=closure,
         example=ball,
         runs=runs,
     )
@@ -304,7 +303,7 @@ def _runs(
             num_steps=num_steps,
             saveat=SaveAt(t0=True, steps=True, fn=observe),
             # The ball turns by up to half a radian a step.
-            solver=Newton(),
+            stage_solver=Newton(),
             throw=False,
             progress_meter=meter(progress, f"s = {method.stages}"),
         )

@@ -7,12 +7,10 @@ from typing import Any, ClassVar, TYPE_CHECKING
 import jax
 import numpy as np
 
-from .._initial_state import initial_state
-from .._integrate import integrate
+from .._initial import initial_state
+from .._integrate import integrate, raise_failures, SaveAt
 from .._method import LobattoIIIAB
-from .._saveat import SaveAt
-from .._solution import raise_failures
-from .._state import State
+from .._system import State
 from ..systems import ChaoticSystem
 from ._arguments import (
     ArgumentError,
@@ -76,7 +74,7 @@ class ChaoticEnergy(AbstractStudyResult):
     dt: tuple[float, ...]
     final_time: float
     members: int
-    multiplier: str
+    closure: str
     times: tuple[float, ...]
     save_every: int
     runs: list[ChaoticRun]
@@ -101,8 +99,8 @@ class ChaoticEnergy(AbstractStudyResult):
             "num_steps": [whole_steps(self.final_time, h) for h in self.dt],
             "final_time": self.final_time,
             "members": self.members,
-            "multiplier": self.multiplier,
-            "solver": "SimplifiedNewton",
+            "closure": self.closure,
+            "stage_solver": "SimplifiedNewton",
             "times": self.times,
             "window": WINDOW,
             "save_every": self.save_every,
@@ -179,7 +177,7 @@ class ChaoticEnergy(AbstractStudyResult):
             (run.stages, run.dt, run.times, run.mean_squared_error())
             for run in self.runs
         ]
-        title = f"J = {self.members}, {self.multiplier} multiplier"
+        title = f"J = {self.members}, {self.closure} closure"
         return {self.name: chaotic_figure(curves, title)}
 
 
@@ -189,7 +187,7 @@ def chaotic_energy(
     dt: Sequence[float] = (0.1, 0.2),
     final_time: float = 200.0,
     members: int = 100,
-    multiplier: str = "propagated",
+    closure: str = "propagated",
     times: Sequence[float] | None = None,
     save_every: int = 1,
     progress: bool = False,
@@ -207,7 +205,8 @@ def chaotic_energy(
     - `dt`: the step sizes h, each of which must divide `final_time`.
     - `final_time`: the length of each run.
     - `members`: the paper's J.
-    - `multiplier`: the closure, as for `nhjax.LobattoIIIAB`; the paper's by default.
+    - `closure`: of the multipliers, as for `nhjax.LobattoIIIAB`; the paper's by
+        default.
     - `times`: when to report μ, as means over a window of ±5; 10, 50, 100 and 200 as
         far as the run goes (its end if it is shorter) by default.
     - `save_every`: save energies after every this many steps.
@@ -241,7 +240,7 @@ def chaotic_energy(
     q0, v0 = chaotic.ensemble(members)
     y0 = jax.vmap(lambda q, v: initial_state(chaotic.system, q, v))(q0, v0)
     runs = [
-        _run(chaotic, y0, LobattoIIIAB(s, multiplier), h, n, save_every, progress)
+        _run(chaotic, y0, LobattoIIIAB(s, closure), h, n, save_every, progress)
         for s in stages
         for h, n in num_steps.items()
     ]
@@ -250,7 +249,7 @@ def chaotic_energy(
         dt=dt,
         final_time=final_time,
         members=members,
-        multiplier=multiplier,
+        closure=closure,
         times=tuple(times),
         save_every=save_every,
         runs=runs,

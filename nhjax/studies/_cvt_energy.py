@@ -9,11 +9,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from .._integrate import integrate
+from .._integrate import integrate, raise_failures, SaveAt
 from .._method import LobattoIIIAB
-from .._newton import Newton
-from .._saveat import SaveAt
-from .._solution import raise_failures
+from .._step import Newton
 from ..systems import ContinuouslyVariableTransmission
 from ._arguments import (
     ArgumentError,
@@ -82,7 +80,7 @@ class CVTEnergy(AbstractStudyResult):
     name: ClassVar[str] = "cvt-energy"
 
     final_time: float
-    multiplier: str
+    closure: str
     epsilon: float
     short_time: float
     runs: list[CVTRun]
@@ -96,8 +94,8 @@ class CVTEnergy(AbstractStudyResult):
             "stages": list(dict.fromkeys(run.stages for run in self.runs)),
             "dt": list(dict.fromkeys(run.dt for run in self.runs)),
             "final_time": self.final_time,
-            "multiplier": self.multiplier,
-            "solver": "Newton",
+            "closure": self.closure,
+            "stage_solver": "Newton",
             "epsilon": self.epsilon,
             "short_time": self.short_time,
             "system": "ContinuouslyVariableTransmission",
@@ -187,7 +185,7 @@ class CVTEnergy(AbstractStudyResult):
         axes[0, 1].legend(loc="upper right")
         figure.suptitle(
             f"CVT, {regime} energy, $h$ = {h:.4g}, $\\epsilon$ = {self.epsilon:g}, "
-            f"{self.multiplier} multiplier"
+            f"{self.closure} closure"
         )
         return figure
 
@@ -198,7 +196,7 @@ def cvt_energy(
     stages: Sequence[int] = (2,),
     dt: Sequence[float] = (0.1, math.pi / 10),
     final_time: float = 5000.0,
-    multiplier: str = "propagated",
+    closure: str = "propagated",
     epsilon: float = 0.5,
     short_time: float = 100.0,
     progress: bool = False,
@@ -214,7 +212,8 @@ def cvt_energy(
     - `stages`: the numbers of stages s.
     - `dt`: the step sizes h.
     - `final_time`: the length of each run, to the nearest whole step.
-    - `multiplier`: the closure, as for `nhjax.LobattoIIIAB`; the paper's by default.
+    - `closure`: of the multipliers, as for `nhjax.LobattoIIIAB`; the paper's by
+        default.
     - `epsilon`: the perturbation ε of the pendulum.
     - `short_time`: how much of the run the pictures of the short term show.
     - `progress`: show a bar for each s and h on the standard error stream.
@@ -242,12 +241,12 @@ def cvt_energy(
     runs = []
     for s in stages:
         for h in dt:
-            method = LobattoIIIAB(s, multiplier)
+            method = LobattoIIIAB(s, closure)
             runs += _runs(regimes, method, h, final_time, epsilon, progress)
     runs.sort(key=lambda run: regimes.index(run.regime))
     return CVTEnergy(
         final_time=final_time,
-        multiplier=multiplier,
+        closure=closure,
         epsilon=epsilon,
         short_time=short_time,
         runs=runs,
@@ -279,7 +278,7 @@ def _runs(
             num_steps=round(final_time / h),
             saveat=SaveAt(t0=True, steps=True, fn=energies),
             # h = π/10 is a large step for the rotating driver.
-            solver=Newton(),
+            stage_solver=Newton(),
             throw=False,
             progress_meter=meter(progress, f"s = {method.stages}, h = {h:.4g}"),
         )

@@ -12,12 +12,10 @@ import tqdm
 
 from .. import plot
 from .._errors import IntegrationError
-from .._integrate import integrate
+from .._integrate import integrate, SaveAt
 from .._method import LobattoIIIAB
-from .._newton import Newton
-from .._saveat import SaveAt
-from .._state import State
-from .._system import LagrangianSystem
+from .._step import Newton
+from .._system import continuous_multiplier, LagrangianSystem, State
 from ._arguments import check_positive, check_stages, check_step_sizes, whole_steps
 from ._result import AbstractStudyResult, initial_data, system_parameters, Timing
 from ._run import compile_and_run
@@ -70,7 +68,7 @@ class AbstractOrderStudy(AbstractStudyResult):
     stages: tuple[int, ...]
     dt: tuple[float, ...]
     final_time: float
-    multiplier: str
+    closure: str
     example: ExactExample
     errors: np.ndarray
     timings: list[Timing]
@@ -98,8 +96,8 @@ class AbstractOrderStudy(AbstractStudyResult):
             "dt": self.dt,
             "num_steps": [whole_steps(self.final_time, h) for h in self.dt],
             "final_time": self.final_time,
-            "multiplier": self.multiplier,
-            "solver": "Newton",
+            "closure": self.closure,
+            "stage_solver": "Newton",
             "system": type(self.example).__name__,
             "system_parameters": system_parameters(self.example),
             "initial_data": initial_data(self.example),
@@ -189,7 +187,7 @@ class AbstractOrderStudy(AbstractStudyResult):
             ax.legend(title="order", loc="lower right", fontsize="small")
         figure.suptitle(
             f"{type(self.example).__name__} at t = {self.final_time:g}, "
-            f"{self.multiplier} multiplier; dashed: the order of the theory"
+            f"{self.closure} closure; dashed: the order of the theory"
         )
         return {self.name: figure}
 
@@ -197,7 +195,7 @@ class AbstractOrderStudy(AbstractStudyResult):
         order = 2 * s - 2
         # λ = Λ^s is that of the method only where it is carried on; the other
         # closures report λ_c.
-        own = s - s % 2 if self.multiplier == "propagated" else order
+        own = s - s % 2 if self.closure == "propagated" else order
         return tuple(own if name == "multiplier" else order for name in self.quantities)
 
 
@@ -211,7 +209,7 @@ def order_study(
     stages: Sequence[int],
     dt: Sequence[float],
     final_time: float,
-    multiplier: str,
+    closure: str,
     progress: bool,
 ) -> _Study:
     """The `study` of an example, for each s and h.
@@ -230,7 +228,7 @@ def order_study(
     exact = _values(study.quantities, end, multiplier_end)
     errors, timings = [], []
     for s in tqdm.tqdm(stages, desc=study.name, disable=not progress):
-        method = LobattoIIIAB(s, multiplier)
+        method = LobattoIIIAB(s, closure)
         ends, timing = _final_values(study, example, method, dt, num_steps)
         timings.append(timing)
         errors.append(
@@ -246,7 +244,7 @@ def order_study(
         stages=tuple(stages),
         dt=dt,
         final_time=final_time,
-        multiplier=multiplier,
+        closure=closure,
         example=example,
         errors=np.array(errors),
         timings=timings,
@@ -254,7 +252,7 @@ def order_study(
 
 
 def _values(
-    quantities: Sequence[str], y: State, continuous_multiplier: Any
+    quantities: Sequence[str], y: State, found_multiplier: Any
 ) -> tuple[Any, ...]:
     values = {
         "q": y.q,
@@ -262,7 +260,7 @@ def _values(
         "v": y.v,
         "p": y.p,
         "multiplier": y.multiplier,
-        "continuous_multiplier": continuous_multiplier,
+        "continuous_multiplier": found_multiplier,
     }
     return tuple(values[name] for name in quantities)
 
@@ -281,7 +279,7 @@ def _final_values(
     start = example.initial_state()
 
     def observe(t, y, args):
-        return _values(study.quantities, y, system.multiplier(t, y, args))
+        return _values(study.quantities, y, continuous_multiplier(system, t, y, args))
 
     def run(h):
         return integrate(
@@ -292,7 +290,7 @@ def _final_values(
             num_steps=max(num_steps),
             saveat=SaveAt(steps=True, fn=observe),
             # The largest steps are too large for SimplifiedNewton at high s.
-            solver=Newton(),
+            stage_solver=Newton(),
             throw=False,
         )
 

@@ -36,7 +36,7 @@ def particle_order(
     stages: Sequence[int] = (2, 3, 4, 5, 6),
     dt: Sequence[float] = (0.5, 0.375, 0.25, 0.1875, 0.125, 0.0625),
     final_time: float = 3.0,
-    multiplier: str = "propagated",
+    closure: str = "propagated",
     system: str = "particle",
     progress: bool = False,
 ) -> ParticleOrder:
@@ -50,7 +50,8 @@ def particle_order(
     - `stages`: the numbers of stages s.
     - `dt`: the step sizes h, each of which must divide `final_time`.
     - `final_time`: when the errors are taken.
-    - `multiplier`: the closure, as for `nhjax.LobattoIIIAB`; the paper's by default.
+    - `closure`: of the multipliers, as for `nhjax.LobattoIIIAB`; the paper's by
+        default.
     - `system`: `"particle"`, or `"sleigh"` for Chaplygin's sleigh.
     - `progress`: show a bar on the standard error stream.
 
@@ -66,6 +67,6 @@ def particle_order(
         stages=stages,
         dt=dt,
         final_time=final_time,
-        multiplier=multiplier,
+        closure=closure,
         progress=progress,
     )

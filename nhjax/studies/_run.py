@@ -6,7 +6,7 @@ from typing import Any
 
 import jax
 
-from .._progress_meter import AbstractProgressMeter, NoProgressMeter, TqdmProgressMeter
+from .._integrate import AbstractProgressMeter, NoProgressMeter, TqdmProgressMeter
 from ._result import Timing
 
 

@@ -35,7 +35,7 @@ def unicycle_order(
     stages: Sequence[int] = (2, 3, 4, 5),
     dt: Sequence[float] = (0.5, 0.375, 0.25, 0.1875, 0.125, 0.0625),
     final_time: float = 3.0,
-    multiplier: str = "propagated",
+    closure: str = "propagated",
     retraction: str = "cayley",
     progress: bool = False,
 ) -> UnicycleOrder:
@@ -49,7 +49,8 @@ def unicycle_order(
     - `stages`: the numbers of stages s.
     - `dt`: the step sizes h, each of which must divide `final_time`.
     - `final_time`: when the errors are taken.
-    - `multiplier`: the closure, as for `nhjax.LobattoIIIAB`; the paper's by default.
+    - `closure`: of the multipliers, as for `nhjax.LobattoIIIAB`; the paper's by
+        default.
     - `retraction`: `"cayley"`, the paper's, or `"exponential"`.
     - `progress`: show a bar on the standard error stream.
 
@@ -65,6 +66,6 @@ def unicycle_order(
         stages=stages,
         dt=dt,
         final_time=final_time,
-        multiplier=multiplier,
+        closure=closure,
         progress=progress,
     )

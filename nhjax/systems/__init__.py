@@ -2,9 +2,7 @@
 
 from ._appell import Appell as Appell
 from ._chaotic import ChaoticSystem as ChaoticSystem
-from ._cvt import (
-    ContinuouslyVariableTransmission as ContinuouslyVariableTransmission,
-)
+from ._cvt import ContinuouslyVariableTransmission as ContinuouslyVariableTransmission
 from ._double_pendulum import DoublePendulum as DoublePendulum
 from ._heavy_top import HeavyTop as HeavyTop, HeavyTopSE3 as HeavyTopSE3
 from ._knife_edge import KnifeEdge as KnifeEdge

@@ -13,10 +13,9 @@ from jaxtyping import Array, ArrayLike, DTypeLike, PyTree
 
 from .._custom_types import Args, FloatScalarLike
 from .._errors import is_traced
-from .._initial_state import initial_state
+from .._initial import initial_state
 from .._manifold import AbstractLieGroup
-from .._state import State
-from .._system import LagrangianSystem
+from .._system import LagrangianSystem, State
 
 
 # Gauss-Legendre rule of one panel: exact to round-off on panels whose length is

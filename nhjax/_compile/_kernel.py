@@ -1,0 +1,288 @@
+"""A program compiled into one kernel of the CPU, where its operations allow it.
+
+XLA runs a program on the CPU as a sequence of kernels, and each costs some 50 ns to
+start, which is as long as the arithmetic of tens of numbers takes. An iteration on the
+stages of a step is some fifty such kernels. A called computation that is marked as
+small is compiled to a single kernel instead, its loops included; on the gallery's
+systems that is three to five times faster.
+
+The mark is the compiler's own and may change its meaning. Without it, as on other
+devices, all works as before; `NHJAX_ONE_KERNEL=0` in the environment leaves it out.
+"""
+
+import os
+from collections.abc import Callable, Iterable
+from contextvars import ContextVar
+from functools import partial
+from typing import Any, TypeVar
+
+import equinox as eqx
+import jax
+import jax.core
+import jax.extend
+import jax.numpy as jnp
+from jax.interpreters import ad, batching, mlir
+from jaxlib.mlir import ir
+
+from ._elementary import is_elementary, LARGEST_REDUCTION
+
+
+T = TypeVar("T")
+
+
+def as_cpu_kernel(function: Callable[..., T], *args: Any) -> T:
+    """`function(*args)`, in one kernel if that is possible.
+
+    It can be transformed as the function itself. What derivatives make of it, forward
+    and transposed, goes into kernels too. Members of a batch run one after the other,
+    each as long as it needs: that is faster than to run them in step, kernel by kernel.
+    """
+    dynamic, static = eqx.partition(args, eqx.is_array)
+    leaves, treedef = jax.tree.flatten(dynamic)
+    kept = []
+
+    def flat(*leaves):
+        args = eqx.combine(jax.tree.unflatten(treedef, leaves), static)
+        arrays, rest = eqx.partition(function(*args), eqx.is_array)
+        kept.append((jax.tree.structure(arrays), rest))
+        return jax.tree.leaves(arrays)
+
+    out = _call(flat, leaves)
+    structure, rest = kept[0]
+    return eqx.combine(jax.tree.unflatten(structure, out), rest)
+
+
+def _call(flat: Callable[..., list[Any]], leaves: list[Any]) -> list[Any]:
+    program = jax.make_jaxpr(flat)(*leaves)
+    # A primitive must be given all that is traced, and has no effects such as printing.
+    captured = any(isinstance(const, jax.core.Tracer) for const in program.consts)
+    if program.effects or captured:
+        return jax.extend.core.jaxpr_as_fun(program)(*leaves)
+    return _kernel.bind(*leaves, program=program)
+
+
+def _split(marks: Iterable[bool], xs: Iterable[Any]) -> tuple[list[Any], list[Any]]:
+    """Those that are marked, and the others."""
+    pairs = list(zip(marks, xs, strict=True))
+    return [x for mark, x in pairs if mark], [x for mark, x in pairs if not mark]
+
+
+def _merged(
+    marks: Iterable[bool], marked: Iterable[Any], others: Iterable[Any]
+) -> list[Any]:
+    """What `_split` took apart."""
+    marked, others = iter(marked), iter(others)
+    return [next(marked) if mark else next(others) for mark in marks]
+
+
+_kernel = jax.extend.core.Primitive("one_kernel")
+_kernel.multiple_results = True
+
+
+@_kernel.def_impl
+def _run(*operands, program):
+    return jax.jit(lambda *x: _kernel.bind(*x, program=program))(*operands)
+
+
+@_kernel.def_abstract_eval
+def _shapes(*operands, program):
+    del operands
+    return program.out_avals
+
+
+def _is_possible(program) -> bool:
+    # Random keys have no kind.
+    kinds = {getattr(aval.dtype, "kind", None) for aval in program.in_avals}
+    plain = kinds <= set("fiub")
+    wanted = os.environ.get("NHJAX_ONE_KERNEL") != "0"
+    return wanted and plain and is_elementary(program.jaxpr)
+
+
+# Whether a kernel is being lowered, in which others are not kernels of their own.
+_within = ContextVar("within", default=False)
+
+
+def _marked(ctx, *operands, program):
+    if _within.get() or not _is_possible(program):
+        return mlir.lower_fun(_unmarked, multiple_results=True)(
+            ctx, *operands, program=program
+        )
+    run = jax.extend.core.jaxpr_as_fun(program)
+
+    def call(*operands):
+        # Operands without elements would vanish.
+        is_full = [x.size > 0 for x in operands]
+        full, empty = _split(is_full, operands)
+
+        def kernel(*full):
+            return run(*_merged(is_full, _tied(full), map(jnp.zeros_like, empty)))
+
+        # Nor may it be seen here which of them are constants.
+        return jax.jit(kernel)(*jax.lax.optimization_barrier(full))
+
+    token = _within.set(True)
+    try:
+        results = mlir.lower_fun(call, multiple_results=True)(ctx, *operands)
+    finally:
+        _within.reset(token)
+    attributes = {"xla_cpu_small_call": "true", "inlineable": "false"}
+    results[0].owner.attributes["mhlo.frontend_attributes"] = ir.DictAttr.get(
+        {key: ir.StringAttr.get(value) for key, value in attributes.items()}
+    )
+    return results
+
+
+def _tied(operands: tuple[Any, ...]) -> list[Any]:
+    """The same operands, of which the compiler cannot know that any is not used.
+
+    It would abort on a parameter of a marked call that is not used, be it after all
+    simplification. So all small ones are made to seem to depend on all others.
+    """
+    firsts = [x.reshape(-1)[0] for x in operands]
+    signs = [(x != jnp.zeros_like(x)).astype(jnp.int32) for x in firsts]
+    never = jnp.sum(jnp.stack(signs)) < 0
+    return [
+        jnp.where(never, jnp.zeros_like(x), x) if x.size <= LARGEST_REDUCTION else x
+        for x in operands
+    ]
+
+
+def _unmarked(*operands, program):
+    return jax.extend.core.jaxpr_as_fun(program)(*operands)
+
+
+mlir.register_lowering(
+    _kernel, mlir.lower_fun(_unmarked, multiple_results=True), cacheable=False
+)
+mlir.register_lowering(_kernel, _marked, platform="cpu", cacheable=False)
+
+
+def _batched(operands, axes, *, program):
+    """Members one by one on the CPU, where a kernel is for one; else all in step."""
+    run = partial(_kernel.bind, program=program)
+    if jax.default_backend() != "cpu" or not _is_possible(program):
+        run = jax.extend.core.jaxpr_as_fun(program)
+        out = jax.vmap(run, in_axes=axes)(*operands)
+        return out, [0] * len(out)
+    is_batched = [axis is not None for axis in axes]
+    batched, shared = _split(is_batched, operands)
+    batched = [
+        jnp.moveaxis(x, axis, 0)
+        for x, axis in zip(batched, _split(is_batched, axes)[0], strict=True)
+    ]
+
+    def member(batched):
+        return run(*_merged(is_batched, batched, shared))
+
+    out = jax.lax.map(member, batched)
+    return out, [0] * len(out)
+
+
+batching.primitive_batchers[_kernel] = _batched
+
+
+def _differentiated(operands, tangents, *, program):
+    """The values and what is linear in the tangents, each a kernel of its own.
+
+    In two, so that reverse mode can keep the first and transpose the second.
+    """
+    run = jax.extend.core.jaxpr_as_fun(program)
+    is_moving = [not isinstance(tangent, ad.Zero) for tangent in tangents]
+    rates, _ = _split(is_moving, tangents)
+    is_smooth = [jnp.issubdtype(x.dtype, jnp.inexact) for x in program.out_avals]
+    treedef = None
+
+    def linearised(*operands):
+        nonlocal treedef
+        moving, fixed = _split(is_moving, operands)
+
+        def values(*moving):
+            return _split(is_smooth, run(*_merged(is_moving, moving, fixed)))
+
+        smooth, push, rest = jax.linearize(values, *moving, has_aux=True)
+        residuals, treedef = jax.tree.flatten(push)
+        return [*_merged(is_smooth, smooth, rest), *residuals]
+
+    try:
+        whole = jax.make_jaxpr(linearised)(*operands)
+    except ValueError:
+        # What JAX cannot linearise, such as a while loop, it may still push forward.
+        all_rates = [ad.instantiate_zeros(tangent) for tangent in tangents]
+        return jax.jvp(run, operands, all_rates)
+    size = len(program.out_avals)
+    # A loop would keep what is the same in each of its rounds as often as there are.
+    fixed, is_varying = _fixed_part(whole)
+    is_kept = [True] * size + is_varying[size:]
+    results = _call(
+        lambda *operands: _split(
+            is_kept, jax.extend.core.jaxpr_as_fun(whole)(*operands)
+        )[0],
+        list(operands),
+    )
+    out, residuals = results[:size], results[size:]
+
+    def push(*given):
+        residuals, rates = given[: -sum(is_moving)], given[-sum(is_moving) :]
+        everything = _merged(
+            is_kept[size:], residuals, _constants(whole, fixed, is_kept)
+        )
+        return list(jax.tree.unflatten(treedef, everything)(*rates))
+
+    changes = _call(push, [*residuals, *rates])
+    zeros = [ad.Zero(aval.to_tangent_aval()) for aval in program.out_avals]
+    return out, _merged(is_smooth, changes, _split(is_smooth, zeros)[1])
+
+
+def _fixed_part(program) -> tuple[list[Any], list[bool]]:
+    """The operations that depend on no operand, and which results depend on one."""
+    traced = [isinstance(const, jax.core.Tracer) for const in program.consts]
+    varying = {*program.jaxpr.invars, *_split(traced, program.jaxpr.constvars)[0]}
+
+    def varies(x) -> bool:
+        return not isinstance(x, jax.extend.core.Literal) and x in varying
+
+    fixed = []
+    for equation in program.eqns:
+        if equation.effects or any(map(varies, equation.invars)):
+            varying.update(equation.outvars)
+        else:
+            fixed.append(equation)
+    return fixed, list(map(varies, program.jaxpr.outvars))
+
+
+def _constants(program, fixed: list[Any], is_kept: list[bool]) -> list[Any]:
+    """The results of a program that are not kept, by its fixed operations."""
+    jaxpr = program.jaxpr
+    part = jaxpr.replace(
+        invars=[],
+        eqns=fixed,
+        outvars=_split(is_kept, jaxpr.outvars)[1],
+        debug_info=jaxpr.debug_info.with_unknown_names(),
+    )
+    return jax.core.eval_jaxpr(part, program.consts)
+
+
+ad.primitive_jvps[_kernel] = _differentiated
+
+
+def _transposed(cotangents, *operands, program):
+    run = jax.extend.core.jaxpr_as_fun(program)
+    is_linear = [ad.is_undefined_primal(x) for x in operands]
+    linear, known = _split(is_linear, operands)
+    is_asked = [not isinstance(cotangent, ad.Zero) for cotangent in cotangents]
+    asked, _ = _split(is_asked, cotangents)
+
+    def pull(*given):
+        known, asked = given[: -sum(is_asked)], given[-sum(is_asked) :]
+
+        def push(*rates):
+            return _split(is_asked, run(*_merged(is_linear, rates, known)))[0]
+
+        transpose = jax.linear_transpose(push, *(x.aval for x in linear))
+        return list(transpose(list(asked)))
+
+    pulled = _call(pull, [*known, *asked])
+    return _merged(is_linear, pulled, [None] * len(known))
+
+
+ad.primitive_transposes[_kernel] = _transposed

@@ -1,0 +1,290 @@
+"""What can be wrong with a state, judged once it has been computed."""
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, PyTree
+
+from .._custom_types import BoolScalar, FloatScalar
+from .._errors import (
+    Check,
+    ConstraintViolationError,
+    DependentConstraintsError,
+    IncompatibleConstraintsError,
+    IrregularLagrangianError,
+    NewtonError,
+    NonFiniteError,
+    require,
+)
+from .._numerics import dependent_rows, Rank
+from .._system import AbstractMechanicalSystem, all_finite, Linearisation, State
+
+
+class Found(NamedTuple):
+    """A state, and the figures by which to judge it."""
+
+    state: State
+    lin: Linearisation
+    generator: FloatScalar  # the value of L or H
+    positions: Float[Array, " k"]  # the holonomic constraints
+    off_group: FloatScalar
+    regularity: FloatScalar
+    ranks: list[Rank]
+    deficient: list[BoolScalar]
+    compatibility: FloatScalar
+    allowed: Float[Array, " l"]
+    allowed_positions: Float[Array, " k"]
+    allowed_off_group: FloatScalar
+    legendre_solved: BoolScalar
+    projected: BoolScalar
+
+
+class _Words(NamedTuple):
+    """The names of a system's functions in messages."""
+
+    generator: str
+    letter: str
+    hessian: str
+    force: str
+    legendre: str
+    fibre: str
+    conjugate: str
+    constraint: str
+
+
+_WORDS = {
+    "lagrangian": _Words(
+        generator="Lagrangian",
+        letter="L",
+        hessian="mass matrix D2D2L",
+        force="D1L + F",
+        legendre="D2L(t, q, v) = p",
+        fibre="v",
+        conjugate="p",
+        constraint="Φ",
+    ),
+    "hamiltonian": _Words(
+        generator="Hamiltonian",
+        letter="H",
+        hessian="Hessian D2D2H",
+        force="F - D1H",
+        legendre="D2H(t, q, p) = v",
+        fibre="p",
+        conjugate="v",
+        constraint="Ψ",
+    ),
+}
+
+
+class _Case(NamedTuple):
+    """What a message may speak of."""
+
+    found: Found
+    q: PyTree[Array]
+    given_name: str
+    given: Float[Array, " n"] | None
+    project: bool
+    words: _Words
+    group: str
+
+    @property
+    def where(self) -> str:
+        # What was given, not what was found from it: that would be a riddle.
+        return f"q = {self.q}, {self.given_name} = {self.given}"
+
+    @property
+    def reached(self) -> str:
+        fibre = self.words.fibre
+        return f"{fibre} = {getattr(self.found.state, fibre)}"
+
+    @property
+    def fibre(self) -> str:
+        return "velocity" if self.words.fibre == "v" else "momentum"
+
+    @property
+    def violations(self) -> str:
+        found = self.found
+        positions = f", Γ = {found.positions}" if found.positions.shape[0] else ""
+        return f"{self.words.constraint} = {found.lin.violation}{positions}"
+
+
+def check_found(
+    system: AbstractMechanicalSystem,
+    found: Found,
+    q: PyTree[Array],
+    v: Float[Array, " n"] | None,
+    p: Float[Array, " n"] | None,
+    project: bool,
+) -> State:
+    """The state, or an exception that says what is wrong with it."""
+    state, lin = found.state, found.lin
+    singular = 10 * state.v.shape[0] * jnp.finfo(state.v.dtype).eps
+    name, given = ("p", p) if v is None else ("v", v)
+    words, group = _WORDS[system.generator], f"{system.manifold_of(q)}"
+    case = (_Case(found, q, name, given, project, words, group),)
+    return require(
+        state,
+        Check(found.off_group <= found.allowed_off_group, _group_error, case),
+        # Not ">": a matrix that is not finite is no singular matrix.
+        Check(~(found.regularity <= singular), _regularity_error, case),
+        Check(found.legendre_solved, _legendre_error, case),
+        *[
+            Check(~deficient, _dependence_error, (*case, rank))
+            for rank, deficient in zip(found.ranks, found.deficient, strict=True)
+        ],
+        Check(found.projected, _projection_error, case),
+        Check(
+            all_finite(
+                (found.generator, found.regularity, lin.violation, found.positions)
+            ),
+            _value_error,
+            case,
+        ),
+        Check(~(found.compatibility <= singular), _compatibility_error, case),
+        Check(
+            jnp.all(jnp.abs(found.positions) <= found.allowed_positions),
+            _position_error,
+            case,
+        ),
+        Check(jnp.all(jnp.abs(lin.violation) <= found.allowed), _violation_error, case),
+        Check(all_finite((lin.acceleration, lin.multiplier)), _force_error, case),
+    )
+
+
+def _group_error(case: _Case) -> ConstraintViolationError:
+    return ConstraintViolationError(
+        f"`q` = {case.q} is no element of the group {case.group}: it is off by "
+        f"{float(case.found.off_group):.3g}. Pass `project=True`, or "
+        "`manifold.normalise(q)`."
+    )
+
+
+def _regularity_error(case: _Case) -> IrregularLagrangianError:
+    return IrregularLagrangianError(
+        f"The {case.words.generator} is not regular: the {case.words.hessian} is "
+        f"singular at {case.where} (reciprocal condition number "
+        f"{float(case.found.regularity):.1e}). Give every coordinate a kinetic energy, "
+        "or remove those without."
+    )
+
+
+def _legendre_error(case: _Case) -> NewtonError:
+    return NewtonError(
+        f"No {case.fibre} with {case.words.legendre} was found for {case.where}. Give "
+        f"`{case.words.fibre}` instead of `{case.words.conjugate}`."
+    )
+
+
+def _projection_error(case: _Case) -> NewtonError:
+    return NewtonError(
+        f"The state could not be projected onto the constraints from {case.where}: "
+        f"Newton's method stopped at q = {case.found.state.q}, {case.reached} with "
+        f"{case.violations}. Start nearer to them."
+    )
+
+
+def _value_error(case: _Case) -> NonFiniteError:
+    words = case.words
+    return NonFiniteError(
+        f"The {words.generator}, its second derivatives in {words.fibre}, or the "
+        f"constraint is not finite at {case.where}: {words.letter} = "
+        f"{case.found.generator}, {case.violations}. Check the functions of the system "
+        "at this state."
+    )
+
+
+def _compatibility_error(case: _Case) -> IncompatibleConstraintsError:
+    return IncompatibleConstraintsError(
+        f"The constraints are not compatible with the {case.words.generator}: C = D2Φ "
+        f"M⁻¹ D2Φᵀ is singular at {case.where} (the paper's compatibility condition; "
+        f"reciprocal condition number {float(case.found.compatibility):.1e}). No "
+        "multiplier is determined there."
+    )
+
+
+def _force_error(case: _Case) -> NonFiniteError:
+    words, lin = case.words, case.found.lin
+    return NonFiniteError(
+        f"The forces {words.force}, or the derivatives of {words.constraint}, are not "
+        f"finite at {case.where}: the rate of {words.fibre} would be "
+        f"{lin.acceleration}, the multiplier {lin.multiplier}. Check the functions of "
+        "the system at this state."
+    )
+
+
+def _dependence_error(case: _Case, rank: Rank) -> DependentConstraintsError:
+    phi, k = case.words.constraint, case.found.positions.shape[0]
+    m = rank.jacobian.shape[0] - k
+    letters = [f"{phi}[{a}]" for a in range(m)] + [f"Γ[{a}]" for a in range(k)]
+    zero = [a for a in range(m + k) if not np.any(rank.jacobian[a])]
+    if zero and zero[0] < m:
+        advice = (
+            f"{letters[zero[0]]} does not depend on velocities there; pass a "
+            "constraint on positions as `holonomic`."
+        )
+    elif zero:
+        advice = (
+            f"{letters[zero[0]]} has no gradient there; a constraint must have one "
+            "where it vanishes."
+        )
+    else:
+        advice = (
+            "Remove redundant constraints, or start from a state at which they are "
+            "independent."
+        )
+    names = " and ".join([f"D2{phi}"] * (m > 0) + ["DΓ"] * (k > 0))
+    have = "have" if m > 0 and k > 0 else "has"
+    which = _enumerated([letters[a] for a in dependent_rows(np.asarray(rank.jacobian))])
+    return DependentConstraintsError(
+        f"The constraints are dependent: {names} {have} not full rank at q = {rank.q}, "
+        f"{case.given_name} = {case.given} (the paper's admissibility condition fails "
+        f"for {which}). {advice}"
+    )
+
+
+def _enumerated(names: list[str]) -> str:
+    return " and ".join([", ".join(names[:-1])] * bool(names[1:]) + names[-1:])
+
+
+def _listed(
+    letters: list[str], values: Float[Array, " l"], allowed: Float[Array, " l"]
+) -> list[str]:
+    return [
+        f"{letter} = {float(value):.6g} (allowed {float(bound):.1e})"
+        for letter, value, bound in zip(letters, values, allowed, strict=True)
+        if abs(value) > bound
+    ]
+
+
+def _violation_error(case: _Case) -> ConstraintViolationError:
+    found, phi = case.found, case.words.constraint
+    violation, k = found.lin.violation, found.positions.shape[0]
+    m = violation.shape[0] - k
+    letters = [f"{phi}[{a}]" for a in range(m)] + [f"dΓ[{a}]/dt" for a in range(k)]
+    bad = _listed(letters, violation, found.allowed)
+    advice = (
+        "the projection did not reach them"
+        if case.project
+        else "choose a velocity on the constraints, or pass `project=True`"
+    )
+    kind = "nonholonomic constraints" if k == 0 else "constraints on velocities"
+    return ConstraintViolationError(
+        f"{len(bad)} of {violation.shape[0]} {kind} violated at q = {found.state.q}, "
+        f"{case.reached}: {'; '.join(bad)}; {advice}."
+    )
+
+
+def _position_error(case: _Case) -> ConstraintViolationError:
+    found = case.found
+    letters = [f"Γ[{a}]" for a in range(found.positions.shape[0])]
+    bad = _listed(letters, found.positions, found.allowed_positions)
+    advice = (
+        "the projection did not reach them"
+        if case.project
+        else "choose a configuration on the constraints, or pass `project=True`"
+    )
+    return ConstraintViolationError(
+        f"{len(bad)} of {len(letters)} holonomic constraints violated at q = "
+        f"{found.state.q}: {'; '.join(bad)}; {advice}."
+    )

@@ -1,0 +1,265 @@
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, PyTree
+
+from .._compile import tracked_jit
+from .._custom_types import Args, BoolScalar, FloatScalar, FloatScalarLike
+from .._errors import DTypeError, require, ShapeError
+from .._numerics import conditioning, inverse, max_norm, Rank, root, those_that_count
+from .._system import (
+    AbstractMechanicalSystem,
+    all_finite,
+    check_flag,
+    check_functions,
+    check_type,
+    configuration,
+    finite,
+    floating,
+    HamiltonianSystem,
+    LagrangianSystem,
+    linearise,
+    parameters,
+    position_scale,
+    real_scalar,
+    require_manifold,
+    State,
+    velocity_scale,
+    violation_scale,
+)
+from ._checks import check_found, Found
+
+
+def initial_state(
+    system: AbstractMechanicalSystem,
+    q: PyTree[Array],
+    v: Float[Array, " n"] | None = None,
+    p: Float[Array, " n"] | None = None,
+    *,
+    t: FloatScalarLike = 0.0,
+    args: Args = None,
+    project: bool = False,
+) -> State:
+    """A consistent state (q, v, p, λ) from a configuration and a velocity or momentum.
+
+    The one of v and p that is not given follows by the Legendre transform p = D2L, or
+    v = D2H. The multiplier is that of the continuous problem, from the hidden
+    constraints dΦ/dt = 0 of nonholonomic and d²Γ/dt² = 0 of holonomic ones: an
+    inconsistent λ_0 would lower the order of the method (paper, section 4).
+
+    **Arguments:**
+
+    - `system`: the mechanical system.
+    - `q`: the configuration, shape (n,), floating point; on a group an element, on a
+        product of groups a tuple of elements.
+    - `v`, `p`: velocity or momentum, shape (n,) with n the dimension of the manifold,
+        of the dtype of q; on a group in the body frame. Give exactly one.
+    - `t`, `args`: passed on to the functions of the system, as `integrate` does.
+    - `project`: replace q by the nearest configuration, and then v by the nearest
+        velocity, in the kinetic metric, that satisfies the constraints (one linear
+        solve for constraints linear or affine in v, Newton's method for others).
+
+    **Returns:** a `State`.
+
+    **Raises:** (what depends on values, under `jit` with the same message in an error
+    of JAX, a `JaxRuntimeError` or a `ValueError`)
+
+    - `TypeError`: `system`, `project` or a part of `args` is of a wrong type.
+    - `ShapeError`, `DTypeError`, `NonFiniteError`: an argument, or the value of one of
+        the system's functions, is not what it should be.
+    - `ConstraintViolationError`: a constraint is violated, or `q` is off the group, and
+        `project` is false.
+    - `IrregularLagrangianError`: D2D2L (or D2D2H) is singular.
+    - `DependentConstraintsError`: D2Φ and DΓ have not full rank (admissibility).
+    - `IncompatibleConstraintsError`: C^{ab} is singular (compatibility).
+    - `NewtonError`: no velocity belongs to the momentum (or the reverse), or Newton's
+        method found no state on the constraints from the one to be projected.
+
+    !!! example
+
+        >>> import jax.numpy as jnp, nhjax
+        >>> system = nhjax.systems.NonholonomicParticle().system
+        >>> y0 = nhjax.initial_state(system, jnp.zeros(3), jnp.ones(3), project=True)
+        >>> [float(x) for x in y0.v]
+        [1.0, 1.0, 0.0]
+    """
+    check_type("system", system, (LagrangianSystem, HamiltonianSystem))
+    check_flag("project", project)
+    q, v, p, t = _check_inputs(system, q, v, p, t)
+    args = parameters(args)
+    check_functions(system, t, q, args)
+    found = _solve(system, t, q, v, p, args, bool(project))
+    return check_found(system, found, q, v, p, bool(project))
+
+
+@tracked_jit("system", "args")
+def _solve(system, t, q, v, p, args, project: bool) -> Found:
+    manifold = system.manifold_of(q)
+    given = p if v is None else v
+    is_fibre = (v is None) == (system.fibre_coordinate_name == "p")
+    legendre_solved = projected = jnp.asarray(True)
+    off_group = manifold.distance_to_group(q)
+    starts = []
+    if project:
+        normal = manifold.normalise(q)
+        possible = all_finite(normal)
+        q = jax.tree.map(lambda x, y: jnp.where(possible, x, y), normal, q)
+        off_group = jnp.where(possible, 0, off_group)
+        if system.holonomic is not None:
+            guess = given if is_fibre else jnp.zeros_like(given)
+            start = q
+            nearest = _project_position(system, t, q, guess, args)
+            q, projected = manifold.act(q, nearest.x), nearest.found
+            starts.append(Rank(nearest.jacobian, start, ~projected))
+    u = given
+    if not is_fibre:
+        u, legendre_solved = _inverse_legendre(system, t, q, given, args)
+    if project and (system.nonholonomic is not None or system.holonomic is not None):
+        nearest = _project_fibre(system, t, q, u, args)
+        starts.append(Rank(nearest.jacobian, q, projected & ~nearest.found))
+        u, projected = nearest.x, projected & nearest.found
+    lin = linearise(system, t, q, u, args)
+    found_v = system.velocity(t, q, u, args)
+    found_p = system.momentum(t, q, u, args)
+    if not project:
+        # What was given is kept to the last bit.
+        found_v = found_v if v is None else v
+        found_p = found_p if p is None else p
+    metric = system.metric(t, q, u, args)
+    ranks = those_that_count([*starts, Rank(lin.jacobian, q, projected)])
+    tolerance = jnp.asarray(1e3 * float(jnp.finfo(u.dtype).eps), u.dtype)
+    return Found(
+        state=State(q, found_v, found_p, lin.multiplier),
+        lin=lin,
+        generator=getattr(system, system.generator)(t, q, u, args),
+        positions=system.position_constraint(t, q, args),
+        off_group=off_group,
+        regularity=conditioning(metric),
+        ranks=ranks,
+        deficient=[rank.deficient for rank in ranks],
+        compatibility=conditioning(lin.jacobian @ lin.reaction),
+        allowed=tolerance * violation_scale(system, lin, t, q, u, args),
+        allowed_positions=tolerance * position_scale(system, t, q, args),
+        allowed_off_group=tolerance,
+        legendre_solved=legendre_solved,
+        projected=projected,
+    )
+
+
+def _inverse_legendre(
+    system, t, q, given: Float[Array, " n"], args
+) -> tuple[Float[Array, " n"], BoolScalar]:
+    """The u whose conjugate is the given one of v and p."""
+    zero = jnp.zeros_like(given)
+    # Where the terms of the equation cancel, as at rest in a magnetic field, u is
+    # rounded by what they amount to, and not by its own size.
+    terms = jnp.abs(given) + jnp.abs(system.fibre_derivative(t, q, zero, args))
+    scale = max_norm(jnp.abs(inverse(system.metric(t, q, zero, args))) @ terms)
+    solved = root(
+        lambda u: system.fibre_derivative(t, q, u, args) - given,
+        zero,
+        jnp.where(jnp.isfinite(scale), scale, 0),
+    )
+    return solved.x, solved.converged
+
+
+class _Nearest(NamedTuple):
+    """The nearest point of a constraint, and the Jacobian where the search starts."""
+
+    x: Float[Array, " n"]
+    found: BoolScalar
+    jacobian: Float[Array, "m n"]
+
+
+def _project_position(system, t, q, u, args) -> _Nearest:
+    """The stationary point of ½ ξᵀ M ξ on Γ(t, q τ(ξ)) = 0."""
+    manifold = system.manifold_of(q)
+    mass = system.metric(t, q, u, args)
+    if system.fibre_coordinate_name == "p":
+        mass = inverse(mass)
+
+    def gamma(xi):
+        return system.position_constraint(t, manifold.act(q, xi), args)
+
+    def sizes(_):
+        return max_norm(*jax.tree.leaves(q)), position_scale(system, t, q, args)
+
+    return _nearest(mass, gamma, jnp.zeros_like(u), sizes)
+
+
+def _project_fibre(system, t, q, u, args) -> _Nearest:
+    """The stationary point of ½ (w-u)ᵀ K (w-u) on Φ(t, q, w) = 0."""
+
+    def phi(w):
+        return system.constraint(t, q, w, args)
+
+    def sizes(jacobian):
+        return max_norm(u), velocity_scale(system, jacobian, t, q, u, args)
+
+    return _nearest(system.metric(t, q, u, args), phi, u, sizes)
+
+
+def _nearest(
+    metric: Float[Array, "n n"],
+    constraint: Callable[[Float[Array, " n"]], Float[Array, " m"]],
+    x: Float[Array, " n"],
+    sizes: Callable[[Float[Array, "m n"]], tuple[FloatScalar, Float[Array, " m"]]],
+) -> _Nearest:
+    """The stationary point of ½ (y-x)ᵀ K (y-x) on constraint(y) = 0.
+
+    `sizes(jacobian)`: what y and the constraint are rounded by.
+    """
+    jacobian = jax.jacrev(constraint)(x)
+    size, terms = sizes(jacobian)
+    # The round-off of the constraint moves y too: from rest, nothing else does.
+    reaction = inverse(metric) @ jacobian.T
+    response = reaction @ inverse(jacobian @ reaction)
+    scale = size + max_norm(jnp.abs(response) @ terms)
+
+    def stationarity(z):
+        y, multiplier = z
+        value, pullback = jax.vjp(constraint, y)
+        return metric @ (y - x) - pullback(multiplier)[0], value
+
+    solved = root(
+        stationarity,
+        (x, jnp.zeros_like(constraint(x))),
+        jnp.where(jnp.isfinite(scale), scale, size),
+        judged=lambda z: z[0],
+    )
+    return _Nearest(solved.x[0], solved.converged, jacobian)
+
+
+def _check_inputs(system, q, v, p, t):
+    if (v is None) == (p is None):
+        given = "neither" if v is None else "both"
+        raise ValueError(f"Give either `v` or `p`; got {given} of them.")
+    name, fibre = ("v", v) if p is None else ("p", p)
+    q, fibre = configuration(q), floating(name, fibre)
+    require_manifold(system, "q", q)
+    if system.manifold is None and q.ndim != 1:
+        raise ShapeError(
+            f"`q` has shape {q.shape}, but a configuration has shape (n,). For many "
+            "trajectories use `jax.vmap`."
+        )
+    manifold = system.manifold_of(q)
+    q = manifold.check(q)
+    leaves = jax.tree.leaves(q)
+    if fibre.shape != (manifold.dim,):
+        raise ShapeError(
+            f"`{name}` has shape {fibre.shape}, but `q` has shape "
+            f"{' x '.join(str(leaf.shape) for leaf in leaves)} and needs a `{name}` of "
+            f"shape ({manifold.dim},)."
+        )
+    for leaf in leaves:
+        if fibre.dtype != leaf.dtype:
+            raise DTypeError(
+                f"`{name}` has dtype {fibre.dtype}, but `q` has {leaf.dtype}: they "
+                "must agree."
+            )
+    t = real_scalar("t", t, fibre.dtype)
+    # All on q, which no system ignores: jit drops a check of what is not used.
+    q = require(q, finite("q", q), finite(name, fibre), finite("t", t))
+    return (q, fibre, None, t) if p is None else (q, None, fibre, t)

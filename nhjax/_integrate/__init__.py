@@ -1,0 +1,18 @@
+"""The time loop: saving, dense output, adjoints, solutions, progress."""
+
+from ._adjoint import (
+    AbstractAdjoint as AbstractAdjoint,
+    DirectAdjoint as DirectAdjoint,
+    RecursiveCheckpointAdjoint as RecursiveCheckpointAdjoint,
+)
+from ._integrate import integrate as integrate
+from ._interpolation import DenseInterpolation as DenseInterpolation
+from ._progress_meter import (
+    AbstractProgressMeter as AbstractProgressMeter,
+    NoProgressMeter as NoProgressMeter,
+    TextProgressMeter as TextProgressMeter,
+    TqdmProgressMeter as TqdmProgressMeter,
+)
+from ._reversible import ReversibleAdjoint as ReversibleAdjoint
+from ._saveat import SaveAt as SaveAt
+from ._solution import raise_failures as raise_failures, Solution as Solution

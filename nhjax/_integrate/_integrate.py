@@ -1,0 +1,300 @@
+from dataclasses import replace
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Int, PyTree
+
+from .._compile import as_cpu_kernel, tracked_jit
+from .._custom_types import Args, FloatScalar, FloatScalarLike, IntScalar
+from .._errors import Check, require
+from .._method import AbstractMethod
+from .._numerics import ClosureConverted, nan_gradient_unless
+from .._results import RESULTS
+from .._step import (
+    AbstractStageSolver,
+    leaves_steps_to_newton,
+    SimplifiedNewton,
+    StepRecord,
+)
+from .._system import (
+    AbstractMechanicalSystem,
+    check_flag,
+    check_state,
+    check_type,
+    finite,
+    HamiltonianSystem,
+    LagrangianSystem,
+    parameters,
+    real_scalar,
+    State,
+)
+from ._adjoint import AbstractAdjoint, DirectAdjoint
+from ._checks import (
+    advancing,
+    check_num_steps,
+    check_saved,
+    countable,
+    is_tracing,
+    known,
+)
+from ._interpolation import (
+    DenseInterpolation,
+    interpolate,
+    require_collocation,
+    step_index,
+)
+from ._loop import Loop
+from ._progress_meter import AbstractProgressMeter, NoProgressMeter
+from ._saveat import SaveAt, stack_saved
+from ._solution import is_unsolved, raise_failures, Solution
+
+
+def integrate(
+    system: AbstractMechanicalSystem,
+    method: AbstractMethod,
+    y0: State,
+    *,
+    dt: FloatScalarLike,
+    num_steps: int | IntScalar,
+    t0: FloatScalarLike = 0.0,
+    args: Args = None,
+    saveat: SaveAt = SaveAt(t1=True),
+    stage_solver: AbstractStageSolver = SimplifiedNewton(),
+    adjoint: AbstractAdjoint = DirectAdjoint(),
+    throw: bool = True,
+    progress_meter: AbstractProgressMeter = NoProgressMeter(),
+) -> Solution:
+    """Integrate a mechanical system over `num_steps` steps of size `dt`.
+
+    Each step solves the discrete equations of the paper (its four summaries) to
+    round-off, so that the constraints on velocities and positions hold at every node to
+    round-off as well; q and p are summed with compensation, and elements of a group
+    stay on it. It works under `jit`, `vmap`, `grad`, `jvp` and `hessian`, with respect
+    to `y0`, `args`, `dt`, `t0` and the array leaves of `system`; stage equations are
+    differentiated by the implicit function theorem. Perturb a state through
+    `initial_state`: the equations of a step read q and p, and only the first multiplier
+    v too.
+
+    **Arguments:**
+
+    - `system`: the mechanical system.
+    - `method`: such as `nhjax.LobattoIIIAB(stages=3)`; `Gauss` only without
+        constraints.
+    - `y0`: a consistent state, from `nhjax.initial_state` or an earlier `Solution`. Its
+        multiplier matters to the propagated closure alone.
+    - `dt`: the step size, a scalar, in units of time; negative to go back.
+    - `num_steps`: how many steps, an int >= 1; see below for arrays.
+    - `t0`: the time of `y0`.
+    - `args`: passed on to the functions of the system. Arrays and floats in it are
+        traced, so that other values recompile nothing; anything else is static.
+
+    **Other arguments:**
+
+    - `saveat`: what to save, the final state by default; see `nhjax.SaveAt`.
+    - `stage_solver`: how the equations of a step are solved,
+        `nhjax.SimplifiedNewton()` by default, or `nhjax.Newton()`.
+    - `adjoint`: what reverse mode keeps of the trajectory: `nhjax.DirectAdjoint()` by
+        default, `nhjax.RecursiveCheckpointAdjoint()`, or `nhjax.ReversibleAdjoint()`.
+    - `throw`: raise if a step cannot be solved. Otherwise the trajectory stays at its
+        last good state from there on, and `result` and `stats` say so; its derivatives
+        are NaN (zero where nothing depends on it). Other members of a batch are not
+        touched.
+    - `progress_meter`: such as `nhjax.TqdmProgressMeter()`.
+
+    **Returns:** a `Solution`.
+
+    **Raises:** `IntegrationError` as described (under `jit` its message comes in an
+    error of JAX, a `JaxRuntimeError` or a `ValueError`), `ShapeError`, `DTypeError`,
+    `NonFiniteError`, `TypeError` and `ValueError` for arguments that cannot be right; a
+    `ValueError` that names the failing hypothesis (H1, H2, H3) if the method cannot
+    integrate constrained systems.
+
+    !!! note
+
+        If what is saved has the same shape for any number of steps (`SaveAt` with `t0`,
+        `t1` and `fn` alone) and there is no progress meter, another `num_steps`
+        recompiles nothing in a plain call. Under `jit` an int is static; an integer
+        array is traced, and under `vmap` each member may have its own. Reverse mode
+        needs an int, or `ReversibleAdjoint`.
+
+        With `steps`, `ts` or `dense` another `num_steps` recompiles everything. For
+        runs of many lengths compile a chunk that leads from state to state, and join
+        what it saves:
+
+            @jax.jit
+            def chunk(y, t):
+                return nhjax.integrate(system, method, y, t0=t, dt=dt, num_steps=100,
+                    saveat=nhjax.SaveAt(steps=True))
+
+            sol = chunk(y, t)
+            y, t = jax.tree.map(lambda x: x[-1], sol.ys), sol.t1
+
+    !!! note
+
+        Globals and variables of enclosing functions that the functions of `system` and
+        `saveat` read are compiled in. A plain call traces them anew if one of them has
+        changed; see `nhjax.LagrangianSystem` for what is tracked, and for the cure
+        under a `jax.jit` of your own.
+
+    !!! example
+
+        >>> import nhjax
+        >>> disc = nhjax.systems.VerticalRollingDisc()
+        >>> sol = nhjax.integrate(disc.system, nhjax.LobattoIIIAB(3),
+        ...     disc.initial_state(), dt=0.1, num_steps=100)
+        >>> sol.ys.q.shape
+        (1, 4)
+    """
+    check_type("system", system, (LagrangianSystem, HamiltonianSystem))
+    check_type("method", method, AbstractMethod, "Such as nhjax.LobattoIIIAB(3).")
+    check_type("y0", y0, State, "Make one with nhjax.initial_state.")
+    check_type("saveat", saveat, SaveAt, "Such as nhjax.SaveAt(t0=True, steps=True).")
+    check_type(
+        "stage_solver", stage_solver, AbstractStageSolver, "Such as nhjax.Newton()."
+    )
+    check_type("adjoint", adjoint, AbstractAdjoint, "Such as nhjax.DirectAdjoint().")
+    check_type("progress_meter", progress_meter, AbstractProgressMeter)
+    throw = check_flag("throw", throw)
+    needed_by = _what_needs_the_length(saveat, progress_meter)
+    num_steps = check_num_steps(num_steps, needed_by)
+    args = parameters(args)
+    check_state(system, y0, args)
+    dtype = y0.p.dtype
+    dt, t0 = real_scalar("dt", dt, dtype), real_scalar("t0", t0, dtype)
+    # All on dt, which is always used: jit drops a check of what is not.
+    dt = require(
+        dt,
+        finite("dt", dt),
+        finite("t0", t0),
+        Check(dt != 0, _zero_step),
+        *countable(num_steps),
+        advancing(t0, dt),
+    )
+    if y0.multiplier.shape[0] > 0:
+        method.require_constraint_hypotheses()
+    if saveat.dense or saveat.ts is not None:
+        require_collocation(method)
+    saveat = saveat.within(t0, dt, num_steps)
+    # A plain call has no use for a length that is known, but for one that changes.
+    if not isinstance(num_steps, int) or (needed_by is None and not is_tracing()):
+        num_steps = jnp.asarray(num_steps, jnp.int32)
+
+    def run(solver: AbstractStageSolver, meter: AbstractProgressMeter) -> Solution:
+        given = (adjoint, y0, t0, dt, num_steps, args, saveat, meter)
+        return _integrate(system, method, solver, *given)
+
+    sol = run(stage_solver, progress_meter)
+    if not is_tracing() and leaves_steps_to_newton(stage_solver) and is_unsolved(sol):
+        # Silently: the meter has shown its run already.
+        sol = run(replace(stage_solver, fallback=True), NoProgressMeter())
+    return raise_failures(sol) if throw else sol
+
+
+def _zero_step() -> ValueError:
+    return ValueError("`dt` is zero; give a positive or negative step size.")
+
+
+@tracked_jit("system", "args", "saveat")
+def _integrate(
+    system: AbstractMechanicalSystem,
+    method: AbstractMethod,
+    solver: AbstractStageSolver,
+    adjoint: AbstractAdjoint,
+    y0: State,
+    t0: FloatScalar,
+    dt: FloatScalar,
+    num_steps: int | IntScalar,
+    args: Args,
+    saveat: SaveAt,
+    meter: AbstractProgressMeter,
+) -> Solution:
+    check_saved(saveat.fn, t0, y0, args)
+    # What user functions close over must be seen to be differentiated.
+    system = system.closure_converted(t0, y0, args)
+    ts = saveat.ts
+    num_records, sampled, record_slots = 0, None, None
+    if saveat.dense or ts is not None:
+        length = known(num_steps)
+        if ts is not None:
+            sampled = jax.vmap(lambda t: step_index(t, t0, dt, length))(ts)
+        num_records, record_slots = _record_slots(saveat.dense, sampled, length)
+    loop = Loop(
+        system,
+        method,
+        solver,
+        t0,
+        dt,
+        num_steps,
+        args,
+        meter,
+        ClosureConverted(saveat.fn, t0, y0, args),
+        saveat.steps,
+        num_records,
+        record_slots,
+    )
+
+    def run(loop: Loop, y0: State):
+        start = loop.start(y0)
+        return start.step_state.state, *adjoint.run(loop, start)
+
+    start, carry, rows = as_cpu_kernel(run, loop, y0)
+    successful = carry.result == RESULTS.successful
+    given = (system, y0, t0, dt, args)
+    state, rows = nan_gradient_unless(successful, (carry.step_state.state, rows), given)
+    t1 = loop.time(num_steps)
+
+    def one(saved: PyTree[Array]) -> PyTree[Array]:
+        return jax.tree.map(lambda x: x[None], saved)
+
+    pieces = [one(loop.saved(t0, start))] if saveat.t0 else []
+    if saveat.steps:
+        pieces.append(jax.tree.map(lambda x: x[:-1], rows.saved))
+    if ts is not None and sampled is not None and record_slots is not None:
+        at_samples = jax.tree.map(lambda x: x[record_slots[sampled]], rows.record)
+        pieces.append(jax.vmap(partial(_sample, loop))(ts, sampled, at_samples))
+    if saveat.saves_end(num_steps):
+        pieces.append(one(loop.saved(t1, state)))
+    times, ys = stack_saved(pieces) if pieces else (None, None)
+    interpolation = None
+    if saveat.dense:
+        records = jax.tree.map(lambda x: x[:-1], rows.record)
+        interpolation = DenseInterpolation(
+            system, method, known(num_steps), t0, dt, records, args
+        )
+    return Solution(t0, t1, times, ys, carry.stats, carry.result, interpolation)
+
+
+def _what_needs_the_length(saveat: SaveAt, meter: AbstractProgressMeter) -> str | None:
+    """The option because of which the number of steps must be known when tracing."""
+    needs = {
+        "the output of `SaveAt(steps=...)`": bool(saveat.steps),
+        "the output of `SaveAt(dense=True)`": saveat.dense,
+        "the output of `SaveAt(ts=...)`": saveat.ts is not None,
+        "the `progress_meter`": not meter.silent,
+    }
+    return next((name for name, needed in needs.items() if needed), None)
+
+
+def _record_slots(
+    dense: bool, sampled: Int[Array, " k"] | None, num_steps: int
+) -> tuple[int, Int[Array, " num_steps+1"] | None]:
+    """How many step records are kept, and in which row that of each step is."""
+    if dense:
+        return num_steps, jnp.arange(num_steps + 1, dtype=jnp.int32)
+    if sampled is None:
+        return 0, None
+    # A row per sample, of which the first in a step is used: there may be more steps
+    # than samples, and more samples than steps.
+    num_samples = sampled.shape[0]
+    slots = jnp.full((num_steps + 1,), num_samples, jnp.int32)
+    return num_samples, slots.at[sampled].min(jnp.arange(num_samples, dtype=jnp.int32))
+
+
+def _sample(
+    loop: Loop, t: FloatScalar, k: Int[Array, ""], record: StepRecord
+) -> PyTree[Array]:
+    start = loop.time(k)
+    theta = (t - start) / loop.dt
+    y = interpolate(loop.system, loop.method, record, start, loop.dt, theta, loop.args)
+    return loop.saved(t, y)

@@ -1,0 +1,149 @@
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Int
+
+from .._custom_types import Args, BoolScalar, FloatScalar, FloatScalarLike
+from .._errors import Check, require
+from .._method import AbstractMethod
+from .._numerics import max_norm, root
+from .._step import Chart, StepRecord
+from .._system import AbstractMechanicalSystem, linearise, real_scalar, State
+
+
+def interpolate(
+    system: AbstractMechanicalSystem,
+    method: AbstractMethod,
+    record: StepRecord,
+    t: FloatScalar,
+    h: FloatScalar,
+    theta: FloatScalar,
+    args: Args,
+) -> State:
+    """The state at t + θ h inside a step that starts at t.
+
+    q by the continuous collocation polynomial u(t), p by the mixed polynomial v(t) of
+    the paper's appendix: both integrate the Lagrange basis on the nodes c_i.
+    """
+    start, time = record.start, t + theta * h
+    weights = method.integrated_basis(theta)
+    chart = Chart(system.manifold_of(start.q), start.q)
+    xi = h * (weights @ record.velocity)
+    q = chart.manifold.act(start.q, xi)
+    p = chart.to_end(xi, start.p + h * (weights @ record.force))
+    u = p
+    if system.fibre_coordinate_name == "v":
+        u = root(
+            lambda u: system.momentum(time, q, u, args) - p, start.v, max_norm(start.v)
+        ).x
+    v = system.velocity(time, q, u, args)
+    if method.closure == "propagated":
+        multiplier = method.basis(theta) @ record.multiplier
+    else:
+        multiplier = linearise(system, time, q, u, args).multiplier
+    return State(q, v, p, multiplier)
+
+
+class DenseInterpolation(eqx.Module):
+    """The collocation polynomials of a whole trajectory.
+
+    They are defined on [t0, t0 + num_steps dt]; use `Solution.evaluate`.
+    """
+
+    method: AbstractMethod = eqx.field(static=True)
+    num_steps: int = eqx.field(static=True)
+    t0: FloatScalar
+    dt: FloatScalar
+    records: StepRecord
+    # The system and args, taken apart: a function is no leaf that `jax.jit` and
+    # `jax.vmap` may return.
+    _arrays: list[Array]
+    _rest: tuple[Any, ...] = eqx.field(static=True)
+    _treedef: Any = eqx.field(static=True)
+
+    def __init__(
+        self,
+        system: AbstractMechanicalSystem,
+        method: AbstractMethod,
+        num_steps: int,
+        t0: FloatScalar,
+        dt: FloatScalar,
+        records: StepRecord,
+        args: Args,
+    ):
+        self.method, self.num_steps = method, num_steps
+        self.t0, self.dt, self.records = t0, dt, records
+        leaves, self._treedef = jax.tree.flatten((system, args))
+        self._arrays = [leaf for leaf in leaves if eqx.is_array(leaf)]
+        self._rest = tuple(None if eqx.is_array(leaf) else leaf for leaf in leaves)
+
+    @property
+    def _system_and_args(self) -> tuple[AbstractMechanicalSystem, Args]:
+        arrays = iter(self._arrays)
+        leaves = [next(arrays) if leaf is None else leaf for leaf in self._rest]
+        return jax.tree.unflatten(self._treedef, leaves)
+
+    def evaluate(self, t: FloatScalarLike) -> State:
+        """The state at time `t`."""
+        batch = self.records.force.shape[:-3]
+        if batch:
+            raise ValueError(
+                f"This solution is a batch of shape {batch}: evaluate each lane, "
+                "`jax.vmap(lambda sol: sol.evaluate(t))(sol)`."
+            )
+        t = real_scalar("t", t, self.t0.dtype)
+        _, inside = step_position(t, self.t0, self.dt, self.num_steps)
+        run = (t, self.t0, self.dt, self.num_steps)
+        t = require(t, Check(inside, _outside, run))
+        return _evaluate(self, t)
+
+
+def _outside(
+    t: np.ndarray, t0: np.ndarray, dt: np.ndarray, num_steps: int
+) -> ValueError:
+    return ValueError(
+        f"Solution.evaluate: `t` = {float(t)} lies outside the run, from {float(t0)} "
+        f"to {float(t0 + num_steps * dt)}."
+    )
+
+
+def step_position(
+    t: Array, t0: FloatScalar, dt: FloatScalar, num_steps: int
+) -> tuple[Array, BoolScalar]:
+    """Times in units of steps, and which of them lie in the run, but for round-off."""
+    position = (t - t0) / dt
+    # The times themselves are rounded, by as much as the largest of them.
+    steps = num_steps + jnp.abs(t0 / dt)
+    slack = jnp.maximum(1e-6, 8 * jnp.finfo(t.dtype).eps * steps)
+    return position, (position >= -slack) & (position <= num_steps + slack)
+
+
+def step_index(
+    t: FloatScalar, t0: FloatScalar, dt: FloatScalar, num_steps: int
+) -> Int[Array, ""]:
+    """The index of the step that contains t."""
+    k = jnp.floor((t - t0) / dt).astype(jnp.int32)
+    return jnp.clip(k, 0, num_steps - 1)
+
+
+@eqx.filter_jit
+def _evaluate(self: DenseInterpolation, t: FloatScalar) -> State:
+    k = step_index(t, self.t0, self.dt, self.num_steps)
+    record = jax.tree.map(lambda x: x[k], self.records)
+    start = self.t0 + k.astype(t.dtype) * self.dt
+    theta = (t - start) / self.dt
+    system, args = self._system_and_args
+    return interpolate(system, self.method, record, start, self.dt, theta, args)
+
+
+def require_collocation(method: AbstractMethod) -> None:
+    """Raise unless the method is a collocation method, so that u(t) exists."""
+    if method.stages > method.orders.C:
+        raise ValueError(
+            f"Dense output and `SaveAt(ts=...)` need a collocation method, one with "
+            f"C(q) for q >= stages = {method.stages}; this tableau has "
+            f"q = {method.orders.C}. Use LobattoIIIAB or Gauss, or save at steps."
+        )

@@ -1,0 +1,202 @@
+from dataclasses import replace
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Int, PyTree
+
+from .._custom_types import BoolScalar
+from .._numerics import iterate, max_norm, relative, Sizes
+from .._results import RESULTS
+from .._step import step, StepState
+from .._system import State
+from ._adjoint import AbstractAdjoint, DirectAdjoint, steps
+from ._loop import Carry, Loop, Rows
+from ._progress_meter import NoProgressMeter
+
+
+class ReversibleAdjoint(AbstractAdjoint):
+    """Keep the end alone and retrace the steps from there: memory O(1).
+
+    On a vector space the method is symmetric: a step of -h leads back. On a group, and
+    with the consistent closure, it does not quite, and the step is inverted by an
+    iteration that starts from one of -h.
+
+    What is retraced differs from what was run by round-off. Where the motion is
+    attracted, as that of a sleigh is, time reversed repels, and the differences grow as
+    fast as the motion decays; prefer `RecursiveCheckpointAdjoint` there. Reverse mode
+    only (and forward over reverse): `jax.jvp` needs one of the other two. It has
+    gradients also if `num_steps` is an array.
+
+    !!! example
+
+        >>> import jax, nhjax
+        >>> disc = nhjax.systems.VerticalRollingDisc()
+        >>> def end(dt):
+        ...     return nhjax.integrate(disc.system, nhjax.LobattoIIIAB(2),
+        ...         disc.initial_state(), dt=dt, num_steps=10,
+        ...         adjoint=nhjax.ReversibleAdjoint()).ys.q[-1, 3]
+        >>> round(float(jax.grad(end)(0.1)), 6)
+        7.0
+    """
+
+    def run(self, loop: Loop, carry: Carry) -> tuple[Carry, Rows]:
+        """All steps of the loop from `carry`: its end, and the rows saved."""
+        return _run((loop, carry))
+
+
+@eqx.filter_custom_vjp
+def _run(arguments: tuple[Loop, Carry]) -> tuple[Carry, Rows]:
+    return DirectAdjoint().run(*arguments)
+
+
+@_run.def_fwd
+def _run_fwd(perturbed, arguments):
+    del perturbed
+    # Not `_run`, which would refuse forward mode over this reverse mode.
+    carry, rows = DirectAdjoint().run(*arguments)
+    # Buffers stand for their shapes alone, and are not kept.
+    shapes = jax.eval_shape(lambda: rows)
+    return (carry, rows), (carry, shapes)
+
+
+@_run.def_bwd
+def _run_bwd(residuals, cotangents, perturbed, arguments):
+    del perturbed
+    (end, shapes), (loop, start) = residuals, arguments
+    meter = eqx.filter(loop.meter, eqx.is_inexact_array)
+    loop = replace(loop, meter=NoProgressMeter())  # it has gone all the way already
+    cotangent, row_cotangents = cotangents
+    cotangent = _filled(cotangent.step_state.state, end.step_state.state)
+    row_cotangents = _filled(row_cotangents, shapes)
+    parameters, fixed = eqx.partition(loop, eqx.is_inexact_array)
+    nothing = jax.tree.map(jnp.zeros_like, parameters)
+
+    def retrace(state, k):
+        step_state, cotangent, total = state
+        step_state = step_back(loop, step_state, k)
+
+        def forward(parameters, y):
+            node_at_y = eqx.tree_at(lambda step_state: step_state.state, step_state, y)
+            carry = start._replace(step_state=node_at_y)
+            carry, rows = eqx.combine(parameters, fixed).step(carry, k)
+            return carry.step_state.state, eqx.filter(rows, eqx.is_inexact_array)
+
+        _, pullback = jax.vjp(forward, parameters, step_state.state)
+        row = eqx.filter(loop.read(row_cotangents, k), eqx.is_inexact_array)
+        change, cotangent = pullback((cotangent, row))
+        return step_state, cotangent, jax.tree.map(jnp.add, total, change)
+
+    last, state = loop.num_steps - 1, (end.step_state, cotangent, nothing)
+    first, cotangents, total = steps(retrace, state, loop.num_steps, last, -1)
+    total, cotangent = _if_retraced(
+        end.result == RESULTS.successful,
+        loop,
+        first.state,
+        start.step_state.state,
+        (cotangent, row_cotangents),
+        (total, cotangents),
+    )
+    of_start = jax.tree.map(lambda _: None, eqx.filter(start, eqx.is_inexact_array))
+    of_start = eqx.tree_at(
+        lambda carry: carry.step_state.state,
+        of_start,
+        cotangent,
+        is_leaf=lambda leaf: leaf is None,
+    )
+    return replace(total, meter=jax.tree.map(lambda _: None, meter)), of_start
+
+
+def _if_retraced(
+    successful: BoolScalar,
+    loop: Loop,
+    reached: State,
+    start: State,
+    cotangents: PyTree[Array],
+    gradient: PyTree[Array],
+) -> PyTree[Array]:
+    """The gradient; NaN if the run failed or was not retraced, zero if nothing asks."""
+    manifold = loop.system.manifold_of(start.q)
+    xi = manifold.local(manifold.compose(manifold.inverse(start.q), reached.q))
+    small = float(jnp.finfo(start.p.dtype).eps) ** 0.375
+    retraced = (max_norm(xi) <= small * (1 + max_norm(*jax.tree.leaves(start.q)))) & (
+        relative(max_norm(reached.p - start.p), max_norm(start.p)) <= small
+    )
+    asked = [jnp.any(leaf != 0) for leaf in jax.tree.leaves(cotangents)]
+    asked = jnp.any(jnp.stack(asked))
+
+    def judged(x):
+        x = jnp.where(successful & retraced, x, jnp.nan)
+        return jnp.where(asked, x, 0)
+
+    return jax.tree.map(judged, gradient)
+
+
+def _filled(cotangents: PyTree[Any], like: PyTree[Any]) -> PyTree[Any]:
+    """Cotangents with zeros where there are none, but for what is no number."""
+
+    def fill(cotangent, x):
+        if cotangent is not None or x is None:
+            return cotangent
+        is_number = jnp.issubdtype(x.dtype, jnp.inexact)
+        return jnp.zeros(x.shape, x.dtype) if is_number else None
+
+    return jax.tree.map(fill, cotangents, like, is_leaf=lambda leaf: leaf is None)
+
+
+def step_back(loop: Loop, step_state: StepState, k: Int[Array, ""]) -> StepState:
+    """The node from which step k led to `node`."""
+    back = _step(loop, step_state, loop.time(k + 1), -loop.dt)
+    if _retraces(loop, step_state):
+        return back
+
+    # y is the step back from z, and z is moved by what the step from y misses `node`
+    # by. The two steps undo each other but for a small error, so that this contracts
+    # far faster than moving y would.
+    manifold, target = loop.system.manifold_of(step_state.state.q), step_state.state
+    propagated = loop.method.closure == "propagated"
+
+    def sweep(z: State):
+        y = _step(
+            loop,
+            eqx.tree_at(lambda step_state: step_state.state, step_state, z),
+            loop.time(k + 1),
+            -loop.dt,
+        )
+        reached = _step(loop, y, loop.time(k), loop.dt).state
+        to_reached = manifold.inverse(reached.q)
+        xi = manifold.local(manifold.compose(to_reached, target.q))
+        misses = [xi, target.p - reached.p]
+        multiplier = z.multiplier
+        if propagated:
+            miss = target.multiplier - reached.multiplier
+            misses.append(loop.dt * miss)
+            multiplier = multiplier + miss
+        size = max_norm(*misses)
+        z = State(manifold.act(z.q, xi), z.v, z.p + misses[1], multiplier)
+        return z, Sizes(size), y
+
+    scale = 1 + max_norm(target.p)
+    limit = loop.stage_solver.max_iterations
+    return iterate(sweep, target, scale, max_iterations=limit).aux
+
+
+def _retraces(loop: Loop, step_state: StepState) -> bool:
+    """Whether a step of -h undoes one of h."""
+    if not loop.system.manifold_of(step_state.state.q).is_flat:
+        return False
+    if loop.system.nonholonomic is not None and loop.method.closure == "consistent":
+        return False
+    return loop.method.is_symmetric
+
+
+def _step(loop: Loop, step_state: StepState, t: Array, h: Array) -> StepState:
+    go_on = jnp.asarray(False)
+    system, method, solver, args = (
+        loop.system,
+        loop.method,
+        loop.stage_solver,
+        loop.args,
+    )
+    return step(system, method, solver, t, h, step_state, args, go_on).step_state

@@ -1,0 +1,175 @@
+import reprlib
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, PyTree
+
+from .._custom_types import FloatScalar, IntScalar
+from .._errors import Check, DTypeError, is_traced, NonFiniteError, require
+from .._system import State
+from ._checks import known
+from ._interpolation import step_position
+
+
+def save_state(t: FloatScalar, y: State, args: Any) -> State:
+    """Save the whole state."""
+    del t, args
+    return y
+
+
+class SaveAt(eqx.Module):
+    """What to save of a trajectory, with diffrax's meanings.
+
+    **Arguments:**
+
+    - `t0`: save the initial state.
+    - `t1`: save the final state.
+    - `ts`: save at these times, by the collocation polynomials; sorted in the
+        direction of time.
+    - `steps`: save after every step (True), or after every k-th step (an int k). With
+        `t1=True` the final state is saved too, but not twice.
+    - `dense`: save the collocation polynomials for `Solution.evaluate`.
+    - `fn`: save `fn(t, y, args)` instead of y.
+
+    The output has exactly as many entries as are saved. Thinned saving (`steps=k`) and
+    `ts` keep no buffer of the length of the run, unless `dense` does; samples are taken
+    after the run, from the records of the steps that contain them.
+
+    **Raises:** `ValueError` if nothing is saved, a flag is not a bool, `steps` is not a
+    bool or an int >= 1, `ts` is not a sorted vector, or `ts` and `steps` are given
+    together; `DTypeError` if `ts` is not real. `integrate` raises a `TypeError` if
+    `fn` returns what is no array.
+
+    !!! example
+
+        >>> import nhjax
+        >>> nhjax.SaveAt(t0=True, steps=10).steps
+        10
+    """
+
+    t0: bool = eqx.field(static=True, default=False)
+    t1: bool = eqx.field(static=True, default=False)
+    ts: Float[Array, " k"] | None = None
+    steps: int = eqx.field(static=True, default=0)
+    dense: bool = eqx.field(static=True, default=False)
+    fn: Callable[[Any, Any, Any], PyTree[Array]] = save_state
+
+    def __init__(
+        self,
+        *,
+        t0: bool = False,
+        t1: bool = False,
+        ts: Float[Array, " k"] | np.ndarray | Sequence[float] | None = None,
+        steps: bool | int = False,
+        dense: bool = False,
+        fn: Callable[[Any, Any, Any], PyTree[Array]] = save_state,
+    ):
+        for name, flag in (("t0", t0), ("t1", t1), ("dense", dense)):
+            if not isinstance(flag, bool):
+                raise ValueError(
+                    f"SaveAt: `{name}` must be True or False, got {flag!r}; times "
+                    "belong in `ts`, and `integrate` sets the ends of the run."
+                )
+        if not isinstance(steps, int | np.integer) or steps < 0:
+            raise ValueError(
+                f"SaveAt: `steps` must be a bool or an int >= 1, got {steps!r}."
+            )
+        if not (t0 or t1 or dense or steps or ts is not None):
+            raise ValueError(
+                "SaveAt: nothing is saved. Ask for some of `t0`, `t1`, `ts`, `steps`, "
+                "`dense`."
+            )
+        if ts is not None and steps:
+            raise ValueError(
+                "SaveAt: give `ts` or `steps`, not both; with `dense=True` the "
+                "solution can be evaluated anywhere afterwards."
+            )
+        if not callable(fn):
+            raise ValueError(
+                f"SaveAt: `fn` must be a function (t, y, args), got {fn!r}."
+            )
+        self.t0, self.t1, self.dense, self.fn = t0, t1, dense, fn
+        self.steps = int(steps)
+        self.ts = None if ts is None else _times(ts)
+
+    def within(
+        self, t0: FloatScalar, dt: FloatScalar, num_steps: int | IntScalar
+    ) -> "SaveAt":
+        """This, checked against the run that it is for, with `ts` of its dtype."""
+        if self.num_saved(num_steps) == 0 and not self.dense:
+            raise ValueError(
+                f"SaveAt: `steps={self.steps}` saves nothing in a run of {num_steps} "
+                "steps. Add `t1=True`."
+            )
+        if self.ts is None:
+            return self
+        ts = self.ts.astype(dt.dtype)
+        # In units of steps, so that direction and dtype need no cases.
+        position, inside = step_position(ts, t0, dt, known(num_steps))
+        ts = require(
+            ts,
+            Check(jnp.all(inside), _outside, (ts, t0, dt, num_steps)),
+            Check(jnp.all(jnp.diff(position) >= 0), _unsorted, (dt,)),
+        )
+        return eqx.tree_at(lambda s: s.ts, self, ts)
+
+    def num_saved(self, num_steps: int | IntScalar) -> int:
+        """The length of the output for a run of `num_steps` steps."""
+        sampled = 0 if self.ts is None else self.ts.shape[0]
+        strided = known(num_steps) // self.steps if self.steps else 0
+        return self.t0 + sampled + strided + self.saves_end(num_steps)
+
+    def saves_end(self, num_steps: int | IntScalar) -> bool:
+        """Whether the final state is saved on its own."""
+        last_is_saved = bool(self.steps) and known(num_steps) % self.steps == 0
+        return self.t1 and not last_is_saved
+
+
+def stack_saved(pieces: list[PyTree[Array]]) -> PyTree[Array]:
+    """Join pieces that have a leading time axis."""
+    if len(pieces) == 1:
+        return pieces[0]
+    return jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *pieces)
+
+
+def _outside(
+    ts: np.ndarray, t0: np.ndarray, dt: np.ndarray, num_steps: int
+) -> ValueError:
+    return ValueError(
+        f"SaveAt: `ts` reaches from {float(np.min(ts))} to {float(np.max(ts))}, "
+        f"outside the run from {float(t0)} to {float(t0 + num_steps * dt)}."
+    )
+
+
+def _unsorted(dt: np.ndarray) -> ValueError:
+    return ValueError(
+        "SaveAt: `ts` must be sorted in the direction of time, which runs "
+        f"{'forward' if dt > 0 else 'backward'} here."
+    )
+
+
+def _times(ts: Any) -> Float[Array, " k"]:
+    try:
+        ts = jnp.asarray(ts)
+    except (TypeError, ValueError):
+        raise DTypeError(
+            f"SaveAt: `ts` must be a vector of real numbers, got {reprlib.repr(ts)} of "
+            f"type {type(ts).__name__}."
+        ) from None
+    if jnp.issubdtype(ts.dtype, jnp.integer):
+        ts = ts.astype(jnp.result_type(float))
+    if not jnp.issubdtype(ts.dtype, jnp.floating):
+        raise DTypeError(f"SaveAt: `ts` must be real, got dtype {ts.dtype}.")
+    if ts.ndim != 1 or ts.shape[0] == 0:
+        raise ValueError(f"SaveAt: `ts` must have shape (k,), k >= 1, got {ts.shape}.")
+    if not is_traced(ts):
+        if not jnp.all(jnp.isfinite(ts)):
+            raise NonFiniteError(f"SaveAt: `ts` is not finite: {ts}.")
+        gaps = jnp.diff(ts)
+        if not (jnp.all(gaps >= 0) or jnp.all(gaps <= 0)):
+            raise ValueError("SaveAt: `ts` must be sorted in the direction of time.")
+    return ts

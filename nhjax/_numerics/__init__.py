@@ -1,0 +1,33 @@
+"""Small building blocks without mechanics: contractions, norms, iterations."""
+
+from ._compensated import two_sum as two_sum
+from ._contraction import (
+    inverse as inverse,
+    Matrix as Matrix,
+    matvec as matvec,
+    small_einsum as small_einsum,
+)
+from ._diagonal import jacobian as jacobian
+from ._implicit import (
+    ClosureConverted as ClosureConverted,
+    frozen as frozen,
+    has_tangent as has_tangent,
+    nan_gradient_unless as nan_gradient_unless,
+    root as root,
+    solve_contraction as solve_contraction,
+    zero_unless as zero_unless,
+)
+from ._iteration import (
+    iterate as iterate,
+    jacobian_and_value as jacobian_and_value,
+    NOISE_UNITS as NOISE_UNITS,
+    Sizes as Sizes,
+    Solved as Solved,
+)
+from ._max_norm import max_norm as max_norm, relative as relative
+from ._rank import (
+    conditioning as conditioning,
+    dependent_rows as dependent_rows,
+    Rank as Rank,
+    those_that_count as those_that_count,
+)

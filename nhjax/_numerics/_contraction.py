@@ -1,0 +1,189 @@
+"""Products and inverses of tiny matrices, in elementary operations.
+
+Libraries of linear algebra are called at a price that matrices of a few rows are not
+worth: inside a time loop the calls cost more than the arithmetic, they cannot be
+compiled into one kernel with what surrounds them, and batches of them run one by one.
+"""
+
+import itertools
+import math
+import string
+from collections.abc import Callable
+from functools import reduce
+from typing import Any, TypeAlias
+
+import jax
+import jax.extend
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from .._compile import LARGEST_REDUCTION
+
+
+# More rows are inverted by a library: a kernel may not sum more numbers than such a
+# matrix has.
+LARGEST = math.isqrt(LARGEST_REDUCTION)
+# Longer sums and larger products are left to one too: what is written out is to stay
+# short, and from some 10⁵ terms on the library was the faster (measured).
+LONGEST_SUM, LARGEST_PRODUCT = 128, 2**15
+
+
+# A square matrix, or its diagonal if it has no other entries.
+Matrix: TypeAlias = Float[Array, "n n"] | Float[Array, " n"]
+
+
+def small_einsum(subscripts: str, a: Array, b: Array) -> Array:
+    """`jnp.einsum(subscripts, a, b)`, written out as products and sums if small."""
+    operands, result = subscripts.split("->")
+    first, second = operands.split(",")
+    summed = [index for index in dict.fromkeys(first + second) if index not in result]
+    order = [*result, *summed]
+    x, y = _aligned(a, first, order), _aligned(b, second, order)
+    shape = jnp.broadcast_shapes(x.shape, y.shape)
+    summed_shape = shape[len(result) :]
+    if math.prod(shape) <= LARGEST_REDUCTION:
+        return jnp.sum(x * y, axis=tuple(range(len(result), len(order))))
+    if math.prod(summed_shape) > LONGEST_SUM or math.prod(shape) > LARGEST_PRODUCT:
+        return jnp.einsum(subscripts, a, b)
+    # Term by term: what is larger is summed by a library.
+    terms = (
+        _term(x, index) * _term(y, index)
+        for index in itertools.product(*map(range, summed_shape))
+    )
+    return reduce(jnp.add, terms)
+
+
+def _term(x: Array, index: tuple[int, ...]) -> Array:
+    """x at an index of its last axes; those of length one have but one term."""
+    lengths = x.shape[x.ndim - len(index) :]
+    return x[(..., *(k if n > 1 else 0 for k, n in zip(index, lengths, strict=True)))]
+
+
+def matvec(matrix: Matrix, x: Float[Array, "... n"]) -> Float[Array, "... n"]:
+    """The matrix times the vectors along the last axis of x, which has at most four."""
+    if matrix.ndim == 1:
+        return jnp.expand_dims(matrix, range(x.ndim - 1)) * x
+    rows = "abc"[: x.ndim - 1]
+    return small_einsum(f"kn,{rows}n->{rows}k", matrix, x)
+
+
+def _aligned(x: Array, indices: str, order: list[str]) -> Array:
+    """x with its axes in the given order, and axes of length one for the others."""
+    present = [index for index in order if index in indices]
+    x = jnp.transpose(x, [indices.index(index) for index in present])
+    return jnp.expand_dims(
+        x, [k for k, index in enumerate(order) if index not in indices]
+    )
+
+
+def _contract_axes(dimension_numbers, a: Array, b: Array) -> Array:
+    """`jax.lax.dot_general` with these dimension numbers, by `contract`."""
+    (summed_a, summed_b), (batch_a, batch_b) = dimension_numbers
+    letters = iter(string.ascii_letters)
+    first = [next(letters) for _ in a.shape]
+    second = [next(letters) for _ in b.shape]
+    for i, j in zip((*batch_a, *summed_a), (*batch_b, *summed_b), strict=True):
+        second[j] = first[i]
+    batch = [first[i] for i in batch_a]
+    free = [first[i] for i in range(a.ndim) if i not in (*batch_a, *summed_a)]
+    free += [second[j] for j in range(b.ndim) if j not in (*batch_b, *summed_b)]
+    subscripts = f"{''.join(first)},{''.join(second)}->{''.join(batch + free)}"
+    return small_einsum(subscripts, a, b)
+
+
+@jax.custom_jvp
+def inverse(matrix: Matrix) -> Matrix:
+    """The inverse of a small matrix; not finite where there is none."""
+    size = matrix.shape[0]
+    # One constraint is by far the commonest case.
+    if matrix.ndim == 1 or size == 1:
+        return 1 / matrix
+    if size == 0:
+        return matrix
+    if size > LARGEST:
+        return jnp.linalg.inv(matrix)
+    return _eliminated(matrix)
+
+
+@inverse.defjvp
+def _inverse_jvp(primals, tangents):
+    (matrix,), (rate,) = primals, tangents
+    x = inverse(matrix)
+    if matrix.ndim == 1:
+        return x, -x * rate * x
+    return x, -small_einsum("ij,jk->ik", small_einsum("ij,jk->ik", x, rate), x)
+
+
+def _eliminated(matrix: Float[Array, "m m"]) -> Float[Array, "m m"]:
+    """The inverse by elimination of Gauss and Jordan, in place, with row pivoting."""
+    rows = jnp.arange(matrix.shape[0])
+
+    def at(x, k):
+        return jax.lax.dynamic_index_in_dim(x, k, keepdims=False)
+
+    def eliminate(k, carry):
+        table, order = carry
+        column, row = at(table.T, k), at(table, k)
+        best = jnp.argmax(jnp.where(rows >= k, jnp.abs(column), -1))
+        # By masks: an index that varies over a batch would gather and scatter.
+        is_k, is_pivot = rows == k, rows == best
+        pivot_row = jnp.sum(jnp.where(is_pivot[:, None], table, 0), axis=0)
+        pivot = at(pivot_row, k)
+        scaled = jnp.where(is_k, 1 / pivot, pivot_row / pivot)
+        # Rows k and `best` change places.
+        column = jnp.where(is_pivot, at(column, k), column)
+        table = jnp.where(is_pivot[:, None], row[None], table)
+        place = jnp.sum(jnp.where(is_pivot, order, 0))
+        order = jnp.where(is_pivot, at(order, k), order)
+        # Column k makes room for that of the inverse.
+        table = jnp.where(is_k[None], 0, table) - column[:, None] * scaled[None]
+        table = jnp.where(is_k[:, None], scaled[None], table)
+        return table, jnp.where(is_k, place, order)
+
+    table, order = jax.lax.fori_loop(0, len(rows), eliminate, (matrix, rows))
+    places = (order[:, None] == rows[None]).astype(matrix.dtype)
+    return small_einsum("ij,jk->ik", table, places)
+
+
+def with_small_products(program: Any) -> Callable[..., list[Any]]:
+    """A closed program as a function, its small products of matrices written out."""
+
+    def run(*args):
+        return _evaluated(program.jaxpr, program.consts, args)
+
+    return run
+
+
+def _evaluated(program, consts, args):
+    values = dict(zip(program.constvars, consts, strict=True))
+    values |= zip(program.invars, args, strict=True)
+
+    def read(variable):
+        is_literal = isinstance(variable, jax.extend.core.Literal)
+        return variable.val if is_literal else values[variable]
+
+    for equation in program.eqns:
+        name, params = equation.primitive.name, equation.params
+        inputs = [read(variable) for variable in equation.invars]
+        if name == "dot_general" and _is_plain(equation):
+            out = [
+                _contract_axes(params["dimension_numbers"], *map(jnp.asarray, inputs))
+            ]
+        elif name == "jit":
+            inner = params["jaxpr"]
+            out = _evaluated(inner.jaxpr, inner.consts, inputs)
+        else:
+            primitive = equation.primitive
+            bound = primitive.get_bind_params(params)
+            # Earlier releases of JAX give functions apart from the other parameters.
+            functions, params = bound if isinstance(bound, tuple) else ((), bound)
+            out = primitive.bind(*functions, *inputs, **params)
+            out = out if primitive.multiple_results else [out]
+        values |= zip(equation.outvars, out, strict=True)
+    return [read(variable) for variable in program.outvars]
+
+
+def _is_plain(equation) -> bool:
+    """Whether a product is of matrices of the type of its result."""
+    types = {variable.aval.dtype for variable in (*equation.invars, *equation.outvars)}
+    return len(types) == 1

@@ -1,0 +1,38 @@
+"""How a run can end, and what to do about it."""
+
+import equinox as eqx
+
+
+class RESULTS(eqx.Enumeration):
+    """How an integration ended. `RESULTS[sol.result]` is the message."""
+
+    successful = ""
+    nonlinear_divergence = (
+        "The stage equations of a step could not be solved: Newton's iteration "
+        "diverged. Try a smaller `dt`, or `stage_solver=nhjax.Newton()`."
+    )
+    nonlinear_max_iterations = (
+        "The stage equations of a step were not solved to round-off within the "
+        "`max_iterations` of the stage solver: its iteration converges too slowly, or "
+        "not at all. Try a smaller `dt`, `stage_solver=nhjax.Newton()`, or more "
+        "iterations; where stiff forces magnify round-off, a `tolerance` of the stage "
+        "solver."
+    )
+    singular_stage_matrix = (
+        "The mass matrix D2D2L (or D2D2H) or the compatibility matrix C = D2Φ M⁻¹ D2Φᵀ "
+        "became singular, so that the multiplier is not determined. The system has "
+        "reached the edge of its domain."
+    )
+    nonfinite_state = (
+        "The state became infinite or NaN, or was so from the start. Check `y0` and "
+        "the functions of the system along the trajectory, or try a smaller `dt`."
+    )
+    left_chart = (
+        "A step turned so far that it left the chart of the retraction (a rotation "
+        "near π for Cayley, near 2π for Exponential). Take a smaller `dt`."
+    )
+    inconsistent_start = (
+        "The initial state violates the constraints at `t0`, its q is off the group, "
+        "or its v and p do not belong together. Make `y0` with `nhjax.initial_state`, "
+        "for the system, args and time of the integration."
+    )

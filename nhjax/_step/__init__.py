@@ -1,0 +1,18 @@
+"""One step: its stage equations, their solvers, its end and its derivative."""
+
+from ._chart import Chart as Chart
+from ._derivative import Parameters as Parameters, primitive_step as primitive_step
+from ._newton import (
+    AbstractStageSolver as AbstractStageSolver,
+    leaves_steps_to_newton as leaves_steps_to_newton,
+    Newton as Newton,
+    SimplifiedNewton as SimplifiedNewton,
+)
+from ._record import StepRecord as StepRecord
+from ._step import (
+    first_step_state as first_step_state,
+    largest_violation as largest_violation,
+    step as step,
+    StepOutcome as StepOutcome,
+    StepState as StepState,
+)

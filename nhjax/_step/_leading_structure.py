@@ -1,0 +1,147 @@
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from .._numerics import inverse, Matrix, matvec, small_einsum
+from .._system import Linearisation
+from ._stages import Stages, StageSystem
+
+
+class LeadingStructure(eqx.Module):
+    """The leading structure of the linearised stage equations of one step.
+
+    With N and K at the start of the step, B_i at the nodes of given stages,
+    R the node rows of a_ij and δΛ the change of all multipliers,
+
+    δu_i = -N⁻¹ r_u + h Σ_j â_ij K⁻¹ B_jᵀ δΛ_j        (stages),
+    δu_i = -N⁻¹ r_v + h Σ_j R_ij K⁻¹ B_jᵀ δΛ_j        (nodes),
+
+    and for the constraints B_i δu_i = -r_Φ at the nodes, Σ_j a_ij B_i δu_j = -r_Γ at
+    the positions, B_s δu_s = -r of the tangency at the end. The last three give a Schur
+    complement for h δy and h δΛ of the holonomic constraints. It is invertible for
+    small h by hypothesis H2 (for the symmetric closure by the sign of ν) and the
+    compatibility condition.
+    """
+
+    momentum_inverse: Matrix
+    reaction: Float[Array, "s n l"]
+    velocity_reaction: Float[Array, "s n l"]
+    schur_inverse: Float[Array, "c c"]
+    end: Linearisation
+
+    def correct_stages(
+        self, stages: StageSystem, x: Stages, residual: Float[Array, "s n"]
+    ) -> Stages:
+        """u - N⁻¹ r_u for the stages, and the velocities that belong to them."""
+        change = matvec(self.momentum_inverse, residual)
+        if not stages.hamiltonian:
+            return eqx.tree_at(lambda z: z.velocity, x, x.velocity - change)
+        x = eqx.tree_at(lambda z: z.momentum, x, x.momentum - change)
+        return eqx.tree_at(lambda z: z.velocity, x, stages.stage_velocities(x))
+
+    def correct_nodes(self, x: Stages, residual: Float[Array, "r n"]) -> Stages:
+        """u - N⁻¹ r_v for the nodes."""
+        node_fibre_coordinate = x.node_fibre_coordinate - matvec(
+            self.momentum_inverse, residual
+        )
+        return eqx.tree_at(lambda z: z.node_fibre_coordinate, x, node_fibre_coordinate)
+
+    def correct_multipliers(
+        self,
+        stages: StageSystem,
+        x: Stages,
+        kinematic: Float[Array, "r m"],
+        holonomic: Float[Array, "s k"],
+    ) -> Stages:
+        """Change the free multipliers so that the constraints hold."""
+        residual = jnp.concatenate([kinematic.reshape(-1), holonomic.reshape(-1)])
+        change = -small_einsum("cd,d->c", self.schur_inverse, residual)
+        h_dy = change[: x.closure.size].reshape(x.closure.shape)
+        h_dholonomic = change[x.closure.size :].reshape(x.holonomic.shape)
+        h_dlambda = stages.free_multipliers(h_dy, h_dholonomic)
+        # h K⁻¹ Bᵀ δΛ; h is divided out only where multipliers themselves are wanted.
+        push = small_einsum("jnm,jm->jn", self.reaction, h_dlambda)
+        a_hat, momentum = stages.coefficients("a_hat"), x.momentum
+        velocity_push = push
+        if stages.hamiltonian:
+            velocity_push = small_einsum(
+                "jnm,jm->jn", self.velocity_reaction, h_dlambda
+            )
+            momentum = momentum + small_einsum("ij,jn->in", a_hat, push)
+        return Stages(
+            velocity=x.velocity + small_einsum("ij,jn->in", a_hat, velocity_push),
+            momentum=momentum,
+            node_fibre_coordinate=x.node_fibre_coordinate
+            + small_einsum("ij,jn->in", stages.node_weights, push),
+            closure=x.closure + h_dy / stages.h,
+            holonomic=x.holonomic + h_dholonomic / stages.h,
+            end_acceleration=x.end_acceleration,
+            end_multiplier=x.end_multiplier,
+        )
+
+    def correct_end(
+        self, x: Stages, residual: tuple[Float[Array, " n"], Float[Array, " l"]]
+    ) -> Stages:
+        """Move the acceleration and λ_c at the end towards those of (q, u) there."""
+        momentum_residual, hidden_residual = residual
+        da, dlam = self.end.solve(-momentum_residual, -hidden_residual)
+        return eqx.tree_at(
+            lambda z: (z.end_acceleration, z.end_multiplier),
+            x,
+            (x.end_acceleration + da, x.end_multiplier + dlam),
+        )
+
+
+def leading_structure(
+    stages: StageSystem, x: Stages, lin: Linearisation
+) -> LeadingStructure:
+    """Factorise the leading structure: N and K at the start of a step, B_i at x."""
+    if not stages.constrained:
+        n, nothing = stages.p.shape[0], jnp.zeros((0, 0), stages.p.dtype)
+        reaction = jnp.zeros((stages.method.stages, n, 0), stages.p.dtype)
+        return LeadingStructure(lin.momentum_inverse, reaction, reaction, nothing, lin)
+    jacobian = jnp.concatenate([lin.jacobian[None], stages.constraint_jacobian(x)])
+    reaction = jnp.swapaxes(matvec(lin.metric_inverse, jacobian), 1, 2)
+    blocks = small_einsum("ian,jnb->ijab", jacobian[1:], reaction)
+    end = eqx.tree_at(
+        lambda z: (z.jacobian, z.reaction, z.compliance_inverse),
+        lin,
+        (jacobian[-1], reaction[-1], inverse(blocks[-1, -1])),
+    )
+    return LeadingStructure(
+        momentum_inverse=lin.momentum_inverse,
+        reaction=reaction,
+        velocity_reaction=(
+            jnp.swapaxes(jacobian, 1, 2) if stages.hamiltonian else reaction
+        ),
+        schur_inverse=inverse(_schur(stages, blocks)),
+        end=end,
+    )
+
+
+def _schur(
+    stages: StageSystem, blocks: Float[Array, "s-1 s l l"]
+) -> Float[Array, "c c"]:
+    """The constraints' change with h δy and h δΛ, from the blocks B_i K⁻¹ B_jᵀ."""
+    m, k, s = stages.num_nonholonomic, stages.num_holonomic, stages.method.stages
+    a, a_hat, b = (stages.coefficients(name) for name in ("a", "a_hat", "b"))
+    rows = []
+    if m:
+        nodes = small_einsum("ij,ijab->iajb", a[1:], blocks[:, :, :m])
+        rows.append(nodes.reshape((s - 1) * m, s, m + k))
+    if k:
+        positions = small_einsum(
+            "ij,ijab->iajb", small_einsum("ik,kj->ij", a[1:], a_hat), blocks[:, :, m:]
+        )
+        rows.append(positions.reshape((s - 1) * k, s, m + k))
+        rows.append(small_einsum("j,jab->ajb", b, blocks[-1, :, m:]))
+    change = jnp.concatenate(rows)
+    columns = []
+    if m:
+        closure = small_einsum(
+            "cjb,jl->clb", change[:, :, :m], stages.closure_weights("E")
+        )
+        columns.append(closure.reshape(change.shape[0], -1))
+    if k:
+        columns.append(change[:, :, m:].reshape(change.shape[0], -1))
+    return jnp.concatenate(columns, axis=1)

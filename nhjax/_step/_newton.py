@@ -1,0 +1,250 @@
+"""The two solvers of the stage equations."""
+
+from abc import abstractmethod
+from collections.abc import Callable
+from typing import TypeAlias
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax.flatten_util import ravel_pytree
+from jaxtyping import Array
+
+from .._custom_types import FloatScalarLike
+from .._numerics import (
+    iterate,
+    jacobian_and_value,
+    matvec,
+    max_norm,
+    NOISE_UNITS,
+    Solved,
+)
+from .._system import all_finite, check_flag, Linearisation
+from ._leading_structure import leading_structure
+from ._scale import fibre_coordinate_scale
+from ._stage_iteration import (
+    corrected,
+    Evaluation,
+    fibre_coordinate_size,
+    increment_size,
+    sizes,
+    stage_residual,
+)
+from ._stages import Stages, StageSystem
+from ._tolerance import check_tolerance, tolerance_array
+
+
+# One iteration on the stages of a step; the equations are an argument, so that it can
+# be differentiated with respect to what is in them.
+FrozenNewtonMap: TypeAlias = Callable[[StageSystem, Stages], Stages]
+
+
+# A residual of more than this, relative to the momenta, is that of no solution.
+_GROSS = 1e-6
+
+
+class AbstractStageSolver(eqx.Module):
+    """How the stage equations of a step are solved."""
+
+    max_iterations: eqx.AbstractVar[int]
+    tolerance: eqx.AbstractVar[FloatScalarLike]
+
+    def __check_init__(self):
+        if not isinstance(self.max_iterations, int) or self.max_iterations < 1:
+            raise ValueError(
+                f"{type(self).__name__}: `max_iterations` must be an int >= 1, got "
+                f"{self.max_iterations!r}."
+            )
+        check_tolerance(self.tolerance)
+
+    @abstractmethod
+    def solve(
+        self, stages: StageSystem, x0: Stages, lin: Linearisation, skip: Array
+    ) -> Solved[Stages, Evaluation]:
+        """Solve the stage equations from `x0`; does nothing where `skip` is true."""
+
+    @abstractmethod
+    def frozen_newton_map(
+        self, stages: StageSystem, lin: Linearisation, x: Stages
+    ) -> FrozenNewtonMap:
+        """An iteration whose fixed points solve the stage equations.
+
+        Its Jacobian is frozen, and it contracts at the solution `x`; derivatives of the
+        solution follow from it.
+        """
+
+
+class SimplifiedNewton(AbstractStageSolver):
+    """Simplified Newton on the stage system, with its leading structure as Jacobian.
+
+    The mass matrix M and the Schur complement of the constraints are inverted once a
+    step, at its start; each iteration costs one evaluation of the stage equations and a
+    few small products. The error falls by a factor O(h²) where M is constant and the
+    constraints are linear in v, O(h) elsewhere.
+
+    Where it does not converge, Newton's method with the exact Jacobian may. It takes
+    over for such a step, and `Solution.stats["num_newton_steps"]` counts them. A
+    program with both in it takes longer to compile, and runs slower also where one
+    would do. So a plain call of `integrate` is repeated with it if it has
+    failed; in a program of your own (`jax.jit`, `jax.vmap`, `jax.grad`) a step that is
+    not solved ends the run, unless you ask for the fallback.
+
+    **Arguments:**
+
+    - `max_iterations`: the number of iterations after which a step counts as failed.
+    - `tolerance`: the size of the increment, relative to the velocities, at which to
+        stop; 0, the default, iterates to round-off. Changing it recompiles nothing.
+    - `fallback`: whether `nhjax.Newton()` takes over a step that is not solved: True,
+        False, or None, the default, for plain calls alone. Derivatives of a run with it
+        use the exact Jacobian as those of `nhjax.Newton()` do.
+
+    !!! example
+
+        >>> import nhjax
+        >>> nhjax.SimplifiedNewton(max_iterations=80).max_iterations
+        80
+    """
+
+    max_iterations: int = eqx.field(static=True, default=100)
+    tolerance: FloatScalarLike = eqx.field(converter=tolerance_array, default=0.0)
+    fallback: bool | None = eqx.field(static=True, default=None)
+
+    def __check_init__(self):
+        if self.fallback is not None:
+            check_flag("fallback", self.fallback)
+
+    def solve(
+        self, stages: StageSystem, x0: Stages, lin: Linearisation, skip: Array
+    ) -> Solved[Stages, Evaluation]:
+        """Solve the stage equations from `x0`; does nothing where `skip` is true."""
+        structure = leading_structure(stages, x0, lin)
+        scale = fibre_coordinate_scale(stages, x0, lin)
+
+        def sweep(x: Stages):
+            x_next, evaluation = corrected(stages, structure, x)
+            return x_next, sizes(stages, x, x_next, lin), evaluation
+
+        solved = iterate(
+            sweep,
+            x0,
+            scale,
+            max_iterations=self.max_iterations,
+            tolerance=self.tolerance,
+            noise_units=NOISE_UNITS,
+            skip=skip,
+        )
+        if not self.fallback:
+            return solved
+        # What is not finite after one iteration is so at the state itself.
+        hopeless = (solved.num_iterations <= 1) & ~all_finite(solved.x)
+        ends = solved.converged | hopeless
+
+        def by_newton():
+            newton = self._newton.solve(stages, x0, lin, ends)
+            count = solved.num_iterations + newton.num_iterations
+            aux = newton.aux._replace(newton=jnp.ones_like(ends))
+            return newton._replace(num_iterations=count, aux=aux)
+
+        return jax.lax.cond(ends, lambda: solved, by_newton)
+
+    @property
+    def _newton(self) -> "Newton":
+        return Newton(tolerance=self.tolerance)
+
+    def frozen_newton_map(
+        self, stages: StageSystem, lin: Linearisation, x: Stages
+    ) -> FrozenNewtonMap:
+        """The iteration of `solve`, with the constraints' slopes at the solution.
+
+        It need not contract where Newton's method took over, whose iteration does.
+        """
+        if self.fallback:
+            return self._newton.frozen_newton_map(stages, lin, x)
+        structure = leading_structure(stages, x, lin)
+        return lambda stages, x: corrected(stages, structure, x)[0]
+
+
+def leaves_steps_to_newton(solver: AbstractStageSolver) -> bool:
+    """Whether a plain call is to be repeated with a fallback if it fails."""
+    return isinstance(solver, SimplifiedNewton) and solver.fallback is None
+
+
+class Newton(AbstractStageSolver):
+    """Newton's method on the stage system with the exact dense Jacobian.
+
+    Dearer per iteration than `SimplifiedNewton`, but it converges for larger steps and
+    for stiff forces, and tells the round-off of these from an iteration that has not
+    converged. Both give the same trajectory to round-off.
+
+    **Arguments:** `max_iterations` and `tolerance`, as for `SimplifiedNewton`.
+
+    !!! example
+
+        >>> import nhjax
+        >>> nhjax.Newton().max_iterations
+        30
+    """
+
+    max_iterations: int = eqx.field(static=True, default=30)
+    tolerance: FloatScalarLike = eqx.field(converter=tolerance_array, default=0.0)
+
+    def solve(
+        self, stages: StageSystem, x0: Stages, lin: Linearisation, skip: Array
+    ) -> Solved[Stages, Evaluation]:
+        """Solve the stage equations from `x0`; does nothing where `skip` is true."""
+        _, unravel = ravel_pytree(x0)
+        scale = fibre_coordinate_scale(stages, x0, lin)
+
+        nudge = float(jnp.finfo(stages.p.dtype).eps) ** 0.5
+        nudged = stages.nudged(jnp.asarray(nudge, stages.p.dtype))
+
+        def residual(z):
+            return stage_residual(stages, unravel(z))
+
+        def sweep(x: Stages):
+            z, _ = ravel_pytree(x)
+            jacobian, r, evaluation = jacobian_and_value(residual, z)
+            change = stage_residual(nudged, x)[0] - r
+            dz, noise = jnp.linalg.solve(jacobian, -jnp.stack([r, change], axis=1)).T
+            x_next = unravel(z + dz)
+            found = sizes(stages, x, x_next, lin)
+            # What round-off of the positions makes of the stages: stiff forces magnify
+            # it.
+            noise = increment_size(stages, x, unravel(z + noise), lin) / nudge
+            found = found._replace(
+                iterate=fibre_coordinate_size(stages, x_next), noise=noise
+            )
+            return x_next, found, evaluation
+
+        solved = iterate(
+            sweep,
+            x0,
+            scale,
+            max_iterations=self.max_iterations,
+            tolerance=self.tolerance,
+            noise_units=NOISE_UNITS,
+            skip=skip,
+        )
+        # Where forces grow without bound, increments are small far from any solution.
+        gross = matvec(lin.momentum_inverse, solved.aux.forces.residual)
+        allowed = jnp.maximum(_GROSS, 1e3 * self.tolerance).astype(scale.dtype)
+        size = jnp.maximum(scale, fibre_coordinate_size(stages, solved.x))
+        is_near = skip | (max_norm(gross) <= allowed * size)
+        return solved._replace(
+            converged=solved.converged & is_near,
+            exhausted=solved.exhausted | (solved.converged & ~is_near),
+        )
+
+    def frozen_newton_map(
+        self, stages: StageSystem, lin: Linearisation, x: Stages
+    ) -> FrozenNewtonMap:
+        """Newton's iteration with the Jacobian at the solution."""
+        z, unravel = ravel_pytree(x)
+        jacobian = jax.jacfwd(lambda z: stage_residual(stages, unravel(z))[0])(z)
+        jacobian_inverse = jnp.linalg.inv(jacobian)
+
+        def corrected(stages: StageSystem, x: Stages) -> Stages:
+            residual, _ = stage_residual(stages, x)
+            return unravel(ravel_pytree(x)[0] - jacobian_inverse @ residual)
+
+        return corrected

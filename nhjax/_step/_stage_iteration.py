@@ -1,0 +1,126 @@
+"""The stage equations as one system: their residual, and a sweep over them."""
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+from jax.flatten_util import ravel_pytree
+from jaxtyping import Array, Float
+
+from .._custom_types import BoolScalar, FloatScalar
+from .._numerics import matvec, max_norm, Sizes, small_einsum
+from .._system import Linearisation
+from ._leading_structure import LeadingStructure
+from ._stages import StageForces, Stages, StageSystem
+
+
+class Evaluation(NamedTuple):
+    """What a solver leaves behind: the equations at the last iterate.
+
+    `newton` is whether Newton's method had to solve what another solver could not.
+    """
+
+    forces: StageForces
+    node_residual: Float[Array, "r n"]
+    newton: BoolScalar
+
+
+def corrected(
+    stages: StageSystem, structure: LeadingStructure, x: Stages
+) -> tuple[Stages, Evaluation]:
+    """A sweep of simplified Newton over the stages, and what it evaluated at x."""
+    # Each residual is evaluated at the newest iterate (Gauss-Seidel): it costs the same
+    # as evaluating all of them at the last one, and contracts faster.
+    forces = stages.evaluate(x)
+    x_next = structure.correct_stages(stages, x, forces.residual)
+    node_residual = stages.node_residual(x_next, forces.force)
+    x_next = structure.correct_nodes(x_next, node_residual)
+    if stages.constrained:
+        x_next = _constrain(stages, structure, x_next)
+    return x_next, Evaluation(forces, node_residual, jnp.asarray(False))
+
+
+def _constrain(stages: StageSystem, structure: LeadingStructure, x: Stages) -> Stages:
+    kinematic, holonomic = _constraints(stages, x)
+    x = structure.correct_multipliers(stages, x, kinematic, holonomic)
+    if stages.symmetric:
+        # λ_c depends on v_{k+1} at zeroth order: it must see the new velocity, or the
+        # two errors would feed each other and contract only as the root of the rate.
+        x = structure.correct_end(x, stages.end_residual(x))
+    return x
+
+
+def _constraints(stages: StageSystem, x: Stages) -> tuple[Array, Array]:
+    """The nonholonomic constraints at the nodes and the holonomic ones, if any."""
+    none = jnp.zeros((0,), stages.p.dtype)
+    return (
+        stages.node_constraint(x) if stages.num_nonholonomic else none,
+        stages.holonomic_constraint(x) if stages.num_holonomic else none,
+    )
+
+
+def stage_residual(
+    stages: StageSystem, x: Stages
+) -> tuple[Float[Array, " k"], Evaluation]:
+    """All equations of a step in one vector."""
+    forces = stages.evaluate(x)
+    node_residual = stages.node_residual(x, forces.force)
+    parts = [forces.residual, node_residual]
+    if stages.hamiltonian:
+        parts.append(x.velocity - stages.stage_velocities(x))
+    parts += _constraints(stages, x)
+    if stages.symmetric:
+        parts += stages.end_residual(x)
+    return (
+        ravel_pytree(parts)[0],
+        Evaluation(forces, node_residual, jnp.asarray(False)),
+    )
+
+
+def sizes(stages: StageSystem, x: Stages, x_next: Stages, lin: Linearisation) -> Sizes:
+    """The sizes of an increment and of the fibre coordinates that it leads to.
+
+    Of the latter those at the end of the step tell enough: it costs time to look at
+    all of them.
+    """
+    increment = increment_size(stages, x, x_next, lin)
+    return Sizes(increment, max_norm(x_next.node_fibre_coordinate[-1]))
+
+
+def fibre_coordinate_size(stages: StageSystem, x: Stages) -> FloatScalar:
+    """The size of the fibre coordinates, of the stages or of the nodes.
+
+    The smaller of the two: while an iteration is far from a solution, one of them can
+    be larger than anything that the other has to do with.
+    """
+    fibre = x.momentum if stages.hamiltonian else x.velocity
+    return jnp.minimum(max_norm(fibre), max_norm(x.node_fibre_coordinate))
+
+
+def increment_size(
+    stages: StageSystem, x: Stages, x_next: Stages, lin: Linearisation
+) -> FloatScalar:
+    """The size of an increment in fibre coordinates.
+
+    Not finite once the iterates have left the chart.
+    """
+    changes = [
+        x_next.node_fibre_coordinate - x.node_fibre_coordinate,
+        x_next.velocity - x.velocity,
+    ]
+    if stages.hamiltonian:
+        changes[1] = matvec(lin.metric_inverse, changes[1])
+        changes.append(x_next.momentum - x.momentum)
+    if stages.constrained:
+        # Multipliers count by their effect on u, h N⁻¹ R δΛ, on its own: Λ can still be
+        # wrong where the stages and nodes happen to be right.
+        before, after = map(stages.multiplier_change, (x, x_next))
+        reaction = lin.reaction
+        if reaction.shape[1] == 1:
+            # The largest entry of the column decides; it is the same for all iterates.
+            reaction = max_norm(reaction).reshape(1, 1)
+        change = small_einsum("sl,nl->sn", after - before, reaction)
+        changes.append(stages.h * change)
+    size = max_norm(*changes)
+    if stages.chart.manifold.is_flat:
+        return size
+    return jnp.where(stages.in_chart(x_next), size, jnp.inf)

@@ -1,0 +1,189 @@
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int, PyTree
+
+from .._custom_types import Args, BoolScalar, FloatScalar
+from .._method import AbstractMethod
+from .._numerics import (
+    frozen,
+    has_tangent,
+    max_norm,
+    relative,
+    small_einsum,
+    Solved,
+    two_sum,
+    zero_unless,
+)
+from .._results import RESULTS
+from .._system import (
+    AbstractMechanicalSystem,
+    all_finite,
+    Linearisation,
+    linearise,
+    State,
+)
+from ._newton import AbstractStageSolver
+from ._record import StepRecord
+from ._stage_iteration import Evaluation
+from ._stages import Stages, StageSystem
+
+
+class StepState(eqx.Module):
+    """What is carried from step to step: a state and what is known there.
+
+    The compensations are the rounding errors of the running sums q and p; the
+    linearisation is both the Jacobian of the next step and the source of λ_c.
+    """
+
+    state: State
+    q_compensation: PyTree[Array]
+    p_compensation: Float[Array, " n"]
+    lin: Linearisation
+
+
+class StepOutcome(NamedTuple):
+    """A step: the next node, or the reason why there is none."""
+
+    step_state: StepState
+    record: StepRecord
+    stages: Stages
+    result: RESULTS
+    num_iterations: Int[Array, ""]
+    residual: FloatScalar
+    constraint_violation: FloatScalar
+    multiplier_defect: FloatScalar
+    newton: BoolScalar  # whether Newton's method had to take over
+
+
+def first_step_state(
+    system: AbstractMechanicalSystem,
+    method: AbstractMethod,
+    t: FloatScalar,
+    y0: State,
+    args: Args,
+) -> StepState:
+    """The node to start from at a consistent state.
+
+    Closures that do not carry the multiplier report λ_c from the first node on.
+    """
+    lin = linearise(system, t, y0.q, system.fibre_coordinate(y0), args)
+    multiplier = _continuous_multiplier(
+        (system, t, y0.q, system.fibre_coordinate(y0), args)
+    )
+    carried = method.closure == "propagated"
+    return StepState(
+        state=State(y0.q, y0.v, y0.p, y0.multiplier if carried else multiplier),
+        q_compensation=system.manifold_of(y0.q).no_compensation(y0.q),
+        p_compensation=jnp.zeros_like(y0.p),
+        lin=frozen(lin),
+    )
+
+
+@eqx.filter_custom_jvp
+def _continuous_multiplier(arguments: tuple[Any, ...]) -> Float[Array, " l"]:
+    return linearise(*arguments).multiplier
+
+
+@_continuous_multiplier.def_jvp
+def _continuous_multiplier_jvp(primals, tangents):
+    # No derivative where there is no multiplier: NaN times zero would be NaN even for a
+    # lane that nothing asks for.
+    (arguments,), (rates,) = primals, tangents
+    multiplier = _continuous_multiplier(arguments)
+    ok = jnp.all(jnp.isfinite(multiplier))
+    perturbed, fixed = eqx.partition(arguments, has_tangent(rates))
+    _, change = jax.jvp(
+        lambda perturbed: linearise(*eqx.combine(perturbed, fixed)).multiplier,
+        (perturbed,),
+        (zero_unless(ok, rates),),
+    )
+    return multiplier, zero_unless(ok, change)
+
+
+def step(
+    system: AbstractMechanicalSystem,
+    method: AbstractMethod,
+    solver: AbstractStageSolver,
+    t: FloatScalar,
+    h: FloatScalar,
+    step_state: StepState,
+    args: Args,
+    skip: BoolScalar,
+) -> StepOutcome:
+    """One step of size h: (q_k, p_k, λ_k) -> (q_{k+1}, p_{k+1}, λ_{k+1}).
+
+    Where `skip` is true nothing is solved and the outcome is to be discarded.
+    """
+    state, lin = step_state.state, step_state.lin
+    propagated = method.closure == "propagated"
+    stages = StageSystem.at(system, method, t, h, state, args)
+    x0 = stages.starting_values(system.fibre_coordinate(state), lin)
+    solved = solver.solve(stages, x0, lin, skip)
+    x, forces = solved.x, solved.aux.forces
+
+    manifold = system.manifold_of(state.q)
+    q, q_compensation = manifold.advance(
+        state.q, stages.increment(x), step_state.q_compensation
+    )
+    p_increment = h * small_einsum("s,sn->n", stages.coefficients("b"), forces.force)
+    p, p_compensation = two_sum(state.p, p_increment + step_state.p_compensation)
+    p, p_compensation = stages.chart.carry(stages.increment(x), p, p_compensation)
+    u = p if stages.hamiltonian else x.node_fibre_coordinate[-1]
+    lin_next = linearise(system, t + h, q, u, args)
+    multiplier = lin_next.multiplier
+    if propagated:
+        # Only nonholonomic multipliers are carried; a step finds the others anew.
+        m = stages.num_nonholonomic
+        multiplier = jnp.concatenate([forces.multiplier[-1, :m], multiplier[m:]])
+    v = system.velocity(t + h, q, u, args)
+    next_node = StepState(
+        State(q, v, p, multiplier), q_compensation, p_compensation, lin_next
+    )
+    in_chart = stages.in_chart(x)
+
+    residual = max_norm(forces.residual, solved.aux.node_residual)
+    scale = max_norm(forces.momentum) + max_norm(h * forces.force)
+    return StepOutcome(
+        step_state=next_node,
+        record=StepRecord(state, x.velocity, forces.force, forces.multiplier),
+        stages=x,
+        result=_result(solved, lin, next_node, in_chart),
+        num_iterations=solved.num_iterations,
+        residual=relative(residual, scale),
+        constraint_violation=largest_violation(system, t + h, next_node, args),
+        multiplier_defect=max_norm(forces.multiplier[-1] - lin_next.multiplier),
+        newton=solved.aux.newton,
+    )
+
+
+def _result(
+    solved: Solved[Stages, Evaluation],
+    lin: Linearisation,
+    step_state: StepState,
+    in_chart: BoolScalar,
+) -> RESULTS:
+    finite = all_finite(step_state.state) & all_finite(step_state.lin)
+    # What is not finite at the first iterate is so near the state itself.
+    failed = RESULTS.where(
+        solved.num_iterations > 1,
+        RESULTS.nonlinear_divergence,
+        RESULTS.nonfinite_state,
+    )
+    failed = RESULTS.where(solved.exhausted, RESULTS.nonlinear_max_iterations, failed)
+    converged = RESULTS.where(finite, RESULTS.successful, RESULTS.nonfinite_state)
+    result = RESULTS.where(solved.converged, converged, failed)
+    result = RESULTS.where(in_chart, result, RESULTS.left_chart)
+    # A singular M or C at the end is found at once: λ_c does not exist there.
+    singular = lin.is_singular | (solved.converged & step_state.lin.is_singular)
+    return RESULTS.where(singular, RESULTS.singular_stage_matrix, result)
+
+
+def largest_violation(
+    system: AbstractMechanicalSystem, t: FloatScalar, step_state: StepState, args: Args
+) -> FloatScalar:
+    """The largest violation of any constraint at a node."""
+    on_positions = system.position_constraint(t, step_state.state.q, args)
+    return max_norm(step_state.lin.violation, on_positions)

@@ -1,0 +1,119 @@
+"""What can be wrong with a state, or with the functions of a system."""
+
+import reprlib
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, PyTree
+
+from .._custom_types import Args
+from .._errors import DTypeError, is_traced, require, ShapeError
+from ._abstract import AbstractMechanicalSystem
+from ._arguments import finite, floating
+from ._state import State
+
+
+def require_manifold(
+    system: AbstractMechanicalSystem, name: str, q: PyTree[Array]
+) -> None:
+    """Raise for a tuple in a system that has no manifold to say what it is."""
+    if system.manifold is None and isinstance(q, tuple):
+        raise ShapeError(
+            f"`{name}` is a tuple of {len(q)}, but the system has no `manifold`. Give "
+            "it one, such as nhjax.ProductGroup(...), or make one array of "
+            f"`{name}`."
+        )
+
+
+def check_functions(
+    system: AbstractMechanicalSystem, t: Array, q: PyTree[Array], args: Args
+) -> None:
+    """Raise unless the functions of the system return what they should."""
+    n, dtype = system.manifold_of(q).dim, jax.tree.leaves(q)[0].dtype
+    u = jax.ShapeDtypeStruct((n,), dtype)
+
+    def few(shape):
+        return shape == () or (len(shape) == 1 and 1 <= shape[0] <= n)
+
+    expected = {
+        system.generator: ("shape (), a scalar", lambda shape: shape == ()),
+        "nonholonomic": (
+            f"shape () or (m,) with 1 <= m <= {n}, the number of coordinates",
+            few,
+        ),
+        "holonomic": (
+            f"shape () or (k,) with 1 <= k <= {n}, the number of coordinates",
+            few,
+        ),
+        "force": (f"shape ({n},)", lambda shape: shape == (n,)),
+    }
+    for name, (function, arguments) in system.functions(t, q, u, args).items():
+        wanted, fits = expected[name]
+        signature = f"({', '.join(system.signatures()[name])})"
+        out = eqx.filter_eval_shape(function, *arguments)
+        shape = getattr(out, "shape", None)
+        if shape is None:
+            raise ShapeError(
+                f"`{name}{signature}` must return an array of {wanted}, got "
+                f"{reprlib.repr(out)} of type {type(out).__name__}."
+            )
+        if not fits(shape):
+            raise ShapeError(
+                f"`{name}{signature}` must return {wanted}, got shape {shape}."
+            )
+        if out.dtype != dtype:
+            raise DTypeError(
+                f"`{name}{signature}` returns dtype {out.dtype}, but `q` has "
+                f"{dtype}: constants of another precision inside it?"
+            )
+
+
+def check_state(system: AbstractMechanicalSystem, y0: State, args: Args) -> None:
+    """Raise unless `y0` can be a state of `system`."""
+    parts = {name: getattr(y0, name) for name in ("p", "v", "q", "multiplier")}
+    for name, x in parts.items():
+        for leaf in jax.tree.leaves(x, is_leaf=lambda leaf: leaf is None):
+            if not eqx.is_array(leaf):
+                raise TypeError(
+                    f"`y0.{name}` must be an array, got {reprlib.repr(leaf)} of type "
+                    f"{type(leaf).__name__}. Use `initial_state`."
+                )
+            floating(f"y0.{name}", leaf)
+            if leaf.dtype != y0.p.dtype:
+                raise DTypeError(
+                    f"`y0.{name}` has dtype {leaf.dtype} and `y0.p` {y0.p.dtype}: all "
+                    "parts of a state must agree. Use `initial_state`."
+                )
+    require_manifold(system, "y0.q", y0.q)
+    advice = (
+        "For many trajectories use `jax.vmap` over `y0`; the last state of a solution "
+        "is `jax.tree.map(lambda x: x[-1], sol.ys)`."
+    )
+    for name in ("q", "p") if system.manifold is None else ("p",):
+        if jnp.ndim(parts[name]) != 1:
+            raise ShapeError(
+                f"`y0.{name}` has shape {parts[name].shape}, but a state has shape "
+                f"(n,). {advice}"
+            )
+    manifold = system.manifold_of(y0.q)
+    manifold.check(y0.q)
+    for name in ("v", "p"):
+        shape = parts[name].shape
+        if shape != (manifold.dim,):
+            raise ShapeError(
+                f"`y0.{name}` has shape {shape}, but `y0.q` needs ({manifold.dim},). "
+                "Use `initial_state`."
+            )
+    t = jnp.zeros((), y0.v.dtype)
+    u = system.fibre_coordinate(y0)
+    expected = eqx.filter_eval_shape(system.constraint, t, y0.q, u, args).shape
+    if y0.multiplier.shape != expected:
+        raise ShapeError(
+            f"`y0.multiplier` has shape {y0.multiplier.shape}, but the constraints of "
+            f"the system have shape {expected}. Use `initial_state` with this system."
+        )
+    for name, x in parts.items():
+        # Of traced parts the integration itself reports it, lane by lane.
+        if not is_traced(*jax.tree.leaves(x)):
+            require(x, finite(f"y0.{name}", x))

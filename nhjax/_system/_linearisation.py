@@ -1,0 +1,177 @@
+from collections.abc import Callable
+from typing import Literal
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, PyTree
+
+from .._custom_types import Args, FloatScalar, FloatScalarLike
+from .._numerics import inverse, jacobian, Matrix, matvec, small_einsum
+from ._abstract import AbstractMechanicalSystem
+from ._state import check_time_and_state, State
+
+
+class Linearisation(eqx.Module):
+    """What is known of the equations of motion at one state (t, q, u).
+
+    u is the fibre coordinate of the system, v or p. With N = ∂p/∂u, B = ∂Φ/∂u of the
+    constraints on velocities, and R = ♭ Bᵀ their reactions, the motion satisfies
+
+    N u̇ - R λ = ad*_v p + free force - ∂t p - D1p v,    B u̇ = -∂t Φ - D1Φ v,
+
+    so that C λ with C = B N⁻¹ R is known: C is the paper's compatibility matrix C^{ab}
+    (section 3). For a Lagrangian system N is the mass matrix M = D2D2L, R = Bᵀ and u̇
+    the acceleration; for a Hamiltonian one N = 1 and R = (D2D2H)⁻¹ Bᵀ. In both
+    N⁻¹ R = K⁻¹ Bᵀ with K the metric on the fibre.
+
+    The same matrices are the leading structure of the stage system. Inverses are formed
+    once and multiplied with afterwards: the matrices are tiny, and a triangular solve
+    inside an iteration costs far more than a product.
+    """
+
+    metric_inverse: Matrix  # K⁻¹
+    jacobian: Float[Array, "l n"]  # B
+    reaction: Float[Array, "n l"]  # N⁻¹ R
+    compliance_inverse: Float[Array, "l l"]  # C⁻¹
+    acceleration: Float[Array, " n"]  # u̇
+    multiplier: Float[Array, " l"]
+    violation: Float[Array, " l"]
+    fibre_coordinate_name: Literal["v", "p"] = eqx.field(static=True)
+
+    @property
+    def momentum_inverse(self) -> Matrix:
+        """N⁻¹: the inverse mass matrix, or the identity of a Hamiltonian system."""
+        if self.fibre_coordinate_name == "v":
+            return self.metric_inverse
+        return jnp.ones_like(self.acceleration)
+
+    @property
+    def is_singular(self) -> Bool[Array, ""]:
+        """Whether K or C could not be inverted."""
+        return ~(
+            jnp.all(jnp.isfinite(self.metric_inverse))
+            & jnp.all(jnp.isfinite(self.compliance_inverse))
+        )
+
+    def solve(
+        self, momentum_residual: Float[Array, " n"], hidden_residual: Float[Array, " l"]
+    ) -> tuple[Float[Array, " n"], Float[Array, " l"]]:
+        """(u̇, λ) with N u̇ - R λ = `momentum_residual`, B u̇ = `hidden_residual`."""
+        free = matvec(self.momentum_inverse, momentum_residual)
+        hidden = hidden_residual - small_einsum("ln,n->l", self.jacobian, free)
+        multiplier = small_einsum("kl,l->k", self.compliance_inverse, hidden)
+        return free + small_einsum("nl,l->n", self.reaction, multiplier), multiplier
+
+
+def _momentum_and_constraint(
+    system: AbstractMechanicalSystem, q: PyTree[Array], args: Args
+) -> Callable[..., tuple[Array, Array]]:
+    """(p, Φ) on the chart around q, from whose derivatives the motion follows."""
+    manifold = system.manifold_of(q)
+
+    def pair(t, xi, u):
+        g = manifold.act(q, xi)
+        return system.momentum(t, g, u, args), system.constraint(t, g, u, args)
+
+    return pair
+
+
+def _inertial_force(system, q, p: Array, v: Array) -> Array:
+    """ad*_v p, by which the body momentum turns."""
+    manifold = system.manifold_of(q)
+    return jnp.zeros_like(p) if manifold.is_flat else manifold.ad_dual(v, p)
+
+
+def motion_residual(
+    system: AbstractMechanicalSystem,
+    t: FloatScalar,
+    q: PyTree[Array],
+    u: Float[Array, " n"],
+    acceleration: Float[Array, " n"],
+    multiplier: Float[Array, " l"],
+    args: Args,
+) -> tuple[Float[Array, " n"], Float[Array, " l"]]:
+    """Residuals of the equations of motion and of the hidden constraint.
+
+    ṗ - ad*_v p - W and dΦ/dt along (q̇, u̇) = (q v, a). They vanish at the continuous
+    multiplier λ = λ_c(q, u).
+    """
+    v = system.velocity(t, q, u, args)
+    (p, _), (p_dot, phi_dot) = jax.jvp(
+        _momentum_and_constraint(system, q, args),
+        (t, jnp.zeros_like(u), u),
+        (jnp.ones_like(t), v, acceleration),
+    )
+    w = system.stage_force(t, q, u, multiplier, args)
+    return p_dot - (w + _inertial_force(system, q, p, v)), phi_dot
+
+
+def linearise(
+    system: AbstractMechanicalSystem,
+    t: FloatScalar,
+    q: PyTree[Array],
+    u: Float[Array, " n"],
+    args: Args,
+) -> Linearisation:
+    """The matrices, the acceleration and the continuous multiplier at (t, q, u)."""
+    zero, v = jnp.zeros_like(u), system.velocity(t, q, u, args)
+    (p, violation), (p_dot, phi_dot) = jax.jvp(
+        _momentum_and_constraint(system, q, args),
+        (t, zero, u),
+        (jnp.ones_like(t), v, zero),
+    )
+    slopes = jax.jacrev(system.constraint, argnums=2)(t, q, u, args)
+    metric = jacobian(lambda u: system.fibre_derivative(t, q, u, args), u)
+    metric_inverse = inverse(metric)
+    reaction = matvec(metric_inverse, slopes).T
+    compliance = small_einsum("kn,nl->kl", slopes, reaction)
+    lin = Linearisation(
+        metric_inverse=metric_inverse,
+        jacobian=slopes,
+        reaction=reaction,
+        compliance_inverse=inverse(compliance),
+        acceleration=zero,
+        multiplier=jnp.zeros_like(violation),
+        violation=violation,
+        fibre_coordinate_name=system.fibre_coordinate_name,
+    )
+    known = system.free_force(t, q, u, args) + _inertial_force(system, q, p, v)
+    acceleration, multiplier = lin.solve(known - p_dot, -phi_dot)
+    return eqx.tree_at(
+        lambda x: (x.acceleration, x.multiplier), lin, (acceleration, multiplier)
+    )
+
+
+def continuous_multiplier(
+    system: AbstractMechanicalSystem, t: FloatScalarLike, y: State, args: Args = None
+) -> Float[Array, " l"]:
+    """The multiplier λ_c of the continuous equations of motion at a state.
+
+    It follows from the hidden constraint dΦ/dt = 0, and for the rows of holonomic
+    constraints, which come last, from d²Γ/dt² = 0 (the paper's section 3). Along a
+    trajectory of a Lobatto method it is of order 2s-2, while the multiplier that the
+    paper propagates is of order s or s-1.
+
+    **Arguments:**
+
+    - `system`: the mechanical system.
+    - `t`: the time of the state.
+    - `y`: a state, such as one of `Solution.ys`.
+    - `args`: passed on to the functions of the system.
+
+    **Returns:** an array of shape (m + k,) for m nonholonomic and k holonomic
+    constraints, in units of force over those of D2Φ.
+
+    **Raises:** `TypeError` if `y` is no `State`.
+
+    !!! example
+
+        >>> import nhjax
+        >>> disc = nhjax.systems.VerticalRollingDisc()
+        >>> nhjax.continuous_multiplier(disc.system, 0.0, disc.initial_state()).shape
+        (2,)
+    """
+    check_time_and_state("continuous_multiplier", t, y, "system, ")
+    t = jnp.asarray(t, y.p.dtype)
+    return linearise(system, t, y.q, system.fibre_coordinate(y), args).multiplier

@@ -1,0 +1,63 @@
+"""The sizes by which violations and increments are judged to be round-off."""
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, PyTree
+
+from .._custom_types import Args, FloatScalar
+from .._numerics import max_norm
+from ._abstract import AbstractMechanicalSystem
+from ._linearisation import Linearisation
+
+
+def violation_scale(
+    system: AbstractMechanicalSystem,
+    lin: Linearisation,
+    t: FloatScalar,
+    q: PyTree[Array],
+    u: Float[Array, " n"],
+    args: Args,
+) -> Float[Array, " l"]:
+    """Row by row the size that the terms of an affine Φ may have at such a u.
+
+    Not their size at u itself: a constraint such as v[1] has but one term, which is
+    round-off in a state that satisfies it.
+    """
+    return velocity_scale(system, lin.jacobian, t, q, u, args)
+
+
+def velocity_scale(
+    system: AbstractMechanicalSystem,
+    jacobian: Float[Array, "l n"],
+    t: FloatScalar,
+    q: PyTree[Array],
+    u: Float[Array, " n"],
+    args: Args,
+) -> Float[Array, " l"]:
+    """The same from the derivatives of Φ in u alone."""
+    affine = _finite_or_zero(system.constraint(t, q, jnp.zeros_like(u), args))
+    slopes = jnp.sum(jnp.abs(jacobian), axis=1)
+    return slopes * max_norm(u) + affine
+
+
+def position_scale(
+    system: AbstractMechanicalSystem, t: FloatScalar, q: PyTree[Array], args: Args
+) -> Float[Array, " k"]:
+    """Row by row the size that the terms of an affine Γ may have at such a q."""
+
+    def gamma(q):
+        return system.position_constraint(t, q, args)
+
+    constant = _finite_or_zero(gamma(jax.tree.map(jnp.zeros_like, q)))
+    if system.holonomic is None:
+        return constant
+    slopes = jax.tree.map(
+        lambda slope: jnp.sum(jnp.abs(slope), axis=tuple(range(1, slope.ndim))),
+        jax.jacrev(gamma)(q),
+    )
+    return sum(jax.tree.leaves(slopes)) * max_norm(*jax.tree.leaves(q)) + constant
+
+
+def _finite_or_zero(x: Array) -> Array:
+    # Where a constraint is singular at zero, that value says nothing of its size.
+    return jnp.abs(jnp.nan_to_num(x, nan=0.0, posinf=0.0, neginf=0.0))
