@@ -26,7 +26,7 @@ constexpr double A[S][S] = {
 constexpr double A_HAT[S][S] = {
     {1. / 6, -1. / 6, 0}, {1. / 6, 1. / 3, 0}, {1. / 6, 5. / 6, 0}};
 constexpr double EPS = std::numeric_limits<double>::epsilon();
-constexpr double PATIENCE = 30;
+constexpr double GROWTH = 2;
 constexpr double NOISIEST = 400 * EPS;
 
 // The two number types: a double, and a vector with a trajectory in each lane.
@@ -216,7 +216,7 @@ inline T step(State<T>& y, double h) {
     free_force(q[2], f[2]);
 
     Vector<T> q_increment, p_increment, v_next;
-    T iterations = y.lambda * 0., believed = iterations + EPS;
+    T iterations = y.lambda * 0., believed = iterations + 15 * EPS;
     T smallest = iterations + std::numeric_limits<double>::infinity();
     Mask<T> running = iterations == 0.;
     for (int sweep = 0; sweep < MAX_ITERATIONS; ++sweep) {
@@ -288,7 +288,7 @@ inline T step(State<T>& y, double h) {
         end += d_end;
 
         Mask<T> stalls = size >= smallest;
-        believed = stalls ? smaller(T(believed * PATIENCE), T(believed * 0. + NOISIEST))
+        believed = stalls ? smaller(T(believed * GROWTH), T(believed * 0. + NOISIEST))
                           : believed;
         Mask<T> stop = (size <= EPS) | (stalls & (size <= believed));
         smallest = smaller(size, smallest);

@@ -170,7 +170,7 @@ def stripped(s: int) -> Run:
             ]
             size = reduce(jnp.maximum, sizes)
             stalls = size >= smallest
-            more = jnp.minimum(30.0 * believed, 400 * eps)
+            more = jnp.minimum(2.0 * believed, 400 * eps)
             believed = jnp.where(stalls, more, believed)
             small = (size <= floor * scale) | (stalls & (size <= believed * scale))
             count = count + ~done
@@ -189,7 +189,7 @@ def stripped(s: int) -> Run:
         y = free.reshape((-1,) + (1,) * len(members)) * multiplier
         zero = jnp.zeros(members)
         start = (velocity, node, y, multiplier, acceleration)
-        progress = (zero + jnp.inf, zero + eps, zero > 0, zero)
+        progress = (zero + jnp.inf, zero + 15 * eps, zero > 0, zero)
         found = jax.lax.while_loop(
             lambda now: jnp.any(~now[7]),
             sweep,

@@ -13,7 +13,7 @@ from jaxtyping import Array
 
 import nhjax
 from nhjax._step import first_step_state, step
-from nhjax._step._stages import Stages
+from nhjax._step._unknowns import Stages
 from nhjax._system import State
 
 

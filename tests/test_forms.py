@@ -27,7 +27,14 @@ from jax.flatten_util import ravel_pytree
 
 import nhjax
 from nhjax._step import first_step_state
-from nhjax._step._stages import StageSystem
+from nhjax._step._stage_equations import (
+    holonomic_constraint,
+    node_residual,
+    stage_forces,
+    stage_velocities,
+)
+from nhjax._step._stage_system import StageSystem
+from nhjax._step._starting_values import starting_values
 from nhjax._system import State
 
 
@@ -162,18 +169,18 @@ def test_both_forms_take_the_same_steps(build, constraint, driven, stages):
 
 def residual_of(stages, x):
     """The stage equations of a system without nonholonomic constraints."""
-    forces = stages.evaluate(x)
-    parts = [forces.residual, stages.node_residual(x, forces.force)]
+    forces = stage_forces(stages, x)
+    parts = [forces.residual, node_residual(stages, x, forces.force)]
     if stages.hamiltonian:
-        parts.append(x.velocity - stages.stage_velocities(x))
+        parts.append(x.velocity - stage_velocities(stages, x))
     if stages.num_holonomic:
-        parts.append(stages.holonomic_constraint(x))
+        parts.append(holonomic_constraint(stages, x))
     return ravel_pytree(parts)[0]
 
 
 def end_of(stages, x):
     """(q_{k+1}, p_{k+1})."""
-    xi, n = stages.increment(x), stages.evaluate(x).force
+    xi, n = stages.increment(x), stage_forces(stages, x).force
     p = stages.chart.to_end(xi, stages.p + stages.h * (stages.method.b @ n))
     return stages.chart.manifold.act(stages.q, xi), p
 
@@ -191,7 +198,7 @@ def one_step(system, method, y0):
         t, h = jnp.zeros(()), jnp.asarray(STEP)
         lin = first_step_state(system, method, t, y0, None).lin
         stages = StageSystem(system, method, t, h, y0.q, y0.p, lin.multiplier, None)
-        x0 = stages.starting_values(system.fibre_coordinate(y0), lin)
+        x0 = starting_values(stages, system.fibre_coordinate(y0), lin)
         solver = nhjax.SimplifiedNewton()
         solved = solver.solve(stages, x0, lin, jnp.asarray(False)).x
         z, unravel = ravel_pytree(solved)

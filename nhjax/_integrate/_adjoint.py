@@ -12,7 +12,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Int
 
-from ._loop import Carry, Loop, Rows
+from ._loop import Loop
+from ._saving import Rows
+from ._stepping import Carry
 
 
 _Run: TypeAlias = tuple[Carry, Rows]

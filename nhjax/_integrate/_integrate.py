@@ -1,21 +1,14 @@
 from dataclasses import replace
-from functools import partial
 
-import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Int, PyTree
 
-from .._compile import as_cpu_kernel, tracked_jit
-from .._custom_types import Args, FloatScalar, FloatScalarLike, IntScalar
+from .._custom_types import Args, FloatScalarLike, IntScalar
 from .._errors import Check, require
 from .._method import AbstractMethod
-from .._numerics import ClosureConverted, nan_gradient_unless
-from .._results import RESULTS
 from .._step import (
     AbstractStageSolver,
     leaves_steps_to_newton,
     SimplifiedNewton,
-    StepRecord,
 )
 from .._system import (
     AbstractMechanicalSystem,
@@ -33,20 +26,15 @@ from ._adjoint import AbstractAdjoint, DirectAdjoint
 from ._checks import (
     advancing,
     check_num_steps,
-    check_saved,
     countable,
     is_tracing,
-    known,
 )
 from ._interpolation import (
-    DenseInterpolation,
-    interpolate,
     require_collocation,
-    step_index,
 )
-from ._loop import Loop
 from ._progress_meter import AbstractProgressMeter, NoProgressMeter
-from ._saveat import SaveAt, stack_saved
+from ._run import run
+from ._saveat import SaveAt
 from ._solution import is_unsolved, raise_failures, Solution
 
 
@@ -180,89 +168,21 @@ def integrate(
     if not isinstance(num_steps, int) or (needed_by is None and not is_tracing()):
         num_steps = jnp.asarray(num_steps, jnp.int32)
 
-    def run(solver: AbstractStageSolver, meter: AbstractProgressMeter) -> Solution:
+    def run_with(
+        stage_solver: AbstractStageSolver, meter: AbstractProgressMeter
+    ) -> Solution:
         given = (adjoint, y0, t0, dt, num_steps, args, saveat, meter)
-        return _integrate(system, method, solver, *given)
+        return run(system, method, stage_solver, *given)
 
-    sol = run(stage_solver, progress_meter)
+    sol = run_with(stage_solver, progress_meter)
     if not is_tracing() and leaves_steps_to_newton(stage_solver) and is_unsolved(sol):
         # Silently: the meter has shown its run already.
-        sol = run(replace(stage_solver, fallback=True), NoProgressMeter())
+        sol = run_with(replace(stage_solver, fallback=True), NoProgressMeter())
     return raise_failures(sol) if throw else sol
 
 
 def _zero_step() -> ValueError:
     return ValueError("`dt` is zero; give a positive or negative step size.")
-
-
-@tracked_jit("system", "args", "saveat")
-def _integrate(
-    system: AbstractMechanicalSystem,
-    method: AbstractMethod,
-    solver: AbstractStageSolver,
-    adjoint: AbstractAdjoint,
-    y0: State,
-    t0: FloatScalar,
-    dt: FloatScalar,
-    num_steps: int | IntScalar,
-    args: Args,
-    saveat: SaveAt,
-    meter: AbstractProgressMeter,
-) -> Solution:
-    check_saved(saveat.fn, t0, y0, args)
-    # What user functions close over must be seen to be differentiated.
-    system = system.closure_converted(t0, y0, args)
-    ts = saveat.ts
-    num_records, sampled, record_slots = 0, None, None
-    if saveat.dense or ts is not None:
-        length = known(num_steps)
-        if ts is not None:
-            sampled = jax.vmap(lambda t: step_index(t, t0, dt, length))(ts)
-        num_records, record_slots = _record_slots(saveat.dense, sampled, length)
-    loop = Loop(
-        system,
-        method,
-        solver,
-        t0,
-        dt,
-        num_steps,
-        args,
-        meter,
-        ClosureConverted(saveat.fn, t0, y0, args),
-        saveat.steps,
-        num_records,
-        record_slots,
-    )
-
-    def run(loop: Loop, y0: State):
-        start = loop.start(y0)
-        return start.step_state.state, *adjoint.run(loop, start)
-
-    start, carry, rows = as_cpu_kernel(run, loop, y0)
-    successful = carry.result == RESULTS.successful
-    given = (system, y0, t0, dt, args)
-    state, rows = nan_gradient_unless(successful, (carry.step_state.state, rows), given)
-    t1 = loop.time(num_steps)
-
-    def one(saved: PyTree[Array]) -> PyTree[Array]:
-        return jax.tree.map(lambda x: x[None], saved)
-
-    pieces = [one(loop.saved(t0, start))] if saveat.t0 else []
-    if saveat.steps:
-        pieces.append(jax.tree.map(lambda x: x[:-1], rows.saved))
-    if ts is not None and sampled is not None and record_slots is not None:
-        at_samples = jax.tree.map(lambda x: x[record_slots[sampled]], rows.record)
-        pieces.append(jax.vmap(partial(_sample, loop))(ts, sampled, at_samples))
-    if saveat.saves_end(num_steps):
-        pieces.append(one(loop.saved(t1, state)))
-    times, ys = stack_saved(pieces) if pieces else (None, None)
-    interpolation = None
-    if saveat.dense:
-        records = jax.tree.map(lambda x: x[:-1], rows.record)
-        interpolation = DenseInterpolation(
-            system, method, known(num_steps), t0, dt, records, args
-        )
-    return Solution(t0, t1, times, ys, carry.stats, carry.result, interpolation)
 
 
 def _what_needs_the_length(saveat: SaveAt, meter: AbstractProgressMeter) -> str | None:
@@ -274,27 +194,3 @@ def _what_needs_the_length(saveat: SaveAt, meter: AbstractProgressMeter) -> str 
         "the `progress_meter`": not meter.silent,
     }
     return next((name for name, needed in needs.items() if needed), None)
-
-
-def _record_slots(
-    dense: bool, sampled: Int[Array, " k"] | None, num_steps: int
-) -> tuple[int, Int[Array, " num_steps+1"] | None]:
-    """How many step records are kept, and in which row that of each step is."""
-    if dense:
-        return num_steps, jnp.arange(num_steps + 1, dtype=jnp.int32)
-    if sampled is None:
-        return 0, None
-    # A row per sample, of which the first in a step is used: there may be more steps
-    # than samples, and more samples than steps.
-    num_samples = sampled.shape[0]
-    slots = jnp.full((num_steps + 1,), num_samples, jnp.int32)
-    return num_samples, slots.at[sampled].min(jnp.arange(num_samples, dtype=jnp.int32))
-
-
-def _sample(
-    loop: Loop, t: FloatScalar, k: Int[Array, ""], record: StepRecord
-) -> PyTree[Array]:
-    start = loop.time(k)
-    theta = (t - start) / loop.dt
-    y = interpolate(loop.system, loop.method, record, start, loop.dt, theta, loop.args)
-    return loop.saved(t, y)

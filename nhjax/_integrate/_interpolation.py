@@ -10,7 +10,7 @@ from .._custom_types import Args, BoolScalar, FloatScalar, FloatScalarLike
 from .._errors import Check, require
 from .._method import AbstractMethod
 from .._numerics import max_norm, root
-from .._step import Chart, StepRecord
+from .._step import chart_at, StepRecord
 from .._system import AbstractMechanicalSystem, linearise, real_scalar, State
 
 
@@ -30,7 +30,7 @@ def interpolate(
     """
     start, time = record.start, t + theta * h
     weights = method.integrated_basis(theta)
-    chart = Chart(system.manifold_of(start.q), start.q)
+    chart = chart_at(system.manifold_of(start.q), start.q)
     xi = h * (weights @ record.velocity)
     q = chart.manifold.act(start.q, xi)
     p = chart.to_end(xi, start.p + h * (weights @ record.force))

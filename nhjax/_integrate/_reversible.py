@@ -9,11 +9,13 @@ from jaxtyping import Array, Int, PyTree
 from .._custom_types import BoolScalar
 from .._numerics import iterate, max_norm, relative, Sizes
 from .._results import RESULTS
-from .._step import step, StepState
-from .._system import State
+from .._step import StepState
+from .._system import AbstractMechanicalSystem, State
 from ._adjoint import AbstractAdjoint, DirectAdjoint, steps
-from ._loop import Carry, Loop, Rows
+from ._loop import Loop
 from ._progress_meter import NoProgressMeter
+from ._saving import Rows
+from ._stepping import Carry, Stepping
 
 
 class ReversibleAdjoint(AbstractAdjoint):
@@ -75,7 +77,7 @@ def _run_bwd(residuals, cotangents, perturbed, arguments):
 
     def retrace(state, k):
         step_state, cotangent, total = state
-        step_state = step_back(loop, step_state, k)
+        step_state = step_back(loop.stepping, step_state, k)
 
         def forward(parameters, y):
             node_at_y = eqx.tree_at(lambda step_state: step_state.state, step_state, y)
@@ -84,7 +86,7 @@ def _run_bwd(residuals, cotangents, perturbed, arguments):
             return carry.step_state.state, eqx.filter(rows, eqx.is_inexact_array)
 
         _, pullback = jax.vjp(forward, parameters, step_state.state)
-        row = eqx.filter(loop.read(row_cotangents, k), eqx.is_inexact_array)
+        row = eqx.filter(loop.saving.read(row_cotangents, k), eqx.is_inexact_array)
         change, cotangent = pullback((cotangent, row))
         return step_state, cotangent, jax.tree.map(jnp.add, total, change)
 
@@ -92,7 +94,7 @@ def _run_bwd(residuals, cotangents, perturbed, arguments):
     first, cotangents, total = steps(retrace, state, loop.num_steps, last, -1)
     total, cotangent = _if_retraced(
         end.result == RESULTS.successful,
-        loop,
+        loop.stepping.system,
         first.state,
         start.step_state.state,
         (cotangent, row_cotangents),
@@ -110,14 +112,14 @@ def _run_bwd(residuals, cotangents, perturbed, arguments):
 
 def _if_retraced(
     successful: BoolScalar,
-    loop: Loop,
+    system: AbstractMechanicalSystem,
     reached: State,
     start: State,
     cotangents: PyTree[Array],
     gradient: PyTree[Array],
 ) -> PyTree[Array]:
     """The gradient; NaN if the run failed or was not retraced, zero if nothing asks."""
-    manifold = loop.system.manifold_of(start.q)
+    manifold = system.manifold_of(start.q)
     xi = manifold.local(manifold.compose(manifold.inverse(start.q), reached.q))
     small = float(jnp.finfo(start.p.dtype).eps) ** 0.375
     retraced = (max_norm(xi) <= small * (1 + max_norm(*jax.tree.leaves(start.q)))) & (
@@ -145,58 +147,52 @@ def _filled(cotangents: PyTree[Any], like: PyTree[Any]) -> PyTree[Any]:
     return jax.tree.map(fill, cotangents, like, is_leaf=lambda leaf: leaf is None)
 
 
-def step_back(loop: Loop, step_state: StepState, k: Int[Array, ""]) -> StepState:
-    """The node from which step k led to `node`."""
-    back = _step(loop, step_state, loop.time(k + 1), -loop.dt)
-    if _retraces(loop, step_state):
-        return back
+def step_back(
+    stepping: Stepping, step_state: StepState, k: Int[Array, ""]
+) -> StepState:
+    """What step k started from, if it led to `step_state`."""
+    go_on = jnp.asarray(False)
 
-    # y is the step back from z, and z is moved by what the step from y misses `node`
-    # by. The two steps undo each other but for a small error, so that this contracts
-    # far faster than moving y would.
-    manifold, target = loop.system.manifold_of(step_state.state.q), step_state.state
-    propagated = loop.method.closure == "propagated"
+    def back_from(step_state: StepState) -> StepState:
+        t, h = stepping.time(k + 1), -stepping.dt
+        return stepping.one_step(step_state, t, h, go_on).step_state
+
+    if _retraces(stepping, step_state):
+        return back_from(step_state)
+
+    # y is the step back from z, and z is moved by what the step from y misses
+    # `step_state` by. The two steps undo each other but for a small error, so that this
+    # contracts far faster than moving y would.
+    target = step_state.state
+    manifold = stepping.system.manifold_of(target.q)
+    propagated = stepping.method.closure == "propagated"
 
     def sweep(z: State):
-        y = _step(
-            loop,
-            eqx.tree_at(lambda step_state: step_state.state, step_state, z),
-            loop.time(k + 1),
-            -loop.dt,
-        )
-        reached = _step(loop, y, loop.time(k), loop.dt).state
+        y = back_from(eqx.tree_at(lambda x: x.state, step_state, z))
+        t, h = stepping.time(k), stepping.dt
+        reached = stepping.one_step(y, t, h, go_on).step_state.state
         to_reached = manifold.inverse(reached.q)
         xi = manifold.local(manifold.compose(to_reached, target.q))
         misses = [xi, target.p - reached.p]
         multiplier = z.multiplier
         if propagated:
             miss = target.multiplier - reached.multiplier
-            misses.append(loop.dt * miss)
+            misses.append(stepping.dt * miss)
             multiplier = multiplier + miss
         size = max_norm(*misses)
         z = State(manifold.act(z.q, xi), z.v, z.p + misses[1], multiplier)
         return z, Sizes(size), y
 
     scale = 1 + max_norm(target.p)
-    limit = loop.stage_solver.max_iterations
+    limit = stepping.stage_solver.max_iterations
     return iterate(sweep, target, scale, max_iterations=limit).aux
 
 
-def _retraces(loop: Loop, step_state: StepState) -> bool:
+def _retraces(stepping: Stepping, step_state: StepState) -> bool:
     """Whether a step of -h undoes one of h."""
-    if not loop.system.manifold_of(step_state.state.q).is_flat:
+    system, method = stepping.system, stepping.method
+    if not system.manifold_of(step_state.state.q).is_flat:
         return False
-    if loop.system.nonholonomic is not None and loop.method.closure == "consistent":
+    if system.nonholonomic is not None and method.closure == "consistent":
         return False
-    return loop.method.is_symmetric
-
-
-def _step(loop: Loop, step_state: StepState, t: Array, h: Array) -> StepState:
-    go_on = jnp.asarray(False)
-    system, method, solver, args = (
-        loop.system,
-        loop.method,
-        loop.stage_solver,
-        loop.args,
-    )
-    return step(system, method, solver, t, h, step_state, args, go_on).step_state
+    return method.is_symmetric

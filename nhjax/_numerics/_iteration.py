@@ -19,8 +19,11 @@ Aux = TypeVar("Aux")
 # noise where an iteration may be slow. Above it they may as well be those of a slow
 # iteration that comes near in circles.
 NOISE_UNITS = 400
-# Each increment that fails to fall makes as many times more noise believable.
-_IMPATIENCE = 30.0
+# With the first increment that fails to fall so many units of round-off are believed to
+# be noise, and with each further one so many times more: where an iteration may be
+# slow, increments that rise and fall need not have come to an end.
+_FIRST_UNITS = 30.0
+_GROWTH, _GROWTH_IF_SLOW = 30.0, 2.0
 # An increment that is larger by this than x and the first increment is of an iteration
 # that diverges.
 _HOPELESS = 1e6
@@ -97,7 +100,9 @@ def iterate(
     dtype = jnp.result_type(*[leaf.dtype for leaf in jax.tree.leaves(x)])
     eps = jnp.finfo(dtype).eps
     floor = jnp.maximum(jnp.asarray(eps, dtype), jnp.asarray(tolerance, dtype))
-    noisiest = eps**0.5 if noise_units is None else noise_units * eps
+    noisiest, growth = eps**0.5, _GROWTH
+    if noise_units is not None:
+        noisiest, growth = noise_units * eps, _GROWTH_IF_SLOW
 
     def body(carry):
         x, _, progress = carry
@@ -108,7 +113,7 @@ def iterate(
         # No quotients, which would wait for each other: sizes are compared as they are.
         measure = jnp.where(size > 0, size, progress.first)
         stalls = increment >= progress.smallest
-        more = jnp.minimum(_IMPATIENCE * progress.believed, noisiest)
+        more = jnp.minimum(growth * progress.believed, noisiest)
         believed = jnp.where(stalls, more, progress.believed)
         magnified = measure
         if sizes.noise is not None:
@@ -134,7 +139,8 @@ def iterate(
     zero = jnp.zeros((), jnp.int32)
     skip = jnp.asarray(skip)
     scale = jnp.asarray(scale, dtype)
-    one, infinite, least = (jnp.asarray(x, dtype) for x in (1, jnp.inf, eps))
+    least = _FIRST_UNITS / growth * eps
+    one, infinite, least = (jnp.asarray(x, dtype) for x in (1, jnp.inf, least))
     never = jnp.zeros_like(skip)
     start = _Progress(one, infinite, least, zero, skip, skip, never)
     x, aux, progress = jax.lax.while_loop(

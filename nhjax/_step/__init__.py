@@ -1,7 +1,10 @@
 """One step: its stage equations, their solvers, its end and its derivative."""
 
-from ._chart import Chart as Chart
-from ._derivative import Parameters as Parameters, primitive_step as primitive_step
+from ._chart import chart_at as chart_at
+from ._derivative import (
+    primitive_step as primitive_step,
+    StepArguments as StepArguments,
+)
 from ._newton import (
     AbstractStageSolver as AbstractStageSolver,
     leaves_steps_to_newton as leaves_steps_to_newton,

@@ -4,7 +4,6 @@ from functools import partial
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 
 from .._compile import as_cpu_kernel
 from .._custom_types import Args, BoolScalar, FloatScalar
@@ -12,31 +11,36 @@ from .._method import AbstractMethod
 from .._numerics import frozen, has_tangent, solve_contraction, zero_unless
 from .._results import RESULTS
 from .._system import AbstractMechanicalSystem, linearise, State
+from ._end import end_state
 from ._newton import AbstractStageSolver
 from ._record import StepRecord
-from ._stages import Stages, StageSystem
+from ._stage_equations import stage_forces
+from ._stage_system import StageSystem
 from ._step import step, StepOutcome, StepState
+from ._unknowns import Stages
 
 
-class Parameters(eqx.Module):
-    """What a step is differentiated with respect to."""
+class StepArguments(eqx.Module):
+    """What a step is differentiated with respect to; of `step_state` the state alone.
+
+    See `StepState.differentiated_in_state`.
+    """
 
     system: AbstractMechanicalSystem
     t: FloatScalar
     h: FloatScalar
-    state: State
+    step_state: StepState
     args: Args
 
 
 @eqx.filter_custom_jvp
 def differentiable_step(
-    parameters: Parameters,
+    arguments: StepArguments,
     method: AbstractMethod,
     solver: AbstractStageSolver,
-    step_state: StepState,
     skip: BoolScalar,
 ) -> StepOutcome:
-    """One step, as `step`, from the state in `parameters` and what else `node` holds.
+    """One step, as `step`.
 
     Derivatives do not pass through the iterations. With G(x; θ) the simplified Newton
     iteration on the stages x, its Jacobian frozen, the solution is a fixed point, so
@@ -46,30 +50,22 @@ def differentiable_step(
 
     and the end of the step follows from x and θ. They are zero where the step failed.
     """
-    step_state = eqx.tree_at(
-        lambda step_state: step_state.state, step_state, parameters.state
-    )
+    system, t, h = arguments.system, arguments.t, arguments.h
     return step(
-        parameters.system,
-        method,
-        solver,
-        parameters.t,
-        parameters.h,
-        step_state,
-        parameters.args,
-        skip,
+        system, method, solver, t, h, arguments.step_state, arguments.args, skip
     )
 
 
 @differentiable_step.def_jvp
 def _differentiable_step_jvp(primals, tangents):
-    parameters, method, solver, step_state, skip = primals
+    arguments, method, solver, skip = primals
     outcome = primitive_step(*primals)
     x, ok = outcome.stages, ~skip & (outcome.result == RESULTS.successful)
-    perturbed, fixed = eqx.partition(parameters, has_tangent(tangents[0]))
+    perturbed, fixed = eqx.partition(arguments, has_tangent(tangents[0]))
 
-    stages = _stage_system(parameters, method)
-    correction = solver.frozen_newton_map(*frozen((stages, step_state.lin, x)))
+    stages = _stage_system(arguments, method)
+    given = frozen((stages, arguments.step_state.lin, x))
+    frozen_newton_map = solver.frozen_newton_map(*given)
 
     # Nothing but states and stages is kept for a reverse pass.
     @partial(jax.checkpoint, prevent_cse=False)
@@ -77,8 +73,8 @@ def _differentiable_step_jvp(primals, tangents):
         rates = zero_unless(ok, rates)
 
         def corrected(perturbed, x):
-            parameters = eqx.combine(perturbed, fixed)
-            return correction(_stage_system(parameters, method), x)
+            arguments = eqx.combine(perturbed, fixed)
+            return frozen_newton_map(_stage_system(arguments, method), x)
 
         def end(perturbed, x):
             return _end(eqx.combine(perturbed, fixed), method, x)
@@ -106,38 +102,38 @@ def _differentiable_step_jvp(primals, tangents):
 primitive_step = partial(as_cpu_kernel, differentiable_step)
 
 
-def _stage_system(parameters: Parameters, method: AbstractMethod) -> StageSystem:
-    y, args = parameters.state, parameters.args
+def _stage_system(arguments: StepArguments, method: AbstractMethod) -> StageSystem:
     return StageSystem.at(
-        parameters.system, method, parameters.t, parameters.h, y, args
+        arguments.system,
+        method,
+        arguments.t,
+        arguments.h,
+        arguments.step_state.state,
+        arguments.args,
     )
 
 
 def _end(
-    parameters: Parameters, method: AbstractMethod, x: Stages
+    arguments: StepArguments, method: AbstractMethod, x: Stages
 ) -> tuple[State, StepRecord]:
     """The state at the end of a step and its record, as functions of the stages.
 
     Without the sums of a step, whose compensation has no derivative, and with p from
     the velocity found at the end: both are the same to round-off.
     """
-    system, args = parameters.system, parameters.args
-    stages = _stage_system(parameters, method)
-    t, u = parameters.t + parameters.h, x.node_fibre_coordinate[-1]
-    q = system.manifold_of(parameters.state.q).act(
-        parameters.state.q, stages.increment(x)
-    )
-    m, carried = stages.num_nonholonomic, method.closure == "propagated"
-    if stages.symmetric:
-        multiplier = x.end_multiplier
-    elif carried and not stages.num_holonomic:
-        multiplier = stages.multipliers(x)[-1]
-    else:
-        multiplier = linearise(system, t, q, u, args).multiplier
-        if carried:
-            nonholonomic = stages.multipliers(x)[-1, :m]
-            multiplier = jnp.concatenate([nonholonomic, multiplier[m:]])
-    v, p = system.velocity(t, q, u, args), system.momentum(t, q, u, args)
-    forces = stages.evaluate(x)
-    record = StepRecord(parameters.state, x.velocity, forces.force, forces.multiplier)
-    return State(q, v, p, multiplier), record
+    system, args, start = arguments.system, arguments.args, arguments.step_state.state
+    stages = _stage_system(arguments, method)
+    t, u = arguments.t + arguments.h, x.node_fibre_coordinate[-1]
+    q = system.manifold_of(start.q).act(start.q, stages.increment(x))
+    p = system.momentum(t, q, u, args)
+
+    def continuous():
+        # The symmetric closure has solved for it.
+        if stages.symmetric:
+            return x.end_multiplier
+        return linearise(system, t, q, u, args).multiplier
+
+    end = end_state(stages, q, u, p, stages.multipliers(x)[-1], continuous)
+    forces = stage_forces(stages, x)
+    record = StepRecord(start, x.velocity, forces.force, forces.multiplier)
+    return end, record

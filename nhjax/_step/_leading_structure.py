@@ -4,7 +4,9 @@ from jaxtyping import Array, Float
 
 from .._numerics import inverse, Matrix, matvec, small_einsum
 from .._system import Linearisation
-from ._stages import Stages, StageSystem
+from ._stage_equations import constraint_jacobian, stage_velocities
+from ._stage_system import StageSystem
+from ._unknowns import Stages
 
 
 class LeadingStructure(eqx.Module):
@@ -37,7 +39,7 @@ class LeadingStructure(eqx.Module):
         if not stages.hamiltonian:
             return eqx.tree_at(lambda z: z.velocity, x, x.velocity - change)
         x = eqx.tree_at(lambda z: z.momentum, x, x.momentum - change)
-        return eqx.tree_at(lambda z: z.velocity, x, stages.stage_velocities(x))
+        return eqx.tree_at(lambda z: z.velocity, x, stage_velocities(stages, x))
 
     def correct_nodes(self, x: Stages, residual: Float[Array, "r n"]) -> Stages:
         """u - N⁻¹ r_v for the nodes."""
@@ -100,7 +102,7 @@ def leading_structure(
         n, nothing = stages.p.shape[0], jnp.zeros((0, 0), stages.p.dtype)
         reaction = jnp.zeros((stages.method.stages, n, 0), stages.p.dtype)
         return LeadingStructure(lin.momentum_inverse, reaction, reaction, nothing, lin)
-    jacobian = jnp.concatenate([lin.jacobian[None], stages.constraint_jacobian(x)])
+    jacobian = jnp.concatenate([lin.jacobian[None], constraint_jacobian(stages, x)])
     reaction = jnp.swapaxes(matvec(lin.metric_inverse, jacobian), 1, 2)
     blocks = small_einsum("ian,jnb->ijab", jacobian[1:], reaction)
     end = eqx.tree_at(

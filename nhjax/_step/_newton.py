@@ -30,8 +30,9 @@ from ._stage_iteration import (
     sizes,
     stage_residual,
 )
-from ._stages import Stages, StageSystem
+from ._stage_system import nudged, StageSystem
 from ._tolerance import check_tolerance, tolerance_array
+from ._unknowns import Stages
 
 
 # One iteration on the stages of a step; the equations are an argument, so that it can
@@ -196,7 +197,7 @@ class Newton(AbstractStageSolver):
         scale = fibre_coordinate_scale(stages, x0, lin)
 
         nudge = float(jnp.finfo(stages.p.dtype).eps) ** 0.5
-        nudged = stages.nudged(jnp.asarray(nudge, stages.p.dtype))
+        moved = nudged(stages, jnp.asarray(nudge, stages.p.dtype))
 
         def residual(z):
             return stage_residual(stages, unravel(z))
@@ -204,7 +205,7 @@ class Newton(AbstractStageSolver):
         def sweep(x: Stages):
             z, _ = ravel_pytree(x)
             jacobian, r, evaluation = jacobian_and_value(residual, z)
-            change = stage_residual(nudged, x)[0] - r
+            change = stage_residual(moved, x)[0] - r
             dz, noise = jnp.linalg.solve(jacobian, -jnp.stack([r, change], axis=1)).T
             x_next = unravel(z + dz)
             found = sizes(stages, x, x_next, lin)

@@ -5,7 +5,8 @@ import jax.numpy as jnp
 from .._custom_types import FloatScalar
 from .._numerics import max_norm, small_einsum
 from .._system import Linearisation, position_scale
-from ._stages import Stages, StageSystem
+from ._stage_system import StageSystem
+from ._unknowns import Stages
 
 
 def fibre_coordinate_scale(

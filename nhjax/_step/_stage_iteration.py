@@ -10,7 +10,17 @@ from .._custom_types import BoolScalar, FloatScalar
 from .._numerics import matvec, max_norm, Sizes, small_einsum
 from .._system import Linearisation
 from ._leading_structure import LeadingStructure
-from ._stages import StageForces, Stages, StageSystem
+from ._stage_equations import (
+    end_residual,
+    holonomic_constraint,
+    in_chart,
+    node_constraint,
+    node_residual,
+    stage_forces,
+    stage_velocities,
+)
+from ._stage_system import StageSystem
+from ._unknowns import StageForces, Stages
 
 
 class Evaluation(NamedTuple):
@@ -30,13 +40,13 @@ def corrected(
     """A sweep of simplified Newton over the stages, and what it evaluated at x."""
     # Each residual is evaluated at the newest iterate (Gauss-Seidel): it costs the same
     # as evaluating all of them at the last one, and contracts faster.
-    forces = stages.evaluate(x)
+    forces = stage_forces(stages, x)
     x_next = structure.correct_stages(stages, x, forces.residual)
-    node_residual = stages.node_residual(x_next, forces.force)
-    x_next = structure.correct_nodes(x_next, node_residual)
+    r_nodes = node_residual(stages, x_next, forces.force)
+    x_next = structure.correct_nodes(x_next, r_nodes)
     if stages.constrained:
         x_next = _constrain(stages, structure, x_next)
-    return x_next, Evaluation(forces, node_residual, jnp.asarray(False))
+    return x_next, Evaluation(forces, r_nodes, jnp.asarray(False))
 
 
 def _constrain(stages: StageSystem, structure: LeadingStructure, x: Stages) -> Stages:
@@ -45,7 +55,7 @@ def _constrain(stages: StageSystem, structure: LeadingStructure, x: Stages) -> S
     if stages.symmetric:
         # λ_c depends on v_{k+1} at zeroth order: it must see the new velocity, or the
         # two errors would feed each other and contract only as the root of the rate.
-        x = structure.correct_end(x, stages.end_residual(x))
+        x = structure.correct_end(x, end_residual(stages, x))
     return x
 
 
@@ -53,8 +63,8 @@ def _constraints(stages: StageSystem, x: Stages) -> tuple[Array, Array]:
     """The nonholonomic constraints at the nodes and the holonomic ones, if any."""
     none = jnp.zeros((0,), stages.p.dtype)
     return (
-        stages.node_constraint(x) if stages.num_nonholonomic else none,
-        stages.holonomic_constraint(x) if stages.num_holonomic else none,
+        node_constraint(stages, x) if stages.num_nonholonomic else none,
+        holonomic_constraint(stages, x) if stages.num_holonomic else none,
     )
 
 
@@ -62,17 +72,17 @@ def stage_residual(
     stages: StageSystem, x: Stages
 ) -> tuple[Float[Array, " k"], Evaluation]:
     """All equations of a step in one vector."""
-    forces = stages.evaluate(x)
-    node_residual = stages.node_residual(x, forces.force)
-    parts = [forces.residual, node_residual]
+    forces = stage_forces(stages, x)
+    r_nodes = node_residual(stages, x, forces.force)
+    parts = [forces.residual, r_nodes]
     if stages.hamiltonian:
-        parts.append(x.velocity - stages.stage_velocities(x))
+        parts.append(x.velocity - stage_velocities(stages, x))
     parts += _constraints(stages, x)
     if stages.symmetric:
-        parts += stages.end_residual(x)
+        parts += end_residual(stages, x)
     return (
         ravel_pytree(parts)[0],
-        Evaluation(forces, node_residual, jnp.asarray(False)),
+        Evaluation(forces, r_nodes, jnp.asarray(False)),
     )
 
 
@@ -123,4 +133,4 @@ def increment_size(
     size = max_norm(*changes)
     if stages.chart.manifold.is_flat:
         return size
-    return jnp.where(stages.in_chart(x_next), size, jnp.inf)
+    return jnp.where(in_chart(stages, x_next), size, jnp.inf)

@@ -1,3 +1,5 @@
+"""One step, and what is carried from step to step."""
+
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -25,10 +27,14 @@ from .._system import (
     linearise,
     State,
 )
+from ._end import end_state
 from ._newton import AbstractStageSolver
 from ._record import StepRecord
+from ._stage_equations import in_chart
 from ._stage_iteration import Evaluation
-from ._stages import Stages, StageSystem
+from ._stage_system import StageSystem
+from ._starting_values import starting_values
+from ._unknowns import Stages
 
 
 class StepState(eqx.Module):
@@ -43,9 +49,17 @@ class StepState(eqx.Module):
     p_compensation: Float[Array, " n"]
     lin: Linearisation
 
+    def differentiated_in_state(self) -> "StepState":
+        """The same, with the derivatives of the state alone.
+
+        Those of the rest are zero: rounding errors have none, and the linearisation is
+        a Jacobian that the end of a step does not depend on.
+        """
+        return eqx.tree_at(lambda x: x.state, jax.lax.stop_gradient(self), self.state)
+
 
 class StepOutcome(NamedTuple):
-    """A step: the next node, or the reason why there is none."""
+    """A step: the next state, or the reason why there is none."""
 
     step_state: StepState
     record: StepRecord
@@ -65,9 +79,9 @@ def first_step_state(
     y0: State,
     args: Args,
 ) -> StepState:
-    """The node to start from at a consistent state.
+    """What the first step starts from at a consistent state.
 
-    Closures that do not carry the multiplier report λ_c from the first node on.
+    Closures that do not carry the multiplier report λ_c from the first state on.
     """
     lin = linearise(system, t, y0.q, system.fibre_coordinate(y0), args)
     multiplier = _continuous_multiplier(
@@ -118,14 +132,12 @@ def step(
     Where `skip` is true nothing is solved and the outcome is to be discarded.
     """
     state, lin = step_state.state, step_state.lin
-    propagated = method.closure == "propagated"
     stages = StageSystem.at(system, method, t, h, state, args)
-    x0 = stages.starting_values(system.fibre_coordinate(state), lin)
+    x0 = starting_values(stages, system.fibre_coordinate(state), lin)
     solved = solver.solve(stages, x0, lin, skip)
     x, forces = solved.x, solved.aux.forces
 
-    manifold = system.manifold_of(state.q)
-    q, q_compensation = manifold.advance(
+    q, q_compensation = system.manifold_of(state.q).advance(
         state.q, stages.increment(x), step_state.q_compensation
     )
     p_increment = h * small_einsum("s,sn->n", stages.coefficients("b"), forces.force)
@@ -133,27 +145,19 @@ def step(
     p, p_compensation = stages.chart.carry(stages.increment(x), p, p_compensation)
     u = p if stages.hamiltonian else x.node_fibre_coordinate[-1]
     lin_next = linearise(system, t + h, q, u, args)
-    multiplier = lin_next.multiplier
-    if propagated:
-        # Only nonholonomic multipliers are carried; a step finds the others anew.
-        m = stages.num_nonholonomic
-        multiplier = jnp.concatenate([forces.multiplier[-1, :m], multiplier[m:]])
-    v = system.velocity(t + h, q, u, args)
-    next_node = StepState(
-        State(q, v, p, multiplier), q_compensation, p_compensation, lin_next
-    )
-    in_chart = stages.in_chart(x)
+    end = end_state(stages, q, u, p, forces.multiplier[-1], lambda: lin_next.multiplier)
+    next_state = StepState(end, q_compensation, p_compensation, lin_next)
 
     residual = max_norm(forces.residual, solved.aux.node_residual)
     scale = max_norm(forces.momentum) + max_norm(h * forces.force)
     return StepOutcome(
-        step_state=next_node,
+        step_state=next_state,
         record=StepRecord(state, x.velocity, forces.force, forces.multiplier),
         stages=x,
-        result=_result(solved, lin, next_node, in_chart),
+        result=_result(solved, lin, next_state, in_chart(stages, x)),
         num_iterations=solved.num_iterations,
         residual=relative(residual, scale),
-        constraint_violation=largest_violation(system, t + h, next_node, args),
+        constraint_violation=largest_violation(system, t + h, next_state, args),
         multiplier_defect=max_norm(forces.multiplier[-1] - lin_next.multiplier),
         newton=solved.aux.newton,
     )
@@ -163,7 +167,7 @@ def _result(
     solved: Solved[Stages, Evaluation],
     lin: Linearisation,
     step_state: StepState,
-    in_chart: BoolScalar,
+    is_in_chart: BoolScalar,
 ) -> RESULTS:
     finite = all_finite(step_state.state) & all_finite(step_state.lin)
     # What is not finite at the first iterate is so near the state itself.
@@ -175,7 +179,7 @@ def _result(
     failed = RESULTS.where(solved.exhausted, RESULTS.nonlinear_max_iterations, failed)
     converged = RESULTS.where(finite, RESULTS.successful, RESULTS.nonfinite_state)
     result = RESULTS.where(solved.converged, converged, failed)
-    result = RESULTS.where(in_chart, result, RESULTS.left_chart)
+    result = RESULTS.where(is_in_chart, result, RESULTS.left_chart)
     # A singular M or C at the end is found at once: λ_c does not exist there.
     singular = lin.is_singular | (solved.converged & step_state.lin.is_singular)
     return RESULTS.where(singular, RESULTS.singular_stage_matrix, result)
@@ -184,6 +188,6 @@ def _result(
 def largest_violation(
     system: AbstractMechanicalSystem, t: FloatScalar, step_state: StepState, args: Args
 ) -> FloatScalar:
-    """The largest violation of any constraint at a node."""
+    """The largest violation of any constraint at a state."""
     on_positions = system.position_constraint(t, step_state.state.q, args)
     return max_norm(step_state.lin.violation, on_positions)

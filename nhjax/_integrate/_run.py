@@ -1,0 +1,116 @@
+"""The program of a run: its loop, what that saves, and the solution."""
+
+from functools import partial
+
+import jax
+from jaxtyping import Array, Int, PyTree
+
+from .._compile import as_cpu_kernel, tracked_jit
+from .._custom_types import Args, FloatScalar, IntScalar
+from .._method import AbstractMethod
+from .._numerics import ClosureConverted, nan_gradient_unless
+from .._results import RESULTS
+from .._step import AbstractStageSolver, StepRecord
+from .._system import AbstractMechanicalSystem, State
+from ._adjoint import AbstractAdjoint
+from ._checks import check_saved, known
+from ._interpolation import DenseInterpolation, interpolate, step_index
+from ._loop import Loop
+from ._progress_meter import AbstractProgressMeter
+from ._saveat import SaveAt, stack_saved
+from ._saving import record_places, RecordPlaces, Saving
+from ._solution import Solution
+from ._stepping import Stepping
+
+
+@tracked_jit("system", "args", "saveat")
+def run(
+    system: AbstractMechanicalSystem,
+    method: AbstractMethod,
+    stage_solver: AbstractStageSolver,
+    adjoint: AbstractAdjoint,
+    y0: State,
+    t0: FloatScalar,
+    dt: FloatScalar,
+    num_steps: int | IntScalar,
+    args: Args,
+    saveat: SaveAt,
+    meter: AbstractProgressMeter,
+) -> Solution:
+    """The solution, of arguments that have been checked."""
+    check_saved(saveat.fn, t0, y0, args)
+    # What user functions close over must be seen to be differentiated.
+    system = system.closure_converted(t0, y0, args)
+    stepping = Stepping(system, method, stage_solver, t0, dt, args)
+    ts, sampled = saveat.ts, None
+    if ts is not None:
+        length = known(num_steps)
+        sampled = jax.vmap(lambda t: step_index(t, t0, dt, length))(ts)
+    places = RecordPlaces(0, None)
+    if saveat.dense or sampled is not None:
+        places = record_places(saveat.dense, sampled, known(num_steps))
+    saving = Saving(
+        fn=ClosureConverted(saveat.fn, t0, y0, args),
+        num_steps=num_steps,
+        stride=saveat.steps,
+        num_saved=known(num_steps) // saveat.steps if saveat.steps else 0,
+        num_records=places.number,
+        record_slots=places.slots,
+    )
+
+    def all_steps(loop: Loop, y0: State):
+        start = loop.stepping.start(y0)
+        return start.step_state.state, *adjoint.run(loop, start)
+
+    loop = Loop(stepping, saving, meter)
+    start, carry, rows = as_cpu_kernel(all_steps, loop, y0)
+    successful = carry.result == RESULTS.successful
+    given = (system, y0, t0, dt, args)
+    found = (carry.step_state.state, rows)
+    end, rows = nan_gradient_unless(successful, found, given)
+    t1 = stepping.time(num_steps)
+
+    pieces = []
+    if saveat.t0:
+        pieces.append(_one(saving.saved(t0, start, args)))
+    if saveat.steps:
+        pieces.append(jax.tree.map(lambda x: x[:-1], rows.saved))
+    if ts is not None and sampled is not None and places.slots is not None:
+        row = places.slots[sampled]
+        records = jax.tree.map(lambda x: x[row], rows.record)
+        sample = partial(_sample, stepping, saving)
+        pieces.append(jax.vmap(sample)(ts, sampled, records))
+    if saveat.saves_end(num_steps):
+        pieces.append(_one(saving.saved(t1, end, args)))
+    times, ys = stack_saved(pieces) if pieces else (None, None)
+    interpolation = None
+    if saveat.dense:
+        records = jax.tree.map(lambda x: x[:-1], rows.record)
+        interpolation = DenseInterpolation(
+            system, method, known(num_steps), t0, dt, records, args
+        )
+    return Solution(t0, t1, times, ys, carry.stats, carry.result, interpolation)
+
+
+def _one(saved: PyTree[Array]) -> PyTree[Array]:
+    """A piece of the output that is saved at one time."""
+    return jax.tree.map(lambda x: x[None], saved)
+
+
+def _sample(
+    stepping: Stepping,
+    saving: Saving,
+    t: FloatScalar,
+    k: Int[Array, ""],
+    record: StepRecord,
+) -> PyTree[Array]:
+    """What is saved at a time t inside of step k."""
+    system, method, h, args = (
+        stepping.system,
+        stepping.method,
+        stepping.dt,
+        stepping.args,
+    )
+    start = stepping.time(k)
+    y = interpolate(system, method, record, start, h, (t - start) / h, args)
+    return saving.saved(t, y, args)

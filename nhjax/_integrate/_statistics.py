@@ -1,0 +1,55 @@
+"""What a run counts and measures on the way, and reports as `Solution.stats`."""
+
+from typing import Any, TypeAlias
+
+import jax.numpy as jnp
+from jaxtyping import Array, Int
+
+from .._custom_types import BoolScalar, FloatScalar
+from .._step import StepOutcome
+
+
+Statistics: TypeAlias = dict[str, Any]
+
+
+def first_statistics(violation: FloatScalar, is_good: BoolScalar) -> Statistics:
+    """The statistics before the first step, where the constraints are violated so."""
+    zero, none = jnp.zeros_like(violation), jnp.zeros((), jnp.int32)
+    return {
+        "num_steps": none,
+        "num_iterations": none,
+        "num_newton_steps": none,
+        "max_residual": zero,
+        "max_constraint_violation": violation,
+        "max_multiplier_defect": zero,
+        "failed_step": jnp.where(is_good, none - 1, none),
+    }
+
+
+def updated_statistics(
+    stats: Statistics,
+    outcome: StepOutcome,
+    alive: BoolScalar,
+    good: BoolScalar,
+    k: Int[Array, ""],
+) -> Statistics:
+    """The statistics after step k, which was taken if `alive` and solved if `good`."""
+
+    def larger(name, value):
+        return jnp.where(good, jnp.maximum(stats[name], value), stats[name])
+
+    return {
+        "num_steps": stats["num_steps"] + good.astype(jnp.int32),
+        "num_iterations": stats["num_iterations"]
+        + jnp.where(alive, outcome.num_iterations, 0),
+        "num_newton_steps": stats["num_newton_steps"]
+        + (good & outcome.newton).astype(jnp.int32),
+        "max_residual": larger("max_residual", outcome.residual),
+        "max_constraint_violation": larger(
+            "max_constraint_violation", outcome.constraint_violation
+        ),
+        "max_multiplier_defect": larger(
+            "max_multiplier_defect", outcome.multiplier_defect
+        ),
+        "failed_step": jnp.where(alive & ~good, k, stats["failed_step"]),
+    }

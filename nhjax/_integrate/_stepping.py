@@ -1,0 +1,123 @@
+"""From step to step: what is carried, and how one step follows from another."""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Int
+
+from .._custom_types import Args, BoolScalar, FloatScalar
+from .._method import AbstractMethod
+from .._numerics import max_norm
+from .._results import RESULTS
+from .._step import (
+    AbstractStageSolver,
+    first_step_state,
+    largest_violation,
+    primitive_step,
+    StepArguments,
+    StepOutcome,
+    StepRecord,
+    StepState,
+)
+from .._system import (
+    AbstractMechanicalSystem,
+    all_finite,
+    position_scale,
+    State,
+    violation_scale,
+)
+from ._statistics import first_statistics, Statistics, updated_statistics
+
+
+class Carry(NamedTuple):
+    """What goes from step to step; of it `step_state` alone has derivatives."""
+
+    step_state: StepState
+    result: RESULTS
+    stats: Statistics
+
+
+class Taken(NamedTuple):
+    """A step that was taken: its record, and whether it was solved."""
+
+    record: StepRecord
+    good: BoolScalar
+
+
+class Stepping(eqx.Module):
+    """The equations of a run, and its steps one by one."""
+
+    system: AbstractMechanicalSystem
+    method: AbstractMethod = eqx.field(static=True)
+    stage_solver: AbstractStageSolver
+    t0: FloatScalar
+    dt: FloatScalar
+    args: Args
+
+    def time(self, k: Int[Array, ""] | int) -> FloatScalar:
+        """t_k by a product: a running sum of dt would drift."""
+        return self.t0 + jnp.asarray(k, self.dt.dtype) * self.dt
+
+    def start(self, y0: State) -> Carry:
+        """The carry before the first step."""
+        system, t, args = self.system, self.t0, self.args
+        step_state = first_step_state(system, self.method, t, y0, args)
+        result = RESULTS.where(
+            _is_consistent(system, t, step_state, args),
+            RESULTS.successful,
+            RESULTS.inconsistent_start,
+        )
+        result = RESULTS.where(all_finite(y0), result, RESULTS.nonfinite_state)
+        violation = largest_violation(system, t, step_state, args)
+        stats = first_statistics(violation, result == RESULTS.successful)
+        return Carry(step_state, result, stats)
+
+    def one_step(
+        self, step_state: StepState, t: FloatScalar, h: FloatScalar, skip: BoolScalar
+    ) -> StepOutcome:
+        """One step of size h from t, forward or back."""
+        start = step_state.differentiated_in_state()
+        arguments = StepArguments(self.system, t, h, start, self.args)
+        return primitive_step(arguments, self.method, self.stage_solver, skip)
+
+    def advance(self, carry: Carry, k: Int[Array, ""]) -> tuple[Carry, Taken]:
+        """Step k; a failed trajectory keeps its last good state."""
+        alive = carry.result == RESULTS.successful
+        outcome = self.one_step(carry.step_state, self.time(k), self.dt, ~alive)
+        good = alive & (outcome.result == RESULTS.successful)
+        step_state = jax.tree.map(
+            lambda new, old: jnp.where(good, new, old),
+            outcome.step_state,
+            carry.step_state,
+        )
+        result = RESULTS.where(alive, outcome.result, carry.result)
+        stats = updated_statistics(carry.stats, outcome, alive, good, k)
+        carry = Carry(step_state, result, jax.lax.stop_gradient(stats))
+        return carry, Taken(outcome.record, good)
+
+
+def _is_consistent(
+    system: AbstractMechanicalSystem, t: FloatScalar, start: StepState, args: Args
+) -> BoolScalar:
+    """Whether Φ = 0 and v, p belong together at the start, but for small errors.
+
+    The bound is to find a state of another system, or one changed by hand in one part;
+    it lets pass the perturbations by which derivatives are approximated.
+    """
+    y, lin = start.state, start.lin
+    small = float(jnp.finfo(y.p.dtype).eps) ** 0.25
+    u = system.fibre_coordinate(y)
+    derivative = system.fibre_derivative(t, y.q, u, args)
+    given = y.p if system.fibre_coordinate_name == "v" else y.v
+    size = max_norm(derivative) + max_norm(given)
+    scale = violation_scale(system, lin, t, y.q, u, args)
+    positions = system.position_constraint(t, y.q, args)
+    allowed = position_scale(system, t, y.q, args)
+    return (
+        jnp.all(jnp.abs(lin.violation) <= small * scale)
+        & jnp.all(jnp.abs(positions) <= small * allowed)
+        & (system.manifold_of(y.q).distance_to_group(y.q) <= small)
+        & (max_norm(derivative - given) <= small * size)
+    )

@@ -1,0 +1,48 @@
+"""Where the iteration on the stages of a step starts."""
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array
+
+from .._system import Linearisation
+from ._stage_system import StageSystem
+from ._unknowns import Stages
+
+
+def starting_values(stages: StageSystem, u: Array, lin: Linearisation) -> Stages:
+    """Stages to first order in h, from the acceleration and λ_c at the start.
+
+    They need no memory of the step before, so a step is a function of its state.
+    """
+    m, s = stages.num_nonholonomic, stages.method.stages
+    push = stages.h * lin.acceleration
+    stage_times = jnp.sum(stages.coefficients("a_hat"), axis=1)
+    node_times = jnp.sum(stages.node_weights, axis=1)
+    # ν of the symmetric closure vanishes with h, all others are multipliers.
+    free = (jnp.arange(s - 1) >= int(stages.symmetric)).astype(u.dtype)
+    nothing = jnp.zeros((0,), u.dtype)
+    fibre = u[None] + jnp.outer(stage_times, push)
+    velocity, momentum = fibre, jnp.zeros((s, 0), u.dtype)
+    if stages.hamiltonian:
+        velocity, momentum = _starting_velocities(stages, u, lin, stage_times), fibre
+    return Stages(
+        velocity=velocity,
+        momentum=momentum,
+        node_fibre_coordinate=u[None] + jnp.outer(node_times, push),
+        closure=jnp.outer(free, lin.multiplier[:m]),
+        holonomic=jnp.outer(jnp.ones((s,), u.dtype), lin.multiplier[m:]),
+        end_acceleration=lin.acceleration if stages.symmetric else nothing,
+        end_multiplier=lin.multiplier if stages.symmetric else nothing,
+    )
+
+
+def _starting_velocities(stages: StageSystem, u, lin: Linearisation, times) -> Array:
+    v = stages.system.velocity(stages.t, stages.q, u, stages.args)
+    _, rate = jax.jvp(
+        lambda t, xi, u: stages.system.velocity(
+            t, stages.chart.manifold.act(stages.q, xi), u, stages.args
+        ),
+        (stages.t, jnp.zeros_like(u), u),
+        (jnp.ones_like(stages.t), v, lin.acceleration),
+    )
+    return v[None] + jnp.outer(times, stages.h * rate)
