@@ -24,6 +24,7 @@ from ._integrate import (
     ReversibleAdjoint as ReversibleAdjoint,
     SaveAt as SaveAt,
     Solution as Solution,
+    step as step,
     TextProgressMeter as TextProgressMeter,
     TqdmProgressMeter as TqdmProgressMeter,
 )

@@ -15,7 +15,6 @@ from .._errors import (
     IrregularLagrangianError,
     NewtonError,
     NonFiniteError,
-    require,
 )
 from .._numerics import dependent_rows, Rank
 from .._system import AbstractMechanicalSystem, all_finite, Linearisation, State
@@ -48,8 +47,8 @@ class _Words(NamedTuple):
     hessian: str
     force: str
     legendre: str
-    fibre: str
-    conjugate: str
+    coordinate: str
+    dual: str
     constraint: str
 
 
@@ -60,8 +59,8 @@ _WORDS = {
         hessian="mass matrix D2D2L",
         force="D1L + F",
         legendre="D2L(t, q, v) = p",
-        fibre="v",
-        conjugate="p",
+        coordinate="v",
+        dual="p",
         constraint="Φ",
     ),
     "hamiltonian": _Words(
@@ -70,8 +69,8 @@ _WORDS = {
         hessian="Hessian D2D2H",
         force="F - D1H",
         legendre="D2H(t, q, p) = v",
-        fibre="p",
-        conjugate="v",
+        coordinate="p",
+        dual="v",
         constraint="Ψ",
     ),
 }
@@ -95,12 +94,12 @@ class _Case(NamedTuple):
 
     @property
     def reached(self) -> str:
-        fibre = self.words.fibre
-        return f"{fibre} = {getattr(self.found.state, fibre)}"
+        letter = self.words.coordinate
+        return f"{letter} = {getattr(self.found.state, letter)}"
 
     @property
-    def fibre(self) -> str:
-        return "velocity" if self.words.fibre == "v" else "momentum"
+    def coordinate_name(self) -> str:
+        return "velocity" if self.words.coordinate == "v" else "momentum"
 
     @property
     def violations(self) -> str:
@@ -109,22 +108,21 @@ class _Case(NamedTuple):
         return f"{self.words.constraint} = {found.lin.violation}{positions}"
 
 
-def check_found(
+def judged(
     system: AbstractMechanicalSystem,
     found: Found,
     q: PyTree[Array],
     v: Float[Array, " n"] | None,
     p: Float[Array, " n"] | None,
     project: bool,
-) -> State:
-    """The state, or an exception that says what is wrong with it."""
+) -> list[Check]:
+    """What must hold of a state, each with the exception that says what is wrong."""
     state, lin = found.state, found.lin
     singular = 10 * state.v.shape[0] * jnp.finfo(state.v.dtype).eps
     name, given = ("p", p) if v is None else ("v", v)
     words, group = _WORDS[system.generator], f"{system.manifold_of(q)}"
     case = (_Case(found, q, name, given, project, words, group),)
-    return require(
-        state,
+    return [
         Check(found.off_group <= found.allowed_off_group, _group_error, case),
         # Not ">": a matrix that is not finite is no singular matrix.
         Check(~(found.regularity <= singular), _regularity_error, case),
@@ -149,7 +147,7 @@ def check_found(
         ),
         Check(jnp.all(jnp.abs(lin.violation) <= found.allowed), _violation_error, case),
         Check(all_finite((lin.acceleration, lin.multiplier)), _force_error, case),
-    )
+    ]
 
 
 def _group_error(case: _Case) -> ConstraintViolationError:
@@ -171,8 +169,8 @@ def _regularity_error(case: _Case) -> IrregularLagrangianError:
 
 def _legendre_error(case: _Case) -> NewtonError:
     return NewtonError(
-        f"No {case.fibre} with {case.words.legendre} was found for {case.where}. Give "
-        f"`{case.words.fibre}` instead of `{case.words.conjugate}`."
+        f"No {case.coordinate_name} with {case.words.legendre} was found for "
+        f"{case.where}. Give `{case.words.coordinate}` instead of `{case.words.dual}`."
     )
 
 
@@ -187,7 +185,7 @@ def _projection_error(case: _Case) -> NewtonError:
 def _value_error(case: _Case) -> NonFiniteError:
     words = case.words
     return NonFiniteError(
-        f"The {words.generator}, its second derivatives in {words.fibre}, or the "
+        f"The {words.generator}, its second derivatives in {words.coordinate}, or the "
         f"constraint is not finite at {case.where}: {words.letter} = "
         f"{case.found.generator}, {case.violations}. Check the functions of the system "
         "at this state."
@@ -207,7 +205,7 @@ def _force_error(case: _Case) -> NonFiniteError:
     words, lin = case.words, case.found.lin
     return NonFiniteError(
         f"The forces {words.force}, or the derivatives of {words.constraint}, are not "
-        f"finite at {case.where}: the rate of {words.fibre} would be "
+        f"finite at {case.where}: the rate of {words.coordinate} would be "
         f"{lin.acceleration}, the multiplier {lin.multiplier}. Check the functions of "
         "the system at this state."
     )

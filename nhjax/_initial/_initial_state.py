@@ -29,7 +29,7 @@ from .._system import (
     velocity_scale,
     violation_scale,
 )
-from ._checks import check_found, Found
+from ._checks import Found, judged
 
 
 def initial_state(
@@ -41,6 +41,7 @@ def initial_state(
     t: FloatScalarLike = 0.0,
     args: Args = None,
     project: bool = False,
+    throw: bool = True,
 ) -> State:
     """A consistent state (q, v, p, λ) from a configuration and a velocity or momentum.
 
@@ -60,6 +61,9 @@ def initial_state(
     - `project`: replace q by the nearest configuration, and then v by the nearest
         velocity, in the kinetic metric, that satisfies the constraints (one linear
         solve for constraints linear or affine in v, Newton's method for others).
+    - `throw`: raise if there is no such state. Otherwise all its numbers are NaN, and
+        `integrate` reports it as not finite; under `vmap` the other members of an
+        ensemble are not touched. Wrong types and shapes raise all the same.
 
     **Returns:** a `State`.
 
@@ -87,11 +91,23 @@ def initial_state(
     """
     check_type("system", system, (LagrangianSystem, HamiltonianSystem))
     check_flag("project", project)
+    throw = check_flag("throw", throw)
     q, v, p, t = _check_inputs(system, q, v, p, t)
     args = parameters(args)
     check_functions(system, t, q, args)
+    inputs = [
+        finite(name, x)
+        for name, x in (("q", q), ("v", v), ("p", p), ("t", t))
+        if x is not None
+    ]
+    if throw:
+        q = require(q, *inputs)
     found = _solve(system, t, q, v, p, args, bool(project))
-    return check_found(system, found, q, v, p, bool(project))
+    checks = judged(system, found, q, v, p, bool(project))
+    if throw:
+        return require(found.state, *checks)
+    good = jnp.all(jnp.stack([jnp.asarray(check.ok) for check in inputs + checks]))
+    return jax.tree.map(lambda x: jnp.where(good, x, jnp.nan), found.state)
 
 
 @tracked_jit("system", "args")
@@ -151,7 +167,7 @@ def _solve(system, t, q, v, p, args, project: bool) -> Found:
 def _inverse_legendre(
     system, t, q, given: Float[Array, " n"], args
 ) -> tuple[Float[Array, " n"], BoolScalar]:
-    """The u whose conjugate is the given one of v and p."""
+    """The u whose fibre derivative is the given one of v and p."""
     zero = jnp.zeros_like(given)
     # Where the terms of the equation cancel, as at rest in a magnetic field, u is
     # rounded by what they amount to, and not by its own size.
@@ -261,5 +277,4 @@ def _check_inputs(system, q, v, p, t):
             )
     t = real_scalar("t", t, fibre.dtype)
     # All on q, which no system ignores: jit drops a check of what is not used.
-    q = require(q, finite("q", q), finite(name, fibre), finite("t", t))
     return (q, fibre, None, t) if p is None else (q, None, fibre, t)

@@ -16,3 +16,4 @@ from ._progress_meter import (
 from ._reversible import ReversibleAdjoint as ReversibleAdjoint
 from ._saveat import SaveAt as SaveAt
 from ._solution import raise_failures as raise_failures, Solution as Solution
+from ._step import step as step

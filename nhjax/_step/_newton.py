@@ -10,13 +10,14 @@ import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array
 
-from .._custom_types import FloatScalarLike
+from .._custom_types import FloatScalar, FloatScalarLike
 from .._numerics import (
     iterate,
     jacobian_and_value,
     matvec,
     max_norm,
     NOISE_UNITS,
+    Sizes,
     Solved,
 )
 from .._system import all_finite, check_flag, Linearisation
@@ -75,6 +76,25 @@ class AbstractStageSolver(eqx.Module):
         """
 
 
+def _iterated(
+    solver: AbstractStageSolver,
+    sweep: Callable[[Stages], tuple[Stages, Sizes, Evaluation]],
+    x0: Stages,
+    scale: FloatScalar,
+    skip: Array,
+) -> Solved[Stages, Evaluation]:
+    """The iteration on the stages that both solvers make, with their own sweeps."""
+    return iterate(
+        sweep,
+        x0,
+        scale,
+        max_iterations=solver.max_iterations,
+        tolerance=solver.tolerance,
+        noise_units=NOISE_UNITS,
+        skip=skip,
+    )
+
+
 class SimplifiedNewton(AbstractStageSolver):
     """Simplified Newton on the stage system, with its leading structure as Jacobian.
 
@@ -125,15 +145,7 @@ class SimplifiedNewton(AbstractStageSolver):
             x_next, evaluation = corrected(stages, structure, x)
             return x_next, sizes(stages, x, x_next, lin), evaluation
 
-        solved = iterate(
-            sweep,
-            x0,
-            scale,
-            max_iterations=self.max_iterations,
-            tolerance=self.tolerance,
-            noise_units=NOISE_UNITS,
-            skip=skip,
-        )
+        solved = _iterated(self, sweep, x0, scale, skip)
         if not self.fallback:
             return solved
         # What is not finite after one iteration is so at the state itself.
@@ -208,24 +220,17 @@ class Newton(AbstractStageSolver):
             change = stage_residual(moved, x)[0] - r
             dz, noise = jnp.linalg.solve(jacobian, -jnp.stack([r, change], axis=1)).T
             x_next = unravel(z + dz)
-            found = sizes(stages, x, x_next, lin)
             # What round-off of the positions makes of the stages: stiff forces magnify
             # it.
             noise = increment_size(stages, x, unravel(z + noise), lin) / nudge
-            found = found._replace(
-                iterate=fibre_coordinate_size(stages, x_next), noise=noise
+            found = Sizes(
+                increment_size(stages, x, x_next, lin),
+                fibre_coordinate_size(stages, x_next),
+                noise,
             )
             return x_next, found, evaluation
 
-        solved = iterate(
-            sweep,
-            x0,
-            scale,
-            max_iterations=self.max_iterations,
-            tolerance=self.tolerance,
-            noise_units=NOISE_UNITS,
-            skip=skip,
-        )
+        solved = _iterated(self, sweep, x0, scale, skip)
         # Where forces grow without bound, increments are small far from any solution.
         gross = matvec(lin.momentum_inverse, solved.aux.forces.residual)
         allowed = jnp.maximum(_GROSS, 1e3 * self.tolerance).astype(scale.dtype)

@@ -1,0 +1,75 @@
+"""One step of a mechanical system, for time loops of a user's own."""
+
+import jax
+import jax.numpy as jnp
+
+from .._custom_types import Args, FloatScalarLike
+from .._method import AbstractMethod
+from .._results import RESULTS
+from .._step import AbstractStageSolver, SimplifiedNewton
+from .._system import AbstractMechanicalSystem, State
+from ._integrate import integrate
+
+
+def step(
+    system: AbstractMechanicalSystem,
+    method: AbstractMethod,
+    t: FloatScalarLike,
+    dt: FloatScalarLike,
+    y: State,
+    args: Args = None,
+    *,
+    stage_solver: AbstractStageSolver = SimplifiedNewton(),
+    throw: bool = True,
+) -> State:
+    """One step of size `dt` from the state `y` at `t` to the state at `t + dt`.
+
+    It solves the discrete equations of the paper (its four summaries), as `integrate`
+    with `num_steps=1` does, with the same result to the last bit. It is for control
+    loops, environments and time loops that `integrate` does not offer; it works under
+    `jit`, `vmap`, `grad`, `jvp`, `hessian` and inside of `jax.lax.scan`. Over many
+    steps `integrate` is faster, and rounds less: it sums q and p with a compensation
+    that a state does not hold.
+
+    **Arguments:**
+
+    - `system`, `method`: as for `nhjax.integrate`.
+    - `t`: the time of `y`.
+    - `dt`: the step size, a scalar, in units of time; negative to go back.
+    - `y`: a consistent state, from `nhjax.initial_state`, from a `Solution` or from a
+        step before.
+    - `args`: passed on to the functions of the system, for instance the controls that
+        are held during the step.
+    - `stage_solver`: `nhjax.SimplifiedNewton()` by default, or `nhjax.Newton()`.
+    - `throw`: raise if the step cannot be solved. Otherwise all numbers of the state
+        that is returned are NaN.
+
+    **Returns:** the `State` at `t + dt`.
+
+    **Raises:** as `nhjax.integrate` does.
+
+    !!! example
+
+        >>> import nhjax
+        >>> disc = nhjax.systems.VerticalRollingDisc()
+        >>> y, method = disc.initial_state(), nhjax.LobattoIIIAB(3)
+        >>> y = nhjax.step(disc.system, method, t=0.0, dt=0.1, y=y)
+        >>> y.q.shape
+        (4,)
+    """
+    sol = integrate(
+        system,
+        method,
+        y,
+        dt=dt,
+        num_steps=1,
+        t0=t,
+        args=args,
+        stage_solver=stage_solver,
+        throw=throw,
+    )
+    end = jax.tree.map(lambda x: x[0], sol.ys)
+    if throw:
+        return end
+    solved = sol.result == RESULTS.successful
+    return jax.tree.map(lambda x: jnp.where(solved, x, jnp.nan), end)

@@ -1,0 +1,133 @@
+"""One step, as users of their own time loops take it."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import nhjax
+from nhjax import LobattoIIIAB, RESULTS, systems
+
+
+H = 0.1
+SYSTEMS = {
+    "nonholonomic": systems.NonholonomicParticle(),
+    "holonomic": systems.SphericalPendulum(),
+    "on a group": systems.Suslov(),
+}
+
+
+@pytest.mark.parametrize("name", SYSTEMS)
+@pytest.mark.parametrize("closure", ["symmetric", "propagated"])
+def test_a_step_is_that_of_integrate_bit_for_bit(name, closure):
+    system, y0 = SYSTEMS[name].system, SYSTEMS[name].initial_state()
+    method = LobattoIIIAB(3, closure)
+    y = nhjax.step(system, method, 0.5, H, y0)
+    sol = nhjax.integrate(system, method, y0, t0=0.5, dt=H, num_steps=1)
+    first = nhjax.integrate(
+        system, method, y0, t0=0.5, dt=H, num_steps=4, saveat=nhjax.SaveAt(steps=True)
+    )
+    for one, of_run, of_long_run in zip(
+        *map(jax.tree.leaves, (y, sol.ys, first.ys)), strict=True
+    ):
+        np.testing.assert_array_equal(one, of_run[0])
+        np.testing.assert_array_equal(one, of_long_run[0])
+
+
+def height_by_steps(system, method, y, g, num_steps):
+    def advance(y, k):
+        return nhjax.step(system, method, H * k, H, y, g), None
+
+    y, _ = jax.lax.scan(advance, y, jnp.arange(num_steps, dtype=float))
+    return y.q[2]
+
+
+def height_by_integrate(system, method, y, g, num_steps):
+    sol = nhjax.integrate(system, method, y, dt=H, num_steps=num_steps, args=g)
+    return sol.ys.q[0, 2]
+
+
+def test_a_scan_over_steps_has_the_gradient_of_integrate():
+    system = nhjax.LagrangianSystem(
+        lambda t, q, v, g: 0.5 * v @ v - g * q[2] * (1 + 0.1 * jnp.sin(t)),
+        holonomic=lambda t, q, g: q @ q - 1.0,
+        nonholonomic=lambda t, q, v, g: v[0] - q[1] * v[2],
+    )
+    q, v = jnp.array([0.6, 0.0, 0.8]), jnp.array([0.0, 0.7, 0.0])
+    y0 = nhjax.initial_state(system, q, v, args=1.3)
+    method, losses = LobattoIIIAB(2), (height_by_steps, height_by_integrate)
+    values = [
+        jax.jit(
+            jax.value_and_grad(lambda g, loss=loss: loss(system, method, y0, g, 20))
+        )(1.3)
+        for loss in losses
+    ]
+    np.testing.assert_allclose(values[0][0], values[1][0], rtol=1e-13)
+    np.testing.assert_allclose(values[0][1], values[1][1], rtol=1e-10)
+    assert abs(values[0][1]) > 1e-2
+
+
+def test_members_of_a_batch_step_on_their_own():
+    system, y0 = SYSTEMS["nonholonomic"].system, SYSTEMS["nonholonomic"].initial_state()
+    sizes = jnp.array([0.05, 0.1, -0.1])
+    method = LobattoIIIAB(2)
+    batch = jax.vmap(lambda h: nhjax.step(system, method, 0.0, h, y0))(sizes)
+    for k, h in enumerate(sizes):
+        alone = nhjax.step(system, method, 0.0, h, y0)
+        np.testing.assert_allclose(batch.q[k], alone.q, rtol=1e-15)
+
+
+def test_a_step_that_cannot_be_solved_raises_or_is_no_number():
+    pendulum = SYSTEMS["holonomic"]
+    system, y0 = pendulum.system, pendulum.initial_state()
+    # Two radians' worth of free flight and more: the sphere is not reached.
+    with pytest.raises(nhjax.IntegrationError, match="step 0"):
+        nhjax.step(system, LobattoIIIAB(2), 0.0, 100.0, y0)
+    sizes = jnp.array([0.1, 100.0])
+    y = jax.vmap(
+        lambda h: nhjax.step(system, LobattoIIIAB(2), 0.0, h, y0, throw=False)
+    )(sizes)
+    assert jnp.all(jnp.isfinite(y.q[0]))
+    for leaf in jax.tree.leaves(y):
+        assert jnp.all(jnp.isnan(leaf[1]))
+
+
+def test_steps_of_controls_that_change():
+    # Between steps the control is what the user makes of the state.
+    system = nhjax.LagrangianSystem(
+        lambda t, q, v, u: 0.5 * v @ v, force=lambda t, q, v, u: u
+    )
+    y = nhjax.initial_state(system, jnp.array([1.0]), jnp.zeros(1), args=jnp.zeros(1))
+    method = nhjax.Gauss(1)
+    for k in range(100):
+        u = -2.0 * y.q - 2.0 * y.v
+        y = nhjax.step(system, method, 0.05 * k, 0.05, y, u)
+    assert abs(float(y.q[0])) < 0.05
+
+
+def test_a_state_that_is_bad_does_not_end_the_others():
+    particle = SYSTEMS["nonholonomic"]
+    system, good = particle.system, particle.initial_state()
+    q = jnp.stack([good.q, good.q, good.q])
+    v = jnp.stack([good.v, good.v + 1.0, jnp.full(3, jnp.nan)])
+
+    def start(q, v):
+        return nhjax.initial_state(system, q, v, throw=False)
+
+    y = jax.vmap(start)(q, v)
+    for leaf, of_good in zip(*map(jax.tree.leaves, (y, good)), strict=True):
+        np.testing.assert_array_equal(leaf[0], of_good)
+        assert jnp.all(jnp.isnan(leaf[1:]))
+    sol = jax.vmap(
+        lambda y: nhjax.integrate(
+            system, LobattoIIIAB(2), y, dt=0.1, num_steps=3, throw=False
+        )
+    )(y)
+    states = [RESULTS.successful] + [RESULTS.nonfinite_state] * 2
+    assert [int(x) for x in sol.result._value] == [int(x._value) for x in states]
+    with pytest.raises(nhjax.ConstraintViolationError):
+        nhjax.initial_state(system, q[1], v[1])
+    with pytest.raises(nhjax.ShapeError):
+        nhjax.initial_state(system, q[1], v[1, :2], throw=False)
+    with pytest.raises(TypeError, match="`throw`"):
+        nhjax.initial_state(system, q[0], v[0], throw="no")  # pyright: ignore[reportArgumentType]
