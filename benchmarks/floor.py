@@ -44,13 +44,12 @@ STATE = 21  # numbers of q, v and p
 
 
 class Case(NamedTuple):
-    """Trajectories that run together, and what they should cost over C++."""
+    """Trajectories that run together."""
 
     name: str
     members: int
     num_steps: int
     lanes: tuple[int, ...]
-    target: float
 
 
 class Run(NamedTuple):
@@ -256,8 +255,7 @@ def report(rows: list[dict[str, Any]]) -> str:
                 continue
             fastest = min(row["times"][key]) / min(row["times"][name])
             line = [row["name"], key, name, f"{micros[key] / floor:.1f}"]
-            line += [f"{fastest:.1f}", f"<= {row['target']:.0f}"]
-            line.append(f"{iterations[key]:.2f}")
+            line += [f"{fastest:.1f}", f"{iterations[key]:.2f}"]
             line += [f"{iterations[name]:.2f}", f"{row['most_iterations']:.1f}"]
             against.append([*line, number(row["difference"])])
     header = ["case", "program", "µs/step/trajectory", "iterations/step"]
@@ -265,7 +263,7 @@ def report(rows: list[dict[str, Any]]) -> str:
     if not against:
         sections.append("There is no C++ compiler here: nhjax's figures alone.")
         return "\n\n".join(sections)
-    header = ["case", "nhjax on", "over", "ratio", "fastest", "target"]
+    header = ["case", "nhjax on", "over", "ratio", "fastest"]
     header += [
         "iterations, nhjax",
         "C++",
@@ -304,8 +302,8 @@ def main() -> None:
         else (options.members, options.num_steps, options.batch_steps)
     )
     cases = [
-        Case("one", 1, one_steps, (1,), 5.0),
-        Case(f"{members}", members, batch_steps, LANES, 8.0),
+        Case("one", 1, one_steps, (1,)),
+        Case(f"{members}", members, batch_steps, LANES),
     ]
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)

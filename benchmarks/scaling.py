@@ -45,13 +45,12 @@ class Problem(NamedTuple):
 
 
 class Axis(NamedTuple):
-    """What is varied, and the exponent that the cost of a step should not exceed."""
+    """What is varied."""
 
     name: str
     label: str
     problems: list[Problem]
     fitted_from: int
-    target: float | None = None
 
 
 def chaotic(m: int) -> tuple[nhjax.LagrangianSystem, nhjax.State]:
@@ -119,7 +118,6 @@ def axes(smoke: bool) -> list[Axis]:
             "number of coordinates n",
             [Problem(2 * m + 1, *chaotic(m), num_steps=num_steps) for m in masses],
             fitted_from=7,
-            target=1.5,
         ),
         Axis(
             "k",
@@ -240,10 +238,9 @@ def summary(measured: list[tuple[Axis, list[dict[str, Any]]]]) -> str:
         line = [axis.name, f"{axis.fitted_from} to {rows[-1]['size']}"]
         for key in ("step", "least"):
             line += [f"{slope:.2f}" for slope in exponents(axis, rows, key).values()]
-        line.append("" if axis.target is None else f"<= {axis.target}")
         lines.append([*line, f"{exponents(axis, rows, 'compile')['fitted']:.2f}"])
     header = ["axis", "range", "ends", "fitted", "ends, least", "fitted, least"]
-    return markdown_table([*header, "target", "compile time, fitted"], lines)
+    return markdown_table([*header, "compile time, fitted"], lines)
 
 
 def draw(measured: list[tuple[Axis, list[dict[str, Any]]]], path: Path) -> None:
@@ -256,11 +253,6 @@ def draw(measured: list[tuple[Axis, list[dict[str, Any]]]], path: Path) -> None:
         least = [row["least"] for row in rows]
         ax.loglog(x, least, ":", color=f"C{k}", linewidth=1)
         ax.loglog(x, y, "o-", color=f"C{k}", markersize=4, linewidth=1)
-        used = x >= axis.fitted_from
-        if axis.target is not None:
-            line = y[used][0] * (x[used] / x[used][0]) ** axis.target
-            ax.loglog(x[used], line, "k:", linewidth=1, label=f"slope {axis.target}")
-            ax.legend(fontsize="small")
         slope = exponents(axis, rows, "step")["fitted"]
         ax.set_title(f"exponent {slope:.2f}", fontsize="medium")
         ax.set_xlabel(axis.label)

@@ -4,7 +4,7 @@ import math
 from abc import abstractmethod
 from collections.abc import Callable
 from functools import partial
-from typing import TypeAlias, TypeVar
+from typing import Any, TypeAlias
 
 import equinox as eqx
 import jax
@@ -18,7 +18,6 @@ from ._stepping import Carry
 
 
 _Run: TypeAlias = tuple[Carry, Rows]
-_State = TypeVar("_State")
 _Advance: TypeAlias = Callable[[_Run, Int[Array, ""]], _Run]
 
 
@@ -36,26 +35,9 @@ def _advance(loop: Loop, state: _Run, k: Int[Array, ""]) -> _Run:
     return carry, loop.write(buffers, rows, k)
 
 
-def steps(
-    advance: Callable[[_State, Int[Array, ""]], _State],
-    state: _State,
-    length: int | Int[Array, ""],
-    first: Int[Array, ""] | int = 0,
-    stride: int = 1,
-) -> _State:
-    """`advance(state, k)` for `length` values of k, from `first`, `stride` apart.
-
-    They are counted on the way: an array of them would grow with the number of steps.
-    With a traced length JAX has no reverse mode for it.
-    """
-
-    def body(_, counted):
-        state, k = counted
-        return advance(state, k), k + stride
-
-    counted = (state, jnp.asarray(first, jnp.int32))
-    end = np.int32(length) if isinstance(length, int) else length
-    return jax.lax.fori_loop(np.int32(0), end, body, counted)[0]
+def count(num_steps: int | Int[Array, ""]) -> Any:
+    """A number of steps as a loop takes it, in int32; known if it is an int."""
+    return np.int32(num_steps) if isinstance(num_steps, int) else num_steps
 
 
 class DirectAdjoint(AbstractAdjoint):
@@ -79,7 +61,10 @@ class DirectAdjoint(AbstractAdjoint):
     def run(self, loop: Loop, carry: Carry) -> _Run:
         """All steps of the loop from `carry`: its end, and the rows saved."""
         state = (carry, loop.empty_rows(carry))
-        return steps(partial(_advance, loop), state, loop.num_steps)
+        end = count(loop.num_steps)
+        return jax.lax.fori_loop(
+            np.int32(0), end, lambda k, state: _advance(loop, state, k), state
+        )
 
 
 class RecursiveCheckpointAdjoint(AbstractAdjoint):
@@ -101,9 +86,14 @@ class RecursiveCheckpointAdjoint(AbstractAdjoint):
 
     !!! example
 
-        >>> import nhjax
-        >>> nhjax.RecursiveCheckpointAdjoint(checkpoints=50).checkpoints
-        50
+        >>> import jax, nhjax
+        >>> disc = nhjax.systems.VerticalRollingDisc()
+        >>> def end(dt):
+        ...     return nhjax.integrate(disc.system, nhjax.LobattoIIIAB(2),
+        ...         disc.initial_state(), dt=dt, num_steps=10,
+        ...         adjoint=nhjax.RecursiveCheckpointAdjoint(checkpoints=4)).ys.q[-1, 3]
+        >>> round(float(jax.grad(end)(0.1)), 6)
+        7.0
     """
 
     checkpoints: int | None = eqx.field(static=True, default=None)
@@ -149,7 +139,15 @@ def _block(advance: _Advance, length: int, stride: int, *, keep_all: bool) -> _A
     """`length` calls of `advance`, `stride` steps apart."""
     one = advance if keep_all else jax.checkpoint(advance, prevent_cse=False)
 
-    return lambda state, k: steps(one, state, length, k, stride)
+    def block(state, k):
+        return jax.lax.fori_loop(
+            np.int32(0),
+            count(length),
+            lambda i, state: one(state, k + np.int32(stride) * i),
+            state,
+        )
+
+    return block
 
 
 def _idle_after_the_end(loop: Loop) -> _Advance:

@@ -44,8 +44,7 @@ class NoProgressMeter(AbstractProgressMeter):
     !!! example
 
         >>> import nhjax
-        >>> nhjax.NoProgressMeter().silent
-        True
+        >>> nhjax.NoProgressMeter().update(50, 100)
     """
 
     @property
@@ -85,8 +84,10 @@ class TqdmProgressMeter(AbstractProgressMeter):
     !!! example
 
         >>> import nhjax
-        >>> nhjax.TqdmProgressMeter("pendulum").description
-        'pendulum'
+        >>> meter = nhjax.TqdmProgressMeter("pendulum")
+        >>> disc = nhjax.systems.VerticalRollingDisc()
+        >>> sol = nhjax.integrate(disc.system, nhjax.LobattoIIIAB(2),
+        ...     disc.initial_state(), dt=0.1, num_steps=100, progress_meter=meter)
     """
 
     description: str = eqx.field(static=True, default="")

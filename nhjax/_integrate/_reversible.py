@@ -4,6 +4,7 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Int, PyTree
 
 from .._custom_types import BoolScalar
@@ -11,7 +12,7 @@ from .._numerics import iterate, max_norm, relative, Sizes
 from .._results import RESULTS
 from .._step import StepState
 from .._system import AbstractMechanicalSystem, State
-from ._adjoint import AbstractAdjoint, DirectAdjoint, steps
+from ._adjoint import AbstractAdjoint, count, DirectAdjoint
 from ._loop import Loop
 from ._progress_meter import NoProgressMeter
 from ._saving import Rows
@@ -90,8 +91,16 @@ def _run_bwd(residuals, cotangents, perturbed, arguments):
         change, cotangent = pullback((cotangent, row))
         return step_state, cotangent, jax.tree.map(jnp.add, total, change)
 
-    last, state = loop.num_steps - 1, (end.step_state, cotangent, nothing)
-    first, cotangents, total = steps(retrace, state, loop.num_steps, last, -1)
+    last, state = (
+        count(loop.num_steps) - np.int32(1),
+        (end.step_state, cotangent, nothing),
+    )
+    first, cotangents, total = jax.lax.fori_loop(
+        np.int32(0),
+        count(loop.num_steps),
+        lambda i, state: retrace(state, last - i),
+        state,
+    )
     total, cotangent = _if_retraced(
         end.result == RESULTS.successful,
         loop.stepping.system,

@@ -70,18 +70,16 @@ def run(
     end, rows = nan_gradient_unless(successful, found, given)
     t1 = stepping.time(num_steps)
 
-    pieces = []
-    if saveat.t0:
-        pieces.append(_one(saving.saved(t0, start, args)))
-    if saveat.steps:
-        pieces.append(jax.tree.map(lambda x: x[:-1], rows.saved))
+    first = [_one(saving.saved(t0, start, args))] if saveat.t0 else []
+    on_the_way = [jax.tree.map(lambda x: x[:-1], rows.saved)] if saveat.steps else []
     if ts is not None and sampled is not None and places.slots is not None:
         row = places.slots[sampled]
         records = jax.tree.map(lambda x: x[row], rows.record)
         sample = partial(_sample, stepping, saving)
-        pieces.append(jax.vmap(sample)(ts, sampled, records))
-    if saveat.saves_end(num_steps):
-        pieces.append(_one(saving.saved(t1, end, args)))
+        on_the_way = [jax.vmap(sample)(ts, sampled, records)]
+    ends = saveat.saves_end(num_steps)
+    last = [_one(saving.saved(t1, end, args))] if ends else []
+    pieces = first + on_the_way + last
     times, ys = stack_saved(pieces) if pieces else (None, None)
     interpolation = None
     if saveat.dense:

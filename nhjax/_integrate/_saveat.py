@@ -47,8 +47,12 @@ class SaveAt(eqx.Module):
     !!! example
 
         >>> import nhjax
-        >>> nhjax.SaveAt(t0=True, steps=10).steps
-        10
+        >>> disc = nhjax.systems.VerticalRollingDisc()
+        >>> sol = nhjax.integrate(disc.system, nhjax.LobattoIIIAB(2),
+        ...     disc.initial_state(), dt=0.1, num_steps=100,
+        ...     saveat=nhjax.SaveAt(t0=True, steps=10))
+        >>> sol.ts.shape
+        (11,)
     """
 
     t0: bool = eqx.field(static=True, default=False)

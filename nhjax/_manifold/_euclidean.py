@@ -20,9 +20,10 @@ class Euclidean(AbstractLieGroup):
 
     !!! example
 
-        >>> import nhjax
-        >>> nhjax.Euclidean(3).dim
-        3
+        >>> import jax.numpy as jnp, nhjax
+        >>> plane = nhjax.Euclidean(2)
+        >>> plane.compose(jnp.array([1.0, 2.0]), jnp.array([3.0, 4.0])).tolist()
+        [4.0, 6.0]
     """
 
     n: int = eqx.field(static=True)

@@ -28,9 +28,11 @@ class ProductGroup(AbstractLieGroup):
 
     !!! example
 
-        >>> import nhjax
-        >>> nhjax.ProductGroup(nhjax.Euclidean(2), nhjax.SO3()).dim
-        5
+        >>> import jax.numpy as jnp, nhjax
+        >>> group = nhjax.ProductGroup(nhjax.Euclidean(2), nhjax.SO3())
+        >>> position, attitude = group.retract(jnp.arange(5.0))
+        >>> position.shape, attitude.shape
+        ((2,), (4,))
     """
 
     factors: tuple[AbstractLieGroup, ...]

@@ -73,9 +73,10 @@ class Cayley(AbstractRetraction):
 
     !!! example
 
-        >>> import nhjax
-        >>> nhjax.SO3(retraction=nhjax.Cayley()).dim
-        3
+        >>> import jax.numpy as jnp, nhjax
+        >>> turn = nhjax.SO2(retraction=nhjax.Cayley()).retract(jnp.array([2.0]))
+        >>> round(4 * float(turn[0]) / 3.141593, 5)
+        2.0
     """
 
     def angle(self, omega: Array) -> Array:
@@ -127,9 +128,10 @@ class Exponential(AbstractRetraction):
 
     !!! example
 
-        >>> import nhjax
-        >>> nhjax.SO2(retraction=nhjax.Exponential()).is_flat
-        True
+        >>> import jax.numpy as jnp, nhjax
+        >>> group = nhjax.SO2(retraction=nhjax.Exponential())
+        >>> [round(float(x), 6) for x in group.retract(jnp.array([0.3]))]
+        [0.3]
     """
 
     def angle(self, omega: Array) -> Array:

@@ -57,7 +57,19 @@ class Solved(NamedTuple, Generic[X, Aux]):
     num_iterations: Int[Array, ""]
 
 
+class _Rules(NamedTuple):
+    """By what increments are judged: see `iterate`."""
+
+    scale: FloatScalar
+    floor: FloatScalar
+    noisiest: float
+    growth: float
+    max_iterations: int
+
+
 class _Progress(NamedTuple):
+    """What is known of an iteration on its way."""
+
     first: FloatScalar
     smallest: FloatScalar
     believed: FloatScalar
@@ -99,47 +111,22 @@ def iterate(
     aux = jax.tree.map(lambda s: jnp.zeros(s.shape, s.dtype), aux_shape)
     dtype = jnp.result_type(*[leaf.dtype for leaf in jax.tree.leaves(x)])
     eps = jnp.finfo(dtype).eps
-    floor = jnp.maximum(jnp.asarray(eps, dtype), jnp.asarray(tolerance, dtype))
-    noisiest, growth = eps**0.5, _GROWTH
-    if noise_units is not None:
-        noisiest, growth = noise_units * eps, _GROWTH_IF_SLOW
+    rules = _Rules(
+        scale=jnp.asarray(scale, dtype),
+        floor=jnp.maximum(jnp.asarray(eps, dtype), jnp.asarray(tolerance, dtype)),
+        noisiest=eps**0.5 if noise_units is None else noise_units * eps,
+        growth=_GROWTH if noise_units is None else _GROWTH_IF_SLOW,
+        max_iterations=max_iterations,
+    )
 
     def body(carry):
         x, _, progress = carry
         x_next, sizes, aux = sweep(x)
-        increment = sizes.increment
-        first = jnp.where(progress.iterations == 0, increment, progress.first)
-        size = jnp.maximum(scale, sizes.iterate)
-        # No quotients, which would wait for each other: sizes are compared as they are.
-        measure = jnp.where(size > 0, size, progress.first)
-        stalls = increment >= progress.smallest
-        more = jnp.minimum(growth * progress.believed, noisiest)
-        believed = jnp.where(stalls, more, progress.believed)
-        magnified = measure
-        if sizes.noise is not None:
-            noise = jnp.minimum(sizes.noise, _LARGEST_NOISE * measure)
-            magnified = jnp.maximum(measure, noise)
-        stagnant = stalls & (increment <= believed * magnified)
-        converged = (increment <= floor * measure) | stagnant
-        count = progress.iterations + 1
-        # False for what is not finite.
-        bounded = increment < _HOPELESS * (measure + first)
-        exhausted = bounded & ~converged & (count >= max_iterations)
-        progress = _Progress(
-            first=unit(first),
-            smallest=jnp.minimum(increment, progress.smallest),
-            believed=believed,
-            iterations=count,
-            done=converged | ~bounded | exhausted,
-            converged=converged,
-            exhausted=exhausted,
-        )
-        return x_next, aux, progress
+        return x_next, aux, _progress(rules, progress, sizes)
 
     zero = jnp.zeros((), jnp.int32)
     skip = jnp.asarray(skip)
-    scale = jnp.asarray(scale, dtype)
-    least = _FIRST_UNITS / growth * eps
+    least = _FIRST_UNITS / rules.growth * eps
     one, infinite, least = (jnp.asarray(x, dtype) for x in (1, jnp.inf, least))
     never = jnp.zeros_like(skip)
     start = _Progress(one, infinite, least, zero, skip, skip, never)
@@ -147,6 +134,37 @@ def iterate(
         lambda carry: ~carry[2].done, body, (x, aux, start)
     )
     return Solved(x, aux, progress.converged, progress.exhausted, progress.iterations)
+
+
+def _progress(rules: _Rules, before: _Progress, sizes: Sizes) -> _Progress:
+    """Whether an iteration has come to an end with an increment, and how."""
+    increment = sizes.increment
+    first = jnp.where(before.iterations == 0, increment, before.first)
+    size = jnp.maximum(rules.scale, sizes.iterate)
+    # No quotients, which would wait for each other: sizes are compared as they are.
+    measure = jnp.where(size > 0, size, before.first)
+    stalls = increment >= before.smallest
+    more = jnp.minimum(rules.growth * before.believed, rules.noisiest)
+    believed = jnp.where(stalls, more, before.believed)
+    magnified = measure
+    if sizes.noise is not None:
+        noise = jnp.minimum(sizes.noise, _LARGEST_NOISE * measure)
+        magnified = jnp.maximum(measure, noise)
+    stagnant = stalls & (increment <= believed * magnified)
+    converged = (increment <= rules.floor * measure) | stagnant
+    count = before.iterations + 1
+    # False for what is not finite.
+    bounded = increment < _HOPELESS * (measure + first)
+    exhausted = bounded & ~converged & (count >= rules.max_iterations)
+    return _Progress(
+        first=unit(first),
+        smallest=jnp.minimum(increment, before.smallest),
+        believed=believed,
+        iterations=count,
+        done=converged | ~bounded | exhausted,
+        converged=converged,
+        exhausted=exhausted,
+    )
 
 
 def dense_increment(

@@ -122,8 +122,12 @@ class SimplifiedNewton(AbstractStageSolver):
     !!! example
 
         >>> import nhjax
-        >>> nhjax.SimplifiedNewton(max_iterations=80).max_iterations
-        80
+        >>> pendulum = nhjax.systems.SphericalPendulum()
+        >>> sol = nhjax.integrate(pendulum.system, nhjax.LobattoIIIAB(3),
+        ...     pendulum.initial_state(), dt=0.1, num_steps=20,
+        ...     stage_solver=nhjax.SimplifiedNewton(max_iterations=80))
+        >>> int(sol.stats["num_steps"])
+        20
     """
 
     max_iterations: int = eqx.field(static=True, default=100)
@@ -194,8 +198,12 @@ class Newton(AbstractStageSolver):
     !!! example
 
         >>> import nhjax
-        >>> nhjax.Newton().max_iterations
-        30
+        >>> pendulum = nhjax.systems.SphericalPendulum()
+        >>> sol = nhjax.integrate(pendulum.system, nhjax.LobattoIIIAB(3),
+        ...     pendulum.initial_state(), dt=0.1, num_steps=20,
+        ...     stage_solver=nhjax.Newton())
+        >>> int(sol.stats["num_steps"])
+        20
     """
 
     max_iterations: int = eqx.field(static=True, default=30)

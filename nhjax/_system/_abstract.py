@@ -1,7 +1,5 @@
-import inspect
 from abc import abstractmethod
 from collections.abc import Callable
-from types import MethodType
 from typing import Any, Literal, Self
 
 import equinox as eqx
@@ -18,46 +16,8 @@ from .._custom_types import (
 )
 from .._manifold import AbstractLieGroup, Euclidean
 from .._numerics import ClosureConverted
+from ._signatures import check_signature
 from ._state import check_time_and_state, State
-
-
-def _signature(function: Callable[..., Any]) -> inspect.Signature | None:
-    """The signature by which a function is called, None where it cannot be known.
-
-    Not that of a function that it wraps, whose arguments need not be the same, unless
-    it has none of its own, such as the outcome of `jax.jit`.
-    """
-    method, of = (
-        getattr(function, "__func__", None),
-        getattr(function, "__self__", None),
-    )
-    if method is not None and of is not None:
-        # A method of an `equinox.Module` has a type of its own that takes anything.
-        function = MethodType(method, of)
-    for follow in (False, True):
-        try:
-            signature = inspect.signature(function, follow_wrapped=follow)
-        except (TypeError, ValueError):
-            continue
-        # Types would make a message long.
-        bare = [
-            parameter.replace(annotation=inspect.Parameter.empty)
-            for parameter in signature.parameters.values()
-        ]
-        return inspect.Signature(bare)
-    return None
-
-
-def _takes(signature: inspect.Signature, arguments: tuple[str, ...]) -> bool:
-    try:
-        signature.bind(*arguments)
-    except TypeError:
-        return False
-    return True
-
-
-def _name(function: Callable[..., Any]) -> str:
-    return getattr(function, "__name__", type(function).__name__)
 
 
 class AbstractMechanicalSystem(eqx.Module):
@@ -81,21 +41,8 @@ class AbstractMechanicalSystem(eqx.Module):
 
     def __check_init__(self):
         for name, arguments in self.signatures().items():
-            function = getattr(self, name)
-            if function is None and name != self.generator:
-                continue
-            expected = f"({', '.join(arguments)})"
-            if not callable(function):
-                raise TypeError(
-                    f"{type(self).__name__}: `{name}` must be a function of "
-                    f"{expected}, got {function!r}."
-                )
-            signature = _signature(function)
-            if signature is not None and not _takes(signature, arguments):
-                raise TypeError(
-                    f"{type(self).__name__}: `{name}` must take {expected}, but "
-                    f"`{_name(function)}{signature}` does not."
-                )
+            if getattr(self, name) is not None or name == self.generator:
+                check_signature(self, name, arguments)
         if not isinstance(self.manifold, AbstractLieGroup | None):
             raise TypeError(
                 f"{type(self).__name__}: `manifold` must be an nhjax manifold such as "

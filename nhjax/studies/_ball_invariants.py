@@ -19,10 +19,11 @@ from ._arguments import (
     check_step_sizes,
     whole_steps,
 )
-from ._result import AbstractStudyResult, initial_data, system_parameters, Timing
+from ._ball_run import BallRun
+from ._result import AbstractStudyResult, initial_data, system_parameters
 from ._retractions import RETRACTIONS
 from ._run import compile_and_run, meter
-from ._table import format_slope, format_table, largest_by_fifths, slopes
+from ._table import format_slope, format_table, slopes
 
 
 if TYPE_CHECKING:
@@ -39,41 +40,6 @@ MOVING_ENERGY = "moving energy"
 # Where the moving energy and the position are round-off.
 ENERGY_FLOOR = 4e-15
 POSITION_FLOOR = 1e-13
-
-
-@dataclasses.dataclass(frozen=True)
-class BallRun:
-    """One run, at every step.
-
-    - `integrals`: shape (k + 1, 4), the three linear first integrals and the moving
-        energy.
-    - `positions`: (x, y), shape (k + 1, 2).
-    - `circle_deviation`: the distance from the exact position at the final time that
-        all step sizes have in common.
-    - `timing`: of the program that runs all step sizes with this s side by side.
-    """
-
-    stages: int
-    dt: float
-    times: np.ndarray
-    integrals: np.ndarray
-    positions: np.ndarray
-    circle_deviation: float
-    mean_iterations: float
-    max_constraint_violation: float
-    timing: Timing
-
-    def deviations(self) -> np.ndarray:
-        """The integrals less their initial values."""
-        return self.integrals - self.integrals[0]
-
-    def largest_linear_errors(self) -> np.ndarray:
-        """The largest deviation of each linear integral, shape (3,)."""
-        return np.max(np.abs(self.deviations()[:, :3]), axis=0)
-
-    def energy_by_fifths(self) -> list[float]:
-        """The largest deviation of the moving energy in each fifth of the run."""
-        return largest_by_fifths(self.deviations()[1:, 3])
 
 
 @dataclasses.dataclass(frozen=True)

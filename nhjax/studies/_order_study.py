@@ -19,22 +19,11 @@ from .._system import continuous_multiplier, LagrangianSystem, State
 from ._arguments import check_positive, check_stages, check_step_sizes, whole_steps
 from ._result import AbstractStudyResult, initial_data, system_parameters, Timing
 from ._run import compile_and_run
-from ._table import format_slope, format_table, slopes
+from ._table import format_slope, format_table, slopes, SYMBOLS
 
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
-
-
-# In tables and in figures.
-SYMBOLS = {
-    "q": ("q", "$q$"),
-    "g": ("g", "$g$"),
-    "v": ("v", "$v$"),
-    "p": ("p", "$p$"),
-    "multiplier": ("λ", r"$\lambda$"),
-    "continuous_multiplier": ("λ_c", r"$\lambda_c(q, p)$"),
-}
 
 
 class ExactExample(Protocol):

@@ -7,6 +7,17 @@ import numpy as np
 from ..diagnostics import convergence_order
 
 
+# Names of quantities, in tables and in figures.
+SYMBOLS = {
+    "q": ("q", "$q$"),
+    "g": ("g", "$g$"),
+    "v": ("v", "$v$"),
+    "p": ("p", "$p$"),
+    "multiplier": ("λ", r"$\lambda$"),
+    "continuous_multiplier": ("λ_c", r"$\lambda_c(q, p)$"),
+}
+
+
 def format_table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     """Right-aligned columns under a ruled header."""
     widths = [max(map(len, column)) for column in zip(header, *rows, strict=True)]

@@ -1,0 +1,43 @@
+"""One run of a ball-invariants study."""
+
+import dataclasses
+
+import numpy as np
+
+from ._result import Timing
+from ._table import largest_by_fifths
+
+
+@dataclasses.dataclass(frozen=True)
+class BallRun:
+    """One run, at every step.
+
+    - `integrals`: shape (k + 1, 4), the three linear first integrals and the moving
+        energy.
+    - `positions`: (x, y), shape (k + 1, 2).
+    - `circle_deviation`: the distance from the exact position at the final time that
+        all step sizes have in common.
+    - `timing`: of the program that runs all step sizes with this s side by side.
+    """
+
+    stages: int
+    dt: float
+    times: np.ndarray
+    integrals: np.ndarray
+    positions: np.ndarray
+    circle_deviation: float
+    mean_iterations: float
+    max_constraint_violation: float
+    timing: Timing
+
+    def deviations(self) -> np.ndarray:
+        """The integrals less their initial values."""
+        return self.integrals - self.integrals[0]
+
+    def largest_linear_errors(self) -> np.ndarray:
+        """The largest deviation of each linear integral, shape (3,)."""
+        return np.max(np.abs(self.deviations()[:, :3]), axis=0)
+
+    def energy_by_fifths(self) -> list[float]:
+        """The largest deviation of the moving energy in each fifth of the run."""
+        return largest_by_fifths(self.deviations()[1:, 3])
