@@ -11,14 +11,14 @@ from .._method import AbstractMethod
 from .._numerics import ClosureConverted, nan_gradient_unless
 from .._results import RESULTS
 from .._step import AbstractStageSolver, StepRecord
-from .._system import AbstractMechanicalSystem, State
+from .._system import AbstractMechanicalSystem, closure_converted, State
 from ._adjoint import AbstractAdjoint
 from ._checks import check_saved, known
 from ._interpolation import DenseInterpolation, interpolate, step_index
 from ._loop import Loop
 from ._progress_meter import AbstractProgressMeter
 from ._saveat import SaveAt, stack_saved
-from ._saving import record_places, RecordPlaces, Saving
+from ._saving import record_places, Saving
 from ._solution import Solution
 from ._stepping import Stepping
 
@@ -40,15 +40,13 @@ def run(
     """The solution, of arguments that have been checked."""
     check_saved(saveat.fn, t0, y0, args)
     # What user functions close over must be seen to be differentiated.
-    system = system.closure_converted(t0, y0, args)
+    system = closure_converted(system, t0, y0, args)
     stepping = Stepping(system, method, stage_solver, t0, dt, args)
     ts, sampled = saveat.ts, None
     if ts is not None:
         length = known(num_steps)
         sampled = jax.vmap(lambda t: step_index(t, t0, dt, length))(ts)
-    places = RecordPlaces(0, None)
-    if saveat.dense or sampled is not None:
-        places = record_places(saveat.dense, sampled, known(num_steps))
+    places = record_places(saveat.dense, sampled, num_steps)
     saving = Saving(
         fn=ClosureConverted(saveat.fn, t0, y0, args),
         num_steps=num_steps,
@@ -64,9 +62,8 @@ def run(
 
     loop = Loop(stepping, saving, meter)
     start, carry, rows = as_cpu_kernel(all_steps, loop, y0)
+    found, given = (carry.step_state.state, rows), (system, y0, t0, dt, args)
     successful = carry.result == RESULTS.successful
-    given = (system, y0, t0, dt, args)
-    found = (carry.step_state.state, rows)
     end, rows = nan_gradient_unless(successful, found, given)
     t1 = stepping.time(num_steps)
 

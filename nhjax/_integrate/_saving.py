@@ -11,6 +11,7 @@ from jaxtyping import Array, Int, PyTree
 from .._custom_types import Args, FloatScalar
 from .._step import StepRecord
 from .._system import State
+from ._checks import known
 from ._stepping import Taken
 
 
@@ -32,17 +33,18 @@ class RecordPlaces(NamedTuple):
 
 
 def record_places(
-    dense: bool, sampled: Int[Array, " k"] | None, num_steps: int
+    dense: bool, sampled: Int[Array, " k"] | None, num_steps: int | Int[Array, ""]
 ) -> RecordPlaces:
     """The places of records for dense output, or for samples in the given steps."""
-    if dense:
-        return RecordPlaces(num_steps, jnp.arange(num_steps + 1, dtype=jnp.int32))
-    if sampled is None:
+    if not dense and sampled is None:
         return RecordPlaces(0, None)
+    length = known(num_steps)
+    if dense or sampled is None:
+        return RecordPlaces(length, jnp.arange(length + 1, dtype=jnp.int32))
     # A row per sample, of which the first in a step is used: there may be more steps
     # than samples, and more samples than steps.
     number = sampled.shape[0]
-    slots = jnp.full((num_steps + 1,), number, jnp.int32)
+    slots = jnp.full((length + 1,), number, jnp.int32)
     first = slots.at[sampled].min(jnp.arange(number, dtype=jnp.int32))
     return RecordPlaces(number, first)
 

@@ -110,7 +110,7 @@ def iterate(
     aux_shape = jax.eval_shape(lambda x: sweep(x)[2], x)
     aux = jax.tree.map(lambda s: jnp.zeros(s.shape, s.dtype), aux_shape)
     dtype = jnp.result_type(*[leaf.dtype for leaf in jax.tree.leaves(x)])
-    eps = jnp.finfo(dtype).eps
+    eps = float(jnp.finfo(dtype).eps)
     rules = _Rules(
         scale=jnp.asarray(scale, dtype),
         floor=jnp.maximum(jnp.asarray(eps, dtype), jnp.asarray(tolerance, dtype)),

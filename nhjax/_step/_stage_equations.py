@@ -6,7 +6,7 @@ from jaxtyping import Array, Float, PyTree
 
 from .._custom_types import BoolScalar
 from .._numerics import small_einsum
-from .._system import motion_residual
+from .._system import motion_residual, whole_force
 from ._chart import positions
 from ._stage_system import StageSystem
 from ._unknowns import StageForces, Stages
@@ -34,7 +34,7 @@ def stage_forces(stages: StageSystem, x: Stages) -> StageForces:
     )
     force, momentum = jax.vmap(
         lambda t, q, u, lam: (
-            stages.system.stage_force(t, q, u, lam, stages.args),
+            whole_force(stages.system, t, q, u, lam, stages.args),
             stages.system.momentum(t, q, u, stages.args),
         )
     )(stages.stage_times, q, u, multiplier)

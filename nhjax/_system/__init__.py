@@ -16,6 +16,7 @@ from ._checks import (
     check_state as check_state,
     require_manifold as require_manifold,
 )
+from ._closure import closure_converted as closure_converted
 from ._hamiltonian import HamiltonianSystem as HamiltonianSystem
 from ._lagrangian import LagrangianSystem as LagrangianSystem
 from ._linearisation import (
@@ -23,6 +24,7 @@ from ._linearisation import (
     Linearisation as Linearisation,
     linearise as linearise,
     motion_residual as motion_residual,
+    whole_force as whole_force,
 )
 from ._scales import (
     position_scale as position_scale,

@@ -1,6 +1,6 @@
 from abc import abstractmethod
 from collections.abc import Callable
-from typing import Any, Literal, Self
+from typing import Any, Literal
 
 import equinox as eqx
 import jax
@@ -15,7 +15,6 @@ from .._custom_types import (
     PositionFunction,
 )
 from .._manifold import AbstractLieGroup, Euclidean
-from .._numerics import ClosureConverted
 from ._signatures import check_signature
 from ._state import check_time_and_state, State
 
@@ -114,18 +113,6 @@ class AbstractMechanicalSystem(eqx.Module):
         """The fibre coordinate u of a state, its v or its p."""
         return getattr(y, self.fibre_coordinate_name)
 
-    def closure_converted(self, t: FloatScalar, y: State, args: Args) -> Self:
-        """This, with what its functions close over among its leaves."""
-        functions = self.functions(t, y.q, self.fibre_coordinate(y), args)
-        return eqx.tree_at(
-            lambda system: [getattr(system, name) for name in functions],
-            self,
-            [
-                ClosureConverted(function, *example)
-                for function, example in functions.values()
-            ],
-        )
-
     def fibre_derivative(
         self, t: FloatScalarLike, q: PyTree[Array], u: Float[Array, " n"], args: Args
     ) -> Float[Array, " n"]:
@@ -219,18 +206,6 @@ class AbstractMechanicalSystem(eqx.Module):
                 q,
             )
         return total
-
-    def stage_force(
-        self,
-        t: FloatScalarLike,
-        q: PyTree[Array],
-        u: Float[Array, " n"],
-        multiplier: Float[Array, " l"],
-        args: Args = None,
-    ) -> Float[Array, " n"]:
-        """The whole force W: free force and reaction."""
-        free = self.free_force(t, q, u, args)
-        return free + self.reaction(t, q, u, multiplier, args)
 
     def constraint_violation(
         self, t: FloatScalarLike, y: State, args: Args = None

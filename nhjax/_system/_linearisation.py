@@ -83,6 +83,19 @@ def _inertial_force(system, q, p: Array, v: Array) -> Array:
     return jnp.zeros_like(p) if manifold.is_flat else manifold.ad_dual(v, p)
 
 
+def whole_force(
+    system: AbstractMechanicalSystem,
+    t: FloatScalar,
+    q: PyTree[Array],
+    u: Float[Array, " n"],
+    multiplier: Float[Array, " l"],
+    args: Args,
+) -> Float[Array, " n"]:
+    """The whole force W on a system: the free force, and the constraints' reaction."""
+    free = system.free_force(t, q, u, args)
+    return free + system.reaction(t, q, u, multiplier, args)
+
+
 def motion_residual(
     system: AbstractMechanicalSystem,
     t: FloatScalar,
@@ -103,7 +116,7 @@ def motion_residual(
         (t, jnp.zeros_like(u), u),
         (jnp.ones_like(t), v, acceleration),
     )
-    w = system.stage_force(t, q, u, multiplier, args)
+    w = whole_force(system, t, q, u, multiplier, args)
     return p_dot - (w + _inertial_force(system, q, p, v)), phi_dot
 
 
