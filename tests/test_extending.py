@@ -2,6 +2,7 @@
 
 import re
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -28,7 +29,7 @@ OPENING, SECTIONS = _sections()
 
 
 def _run(title):
-    namespace = {"__name__": f"extending.{title}"}
+    namespace: dict[str, Any] = {"__name__": f"extending.{title}"}
     for block in (*OPENING, *SECTIONS[title]):
         exec(compile(block, f"{PAGE.name}: {title}", "exec"), namespace)
     return namespace

@@ -1,6 +1,7 @@
 """The rooms of nhjax: no import points up, and no part is too long to be read."""
 
 import ast
+import re
 
 import pytest
 
@@ -162,3 +163,17 @@ def _too_long():
 
 def test_nothing_is_longer_than_can_be_read():
     assert sorted(_too_long()) == sorted(LONGER)
+
+
+# Parts of JAX and equinox that may go without notice.
+INTERNAL = re.compile(
+    r"\bjax\.(core|extend|interpreters|_src)\b|\bjaxlib\.|\.primitive\b"
+    r"|\b(eqx|equinox)\.internal\b|xla_cpu_\w+"
+)
+
+
+def test_what_leans_on_internals_is_on_their_page():
+    page = (rooms.DOCS / "jax_internals.md").read_text(encoding="utf-8")
+    leaning = {module for module, text in SOURCES.items() if INTERNAL.search(text)}
+    named = re.findall(r"`((?:_\w+/)?_\w+)\.py`", page)
+    assert leaning == {name.replace("/", ".") for name in named}
