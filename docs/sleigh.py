@@ -36,10 +36,10 @@ def main() -> None:
     plot.trajectory(paths, names=("$x$", "$y$"), ax=left, linewidth=1.0)
     left.set_title("Chaplygin sleighs thrown backwards")
     sleigh = nhjax.systems.ChaplyginSleigh()
-    for multiplier in ("propagated", "consistent", "symmetric"):
+    for closure in ("propagated", "consistent", "symmetric"):
         sol = nhjax.integrate(
             sleigh.system,
-            nhjax.LobattoIIIAB(4, multiplier),
+            nhjax.LobattoIIIAB(4, closure),
             sleigh.initial_state(),
             dt=0.1,
             num_steps=2000,
@@ -47,12 +47,12 @@ def main() -> None:
             throw=False,
         )
         error = np.abs(energy_error(sleigh.system, sol))
-        right.semilogy(sol.ts, np.maximum(error, 1e-17), linewidth=1, label=multiplier)
+        right.semilogy(sol.ts, np.maximum(error, 1e-17), linewidth=1, label=closure)
     right.set_ylim(1e-20, 1e1)
     right.set_xlabel("time $t$")
     right.set_ylabel("$|E(t) - E(t_0)|$")
     right.set_title("energy error, s = 4, h = 0.1")
-    right.legend(title="multiplier", loc="lower right", fontsize="small")
+    right.legend(title="closure", loc="lower right", fontsize="small")
     figure.savefig(Path(__file__).with_suffix(".png"), dpi=110)
 
 

@@ -47,6 +47,12 @@ class DirectAdjoint(AbstractAdjoint):
     (`jax.hessian`, and either mode over either) work as well. If `num_steps` is an
     array, there is forward mode alone.
 
+    !!! note
+
+        It is not what diffrax calls `DirectAdjoint`, which nests scans and checkpoints
+        up to a largest number of steps, and is advised against there. Here the number
+        of steps is known, this is a plain loop, and it is the default.
+
     !!! example
 
         >>> import jax, nhjax
@@ -78,6 +84,14 @@ class RecursiveCheckpointAdjoint(AbstractAdjoint):
 
     Forward mode, second derivatives and `num_steps` as an array are as with
     `DirectAdjoint`.
+
+    !!! note
+
+        It is not what diffrax calls `RecursiveCheckpointAdjoint`, whose binomial scheme
+        places checkpoints while the number of steps is not yet known, takes
+        log(max_steps) of them by default, and has reverse mode alone. Here the number
+        of steps is known and blocks are of equal length; `checkpoints` counts those of
+        one level, and the default is faster and needs more memory.
 
     **Arguments:**
 

@@ -1,0 +1,272 @@
+"""The rooms of nhjax and the imports between them: `python docs/rooms.py` draws them.
+
+It writes docs/rooms.png and docs/rooms.md. `tests/test_rooms.py` uses the same
+functions to check that no arrow points up.
+"""
+
+import ast
+from collections.abc import Iterable, Iterator, Mapping
+from pathlib import Path
+from typing import NamedTuple
+
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.patches import FancyArrowPatch
+from matplotlib.path import Path as MplPath
+
+
+DOCS = Path(__file__).parent
+PACKAGE = DOCS.parent / "nhjax"
+
+# From the ground up. Within a floor a room may import from those to its left.
+FLOORS = (
+    ("_custom_types", "_errors", "_results"),
+    ("_compile",),
+    ("_method",),
+    ("_numerics",),
+    ("_manifold",),
+    ("_system",),
+    ("_initial",),
+    ("_step",),
+    ("_integrate",),
+    ("systems", "diagnostics", "plot", "studies", "__main__"),
+)
+ROOMS = tuple(room for floor in FLOORS for room in floor)
+
+
+class Import(NamedTuple):
+    """One module of the package that reads from another, and at which line."""
+
+    importer: str
+    imported: str
+    line: int
+
+
+def read_sources(package: Path = PACKAGE) -> dict[str, str]:
+    """The text of each module, by its dotted name without that of the package.
+
+    A room that is a folder goes by its own name; the package itself is "".
+    """
+    sources = {}
+    for path in sorted(package.rglob("*.py")):
+        parts = path.relative_to(package).with_suffix("").parts
+        if parts[-1] == "__init__":
+            parts = parts[:-1]
+        sources[".".join(parts)] = path.read_text(encoding="utf-8")
+    return sources
+
+
+def read_imports(sources: Mapping[str, str], name: str = "nhjax") -> list[Import]:
+    """Every import of a module of the package by another, functions' own included."""
+    folders = {module.rpartition(".")[0] for module in sources} | {""}
+    found = []
+    for module, text in sources.items():
+        here = module.split(".") if module else []
+        if module not in folders and here:
+            here = here[:-1]
+        for node in ast.walk(ast.parse(text)):
+            if not isinstance(node, ast.Import | ast.ImportFrom):
+                continue
+            for target in _targets(node, here, name):
+                imported = _module_of(target, sources)
+                if imported is not None and imported != module:
+                    found.append(Import(module, imported, node.lineno))
+    return found
+
+
+def _targets(
+    node: ast.Import | ast.ImportFrom, here: list[str], name: str
+) -> Iterator[list[str]]:
+    """What a statement imports, as paths from the top of the package."""
+    if isinstance(node, ast.Import):
+        for alias in node.names:
+            parts = alias.name.split(".")
+            if parts[0] == name:
+                yield parts[1:]
+    else:
+        base = node.module.split(".") if node.module else []
+        if node.level:
+            base = here[: len(here) - node.level + 1] + base
+        elif base[:1] == [name]:
+            base = base[1:]
+        else:
+            return
+        for alias in node.names:
+            yield [*base, alias.name]
+
+
+def _module_of(target: list[str], sources: Mapping[str, str]) -> str | None:
+    """The module that a path leads to; what follows it is a name inside."""
+    for length in range(len(target), -1, -1):
+        module = ".".join(target[:length])
+        if module in sources:
+            return module
+    return None
+
+
+def room(module: str) -> str:
+    """The room that a module is in; "" for the package itself."""
+    return module.split(".")[0]
+
+
+def between_rooms(imports: Iterable[Import]) -> list[Import]:
+    """The imports that lead from a room to another.
+
+    The package's own `__init__`, which gathers the public names, is no room. It stands
+    above all but the command line.
+    """
+    return [
+        found
+        for found in imports
+        if room(found.importer) and room(found.importer) != room(found.imported)
+        if (room(found.importer), found.imported) != ("__main__", "")
+    ]
+
+
+def upward(imports: Iterable[Import], rooms: tuple[str, ...] = ROOMS) -> list[Import]:
+    """The imports between rooms that do not point down."""
+
+    def height(module: str) -> int:
+        return rooms.index(room(module)) if room(module) else len(rooms)
+
+    return [
+        found
+        for found in between_rooms(imports)
+        if height(found.imported) >= height(found.importer)
+    ]
+
+
+def circle(arrows: Iterable[tuple[str, str]]) -> list[str] | None:
+    """Names that import each other in a circle, or None if there is none."""
+    leads_to: dict[str, set[str]] = {}
+    for start, end in arrows:
+        leads_to.setdefault(start, set()).add(end)
+    done: set[str] = set()
+
+    def search(name: str, path: list[str]) -> list[str] | None:
+        if name in path:
+            return [*path[path.index(name) :], name]
+        if name in done:
+            return None
+        for end in sorted(leads_to.get(name, ())):
+            found = search(end, [*path, name])
+            if found:
+                return found
+        done.add(name)
+        return None
+
+    for name in sorted(leads_to):
+        found = search(name, [])
+        if found:
+            return found
+    return None
+
+
+def purpose(source: str) -> str:
+    """The first paragraph of a module's docstring, on one line."""
+    text = ast.get_docstring(ast.parse(source)) or ""
+    return " ".join(text.split("\n\n")[0].split())
+
+
+def page(sources: Mapping[str, str]) -> str:
+    """The text of docs/rooms.md."""
+    arrows = {
+        (room(found.importer), room(found.imported))
+        for found in between_rooms(read_imports(sources))
+    }
+    lines = [
+        "# The rooms",
+        "",
+        "The package is made of rooms, each a folder or a file with one purpose. A",
+        "room imports only from rooms below it, and from a folder only what its",
+        "`__init__` names. `tests/test_rooms.py` reads the imports and fails on an",
+        "arrow that points up. `python docs/rooms.py` draws the picture from the",
+        "imports and writes this page. Grey arrows lead to the ground floor.",
+        "",
+        "![The rooms of nhjax and their imports](rooms.png)",
+        "",
+        "From the top down:",
+        "",
+        "| room | purpose | imports from |",
+        "| --- | --- | --- |",
+    ]
+    for name in reversed(ROOMS):
+        below = [f"`{other}`" for other in ROOMS if (name, other) in arrows]
+        lines.append(f"| `{name}` | {purpose(sources[name])} | {', '.join(below)} |")
+    return "\n".join(lines) + "\n"
+
+
+def draw(sources: Mapping[str, str]) -> Figure:
+    """The picture of the rooms, each on a level of its own and arrows pointing down."""
+    figure = Figure(figsize=(9, 10), layout="constrained")
+    ax = figure.subplots()
+    box = {"boxstyle": "round,pad=0.4", "facecolor": "#eef3f8", "edgecolor": "#4a6a8a"}
+    for name, (x, y) in _PLACES.items():
+        ax.text(
+            x, y, name, ha="center", va="center", family="monospace", bbox=box, zorder=3
+        )
+    arrows = {
+        (room(found.importer), room(found.imported))
+        for found in between_rooms(read_imports(sources))
+    }
+    for start, end in sorted(arrows):
+        _arrow(ax, _PLACES[start], _PLACES[end], light=end in FLOORS[0])
+    ax.set_xlim(-0.6, 4.6)
+    ax.set_ylim(-0.6, len(ROOMS) - 0.4)
+    ax.axis("off")
+    return figure
+
+
+# Columns in which few arrows pass behind a room.
+_COLUMNS = {
+    "_custom_types": 1.2,
+    "_errors": 2.8,
+    "_results": 3.6,
+    "_compile": 0.4,
+    "_method": 4.0,
+    "_numerics": 0.9,
+    "_manifold": 1.9,
+    "_system": 1.4,
+    "_initial": 0.6,
+    "_step": 2.4,
+    "_integrate": 3.0,
+    "systems": 0.0,
+    "diagnostics": 1.8,
+    "plot": 2.5,
+    "studies": 3.3,
+    "__main__": 4.0,
+}
+_PLACES = {name: (_COLUMNS[name], height) for height, name in enumerate(ROOMS)}
+
+
+def _arrow(
+    ax: Axes, start: tuple[float, float], end: tuple[float, float], *, light: bool
+) -> None:
+    """A curve that leaves a room at its bottom and comes to another at its top."""
+    (x0, y0), (x1, y1) = (start[0], start[1] - 0.24), (end[0], end[1] + 0.26)
+    pull = 0.45 * (y0 - y1)
+    path = MplPath(
+        [(x0, y0), (x0, y0 - pull), (x1, y1 + pull), (x1, y1)],
+        [MplPath.MOVETO, MplPath.CURVE4, MplPath.CURVE4, MplPath.CURVE4],
+    )
+    ax.add_patch(
+        FancyArrowPatch(
+            path=path,
+            arrowstyle="-|>",
+            mutation_scale=9,
+            color="#b0b8c0" if light else "#4a6a8a",
+            linewidth=0.7 if light else 1.0,
+            zorder=1 if light else 2,
+        )
+    )
+
+
+def main() -> None:
+    """Write the picture and the page."""
+    sources = read_sources()
+    draw(sources).savefig(DOCS / "rooms.png", dpi=80)
+    (DOCS / "rooms.md").write_text(page(sources), encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,78 @@
+"""The page about writing one's own parts: its blocks run as printed, and are right."""
+
+import re
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import nhjax
+
+
+PAGE = Path(__file__).parents[1] / "docs" / "extending.md"
+
+
+def _sections():
+    """The blocks of each section, after those that all of them begin with."""
+    opening, *sections = re.split(
+        r"^## (.+)$", PAGE.read_text(encoding="utf-8"), flags=re.MULTILINE
+    )
+    titles, texts = sections[::2], sections[1::2]
+    return _blocks(opening), dict(zip(titles, map(_blocks, texts), strict=True))
+
+
+def _blocks(text):
+    return re.findall(r"^```python\n(.*?)^```$", text, re.MULTILINE | re.DOTALL)
+
+
+OPENING, SECTIONS = _sections()
+
+
+def _run(title):
+    namespace: dict[str, Any] = {"__name__": f"extending.{title}"}
+    for block in (*OPENING, *SECTIONS[title]):
+        exec(compile(block, f"{PAGE.name}: {title}", "exec"), namespace)
+    return namespace
+
+
+# What the page asserts itself is the comparison with what nhjax has.
+@pytest.mark.parametrize("title", ["A group", "A retraction", "A method"])
+def test_own_groups_and_methods_work(title):
+    _run(title)
+
+
+def test_own_stage_solver_works_and_says_where_it_failed():
+    names = _run("A stage solver")
+    particle = names["particle"]
+    sol = nhjax.integrate(
+        particle.system,
+        nhjax.LobattoIIIAB(3),
+        particle.initial_state(),
+        dt=0.05,
+        num_steps=50,
+        stage_solver=names["Chord"](max_iterations=2),
+        throw=False,
+    )
+    assert bool(sol.result == nhjax.RESULTS.nonlinear_max_iterations)
+
+
+def test_own_adjoint_works():
+    _run("An adjoint")
+
+
+def test_own_progress_meter_is_told():
+    heard = _run("A progress meter")["heard"]
+    assert sorted(heard)[-1] == (1000, 1000)
+    assert 50 < len(heard) < 200
+
+
+def test_every_section_with_code_is_run_here():
+    with_code = {title for title, blocks in SECTIONS.items() if blocks}
+    assert with_code == {
+        "A group",
+        "A retraction",
+        "A method",
+        "A stage solver",
+        "An adjoint",
+        "A progress meter",
+    }

@@ -1,0 +1,171 @@
+"""The rooms of nhjax: no import points up, and no part is too long to be read."""
+
+import ast
+import re
+
+import pytest
+
+from docs import rooms
+
+
+SOURCES = rooms.read_sources()
+IMPORTS = rooms.read_imports(SOURCES)
+
+LONGEST_FILE, LONGEST_CLASS, LONGEST_FUNCTION = 300, 200, 60
+
+# What may be longer, and why. An entry that is not needed fails.
+LONGER: dict[str, str] = {}
+
+
+def test_every_module_is_in_a_room():
+    assert {rooms.room(module) for module in SOURCES} - {""} == set(rooms.ROOMS)
+
+
+def test_imports_point_down():
+    assert [
+        f"{i.importer}:{i.line} -> {i.imported}" for i in rooms.upward(IMPORTS)
+    ] == []
+
+
+def test_rooms_form_no_circle():
+    pairs = [
+        (rooms.room(i.importer), rooms.room(i.imported))
+        for i in rooms.between_rooms(IMPORTS)
+    ]
+    assert rooms.circle(pairs) is None
+
+
+def test_modules_form_no_circle():
+    assert rooms.circle((i.importer, i.imported) for i in IMPORTS) is None
+
+
+def test_rooms_are_entered_by_the_door():
+    """What is inside of a folder is imported from its `__init__` alone."""
+    around = [
+        f"{i.importer}:{i.line} -> {i.imported}"
+        for i in rooms.between_rooms(IMPORTS)
+        if "." in i.imported
+    ]
+    assert around == []
+
+
+@pytest.mark.parametrize("room", rooms.ROOMS)
+def test_a_room_says_what_it_is_for(room):
+    assert rooms.purpose(SOURCES[room]).endswith(".")
+
+
+def test_the_page_is_that_of_the_imports():
+    page = (rooms.DOCS / "rooms.md").read_text(encoding="utf-8")
+    assert page == rooms.page(SOURCES), "run `python docs/rooms.py`"
+
+
+# A made-up package, to see that what must be found is found.
+FLOORS = ("_low", "_high")
+
+
+def _made_up(**modules):
+    texts = {name.replace("__", "."): text for name, text in modules.items()}
+    return rooms.read_imports({"": "", **texts})
+
+
+def test_an_arrow_that_points_up_is_found():
+    found = _made_up(
+        _low="from ._inner import x",
+        _low___inner="def f():\n    from .._high import y",
+        _high="from ._low import x",
+    )
+    up = rooms.upward(found, FLOORS)
+    assert up == [rooms.Import("_low._inner", "_high", 2)]
+    between = rooms.between_rooms(found)
+    assert rooms.circle(
+        (rooms.room(i.importer), rooms.room(i.imported)) for i in between
+    )
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "import pkg._high",
+        "import pkg._high as high",
+        "from pkg import _high",
+        "from pkg._high import x",
+        "from . import _high",
+        "from ._high import x",
+        "if TYPE_CHECKING:\n    from ._high import x",
+    ],
+)
+def test_every_form_of_import_is_read(text):
+    sources = {"": "", "_low": text, "_high": "x = 1"}
+    found = rooms.read_imports(sources, "pkg")
+    assert rooms.upward(found, FLOORS)
+    assert not rooms.upward(found, FLOORS[::-1])
+
+
+def test_the_public_names_are_above_all_rooms():
+    found = _made_up(_low="from . import x")
+    assert rooms.upward(found, FLOORS)
+
+
+def test_imports_that_point_down_are_let_pass():
+    found = _made_up(
+        _low="import numpy\nfrom numpy import _high",
+        _high="from ._low import x",
+        _high___inner="from .._low import x\nfrom . import _other",
+        _high___other="from .._low import x",
+    )
+    assert rooms.upward(found, FLOORS) == []
+    assert rooms.Import("_high._inner", "_high._other", 2) in found
+
+
+def test_a_way_around_the_door_is_found():
+    found = _made_up(_low="", _low___inner="", _high="from ._low._inner import x")
+    assert [i.imported for i in rooms.between_rooms(found)] == ["_low._inner"]
+
+
+def test_a_circle_is_found():
+    chain = [("a", "b"), ("b", "c"), ("a", "c")]
+    assert rooms.circle(chain) is None
+    assert rooms.circle([*chain, ("c", "a")]) == ["a", "b", "c", "a"]
+
+
+def _length_of_code(node: ast.FunctionDef | ast.AsyncFunctionDef) -> int:
+    """The lines of a function without its docstring."""
+    length = (node.end_lineno or node.lineno) - node.lineno + 1
+    if ast.get_docstring(node) is None:
+        return length
+    text = node.body[0]
+    return length - ((text.end_lineno or text.lineno) - text.lineno + 1)
+
+
+def _too_long():
+    for module, text in SOURCES.items():
+        if len(text.splitlines()) > LONGEST_FILE:
+            yield module
+        for node in ast.walk(ast.parse(text)):
+            if isinstance(node, ast.ClassDef):
+                length = (node.end_lineno or node.lineno) - node.lineno + 1
+                if length > LONGEST_CLASS:
+                    yield f"{module}.{node.name}"
+            elif (
+                isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef)
+                and _length_of_code(node) > LONGEST_FUNCTION
+            ):
+                yield f"{module}.{node.name}"
+
+
+def test_nothing_is_longer_than_can_be_read():
+    assert sorted(_too_long()) == sorted(LONGER)
+
+
+# Parts of JAX and equinox that may go without notice.
+INTERNAL = re.compile(
+    r"\bjax\.(core|extend|interpreters|_src)\b|\bjaxlib\.|\.primitive\b"
+    r"|\b(eqx|equinox)\.internal\b|xla_cpu_\w+"
+)
+
+
+def test_what_leans_on_internals_is_on_their_page():
+    page = (rooms.DOCS / "jax_internals.md").read_text(encoding="utf-8")
+    leaning = {module for module, text in SOURCES.items() if INTERNAL.search(text)}
+    named = re.findall(r"`((?:_\w+/)?_\w+)\.py`", page)
+    assert leaning == {name.replace("/", ".") for name in named}
