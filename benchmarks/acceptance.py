@@ -29,6 +29,7 @@ from jaxtyping import Array, Float
 
 import nhjax
 from nhjax import systems
+from nhjax._method import AbstractMethod
 from nhjax._numerics import max_norm
 from nhjax._step import first_step_state, step, StepOutcome, StepState
 from nhjax._step._stage_iteration import stage_residual
@@ -177,7 +178,7 @@ def largest_ratio(x: Array, scale: Array) -> Float[Array, ""]:
 @eqx.filter_jit
 def run(
     system: nhjax.LagrangianSystem,
-    method: nhjax.AbstractMethod,
+    method: AbstractMethod,
     y0: nhjax.State,
     sizes: Float[Array, " k"],
     num_steps: int,
@@ -218,7 +219,7 @@ def run(
 @eqx.filter_jit
 def single_steps(
     system: nhjax.LagrangianSystem,
-    method: nhjax.AbstractMethod,
+    method: AbstractMethod,
     starts: nhjax.State,
     sizes: Float[Array, " k"],
 ) -> Row:

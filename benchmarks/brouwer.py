@@ -12,6 +12,7 @@ import numpy as np
 
 import nhjax
 from nhjax import systems
+from nhjax._method import AbstractMethod
 from nhjax.systems._base import AbstractExample
 
 from ._report import markdown_table, number, write
@@ -19,7 +20,7 @@ from ._report import markdown_table, number, write
 
 def energy_rms(
     example: AbstractExample,
-    method: nhjax.AbstractMethod,
+    method: AbstractMethod,
     dt: float,
     counts: list[int],
     members: int,

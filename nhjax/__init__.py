@@ -30,7 +30,6 @@ from ._integrate import (
 )
 from ._manifold import (
     AbstractLieGroup as AbstractLieGroup,
-    AbstractRetraction as AbstractRetraction,
     Cayley as Cayley,
     Euclidean as Euclidean,
     Exponential as Exponential,
@@ -41,7 +40,6 @@ from ._manifold import (
     SO3 as SO3,
 )
 from ._method import (
-    AbstractMethod as AbstractMethod,
     Gauss as Gauss,
     LobattoIIIAB as LobattoIIIAB,
     PartitionedRungeKutta as PartitionedRungeKutta,
@@ -51,9 +49,10 @@ from ._step import (
     AbstractStageSolver as AbstractStageSolver,
     Newton as Newton,
     SimplifiedNewton as SimplifiedNewton,
+    Solved as Solved,
+    stage_residual as stage_residual,
 )
 from ._system import (
-    AbstractMechanicalSystem as AbstractMechanicalSystem,
     continuous_multiplier as continuous_multiplier,
     HamiltonianSystem as HamiltonianSystem,
     LagrangianSystem as LagrangianSystem,

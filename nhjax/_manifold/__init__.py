@@ -1,3 +1,5 @@
+"""Configuration spaces: vector spaces, Lie groups, and their retractions."""
+
 from ._abstract import AbstractLieGroup as AbstractLieGroup
 from ._euclidean import Euclidean as Euclidean
 from ._product import ProductGroup as ProductGroup

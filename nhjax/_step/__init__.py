@@ -1,5 +1,6 @@
 """One step: its stage equations, their solvers, its end and its derivative."""
 
+from .._numerics import Solved as Solved
 from ._chart import chart_at as chart_at
 from ._derivative import (
     primitive_step as primitive_step,
@@ -12,6 +13,7 @@ from ._newton import (
     SimplifiedNewton as SimplifiedNewton,
 )
 from ._record import StepRecord as StepRecord
+from ._stage_iteration import stage_residual as stage_residual
 from ._step import (
     first_step_state as first_step_state,
     largest_violation as largest_violation,
