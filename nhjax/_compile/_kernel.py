@@ -37,6 +37,9 @@ def as_cpu_kernel(function: Callable[..., T], *args: Any) -> T:
     and transposed, goes into kernels too. Members of a batch run one after the other,
     each as long as it needs: that is faster than to run them in step, kernel by kernel.
     """
+    # Who asks for no compilation wants to look at one operation after the other.
+    if jax.config.jax_disable_jit:  # pyright: ignore[reportAttributeAccessIssue]
+        return function(*args)
     dynamic, static = eqx.partition(args, eqx.is_array)
     leaves, treedef = jax.tree.flatten(dynamic)
     kept = []
