@@ -56,8 +56,7 @@ def as_cpu_kernel(function: Callable[..., T], *args: Any) -> T:
 
 def _call(flat: Callable[..., list[Any]], leaves: list[Any]) -> list[Any]:
     program = jax.make_jaxpr(flat)(*leaves)
-    # A primitive must be given all traced values as operands, and may have no effects
-    # such as printing.
+    # A primitive needs all traced values as operands, and may not print, for instance.
     captured = any(isinstance(const, jax.core.Tracer) for const in program.consts)
     if program.effects or captured:
         return jax.extend.core.jaxpr_as_fun(program)(*leaves)
@@ -114,16 +113,14 @@ def _marked(ctx, *operands, program):
     run = jax.extend.core.jaxpr_as_fun(program)
 
     def call(*operands):
-        # Operands without elements would be removed by the compiler, so that they are
-        # left out here.
+        # The compiler would remove operands without elements: they are left out here.
         is_full = [x.size > 0 for x in operands]
         full, empty = _split(is_full, operands)
 
         def kernel(*full):
             return run(*_merged(is_full, _tied(full), map(jnp.zeros_like, empty)))
 
-        # The barrier hides from the compiler which operands are constants, since it
-        # would remove these too.
+        # The barrier hides which operands are constants: those would be removed too.
         return jax.jit(kernel)(*jax.lax.optimization_barrier(full))
 
     token = _within.set(True)
@@ -165,10 +162,7 @@ mlir.register_lowering(_kernel, _marked, platform="cpu", cacheable=False)
 
 
 def _batched(operands, axes, *, program):
-    """Run the members of a batch one by one in a kernel on the CPU, else all together.
-
-    This is the rule by which `jax.vmap` treats the primitive.
-    """
+    """Run the members of a batch one by one in a kernel on the CPU, else together."""
     run = partial(_kernel.bind, program=program)
     if jax.default_backend() != "cpu" or not _is_possible(program):
         run = jax.extend.core.jaxpr_as_fun(program)
@@ -217,8 +211,7 @@ def _differentiated(operands, tangents, *, program):
     try:
         whole = jax.make_jaxpr(linearised)(*operands)
     except ValueError:
-        # JAX cannot linearise some programs, such as a while loop, but can compute
-        # their derivative in forward mode.
+        # What JAX cannot linearise, such as a while loop, has forward mode at least.
         all_rates = [ad.instantiate_zeros(tangent) for tangent in tangents]
         return jax.jvp(run, operands, all_rates)
     size = len(program.out_avals)

@@ -27,10 +27,8 @@ class Found(NamedTuple):
     - `off_group`: the distance of the given q to the group.
     - `regularity`, `compatibility`: the reciprocal condition numbers of the metric on
         the fibre and of the compatibility matrix.
-    - `ranks`, `deficient`: the constraint derivatives that must have full rank, and
-        whether each of them has not.
-    - `allowed`, `allowed_positions`, `allowed_off_group`: the bounds on violations of
-        constraints on velocities, on positions, and on `off_group`.
+    - `ranks`, `deficient`: the derivatives that must have full rank, and which lack it.
+    - `allowed`, `allowed_positions`, `allowed_off_group`: the bounds on violations.
     - `legendre_solved`: whether the Legendre transform could be inverted.
     - `projected`: whether the projection onto the constraints has converged.
     """
@@ -101,8 +99,7 @@ class _Case(NamedTuple):
 
     @property
     def where(self) -> str:
-        # The message shows what the user gave, not what was computed from it, which the
-        # user would not recognise.
+        # The message shows what the user gave, which the user recognises.
         return f"q = {self.q}, {self.given_name} = {self.given}"
 
     @property

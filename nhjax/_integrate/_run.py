@@ -39,8 +39,7 @@ def run(
 ) -> Solution:
     """Integrate with arguments that have been checked, and return the solution."""
     check_saved(saveat.fn, t0, y0, args)
-    # Arrays that the user's functions close over become leaves of the system, so that
-    # derivatives reach them.
+    # Arrays that the user's functions close over become leaves, for derivatives.
     system = closure_converted(system, t0, y0, args)
     stepping = Stepping(system, method, stage_solver, t0, dt, args)
     ts, sampled = saveat.ts, None

@@ -22,11 +22,10 @@ from ._state import check_time_and_state, State
 class AbstractMechanicalSystem(eqx.Module):
     """A mechanical system with constraints, written on TQ or on T*Q.
 
-    The two kinds differ in the fibre coordinate u: it is the velocity of a Lagrangian
-    system, and the momentum of a Hamiltonian system. In terms of (t, q, u) both are
-    given by the functions `velocity`, `momentum`, `free_force` and `constraint`, and by
-    the metric K, which turns constraint derivatives into reactions. The equations of a
-    step are written in these alone.
+    The two kinds differ in the fibre coordinate u, the velocity of a Lagrangian and the
+    momentum of a Hamiltonian system. In terms of (t, q, u) both are `velocity`,
+    `momentum`, `free_force`, `constraint` and the metric K, which turns constraint
+    derivatives into reactions. The equations of a step are written in these alone.
     """
 
     nonholonomic: eqx.AbstractVar[PhaseFunction | None]
@@ -174,8 +173,7 @@ class AbstractMechanicalSystem(eqx.Module):
 
         The m nonholonomic constraints come first, then the rates dΓ/dt of the k
         holonomic ones (their tangency). By Chetaev's rule the reaction of a holonomic
-        constraint is that of its tangency, so that these rows determine all
-        multipliers.
+        constraint is that of its tangency: these rows determine all multipliers.
         """
         if self.holonomic is None:
             return self.kinematic_constraint(t, q, u, args)
@@ -215,9 +213,8 @@ class AbstractMechanicalSystem(eqx.Module):
     ) -> Float[Array, " c"]:
         """Compute all constraint functions at a state, of shape (m + 2k,).
 
-        These are the values of the m nonholonomic constraints, of the time derivatives
-        of the k holonomic ones, and of the holonomic ones themselves. All of them
-        vanish at a consistent state.
+        They are the m nonholonomic constraints, the time derivatives of the k holonomic
+        ones and these themselves. All of them vanish at a consistent state.
         """
         check_time_and_state("constraint_violation", t, y)
         on_velocities = self.constraint(t, y.q, self.fibre_coordinate(y), args)
