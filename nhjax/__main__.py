@@ -1,4 +1,4 @@
-"""The command line: `nhjax list` and `nhjax run STUDY`."""
+"""The command line of nhjax, with the commands `nhjax list` and `nhjax run STUDY`."""
 
 import argparse
 import inspect
@@ -142,7 +142,7 @@ def _add_options(parser: argparse.ArgumentParser, function: Callable) -> None:
 
 
 def _number(text: str) -> float:
-    """A float, or a fraction of π such as pi/10."""
+    """Parse a number, which may be a float or a fraction of π such as pi/10."""
     numerator, slash, denominator = text.partition("/")
     value = math.pi if numerator == "pi" else float(numerator)
     divisor = float(denominator) if slash else 1.0

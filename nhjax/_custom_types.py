@@ -13,8 +13,8 @@ IntScalar: TypeAlias = Int[Array, ""]
 BoolScalar: TypeAlias = Bool[Array, ""]
 Args: TypeAlias = Any
 
-# L(t, q, v, args) -> (),  Φ(t, q, v, args) -> () or (m,),  F(t, q, v, args) -> (n,),
-# and of (t, q, p, args) for Hamiltonian systems
+# The functions L(t, q, v, args) of shape (), Φ(t, q, v, args) of shape () or (m,) and
+# F(t, q, v, args) of shape (n,); for Hamiltonian systems they take (t, q, p, args).
 PhaseFunction: TypeAlias = Callable[[Any, Any, Any, Any], Any]
-# Γ(t, q, args) -> () or (k,)
+# The holonomic constraints Γ(t, q, args), of shape () or (k,).
 PositionFunction: TypeAlias = Callable[[Any, Any, Any], Any]

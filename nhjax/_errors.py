@@ -1,4 +1,4 @@
-"""The exceptions that nhjax raises, and the one place where a condition is enforced."""
+"""The exceptions that nhjax raises, and the functions that enforce conditions."""
 
 import logging
 from collections.abc import Callable, Iterator
@@ -18,43 +18,60 @@ T = TypeVar("T")
 
 
 class ShapeError(ValueError):
-    """An argument, or the value of a user's function, has the wrong shape."""
+    """Raised if an argument, or the value of a user's function, has a wrong shape."""
 
 
 class DTypeError(TypeError):
-    """An argument is not made of floating-point numbers, or of unlike ones."""
+    """Raised if an argument is not floating-point, or its parts differ in precision."""
 
 
 class NonFiniteError(ValueError):
-    """An argument, or the value of a user's function at it, is not finite."""
+    """Raised if an argument, or a user's function at it, is infinite or NaN."""
 
 
 class ConstraintViolationError(ValueError):
-    """The state does not satisfy the constraints."""
+    """Raised if an initial state violates the constraints or is not on its group."""
 
 
 class IrregularLagrangianError(ValueError):
-    """The mass matrix D2D2L is singular: the Legendre transform is not invertible."""
+    """Raised if the mass matrix D2D2L is singular, so that v does not follow from p.
+
+    For a Hamiltonian system the matrix is D2D2H. The Legendre transform is then not
+    invertible.
+    """
 
 
 class DependentConstraintsError(ValueError):
-    """D2Φ has not full rank: the paper's admissibility condition fails."""
+    """Raised if the constraints are dependent, that is, D2Φ has not full rank.
+
+    This is the paper's admissibility condition; with holonomic constraints the rows of
+    DΓ count too.
+    """
 
 
 class IncompatibleConstraintsError(ValueError):
-    """C = D2Φ M⁻¹ D2Φᵀ is singular: the paper's compatibility condition fails."""
+    """Raised if C = D2Φ M⁻¹ D2Φᵀ is singular, so that no multiplier is determined.
+
+    This is the paper's compatibility condition.
+    """
 
 
 class NewtonError(RuntimeError):
-    """A nonlinear equation outside the time loop could not be solved."""
+    """Raised if `initial_state` could not solve an equation by Newton's method.
+
+    The equation is the Legendre transform or the projection onto the constraints.
+    """
 
 
 class IntegrationError(RuntimeError):
-    """A trajectory could not be continued; the message names lane, step and reason."""
+    """Raised if `integrate` could not continue a trajectory to the end of the run.
+
+    The message names the lane of a batch, the step and the reason.
+    """
 
 
 def is_traced(*arrays: object) -> bool:
-    """Whether any of the arrays has no value yet (inside jit, vmap or grad)."""
+    """Tell whether any of the arrays has no value yet (inside jit, vmap or grad)."""
     return any(isinstance(x, Tracer) for x in arrays)
 
 
@@ -62,8 +79,8 @@ class Check(NamedTuple):
     """A condition, and the exception that says what is wrong where it fails.
 
     `error(*values)` makes the exception from values as NumPy arrays, also in a compiled
-    program. It should be a function of a module: one made on the spot would have an
-    eager `vmap` compile anew at each call.
+    program. It should be defined at the top level of a module: with a function that is
+    made anew for every check, an eager `vmap` would compile anew at each call.
     """
 
     ok: Bool[Array, ""] | np.bool_ | bool
@@ -76,10 +93,10 @@ def require(tree: T, *checks: Check) -> T:
 
     With concrete values the exception is raised here and now. With traced ones it is
     raised when the compiled program runs, as a runtime error of JAX with the same
-    message, which under `vmap` begins with the first lane that fails. All of this hangs
-    on `tree`, which must be used.
+    message, which under `vmap` begins with the first lane that fails. The returned tree
+    must be used afterwards: `jax.jit` drops checks whose result is not used.
     """
-    # The message is about values, whatever is being differentiated.
+    # The message is about values alone, so that their derivatives are dropped.
     checks = tuple(
         Check(check.ok, check.error, _without_tangents(check.values))
         for check in checks
@@ -109,7 +126,7 @@ def _on_host(values: PyTree[Any]) -> PyTree[Any]:
 
 
 def _first_error(bad: np.ndarray, values: tuple[np.ndarray, list]) -> Exception:
-    """The exception of the first check that fails in the first lane where one does."""
+    """Make the exception of the first failed check in the first lane that has one."""
     lane = next(index for index in np.ndindex(bad.shape) if bad[index])
     failed, details = jax.tree.map(
         lambda x: x[lane] if isinstance(x, np.ndarray) else x, values
@@ -122,11 +139,12 @@ def _first_error(bad: np.ndarray, values: tuple[np.ndarray, list]) -> Exception:
 
 
 def lane_name(index: tuple[int, ...]) -> int | tuple[int, ...] | None:
-    """An index into a batch, as users would write it; None without a batch."""
+    """Write an index into a batch as users would; it is None without a batch."""
     return index if len(index) > 1 else (index[0] if index else None)
 
 
-# Compiled, since an eager `vmap` would compile the call-back anew at each call.
+# This function is compiled as a whole, since an eager `vmap` would compile the
+# call-back anew at each call.
 @eqx.filter_jit
 def raise_where(
     tree: T,
@@ -163,7 +181,10 @@ def raise_where(
 
 
 def _passes(on_host: Callable[..., Any]) -> Callable[..., Bool[Array, ""]]:
-    """Of (bad, *arrays): True, unless any is bad, where `on_host` raises."""
+    """Make a function of (bad, *arrays) that is True unless `bad`, where it raises.
+
+    The exception is raised by `on_host(bad, *arrays)`, called on the host.
+    """
 
     @jax.custom_jvp
     def passes(bad, *arrays):
@@ -181,9 +202,10 @@ def _passes(on_host: Callable[..., Any]) -> Callable[..., Bool[Array, ""]]:
 
 
 def _lanes(on_host: Callable[..., Any]) -> Callable[..., Bool[Array, ""]]:
-    """The same on a batch: one verdict on all lanes.
+    """Make the function of `_passes`, so that a batch has one result for all lanes.
 
-    Where each lane had its own, `vmap` would have the host called in good cases too.
+    If each lane had its own result, `vmap` would call the host even if all lanes are
+    good.
     """
 
     @custom_vmap
@@ -208,26 +230,28 @@ def _lanes(on_host: Callable[..., Any]) -> Callable[..., Bool[Array, ""]]:
 
 
 def _within_a_compiled_program() -> Iterator[None]:
-    """Where exceptions of compiled programs seem to be raised; see below."""
+    """Yield once, in the frame where compiled programs seem to raise exceptions."""
     yield
 
 
 # XLA prints the frames of Python from that of the deepest entry of a traceback outwards
-# to the main program, some twenty of JAX. A generator that waits has none outside.
+# to the main program, among them some twenty frames of JAX. The frame of a generator
+# that waits has no frames outside of it, so that nothing else is printed.
 _NOWHERE: Any = _within_a_compiled_program()
 next(_NOWHERE)
 
 
 def _short_traceback() -> TracebackType:
-    """A traceback of one entry."""
+    """Make a traceback of one entry, that of the waiting generator above."""
     frame = _NOWHERE.gi_frame
     return TracebackType(None, frame, frame.f_lasti, frame.f_lineno)
 
 
 class _OneLine(logging.Filter):
-    """Makes one line of what JAX logs of a call-back that raised one of our exceptions.
+    """A filter that shortens what JAX logs of a call-back that raised our exception.
 
-    JAX logs them with two tracebacks before it raises them.
+    JAX logs such exceptions with two tracebacks before it raises them; the filter
+    leaves one line, with the type and the message of the exception.
     """
 
     def filter(self, record: logging.LogRecord) -> bool:

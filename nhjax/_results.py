@@ -1,10 +1,10 @@
-"""How a run can end, and what to do about it."""
+"""The ways in which a run can end, with messages that say what to do about each."""
 
 import equinox as eqx
 
 
 class RESULTS(eqx.Enumeration):
-    """How an integration ended. `RESULTS[sol.result]` is the message."""
+    """The ways in which a run can end; `RESULTS[sol.result]` is the message."""
 
     successful = ""
     nonlinear_divergence = (

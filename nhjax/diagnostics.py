@@ -1,4 +1,4 @@
-"""What a physicist asks of a computed trajectory."""
+"""Energy errors, momentum maps and convergence orders of computed trajectories."""
 
 import reprlib
 from collections.abc import Callable
@@ -24,7 +24,7 @@ from ._system import (
 def energy_error(
     system: AbstractMechanicalSystem, sol: Solution, args: Args = None
 ) -> Float[Array, "... k"]:
-    """The energy error E(t) - E(t0) along a saved trajectory.
+    """Compute the energy error E(t) - E(t0) along a saved trajectory.
 
     It works under `vmap`, and on a solution that comes out of `vmap` as long as all
     members share `system` and `args`.
@@ -66,7 +66,7 @@ def energy_error(
 def momentum_map(
     y: State, generator: Callable[[Any], Float[Array, " n"]]
 ) -> Float[Array, "..."]:
-    """The momentum p · ξ_Q(q) along an infinitesimal symmetry ξ_Q.
+    """Compute the momentum p · ξ_Q(q) along an infinitesimal symmetry ξ_Q.
 
     It is conserved when ξ_Q is a symmetry of the Lagrangian that the constraints allow
     as a virtual displacement, D2Φ · ξ_Q = 0; otherwise it obeys the nonholonomic
@@ -118,7 +118,7 @@ def convergence_order(
     step_sizes: Float[np.ndarray, " k"] | list[float] | tuple[float, ...],
     errors: Float[np.ndarray, "k ..."] | list[float] | tuple[float, ...],
 ) -> Float[np.ndarray, "l ..."]:
-    """The observed order between successive step sizes, Δ log(error) / Δ log(h).
+    """Compute the observed orders Δ log(error) / Δ log(h) between successive steps h.
 
     **Arguments:**
 
@@ -128,7 +128,7 @@ def convergence_order(
     **Returns:** a NumPy array of shape (k - 1, ...).
 
     **Raises:** `ValueError` for sizes or errors that have no slope between them,
-    `TypeError` for what is no number.
+    `TypeError` if they are not numbers.
 
     !!! example
 
@@ -165,7 +165,7 @@ def convergence_order(
 
 
 def numbers(name: str, x: Any) -> np.ndarray:
-    """`x` as a float64 array on the host, or a `TypeError`."""
+    """Convert `x` to a float64 array on the host, or raise a `TypeError`."""
     try:
         return np.asarray(x, dtype=np.float64)
     except (TypeError, ValueError):
@@ -176,12 +176,12 @@ def numbers(name: str, x: Any) -> np.ndarray:
 
 
 def check_system(system: Any) -> None:
-    """Raise a `TypeError` unless `system` is one."""
+    """Raise a `TypeError` unless `system` is a mechanical system of nhjax."""
     check_type("system", system, (LagrangianSystem, HamiltonianSystem))
 
 
 def saved_states(sol: Solution) -> tuple[Float[Array, "... k"], State]:
-    """The times and states that `sol` holds, or an error that says how to save them."""
+    """Return the times and states of `sol`, or raise an error on how to save them."""
     check_type("sol", sol, Solution, "It is what `nhjax.integrate` returns.")
     if sol.ts is None or not isinstance(sol.ys, State):
         held = "nothing" if sol.ts is None else f"values of type {type(sol.ys)}"
@@ -193,7 +193,7 @@ def saved_states(sol: Solution) -> tuple[Float[Array, "... k"], State]:
 
 
 def map_over_axes(axes: int, function: Callable[..., Array]) -> Callable[..., Array]:
-    """`function` mapped over that many leading axes."""
+    """Map a function over the given number of leading axes of its arguments."""
     for _ in range(axes):
         function = jax.vmap(function)
     return function

@@ -1,8 +1,8 @@
-"""Pictures of trajectories and of convergence, on matplotlib.
+"""Figures of trajectories and of convergence, drawn with matplotlib.
 
-Every function draws into `ax` if one is given and into the axes of a new figure
-otherwise, returns the axes, and never shows or saves anything. Matplotlib is imported
-by the first call.
+Every function draws into the axes `ax` if they are given, and into the axes of a new
+figure otherwise. It returns the axes, and never shows or saves anything. Matplotlib is
+imported by the first call that needs it.
 """
 
 import reprlib
@@ -37,14 +37,15 @@ def trajectory(
     ax: "Axes | None" = None,
     **style: Any,
 ) -> "Axes":
-    """The path in the plane, or the space, of some coordinates.
+    """Draw the path of two or three coordinates of a trajectory, in plane or space.
 
     **Arguments:**
 
-    - `sol`: a `Solution` that holds states; a batch is drawn as one path for each.
-    - `coordinates`: the indices of two or three entries of q; of an element of a group
-        those of its numbers, one part of a product after the other.
-    - `names`: what to call them on the axes.
+    - `sol`: a `Solution` that holds states; of a batch the path of each member is
+        drawn.
+    - `coordinates`: the indices of two or three entries of q. On a group they count the
+        numbers of an element, on a product those of one factor after the other.
+    - `names`: the names of the coordinates for the labels of the axes.
     - `ax`: the axes to draw into; for three coordinates, with a 3d projection.
     - `style`: passed on to `Axes.plot`.
 
@@ -97,7 +98,7 @@ def energy(
     ax: "Axes | None" = None,
     **style: Any,
 ) -> "Axes":
-    """The energy error E(t) - E(t0) against time.
+    """Draw the energy error E(t) - E(t0) against time.
 
     **Arguments:**
 
@@ -116,7 +117,7 @@ def energy(
 
 
 def multiplier(sol: Solution, *, ax: "Axes | None" = None, **style: Any) -> "Axes":
-    """The multipliers λ_a against time, one line for each constraint.
+    """Draw the multipliers λ_a against time, one line for each constraint.
 
     **Arguments:**
 
@@ -144,9 +145,10 @@ def constraint(
     ax: "Axes | None" = None,
     **style: Any,
 ) -> "Axes":
-    """The constraint functions at the saved states against time.
+    """Draw the values of the constraint functions at the saved states against time.
 
-    Φ_a of nonholonomic constraints; dΓ_a/dt and Γ_a of holonomic ones.
+    They are Φ_a for each nonholonomic constraint, dΓ_a/dt and Γ_a for each holonomic
+    one.
 
     **Arguments:**
 
@@ -185,7 +187,7 @@ def convergence(
     ax: "Axes | None" = None,
     **style: Any,
 ) -> "Axes":
-    """Errors against step sizes on logarithmic scales.
+    """Draw errors against step sizes on logarithmic scales.
 
     **Arguments:**
 
@@ -239,7 +241,8 @@ def _axes(ax: "Axes | None", projection: str | None = None) -> "Axes":
                 f"{type(ax).__name__}."
             )
         return ax
-    # Only here: drawing into given axes must not choose a backend.
+    # The import is here alone, because drawing into given axes must not choose a
+    # backend of matplotlib.
     from matplotlib import pyplot as plt
 
     keywords = {} if projection is None else {"projection": projection}

@@ -1,4 +1,4 @@
-"""What makes programs fast, and keeps what is compiled in from being stale."""
+"""Compilation of programs into one kernel, and anew when what they read changes."""
 
 from ._elementary import (
     CALLING as CALLING,

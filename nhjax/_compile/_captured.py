@@ -1,4 +1,4 @@
-"""What functions read beside their arguments, as something that can be compared.
+"""The values that functions read beside their arguments, in a form to be compared.
 
 A compiled function keeps the values that globals and closed-over variables had when it
 was traced. The entries found here differ as soon as such a value does, so that a cache
@@ -17,24 +17,26 @@ from ._kinds import Kind, kind_of
 from ._names import is_installed, names, Path
 
 
-# Of a function that reads more than this the rest is not looked at: that would take
+# If functions read more values than this, the rest is ignored: to compare it would take
 # longer than a short run.
 MOST_ENTRIES = 2000
 
 
 class Place(NamedTuple):
-    """Where a value was read: an object, by identity, and a name or index in it."""
+    """The place where a value was read: an object's identity, and a name or index."""
 
     owner: int
     name: Hashable
 
 
 class Entry(NamedTuple):
-    """A value that a function reads, and where; the owner is held with it.
+    """A value that a function reads, with the place where it does so.
 
-    `key` is for comparison between calls: with the owner by its number in the order of
-    the visit, or -1, where `place` has its identity. `content` is for comparison within
-    a call: a value that has parts is itself, whatever its number.
+    The owner, the object in which the value was found, is kept so that its identity is
+    not reused. `key` serves for comparison between calls: it has the owner's number in
+    the order of the visit, or -1, where `place` has the owner's identity. `content`
+    serves for comparison within a call: a value that has parts stands there for itself,
+    whatever its number.
     """
 
     key: tuple[int, Hashable, Hashable]
@@ -44,12 +46,15 @@ class Entry(NamedTuple):
 
     @property
     def atom(self) -> Hashable:
-        """The value, as something that can be compared."""
+        """Return the value in a form that can be compared and hashed."""
         return self.key[-1]
 
 
 class Identity:
-    """An object that equals itself alone, held so that its identity is not reused."""
+    """A wrapper of an object by which two are equal only if they hold the same object.
+
+    The object is kept, so that its identity is not reused.
+    """
 
     def __init__(self, value: object):
         self.value = value
@@ -62,14 +67,17 @@ class Identity:
 
 
 class Unrepeatable:
-    """Equals nothing but itself: what is made with a tracer cannot be used again."""
+    """A value that equals nothing but itself, which stands for a tracer.
+
+    A program that was made with a tracer cannot be used again.
+    """
 
 
 def captured(tree: Any, ignored: Collection[Place] = ()) -> list[Entry]:
-    """What the functions among the leaves of a tree read, but for ignored places.
+    """List what the functions among the leaves of a tree read, except ignored places.
 
-    The arrays among its leaves are not looked at: they are arguments of what is
-    compiled.
+    The arrays among the leaves are left out, because they are arguments of the compiled
+    program.
     """
     walk = _Walk(ignored)
     walk.arguments(tree)
@@ -77,7 +85,7 @@ def captured(tree: Any, ignored: Collection[Place] = ()) -> list[Entry]:
 
 
 def all_of(owner: object) -> Place:
-    """The place that stands for all that is in an object."""
+    """Make the place that stands for everything inside of an object."""
     return Place(id(owner), Ellipsis)
 
 
@@ -85,12 +93,13 @@ class _Walk:
     def __init__(self, ignored: Collection[Place]):
         self.entries: list[Entry] = []
         self.ignored = ignored
-        # What was visited, numbered in order: equal structures have equal numbers.
-        # Identities are not reused meanwhile, as the objects are held by the entries.
+        # The objects that were visited, by identity, with their numbers in order: equal
+        # structures have equal numbers. Identities are not reused meanwhile, as the
+        # entries hold the objects.
         self.numbers: dict[int, int] = {}
 
     def arguments(self, tree: Any) -> None:
-        """Note the leaves of a tree that are no arrays, and the code of its classes."""
+        """Record the leaves of a tree but for arrays, and the code of its classes."""
         nodes = []
 
         def note(node: Any) -> bool:
@@ -113,7 +122,7 @@ class _Walk:
                         self.read(node, name, variables[name])
 
     def read(self, owner: object, name: Hashable, value: Any) -> None:
-        """Note one value, and what is in it."""
+        """Record one value, and the values inside of it."""
         place = Place(id(owner), name)
         if len(self.entries) >= MOST_ENTRIES:
             return
@@ -132,7 +141,7 @@ class _Walk:
             self.contents(value, kind)
 
     def contents(self, value: Any, kind: Kind) -> None:
-        """Note what is in a value that has parts."""
+        """Record the values inside of a value that has parts."""
         if kind is Kind.FUNCTION:
             self.function(value)
         elif kind is Kind.MAPPING:
@@ -151,18 +160,19 @@ class _Walk:
         elif kind is Kind.OPEN:
             self.attributes(value)
             self.methods(type(value))
-        # What a decorator keeps; `jax.jit` makes an object of a library's class.
+        # Decorators keep the function that they wrap under this name. The result of
+        # `jax.jit` is an object of a library's class, and so opaque.
         if kind is Kind.FUNCTION or kind is Kind.OPAQUE:
             self.named(value, ("__wrapped__",))
 
     def named(self, value: Any, attributes: Collection[str]) -> None:
-        """Note those attributes that there are."""
+        """Record those of the named attributes that the value has."""
         for name in attributes:
             if hasattr(value, name):
                 self.read(value, name, getattr(value, name))
 
     def attributes(self, value: Any) -> None:
-        """Note the attributes of an object."""
+        """Record the attributes of an object, those in slots included."""
         for name, item in list(_variables(value).items()):
             self.read(value, name, item)
         for base in type(value).__mro__:
@@ -170,7 +180,7 @@ class _Walk:
             self.named(value, (slots,) if isinstance(slots, str) else tuple(slots))
 
     def methods(self, kind: type) -> None:
-        """Note the attributes of a class of the user's and what its methods read."""
+        """Record the attributes of a user's class, and what its methods read."""
         for base in kind.__mro__:
             if is_installed(base.__module__) or id(base) in self.numbers:
                 continue
@@ -181,14 +191,14 @@ class _Walk:
                 elif isinstance(item, staticmethod | classmethod):
                     item = item.__func__
                 if isinstance(item, types.FunctionType):
-                    # That which a dataclass generates reads nothing of the user's.
+                    # Methods that a dataclass generates read nothing of the user's.
                     if item.__code__.co_filename != "<string>":
                         self.read(base, name, item)
                 elif not (name.startswith("__") or name == "_abc_impl"):
                     self.read(base, name, item)
 
     def function(self, function: types.FunctionType) -> None:
-        """Note what a function closes over, its defaults, and the globals it reads."""
+        """Record what a function closes over, its defaults, and globals it reads."""
         code, variables = function.__code__, function.__globals__
         found = names(code)
         cells = function.__closure__ or ()
@@ -197,14 +207,14 @@ class _Walk:
                 try:
                     content = cell.cell_contents
                 except ValueError:
-                    # It has no value yet.
+                    # The closed-over variable has no value yet.
                     break
                 self.chain(cell, "content", content, path)
         if function.__defaults__:
             self.read(function, "defaults", function.__defaults__)
         if function.__kwdefaults__:
             self.read(function, "kwdefaults", function.__kwdefaults__)
-        # The globals of a library are its own, and stay.
+        # The globals of a library are its own, and taken to stay the same.
         if is_installed(str(variables.get("__name__", ""))):
             return
         for name, paths in found.of_globals.items():
@@ -212,7 +222,7 @@ class _Walk:
                 self.chain(variables, name, variables[name], path)
 
     def chain(self, owner: object, name: str, value: Any, path: Path) -> None:
-        """Note `value.a.b`, as far as it leads through modules of the user's."""
+        """Record `value` and the path `value.a.b` through modules of the user."""
         self.read(owner, name, value)
         for attribute in path:
             if not isinstance(value, types.ModuleType) or is_installed(value.__name__):
@@ -224,18 +234,19 @@ class _Walk:
 
 
 def _atom(value: Any, kind: Kind) -> Hashable | None:
-    """A value that has no parts, with its type; None if it may have some."""
+    """Return a value without parts, with its type; None if the value may have parts."""
     if kind is Kind.PLAIN:
         return type(value), value
     if kind is Kind.FLOAT:
-        # Zeros of both signs differ, and not a number equals itself.
+        # In hexadecimal form zeros of different signs differ, and NaN equals itself.
         return type(value), float.hex(value)
     if kind is Kind.COMPLEX:
         return type(value), repr(value)
     if kind is Kind.TRACER:
         return Unrepeatable()
     if kind is Kind.NUMPY and not value.dtype.hasobject:
-        # Such an array can be changed in place; one of JAX's cannot.
+        # An array of NumPy can be changed in place, so that its contents are compared;
+        # an array of JAX cannot.
         digest = hashlib.blake2b(value.tobytes(), digest_size=16).digest()
         return type(value), value.dtype, value.shape, digest
     is_closed = kind is Kind.OPAQUE and not hasattr(value, "__wrapped__")
@@ -246,7 +257,7 @@ def _atom(value: Any, kind: Kind) -> Hashable | None:
 
 
 def _name(value: Any, kind: Kind) -> Hashable:
-    """What tells values with parts apart, beside their parts."""
+    """Return what distinguishes values with parts, apart from their parts."""
     if kind is Kind.FUNCTION:
         return value.__code__
     if kind is Kind.NUMPY:
@@ -261,7 +272,7 @@ def _static_fields(cls: type) -> list[str]:
 
 
 def _variables(value: Any) -> dict[str, Any]:
-    """The attributes of an object, by the way that no class can make slow."""
+    """Return the attributes of an object, read in a way that no class can make slow."""
     try:
         return object.__getattribute__(value, "__dict__")
     except AttributeError:

@@ -1,4 +1,4 @@
-"""The kinds of operations, and which programs can go into one kernel of the CPU."""
+"""The kinds of operations, which decide if a program can be one kernel of the CPU."""
 
 import math
 from collections.abc import Iterator
@@ -8,11 +8,12 @@ import jax
 from jaxtyping import PyTree
 
 
-# What the CPU's emitter of such kernels knows, by the names of JAX. Calls into
-# libraries (products of matrices, factorisations, transforms), sorting, scattering and
-# callbacks are not among it.
+# The lists below name, as JAX does, the operations that XLA can put into such kernels.
+# Calls into libraries (products of matrices, factorisations, transforms), sorting,
+# scattering and callbacks are not among them.
 #
-# Element by element, which `_diagonal` relies on: nothing else may be listed here.
+# These operations act element by element, which `_diagonal` relies on: no other may be
+# listed here.
 ELEMENTWISE = """
     abs acos acosh add add_any and asin asinh atan atan2 atanh
     bitcast_convert_type cbrt ceil clamp convert_element_type cos cosh div eq erf
@@ -28,24 +29,25 @@ _SHAPING = """
     concatenate copy copy_p expand_dims pad rev slice split squeeze stack
     transpose unstack
 """.split()  # noqa: SIM905
-# What may be large, such as the rows that are saved: it is moved in part.
+# The arrays of these operations may be large, such as the rows that are saved, because
+# only a part of an array is moved.
 _MOVING = """
     broadcast_in_dim dynamic_slice dynamic_update_slice empty empty2 iota
     reshape
 """.split()  # noqa: SIM905
-# Those that contain programs, which are looked into.
+# These operations contain programs, whose operations are examined in turn.
 CALLING = """
     checkpoint closed_call custom_jvp_call custom_vjp_call jit remat2
 """.split()  # noqa: SIM905
 _CONTAINING = [*CALLING, "cond", "custom_linear_solve", "one_kernel", "scan", "while"]
-# Numbers of elements: larger reductions are given to a library, and work on larger
-# arrays to several threads, which a kernel cannot start.
+# Numbers of elements: reductions of more are left to a library, and work on arrays of
+# more to several threads, which a kernel cannot start.
 LARGEST_REDUCTION = 1024
 LARGEST_ARRAY = 4096
 
 
 def is_elementary(program: Any) -> bool:
-    """Whether all operations of a program can go into one kernel."""
+    """Tell whether all operations of a program can go into one kernel."""
     return all(map(_is_elementary, program.eqns))
 
 

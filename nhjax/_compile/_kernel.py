@@ -1,4 +1,4 @@
-"""A program compiled into one kernel of the CPU, where its operations allow it.
+"""Compilation of a program into one kernel of the CPU, if its operations allow it.
 
 XLA runs a program on the CPU as a sequence of kernels, and each costs some 50 ns to
 start, which is as long as the arithmetic of tens of numbers takes. An iteration on the
@@ -6,8 +6,9 @@ stages of a step is some fifty such kernels. A called computation that is marked
 small is compiled to a single kernel instead, its loops included; on the gallery's
 systems that is three to five times faster.
 
-The mark is the compiler's own and may change its meaning. Without it, as on other
-devices, all works as before; `NHJAX_ONE_KERNEL=0` in the environment leaves it out.
+The mark is internal to the compiler, and its meaning may change. Without the mark, as
+on other devices, the results are the same; `NHJAX_ONE_KERNEL=0` in the environment
+leaves it out.
 """
 
 import os
@@ -31,11 +32,12 @@ T = TypeVar("T")
 
 
 def as_cpu_kernel(function: Callable[..., T], *args: Any) -> T:
-    """`function(*args)`, in one kernel if that is possible.
+    """Compute `function(*args)`, in one kernel of the CPU if that is possible.
 
-    It can be transformed as the function itself. What derivatives make of it, forward
-    and transposed, goes into kernels too. Members of a batch run one after the other,
-    each as long as it needs: that is faster than to run them in step, kernel by kernel.
+    The call can be transformed like the function itself. The programs of its
+    derivatives, forward and transposed, go into kernels too. Members of a batch run one
+    after the other, each for as long as it needs, which is faster than to run all of
+    them together, kernel by kernel.
     """
     # Who asks for no compilation wants to look at one operation after the other.
     if jax.config.jax_disable_jit:  # pyright: ignore[reportAttributeAccessIssue]
@@ -57,7 +59,7 @@ def as_cpu_kernel(function: Callable[..., T], *args: Any) -> T:
 
 def _call(flat: Callable[..., list[Any]], leaves: list[Any]) -> list[Any]:
     program = jax.make_jaxpr(flat)(*leaves)
-    # A primitive must be given all that is traced, and has no effects such as printing.
+    # A primitive needs all traced values as operands, and may not print, for instance.
     captured = any(isinstance(const, jax.core.Tracer) for const in program.consts)
     if program.effects or captured:
         return jax.extend.core.jaxpr_as_fun(program)(*leaves)
@@ -65,7 +67,7 @@ def _call(flat: Callable[..., list[Any]], leaves: list[Any]) -> list[Any]:
 
 
 def _split(marks: Iterable[bool], xs: Iterable[Any]) -> tuple[list[Any], list[Any]]:
-    """Those that are marked, and the others."""
+    """Split a sequence into the entries whose mark is true, and the other entries."""
     pairs = list(zip(marks, xs, strict=True))
     return [x for mark, x in pairs if mark], [x for mark, x in pairs if not mark]
 
@@ -73,7 +75,7 @@ def _split(marks: Iterable[bool], xs: Iterable[Any]) -> tuple[list[Any], list[An
 def _merged(
     marks: Iterable[bool], marked: Iterable[Any], others: Iterable[Any]
 ) -> list[Any]:
-    """What `_split` took apart."""
+    """Merge two sequences that `_split` made, in the original order."""
     marked, others = iter(marked), iter(others)
     return [next(marked) if mark else next(others) for mark in marks]
 
@@ -94,14 +96,15 @@ def _shapes(*operands, program):
 
 
 def _is_possible(program) -> bool:
-    # Random keys have no kind.
+    # The dtype of random keys has no attribute `kind`, which gives None here.
     kinds = {getattr(aval.dtype, "kind", None) for aval in program.in_avals}
     plain = kinds <= set("fiub")
     wanted = os.environ.get("NHJAX_ONE_KERNEL") != "0"
     return wanted and plain and is_elementary(program.jaxpr)
 
 
-# Whether a kernel is being lowered, in which others are not kernels of their own.
+# Whether a kernel is being lowered; kernels inside of it do not become kernels of their
+# own.
 _within = ContextVar("within", default=False)
 
 
@@ -113,14 +116,14 @@ def _marked(ctx, *operands, program):
     run = jax.extend.core.jaxpr_as_fun(program)
 
     def call(*operands):
-        # Operands without elements would vanish.
+        # The compiler would remove operands without elements: they are left out here.
         is_full = [x.size > 0 for x in operands]
         full, empty = _split(is_full, operands)
 
         def kernel(*full):
             return run(*_merged(is_full, _tied(full), map(jnp.zeros_like, empty)))
 
-        # Nor may it be seen here which of them are constants.
+        # The barrier hides which operands are constants: those would be removed too.
         return jax.jit(kernel)(*jax.lax.optimization_barrier(full))
 
     token = _within.set(True)
@@ -136,10 +139,11 @@ def _marked(ctx, *operands, program):
 
 
 def _tied(operands: tuple[Any, ...]) -> list[Any]:
-    """The same operands, of which the compiler cannot know that any is not used.
+    """Return the same operands, made so that the compiler cannot find one unused.
 
-    It would abort on a parameter of a marked call that is not used, be it after all
-    simplification. So all small ones are made to seem to depend on all others.
+    The compiler aborts if a parameter of a marked call is not used, even if this turns
+    out only after all simplifications. For this reason every small operand is made to
+    depend on all others in a way that never changes its value.
     """
     firsts = [x.reshape(-1)[0] for x in operands]
     signs = [(x != jnp.zeros_like(x)).astype(jnp.int32) for x in firsts]
@@ -161,7 +165,7 @@ mlir.register_lowering(_kernel, _marked, platform="cpu", cacheable=False)
 
 
 def _batched(operands, axes, *, program):
-    """Members one by one on the CPU, where a kernel is for one; else all in step."""
+    """Run the members of a batch one by one in a kernel on the CPU, else together."""
     run = partial(_kernel.bind, program=program)
     if jax.default_backend() != "cpu" or not _is_possible(program):
         run = jax.extend.core.jaxpr_as_fun(program)
@@ -185,9 +189,10 @@ batching.primitive_batchers[_kernel] = _batched
 
 
 def _differentiated(operands, tangents, *, program):
-    """The values and what is linear in the tangents, each a kernel of its own.
+    """Compute values and tangents in two kernels, the second linear in the tangents.
 
-    In two, so that reverse mode can keep the first and transpose the second.
+    There are two kernels so that reverse mode can keep the results of the first and
+    transpose the second.
     """
     run = jax.extend.core.jaxpr_as_fun(program)
     is_moving = [not isinstance(tangent, ad.Zero) for tangent in tangents]
@@ -209,11 +214,12 @@ def _differentiated(operands, tangents, *, program):
     try:
         whole = jax.make_jaxpr(linearised)(*operands)
     except ValueError:
-        # What JAX cannot linearise, such as a while loop, it may still push forward.
+        # What JAX cannot linearise, such as a while loop, has forward mode at least.
         all_rates = [ad.instantiate_zeros(tangent) for tangent in tangents]
         return jax.jvp(run, operands, all_rates)
     size = len(program.out_avals)
-    # A loop would keep what is the same in each of its rounds as often as there are.
+    # Residuals that depend on no operand are computed again and not kept: in a loop
+    # they would be kept once for each round.
     fixed, is_varying = _fixed_part(whole)
     is_kept = [True] * size + is_varying[size:]
     results = _call(
@@ -237,7 +243,7 @@ def _differentiated(operands, tangents, *, program):
 
 
 def _fixed_part(program) -> tuple[list[Any], list[bool]]:
-    """The operations that depend on no operand, and which results depend on one."""
+    """Find the operations that depend on no operand, and the results that do on one."""
     traced = [isinstance(const, jax.core.Tracer) for const in program.consts]
     varying = {*program.jaxpr.invars, *_split(traced, program.jaxpr.constvars)[0]}
 
@@ -254,7 +260,7 @@ def _fixed_part(program) -> tuple[list[Any], list[bool]]:
 
 
 def _constants(program, fixed: list[Any], is_kept: list[bool]) -> list[Any]:
-    """The results of a program that are not kept, by its fixed operations."""
+    """Compute the results of a program that are not kept, from its fixed operations."""
     jaxpr = program.jaxpr
     part = jaxpr.replace(
         invars=[],

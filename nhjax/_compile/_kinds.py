@@ -1,4 +1,4 @@
-"""What kinds of values there are for those who look into what functions read."""
+"""The kinds of values that functions may read, each searched in its own way."""
 
 import argparse
 import enum
@@ -15,7 +15,7 @@ from ._names import is_installed
 
 
 class Kind(enum.Enum):
-    """How a value is looked into."""
+    """The way in which a value is searched for the values that it contains."""
 
     PLAIN = enum.auto()
     FLOAT = enum.auto()
@@ -29,13 +29,13 @@ class Kind(enum.Enum):
     MAPPING = enum.auto()
     SEQUENCE = enum.auto()
     CLASS = enum.auto()
-    # An object whose attributes are looked at.
+    # An object whose attributes are searched.
     OPEN = enum.auto()
-    # Any other, of which its identity is all.
+    # Any other object, which is compared by its identity alone.
     OPAQUE = enum.auto()
 
 
-# The first that fits is taken.
+# The kind of a class is that of the first row that fits.
 _KINDS: list[tuple[Kind, tuple[type, ...]]] = [
     (Kind.OPAQUE, (enum.Enum, types.ModuleType)),
     (Kind.NUMPY, (np.ndarray, np.generic)),
@@ -50,14 +50,14 @@ _KINDS: list[tuple[Kind, tuple[type, ...]]] = [
     (Kind.MAPPING, (dict, types.MappingProxyType)),
     (Kind.SEQUENCE, (list, tuple, deque, set, frozenset)),
     (Kind.CLASS, (type,)),
-    # Of a class that is not the user's, but made to hold what is.
+    # These classes are not the user's, but made to hold the user's values.
     (Kind.OPEN, (types.SimpleNamespace, argparse.Namespace, eqx.Module)),
 ]
 
 
 @lru_cache(maxsize=4096)
 def kind_of(cls: type) -> Kind:
-    """The kind of the instances of a class."""
+    """Find the kind of the instances of a class."""
     for kind, classes in _KINDS:
         if issubclass(cls, classes):
             return kind

@@ -1,4 +1,4 @@
-"""Which variables the code of a function reads, and which modules are of libraries."""
+"""The variables that the code of a function reads, and the modules of libraries."""
 
 import dis
 import sys
@@ -14,15 +14,15 @@ Path: TypeAlias = tuple[str, ...]
 _LOADS_GLOBAL = ("LOAD_GLOBAL", "LOAD_NAME", "LOAD_FROM_DICT_OR_GLOBALS")
 _LOADS_CLOSED = ("LOAD_DEREF", "LOAD_CLASSDEREF", "LOAD_FROM_DICT_OR_DEREF")
 _LOADS_ATTRIBUTE = ("LOAD_ATTR", "LOAD_METHOD")
-# Those that may be installed from a working copy, outside of the usual folders.
+# These libraries may be installed from a working copy, outside of the usual folders.
 _LIBRARIES = ("equinox", "jax", "jaxlib", "jaxtyping", "nhjax", "numpy")
 
 
 class Names(NamedTuple):
-    """The variables that code reads, each with the paths that start there.
+    """The variables that code reads, each with the attribute paths that start there.
 
-    Without those that it assigns: what is traced must not be traced anew because of
-    what it did itself.
+    Variables that the code itself assigns are left out: a function must not be traced
+    anew because of what it did itself.
     """
 
     of_globals: dict[str, set[Path]]
@@ -31,7 +31,7 @@ class Names(NamedTuple):
 
 @lru_cache(maxsize=4096)
 def names(code: types.CodeType) -> Names:
-    """The variables that a function reads, and functions defined inside of it."""
+    """Find the variables that a function and the functions defined inside it read."""
     found, assigned = Names({}, {}), Names({}, {})
     path: list[str] | None = None
     for instruction in dis.get_instructions(code):
@@ -72,7 +72,7 @@ def _without(
 
 @lru_cache(maxsize=4096)
 def is_installed(module: str) -> bool:
-    """Whether a module is Python's own or of an installed library, not of a user's."""
+    """Tell whether a module is Python's own or an installed library's, not a user's."""
     if module == "__main__":
         return False
     if module.partition(".")[0] in (*_LIBRARIES, *sys.builtin_module_names):

@@ -1,4 +1,4 @@
-"""Compilation that knows of the globals and closed-over variables of functions."""
+"""Compilation that notices changes of globals and closed-over variables."""
 
 import inspect
 from collections import deque
@@ -13,13 +13,16 @@ from ._captured import all_of, captured, Entry, Place, Unrepeatable
 
 T = TypeVar("T")
 
-# How many of what is remembered below; if there are more, all is forgotten, and what is
-# still used is traced once more.
+# The largest number of entries in each of the two dictionaries below. If there are
+# more, all are forgotten, and programs that are still used are traced once more.
 _MOST = 1000
 
 
 class _Key:
-    """What functions read, and whether a program was traced with it just now."""
+    """The values that functions read, as a key for compiled programs.
+
+    `is_traced` tells whether a program has just been traced with this key.
+    """
 
     def __init__(self, atoms: tuple[Hashable, ...]):
         self.atoms = atoms
@@ -33,20 +36,24 @@ class _Key:
         return isinstance(other, _Key) and self.atoms == other.atoms
 
 
-# What changes while functions are traced, such as a list in which they count their
-# calls, is not looked at: they would be traced anew for ever. Its owners are held, so
-# that their identities are not reused.
+# Values that change while functions are traced, such as a list in which they count
+# their calls, are ignored: otherwise the functions would be traced anew for ever. Their
+# places are kept with the objects that own them, so that the identities of these are
+# not reused.
 _unsteady: dict[Place, object] = {}
-# The key that a program was traced with, by what it became while that was done.
+# The key that a program was traced with, found by what that key had become at the end
+# of tracing.
 _earlier: dict[_Key, _Key] = {}
 
 
 def tracked_jit(*tracked: str) -> Callable[[Callable[..., T]], Callable[..., T]]:
-    """As `equinox.filter_jit`, but traced anew if what functions read has changed.
+    """Compile like `equinox.filter_jit`, and trace anew if what functions read changes.
+
+    It makes a decorator for a function that is called with positional arguments.
 
     **Arguments:**
 
-    - `tracked`: the names of the arguments in which functions of the user's are.
+    - `tracked`: the names of the arguments that contain functions of the user.
     """
 
     def decorator(function: Callable[..., T]) -> Callable[..., T]:
@@ -80,7 +87,11 @@ def _key(entries: list[Entry]) -> _Key:
 
 
 def _learn(key: _Key, before: list[Entry], functions: Any) -> None:
-    """Find what tracing changed, and let what it became count as what it was."""
+    """Remember what tracing changed, so that the program is found again afterwards.
+
+    The changed places are ignored from now on, and the key as it is after tracing
+    stands for the one as it was before.
+    """
     after = captured(functions, _unsteady)
     changed = _changed(before, after)
     if not changed:
@@ -93,7 +104,7 @@ def _learn(key: _Key, before: list[Entry], functions: Any) -> None:
 
 
 def _changed(before: list[Entry], after: list[Entry]) -> dict[Place, object]:
-    """The places at which entries differ, with their owners."""
+    """Find the places at which two lists of entries differ, with their owners."""
     atoms = [{entry.place: entry for entry in entries} for entries in (before, after)]
     changed = {}
     for one, other in (atoms, atoms[::-1]):
@@ -102,7 +113,7 @@ def _changed(before: list[Entry], after: list[Entry]) -> dict[Place, object]:
             if isinstance(entry.content, Unrepeatable):
                 continue
             if there is None and isinstance(entry.owner, list | set | deque):
-                # Of what grows, the next element would be unknown again.
+                # The container grows, so that its next element would be new again.
                 place = all_of(entry.owner)
             if there is None or there.content != entry.content:
                 changed[place] = entry.owner

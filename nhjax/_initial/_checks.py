@@ -1,4 +1,4 @@
-"""What can be wrong with a state, judged once it has been computed."""
+"""Checks of an initial state once it has been computed, with their messages."""
 
 from typing import NamedTuple
 
@@ -21,7 +21,17 @@ from .._system import AbstractMechanicalSystem, all_finite, Linearisation, State
 
 
 class Found(NamedTuple):
-    """A state, and the figures by which to judge it."""
+    """A state that was computed, and the numbers by which it is judged.
+
+    - `lin`: the linearisation of the equations of motion at the state.
+    - `off_group`: the distance of the given q to the group.
+    - `regularity`, `compatibility`: the reciprocal condition numbers of the metric on
+        the fibre and of the compatibility matrix.
+    - `ranks`, `deficient`: the derivatives that must have full rank, and which lack it.
+    - `allowed`, `allowed_positions`, `allowed_off_group`: the bounds on violations.
+    - `legendre_solved`: whether the Legendre transform could be inverted.
+    - `projected`: whether the projection onto the constraints has converged.
+    """
 
     state: State
     lin: Linearisation
@@ -40,7 +50,7 @@ class Found(NamedTuple):
 
 
 class _Words(NamedTuple):
-    """The names of a system's functions in messages."""
+    """The names of a system's functions and variables that messages use."""
 
     generator: str
     letter: str
@@ -77,7 +87,7 @@ _WORDS = {
 
 
 class _Case(NamedTuple):
-    """What a message may speak of."""
+    """A state and what it was made from, as the messages of errors need them."""
 
     found: Found
     q: PyTree[Array]
@@ -89,7 +99,7 @@ class _Case(NamedTuple):
 
     @property
     def where(self) -> str:
-        # What was given, not what was found from it: that would be a riddle.
+        # The message shows what the user gave, which the user recognises.
         return f"q = {self.q}, {self.given_name} = {self.given}"
 
     @property
@@ -116,7 +126,7 @@ def judged(
     p: Float[Array, " n"] | None,
     project: bool,
 ) -> list[Check]:
-    """What must hold of a state, each with the exception that says what is wrong."""
+    """List the conditions on a state, each with the exception for where it fails."""
     state, lin = found.state, found.lin
     singular = 10 * state.v.shape[0] * jnp.finfo(state.v.dtype).eps
     name, given = ("p", p) if v is None else ("v", v)
@@ -124,7 +134,8 @@ def judged(
     case = (_Case(found, q, name, given, project, words, group),)
     return [
         Check(found.off_group <= found.allowed_off_group, _group_error, case),
-        # Not ">": a matrix that is not finite is no singular matrix.
+        # The negated "<=" lets NaN pass, which ">" would not: a matrix that is not
+        # finite is reported by another check, and not as singular.
         Check(~(found.regularity <= singular), _regularity_error, case),
         Check(found.legendre_solved, _legendre_error, case),
         *[

@@ -43,12 +43,13 @@ def initial_state(
     project: bool = False,
     throw: bool = True,
 ) -> State:
-    """A consistent state (q, v, p, λ) from a configuration and a velocity or momentum.
+    """Make a consistent state (q, v, p, λ) from a configuration and a v or p.
 
-    The one of v and p that is not given follows by the Legendre transform p = D2L, or
-    v = D2H. The multiplier is that of the continuous problem, from the hidden
-    constraints dΦ/dt = 0 of nonholonomic and d²Γ/dt² = 0 of holonomic ones: an
-    inconsistent λ_0 would lower the order of the method (paper, section 4).
+    Of velocity and momentum one is given, and the other follows by the Legendre
+    transform p = D2L or v = D2H. The multiplier is that of the continuous problem,
+    which follows from the hidden constraints: dΦ/dt = 0 of nonholonomic constraints and
+    d²Γ/dt² = 0 of holonomic ones. An inconsistent λ_0 would lower the order of the
+    method (paper, section 4).
 
     **Arguments:**
 
@@ -67,8 +68,8 @@ def initial_state(
 
     **Returns:** a `State`.
 
-    **Raises:** (what depends on values, under `jit` with the same message in an error
-    of JAX, a `JaxRuntimeError` or a `ValueError`)
+    **Raises:** the following errors. Under `jit` those that depend on values come with
+    the same message in an error of JAX, a `JaxRuntimeError` or a `ValueError`.
 
     - `TypeError`: `system`, `project` or a part of `args` is of a wrong type.
     - `ShapeError`, `DTypeError`, `NonFiniteError`: an argument, or the value of one of
@@ -140,7 +141,7 @@ def _solve(system, t, q, v, p, args, project: bool) -> Found:
     found_v = system.velocity(t, q, u, args)
     found_p = system.momentum(t, q, u, args)
     if not project:
-        # What was given is kept to the last bit.
+        # The velocity or momentum that was given is kept to the last bit.
         found_v = found_v if v is None else v
         found_p = found_p if p is None else p
     metric = system.metric(t, q, u, args)
@@ -167,7 +168,7 @@ def _solve(system, t, q, v, p, args, project: bool) -> Found:
 def _inverse_legendre(
     system, t, q, given: Float[Array, " n"], args
 ) -> tuple[Float[Array, " n"], BoolScalar]:
-    """The u whose fibre derivative is the given one of v and p."""
+    """Find the u whose fibre derivative is the given p or v, and whether it exists."""
     zero = jnp.zeros_like(given)
     # Where the terms of the equation cancel, as at rest in a magnetic field, u is
     # rounded by what they amount to, and not by its own size.
@@ -182,7 +183,12 @@ def _inverse_legendre(
 
 
 class _Nearest(NamedTuple):
-    """The nearest point of a constraint, and the Jacobian where the search starts."""
+    """The result of a search for the nearest point on a constraint.
+
+    - `x`: the point at which the search ended.
+    - `found`: whether it is a solution.
+    - `jacobian`: the Jacobian of the constraint where the search started.
+    """
 
     x: Float[Array, " n"]
     found: BoolScalar
@@ -190,7 +196,10 @@ class _Nearest(NamedTuple):
 
 
 def _project_position(system, t, q, u, args) -> _Nearest:
-    """The stationary point of ½ ξᵀ M ξ on Γ(t, q τ(ξ)) = 0."""
+    """Project q onto Γ = 0: find the stationary point of ½ ξᵀ M ξ on Γ(t, q τ(ξ)) = 0.
+
+    M is the mass matrix at (t, q, u).
+    """
     manifold = system.manifold_of(q)
     mass = system.metric(t, q, u, args)
     if system.fibre_coordinate_name == "p":
@@ -206,7 +215,10 @@ def _project_position(system, t, q, u, args) -> _Nearest:
 
 
 def _project_fibre(system, t, q, u, args) -> _Nearest:
-    """The stationary point of ½ (w-u)ᵀ K (w-u) on Φ(t, q, w) = 0."""
+    """Project u onto Φ = 0: find the stationary point w of ½ (w-u)ᵀ K (w-u) there.
+
+    The constraint is Φ(t, q, w) = 0, and K the metric on the fibre at (t, q, u).
+    """
 
     def phi(w):
         return system.constraint(t, q, w, args)
@@ -223,13 +235,19 @@ def _nearest(
     x: Float[Array, " n"],
     sizes: Callable[[Float[Array, "m n"]], tuple[FloatScalar, Float[Array, " m"]]],
 ) -> _Nearest:
-    """The stationary point of ½ (y-x)ᵀ K (y-x) on constraint(y) = 0.
+    """Find the stationary point y of ½ (y-x)ᵀ K (y-x) on constraint(y) = 0.
 
-    `sizes(jacobian)`: what y and the constraint are rounded by.
+    **Arguments:**
+
+    - `metric`: the matrix K.
+    - `constraint`: the function that is to vanish.
+    - `x`: the point from which the search starts.
+    - `sizes`: called as `sizes(jacobian)`, the sizes of y and of the terms of the
+        constraint, to which their round-off is proportional.
     """
     jacobian = jax.jacrev(constraint)(x)
     size, terms = sizes(jacobian)
-    # The round-off of the constraint moves y too: from rest, nothing else does.
+    # The round-off of the constraint moves y too. If y is zero, nothing else does.
     reaction = inverse(metric) @ jacobian.T
     response = reaction @ inverse(jacobian @ reaction)
     scale = size + max_norm(jnp.abs(response) @ terms)
@@ -276,5 +294,6 @@ def _check_inputs(system, q, v, p, t):
                 "must agree."
             )
     t = real_scalar("t", t, fibre.dtype)
-    # All on q, which no system ignores: jit drops a check of what is not used.
+    # All checks are attached to q, which no system ignores: `jax.jit` drops a check of
+    # what is not used.
     return (q, fibre, None, t) if p is None else (q, None, fibre, t)

@@ -1,4 +1,4 @@
-"""The time loop: saving, dense output, adjoints, solutions, progress."""
+"""The integration of a system over many steps, its output and its derivatives."""
 
 from ._adjoint import (
     AbstractAdjoint as AbstractAdjoint,

@@ -1,4 +1,4 @@
-"""How a trajectory is differentiated in reverse mode: what is kept of it, and where."""
+"""The ways in which a run is differentiated in reverse mode, and what each keeps."""
 
 import math
 from abc import abstractmethod
@@ -22,11 +22,15 @@ _Advance: TypeAlias = Callable[[_Run, Int[Array, ""]], _Run]
 
 
 class AbstractAdjoint(eqx.Module):
-    """How `integrate` is differentiated in reverse mode."""
+    """The way in which `integrate` is differentiated in reverse mode.
+
+    An adjoint decides what is kept of the steps of a run for the reverse pass, and what
+    is computed again.
+    """
 
     @abstractmethod
     def run(self, loop: Loop, carry: Carry) -> _Run:
-        """All steps of the loop from `carry`: its end, and the rows saved."""
+        """Run all steps of the loop from `carry`; return its end and all saved rows."""
 
 
 def _advance(loop: Loop, state: _Run, k: Int[Array, ""]) -> _Run:
@@ -36,7 +40,7 @@ def _advance(loop: Loop, state: _Run, k: Int[Array, ""]) -> _Run:
 
 
 def count(num_steps: int | Int[Array, ""]) -> Any:
-    """A number of steps as a loop takes it, in int32; known if it is an int."""
+    """Convert a number of steps to int32 for a loop; an int stays known to tracing."""
     return np.int32(num_steps) if isinstance(num_steps, int) else num_steps
 
 
@@ -65,7 +69,7 @@ class DirectAdjoint(AbstractAdjoint):
     """
 
     def run(self, loop: Loop, carry: Carry) -> _Run:
-        """All steps of the loop from `carry`: its end, and the rows saved."""
+        """Run all steps of the loop from `carry`; return its end and all saved rows."""
         state = (carry, loop.empty_rows(carry))
         end = count(loop.num_steps)
         return jax.lax.fori_loop(
@@ -121,9 +125,9 @@ class RecursiveCheckpointAdjoint(AbstractAdjoint):
             )
 
     def run(self, loop: Loop, carry: Carry) -> _Run:
-        """All steps of the loop from `carry`: its end, and the rows saved."""
+        """Run all steps of the loop from `carry`; return its end and all saved rows."""
         if not isinstance(loop.num_steps, int):
-            # Blocks are for reverse mode, and there is none.
+            # Blocks serve reverse mode alone, which needs a known number of steps.
             return DirectAdjoint().run(loop, carry)
         lengths = self._block_lengths(loop.num_steps)
         advance: _Advance = partial(_advance, loop)
@@ -136,7 +140,7 @@ class RecursiveCheckpointAdjoint(AbstractAdjoint):
         return advance(state, jnp.zeros((), jnp.int32))
 
     def _block_lengths(self, num_steps: int) -> list[int]:
-        """How many blocks there are on each level, the outermost first."""
+        """List the number of blocks on each level, the outermost level first."""
         number = self.checkpoints
         number = math.isqrt(num_steps - 1) + 1 if number is None else number
         lengths, steps = [], num_steps
@@ -144,13 +148,14 @@ class RecursiveCheckpointAdjoint(AbstractAdjoint):
             steps = -(-steps // number)
             lengths.append(number)
         lengths.append(steps)
-        # Rounding up may have left whole blocks idle.
+        # Because the lengths were rounded up, whole blocks could lie beyond the end of
+        # the run; the outermost level leaves them out.
         lengths[0] = -(-num_steps // math.prod(lengths[1:]))
         return lengths
 
 
 def _block(advance: _Advance, length: int, stride: int, *, keep_all: bool) -> _Advance:
-    """`length` calls of `advance`, `stride` steps apart."""
+    """Make a function that calls `advance` `length` times, `stride` steps apart."""
     one = advance if keep_all else jax.checkpoint(advance, prevent_cse=False)
 
     def block(state, k):
@@ -165,10 +170,14 @@ def _block(advance: _Advance, length: int, stride: int, *, keep_all: bool) -> _A
 
 
 def _idle_after_the_end(loop: Loop) -> _Advance:
-    """`_advance`, but nothing where the last block is longer than the run."""
+    """Make a variant of `_advance` that does nothing in steps after the end of the run.
+
+    It is needed where the last block is longer than what is left of the run.
+    """
 
     def advance_or_idle(state, k):
-        # The buffers stay outside of the branches, which would copy them.
+        # The buffers are written outside of the branches of `jax.lax.cond`, which would
+        # copy them.
         carry, buffers = state
         nothing = jax.tree.map(
             lambda x: jnp.zeros(x.shape, x.dtype),

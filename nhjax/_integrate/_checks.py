@@ -1,4 +1,4 @@
-"""What can be wrong with the options of a run, beside its system and its state."""
+"""Checks of the options of a run; the system and the state are checked elsewhere."""
 
 import reprlib
 from collections.abc import Callable
@@ -20,12 +20,14 @@ _MOST_STEPS = 2**31 - 1
 
 
 def check_num_steps(num_steps: Any, needed_by: str | None) -> int | IntScalar:
-    """`num_steps` as an int >= 1, or as an array if nothing needs to know it.
+    """Return `num_steps` as an int >= 1, or as an array if no option needs its value.
 
     **Arguments:**
 
-    - `num_steps`: that of the user.
-    - `needed_by`: the option whose output has a shape that depends on it, if any.
+    - `num_steps`: the argument of the user.
+    - `needed_by`: the name of an option that needs the number of steps when tracing,
+        for instance because the shape of its output depends on it; None if there is
+        none.
     """
     if isinstance(num_steps, jax.Array | np.ndarray):
         return _traced_count(num_steps, needed_by)
@@ -70,13 +72,16 @@ def _count_error(num_steps: Any) -> ValueError:
 
 
 def known(num_steps: int | IntScalar) -> int:
-    """A number of steps that is an int, where `check_num_steps` has seen to that."""
+    """Return a number of steps that `check_num_steps` has made an int, as an int."""
     assert isinstance(num_steps, int)
     return num_steps
 
 
 def countable(num_steps: int | IntScalar) -> list[Check]:
-    """The check of a traced number of steps; that of an int is done already."""
+    """Make the check that a traced number of steps is in its range.
+
+    The list is empty for a number that is known, which `check_num_steps` has checked.
+    """
     if isinstance(num_steps, int) or not is_traced(num_steps):
         return []
     ok = num_steps >= 1
@@ -86,11 +91,12 @@ def countable(num_steps: int | IntScalar) -> list[Check]:
 
 
 def advancing(t0: FloatScalar, dt: FloatScalar) -> Check:
-    """The check that the first step changes t."""
-    # On the host where it is known: an operation there takes a tenth of the time.
+    """Make the check that t0 + dt differs from t0, so that time advances."""
+    # Known values are compared on the host with NumPy, where an operation takes a tenth
+    # of the time.
     numpy: Any = jnp if is_traced(t0, dt) else np
     first, h = numpy.asarray(t0), numpy.asarray(dt)
-    # What is infinite has a check of its own.
+    # Infinite numbers have a check of their own.
     with np.errstate(over="ignore", invalid="ignore"):
         ok = first + h != first
     return Check(ok, _standstill_error, (first, h))
@@ -107,7 +113,7 @@ def _standstill_error(first: Any, h: Any) -> ValueError:
 def check_saved(
     fn: Callable[[Any, Any, Any], PyTree[Array]], t: FloatScalar, y: Any, args: Args
 ) -> None:
-    """Raise unless what `SaveAt(fn=...)` returns can be saved."""
+    """Raise a `TypeError` unless `SaveAt(fn=...)` returns what can be saved, arrays."""
     leaves = jax.tree.leaves(eqx.filter_eval_shape(fn, t, y, args))
     wrong = [
         leaf
@@ -124,14 +130,16 @@ def check_saved(
     )
 
 
-# JAX keeps what is being traced, if anything, in a state that can only be compared.
-# Releases that have no such function in public count as always tracing.
+# JAX keeps what is being traced, if anything, in a state that can only be compared
+# with another. In releases of JAX that do not make this function public, `is_tracing`
+# always returns True.
 _trace_state = getattr(jax.extend.core, "get_opaque_trace_state", lambda **_: object())
 with jax.ensure_compile_time_eval():
-    # Also where this is imported inside of a transformation.
+    # This gives the state outside of all transformations also if this module is
+    # imported inside of one.
     _NOT_TRACING = _trace_state(convention="nhjax")
 
 
 def is_tracing() -> bool:
-    """Whether this is called inside a transformation such as jit, vmap or grad."""
+    """Tell whether this is called inside a transformation such as jit, vmap or grad."""
     return _trace_state(convention="nhjax") != _NOT_TRACING

@@ -186,7 +186,7 @@ def _zero_step() -> ValueError:
 
 
 def _what_needs_the_length(saveat: SaveAt, meter: AbstractProgressMeter) -> str | None:
-    """The option because of which the number of steps must be known when tracing."""
+    """Name the first option that needs `num_steps` when tracing; None if none does."""
     needs = {
         "the output of `SaveAt(steps=...)`": bool(saveat.steps),
         "the output of `SaveAt(dense=True)`": saveat.dense,

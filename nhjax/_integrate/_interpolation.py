@@ -23,10 +23,11 @@ def interpolate(
     theta: FloatScalar,
     args: Args,
 ) -> State:
-    """The state at t + θ h inside a step that starts at t.
+    """Compute the state at t + θ h, inside a step that starts at t.
 
-    q by the continuous collocation polynomial u(t), p by the mixed polynomial v(t) of
-    the paper's appendix: both integrate the Lagrange basis on the nodes c_i.
+    The configuration q is the value of the continuous collocation polynomial u(t), and
+    the momentum p that of the mixed polynomial v(t) of the paper's appendix. Both
+    polynomials are integrals of the Lagrange basis on the nodes c_i.
     """
     start, time = record.start, t + theta * h
     weights = method.integrated_basis(theta)
@@ -48,9 +49,10 @@ def interpolate(
 
 
 class DenseInterpolation(eqx.Module):
-    """The collocation polynomials of a whole trajectory.
+    """The collocation polynomials of a whole trajectory, one for each of its steps.
 
-    They are defined on [t0, t0 + num_steps dt]; use `Solution.evaluate`.
+    They are defined on [t0, t0 + num_steps dt]. `integrate` makes an instance if it is
+    called with `SaveAt(dense=True)`; users evaluate it through `Solution.evaluate`.
     """
 
     method: AbstractMethod = eqx.field(static=True)
@@ -58,8 +60,9 @@ class DenseInterpolation(eqx.Module):
     t0: FloatScalar
     dt: FloatScalar
     records: StepRecord
-    # The system and args, taken apart: a function is no leaf that `jax.jit` and
-    # `jax.vmap` may return.
+    # The system and args are kept as a list of their arrays, a tuple of their other
+    # leaves and the structure of the tree, because `jax.jit` and `jax.vmap` cannot
+    # return a leaf that is a function.
     _arrays: list[Array]
     _rest: tuple[Any, ...] = eqx.field(static=True)
     _treedef: Any = eqx.field(static=True)
@@ -87,7 +90,7 @@ class DenseInterpolation(eqx.Module):
         return jax.tree.unflatten(self._treedef, leaves)
 
     def evaluate(self, t: FloatScalarLike) -> State:
-        """The state at time `t`."""
+        """Compute the state at time `t`, which must lie inside the run."""
         batch = self.records.force.shape[:-3]
         if batch:
             raise ValueError(
@@ -113,9 +116,10 @@ def _outside(
 def step_position(
     t: Array, t0: FloatScalar, dt: FloatScalar, num_steps: int
 ) -> tuple[Array, BoolScalar]:
-    """Times in units of steps, and which of them lie in the run, but for round-off."""
+    """Convert times to units of steps; tell which lie in the run, up to round-off."""
     position = (t - t0) / dt
-    # The times themselves are rounded, by as much as the largest of them.
+    # The times themselves are rounded, by an error in proportion to the largest of
+    # them.
     steps = num_steps + jnp.abs(t0 / dt)
     slack = jnp.maximum(1e-6, 8 * jnp.finfo(t.dtype).eps * steps)
     return position, (position >= -slack) & (position <= num_steps + slack)
@@ -124,7 +128,7 @@ def step_position(
 def step_index(
     t: FloatScalar, t0: FloatScalar, dt: FloatScalar, num_steps: int
 ) -> Int[Array, ""]:
-    """The index of the step that contains t."""
+    """Find the index of the step that contains the time t."""
     k = jnp.floor((t - t0) / dt).astype(jnp.int32)
     return jnp.clip(k, 0, num_steps - 1)
 

@@ -1,4 +1,4 @@
-"""The time loop: step, save, and go on."""
+"""The body of the time loop: it takes a step and saves what is to be saved of it."""
 
 import equinox as eqx
 import jax
@@ -12,10 +12,10 @@ from ._stepping import Carry, Stepping
 
 
 class Loop(eqx.Module):
-    """How a run steps, what it saves on the way, and who is told of its progress.
+    """The time loop of a run: its steps, what it saves of them, and its progress meter.
 
-    An adjoint calls `step` for all k in 0..num_steps - 1 in turn, and `write`s the rows
-    that it leaves to buffers that start as `empty_rows`.
+    An adjoint calls `step` for k = 0, ..., num_steps - 1 in turn, and calls `write` to
+    put the rows that each step returns into buffers that start as `empty_rows`.
     """
 
     stepping: Stepping
@@ -24,11 +24,11 @@ class Loop(eqx.Module):
 
     @property
     def num_steps(self) -> int | Int[Array, ""]:
-        """How many steps there are."""
+        """Return the number of steps of the run."""
         return self.saving.num_steps
 
     def step(self, carry: Carry, k: Int[Array, ""]) -> tuple[Carry, Rows]:
-        """Step k: the carry after it, and what it leaves to be saved."""
+        """Take step k; return the carry after it and the rows that it saves."""
         carry, taken = self.stepping.advance(carry, k)
         if not self.meter.silent:
             self.meter.report(k, known(self.num_steps))
@@ -40,6 +40,6 @@ class Loop(eqx.Module):
         return self.saving.write(buffers, rows, k)
 
     def empty_rows(self, carry: Carry) -> Rows:
-        """Buffers for all rows that are saved."""
+        """Make buffers of zeros for all rows that the run saves."""
         k = jnp.zeros((), jnp.int32)
         return self.saving.empty(jax.eval_shape(lambda: self.step(carry, k)[1]))

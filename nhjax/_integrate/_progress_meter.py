@@ -9,22 +9,31 @@ from jaxtyping import Array, Int
 
 
 class AbstractProgressMeter(eqx.Module):
-    """Shows how many steps of a run are done, from inside the compiled loop."""
+    """A progress meter, which shows how many steps of a run are done.
+
+    It is called on the host from inside the compiled time loop. A meter of one's own is
+    a subclass with `update`.
+    """
 
     @abstractmethod
     def update(self, done: int, total: int) -> None:
-        """Called on the host now and then, with done = total at the end."""
+        """Show that `done` of `total` steps are complete.
+
+        The loop calls it on the host about a hundred times a run, and with
+        done = total at the end.
+        """
 
     @property
     def silent(self) -> bool:
-        """Whether there is nothing to show, so that the loop need not call back."""
+        """Tell whether the meter shows nothing, so that the loop need not call it."""
         return False
 
     def report(self, k: Int[Array, ""], num_steps: int) -> None:
-        """Show, from inside a traced loop, that step `k` is complete."""
+        """Report from inside a traced loop that step `k` is complete."""
         if self.silent:
             return
-        # About a hundred calls a run: each one leaves the compiled program.
+        # There are about a hundred calls a run: each one leaves the compiled program,
+        # which costs time.
         every = max(1, num_steps // 100)
         done = k + 1
 
@@ -39,7 +48,7 @@ class AbstractProgressMeter(eqx.Module):
 
 
 class NoProgressMeter(AbstractProgressMeter):
-    """Shows nothing.
+    """A progress meter that shows nothing, the default of `integrate`.
 
     !!! example
 
@@ -49,15 +58,15 @@ class NoProgressMeter(AbstractProgressMeter):
 
     @property
     def silent(self) -> bool:
-        """True."""
+        """Return True: this meter shows nothing."""
         return True
 
     def update(self, done: int, total: int) -> None:
-        """Do nothing."""
+        """Do nothing, whatever has been done."""
 
 
 class TextProgressMeter(AbstractProgressMeter):
-    """Prints a line for every tenth of the run.
+    """A progress meter that prints a line for every tenth of the run.
 
     !!! example
 
@@ -67,7 +76,7 @@ class TextProgressMeter(AbstractProgressMeter):
     """
 
     def update(self, done: int, total: int) -> None:
-        """Print how many steps are done."""
+        """Print how many steps are done if another tenth of the run is complete."""
         # Reports come a hundredth of the run apart, not at each step.
         tenth, apart = max(1, total // 10), max(1, total // 100)
         if done == total or (done >= tenth and done % tenth < apart):
@@ -75,7 +84,7 @@ class TextProgressMeter(AbstractProgressMeter):
 
 
 class TqdmProgressMeter(AbstractProgressMeter):
-    """Shows a tqdm bar on the standard error stream.
+    """A progress meter that shows a tqdm bar on the standard error stream.
 
     **Arguments:**
 
@@ -98,7 +107,7 @@ class TqdmProgressMeter(AbstractProgressMeter):
         self._open = _Open()
 
     def update(self, done: int, total: int) -> None:
-        """Move the bar to `done`, and close it at the end."""
+        """Move the bar to `done` steps, and close it at the end of the run."""
         bar = self._open.bars.get(total)
         if bar is None:
             bar = self._open.bars[total] = tqdm.tqdm(
@@ -112,7 +121,11 @@ class TqdmProgressMeter(AbstractProgressMeter):
 
 
 class _Open:
-    """The open bars of a meter: host state, for which jit must not compile anew."""
+    """The open bars of a meter, by the number of steps of their runs.
+
+    They are state on the host. All instances are equal and have the same hash, so that
+    `jax.jit` does not compile a program anew for each of them.
+    """
 
     def __init__(self):
         self.bars: dict[int, Any] = {}

@@ -20,16 +20,18 @@ from ._stepping import Carry, Stepping
 
 
 class ReversibleAdjoint(AbstractAdjoint):
-    """Keep the end alone and retrace the steps from there: memory O(1).
+    """Keep the end of the run alone and retrace the steps from there: memory O(1).
 
-    On a vector space the method is symmetric: a step of -h leads back. On a group, and
-    with the consistent closure, it does not quite, and the step is inverted by an
-    iteration that starts from one of -h.
+    On a vector space the method is symmetric, so that a step of -h leads back to where
+    a step of h came from. On a group, and with the consistent closure, it leads back up
+    to a small error only, and the step is inverted by an iteration that starts from the
+    step of -h.
 
-    What is retraced differs from what was run by round-off. Where the motion is
-    attracted, as that of a sleigh is, time reversed repels, and the differences grow as
-    fast as the motion decays; prefer `RecursiveCheckpointAdjoint` there. Reverse mode
-    only (and forward over reverse): `jax.jvp` needs one of the other two. It has
+    The states that are retraced differ by round-off from those of the run. Where the
+    motion is attracted to some set, as that of a sleigh is, it is repelled in reversed
+    time, and the differences grow as fast as the motion decays; prefer
+    `RecursiveCheckpointAdjoint` there. This adjoint allows reverse mode and forward
+    over reverse mode alone: `jax.jvp` needs one of the other two adjoints. It gives
     gradients also if `num_steps` is an array.
 
     !!! example
@@ -45,7 +47,7 @@ class ReversibleAdjoint(AbstractAdjoint):
     """
 
     def run(self, loop: Loop, carry: Carry) -> tuple[Carry, Rows]:
-        """All steps of the loop from `carry`: its end, and the rows saved."""
+        """Run all steps of the loop from `carry`; return its end and all saved rows."""
         return _run((loop, carry))
 
 
@@ -57,9 +59,9 @@ def _run(arguments: tuple[Loop, Carry]) -> tuple[Carry, Rows]:
 @_run.def_fwd
 def _run_fwd(perturbed, arguments):
     del perturbed
-    # Not `_run`, which would refuse forward mode over this reverse mode.
+    # A call of `_run` would refuse forward mode over this reverse mode.
     carry, rows = DirectAdjoint().run(*arguments)
-    # Buffers stand for their shapes alone, and are not kept.
+    # The backward pass needs the shapes of the buffers alone, so these are not kept.
     shapes = jax.eval_shape(lambda: rows)
     return (carry, rows), (carry, shapes)
 
@@ -69,7 +71,7 @@ def _run_bwd(residuals, cotangents, perturbed, arguments):
     del perturbed
     (end, shapes), (loop, start) = residuals, arguments
     meter = eqx.filter(loop.meter, eqx.is_inexact_array)
-    loop = replace(loop, meter=NoProgressMeter())  # it has gone all the way already
+    loop = replace(loop, meter=NoProgressMeter())  # the forward pass has shown all
     cotangent, row_cotangents = cotangents
     cotangent = _filled(cotangent.step_state.state, end.step_state.state)
     row_cotangents = _filled(row_cotangents, shapes)
@@ -127,7 +129,11 @@ def _if_retraced(
     cotangents: PyTree[Array],
     gradient: PyTree[Array],
 ) -> PyTree[Array]:
-    """The gradient; NaN if the run failed or was not retraced, zero if nothing asks."""
+    """Return the gradient, or NaN if the run failed or could not be retraced.
+
+    A run counts as retraced if the state that was `reached` agrees with the `start`.
+    The gradient is zero where all cotangents are, since then nothing depends on it.
+    """
     manifold = system.manifold_of(start.q)
     xi = manifold.local(manifold.compose(manifold.inverse(start.q), reached.q))
     small = float(jnp.finfo(start.p.dtype).eps) ** 0.375
@@ -145,7 +151,10 @@ def _if_retraced(
 
 
 def _filled(cotangents: PyTree[Any], like: PyTree[Any]) -> PyTree[Any]:
-    """Cotangents with zeros where there are none, but for what is no number."""
+    """Fill in zeros for missing cotangents of arrays of inexact numbers.
+
+    The missing cotangents of other arrays, such as integers, stay None.
+    """
 
     def fill(cotangent, x):
         if cotangent is not None or x is None:
@@ -159,7 +168,7 @@ def _filled(cotangents: PyTree[Any], like: PyTree[Any]) -> PyTree[Any]:
 def step_back(
     stepping: Stepping, step_state: StepState, k: Int[Array, ""]
 ) -> StepState:
-    """What step k started from, if it led to `step_state`."""
+    """Compute the state that step k started from, given the one that it led to."""
     go_on = jnp.asarray(False)
 
     def back_from(step_state: StepState) -> StepState:
@@ -169,9 +178,10 @@ def step_back(
     if _retraces(stepping, step_state):
         return back_from(step_state)
 
-    # y is the step back from z, and z is moved by what the step from y misses
-    # `step_state` by. The two steps undo each other but for a small error, so that this
-    # contracts far faster than moving y would.
+    # Let y be the end of a step back from z. Each sweep moves z by the difference
+    # between `step_state` and the end of the step forward from y. The two steps undo
+    # each other up to a small error, so that this iteration contracts far faster than
+    # one that moves y would.
     target = step_state.state
     manifold = stepping.system.manifold_of(target.q)
     propagated = stepping.method.closure == "propagated"
@@ -198,7 +208,7 @@ def step_back(
 
 
 def _retraces(stepping: Stepping, step_state: StepState) -> bool:
-    """Whether a step of -h undoes one of h."""
+    """Tell whether a step of -h undoes a step of h, up to round-off."""
     system, method = stepping.system, stepping.method
     if not system.manifold_of(step_state.state.q).is_flat:
         return False

@@ -1,4 +1,4 @@
-"""The program of a run: its loop, what that saves, and the solution."""
+"""The compiled program of a run: its loop, what is saved of it, and the solution."""
 
 from functools import partial
 
@@ -37,9 +37,9 @@ def run(
     saveat: SaveAt,
     meter: AbstractProgressMeter,
 ) -> Solution:
-    """The solution, of arguments that have been checked."""
+    """Integrate with arguments that have been checked, and return the solution."""
     check_saved(saveat.fn, t0, y0, args)
-    # What user functions close over must be seen to be differentiated.
+    # Arrays that the user's functions close over become leaves, for derivatives.
     system = closure_converted(system, t0, y0, args)
     stepping = Stepping(system, method, stage_solver, t0, dt, args)
     ts, sampled = saveat.ts, None
@@ -88,7 +88,7 @@ def run(
 
 
 def _one(saved: PyTree[Array]) -> PyTree[Array]:
-    """A piece of the output that is saved at one time."""
+    """Make a piece of the output, with a time axis of length one, from one entry."""
     return jax.tree.map(lambda x: x[None], saved)
 
 
@@ -99,7 +99,7 @@ def _sample(
     k: Int[Array, ""],
     record: StepRecord,
 ) -> PyTree[Array]:
-    """What is saved at a time t inside of step k."""
+    """Compute what is saved at a time t that lies inside of step k."""
     system, method, h, args = (
         stepping.system,
         stepping.method,

@@ -16,13 +16,15 @@ from ._interpolation import step_position
 
 
 def save_state(t: FloatScalar, y: State, args: Any) -> State:
-    """Save the whole state."""
+    """Return the whole state `y`: the default of `fn` in `SaveAt`."""
     del t, args
     return y
 
 
 class SaveAt(eqx.Module):
-    """What to save of a trajectory, with diffrax's meanings.
+    """The choice of what `integrate` saves of a trajectory.
+
+    The options have the same meanings as those of `diffrax.SaveAt`.
 
     **Arguments:**
 
@@ -35,14 +37,15 @@ class SaveAt(eqx.Module):
     - `dense`: save the collocation polynomials for `Solution.evaluate`.
     - `fn`: save `fn(t, y, args)` instead of y.
 
-    The output has exactly as many entries as are saved. Thinned saving (`steps=k`) and
-    `ts` keep no buffer of the length of the run, unless `dense` does; samples are taken
-    after the run, from the records of the steps that contain them.
+    The output has exactly as many entries as are saved. Saving every k-th step
+    (`steps=k`) and saving at given times (`ts`) need no buffer of the length of the
+    run, unless `dense` asks for one. The samples at `ts` are computed after the run,
+    from the records of the steps that contain them.
 
     **Raises:** `ValueError` if nothing is saved, a flag is not a bool, `steps` is not a
     bool or an int >= 1, `ts` is not a sorted vector, or `ts` and `steps` are given
     together; `DTypeError` if `ts` is not real. `integrate` raises a `TypeError` if
-    `fn` returns what is no array.
+    `fn` returns something that is not an array or a tree of arrays.
 
     !!! example
 
@@ -103,7 +106,7 @@ class SaveAt(eqx.Module):
     def within(
         self, t0: FloatScalar, dt: FloatScalar, num_steps: int | IntScalar
     ) -> "SaveAt":
-        """This, checked against the run that it is for, with `ts` of its dtype."""
+        """Check the options against a run; return them with `ts` in the run's dtype."""
         if self.num_saved(num_steps) == 0 and not self.dense:
             raise ValueError(
                 f"SaveAt: `steps={self.steps}` saves nothing in a run of {num_steps} "
@@ -112,7 +115,8 @@ class SaveAt(eqx.Module):
         if self.ts is None:
             return self
         ts = self.ts.astype(dt.dtype)
-        # In units of steps, so that direction and dtype need no cases.
+        # Positions in units of steps make the checks the same for both directions of
+        # time and for all dtypes.
         position, inside = step_position(ts, t0, dt, known(num_steps))
         ts = require(
             ts,
@@ -122,19 +126,19 @@ class SaveAt(eqx.Module):
         return eqx.tree_at(lambda s: s.ts, self, ts)
 
     def num_saved(self, num_steps: int | IntScalar) -> int:
-        """The length of the output for a run of `num_steps` steps."""
+        """Return the number of entries of the output for a run of `num_steps` steps."""
         sampled = 0 if self.ts is None else self.ts.shape[0]
         strided = known(num_steps) // self.steps if self.steps else 0
         return self.t0 + sampled + strided + self.saves_end(num_steps)
 
     def saves_end(self, num_steps: int | IntScalar) -> bool:
-        """Whether the final state is saved on its own."""
+        """Tell whether `t1` adds an entry for a final state that `steps` leaves out."""
         last_is_saved = bool(self.steps) and known(num_steps) % self.steps == 0
         return self.t1 and not last_is_saved
 
 
 def stack_saved(pieces: list[PyTree[Array]]) -> PyTree[Array]:
-    """Join pieces that have a leading time axis."""
+    """Concatenate pieces of the output along their leading axis, the time axis."""
     if len(pieces) == 1:
         return pieces[0]
     return jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *pieces)

@@ -1,4 +1,4 @@
-"""What is saved of a run on the way, and where."""
+"""The buffers into which a run saves states and records of its steps."""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -16,16 +16,20 @@ from ._stepping import Taken
 
 
 class Rows(NamedTuple):
-    """What a step leaves to be saved, or the buffers of all that was."""
+    """The entries that one step saves, or the buffers with the entries of all steps.
+
+    - `saved`: the time and the value of `SaveAt(fn=...)`; None if steps save none.
+    - `record`: the record of the step for interpolation; None if none is kept.
+    """
 
     saved: PyTree[Array] | None
     record: StepRecord | None
 
 
 class RecordPlaces(NamedTuple):
-    """How many records of steps are kept, and in which row that of each step is.
+    """The number of step records that are kept, and the row of each step's record.
 
-    What is not kept is written to one row more than there are.
+    A record that is not kept is written to one extra row at the end of the buffer.
     """
 
     number: int
@@ -35,14 +39,14 @@ class RecordPlaces(NamedTuple):
 def record_places(
     dense: bool, sampled: Int[Array, " k"] | None, num_steps: int | Int[Array, ""]
 ) -> RecordPlaces:
-    """The places of records for dense output, or for samples in the given steps."""
+    """Find the places of the records for dense output or for the sampled steps."""
     if not dense and sampled is None:
         return RecordPlaces(0, None)
     length = known(num_steps)
     if dense or sampled is None:
         return RecordPlaces(length, jnp.arange(length + 1, dtype=jnp.int32))
-    # A row per sample, of which the first in a step is used: there may be more steps
-    # than samples, and more samples than steps.
+    # There is one row for each sample, and samples in the same step share the row of
+    # the first: there may be more steps than samples, and more samples than steps.
     number = sampled.shape[0]
     slots = jnp.full((length + 1,), number, jnp.int32)
     first = slots.at[sampled].min(jnp.arange(number, dtype=jnp.int32))
@@ -50,11 +54,12 @@ def record_places(
 
 
 class Saving(eqx.Module):
-    """What is saved: `fn` of the state after every `stride`-th step (0: of none), and
-    the records of some steps.
+    """The choice of what the steps of a run save, and the places where they save it.
 
-    `num_saved` is how many states that makes; it and `num_steps` are known where they
-    are needed.
+    A run saves the value of `fn` at the state after every `stride`-th step (after none
+    if `stride` is 0), which makes `num_saved` entries, and `num_records` records of
+    steps. `num_saved` and `num_steps` are Python's integers where their values are
+    needed during tracing.
     """
 
     fn: Callable[[FloatScalar, State, Args], PyTree[Array]]
@@ -65,13 +70,13 @@ class Saving(eqx.Module):
     record_slots: Int[Array, " num_steps+1"] | None
 
     def saved(self, t: FloatScalar, y: State, args: Args) -> PyTree[Array]:
-        """What is saved of a state: its time and `fn` of it."""
+        """Compute the entry that is saved of a state: its time, and `fn` at it."""
         return t, jax.tree.map(jnp.asarray, self.fn(t, y, args))
 
     def rows(
         self, t: FloatScalar, y: State, args: Args, taken: Taken, k: Int[Array, ""]
     ) -> Rows:
-        """What step k, which leads to the state y at t, leaves to be saved."""
+        """Compute the rows that step k saves, which leads to the state y at t."""
         return Rows(self._state_row(t, y, args, k), self._record_row(taken))
 
     def _state_row(
@@ -90,7 +95,8 @@ class Saving(eqx.Module):
     def _record_row(self, taken: Taken) -> StepRecord | None:
         if not self.num_records:
             return None
-        # At rest after a failure, so that dense output stays where it was.
+        # After a failure the records are those of a system at rest, so that dense
+        # output stays at the last good state.
         record, good = taken
         return StepRecord(
             record.start,
@@ -104,7 +110,10 @@ class Saving(eqx.Module):
         return jnp.where(kept, (k + 1) // self.stride - 1, self.num_saved)
 
     def empty(self, row: Rows) -> Rows:
-        """Buffers for all rows that are saved, and one more, from the shapes of one."""
+        """Make buffers of zeros for all rows that are saved, and for one more.
+
+        `row` is what one step saves; its arrays may be given by their shapes alone.
+        """
 
         def buffers(length, tree):
             return jax.tree.map(
@@ -116,7 +125,7 @@ class Saving(eqx.Module):
         )
 
     def write(self, buffers: Rows, rows: Rows, k: Int[Array, ""]) -> Rows:
-        """Write the rows of step k where they belong; k >= num_steps saves nothing."""
+        """Write the rows of step k to their places; save nothing if k >= num_steps."""
 
         def put(buffer, row, slot):
             return jax.tree.map(
@@ -134,7 +143,7 @@ class Saving(eqx.Module):
         return Rows(saved, records)
 
     def read(self, buffers: Rows, k: Int[Array, ""]) -> Rows:
-        """The rows of step k in buffers of all rows, where `write` puts them."""
+        """Read the rows of step k from the buffers, from where `write` puts them."""
 
         def get(buffer, slot):
             return jax.tree.map(lambda x: x[slot], buffer)

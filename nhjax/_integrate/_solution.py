@@ -14,24 +14,31 @@ from ._interpolation import DenseInterpolation
 
 
 class Solution(eqx.Module):
-    """The outcome of `nhjax.integrate`.
+    """The outcome of `nhjax.integrate`: what was saved, and how the run went.
 
-    - `t0`, `t1`: first and last time.
-    - `ts`: the times at which output was saved, shape (k,); None if nothing was.
-    - `ys`: the saved states, a `State` with leading axis k, or whatever
-        `SaveAt(fn=...)` returned, stacked; None if nothing was.
-    - `stats`: `num_steps` (steps completed), `num_iterations` (of the nonlinear solver,
-        in all), `num_newton_steps` (steps that the solver's own iteration did not solve
-        and Newton's method had to), `max_residual` (of the stage equations, relative
-        to the momenta),
-        `max_constraint_violation` (|Φ| at the nodes, the first included),
-        `max_multiplier_defect` (|Λ^s - λ_c|, how far the last stage multiplier of a
-        step is from the continuous one), `failed_step` (index of the step that
-        failed, -1 if none).
-    - `result`: a `RESULTS`.
-    - `interpolation`: the collocation polynomials, with `SaveAt(dense=True)`.
+    - `t0`, `t1`: the first and the last time of the run.
+    - `ts`: the times at which output was saved, of shape (k,); None if only dense
+        output was.
+    - `ys`: the saved states, a `State` with a leading axis of length k, or what
+        `SaveAt(fn=...)` returned, stacked along such an axis; None where `ts` is.
+    - `stats`: a dictionary of numbers about the run:
+        `num_steps` (how many steps were completed),
+        `num_iterations` (how many iterations the stage solver made in all),
+        `num_newton_steps` (how many steps the stage solver's own iteration did not
+        solve, so that Newton's method had to),
+        `max_residual` (the largest residual of the stage equations, relative to the
+        momenta),
+        `max_constraint_violation` (the largest |Φ| at the nodes, the initial state
+        included),
+        `max_multiplier_defect` (the largest |Λ^s - λ_c|, the distance of the last stage
+        multiplier of a step from the continuous multiplier), and
+        `failed_step` (the index of the step that failed, -1 if none did).
+    - `result`: a member of `nhjax.RESULTS`, which says how the run ended.
+    - `interpolation`: the collocation polynomials, with `SaveAt(dense=True)`; None
+        without.
 
-    Under `vmap` every array has the batch as leading axis; a batch member is a lane.
+    Under `vmap` every array has the batch as its leading axis; a member of the batch is
+    called a lane.
     """
 
     t0: Float[Array, ""]
@@ -44,14 +51,16 @@ class Solution(eqx.Module):
     interpolation: DenseInterpolation | None
 
     def evaluate(self, t: FloatScalarLike) -> State:
-        """The state at any time of the run, by the collocation polynomials.
+        """Compute the state at any time of the run, by the collocation polynomials.
 
-        q(t) is the paper's continuous polynomial u(t), p(t) the mixed one v(t) of its
-        Proposition on continuous approximation; v(t) follows from p(t) by the Legendre
-        transform, and λ(t) is the continuous multiplier there (of a propagated
-        multiplier, the polynomial through the Λ^i). At the nodes they are the states.
-        Inside a step the error is O(h^s) in q, v and p, one order better in p and v if
-        no force depends on the velocity.
+        The configuration q(t) is the paper's continuous polynomial u(t), and the
+        momentum p(t) is the mixed polynomial v(t) of its Proposition on continuous
+        approximation. The velocity v(t) follows from p(t) by the Legendre transform.
+        The multiplier λ(t) is the continuous multiplier at that state; with the
+        propagated closure it is the polynomial through the stage multipliers Λ^i.
+        At the ends of the steps the result is the state that `integrate` computed.
+        Inside a step the error is O(h^s) in q, v and p, and one order better in p and v
+        if no force depends on the velocity.
 
         **Arguments:**
 
@@ -80,10 +89,11 @@ class Solution(eqx.Module):
         return self.interpolation.evaluate(t)
 
     def failures(self) -> list[tuple[int | tuple[int, ...] | None, int, str]]:
-        """The failed lanes as (lane, step, reason).
+        """List the runs that failed, each as (lane, step, reason).
 
-        `lane` is None without a batch, an index into a batch, and a tuple of indices
-        into a batch of batches.
+        `step` is the index of the step that could not be taken, and `reason` the
+        message of its `RESULTS`. `lane` is None for a solution without a batch, an
+        index for a batch, and a tuple of indices for a batch of batches.
         """
         codes, steps = self.result._value, self.stats["failed_step"]
         if is_traced(codes, steps):
@@ -95,7 +105,7 @@ class Solution(eqx.Module):
 
 
 def is_unsolved(sol: Solution) -> bool:
-    """Whether a single run has ended because a step could not be solved."""
+    """Tell whether a run without a batch ended because a step could not be solved."""
     unsolved = (
         RESULTS.nonlinear_divergence,
         RESULTS.nonlinear_max_iterations,
@@ -105,7 +115,7 @@ def is_unsolved(sol: Solution) -> bool:
 
 
 def raise_failures(sol: Solution) -> Solution:
-    """`sol`, or an `IntegrationError` that names lane, step and reason."""
+    """Return `sol`, or raise an `IntegrationError` with lane, step and reason."""
     codes, steps = sol.result._value, sol.stats["failed_step"]
     bad = codes != _messages().index("")
     if is_traced(codes, steps):
@@ -146,8 +156,8 @@ def _failure_message(
 
 @functools.cache
 def _messages() -> list[str]:
-    """The messages of `RESULTS` in the order of their codes."""
-    # Items are arrays, and their codes are needed on the host.
+    """List the messages of `RESULTS` in the order of their integer codes."""
+    # The items are arrays of JAX, while their codes are needed as Python's integers.
     items = [
         RESULTS.successful,
         RESULTS.nonlinear_divergence,

@@ -1,4 +1,4 @@
-"""What a run counts and measures on the way, and reports as `Solution.stats`."""
+"""The numbers that a run collects step by step and reports as `Solution.stats`."""
 
 from typing import Any, TypeAlias
 
@@ -13,7 +13,13 @@ Statistics: TypeAlias = dict[str, Any]
 
 
 def first_statistics(violation: FloatScalar, is_good: BoolScalar) -> Statistics:
-    """The statistics before the first step, where the constraints are violated so."""
+    """Make the statistics of a run before its first step.
+
+    **Arguments:**
+
+    - `violation`: the largest constraint violation of the initial state.
+    - `is_good`: whether the run can start; otherwise step 0 counts as failed.
+    """
     zero, none = jnp.zeros_like(violation), jnp.zeros((), jnp.int32)
     return {
         "num_steps": none,
@@ -33,7 +39,16 @@ def updated_statistics(
     good: BoolScalar,
     k: Int[Array, ""],
 ) -> Statistics:
-    """The statistics after step k, which was taken if `alive` and solved if `good`."""
+    """Update the statistics of a run after its step k.
+
+    **Arguments:**
+
+    - `stats`: the statistics before the step.
+    - `outcome`: the outcome of the step.
+    - `alive`: whether the run had not failed before, so that the step was taken.
+    - `good`: whether the step was taken and solved.
+    - `k`: the index of the step.
+    """
 
     def larger(name, value):
         return jnp.where(good, jnp.maximum(stats[name], value), stats[name])

@@ -1,4 +1,4 @@
-"""One step of a mechanical system, for time loops of a user's own."""
+"""The function `nhjax.step`, for users who write their own time loop."""
 
 import jax
 import jax.numpy as jnp
@@ -22,14 +22,14 @@ def step(
     stage_solver: AbstractStageSolver = SimplifiedNewton(),
     throw: bool = True,
 ) -> State:
-    """One step of size `dt` from the state `y` at `t` to the state at `t + dt`.
+    """Take one step of size `dt`, from the state `y` at `t` to the state at `t + dt`.
 
-    It solves the discrete equations of the paper (its four summaries), as `integrate`
-    with `num_steps=1` does, with the same result to the last bit. It is for control
-    loops, environments and time loops that `integrate` does not offer; it works under
-    `jit`, `vmap`, `grad`, `jvp`, `hessian` and inside of `jax.lax.scan`. Over many
-    steps `integrate` is faster, and rounds less: it sums q and p with a compensation
-    that a state does not hold.
+    The step solves the discrete equations of the paper (its four summaries), and its
+    result is the same to the last bit as that of `integrate` with `num_steps=1`. Use it
+    for control loops, environments and other time loops that `integrate` does not
+    offer. It works under `jit`, `vmap`, `grad`, `jvp`, `hessian` and inside of
+    `jax.lax.scan`. Over many steps `integrate` is faster and its rounding errors are
+    smaller, because it sums q and p with a compensation that a `State` does not hold.
 
     **Arguments:**
 

@@ -1,4 +1,4 @@
-"""From step to step: what is carried, and how one step follows from another."""
+"""The steps of a run: what is carried from one to the next, and how each is taken."""
 
 from typing import NamedTuple
 
@@ -32,7 +32,10 @@ from ._statistics import first_statistics, Statistics, updated_statistics
 
 
 class Carry(NamedTuple):
-    """What goes from step to step; of it `step_state` alone has derivatives."""
+    """The data that the time loop carries from one step to the next.
+
+    Derivatives pass through `step_state` alone.
+    """
 
     step_state: StepState
     result: RESULTS
@@ -40,14 +43,14 @@ class Carry(NamedTuple):
 
 
 class Taken(NamedTuple):
-    """A step that was taken: its record, and whether it was solved."""
+    """The record of a step that was taken, and whether the step was solved."""
 
     record: StepRecord
     good: BoolScalar
 
 
 class Stepping(eqx.Module):
-    """The equations of a run, and its steps one by one."""
+    """The system, method and options of a run, with functions that take its steps."""
 
     system: AbstractMechanicalSystem
     method: AbstractMethod = eqx.field(static=True)
@@ -57,11 +60,11 @@ class Stepping(eqx.Module):
     args: Args
 
     def time(self, k: Int[Array, ""] | int) -> FloatScalar:
-        """t_k by a product: a running sum of dt would drift."""
+        """Compute the time t_k as a product, since a running sum of dt would drift."""
         return self.t0 + jnp.asarray(k, self.dt.dtype) * self.dt
 
     def start(self, y0: State) -> Carry:
-        """The carry before the first step."""
+        """Make the carry of the time loop before the first step."""
         system, t, args = self.system, self.t0, self.args
         step_state = first_step_state(system, self.method, t, y0, args)
         result = RESULTS.where(
@@ -77,13 +80,13 @@ class Stepping(eqx.Module):
     def one_step(
         self, step_state: StepState, t: FloatScalar, h: FloatScalar, skip: BoolScalar
     ) -> StepOutcome:
-        """One step of size h from t, forward or back."""
+        """Take one step of size h from t; h may be negative, to go back."""
         start = step_state.differentiated_in_state()
         arguments = StepArguments(self.system, t, h, start, self.args)
         return primitive_step(arguments, self.method, self.stage_solver, skip)
 
     def advance(self, carry: Carry, k: Int[Array, ""]) -> tuple[Carry, Taken]:
-        """Step k; a failed trajectory keeps its last good state."""
+        """Take step k; a trajectory that has failed keeps its last good state."""
         alive = carry.result == RESULTS.successful
         outcome = self.one_step(carry.step_state, self.time(k), self.dt, ~alive)
         good = alive & (outcome.result == RESULTS.successful)
@@ -101,10 +104,12 @@ class Stepping(eqx.Module):
 def _is_consistent(
     system: AbstractMechanicalSystem, t: FloatScalar, start: StepState, args: Args
 ) -> BoolScalar:
-    """Whether Φ = 0 and v, p belong together at the start, but for small errors.
+    """Tell whether the initial state is consistent, up to small errors.
 
-    The bound is to find a state of another system, or one changed by hand in one part;
-    it lets pass the perturbations by which derivatives are approximated.
+    It is if it lies on the group, satisfies the constraints, and its v and p belong
+    together by the Legendre transform. The bound on the errors is meant to find a state
+    of another system, or one of which a single part was changed by hand. It is large
+    enough for the perturbations by which derivatives are approximated.
     """
     y, lin = start.state, start.lin
     small = float(jnp.finfo(y.p.dtype).eps) ** 0.25

@@ -21,124 +21,137 @@ class AbstractLieGroup(eqx.Module):
     configuration (paper, section 5). Velocities and momenta are left-trivialised, that
     is, vectors of 𝔤 and 𝔤*.
 
-    A group of one's own is a subclass with `dim`, `identity`, `check`, `compose`,
-    `inverse`, `retract` and `local`; everything else follows from these by automatic
-    differentiation, and may be overridden with closed forms. An element is a pytree of
-    arrays; τ and its inverse must satisfy τ(0) = e and dτ_0 = I.
+    To define a group of your own, write a subclass with `dim`, `identity`, `check`,
+    `compose`, `inverse`, `retract` and `local`. Everything else follows from these by
+    automatic differentiation, and may be overridden with closed forms. An element is a
+    pytree of arrays; the retraction must satisfy τ(0) = e and dτ_0 = I.
     """
 
     @property
     @abstractmethod
     def dim(self) -> int:
-        """The dimension n of the group."""
+        """Return the dimension n of the group."""
 
     @abstractmethod
     def identity(self, dtype: DTypeLike | None = None) -> Element:
-        """The identity e."""
+        """Return the identity element e."""
 
     @abstractmethod
     def check(self, q: Element, name: str = "q") -> Element:
-        """`q`, or a `ShapeError` if it cannot be an element; `name` is for messages."""
+        """Return `q`, or raise a `ShapeError` if it cannot be an element.
+
+        The message of the error calls it `name`.
+        """
 
     @abstractmethod
     def compose(self, g: Element, h: Element) -> Element:
-        """The product g h."""
+        """Compute the product g h of two elements."""
 
     @abstractmethod
     def inverse(self, g: Element) -> Element:
-        """g⁻¹."""
+        """Compute the inverse element g⁻¹."""
 
     @abstractmethod
     def retract(self, xi: Vector) -> Element:
-        """τ(ξ)."""
+        """Compute the element τ(ξ) from a vector ξ of the Lie algebra."""
 
     @abstractmethod
     def local(self, g: Element) -> Vector:
-        """τ⁻¹(g), for g near the identity."""
+        """Compute τ⁻¹(g), the vector ξ with τ(ξ) = g, for g near the identity."""
 
     @property
     def is_flat(self) -> bool:
-        """Whether dτ = I and Ad = I everywhere, so that nobody need apply them."""
+        """Tell whether dτ = I and Ad = I everywhere, as on a vector space.
+
+        The equations of a step then leave them out.
+        """
         return False
 
     def in_chart(self, xi: Vector) -> BoolScalar:
-        """Whether τ is invertible around ξ, with a margin."""
+        """Tell whether τ is invertible around ξ, with a margin."""
         return jnp.asarray(True)
 
     def distance_to_group(self, q: Element) -> FloatScalar:
-        """How far the array `q` is from the group."""
+        """Compute the distance of the numbers in `q` to the group."""
         return jnp.zeros((), _dtype(q))
 
     def normalise(self, q: Element) -> Element:
-        """The element nearest to `q`."""
+        """Return the element of the group that is nearest to `q`."""
         return q
 
-    # Nothing of the library needs these two, and the maps of a group do not determine
-    # them: a group of a user's own may do without.
+    # Nothing in the library needs the two methods below, and the maps of a group do not
+    # determine them: a user's own group need not have them.
 
     def matrix(self, g: Element) -> Float[Array, "k k"]:
-        """g as a matrix."""
+        """Return the matrix that represents the element g."""
         raise NotImplementedError(_no_matrix(self, "matrix"))
 
     def hat(self, xi: Vector) -> Float[Array, "k k"]:
-        """ξ^, the matrix of a vector of the Lie algebra."""
+        """Return ξ^, the matrix that represents a vector of the Lie algebra."""
         raise NotImplementedError(_no_matrix(self, "hat"))
 
     def act(self, g: Element, xi: Vector) -> Element:
-        """g τ(ξ)."""
+        """Compute g τ(ξ), the element that ξ leads to from g."""
         return self.compose(g, self.retract(xi))
 
     def no_compensation(self, q: Element) -> Element:
-        """The compensation to start `advance` from."""
+        """Return the compensation to start `advance` from, which is zero."""
         return jax.tree.map(jnp.zeros_like, q)
 
     def advance(
         self, q: Element, xi: Vector, compensation: Element
     ) -> tuple[Element, Element]:
-        """g τ(ξ), with the rounding error of the sum carried in `compensation`."""
+        """Compute g τ(ξ) and its compensation, the rounding error of the sum so far.
+
+        The compensation is added in the next call, so that rounding errors do not add
+        up over many steps. A group without such a sum returns it unchanged.
+        """
         return self.act(q, xi), compensation
 
     def tangent(self, g: Element, eta: Vector) -> Element:
-        """T L_g η: the derivative of ε -> g τ(εη) at ε = 0, shaped like g."""
+        """Compute T L_g η, the derivative of ε -> g τ(εη) at ε = 0, shaped like g."""
         return _jvp(lambda z: self.act(g, z), jnp.zeros_like(eta), eta)
 
     def left_gradient(self, function: Callable[[Element], Array], q: Element) -> Vector:
-        """L_g^* D f(g), the derivative along ξ -> g τ(ξ) at ξ = 0."""
+        """Compute L_g^* D f(g), the gradient of ξ -> f(g τ(ξ)) at ξ = 0."""
         zero = jnp.zeros(self.dim, _dtype(q))
         return transpose(lambda eta: self.tangent(q, eta), zero)(jax.grad(function)(q))
 
     def dtau(self, xi: Vector, eta: Vector) -> Vector:
-        """dτ_ξ η, the left-trivialised tangent: D τ(ξ) η = τ(ξ) (dτ_ξ η)^."""
+        """Compute dτ_ξ η, the left-trivialised tangent: D τ(ξ) η = τ(ξ) (dτ_ξ η)^."""
         back = self.inverse(self.retract(xi))
         return _jvp(lambda z: self.local(self.compose(back, self.retract(z))), xi, eta)
 
     def dtau_inv(self, xi: Vector, eta: Vector) -> Vector:
-        """dτ_ξ⁻¹ η."""
+        """Compute dτ_ξ⁻¹ η, the inverse of the left-trivialised tangent."""
         columns = jax.vmap(lambda e: self.dtau(xi, e), out_axes=1)
         return jnp.linalg.solve(columns(jnp.eye(self.dim, dtype=xi.dtype)), eta)
 
     def ddtau(self, xi: Vector, eta: Vector, delta: Vector) -> Vector:
-        """ddτ_ξ(η, δ), the second tangent: ∂_ξ(dτ_ξ η) δ = dτ_ξ ddτ_ξ(η, δ)."""
-        # Differentiate dτ_ξ⁻¹ y = η at y = dτ_ξ η. The inverse is the simpler one: for
-        # Cayley's map it is a polynomial.
+        """Compute the second tangent ddτ_ξ(η, δ) of τ.
+
+        It is defined by ∂_ξ(dτ_ξ η) δ = dτ_ξ ddτ_ξ(η, δ).
+        """
+        # This differentiates dτ_ξ⁻¹ y = η at y = dτ_ξ η. The inverse is simpler than
+        # dτ: for Cayley's map it is a polynomial.
         y = self.dtau(xi, eta)
         return -_jvp(lambda z: self.dtau_inv(z, y), xi, delta)
 
     def dtau_dual(self, xi: Vector, mu: Vector) -> Vector:
-        """dτ_ξ^* μ: ⟨dτ_ξ^* μ, η⟩ = ⟨μ, dτ_ξ η⟩."""
+        """Compute dτ_ξ^* μ, for which ⟨dτ_ξ^* μ, η⟩ = ⟨μ, dτ_ξ η⟩."""
         return transpose(lambda eta: self.dtau(xi, eta), mu)(mu)
 
     def dtau_inv_dual(self, xi: Vector, mu: Vector) -> Vector:
-        """(dτ_ξ⁻¹)^* μ."""
+        """Compute (dτ_ξ⁻¹)^* μ, the dual of `dtau_inv`."""
         return transpose(lambda eta: self.dtau_inv(xi, eta), mu)(mu)
 
     def ddtau_dual(self, xi: Vector, eta: Vector, mu: Vector) -> Vector:
-        """(ddτ_ξ(η, ·))^* μ: its pairing with δ is ⟨μ, ddτ_ξ(η, δ)⟩."""
+        """Compute (ddτ_ξ(η, ·))^* μ, whose pairing with δ is ⟨μ, ddτ_ξ(η, δ)⟩."""
         y = self.dtau(xi, eta)
         return transpose(lambda z: -self.dtau_inv(z, y), xi)(mu)
 
     def Ad(self, g: Element, eta: Vector) -> Vector:
-        """Ad_g η = g η g⁻¹."""
+        """Compute Ad_g η = g η g⁻¹, the adjoint action of the group."""
         back = self.inverse(g)
 
         def conjugate(z):
@@ -147,40 +160,40 @@ class AbstractLieGroup(eqx.Module):
         return _jvp(conjugate, jnp.zeros_like(eta), eta)
 
     def ad(self, xi: Vector, eta: Vector) -> Vector:
-        """ad_ξ η = [ξ, η]."""
+        """Compute ad_ξ η = [ξ, η], the bracket of the Lie algebra."""
         return _jvp(lambda z: self.Ad(self.retract(z), eta), jnp.zeros_like(xi), xi)
 
     def Ad_dual(self, g: Element, mu: Vector) -> Vector:
-        """Ad_g^* μ: ⟨Ad_g^* μ, η⟩ = ⟨μ, Ad_g η⟩."""
+        """Compute Ad_g^* μ, for which ⟨Ad_g^* μ, η⟩ = ⟨μ, Ad_g η⟩."""
         return transpose(lambda eta: self.Ad(g, eta), mu)(mu)
 
     def to_end(self, xi: Vector, mu: Vector) -> Vector:
-        """Ad_{τ(ξ)}^* μ: a covector at g, seen at g τ(ξ)."""
+        """Compute Ad_{τ(ξ)}^* μ: carry a covector from g to g τ(ξ)."""
         return self.Ad_dual(self.retract(xi), mu)
 
     def to_end_change(self, xi: Vector, mu: Vector) -> Vector:
-        """Ad_{τ(ξ)}^* μ - μ; a group that can do so gives it without cancellation."""
+        """Compute Ad_{τ(ξ)}^* μ - μ; subclasses may do so without cancellation."""
         return self.to_end(xi, mu) - mu
 
     def to_start(self, xi: Vector, mu: Vector) -> Vector:
-        """Ad_{τ(ξ)⁻¹}^* μ: a covector at g τ(ξ), seen at g."""
+        """Compute Ad_{τ(ξ)⁻¹}^* μ: carry a covector from g τ(ξ) to g."""
         return self.Ad_dual(self.inverse(self.retract(xi)), mu)
 
     def ad_dual(self, xi: Vector, mu: Vector) -> Vector:
-        """ad_ξ^* μ: ⟨ad_ξ^* μ, η⟩ = ⟨μ, ad_ξ η⟩."""
+        """Compute ad_ξ^* μ, for which ⟨ad_ξ^* μ, η⟩ = ⟨μ, ad_ξ η⟩."""
         return transpose(lambda eta: self.ad(xi, eta), mu)(mu)
 
 
 def transpose(
     function: Callable[[Vector], PyTree[Array]], at: Vector
 ) -> Callable[[PyTree[Array]], Vector]:
-    """The transposed derivative of `function` at a vector."""
+    """Return the transpose of the derivative of a function at a vector."""
     _, pullback = jax.vjp(function, at)
     return lambda covector: pullback(covector)[0]
 
 
 def check_shape(q: Element, shape: tuple[int, ...], group: str, name: str) -> Element:
-    """`q`, or a `ShapeError` if it is not one array of this shape."""
+    """Return `q`, or raise a `ShapeError` unless it is one array of this shape."""
     if isinstance(q, (tuple, list, dict)):
         raise ShapeError(
             f"`{name}` is {eqx.tree_pformat(q)}, but the manifold {group} needs an "

@@ -34,94 +34,94 @@ class Euclidean(AbstractLieGroup):
 
     @property
     def dim(self) -> int:
-        """The dimension n."""
+        """Return the dimension n of the space."""
         return self.n
 
     @property
     def is_flat(self) -> bool:
-        """True: dτ and Ad are identities."""
+        """Return True, because dτ and Ad are identities here."""
         return True
 
     def identity(self, dtype: DTypeLike | None = None) -> Point:
-        """The zero vector."""
+        """Return the zero vector, which is the identity of the group."""
         return jnp.zeros(self.n, dtype)
 
     def check(self, q: Point, name: str = "q") -> Point:
-        """`q`, or a `ShapeError` if it is not of shape (n,)."""
+        """Return `q`, or raise a `ShapeError` if it is not of shape (n,)."""
         return check_shape(q, (self.n,), f"Euclidean({self.n})", name)
 
     def compose(self, g: Point, h: Point) -> Point:
-        """The sum g + h."""
+        """Compute the sum g + h, which is the product of the group."""
         return g + h
 
     def inverse(self, g: Point) -> Point:
-        """-g."""
+        """Compute -g, the inverse of g in the group."""
         return -g
 
     def retract(self, xi: Vector) -> Point:
-        """ξ."""
+        """Return ξ, because the retraction is the identity."""
         return xi
 
     def local(self, g: Point) -> Vector:
-        """g."""
+        """Return g, because the retraction is the identity."""
         return g
 
     def advance(self, q: Point, xi: Vector, compensation: Point) -> tuple[Point, Point]:
-        """The point q + ξ by compensated summation."""
+        """Compute the point q + ξ by compensated summation."""
         return two_sum(q, xi + compensation)
 
     def matrix(self, g: Point) -> Float[Array, "n+1 n+1"]:
-        """The translation by g, in homogeneous coordinates."""
+        """Return the matrix of the translation by g in homogeneous coordinates."""
         return homogeneous(jnp.eye(self.n, dtype=g.dtype), g, 1.0)
 
     def hat(self, xi: Vector) -> Float[Array, "n+1 n+1"]:
-        """ξ as the last column of a matrix."""
+        """Return the matrix of ξ, which has ξ as its last column."""
         return homogeneous(jnp.zeros((self.n, self.n), xi.dtype), xi, 0.0)
 
     def tangent(self, g: Point, eta: Vector) -> Point:
-        """η."""
+        """Return η, because the tangent of a translation is the identity."""
         return eta
 
     def dtau(self, xi: Vector, eta: Vector) -> Vector:
-        """η."""
+        """Return η, because dτ is the identity."""
         return eta
 
     def dtau_inv(self, xi: Vector, eta: Vector) -> Vector:
-        """η."""
+        """Return η, because dτ⁻¹ is the identity."""
         return eta
 
     def ddtau(self, xi: Vector, eta: Vector, delta: Vector) -> Vector:
-        """Zero."""
+        """Return zero, because dτ is constant."""
         return jnp.zeros_like(eta)
 
     def dtau_dual(self, xi: Vector, mu: Vector) -> Vector:
-        """μ."""
+        """Return μ, because dτ is the identity."""
         return mu
 
     def dtau_inv_dual(self, xi: Vector, mu: Vector) -> Vector:
-        """μ."""
+        """Return μ, because dτ⁻¹ is the identity."""
         return mu
 
     def ddtau_dual(self, xi: Vector, eta: Vector, mu: Vector) -> Vector:
-        """Zero."""
+        """Return zero, because dτ is constant."""
         return jnp.zeros_like(mu)
 
     def Ad(self, g: Point, eta: Vector) -> Vector:
-        """η."""
+        """Return η, because the group is commutative."""
         return eta
 
     def Ad_dual(self, g: Point, mu: Vector) -> Vector:
-        """μ."""
+        """Return μ, because the group is commutative."""
         return mu
 
     def to_end_change(self, xi: Vector, mu: Vector) -> Vector:
-        """0."""
+        """Return zero, because Ad^* is the identity."""
         return jnp.zeros_like(mu)
 
     def ad(self, xi: Vector, eta: Vector) -> Vector:
-        """Zero."""
+        """Return zero, because the group is commutative."""
         return jnp.zeros_like(eta)
 
     def ad_dual(self, xi: Vector, mu: Vector) -> Vector:
-        """Zero."""
+        """Return zero, because the group is commutative."""
         return jnp.zeros_like(mu)

@@ -3,10 +3,10 @@ from jaxtyping import Array, Float
 
 
 def turn(v: Float[Array, "2 ..."]) -> Float[Array, "2 ..."]:
-    """J v, the quarter turn of a vector of the plane (of the columns of a matrix)."""
+    """Compute J v, a vector of the plane (or the columns of a matrix) turned by π/2."""
     return jnp.concatenate([-v[1:], v[:1]])
 
 
 def rotate(angle: Float[Array, ""], v: Float[Array, "2"]) -> Float[Array, "2"]:
-    """v turned by an angle."""
+    """Turn a vector v of the plane by an angle."""
     return jnp.cos(angle) * v + jnp.sin(angle) * turn(v)

@@ -17,10 +17,11 @@ Vector = Float[Array, " n"]
 
 
 class ProductGroup(AbstractLieGroup):
-    """The direct product of groups: a tuple of elements, factor by factor.
+    """The direct product of Lie groups, which are its factors.
 
-    Vectors of the Lie algebra and its dual are those of the factors, concatenated.
-    Factors may themselves be products.
+    An element is a tuple of elements, one for each factor. Vectors of the Lie algebra
+    and of its dual are those of the factors, concatenated. Factors may themselves be
+    products.
 
     **Arguments:**
 
@@ -52,20 +53,20 @@ class ProductGroup(AbstractLieGroup):
 
     @property
     def dim(self) -> int:
-        """The sum of the dimensions."""
+        """Return the dimension of the product, the sum of those of the factors."""
         return sum(group.dim for group in self.factors)
 
     @property
     def is_flat(self) -> bool:
-        """Whether all factors are flat."""
+        """Tell whether all factors are flat."""
         return all(group.is_flat for group in self.factors)
 
     def identity(self, dtype: DTypeLike | None = None) -> Element:
-        """The tuple of identities."""
+        """Return the tuple of the factors' identities."""
         return tuple(group.identity(dtype) for group in self.factors)
 
     def check(self, q: Element, name: str = "q") -> Element:
-        """`q`, or a `ShapeError` if it is not a tuple of the factors' elements."""
+        """Return `q`, or raise a `ShapeError` unless it is a tuple of elements."""
         if not isinstance(q, tuple) or len(q) != len(self.factors):
             kinds = ", ".join(type(group).__name__ for group in self.factors)
             raise ShapeError(
@@ -77,122 +78,122 @@ class ProductGroup(AbstractLieGroup):
         return q
 
     def in_chart(self, xi: Vector) -> BoolScalar:
-        """Whether every factor is in its chart."""
+        """Tell whether the vector of every factor lies in that factor's chart."""
         return reduce(
             jnp.logical_and, self._each(lambda group, x: group.in_chart(x), xi)
         )
 
     def distance_to_group(self, q: Element) -> FloatScalar:
-        """The largest of the factors' defects."""
+        """Compute the largest distance of a part of `q` to its factor."""
         return reduce(
             jnp.maximum, self._each(lambda group, g: group.distance_to_group(g), q)
         )
 
     def normalise(self, q: Element) -> Element:
-        """Every factor normalised."""
+        """Normalise the part of every factor."""
         return self._tuple(lambda group, g: group.normalise(g), q)
 
     def compose(self, g: Element, h: Element) -> Element:
-        """The tuple of products."""
+        """Compute the tuple of the factors' products."""
         return self._tuple(lambda group, g, h: group.compose(g, h), g, h)
 
     def inverse(self, g: Element) -> Element:
-        """The tuple of inverses."""
+        """Compute the tuple of the factors' inverses."""
         return self._tuple(lambda group, g: group.inverse(g), g)
 
     def retract(self, xi: Vector) -> Element:
-        """The tuple of retractions."""
+        """Compute the tuple of the factors' τ(ξ)."""
         return self._tuple(lambda group, x: group.retract(x), xi)
 
     def local(self, g: Element) -> Vector:
-        """The factors' τ⁻¹."""
+        """Compute the concatenated vectors τ⁻¹(g) of the factors."""
         return self._vector(lambda group, g: group.local(g), g)
 
     def act(self, g: Element, xi: Vector) -> Element:
-        """The tuple of g τ(ξ)."""
+        """Compute the tuple of the factors' g τ(ξ)."""
         return self._tuple(lambda group, g, x: group.act(g, x), g, xi)
 
     def no_compensation(self, q: Element) -> Element:
-        """The factors' compensations."""
+        """Return the tuple of the compensations to start `advance` from."""
         return self._tuple(lambda group, g: group.no_compensation(g), q)
 
     def advance(
         self, q: Element, xi: Vector, compensation: Element
     ) -> tuple[Element, Element]:
-        """Every factor advanced."""
+        """Advance the part of every factor, with its own compensation."""
         pairs = self._each(
             lambda group, g, x, c: group.advance(g, x, c), q, xi, compensation
         )
         return tuple(g for g, _ in pairs), tuple(c for _, c in pairs)
 
     def matrix(self, g: Element) -> Float[Array, "k k"]:
-        """The factors' matrices as blocks."""
+        """Return the block-diagonal matrix of the factors' matrices of g."""
         return block_diag(*self._each(lambda group, g: group.matrix(g), g))
 
     def hat(self, xi: Vector) -> Float[Array, "k k"]:
-        """The factors' matrices as blocks."""
+        """Return the block-diagonal matrix of the factors' matrices ξ^."""
         return block_diag(*self._each(lambda group, x: group.hat(x), xi))
 
     def tangent(self, g: Element, eta: Vector) -> Element:
-        """The tuple of tangents."""
+        """Compute the tuple of the factors' tangents T L_g η."""
         return self._tuple(lambda group, g, y: group.tangent(g, y), g, eta)
 
     def dtau(self, xi: Vector, eta: Vector) -> Vector:
-        """The factors' dτ."""
+        """Apply the dτ of every factor, to its parts of the vectors."""
         return self._vector(lambda group, x, y: group.dtau(x, y), xi, eta)
 
     def dtau_inv(self, xi: Vector, eta: Vector) -> Vector:
-        """The factors' dτ⁻¹."""
+        """Apply the dτ⁻¹ of every factor, to its parts of the vectors."""
         return self._vector(lambda group, x, y: group.dtau_inv(x, y), xi, eta)
 
     def ddtau(self, xi: Vector, eta: Vector, delta: Vector) -> Vector:
-        """The factors' ddτ."""
+        """Apply the ddτ of every factor, to its parts of the vectors."""
         return self._vector(lambda group, x, y, d: group.ddtau(x, y, d), xi, eta, delta)
 
     def dtau_dual(self, xi: Vector, mu: Vector) -> Vector:
-        """The factors' dτ^*."""
+        """Apply the dτ^* of every factor, to its parts of the vectors."""
         return self._vector(lambda group, x, m: group.dtau_dual(x, m), xi, mu)
 
     def dtau_inv_dual(self, xi: Vector, mu: Vector) -> Vector:
-        """The factors' (dτ⁻¹)^*."""
+        """Apply the (dτ⁻¹)^* of every factor, to its parts of the vectors."""
         return self._vector(lambda group, x, m: group.dtau_inv_dual(x, m), xi, mu)
 
     def ddtau_dual(self, xi: Vector, eta: Vector, mu: Vector) -> Vector:
-        """The factors' ddτ^*."""
+        """Apply the ddτ^* of every factor, to its parts of the vectors."""
         return self._vector(
             lambda group, x, y, m: group.ddtau_dual(x, y, m), xi, eta, mu
         )
 
     def Ad(self, g: Element, eta: Vector) -> Vector:
-        """The factors' Ad."""
+        """Apply the Ad_g of every factor, to its part of the vector."""
         return self._vector(lambda group, g, y: group.Ad(g, y), g, eta)
 
     def Ad_dual(self, g: Element, mu: Vector) -> Vector:
-        """The factors' Ad^*."""
+        """Apply the Ad_g^* of every factor, to its part of the covector."""
         return self._vector(lambda group, g, m: group.Ad_dual(g, m), g, mu)
 
     def to_end(self, xi: Vector, mu: Vector) -> Vector:
-        """The factors' Ad_{τ(ξ)}^*."""
+        """Apply the Ad_{τ(ξ)}^* of every factor, to its part of the covector."""
         return self._vector(lambda group, x, m: group.to_end(x, m), xi, mu)
 
     def to_end_change(self, xi: Vector, mu: Vector) -> Vector:
-        """The factors' Ad_{τ(ξ)}^* μ - μ."""
+        """Compute the Ad_{τ(ξ)}^* μ - μ of every factor, concatenated."""
         return self._vector(lambda group, x, m: group.to_end_change(x, m), xi, mu)
 
     def to_start(self, xi: Vector, mu: Vector) -> Vector:
-        """The factors' Ad_{τ(ξ)⁻¹}^*."""
+        """Apply the Ad_{τ(ξ)⁻¹}^* of every factor, to its part of the covector."""
         return self._vector(lambda group, x, m: group.to_start(x, m), xi, mu)
 
     def ad(self, xi: Vector, eta: Vector) -> Vector:
-        """The factors' ad."""
+        """Apply the ad_ξ of every factor, to its parts of the vectors."""
         return self._vector(lambda group, x, y: group.ad(x, y), xi, eta)
 
     def ad_dual(self, xi: Vector, mu: Vector) -> Vector:
-        """The factors' ad^*."""
+        """Apply the ad_ξ^* of every factor, to its parts of the vectors."""
         return self._vector(lambda group, x, m: group.ad_dual(x, m), xi, mu)
 
     def _each(self, function: Callable[..., Any], *arguments: Any) -> list[Any]:
-        """`function` of every factor and its parts of elements and of vectors."""
+        """Call a function with every factor and its parts of elements and vectors."""
         parts = [a if isinstance(a, tuple) else self._split(a) for a in arguments]
         return [function(*part) for part in zip(self.factors, *parts, strict=True)]
 

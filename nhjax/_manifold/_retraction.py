@@ -14,55 +14,58 @@ _MARGIN = 0.05
 
 
 class AbstractRetraction(eqx.Module):
-    """A retraction τ: 𝔤 -> G with τ(0) = e and dτ_0 = I.
+    """A retraction τ: 𝔤 -> G with τ(0) = e and dτ_0 = I, for groups of motions.
 
-    A retraction is given by its scalar functions of the rotation vector ω or of
-    s = |ω|². The groups' formulas are made of them, so that those of the plane are
-    those of space.
+    A retraction is given by scalar functions of the rotation vector ω or of s = |ω|².
+    The formulas of all groups are made of these functions, so that the groups of the
+    plane use the same ones as those of space.
 
-    - the rotation by τ(ω): `angle`, `rate`, `plane_rotation`, `half_rotation`,
-      `rotation_vector`;
-    - dτ_ω η = α η - β ω × η + γ (ω·η) ω: `dtau_coefficients`;
-    - dτ_ω⁻¹ η = α η + ½ ω × η + γ (ω·η) ω: `dtau_inv_coefficients`.
+    - `angle`, `rate`, `plane_rotation`, `half_rotation` and `rotation_vector` describe
+      the rotation τ(ω);
+    - `dtau_coefficients` are those of dτ_ω η = α η - β ω × η + γ (ω·η) ω;
+    - `dtau_inv_coefficients` are those of dτ_ω⁻¹ η = α η + ½ ω × η + γ (ω·η) ω.
     """
 
     @abstractmethod
     def angle(self, omega: Array) -> Array:
-        """The angle of the plane rotation τ(ω)."""
+        """Compute the angle of the plane rotation τ(ω)."""
 
     @abstractmethod
     def rate(self, angle: Array) -> Array:
-        """The ω whose plane rotation has this angle."""
+        """Compute the ω whose plane rotation τ(ω) has this angle."""
 
     @abstractmethod
     def plane_rotation(self, omega: FloatScalar) -> tuple[FloatScalar, FloatScalar]:
-        """cos φ - 1, without cancellation, and sin φ of the angle φ of τ(ω)."""
+        """Compute cos φ - 1 and sin φ of the angle φ of τ(ω), without cancellation."""
 
     @abstractmethod
     def half_rotation(self, s: FloatScalar) -> tuple[FloatScalar, FloatScalar]:
-        """cos(φ/2) - 1, without cancellation, and sin(φ/2)/|ω| of the angle φ."""
+        """Compute cos(φ/2) - 1 and sin(φ/2)/|ω| of the angle φ of τ(ω).
+
+        The difference is computed without cancellation.
+        """
 
     @abstractmethod
     def rotation_vector(
         self, w: FloatScalar, v: Float[Array, "3"]
     ) -> Float[Array, "3"]:
-        """The shortest ω that gives the rotation of the unit quaternion (w, v)."""
+        """Compute the shortest ω that gives the rotation of the quaternion (w, v)."""
 
     @abstractmethod
     def dtau_coefficients(
         self, s: FloatScalar
     ) -> tuple[FloatScalar, FloatScalar, FloatScalar | float]:
-        """α, β and γ of dτ."""
+        """Compute the coefficients α, β and γ of dτ."""
 
     @abstractmethod
     def dtau_inv_coefficients(
         self, s: FloatScalar
     ) -> tuple[FloatScalar | float, FloatScalar | float]:
-        """α and γ of dτ⁻¹."""
+        """Compute the coefficients α and γ of dτ⁻¹."""
 
     @abstractmethod
     def in_chart(self, s: FloatScalar) -> BoolScalar:
-        """Whether the rotation is well inside the domain where τ is invertible."""
+        """Tell whether the rotation is well inside the domain where τ is invertible."""
 
 
 class Cayley(AbstractRetraction):
@@ -80,44 +83,44 @@ class Cayley(AbstractRetraction):
     """
 
     def angle(self, omega: Array) -> Array:
-        """2 arctan(ω/2)."""
+        """Compute the angle 2 arctan(ω/2)."""
         return 2 * jnp.arctan(0.5 * omega)
 
     def rate(self, angle: Array) -> Array:
-        """2 tan(θ/2)."""
+        """Compute the ω = 2 tan(θ/2) of an angle θ."""
         return 2 * jnp.tan(0.5 * angle)
 
     def plane_rotation(self, omega: FloatScalar) -> tuple[FloatScalar, FloatScalar]:
-        """-ω²/2 and ω, both over 1 + ω²/4."""
+        """Compute cos φ - 1 = -ω²/2 / (1 + ω²/4) and sin φ = ω / (1 + ω²/4)."""
         sin = omega / (1 + 0.25 * omega**2)
         return -0.5 * omega * sin, sin
 
     def half_rotation(self, s: FloatScalar) -> tuple[FloatScalar, FloatScalar]:
-        """1/r - 1 and 1/(2r) with r² = 1 + s/4."""
+        """Compute cos(φ/2) - 1 = 1/r - 1 and sin(φ/2)/|ω| = 1/(2r), r² = 1 + s/4."""
         r = jnp.sqrt(1 + 0.25 * s)
         return -0.25 * s / (r * (1 + r)), 0.5 / r
 
     def rotation_vector(
         self, w: FloatScalar, v: Float[Array, "3"]
     ) -> Float[Array, "3"]:
-        """2v/w."""
+        """Compute the ω = 2v/w of the quaternion (w, v)."""
         return 2 * v / w
 
     def dtau_coefficients(
         self, s: FloatScalar
     ) -> tuple[FloatScalar, FloatScalar, FloatScalar | float]:
-        """α = 1/(1 + s/4), β = α/2, γ = 0."""
+        """Compute the coefficients α = 1/(1 + s/4), β = α/2 and γ = 0 of dτ."""
         alpha = 1 / (1 + 0.25 * s)
         return alpha, 0.5 * alpha, 0.0
 
     def dtau_inv_coefficients(
         self, s: FloatScalar
     ) -> tuple[FloatScalar | float, FloatScalar | float]:
-        """α = 1, γ = 1/4."""
+        """Return the coefficients α = 1 and γ = 1/4 of dτ⁻¹."""
         return 1.0, 0.25
 
     def in_chart(self, s: FloatScalar) -> BoolScalar:
-        """Whether 2 arctan(√s/2) is less than π by a margin."""
+        """Tell whether the angle 2 arctan(√s/2) is less than π by a margin."""
         return s < (2 * tan((pi - _MARGIN) / 2)) ** 2
 
 
@@ -135,19 +138,19 @@ class Exponential(AbstractRetraction):
     """
 
     def angle(self, omega: Array) -> Array:
-        """ω."""
+        """Return ω, which is the angle itself."""
         return omega
 
     def rate(self, angle: Array) -> Array:
-        """θ."""
+        """Return the angle θ, which is ω itself."""
         return angle
 
     def plane_rotation(self, omega: FloatScalar) -> tuple[FloatScalar, FloatScalar]:
-        """-2 sin²(ω/2) and sin ω."""
+        """Compute cos ω - 1 = -2 sin²(ω/2) and sin ω."""
         return -2 * jnp.sin(0.5 * omega) ** 2, jnp.sin(omega)
 
     def half_rotation(self, s: FloatScalar) -> tuple[FloatScalar, FloatScalar]:
-        """cos(√s/2) - 1 and sin(√s/2)/√s."""
+        """Compute cos(√s/2) - 1 and sin(√s/2)/√s, without cancellation."""
         u = 0.25 * s
         c = stumpff(u, 3)
         return -u * c[2], 0.5 * c[1]
@@ -155,8 +158,9 @@ class Exponential(AbstractRetraction):
     def rotation_vector(
         self, w: FloatScalar, v: Float[Array, "3"]
     ) -> Float[Array, "3"]:
-        """2 arctan(|v|/w) v/|v|, by the tangent of half the angle."""
-        # Of q and -q, which are one rotation, the one with the shorter vector.
+        """Compute ω = 2 arctan(|v|/w) v/|v|, by the tangent of half the angle."""
+        # The quaternions q and -q are the same rotation; this takes the one with the
+        # shorter ω.
         sign = jnp.where(w < 0, -1.0, 1.0).astype(w.dtype)
         v, w = sign * v, 1 + sign * w
         return 4 * arctan_ratio(jnp.sum(v**2) / w**2) / w * v
@@ -164,25 +168,25 @@ class Exponential(AbstractRetraction):
     def dtau_coefficients(
         self, s: FloatScalar
     ) -> tuple[FloatScalar, FloatScalar, FloatScalar | float]:
-        """Stumpff's c_1, c_2, c_3."""
+        """Compute the coefficients of dτ, Stumpff's functions c_1, c_2 and c_3."""
         c = stumpff(s, 4)
         return c[1], c[2], c[3]
 
     def dtau_inv_coefficients(
         self, s: FloatScalar
     ) -> tuple[FloatScalar | float, FloatScalar | float]:
-        """α = (θ/2) cot(θ/2) and γ = (1 - α)/θ², θ² = s."""
+        """Compute α = (θ/2) cot(θ/2) and γ = (1 - α)/θ² of dτ⁻¹, with θ² = s."""
         c = stumpff(0.25 * s, 4)
-        # 1 - α without cancellation: c_1 - c_0 = θ²/4 (c_2 - c_3) at θ²/4.
+        # This avoids cancellation in 1 - α by c_1 - c_0 = θ²/4 (c_2 - c_3) at θ²/4.
         return c[0] / c[1], 0.25 * (c[2] - c[3]) / c[1]
 
     def in_chart(self, s: FloatScalar) -> BoolScalar:
-        """Whether √s is less than 2π by a margin."""
+        """Tell whether the angle √s is less than 2π by a margin."""
         return s < (2 * pi - _MARGIN) ** 2
 
 
 def check_retraction(group: str, retraction: object) -> None:
-    """Raise unless `retraction` is one that the groups have formulas for."""
+    """Raise unless `retraction` is one of those for which the groups have formulas."""
     if type(retraction) in (Cayley, Exponential):
         return
     allowed = "Cayley() and Exponential()"

@@ -16,9 +16,10 @@ Vector = Float[Array, "3"]
 
 
 class SE2(AbstractMotionGroup):
-    """The rigid motions of the plane: (x, y, θ), with body velocity (v1, v2, ω).
+    """The group SE(2) of rigid motions of the plane, with elements (x, y, θ).
 
-    d(x, y)/dt = R(θ) (v1, v2) and dθ/dt = ω. The angle is a lift, as on `SO2`.
+    The body velocity is (v1, v2, ω), with d(x, y)/dt = R(θ) (v1, v2) and dθ/dt = ω. The
+    angle is never wrapped to one turn, as on `SO2`.
 
     **Arguments:**
 
@@ -38,31 +39,31 @@ class SE2(AbstractMotionGroup):
 
     @property
     def dim(self) -> int:
-        """3."""
+        """Return the dimension 3 of the group."""
         return 3
 
     def identity(self, dtype: DTypeLike | None = None) -> Pose:
-        """(0, 0, 0)."""
+        """Return the identity (0, 0, 0)."""
         return jnp.zeros(3, dtype)
 
     def check(self, q: Pose, name: str = "q") -> Pose:
-        """`q`, or a `ShapeError` if it is not of shape (3,)."""
+        """Return `q`, or raise a `ShapeError` if it is not of shape (3,)."""
         return check_shape(q, (3,), "SE2", name)
 
     def in_chart(self, xi: Vector) -> BoolScalar:
-        """Whether the rotation of τ(ξ) is short of the end of the chart."""
+        """Tell whether the rotation of τ(ξ) stays inside of the chart."""
         return self.retraction.in_chart(xi[2] ** 2)
 
     def compose(self, g: Pose, h: Pose) -> Pose:
-        """(x + R(θ) x', θ + θ')."""
+        """Compute the product (x + R(θ) x', θ + θ') of (x, θ) and (x', θ')."""
         return g + self.tangent(g, h)
 
     def inverse(self, g: Pose) -> Pose:
-        """(-R(θ)ᵀ x, -θ)."""
+        """Compute the inverse (-R(θ)ᵀ x, -θ) of (x, θ)."""
         return jnp.concatenate([rotate(-g[2], -g[:2]), -g[2:]])
 
     def retract(self, xi: Vector) -> Pose:
-        """τ(ξ)."""
+        """Compute the motion τ(ξ)."""
         return jnp.concatenate([self._translation(xi), self.retraction.angle(xi[2:])])
 
     def _translation(self, xi: Vector) -> Float[Array, "2"]:
@@ -71,7 +72,7 @@ class SE2(AbstractMotionGroup):
         return alpha * v + beta * omega * turn(v)
 
     def local(self, g: Pose) -> Vector:
-        """The ξ with τ(ξ) = g."""
+        """Compute the ξ with τ(ξ) = g."""
         rate = self.retraction.rate(g[2:])
         omega = rate[0]
         alpha, _ = self.retraction.dtau_inv_coefficients(omega**2)
@@ -79,24 +80,24 @@ class SE2(AbstractMotionGroup):
         return jnp.concatenate([v, rate])
 
     def advance(self, q: Pose, xi: Vector, compensation: Pose) -> tuple[Pose, Pose]:
-        """g τ(ξ) by compensated summation."""
+        """Compute g τ(ξ) by compensated summation."""
         return two_sum(q, self.tangent(q, self.retract(xi)) + compensation)
 
     def matrix(self, g: Pose) -> Float[Array, "3 3"]:
-        """The motion in homogeneous coordinates."""
+        """Return the matrix of the motion in homogeneous coordinates."""
         rotation = SO2(self.retraction).matrix(g[2:])
         return homogeneous(rotation, g[:2], 1.0)
 
     def hat(self, xi: Vector) -> Float[Array, "3 3"]:
-        """[[ω J, v], [0, 0]]."""
+        """Return the matrix [[ω J, v], [0, 0]] of ξ = (v, ω)."""
         return homogeneous(SO2(self.retraction).hat(xi[2:]), xi[:2], 0.0)
 
     def tangent(self, g: Pose, eta: Vector) -> Pose:
-        """(R(θ) v, ω)."""
+        """Compute the tangent (R(θ) v, ω) at g = (x, θ) of η = (v, ω)."""
         return jnp.concatenate([rotate(g[2], eta[:2]), eta[2:]])
 
     def dtau(self, xi: Vector, eta: Vector) -> Vector:
-        """The formula of `SO3` for motions of the plane."""
+        """Compute dτ_ξ η, by the formula of `SO3` for motions of the plane."""
         v, omega = xi[:2], xi[2]
         u, sigma = eta[:2], eta[2]
         s = omega**2
@@ -106,7 +107,7 @@ class SE2(AbstractMotionGroup):
         return jnp.concatenate([linear, (alpha + gamma * s) * eta[2:]])
 
     def dtau_inv(self, xi: Vector, eta: Vector) -> Vector:
-        """The inverse formula of `SO3` for motions of the plane."""
+        """Compute dτ_ξ⁻¹ η, by the formula of `SO3` for motions of the plane."""
         v, omega = xi[:2], xi[2]
         u, sigma = eta[:2], eta[2]
         s = omega**2
@@ -116,19 +117,22 @@ class SE2(AbstractMotionGroup):
         return jnp.concatenate([linear, (alpha + gamma * s) * eta[2:]])
 
     def Ad(self, g: Pose, eta: Vector) -> Vector:
-        """(R(θ) u - σ J x, σ)."""
+        """Compute Ad_g η = (R(θ) u - σ J x, σ) of η = (u, σ)."""
         linear = rotate(g[2], eta[:2]) - eta[2] * turn(g[:2])
         return jnp.concatenate([linear, eta[2:]])
 
     def to_end_change(self, xi: Vector, mu: Vector) -> Vector:
-        """(R(θ)ᵀ m - m, -m·J x) of μ = (m, σ), with (x, θ) = τ(ξ)."""
-        # With Cayley's map neither the angle nor its functions are needed.
+        """Compute Ad_{τ(ξ)}^* μ - μ, without cancellation.
+
+        It is (R(θ)ᵀ m - m, -m·J x) for μ = (m, σ) and τ(ξ) = (x, θ).
+        """
+        # With Cayley's map neither the angle nor trigonometric functions are needed.
         less, sin = self.retraction.plane_rotation(xi[2])
         moment = jnp.sum(turn(self._translation(xi)) * mu[:2])
         turned = less * mu[:2] - sin * turn(mu[:2])
         return jnp.concatenate([turned, -moment[None]])
 
     def ad(self, xi: Vector, eta: Vector) -> Vector:
-        """(ω J u - σ J v, 0)."""
+        """Compute [ξ, η] = (ω J u - σ J v, 0) of ξ = (v, ω) and η = (u, σ)."""
         linear = xi[2] * turn(eta[:2]) - eta[2] * turn(xi[:2])
         return jnp.concatenate([linear, jnp.zeros_like(eta[2:])])

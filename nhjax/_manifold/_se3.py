@@ -17,9 +17,10 @@ Vector = Float[Array, "6"]
 
 
 class SE3(AbstractMotionGroup):
-    """The rigid motions of space: a unit quaternion q, then a translation x.
+    """The group SE(3) of rigid motions of space.
 
-    The velocity is (v, ω), both in the body: dx/dt = R(q) v, dq/dt = q ∘ (0, ω/2).
+    An element is a unit quaternion q followed by a translation x, in one array of shape
+    (7,). The body velocity is (v, ω), with dx/dt = R(q) v and dq/dt = q ∘ (0, ω/2).
 
     **Arguments:**
 
@@ -39,7 +40,7 @@ class SE3(AbstractMotionGroup):
 
     @property
     def dim(self) -> int:
-        """6."""
+        """Return the dimension 6 of the group."""
         return 6
 
     @property
@@ -47,37 +48,37 @@ class SE3(AbstractMotionGroup):
         return SO3(self.retraction)
 
     def identity(self, dtype: DTypeLike | None = None) -> Pose:
-        """(1, 0, 0, 0, 0, 0, 0)."""
+        """Return the identity (1, 0, 0, 0, 0, 0, 0)."""
         return jnp.array([1.0] + 6 * [0.0], dtype)
 
     def check(self, q: Pose, name: str = "q") -> Pose:
-        """`q`, or a `ShapeError` if it is not of shape (7,)."""
+        """Return `q`, or raise a `ShapeError` if it is not of shape (7,)."""
         return check_shape(q, (7,), "SE3", name)
 
     def in_chart(self, xi: Vector) -> BoolScalar:
-        """Whether the rotation of τ(ξ) is short of the end of the chart."""
+        """Tell whether the rotation of τ(ξ) stays inside of the chart."""
         return self._rotations.in_chart(xi[3:])
 
     def distance_to_group(self, q: Pose) -> FloatScalar:
-        """| |quaternion| - 1 |."""
+        """Compute | |q| - 1 |, the deviation of the quaternion's norm from 1."""
         return self._rotations.distance_to_group(q[:4])
 
     def normalise(self, q: Pose) -> Pose:
-        """`q` with a quaternion of norm 1."""
+        """Return `q` with its quaternion scaled to norm 1."""
         return jnp.concatenate([self._rotations.normalise(q[:4]), q[4:]])
 
     def compose(self, g: Pose, h: Pose) -> Pose:
-        """(q ∘ q', x + R(q) x')."""
+        """Compute the product (q ∘ q', x + R(q) x') of (q, x) and (q', x')."""
         rotation = self._rotations.compose(g[:4], h[:4])
         return jnp.concatenate([rotation, g[4:] + rotate(g[:4], h[4:])])
 
     def inverse(self, g: Pose) -> Pose:
-        """(q*, -R(q)ᵀ x)."""
+        """Compute the inverse (q*, -R(q)ᵀ x) of (q, x)."""
         rotation = self._rotations.inverse(g[:4])
         return jnp.concatenate([rotation, rotate(rotation, -g[4:])])
 
     def retract(self, xi: Vector) -> Pose:
-        """τ(ξ)."""
+        """Compute the motion τ(ξ)."""
         rotation = self._rotations.retract(xi[3:])
         return jnp.concatenate([rotation, self._translation(xi)])
 
@@ -88,12 +89,12 @@ class SE3(AbstractMotionGroup):
         return self._solve(-omega, v)
 
     def _solve(self, omega, v):
-        """(I + ω^/2)⁻¹ v, of which Cayley's map is made."""
+        """Compute (I + ω^/2)⁻¹ v, of which Cayley's map is made."""
         alpha, _, _ = self.retraction.dtau_coefficients(dot(omega, omega))
         return alpha * self._rotations.dtau_inv(-omega, v)
 
     def local(self, g: Pose) -> Vector:
-        """The ξ with τ(ξ) = g and the shorter rotation vector."""
+        """Compute the ξ with τ(ξ) = g that has the shorter rotation vector."""
         omega, x = self._rotations.local(g[:4]), g[4:]
         if isinstance(self.retraction, Exponential):
             v = self._rotations.dtau_inv(-omega, x)
@@ -102,27 +103,30 @@ class SE3(AbstractMotionGroup):
         return jnp.concatenate([v, omega])
 
     def advance(self, q: Pose, xi: Vector, compensation: Pose) -> tuple[Pose, Pose]:
-        """g τ(ξ) by compensated summation, the quaternion of norm 1 to rounding."""
+        """Compute g τ(ξ) by compensated summation.
+
+        The quaternion has norm 1 up to rounding.
+        """
         step = rotate(q[:4], self._translation(xi))
         x, x_error = two_sum(q[4:], step + compensation[4:])
         rotation, error = self._rotations.advance(q[:4], xi[3:], compensation[:4])
         return jnp.concatenate([rotation, x]), jnp.concatenate([error, x_error])
 
     def matrix(self, g: Pose) -> Float[Array, "4 4"]:
-        """The motion in homogeneous coordinates."""
+        """Return the matrix of the motion in homogeneous coordinates."""
         return homogeneous(self._rotations.matrix(g[:4]), g[4:], 1.0)
 
     def hat(self, xi: Vector) -> Float[Array, "4 4"]:
-        """[[ω^, v], [0, 0]]."""
+        """Return the matrix [[ω^, v], [0, 0]] of ξ = (v, ω)."""
         return homogeneous(self._rotations.hat(xi[3:]), xi[:3], 0.0)
 
     def tangent(self, g: Pose, eta: Vector) -> Pose:
-        """(q ∘ (0, ω/2), R(q) v)."""
+        """Compute the tangent (q ∘ (0, ω/2), R(q) v) at g of η = (v, ω)."""
         rotation = self._rotations.tangent(g[:4], eta[3:])
         return jnp.concatenate([rotation, rotate(g[:4], eta[:3])])
 
     def dtau(self, xi: Vector, eta: Vector) -> Vector:
-        """dτ_ξ η."""
+        """Compute dτ_ξ η, the left-trivialised tangent of τ."""
         if isinstance(self.retraction, Exponential):
             return _dual_part(self._rotations.dtau, xi, eta)
         sigma = self._rotations.dtau(xi[3:], eta[3:])
@@ -130,7 +134,7 @@ class SE3(AbstractMotionGroup):
         return jnp.concatenate([u, sigma])
 
     def dtau_inv(self, xi: Vector, eta: Vector) -> Vector:
-        """dτ_ξ⁻¹ η."""
+        """Compute dτ_ξ⁻¹ η, the inverse of the left-trivialised tangent."""
         if isinstance(self.retraction, Exponential):
             return _dual_part(self._rotations.dtau_inv, xi, eta)
         y = eta[:3] - 0.5 * cross(eta[3:], xi[:3])
@@ -138,13 +142,16 @@ class SE3(AbstractMotionGroup):
         return jnp.concatenate([y + 0.5 * cross(xi[3:], y), sigma])
 
     def Ad(self, g: Pose, eta: Vector) -> Vector:
-        """(R u + x × R σ, R σ)."""
+        """Compute Ad_g η = (R u + x × R σ, R σ) of η = (u, σ)."""
         sigma = rotate(g[:4], eta[3:])
         u = rotate(g[:4], eta[:3]) + cross(g[4:], sigma)
         return jnp.concatenate([u, sigma])
 
     def to_end_change(self, xi: Vector, mu: Vector) -> Vector:
-        """(Rᵀ m, Rᵀ (σ + m × x)) - μ of μ = (m, σ), with (R, x) = τ(ξ)."""
+        """Compute Ad_{τ(ξ)}^* μ - μ, without cancellation.
+
+        It is (Rᵀ m, Rᵀ (σ + m × x)) - μ for μ = (m, σ) and τ(ξ) = (R, x).
+        """
         m, sigma = mu[:3], mu[3:]
         back = self._rotations.inverse(self._rotations.retract(xi[3:]))
         moment = rotate(back, cross(m, self._translation(xi)))
@@ -152,15 +159,15 @@ class SE3(AbstractMotionGroup):
         return jnp.concatenate([rotation_change(back, m), turned + moment])
 
     def ad(self, xi: Vector, eta: Vector) -> Vector:
-        """(ω × u + v × σ, ω × σ)."""
+        """Compute [ξ, η] = (ω × u + v × σ, ω × σ) of ξ = (v, ω), η = (u, σ)."""
         return _dual_part(self._rotations.ad, xi, eta)
 
 
 def _dual_part(function, xi: Vector, eta: Vector) -> Vector:
-    """A map of se(3) from the same map of so(3).
+    """Extend a map of so(3) that is built from brackets to a map of se(3).
 
-    ξ is the dual number ω + ε v with ε² = 0, so that what is built from brackets alone
-    extends from so(3) by its derivative: f(ω + ε v, σ + ε u) = f + ε Df (v, u).
+    A vector ξ = (v, ω) is the dual number ω + ε v with ε² = 0, so that a map built from
+    brackets alone extends by its derivative: f(ω + ε v, σ + ε u) = f + ε Df (v, u).
     """
     value: Vector3
     slope: Vector3

@@ -1,6 +1,6 @@
-"""Scalar functions of the rotation angle, smooth at zero.
+"""Scalar functions of the rotation angle that are smooth at zero.
 
-All are functions of a square, so that no square root is differentiated at zero.
+All of them are functions of a square, so that no square root is differentiated at zero.
 """
 
 from functools import partial
@@ -14,21 +14,22 @@ from jaxtyping import Array, Float
 from .._custom_types import FloatScalar
 
 
-# Below this s the series is used. Above it the recursion loses nothing: it divides
-# its rounding errors by s.
+# Below this s the series is used. Above it the recursion is as accurate, because it
+# divides its rounding errors by s.
 _SWITCH = 2.0
 
-# The first term left out, of c_0 at the switch, is 2e-18.
+# The first term of the series that is left out is at most 2e-18, for c_0 at the switch.
 _NUM_TERMS = 11
 
 
 @partial(jax.custom_jvp, nondiff_argnums=(1,))
 def stumpff(s: FloatScalar, n: int) -> Float[Array, " n"]:
-    """Stumpff's functions c_k(s) = Σ_j (-s)^j / (2j + k)!, k = 0, ..., n - 1.
+    """Compute Stumpff's c_k(s) = Σ_j (-s)^j / (2j + k)! for k = 0, ..., n - 1.
 
-    For s = θ² >= 0: c_0 = cos θ, c_1 = sin θ / θ, c_2 = (1 - cos θ)/θ²,
-    c_3 = (θ - sin θ)/θ³. As 2 c_k' = k c_{k+2} - c_{k+1} stays in the family, no series
-    and no quotient is ever differentiated: a derivative is as accurate as a value.
+    For s = θ² >= 0 these functions are c_0 = cos θ, c_1 = sin θ / θ,
+    c_2 = (1 - cos θ)/θ² and c_3 = (θ - sin θ)/θ³. Their derivatives
+    2 c_k' = k c_{k+2} - c_{k+1} are of the same family, so that no series and no
+    quotient is ever differentiated: a derivative is as accurate as a value.
     """
     small = s < _SWITCH
     series = _horner(_coefficients(n, s.dtype), jnp.where(small, s, 0.0))
@@ -51,7 +52,7 @@ def _coefficients(n, dtype):
 
 
 def _recursion(s, n):
-    """c_0 and c_1 by the library, the others from s c_k = 1/(k - 2)! - c_{k-2}."""
+    """Compute c_0 and c_1 by cos and sin, the others by s c_k = 1/(k-2)! - c_{k-2}."""
     theta = jnp.sqrt(s)
     c = [jnp.cos(theta), jnp.sin(theta) / theta]
     for k in range(2, n):
@@ -67,10 +68,10 @@ def _horner(coefficients, x):
 
 
 def arctan_ratio(x: FloatScalar) -> FloatScalar:
-    """arctan(√x)/√x for 0 <= x <= 1.
+    """Compute arctan(√x)/√x for 0 <= x <= 1.
 
     Halving the angle twice leaves √x <= tan(π/16), where one short series serves for
-    all x: no branch, and any derivative.
+    all x. So there is no branch, and derivatives of any order exist.
     """
     scale = 1.0
     for _ in range(2):

@@ -13,11 +13,12 @@ Vector = Float[Array, "1"]
 
 
 class SO2(AbstractLieGroup):
-    """The rotations of the plane: an angle θ, with angular velocity ω = dθ/dt.
+    """The group SO(2) of rotations of the plane, with an angle θ for an element.
 
-    The angle is a lift, never wrapped to one turn: it counts the turns, and is the same
-    array of shape (1,) as a coordinate of `Euclidean(1)`. With `Exponential()` the two
-    groups are one; with `Cayley()` a step turns by 2 arctan(ω/2).
+    The velocity is ω = dθ/dt. The angle is never wrapped to one turn, so that it counts
+    the turns: it is an array of shape (1,), as an element of `Euclidean(1)` is. With
+    `Exponential()` the two groups are the same; with `Cayley()` the retraction turns by
+    2 arctan(ω/2).
 
     **Arguments:**
 
@@ -37,70 +38,70 @@ class SO2(AbstractLieGroup):
 
     @property
     def dim(self) -> int:
-        """1."""
+        """Return the dimension 1 of the group."""
         return 1
 
     @property
     def is_flat(self) -> bool:
-        """Whether dτ = 1: with the exponential map."""
+        """Tell whether dτ = 1, which is so with the exponential map."""
         return isinstance(self.retraction, Exponential)
 
     def identity(self, dtype: DTypeLike | None = None) -> Angle:
-        """The angle 0."""
+        """Return the identity, which is the angle 0."""
         return jnp.zeros(1, dtype)
 
     def check(self, q: Angle, name: str = "q") -> Angle:
-        """`q`, or a `ShapeError` if it is not of shape (1,)."""
+        """Return `q`, or raise a `ShapeError` if it is not of shape (1,)."""
         return check_shape(q, (1,), "SO2", name)
 
     def in_chart(self, xi: Vector) -> BoolScalar:
-        """Whether the rotation is short of the end of Cayley's chart."""
+        """Tell whether the rotation stays inside of the chart, if that has an end."""
         if self.is_flat:
             return jnp.asarray(True)
         return self.retraction.in_chart(xi[0] ** 2)
 
     def compose(self, g: Angle, h: Angle) -> Angle:
-        """The sum of the angles."""
+        """Compute the sum of the angles, the product of the rotations."""
         return g + h
 
     def inverse(self, g: Angle) -> Angle:
-        """-θ."""
+        """Compute the inverse rotation, which has the angle -θ."""
         return -g
 
     def retract(self, xi: Vector) -> Angle:
-        """The angle of τ(ω)."""
+        """Compute the angle of the rotation τ(ω)."""
         return self.retraction.angle(xi)
 
     def local(self, g: Angle) -> Vector:
-        """The ω with τ(ω) = θ."""
+        """Compute the ω for which τ(ω) has the angle θ."""
         return self.retraction.rate(g)
 
     def advance(self, q: Angle, xi: Vector, compensation: Angle) -> tuple[Angle, Angle]:
-        """g τ(ω) by compensated summation."""
+        """Compute g τ(ω) by compensated summation."""
         return two_sum(q, self.retract(xi) + compensation)
 
     def matrix(self, g: Angle) -> Float[Array, "2 2"]:
-        """The rotation matrix."""
+        """Return the rotation matrix of the angle."""
         basis = jnp.eye(2, dtype=g.dtype)
         return jnp.cos(g[0]) * basis + jnp.sin(g[0]) * turn(basis)
 
     def hat(self, xi: Vector) -> Float[Array, "2 2"]:
-        """[[0, -ω], [ω, 0]]."""
+        """Return the matrix [[0, -ω], [ω, 0]] of an angular velocity ω."""
         return xi[0] * turn(jnp.eye(2, dtype=xi.dtype))
 
     def tangent(self, g: Angle, eta: Vector) -> Angle:
-        """η."""
+        """Return η, which is the rate of the angle."""
         return eta
 
     def dtau(self, xi: Vector, eta: Vector) -> Vector:
-        """dτ_ω η."""
+        """Compute dτ_ω η, the left-trivialised tangent of τ."""
         if self.is_flat:
             return eta
         alpha, _, _ = self.retraction.dtau_coefficients(xi[0] ** 2)
         return alpha * eta
 
     def dtau_inv(self, xi: Vector, eta: Vector) -> Vector:
-        """dτ_ω⁻¹ η."""
+        """Compute dτ_ω⁻¹ η, the inverse of the left-trivialised tangent."""
         if self.is_flat:
             return eta
         s = xi[0] ** 2
@@ -108,17 +109,17 @@ class SO2(AbstractLieGroup):
         return (alpha + gamma * s) * eta
 
     def Ad(self, g: Angle, eta: Vector) -> Vector:
-        """η."""
+        """Return η, because the group is commutative."""
         return eta
 
     def Ad_dual(self, g: Angle, mu: Vector) -> Vector:
-        """μ."""
+        """Return μ, because the group is commutative."""
         return mu
 
     def ad(self, xi: Vector, eta: Vector) -> Vector:
-        """Zero."""
+        """Return zero, because the group is commutative."""
         return jnp.zeros_like(eta)
 
     def ad_dual(self, xi: Vector, mu: Vector) -> Vector:
-        """Zero."""
+        """Return zero, because the group is commutative."""
         return jnp.zeros_like(mu)

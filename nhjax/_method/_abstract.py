@@ -1,4 +1,4 @@
-"""The interface of a method: its coefficients and what is known of them."""
+"""The interface of a method: its coefficients and the properties that follow."""
 
 import abc
 import math
@@ -37,10 +37,10 @@ MOST_STAGES = 32
 class AbstractMethod(eqx.Module):
     """A symplectic partitioned Runge-Kutta method: (a, b) for q, its conjugate for p.
 
-    All of its data is static: a method is hashable, has no array leaves, can be a
-    static argument of `jax.jit`, and equals any other with the same data. Coefficients
-    are computed in 60 digits and rounded once. A subclass has `stages`, `closure`
-    and `_tableau`, and is final.
+    All data of a method is static: it is hashable, has no array leaves, can be a static
+    argument of `jax.jit`, and equals any other method with the same data. Coefficients
+    are computed in 60 digits and rounded once. A subclass defines `stages`, `closure`
+    and `_tableau`, and has no subclasses of its own.
     """
 
     stages: eqx.AbstractVar[int]
@@ -48,61 +48,64 @@ class AbstractMethod(eqx.Module):
 
     @abc.abstractmethod
     def _tableau(self) -> Tableau:
-        """The tableau, one object for all equal methods."""
+        """Return the tableau of the method, the same object for all equal methods."""
 
     @property
     def a(self) -> np.ndarray:
-        """a_ij, read-only float64 of shape (s, s)."""
+        """Return the coefficients a_ij, a read-only float64 array of shape (s, s)."""
         return self._tableau().a
 
     @property
     def b(self) -> np.ndarray:
-        """b_j, read-only float64 of shape (s,)."""
+        """Return the weights b_j, a read-only float64 array of shape (s,)."""
         return self._tableau().b
 
     @property
     def c(self) -> np.ndarray:
-        """c_i, read-only float64 of shape (s,)."""
+        """Return the nodes c_i, a read-only float64 array of shape (s,)."""
         return self._tableau().c
 
     @property
     def a_hat(self) -> np.ndarray:
-        """â_ij = b_j (1 - a_ji / b_i), read-only float64 of shape (s, s)."""
+        """Return the symplectic conjugate â_ij = b_j (1 - a_ji / b_i).
+
+        It is a read-only float64 array of shape (s, s).
+        """
         return self._tableau().a_hat
 
     @property
     def orders(self) -> SimplifyingAssumptions:
-        """The simplifying assumptions B(p), C(q), D(r) and CĈ(Q) that hold."""
+        """Find the simplifying assumptions B(p), C(q), D(r) and CĈ(Q) that hold."""
         return _conditions.simplifying_assumptions(self._tableau())
 
     @property
     def order(self) -> int:
-        """min(p, 2q, q + r), the order of q and p by the paper's theorem."""
+        """Return the order min(p, 2q, q + r) of q and p, by the paper's theorem."""
         p, q, r, _ = self.orders
         return min(p, 2 * q, q + r)
 
     @property
     def hypotheses(self) -> Hypotheses:
-        """Which of H1, H2, H3, needed by systems with constraints, hold."""
+        """Find which of H1, H2, H3 hold, which systems with constraints need."""
         return _conditions.hypotheses(self._tableau())
 
     @property
     def is_symmetric(self) -> bool:
-        """Whether a_{s+1-i,s+1-j} + a_ij = b_j: a step of -h undoes a step of h."""
+        """Tell if a_{s+1-i,s+1-j} + a_ij = b_j: a step of -h then undoes one of h."""
         return _conditions.is_symmetric(self._tableau())
 
     @property
     def stability_at_infinity(self) -> float:
-        """R_A(∞), the limit of the stability function of (a, b); inf if unbounded."""
+        """Compute R_A(∞), the limit of the stability function; inf if unbounded."""
         return _conditions.stability_at_infinity(self._tableau())
 
     @property
     def multiplier_order(self) -> int:
-        """The order of the multiplier that a solution reports.
+        """Return the order of convergence of the multiplier that a solution reports.
 
-        `"propagated"`: q of C(q), less one if R_A(∞) = 1 (the paper's theorem on global
-        convergence). Otherwise the multiplier is the continuous one, as exact as the
-        state.
+        With `closure="propagated"` it is q of C(q), less one if R_A(∞) = 1 (the paper's
+        theorem on global convergence). With the other closures the multiplier is the
+        continuous one, and has the order of the state.
 
         **Raises:** a `ValueError` as `require_constraint_hypotheses` does.
         """
@@ -114,7 +117,7 @@ class AbstractMethod(eqx.Module):
 
     @property
     def closure_weights(self) -> ClosureWeights:
-        """How the multipliers of a step follow from its unknowns; see `ClosureWeights`.
+        """Return the weights that give a step's multipliers, as in `ClosureWeights`.
 
         **Raises:** a `ValueError` as `require_constraint_hypotheses` does.
         """
@@ -122,7 +125,7 @@ class AbstractMethod(eqx.Module):
         return make_closure_weights(self._tableau(), self.closure == "symmetric")
 
     def basis(self, theta: ArrayLike) -> Float[Array, "*batch s"]:
-        """The Lagrange basis ℓ_1(θ), ..., ℓ_s(θ) on the nodes c.
+        """Evaluate the Lagrange basis ℓ_1(θ), ..., ℓ_s(θ) on the nodes c.
 
         **Arguments:**
 
@@ -140,11 +143,11 @@ class AbstractMethod(eqx.Module):
         return _basis.lagrange(self._tableau(), theta)
 
     def integrated_basis(self, theta: ArrayLike) -> Float[Array, "*batch s"]:
-        """∫_0^θ ℓ_j: the weights of a collocation polynomial at t_k + θ h.
+        """Compute ∫_0^θ ℓ_j, the weights of a collocation polynomial at t_k + θ h.
 
-        At θ = 0 it is exactly 0, and at θ = 1 exactly `b` for a collocation method, so
-        dense output meets the states at both ends. Arguments, result and errors are
-        those of `basis`.
+        At θ = 0 they are exactly 0, and at θ = 1 exactly `b` for a collocation method,
+        so that dense output agrees with the states at both ends of a step. Arguments,
+        result and errors are those of `basis`.
         """
         return _basis.integrated_lagrange(self._tableau(), theta)
 
@@ -192,7 +195,7 @@ class AbstractMethod(eqx.Module):
 
 
 def check_stages(stages: int, minimum: int, method: str) -> int:
-    """`stages` as an int.
+    """Return a number of stages as an int, or raise an error if it is not in range.
 
     **Arguments:**
 
@@ -226,7 +229,7 @@ def check_stages(stages: int, minimum: int, method: str) -> int:
 
 
 def check_closure(closure: str) -> str:
-    """`closure` if it is one of `MULTIPLIERS`.
+    """Return `closure` if it is one of `CLOSURES`.
 
     **Raises:**
 

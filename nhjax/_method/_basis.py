@@ -1,4 +1,4 @@
-"""The Lagrange basis on the nodes and its integral: dense output, starting values.
+"""The Lagrange basis on the nodes of a tableau and its integral, for dense output.
 
 In x = 2θ - 1 the basis is expanded in Legendre polynomials, ℓ_j(θ) = Σ_n K_nj P_n(x),
 with coefficients of order one at any s, where monomials would cancel. Its integral is
@@ -23,7 +23,7 @@ from ._tableau import lagrange_in_legendre, Tableau
 
 @lru_cache(maxsize=128)
 def _coefficients(t: Tableau) -> tuple[np.ndarray, np.ndarray]:
-    """K, and the rows -2 K_nj / (n (n + 1)) for n = 1..s-1, rounded once."""
+    """Compute K and the rows -2 K_nj / (n (n + 1)), n = 1..s-1, rounded once."""
     s, c = t.stages, t.mp_c
     for i in range(s):
         for j in range(i):
@@ -48,7 +48,7 @@ def _floating(theta: ArrayLike) -> Array:
 
 
 def _combine(polynomials: list[Array], coefficients: np.ndarray) -> Array:
-    # Full precision by request: the default may be TensorFloat-32 on a GPU.
+    # Full precision is requested, because the default on a GPU may be TensorFloat-32.
     values = jnp.stack(polynomials, axis=-1)
     return jnp.matmul(
         values,
@@ -58,7 +58,7 @@ def _combine(polynomials: list[Array], coefficients: np.ndarray) -> Array:
 
 
 def lagrange(t: Tableau, theta: ArrayLike) -> Float[Array, "*batch s"]:
-    """ℓ_1(θ), ..., ℓ_s(θ).
+    """Evaluate the Lagrange basis ℓ_1(θ), ..., ℓ_s(θ) on the nodes of a tableau.
 
     **Arguments:**
 
@@ -82,7 +82,7 @@ def lagrange(t: Tableau, theta: ArrayLike) -> Float[Array, "*batch s"]:
 
 
 def integrated_lagrange(t: Tableau, theta: ArrayLike) -> Float[Array, "*batch s"]:
-    """∫_0^θ ℓ_1, ..., ∫_0^θ ℓ_s.
+    """Evaluate the integrals ∫_0^θ ℓ_1, ..., ∫_0^θ ℓ_s of the Lagrange basis.
 
     Arguments, result and errors are those of `lagrange`.
     """

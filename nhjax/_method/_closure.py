@@ -1,7 +1,7 @@
-"""How the multipliers of one step follow from as many unknowns as it has equations.
+"""The closures, which express a step's multipliers by as many unknowns as equations.
 
 The constraint at stage 1 holds by hypothesis H1, which leaves (s - 1) equations per
-constraint for s multipliers. A closure writes
+constraint for s multipliers. A closure writes the multipliers as
 
     (Λ^1, ..., Λ^s) = start λ_k + end λ_{k+1} + E y,    y of s - 1 entries,
 
@@ -20,7 +20,9 @@ from ._tableau import Tableau
 
 @dataclass(frozen=True, eq=False)
 class ClosureWeights:
-    """The closure of the multipliers; read-only float64 arrays, compared by identity.
+    """The weights of a closure, by which a step's multipliers follow from its unknowns.
+
+    They are read-only float64 arrays; instances are compared by identity.
 
     **Fields:**
 
@@ -36,12 +38,13 @@ class ClosureWeights:
 
 @lru_cache(maxsize=128)
 def make_closure_weights(t: Tableau, symmetric: bool) -> ClosureWeights:
-    """The closure of a tableau that satisfies H1, H2 and H3.
+    """Make the weights of the closure of a tableau that satisfies H1, H2 and H3.
 
-    Unless symmetric, Λ^1 = λ_k and y = (Λ^2, ..., Λ^s): the equations of the paper. The
-    symmetric one has y = (ν, Λ^2, ..., Λ^{s-1}), Λ^1 = λ_k + ν and Λ^s = λ_{k+1} + σ ν.
-    A step back exchanges the two ends and maps ν to σ ν, so it retraces the step if
-    σ = ±1. Of these σ = -R_A(∞) is the one with A_{2:,:} E invertible: the solutions of
+    If the closure is not symmetric, Λ^1 = λ_k and y = (Λ^2, ..., Λ^s), as in the
+    equations of the paper. The symmetric closure has y = (ν, Λ^2, ..., Λ^{s-1}),
+    Λ^1 = λ_k + ν and Λ^s = λ_{k+1} + σ ν. A step back exchanges the two ends and maps
+    ν to σ ν, so that it retraces the step if σ = ±1. Of these two σ = -R_A(∞) is the
+    one for which A_{2:,:} E is invertible, because the solutions of
     Σ_j a_ij Λ^j = 0, i >= 2, have Λ^s = R_A(∞) Λ^1.
 
     **Arguments:**

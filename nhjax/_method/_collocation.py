@@ -7,11 +7,11 @@ from ._tableau import gauss_tableau, lobatto_tableau, Tableau
 
 
 class LobattoIIIAB(AbstractMethod):
-    """The Lobatto IIIA-IIIB pair: order 2s - 2, symmetric, for any system.
+    """The Lobatto IIIA-IIIB pair of order 2s - 2, symmetric and fit for any system.
 
-    Lobatto IIIA (a, b) for q and its symplectic conjugate, Lobatto IIIB (â, b), for p:
-    the paper's methods. s = 2 is the trapezoidal rule with its conjugate, that is
-    Störmer-Verlet for a separable Lagrangian.
+    It integrates q by Lobatto IIIA (a, b) and p by the symplectic conjugate, Lobatto
+    IIIB (â, b). These are the paper's methods. For s = 2 it is the trapezoidal rule
+    with its conjugate, which for a separable Lagrangian is the Störmer-Verlet method.
 
     !!! example
 
@@ -29,11 +29,12 @@ class LobattoIIIAB(AbstractMethod):
 
         - `stages`: s from 2 to 32, beyond which coefficients take minutes to find
             and nothing is gained in float64.
-        - `closure`: how the constraints' multipliers are closed from step to step.
-            `"propagated"` carries Λ^s to the next step as its Λ^1 (the paper's);
-            `"consistent"` starts each step from the continuous multiplier of the state;
-            `"symmetric"` does so at both ends, up to one unknown that makes the step
-            symmetric, and remembers nothing but the state.
+        - `closure`: how the first of the s multipliers of a step is determined, for
+            which there is no equation. `"propagated"`, the choice of the paper, carries
+            Λ^s to the next step as its Λ^1. `"consistent"` takes for Λ^1 the continuous
+            multiplier of the state. `"symmetric"` uses the continuous multipliers of
+            the states at both ends of the step, with one unknown added that makes the
+            step symmetric; a step then depends on nothing but its state.
 
         **Raises:**
 
@@ -48,10 +49,11 @@ class LobattoIIIAB(AbstractMethod):
 
 
 class Gauss(AbstractMethod):
-    """The Gauss methods: order 2s, symplectic and symmetric, without constraints.
+    """The Gauss method of order 2s, symplectic and symmetric, without constraints.
 
-    (a, b) is its own symplectic conjugate. Its stages do not include the ends of the
-    step (H1 and H3 fail), so with constraints it is refused.
+    Its tableau (a, b) is its own symplectic conjugate. The stages do not include the
+    ends of the step (hypotheses H1 and H3 fail), so that `integrate` refuses it for
+    systems with constraints.
 
     !!! example
 
@@ -77,7 +79,7 @@ class Gauss(AbstractMethod):
 
     @property
     def closure(self) -> None:
-        """None: the methods take no constraints, whose multipliers a closure gives."""
+        """Return None: the method takes no constraints, and so needs no closure."""
         return None
 
     def _tableau(self) -> Tableau:

@@ -1,4 +1,4 @@
-"""What a tableau satisfies: order conditions, hypotheses, symmetry, stability.
+"""The properties of a tableau: order conditions, hypotheses, symmetry and stability.
 
 The simplifying assumptions are those of Butcher (Hairer, Lubich, Wanner, "Geometric
 Numerical Integration", II.1) and the mixed one of L. Jay ("Symplectic partitioned
@@ -55,7 +55,7 @@ def _times(a: Matrix, x: list[Number]) -> list[Number]:
 
 
 def _largest(defects: Callable[[int], list[Number]], first: int, t: Tableau) -> int:
-    """The largest k for which the defects of orders `first`..k are all round-off."""
+    """Find the largest k for which the defects of orders `first`..k are round-off."""
     k = first
     while k <= 2 * t.stages and all(abs(d) <= t.tolerance for d in defects(k)):
         k += 1
@@ -64,7 +64,9 @@ def _largest(defects: Callable[[int], list[Number]], first: int, t: Tableau) -> 
 
 @lru_cache(maxsize=128)
 def simplifying_assumptions(t: Tableau) -> SimplifyingAssumptions:
-    """The orders B(p), C(q), D(r) of (a, b, c) and CĈ(Q) of the pair (a, â).
+    """Find the largest p, q, r and Q for which B(p), C(q), D(r) and CĈ(Q) hold.
+
+    The first three are conditions on (a, b, c), the last one on the pair (a, â).
 
     **Arguments:**
 
@@ -109,7 +111,7 @@ def simplifying_assumptions(t: Tableau) -> SimplifyingAssumptions:
 
 @lru_cache(maxsize=128)
 def hypotheses(t: Tableau) -> Hypotheses:
-    """The hypotheses H1, H2, H3 of the integrator for constrained systems.
+    """Find which of H1, H2, H3 hold, the hypotheses for systems with constraints.
 
     **Arguments:**
 
@@ -134,10 +136,10 @@ def hypotheses(t: Tableau) -> Hypotheses:
 
 @lru_cache(maxsize=128)
 def is_symmetric(t: Tableau) -> bool:
-    """Whether a_{s+1-i,s+1-j} + a_ij = b_j, i.e. the method equals its adjoint.
+    """Tell whether a_{s+1-i,s+1-j} + a_ij = b_j, so that the method is its own adjoint.
 
-    Hairer, Lubich, Wanner, V.2.1. The conjugate â is then symmetric too. Applying the
-    identity twice gives b_{s+1-j} = b_j.
+    See Hairer, Lubich, Wanner, V.2.1. The conjugate â is then symmetric too. Applying
+    the identity twice gives b_{s+1-j} = b_j.
 
     **Arguments:**
 
@@ -156,7 +158,9 @@ def is_symmetric(t: Tableau) -> bool:
 
 
 def is_symplectic_pair(t: Tableau, a_hat: Matrix) -> bool:
-    """Whether b_i â_ij + b_j a_ji = b_i b_j (Hairer, Lubich, Wanner, VI.4.1).
+    """Tell whether b_i â_ij + b_j a_ji = b_i b_j, so that the pair is symplectic.
+
+    See Hairer, Lubich, Wanner, VI.4.1.
 
     **Arguments:**
 
@@ -178,10 +182,11 @@ def is_symplectic_pair(t: Tableau, a_hat: Matrix) -> bool:
 
 @lru_cache(maxsize=128)
 def stability_at_infinity(t: Tableau) -> float:
-    """R_A(∞), the limit of R(z) = det(I - zA + z 1 bᵀ) / det(I - zA) as z → ∞.
+    """Compute R_A(∞), the limit of the stability function of a tableau as z → ∞.
 
-    Hairer, Wanner, "Solving Ordinary Differential Equations II", IV.3, for any tableau,
-    A singular or not: the ratio of the leading coefficients.
+    The stability function is R(z) = det(I - zA + z 1 bᵀ) / det(I - zA) (Hairer, Wanner,
+    "Solving Ordinary Differential Equations II", IV.3). Its limit is the ratio of the
+    leading coefficients, whether A is singular or not.
 
     **Arguments:**
 
@@ -210,9 +215,10 @@ def stability_at_infinity(t: Tableau) -> float:
 def _leading_term(
     rows: list[list[Number]], keep: range, tolerance: Number
 ) -> tuple[int, Number]:
-    """Degree and leading coefficient of z ↦ det(I - zM), M = rows restricted to `keep`.
+    """Compute the degree and the leading coefficient of the polynomial det(I - zM).
 
-    By Faddeev and LeVerrier: det(I - zM) = 1 + f_1 z + ... + f_n z^n with
+    M is the matrix of `rows`, restricted to the rows and columns in `keep`. By the
+    algorithm of Faddeev and LeVerrier, det(I - zM) = 1 + f_1 z + ... + f_n z^n with
     f_k = -tr(M N_k) / k, N_1 = I, N_{k+1} = M N_k + f_k I.
     """
     n = len(keep)

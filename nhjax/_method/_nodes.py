@@ -7,7 +7,7 @@ from ._precision import CONTEXT, Number
 
 
 def legendre(degree: int, x: Number) -> list[Number]:
-    """Legendre polynomials P_0(x), ..., P_degree(x) by the three-term recurrence.
+    """Evaluate the Legendre polynomials P_0(x), ..., P_degree(x) by their recurrence.
 
     **Arguments:**
 
@@ -25,7 +25,9 @@ def legendre(degree: int, x: Number) -> list[Number]:
 
 
 def lobatto_points(stages: int) -> list[Number]:
-    """-1, the zeros of P'_{s-1} and 1: exactly symmetric, in increasing order.
+    """Compute the Lobatto points on [-1, 1]: -1, the zeros of P'_{s-1}, and 1.
+
+    They are exactly symmetric about 0, and in increasing order.
 
     **Arguments:**
 
@@ -49,7 +51,9 @@ def lobatto_points(stages: int) -> list[Number]:
 
 
 def gauss_points(stages: int) -> list[Number]:
-    """The zeros of P_s: exactly symmetric, in increasing order.
+    """Compute the Gauss points on [-1, 1], the zeros of P_s.
+
+    They are exactly symmetric about 0, and in increasing order.
 
     **Arguments:**
 
@@ -73,7 +77,7 @@ def gauss_points(stages: int) -> list[Number]:
 
 
 def _newton(f: Callable[[Number], tuple[Number, Number]], guess: float) -> Number:
-    """The root of `f` near `guess`; `f` returns the value and the derivative."""
+    """Find the root of `f` near `guess`; `f` returns its value and derivative."""
     x = CONTEXT.mpf(guess)
     for _ in range(100):
         value, slope = f(x)
@@ -86,6 +90,6 @@ def _newton(f: Callable[[Number], tuple[Number, Number]], guess: float) -> Numbe
 
 
 def _mirrored(right: list[Number], count: int) -> list[Number]:
-    """Points of [-1, 1] in increasing order, exactly symmetric, from those > 0."""
+    """Make all points, exactly symmetric and in increasing order, from those > 0."""
     centre = [CONTEXT.mpf(0)] if count % 2 else []
     return [-x for x in right] + centre + right[::-1]

@@ -9,12 +9,13 @@ from ._tableau import Tableau, user_tableau
 
 
 class PartitionedRungeKutta(AbstractMethod):
-    """Any Runge-Kutta tableau (a, b) for q with its symplectic conjugate for p.
+    """A method from any Runge-Kutta tableau (a, b) for q, with its conjugate for p.
 
-    c_i = Σ_j a_ij and â_ij = b_j (1 - a_ji / b_i) follow. The float64 coefficients are
-    taken exactly, and the conditions on them checked to 1e-13. (At s = 12 the defect of
-    the first order that a tableau lacks may itself be that small, and `orders` is then
-    too high.) With constraints the tableau must satisfy H1, H2 and H3.
+    The nodes c_i = Σ_j a_ij and the symplectic conjugate â_ij = b_j (1 - a_ji / b_i)
+    follow from the tableau. The float64 coefficients are taken as exact, and the
+    conditions on them are checked to 1e-13. (At s = 12 the defect of the first order
+    that a tableau lacks may itself be that small, and `orders` is then too high.) For
+    systems with constraints the tableau must satisfy H1, H2 and H3.
 
     !!! example
 

@@ -1,4 +1,4 @@
-"""Butcher tableaux in many digits, rounded to float64 once at the very end.
+"""Butcher tableaux, computed in 60 digits and rounded to float64 once at the end.
 
 A collocation tableau on nodes c_1 < ... < c_s has
 
@@ -39,12 +39,12 @@ class Tableau:
 
     @property
     def stages(self) -> int:
-        """The number of stages s."""
+        """Return the number of stages s."""
         return len(self.mp_b)
 
     @cached_property
     def mp_a_hat(self) -> Matrix:
-        """The symplectic conjugate â_ij = b_j (1 - a_ji / b_i), in mp numbers."""
+        """Compute the symplectic conjugate â_ij = b_j (1 - a_ji / b_i) as mp matrix."""
         a, b, s = self.mp_a, self.mp_b, self.stages
         a_hat = CONTEXT.matrix(s, s)
         for i in range(s):
@@ -57,29 +57,30 @@ class Tableau:
 
     @cached_property
     def a(self) -> np.ndarray:
-        """The coefficients a_ij in float64, read-only, shape (s, s)."""
+        """Return the coefficients a_ij, a read-only float64 array of shape (s, s)."""
         return to_float64(self.mp_a)
 
     @cached_property
     def b(self) -> np.ndarray:
-        """The weights b_j in float64, read-only, shape (s,)."""
+        """Return the weights b_j, a read-only float64 array of shape (s,)."""
         return to_float64(self.mp_b)
 
     @cached_property
     def c(self) -> np.ndarray:
-        """The nodes c_i in float64, read-only, shape (s,)."""
+        """Return the nodes c_i, a read-only float64 array of shape (s,)."""
         return to_float64(self.mp_c)
 
     @cached_property
     def a_hat(self) -> np.ndarray:
-        """The symplectic conjugate â_ij in float64, read-only, shape (s, s)."""
+        """Return the symplectic conjugate â_ij, a read-only float64 (s, s) array."""
         return to_float64(self.mp_a_hat)
 
 
 def lagrange_in_legendre(nodes: list[Number]) -> Matrix:
-    """Coefficients of the Lagrange basis in the shifted Legendre basis on [0, 1].
+    """Expand the Lagrange basis in the shifted Legendre polynomials on [0, 1].
 
-    ℓ_j(θ) = Σ_n K_nj P_n(2θ - 1), that is K = V^{-1} with V_in = P_n(2 c_i - 1).
+    The coefficients K_nj are those in ℓ_j(θ) = Σ_n K_nj P_n(2θ - 1), which means that
+    K = V^{-1} with V_in = P_n(2 c_i - 1).
 
     **Arguments:**
 
@@ -95,7 +96,7 @@ def lagrange_in_legendre(nodes: list[Number]) -> Matrix:
 
 
 def _integrated_legendre(degree: int, x: Number) -> list[Number]:
-    """∫_0^θ P_n(2τ - 1) dτ for n = 0..degree at x = 2θ - 1."""
+    """Compute ∫_0^θ P_n(2τ - 1) dτ for n = 0..degree, given x = 2θ - 1."""
     p = legendre(degree + 1, x)
     first = (x + 1) / 2
     return [first] + [
@@ -104,7 +105,7 @@ def _integrated_legendre(degree: int, x: Number) -> list[Number]:
 
 
 def _collocation(points: list[Number]) -> Tableau:
-    """The collocation tableau on nodes (1 + points) / 2, `points` symmetric about 0."""
+    """Make the collocation tableau with nodes (1 + x) / 2, x in symmetric `points`."""
     s = len(points)
     nodes = [(1 + x) / 2 for x in points]
     k = lagrange_in_legendre(nodes)
@@ -126,9 +127,10 @@ def _collocation(points: list[Number]) -> Tableau:
 
 @cache
 def lobatto_tableau(stages: int) -> Tableau:
-    """Lobatto IIIA: collocation at 0, 1 and the s - 2 zeros of P'_{s-1}(2c - 1).
+    """Make the tableau of the Lobatto IIIA method with s stages.
 
-    Hairer, Lubich, Wanner, II.1.4. Its symplectic conjugate is Lobatto IIIB.
+    It is collocation at 0, 1 and the s - 2 zeros of P'_{s-1}(2c - 1) (Hairer, Lubich,
+    Wanner, II.1.4). Its symplectic conjugate is Lobatto IIIB.
 
     **Arguments:**
 
@@ -148,9 +150,10 @@ def lobatto_tableau(stages: int) -> Tableau:
 
 @cache
 def gauss_tableau(stages: int) -> Tableau:
-    """Gauss: collocation at the s zeros of P_s(2c - 1); self-conjugate.
+    """Make the tableau of the Gauss method with s stages.
 
-    Hairer, Lubich, Wanner, II.1.3.
+    It is collocation at the s zeros of P_s(2c - 1) (Hairer, Lubich, Wanner, II.1.3),
+    and its own symplectic conjugate.
 
     **Arguments:**
 
@@ -170,7 +173,7 @@ def gauss_tableau(stages: int) -> Tableau:
 
 @lru_cache(maxsize=128)
 def user_tableau(a: tuple[tuple[float, ...], ...], b: tuple[float, ...]) -> Tableau:
-    """The tableau of float64 coefficients, taken exactly; c_i = Σ_j a_ij.
+    """Make a tableau with c_i = Σ_j a_ij from float64 coefficients, taken as exact.
 
     **Arguments:**
 

@@ -1,4 +1,4 @@
-"""Small building blocks without mechanics: contractions, norms, iterations."""
+"""The numerical building blocks without mechanics: products, norms, iterations."""
 
 from ._compensated import two_sum as two_sum
 from ._contraction import (

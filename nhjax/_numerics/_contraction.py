@@ -1,8 +1,8 @@
-"""Products and inverses of tiny matrices, in elementary operations.
+"""Products and inverses of tiny matrices, written in elementary operations.
 
-Libraries of linear algebra are called at a price that matrices of a few rows are not
-worth: inside a time loop the calls cost more than the arithmetic, they cannot be
-compiled into one kernel with what surrounds them, and batches of them run one by one.
+For matrices of a few rows a call into a library of linear algebra is too expensive:
+inside a time loop the calls cost more than the arithmetic, they cannot be compiled into
+one kernel with the operations around them, and batches of them run one by one.
 """
 
 import itertools
@@ -20,11 +20,11 @@ from jaxtyping import Array, Float
 from .._compile import LARGEST_REDUCTION
 
 
-# More rows are inverted by a library: a kernel may not sum more numbers than such a
-# matrix has.
+# Matrices with more rows are inverted by a library: a kernel may not sum more numbers
+# than a matrix of this size has.
 LARGEST = math.isqrt(LARGEST_REDUCTION)
-# Longer sums and larger products are left to one too: what is written out is to stay
-# short, and from some 10⁵ terms on the library was the faster (measured).
+# Longer sums and larger products are left to a library too: the program that is written
+# out must stay short, and from some 10⁵ terms on the library was faster (measured).
 LONGEST_SUM, LARGEST_PRODUCT = 128, 2**15
 
 
@@ -33,7 +33,7 @@ Matrix: TypeAlias = Float[Array, "n n"] | Float[Array, " n"]
 
 
 def small_einsum(subscripts: str, a: Array, b: Array) -> Array:
-    """`jnp.einsum(subscripts, a, b)`, written out as products and sums if small."""
+    """Compute `jnp.einsum(subscripts, a, b)`, as single products and sums if small."""
     operands, result = subscripts.split("->")
     first, second = operands.split(",")
     summed = [index for index in dict.fromkeys(first + second) if index not in result]
@@ -45,7 +45,8 @@ def small_einsum(subscripts: str, a: Array, b: Array) -> Array:
         return jnp.sum(x * y, axis=tuple(range(len(result), len(order))))
     if math.prod(summed_shape) > LONGEST_SUM or math.prod(shape) > LARGEST_PRODUCT:
         return jnp.einsum(subscripts, a, b)
-    # Term by term: what is larger is summed by a library.
+    # The terms are added one by one, since a reduction of this size would be a call
+    # into a library.
     terms = (
         _term(x, index) * _term(y, index)
         for index in itertools.product(*map(range, summed_shape))
@@ -54,13 +55,16 @@ def small_einsum(subscripts: str, a: Array, b: Array) -> Array:
 
 
 def _term(x: Array, index: tuple[int, ...]) -> Array:
-    """x at an index of its last axes; those of length one have but one term."""
+    """Take x at an index of its last axes; axes of length one are constant."""
     lengths = x.shape[x.ndim - len(index) :]
     return x[(..., *(k if n > 1 else 0 for k, n in zip(index, lengths, strict=True)))]
 
 
 def matvec(matrix: Matrix, x: Float[Array, "... n"]) -> Float[Array, "... n"]:
-    """The matrix times the vectors along the last axis of x, which has at most four."""
+    """Multiply the vectors along the last axis of x by a matrix.
+
+    The array x has at most four axes.
+    """
     if matrix.ndim == 1:
         return jnp.expand_dims(matrix, range(x.ndim - 1)) * x
     rows = "abc"[: x.ndim - 1]
@@ -68,7 +72,7 @@ def matvec(matrix: Matrix, x: Float[Array, "... n"]) -> Float[Array, "... n"]:
 
 
 def _aligned(x: Array, indices: str, order: list[str]) -> Array:
-    """x with its axes in the given order, and axes of length one for the others."""
+    """Put the axes of x in the given order; missing axes get length one."""
     present = [index for index in order if index in indices]
     x = jnp.transpose(x, [indices.index(index) for index in present])
     return jnp.expand_dims(
@@ -77,7 +81,7 @@ def _aligned(x: Array, indices: str, order: list[str]) -> Array:
 
 
 def _contract_axes(dimension_numbers, a: Array, b: Array) -> Array:
-    """`jax.lax.dot_general` with these dimension numbers, by `contract`."""
+    """Compute `jax.lax.dot_general` with these dimension numbers by `small_einsum`."""
     (summed_a, summed_b), (batch_a, batch_b) = dimension_numbers
     letters = iter(string.ascii_letters)
     first = [next(letters) for _ in a.shape]
@@ -93,9 +97,9 @@ def _contract_axes(dimension_numbers, a: Array, b: Array) -> Array:
 
 @jax.custom_jvp
 def inverse(matrix: Matrix) -> Matrix:
-    """The inverse of a small matrix; not finite where there is none."""
+    """Invert a small matrix; the result is not finite if there is no inverse."""
     size = matrix.shape[0]
-    # One constraint is by far the commonest case.
+    # A system with one constraint, whose matrix has size 1, is the commonest case.
     if matrix.ndim == 1 or size == 1:
         return 1 / matrix
     if size == 0:
@@ -115,7 +119,7 @@ def _inverse_jvp(primals, tangents):
 
 
 def _eliminated(matrix: Float[Array, "m m"]) -> Float[Array, "m m"]:
-    """The inverse by elimination of Gauss and Jordan, in place, with row pivoting."""
+    """Invert a matrix by Gauss-Jordan elimination in place, with row pivoting."""
     rows = jnp.arange(matrix.shape[0])
 
     def at(x, k):
@@ -125,7 +129,8 @@ def _eliminated(matrix: Float[Array, "m m"]) -> Float[Array, "m m"]:
         table, order = carry
         column, row = at(table.T, k), at(table, k)
         best = jnp.argmax(jnp.where(rows >= k, jnp.abs(column), -1))
-        # By masks: an index that varies over a batch would gather and scatter.
+        # Rows are chosen by masks: an index that varies over a batch would lead to
+        # gather and scatter operations.
         is_k, is_pivot = rows == k, rows == best
         pivot_row = jnp.sum(jnp.where(is_pivot[:, None], table, 0), axis=0)
         pivot = at(pivot_row, k)
@@ -135,7 +140,7 @@ def _eliminated(matrix: Float[Array, "m m"]) -> Float[Array, "m m"]:
         table = jnp.where(is_pivot[:, None], row[None], table)
         place = jnp.sum(jnp.where(is_pivot, order, 0))
         order = jnp.where(is_pivot, at(order, k), order)
-        # Column k makes room for that of the inverse.
+        # Column k is replaced by the column of the inverse.
         table = jnp.where(is_k[None], 0, table) - column[:, None] * scaled[None]
         table = jnp.where(is_k[:, None], scaled[None], table)
         return table, jnp.where(is_k, place, order)
@@ -146,7 +151,7 @@ def _eliminated(matrix: Float[Array, "m m"]) -> Float[Array, "m m"]:
 
 
 def with_small_products(program: Any) -> Callable[..., list[Any]]:
-    """A closed program as a function, its small products of matrices written out."""
+    """Make a function of a program, in which small matrix products are written out."""
 
     def run(*args):
         return _evaluated(program.jaxpr, program.consts, args)
@@ -175,7 +180,8 @@ def _evaluated(program, consts, args):
         else:
             primitive = equation.primitive
             bound = primitive.get_bind_params(params)
-            # Earlier releases of JAX give functions apart from the other parameters.
+            # Earlier releases of JAX return functions separately from the other
+            # parameters.
             functions, params = bound if isinstance(bound, tuple) else ((), bound)
             out = primitive.bind(*functions, *inputs, **params)
             out = out if primitive.multiple_results else [out]
@@ -184,6 +190,6 @@ def _evaluated(program, consts, args):
 
 
 def _is_plain(equation) -> bool:
-    """Whether a product is of matrices of the type of its result."""
+    """Tell whether the factors of a product have the dtype of its result."""
     types = {variable.aval.dtype for variable in (*equation.invars, *equation.outvars)}
     return len(types) == 1

@@ -1,4 +1,4 @@
-"""Jacobians that are diagonal, known from the program of a function."""
+"""Jacobians, which are computed as diagonals where the function's program allows it."""
 
 import itertools
 import math
@@ -15,25 +15,30 @@ from ._contraction import Matrix
 
 
 class _Aligned(NamedTuple):
-    """Of a vector, or of a number i = 0: element i depends on u_{i + offset}."""
+    """The dependence of a vector whose element i depends on u_{i + offset} alone.
+
+    A number counts as the element i = 0.
+    """
 
     offset: int
 
 
 class _Unknown(NamedTuple):
-    """May depend on all."""
+    """The dependence of a value that may depend on all elements of u."""
 
 
-# What a value depends on; None is nothing at all.
+# The dependence of a value on u; None if it does not depend on u at all.
 _Dependence: TypeAlias = _Aligned | _Unknown | None
 
 
 def jacobian(function: Callable[[Array], Array], u: Float[Array, " n"]) -> Matrix:
-    """∂f_i/∂u_j, or its diagonal alone if no f_i depends on any but u_i.
+    """Compute ∂f_i/∂u_j, or its diagonal alone if each f_i depends on u_i alone.
 
-    The mass matrices of most Lagrangians that one writes down are diagonal, and cost n
-    instead of n² then. It is decided from the operations of the derivative, not from
-    values, when the function is traced: what it does not see through counts as dense.
+    The mass matrices of most Lagrangians that one writes down are diagonal; their
+    products with vectors then cost n instead of n² operations. Whether the Jacobian is
+    diagonal is decided when the function is traced, from the operations of its
+    derivative and not from values. A function whose operations are not understood
+    counts as dense.
     """
 
     def push(u, du):
@@ -51,7 +56,7 @@ def jacobian(function: Callable[[Array], Array], u: Float[Array, " n"]) -> Matri
 
 
 def _followed(program: Any, inputs: Sequence[_Dependence]) -> list[_Dependence]:
-    """What the results of a program depend on."""
+    """Find the dependences of a program's results, given those of its inputs."""
     known = dict.fromkeys(program.constvars)
     known |= zip(program.invars, inputs, strict=True)
 
@@ -82,7 +87,7 @@ def _dependences(equation: Any, inputs: list[_Dependence]) -> list[_Dependence]:
 
 
 def _dependence(name: str, equation: Any, inputs: list[_Dependence]) -> _Dependence:
-    """That of the result of one operation, of which some input depends on u."""
+    """Find the dependence of an operation's result, if some input depends on u."""
     params, shape = equation.params, equation.outvars[0].aval.shape
     shapes = [x.aval.shape for x in equation.invars]
     moving = [k for k, x in enumerate(inputs) if x is not None]
@@ -115,7 +120,7 @@ def _dependence(name: str, equation: Any, inputs: list[_Dependence]) -> _Depende
 
 
 def _is_scaling(name: str, params: dict[str, Any], shapes: list[Any]) -> bool:
-    """Whether it is a product or sum over no index, as derivatives of v·v leave it."""
+    """Tell if it is a product or sum over no index, as derivatives of v·v contain."""
     if name == "reduce_sum":
         return params["axes"] == ()
     if name != "dot_general":

@@ -1,4 +1,4 @@
-"""Derivatives by the implicit function theorem, and where they are not defined."""
+"""Derivatives by the implicit function theorem, also where they are not defined."""
 
 from collections.abc import Callable
 from typing import Any, TypeVar
@@ -16,10 +16,10 @@ from ._iteration import dense_increment, iterate, Sizes, Solved
 from ._max_norm import max_norm
 
 
-# Round-off units below which terms of the Neumann series are left out.
+# Terms of the Neumann series below this many units of round-off are left out.
 _UNITS_LEFT = 256
-# Terms that have ceased to fall above as many units are not those of a series that
-# converges: there is no derivative then, rather than a wrong one.
+# If the terms of the series stop falling above this many units of round-off, it does
+# not converge: the derivative is NaN then, rather than a wrong number.
 _NOISIEST = 1e4
 
 T = TypeVar("T")
@@ -27,14 +27,15 @@ X = TypeVar("X", bound=PyTree[Array])
 
 
 def solve_contraction(contraction: Callable[[X], X], b: X, *, max_iterations: int) -> X:
-    """x with x = G x + b, for a linear G that contracts; NaN if it does not.
+    """Solve x = G x + b for a linear G that contracts; x is NaN if it does not.
 
     Both x and the solution of the transposed equation are sums of the Neumann series,
-    until its terms are below 256 units of round-off; those that are left out sum up to
-    ρ / (1 - ρ) of that where G contracts by ρ. Where x -> G x + b is a simplified
-    Newton iteration, linearised, this is iterative refinement with its factors, and
-    costs about as many evaluations as the nonlinear iteration did. Derivatives of every
-    order follow from the equation, not from the iterations.
+    taken until its terms are below 256 units of round-off. The terms that are left out
+    sum up to ρ / (1 - ρ) times that bound where G contracts by ρ. If x -> G x + b is a
+    linearised simplified Newton iteration, the sum is iterative refinement with the
+    factors of that iteration, and takes about as many evaluations as the nonlinear
+    iteration did. Derivatives of every order follow from the equation, not from the
+    iterations.
     """
     given, treedef = jax.tree.flatten(b)
 
@@ -73,7 +74,7 @@ def solve_contraction(contraction: Callable[[X], X], b: X, *, max_iterations: in
 
 
 def _not_empty(tree: PyTree[Array]) -> list[Array]:
-    """The leaves that have elements."""
+    """List the leaves of a tree that have elements."""
     return [leaf for leaf in jax.tree.leaves(tree) if leaf.size]
 
 
@@ -82,9 +83,10 @@ def _minus(xs: list[Array], ys: list[Array]) -> list[Array]:
 
 
 def _mixed(xs: list[Array]) -> list[Array]:
-    """The same, of which none is constant unless all are.
+    """Return the same arrays, each of which depends on all of them.
 
-    A linear equation with a constant on one side could not be transposed.
+    So either all of them are constant for differentiation or none is: a linear equation
+    of which some parts are constant could not be transposed.
     """
     nothing = 0 * sum(x.reshape(-1)[0] for x in xs)
     return [x + nothing for x in xs]
@@ -98,12 +100,13 @@ def root(
     judged: Callable[[X], PyTree[Array]] = lambda x: x,
     max_iterations: int = 30,
 ) -> Solved[X, None]:
-    """A root of `residual` near `x0`, to round-off, by Newton's method.
+    """Find a root of `residual` near `x0`, to round-off, by Newton's method.
 
-    `scale` is the size that the `judged` part of x is rounded by: not that of x0 where
-    this is an increment to something larger. Multipliers, which have units of their
-    own and follow from the rest, need not be judged. The derivative is that of the
-    root, by a dense solve with the Jacobian there.
+    The iteration ends by the size of the `judged` part of its increments. `scale` is
+    the size to which the round-off of that part is proportional, which is larger than
+    the size of x0 if x is an increment to something larger. Multipliers, which have
+    units of their own and follow from the rest, need not be judged. The derivative of
+    the root is found by a dense solve with the Jacobian there.
     """
     flat, unravel = ravel_pytree(x0)
     scale = jax.lax.stop_gradient(scale)
@@ -113,14 +116,15 @@ def root(
 
     def sweep(x):
         dx, _ = dense_increment(lambda z: (flat_residual(z), None), x)
-        # What is not judged may still not be NaN.
+        # The part that is not judged must be finite all the same.
         rest = jnp.where(jnp.all(jnp.isfinite(dx)), 0, jnp.inf).astype(dx.dtype)
         size = rest + max_norm(*jax.tree.leaves(judged(unravel(dx))))
         return x + dx, Sizes(size), None
 
     def newton(_, x):
         solved = iterate(sweep, x, scale, max_iterations=max_iterations)
-        # As numbers: `custom_root` takes the tangents of `aux` for such.
+        # The outcome is converted to floats, because `custom_root` takes the tangents
+        # of `aux` for floats.
         outcome = (solved.converged, solved.exhausted, solved.num_iterations)
         return solved.x, jax.tree.map(lambda z: z.astype(x.dtype), outcome)
 
@@ -135,12 +139,13 @@ def root(
 
 
 def nan_gradient_unless(ok: BoolScalar, tree: X, parameters: PyTree[Any]) -> X:
-    """The same values, with NaN for derivatives where `ok` is false.
+    """Return the same values, with derivatives that are NaN where `ok` is false.
 
-    Those with respect to all that is among the `parameters`, whether or not the values
-    came to depend on it. A derivative of nothing stays zero: a loss that leaves out a
-    failed lane has one. The rule is written as a linear equation, because a rule of
-    forward mode is transposed to that of reverse mode, and this one is not linear.
+    This holds for the derivatives with respect to all `parameters`, whether or not the
+    values depend on them. A zero cotangent stays zero, so that a loss that leaves out a
+    failed lane has a derivative. The rule is written as a linear equation, because JAX
+    transposes the rule of forward mode to that of reverse mode, and this rule is not
+    linear.
     """
     parameters = eqx.filter(parameters, eqx.is_inexact_array)
     return jax.tree.map(
@@ -153,8 +158,9 @@ def nan_gradient_unless(ok: BoolScalar, tree: X, parameters: PyTree[Any]) -> X:
 
 @eqx.filter_custom_jvp
 def _identity(x: Array, ok: BoolScalar, parameters: PyTree[Array]) -> Array:
-    # By this function alone JAX decides whether x has a lane for each of a batch, and
-    # the derivative has one wherever `ok` or a parameter does. It compiles to nothing.
+    # From this function JAX decides whether x is batched under `vmap`. The derivative
+    # of x is batched wherever `ok` or a parameter is, so that x must seem to depend on
+    # them. The function compiles to nothing.
     for leaf in jax.tree.leaves(parameters):
         ok = ok | jnp.any(leaf == 0)
     return jnp.where(ok, x, x)
@@ -179,11 +185,12 @@ def _identity_jvp(primals, tangents):
 
 
 class ClosureConverted(eqx.Module):
-    """A function and what it closes over, the arrays in this among the leaves.
+    """A function with the arrays that it closes over, which are among its leaves.
 
-    So that derivatives reach it where rules of differentiation are our own, which must
-    be given all that is differentiated. As `equinox.filter_closure_convert`, but it
-    takes arrays of any sharding, as there are inside and outside of `jax.shard_map`.
+    Our own rules of differentiation must be given all that is differentiated; with this
+    class derivatives reach the closed-over arrays too. It does what
+    `equinox.filter_closure_convert` does, but takes arrays of any sharding, as there
+    are inside and outside of `jax.shard_map`.
     """
 
     consts: list[Array]
@@ -207,19 +214,19 @@ class ClosureConverted(eqx.Module):
 
 
 def has_tangent(tangents: PyTree[Any]) -> PyTree[bool]:
-    """Which leaves of a tree of tangents are not the `None` of a symbolic zero."""
+    """Tell which leaves of a tree of tangents are not the `None` of a symbolic zero."""
     return jax.tree.map(
         lambda leaf: leaf is not None, tangents, is_leaf=lambda leaf: leaf is None
     )
 
 
 def zero_unless(ok: BoolScalar, tree: X) -> X:
-    """The tree with zeros where `ok` is false; `None` stays."""
+    """Replace the numbers of a tree by zeros where `ok` is false; `None` stays."""
     return jax.tree.map(lambda x: jnp.where(ok, x, jnp.zeros_like(x)), tree)
 
 
 def frozen(tree: T) -> T:
-    """The same without derivatives; functions and other leaves are left alone."""
+    """Stop derivatives through the arrays of a tree, and keep its other leaves."""
     return jax.tree.map(
         lambda x: jax.lax.stop_gradient(x) if eqx.is_array(x) else x, tree
     )

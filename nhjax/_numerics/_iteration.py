@@ -1,4 +1,4 @@
-"""The loop that ends at round-off, and the increments that it is fed."""
+"""Iterations that run until their increments are round-off, and Newton increments."""
 
 from collections.abc import Callable
 from typing import Generic, NamedTuple, TypeVar
@@ -15,27 +15,28 @@ X = TypeVar("X")
 Aux = TypeVar("Aux")
 
 
-# The units of round-off up to which increments that have ceased to fall are taken for
-# noise where an iteration may be slow. Above it they may as well be those of a slow
-# iteration that comes near in circles.
+# Where an iteration may be slow, increments that have stopped falling are taken for
+# noise up to this many units of round-off. Larger ones may as well be those of a slow
+# iteration that approaches the solution in circles.
 NOISE_UNITS = 400
-# With the first increment that fails to fall so many units of round-off are believed to
-# be noise, and with each further one so many times more: where an iteration may be
-# slow, increments that rise and fall need not have come to an end.
+# At the first increment that fails to fall, this many units of round-off are believed
+# to be noise, and at each further one the number grows by one of the two factors below.
+# The factor is smaller where an iteration may be slow, since its increments may rise
+# and fall before it has come to an end.
 _FIRST_UNITS = 30.0
 _GROWTH, _GROWTH_IF_SLOW = 30.0, 2.0
-# An increment that is larger by this than x and the first increment is of an iteration
-# that diverges.
+# An iteration diverges if an increment is larger by this factor than x and the first
+# increment together.
 _HOPELESS = 1e6
-# No more magnification of round-off than this is believed in.
+# The magnification of round-off by the problem is not believed to exceed this factor.
 _LARGEST_NOISE = 1e5
 
 
 class Sizes(NamedTuple):
-    """The sizes of an increment and of the iterate that it leads to, in one unit.
+    """The sizes of an increment and of the iterate that it leads to, in the same unit.
 
-    `noise` is how much the iterate would change if what is given were changed by its
-    own size, where that is known: round-off does so in units of round-off.
+    `noise`, where it is known, is the change of the iterate if the data of the problem
+    changed by its own size; round-off changes the data by units of round-off.
     """
 
     increment: FloatScalar
@@ -44,10 +45,11 @@ class Sizes(NamedTuple):
 
 
 class Solved(NamedTuple, Generic[X, Aux]):
-    """The outcome of an iteration: `aux` belongs to the last evaluation.
+    """The outcome of an iteration: its last iterate, and whether it has converged.
 
-    If it has not converged, it was `exhausted` where it was given up for the number of
-    its iterations, and has diverged otherwise.
+    `aux` is what the last sweep evaluated. An iteration that has not converged is
+    `exhausted` if it was given up after the largest number of iterations; otherwise it
+    has diverged.
     """
 
     x: X
@@ -58,7 +60,7 @@ class Solved(NamedTuple, Generic[X, Aux]):
 
 
 class _Rules(NamedTuple):
-    """By what increments are judged: see `iterate`."""
+    """The constants by which `iterate` judges the increments of an iteration."""
 
     scale: FloatScalar
     floor: FloatScalar
@@ -68,7 +70,13 @@ class _Rules(NamedTuple):
 
 
 class _Progress(NamedTuple):
-    """What is known of an iteration on its way."""
+    """The progress of an iteration so far.
+
+    - `first`, `smallest`: the first and the smallest increment.
+    - `believed`: the size of increments, relative to x, that is believed to be noise.
+    - `iterations`: how many iterations have been made.
+    - `done`, `converged`, `exhausted`: whether the iteration has ended, and how.
+    """
 
     first: FloatScalar
     smallest: FloatScalar
@@ -92,20 +100,20 @@ def iterate(
     """Repeat `sweep` until its increments no longer fall.
 
     `sweep(x)` returns the next iterate, the sizes of the increment and of the iterate,
-    and whatever was evaluated at x. Increments count relative to `scale`, what x is
-    rounded by, or to the size of the iterate, if it is larger: x may start from
-    nothing. Where neither is known to be more than nothing they count relative to the
-    first, which counts as it is.
+    and whatever was evaluated at x. Increments are measured relative to `scale`, the
+    size to which the round-off of x is proportional, or relative to the size of the
+    iterate if that is larger, because x may start from zero. If both are zero,
+    increments are measured relative to the first one, which is measured as it is.
 
-    An increment below the unit round-off (or `tolerance`) ends the iteration; so do
-    small increments that have ceased to fall, since that is round-off speaking. The
-    floor of round-off depends on the conditioning of the problem, so that one absolute
-    threshold would be either too coarse or never met (Hairer, Lubich, Wanner, GNI,
-    section VIII.6): the more often increments fail to fall, the larger a floor is
-    believed, up to `noise_units` of round-off. By default that is its square root, for
-    iterations that converge so fast that nothing but noise can be in their way.
-    An increment that is not finite, or far larger than the first and the iterate, ends
-    the iteration too.
+    An increment below the unit round-off (or `tolerance`) ends the iteration. Small
+    increments that have stopped falling end it too, because they are round-off. How
+    large round-off can be depends on the conditioning of the problem, so that one
+    absolute threshold would be either too coarse or never met (Hairer, Lubich, Wanner,
+    GNI, section VIII.6): the more often increments fail to fall, the larger a level of
+    round-off is believed, up to `noise_units` of round-off. By default the largest
+    level is the square root of the unit round-off, which suits iterations that converge
+    so fast that nothing but noise can slow them down. An increment that is not finite,
+    or far larger than the first one and the iterate, ends the iteration as well.
     """
     aux_shape = jax.eval_shape(lambda x: sweep(x)[2], x)
     aux = jax.tree.map(lambda s: jnp.zeros(s.shape, s.dtype), aux_shape)
@@ -137,11 +145,12 @@ def iterate(
 
 
 def _progress(rules: _Rules, before: _Progress, sizes: Sizes) -> _Progress:
-    """Whether an iteration has come to an end with an increment, and how."""
+    """Update the progress of an iteration by an increment; decide whether it ends."""
     increment = sizes.increment
     first = jnp.where(before.iterations == 0, increment, before.first)
     size = jnp.maximum(rules.scale, sizes.iterate)
-    # No quotients, which would wait for each other: sizes are compared as they are.
+    # Sizes are compared without forming quotients, which would have to be computed one
+    # after the other.
     measure = jnp.where(size > 0, size, before.first)
     stalls = increment >= before.smallest
     more = jnp.minimum(rules.growth * before.believed, rules.noisiest)
@@ -153,7 +162,7 @@ def _progress(rules: _Rules, before: _Progress, sizes: Sizes) -> _Progress:
     stagnant = stalls & (increment <= believed * magnified)
     converged = (increment <= rules.floor * measure) | stagnant
     count = before.iterations + 1
-    # False for what is not finite.
+    # This is False if the increment is not finite.
     bounded = increment < _HOPELESS * (measure + first)
     exhausted = bounded & ~converged & (count >= rules.max_iterations)
     return _Progress(
@@ -171,7 +180,7 @@ def dense_increment(
     residual: Callable[[Float[Array, " k"]], tuple[Float[Array, " k"], Aux]],
     x: Float[Array, " k"],
 ) -> tuple[Float[Array, " k"], Aux]:
-    """The Newton increment -J⁻¹ r at x with the exact Jacobian J by autodiff."""
+    """Compute the Newton increment -J⁻¹ r at x with the exact J by autodiff."""
     jacobian, r, aux = jacobian_and_value(residual, x)
     return jnp.linalg.solve(jacobian, -r), aux
 
@@ -180,7 +189,7 @@ def jacobian_and_value(
     residual: Callable[[Float[Array, " k"]], tuple[Float[Array, " k"], Aux]],
     x: Float[Array, " k"],
 ) -> tuple[Float[Array, "k k"], Float[Array, " k"], Aux]:
-    """The exact Jacobian of a residual by autodiff, the residual, and its `aux`."""
+    """Compute a residual, its `aux`, and its exact Jacobian by autodiff."""
 
     def evaluated_twice_is_once(x):
         r, aux = residual(x)

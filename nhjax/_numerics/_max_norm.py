@@ -1,4 +1,4 @@
-"""The sizes of arrays: their largest number, and relative to another size."""
+"""The sizes of arrays, which are measured by their largest number."""
 
 from functools import reduce
 
@@ -10,12 +10,13 @@ from .._custom_types import FloatScalar, FloatScalarLike
 
 
 def max_norm(*arrays: Array) -> FloatScalar:
-    """max |x| over one or more arrays; NaN if any number is, 0 if all are empty.
+    """Compute max |x| over one or more arrays; NaN if a number is, 0 if all are empty.
 
-    Numbers that are not negative are ordered as their bit patterns are, with NaN above
-    infinity. A maximum of floats that hands on NaN is five instructions that wait for
-    each other, one of integers is two: as floats, sizes took a third of the time of an
-    iteration on the stages.
+    The maximum is taken over the bit patterns, since numbers that are not negative are
+    ordered as their bit patterns are, with NaN above infinity. A maximum of floats that
+    propagates NaN takes five instructions that wait for each other, one of integers
+    takes two: with maxima of floats, the sizes took a third of the time of an iteration
+    on the stages.
     """
     dtype = jnp.result_type(*arrays)
     bits = {2: jnp.int16, 4: jnp.int32, 8: jnp.int64}[dtype.itemsize]
@@ -30,10 +31,10 @@ def max_norm(*arrays: Array) -> FloatScalar:
 
 
 def unit(scale: FloatScalarLike) -> FloatScalar:
-    """What sizes are measured in: the scale, or one where it is zero."""
+    """Return the unit in which sizes are measured: the scale, or one if it is zero."""
     return jnp.where(scale > 0, scale, 1)
 
 
 def relative(size: FloatScalar, scale: FloatScalarLike) -> FloatScalar:
-    """A size over what it is measured in."""
+    """Divide a size by the scale that it is measured in, or by one if that is zero."""
     return size / unit(scale)

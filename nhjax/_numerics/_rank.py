@@ -13,8 +13,9 @@ from .._custom_types import BoolScalar, FloatScalar
 class Rank(NamedTuple):
     """The derivatives of constraints at some configuration, which must have full rank.
 
-    They have k rows of DΓ, or m + k of D2Φ and DΓ. Where Newton's method starts they
-    `count` only if it fails: it may leave the place.
+    The `jacobian` has k rows of DΓ, or m + k rows of D2Φ and DΓ, and `counts` tells
+    whether its rank matters: where Newton's method starts it does so only if the method
+    fails, since otherwise the method has left the place.
     """
 
     jacobian: Float[Array, "l n"]
@@ -23,15 +24,16 @@ class Rank(NamedTuple):
 
     @property
     def deficient(self) -> BoolScalar:
-        """Whether it counts and is not of full rank."""
+        """Tell whether the rank matters and is not full."""
         n, eps = self.jacobian.shape[1], jnp.finfo(self.jacobian.dtype).eps
         return self.counts & (conditioning(self.jacobian) <= 10 * n * eps)
 
 
 def those_that_count(ranks: list[Rank]) -> list[Rank]:
-    """At most one of each shape: of several, the one that counts.
+    """Keep at most one matrix of each shape, namely the one that counts.
 
-    Singular values are what costs most here.
+    The fewer matrices there are, the fewer singular values must be computed, which cost
+    more than anything else here.
     """
     merged: dict[tuple[int, ...], Rank] = {}
     for rank in ranks:
@@ -44,16 +46,17 @@ def those_that_count(ranks: list[Rank]) -> list[Rank]:
 
 
 def conditioning(matrix: Float[Array, "k l"]) -> FloatScalar:
-    """Smallest over largest singular value, after scaling rows (and columns) to one.
+    """Compute the ratio of the smallest to the largest singular value, after scaling.
 
-    The scaling makes it blind to the units of single coordinates and constraints.
+    Rows, and of square matrices the columns too, are scaled to size one, which makes
+    the ratio independent of the units of single coordinates and constraints.
     """
     if matrix.shape[0] == 0:
         return jnp.ones((), matrix.dtype)
     rows = jnp.max(jnp.abs(matrix), axis=1)
     rows = jnp.where(rows > 0, rows, 1)
     if matrix.shape[0] == matrix.shape[1]:
-        # Each root on its own: a product could overflow.
+        # The matrix is divided by each root on its own: their product could overflow.
         roots = jnp.sqrt(rows)
         scaled = matrix / roots[:, None] / roots[None, :]
     else:
@@ -61,12 +64,12 @@ def conditioning(matrix: Float[Array, "k l"]) -> FloatScalar:
     if matrix.shape[0] > matrix.shape[1]:
         return jnp.zeros((), matrix.dtype)
     singular = jnp.linalg.svd(scaled, compute_uv=False)
-    # Not "> 0": what is not a number must not pass for singular.
+    # The test is "== 0" and not "> 0", so that NaN does not count as singular.
     return jnp.where(singular[0] == 0, 0, singular[-1] / singular[0])
 
 
 def dependent_rows(jacobian: np.ndarray) -> list[int]:
-    """The rows that take part in a vanishing combination of rows."""
+    """Find the rows that take part in a vanishing linear combination of rows."""
     rows = np.max(np.abs(jacobian), axis=1, keepdims=True)
     left, singular, _ = np.linalg.svd(jacobian / np.where(rows > 0, rows, 1))
     singular = np.append(singular, np.zeros(len(jacobian) - len(singular)))

@@ -1,4 +1,4 @@
-"""One step: its stage equations, their solvers, its end and its derivative."""
+"""One step of a method: its stage equations, their solvers, its end and derivative."""
 
 from .._numerics import Solved as Solved
 from ._chart import chart_at as chart_at

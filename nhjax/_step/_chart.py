@@ -1,4 +1,4 @@
-"""The chart around the start of a step, on a vector space and on a curved group."""
+"""The chart around the start of a step, on a vector space or on a Lie group."""
 
 from abc import abstractmethod
 
@@ -15,8 +15,8 @@ from .._numerics import two_sum
 class AbstractChart(eqx.Module):
     """The chart Ξ -> g_k τ(Ξ) of a manifold around g_k, in which a step is written.
 
-    Positions, velocities and covectors at g_k τ(Ξ) are carried to the chart and back
-    (paper, section 6).
+    Its methods carry velocities and covectors at g_k τ(Ξ) to the chart and back (paper,
+    section 6).
     """
 
     manifold: eqx.AbstractVar[AbstractLieGroup]
@@ -26,13 +26,13 @@ class AbstractChart(eqx.Module):
     def body_velocities(
         self, xi: Float[Array, "r n"], velocity: Float[Array, "r n"]
     ) -> Float[Array, "r n"]:
-        """dτ_Ξ H, the body velocities of the chart velocities H."""
+        """Compute the body velocities dτ_Ξ H of the chart velocities H."""
 
     @abstractmethod
     def chart_velocities(
         self, xi: Float[Array, "r n"], body_velocity: Float[Array, "r n"]
     ) -> Float[Array, "r n"]:
-        """dτ_Ξ⁻¹ η, the chart velocities of the body velocities η."""
+        """Compute the chart velocities dτ_Ξ⁻¹ η of the body velocities η."""
 
     @abstractmethod
     def to_chart(
@@ -42,23 +42,23 @@ class AbstractChart(eqx.Module):
         momentum: Float[Array, "r n"],
         force: Float[Array, "r n"],
     ) -> tuple[Float[Array, "r n"], Float[Array, "r n"]]:
-        """(Π, F): momenta and forces with respect to the coordinates Ξ.
+        """Compute (Π, F), the momenta and forces with respect to the coordinates Ξ.
 
-        Π = dτ_Ξ^* μ, and F = dτ_Ξ^* w + (ddτ_Ξ)^*(H, Π), in which the second term is
-        the derivative of ⟨μ, dτ_Ξ H⟩ along Ξ.
+        They are Π = dτ_Ξ^* μ and F = dτ_Ξ^* w + (ddτ_Ξ)^*(H, Π) for body momenta μ and
+        body forces w. The second term of F is the derivative of ⟨μ, dτ_Ξ H⟩ along Ξ.
         """
 
     @abstractmethod
     def to_start(
         self, xi: Float[Array, "r n"], covector: Float[Array, "r n"]
     ) -> Float[Array, "r n"]:
-        """Ad^*_{τ(Ξ)⁻¹} w, body covectors at g_k τ(Ξ) as body covectors at g_k."""
+        """Compute Ad^*_{τ(Ξ)⁻¹} w: carry body covectors from g_k τ(Ξ) to g_k."""
 
     @abstractmethod
     def to_end(
         self, xi: Float[Array, " n"], covector: Float[Array, " n"]
     ) -> Float[Array, " n"]:
-        """Ad^*_{τ(Ξ)} μ, a body covector at g_k as a body covector at g_k τ(Ξ)."""
+        """Compute Ad^*_{τ(Ξ)} μ: carry a body covector from g_k to g_k τ(Ξ)."""
 
     @abstractmethod
     def carry(
@@ -67,7 +67,10 @@ class AbstractChart(eqx.Module):
         momentum: Float[Array, " n"],
         compensation: Float[Array, " n"],
     ) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
-        """Ad^*_{τ(ξ)} of a compensated sum, as a compensated sum."""
+        """Apply Ad^*_{τ(ξ)} to a compensated sum; return a compensated sum.
+
+        A compensated sum is a number and the rounding error it has accumulated.
+        """
 
     @abstractmethod
     def base_momentum(
@@ -77,22 +80,29 @@ class AbstractChart(eqx.Module):
         transported: Float[Array, " n"],
         chart_force: Float[Array, " n"],
     ) -> Float[Array, " n"]:
-        """What the sums h Σ â_ij F^j start from in the stage momenta Π^i.
+        """Compute the constant term of the stage momenta Π^i = base + h Σ â_ij F^j.
 
-        dτ_ξ^* μ_{k+1} - h Σ b_j F^j, with μ_{k+1} = Ad^*_{τ(ξ)}(μ_k + h Σ b_j n^j) and
-        the two sums given.
+        It is dτ_ξ^* μ_{k+1} - h Σ b_j F^j, with
+        μ_{k+1} = Ad^*_{τ(ξ)}(μ_k + h Σ b_j n^j).
+
+        **Arguments:**
+
+        - `xi`: ξ, the increment of the whole step in the chart.
+        - `momentum`: μ_k.
+        - `transported`: h Σ b_j n^j.
+        - `chart_force`: h Σ b_j F^j.
         """
 
     @abstractmethod
     def in_domain(self, xi: Float[Array, "r n"]) -> BoolScalar:
-        """Whether all Ξ^i lie where τ is invertible."""
+        """Tell whether all Ξ^i lie where the retraction τ is invertible."""
 
 
 class FlatChart(AbstractChart):
-    """The chart of a vector space, where nothing is carried.
+    """The chart of a vector space, on which dτ and Ad^* are the identity.
 
-    What it returns is what it was given, so that the program of a step is that of the
-    paper's equations on a vector space.
+    Its methods return what they were given, so that the compiled program of a step is
+    that of the paper's equations on a vector space.
     """
 
     manifold: AbstractLieGroup
@@ -101,13 +111,13 @@ class FlatChart(AbstractChart):
     def body_velocities(
         self, xi: Float[Array, "r n"], velocity: Float[Array, "r n"]
     ) -> Float[Array, "r n"]:
-        """H itself."""
+        """Return the chart velocities H, which are the body velocities here."""
         return velocity
 
     def chart_velocities(
         self, xi: Float[Array, "r n"], body_velocity: Float[Array, "r n"]
     ) -> Float[Array, "r n"]:
-        """η itself."""
+        """Return the body velocities η, which are the chart velocities here."""
         return body_velocity
 
     def to_chart(
@@ -117,19 +127,19 @@ class FlatChart(AbstractChart):
         momentum: Float[Array, "r n"],
         force: Float[Array, "r n"],
     ) -> tuple[Float[Array, "r n"], Float[Array, "r n"]]:
-        """(μ, w) themselves."""
+        """Return the momenta μ and the forces w unchanged."""
         return momentum, force
 
     def to_start(
         self, xi: Float[Array, "r n"], covector: Float[Array, "r n"]
     ) -> Float[Array, "r n"]:
-        """w itself."""
+        """Return the covectors w unchanged."""
         return covector
 
     def to_end(
         self, xi: Float[Array, " n"], covector: Float[Array, " n"]
     ) -> Float[Array, " n"]:
-        """μ itself."""
+        """Return the covector μ unchanged."""
         return covector
 
     def carry(
@@ -138,7 +148,7 @@ class FlatChart(AbstractChart):
         momentum: Float[Array, " n"],
         compensation: Float[Array, " n"],
     ) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
-        """The sum itself."""
+        """Return the compensated sum unchanged."""
         return momentum, compensation
 
     def base_momentum(
@@ -148,16 +158,16 @@ class FlatChart(AbstractChart):
         transported: Float[Array, " n"],
         chart_force: Float[Array, " n"],
     ) -> Float[Array, " n"]:
-        """μ_k: the two sums are the same here, and cancel."""
+        """Return μ_k, because the two sums are the same here and cancel."""
         return momentum
 
     def in_domain(self, xi: Float[Array, "r n"]) -> BoolScalar:
-        """True: the chart is the whole space."""
+        """Return True, because the chart is the whole space."""
         return jnp.asarray(True)
 
 
 class CurvedChart(AbstractChart):
-    """The chart of a Lie group around g_k, by its retraction τ."""
+    """The chart of a Lie group around g_k that its retraction τ gives."""
 
     manifold: AbstractLieGroup
     origin: PyTree[Array]
@@ -165,13 +175,13 @@ class CurvedChart(AbstractChart):
     def body_velocities(
         self, xi: Float[Array, "r n"], velocity: Float[Array, "r n"]
     ) -> Float[Array, "r n"]:
-        """dτ_Ξ H, the body velocities of the chart velocities H."""
+        """Compute the body velocities dτ_Ξ H of the chart velocities H."""
         return jax.vmap(self.manifold.dtau)(xi, velocity)
 
     def chart_velocities(
         self, xi: Float[Array, "r n"], body_velocity: Float[Array, "r n"]
     ) -> Float[Array, "r n"]:
-        """dτ_Ξ⁻¹ η, the chart velocities of the body velocities η."""
+        """Compute the chart velocities dτ_Ξ⁻¹ η of the body velocities η."""
         return jax.vmap(self.manifold.dtau_inv)(xi, body_velocity)
 
     def to_chart(
@@ -181,7 +191,7 @@ class CurvedChart(AbstractChart):
         momentum: Float[Array, "r n"],
         force: Float[Array, "r n"],
     ) -> tuple[Float[Array, "r n"], Float[Array, "r n"]]:
-        """(Π, F): momenta and forces with respect to the coordinates Ξ."""
+        """Compute (Π, F), the momenta and forces with respect to the coordinates Ξ."""
 
         def one(xi, velocity, momentum, force):
             _, pullback = jax.vjp(self.manifold.dtau, xi, velocity)
@@ -193,13 +203,13 @@ class CurvedChart(AbstractChart):
     def to_start(
         self, xi: Float[Array, "r n"], covector: Float[Array, "r n"]
     ) -> Float[Array, "r n"]:
-        """Ad^*_{τ(Ξ)⁻¹} w, body covectors at g_k τ(Ξ) as body covectors at g_k."""
+        """Compute Ad^*_{τ(Ξ)⁻¹} w: carry body covectors from g_k τ(Ξ) to g_k."""
         return jax.vmap(self.manifold.to_start)(xi, covector)
 
     def to_end(
         self, xi: Float[Array, " n"], covector: Float[Array, " n"]
     ) -> Float[Array, " n"]:
-        """Ad^*_{τ(Ξ)} μ, a body covector at g_k as a body covector at g_k τ(Ξ)."""
+        """Compute Ad^*_{τ(Ξ)} μ: carry a body covector from g_k to g_k τ(Ξ)."""
         return self.manifold.to_end(xi, covector)
 
     def carry(
@@ -208,10 +218,10 @@ class CurvedChart(AbstractChart):
         momentum: Float[Array, " n"],
         compensation: Float[Array, " n"],
     ) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
-        """Ad^*_{τ(ξ)} of a compensated sum, as a compensated sum.
+        """Apply Ad^*_{τ(ξ)} to a compensated sum; return a compensated sum.
 
-        The rounding of plain products with Ad^* would add up over the steps as that of
-        plain sums does.
+        The rounding errors of plain products with Ad^* would add up over the steps, as
+        those of plain sums do.
         """
         change = self.manifold.to_end_change(xi, momentum)
         return two_sum(momentum, change + self.manifold.to_end(xi, compensation))
@@ -223,21 +233,21 @@ class CurvedChart(AbstractChart):
         transported: Float[Array, " n"],
         chart_force: Float[Array, " n"],
     ) -> Float[Array, " n"]:
-        """dτ_ξ^* μ_{k+1} - h Σ b_j F^j."""
+        """Compute dτ_ξ^* μ_{k+1} - h Σ b_j F^j, the constant term of Π^i."""
         end = self.to_end(xi, momentum + transported)
         return self.manifold.dtau_dual(xi, end) - chart_force
 
     def in_domain(self, xi: Float[Array, "r n"]) -> BoolScalar:
-        """Whether all Ξ^i lie where τ is invertible."""
+        """Tell whether all Ξ^i lie where the retraction τ is invertible."""
         return jnp.all(jax.vmap(self.manifold.in_chart)(xi))
 
 
 def chart_at(manifold: AbstractLieGroup, origin: PyTree[Array]) -> AbstractChart:
-    """The chart of a manifold around one of its elements."""
+    """Make the chart of a manifold around one of its elements."""
     kind = FlatChart if manifold.is_flat else CurvedChart
     return kind(manifold, origin)
 
 
 def positions(chart: AbstractChart, xi: Float[Array, "r n"]) -> PyTree[Array]:
-    """g_k τ(Ξ^i) for each row of Ξ."""
+    """Compute the positions g_k τ(Ξ^i), one for each row of Ξ."""
     return jax.vmap(lambda xi: chart.manifold.act(chart.origin, xi))(xi)

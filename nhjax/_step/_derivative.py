@@ -1,4 +1,4 @@
-"""A step with its derivative: the implicit function theorem at the converged stages."""
+"""A step with its derivative, by the implicit function theorem at the solved stages."""
 
 from functools import partial
 
@@ -21,9 +21,9 @@ from ._unknowns import Stages
 
 
 class StepArguments(eqx.Module):
-    """What a step is differentiated with respect to; of `step_state` the state alone.
+    """The arguments of a step with respect to which it can be differentiated.
 
-    See `StepState.differentiated_in_state`.
+    Of `step_state` this is the state alone; see `StepState.differentiated_in_state`.
     """
 
     system: AbstractMechanicalSystem
@@ -40,15 +40,16 @@ def differentiable_step(
     solver: AbstractStageSolver,
     skip: BoolScalar,
 ) -> StepOutcome:
-    """One step, as `step`.
+    """Take one step as `step` does, with a derivative that skips the iterations.
 
-    Derivatives do not pass through the iterations. With G(x; θ) the simplified Newton
-    iteration on the stages x, its Jacobian frozen, the solution is a fixed point, so
+    Let G(x; θ) be the Newton iteration of the stage solver on the stages x, with its
+    Jacobian frozen, and θ the arguments of the step. The solution is a fixed point, so
     that
 
     dx = ∂G/∂x dx + ∂G/∂θ dθ,
 
-    and the end of the step follows from x and θ. They are zero where the step failed.
+    and the end of the step follows from x and θ. All derivatives are zero where the
+    step failed.
     """
     system, t, h = arguments.system, arguments.t, arguments.h
     return step(
@@ -67,7 +68,7 @@ def _differentiable_step_jvp(primals, tangents):
     given = frozen((stages, arguments.step_state.lin, x))
     frozen_newton_map = solver.frozen_newton_map(*given)
 
-    # Nothing but states and stages is kept for a reverse pass.
+    # By the checkpoint nothing but states and stages is kept for a reverse pass.
     @partial(jax.checkpoint, prevent_cse=False)
     def change(perturbed, x, rates):
         rates = zero_unless(ok, rates)
@@ -81,7 +82,8 @@ def _differentiable_step_jvp(primals, tangents):
 
         _, b = jax.jvp(lambda theta: corrected(theta, x), (perturbed,), (rates,))
         _, contraction = jax.linearize(lambda x: corrected(perturbed, x), x)
-        # From nothing, where the iteration of the step started from a good guess.
+        # This iteration starts from zero, while that of the step starts from a good
+        # guess, so that it is allowed twice as many iterations.
         limit = 2 * solver.max_iterations
         dx = solve_contraction(contraction, b, max_iterations=limit)
         _, dend = jax.jvp(end, (perturbed, x), (rates, zero_unless(ok, dx)))
@@ -96,9 +98,9 @@ def _differentiable_step_jvp(primals, tangents):
     )
 
 
-# Where JAX splits a scan into what is known and what is linear, it drops the rules of
-# functions, but not those of primitives. Without its rule a step could be
-# differentiated in reverse mode once, and not again.
+# When JAX splits a scan into a known and a linear part, it drops the derivative rules
+# of functions, but not those of primitives. Without its rule a step could be
+# differentiated in reverse mode only once, and not again.
 primitive_step = partial(as_cpu_kernel, differentiable_step)
 
 
@@ -116,10 +118,11 @@ def _stage_system(arguments: StepArguments, method: AbstractMethod) -> StageSyst
 def _end(
     arguments: StepArguments, method: AbstractMethod, x: Stages
 ) -> tuple[State, StepRecord]:
-    """The state at the end of a step and its record, as functions of the stages.
+    """Compute the state at the end of a step and its record, given the stages alone.
 
-    Without the sums of a step, whose compensation has no derivative, and with p from
-    the velocity found at the end: both are the same to round-off.
+    This is the end of `step` without its compensated sums, whose compensation has no
+    derivative, and with p from the fibre coordinate found at the end; the results agree
+    to round-off.
     """
     system, args, start = arguments.system, arguments.args, arguments.step_state.state
     stages = _stage_system(arguments, method)
@@ -128,7 +131,7 @@ def _end(
     p = system.momentum(t, q, u, args)
 
     def continuous():
-        # The symmetric closure has solved for it.
+        # With the symmetric closure this multiplier is one of the unknowns of the step.
         if stages.symmetric:
             return x.end_multiplier
         return linearise(system, t, q, u, args).multiplier

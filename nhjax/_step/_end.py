@@ -1,4 +1,4 @@
-"""The state at the end of a step, from its stages."""
+"""The state at the end of a step, made from its stages."""
 
 from collections.abc import Callable
 
@@ -17,19 +17,21 @@ def end_state(
     last_multiplier: Float[Array, " l"],
     continuous: Callable[[], Float[Array, " l"]],
 ) -> State:
-    """What a step reports at its end, where its q, u and p have been found.
+    """Make the state at the end of a step from its q, u, p and multipliers.
 
     **Arguments:**
 
     - `q`, `u`, `p`: the configuration, the fibre coordinate and the momentum, however
         they were summed.
     - `last_multiplier`: Λ^s, which the propagated closure carries to the next step.
-    - `continuous`: gives λ_c(q, u), which is asked for where it is reported.
+    - `continuous`: a function without arguments that returns λ_c(q, u). It is called
+        only if the closure reports the continuous multiplier.
     """
     v = stages.system.velocity(stages.t + stages.h, q, u, stages.args)
     if stages.method.closure != "propagated":
         return State(q, v, p, continuous())
-    # Only nonholonomic multipliers are carried; a step finds the others anew.
+    # Only nonholonomic multipliers are carried to the next step, which finds the
+    # holonomic ones anew.
     m = stages.num_nonholonomic
     multiplier = last_multiplier[:m]
     if stages.num_holonomic:

@@ -10,19 +10,20 @@ from ._unknowns import Stages
 
 
 class LeadingStructure(eqx.Module):
-    """The leading structure of the linearised stage equations of one step.
+    """The leading part of the linearised stage equations of one step, factorised.
 
-    With N and K at the start of the step, B_i at the nodes of given stages,
-    R the node rows of a_ij and δΛ the change of all multipliers,
+    It serves as the Jacobian of simplified Newton. With N and K at the start of the
+    step, B_i at the nodes of given stages, R the node rows of a_ij and δΛ the change of
+    all multipliers, the unknowns change by
 
     δu_i = -N⁻¹ r_u + h Σ_j â_ij K⁻¹ B_jᵀ δΛ_j        (stages),
     δu_i = -N⁻¹ r_v + h Σ_j R_ij K⁻¹ B_jᵀ δΛ_j        (nodes),
 
-    and for the constraints B_i δu_i = -r_Φ at the nodes, Σ_j a_ij B_i δu_j = -r_Γ at
-    the positions, B_s δu_s = -r of the tangency at the end. The last three give a Schur
-    complement for h δy and h δΛ of the holonomic constraints. It is invertible for
-    small h by hypothesis H2 (for the symmetric closure by the sign of ν) and the
-    compatibility condition.
+    and the constraints require B_i δu_i = -r_Φ at the nodes, Σ_j a_ij B_i δu_j = -r_Γ
+    at the positions, and B_s δu_s = -r for the tangency at the end of the step. These
+    three give a Schur complement for the unknowns h δy of the closure and h δΛ of the
+    holonomic constraints. For small h it is invertible by hypothesis H2 (for the
+    symmetric closure by the sign of ν) and the compatibility condition.
     """
 
     momentum_inverse: Matrix
@@ -34,7 +35,7 @@ class LeadingStructure(eqx.Module):
     def correct_stages(
         self, stages: StageSystem, x: Stages, residual: Float[Array, "s n"]
     ) -> Stages:
-        """u - N⁻¹ r_u for the stages, and the velocities that belong to them."""
+        """Compute u - N⁻¹ r_u for the stages, and the velocities that belong to it."""
         change = matvec(self.momentum_inverse, residual)
         if not stages.hamiltonian:
             return eqx.tree_at(lambda z: z.velocity, x, x.velocity - change)
@@ -42,7 +43,7 @@ class LeadingStructure(eqx.Module):
         return eqx.tree_at(lambda z: z.velocity, x, stage_velocities(stages, x))
 
     def correct_nodes(self, x: Stages, residual: Float[Array, "r n"]) -> Stages:
-        """u - N⁻¹ r_v for the nodes."""
+        """Compute the fibre coordinates u - N⁻¹ r_v of the nodes."""
         node_fibre_coordinate = x.node_fibre_coordinate - matvec(
             self.momentum_inverse, residual
         )
@@ -55,13 +56,13 @@ class LeadingStructure(eqx.Module):
         kinematic: Float[Array, "r m"],
         holonomic: Float[Array, "s k"],
     ) -> Stages:
-        """Change the free multipliers so that the constraints hold."""
+        """Change the free multipliers so that the linearised constraints hold."""
         residual = jnp.concatenate([kinematic.reshape(-1), holonomic.reshape(-1)])
         change = -small_einsum("cd,d->c", self.schur_inverse, residual)
         h_dy = change[: x.closure.size].reshape(x.closure.shape)
         h_dholonomic = change[x.closure.size :].reshape(x.holonomic.shape)
         h_dlambda = stages.free_multipliers(h_dy, h_dholonomic)
-        # h K⁻¹ Bᵀ δΛ; h is divided out only where multipliers themselves are wanted.
+        # This is h K⁻¹ Bᵀ δΛ; a division by h is needed for the multipliers alone.
         push = small_einsum("jnm,jm->jn", self.reaction, h_dlambda)
         a_hat, momentum = stages.coefficients("a_hat"), x.momentum
         velocity_push = push
@@ -97,7 +98,7 @@ class LeadingStructure(eqx.Module):
 def leading_structure(
     stages: StageSystem, x: Stages, lin: Linearisation
 ) -> LeadingStructure:
-    """Factorise the leading structure: N and K at the start of a step, B_i at x."""
+    """Factorise the leading structure, with N and K at the start and B_i at x."""
     if not stages.constrained:
         n, nothing = stages.p.shape[0], jnp.zeros((0, 0), stages.p.dtype)
         reaction = jnp.zeros((stages.method.stages, n, 0), stages.p.dtype)
@@ -124,7 +125,10 @@ def leading_structure(
 def _schur(
     stages: StageSystem, blocks: Float[Array, "s-1 s l l"]
 ) -> Float[Array, "c c"]:
-    """The constraints' change with h δy and h δΛ, from the blocks B_i K⁻¹ B_jᵀ."""
+    """Assemble the derivative of the constraints by h δy and h δΛ.
+
+    `blocks` are the products B_i K⁻¹ B_jᵀ for i >= 2 and all j.
+    """
     m, k, s = stages.num_nonholonomic, stages.num_holonomic, stages.method.stages
     a, a_hat, b = (stages.coefficients(name) for name in ("a", "a_hat", "b"))
     rows = []

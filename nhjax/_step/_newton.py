@@ -1,4 +1,4 @@
-"""The two solvers of the stage equations."""
+"""The two solvers of the stage equations, simplified Newton and Newton's method."""
 
 from abc import abstractmethod
 from collections.abc import Callable
@@ -36,17 +36,17 @@ from ._tolerance import check_tolerance, tolerance_array
 from ._unknowns import Stages
 
 
-# One iteration on the stages of a step; the equations are an argument, so that it can
-# be differentiated with respect to what is in them.
+# One iteration on the stages of a step. The equations are an argument, so that the
+# iteration can be differentiated with respect to the data in them.
 FrozenNewtonMap: TypeAlias = Callable[[StageSystem, Stages], Stages]
 
 
-# A residual of more than this, relative to the momenta, is that of no solution.
+# Stages with a larger residual than this, relative to the momenta, are no solution.
 _GROSS = 1e-6
 
 
 class AbstractStageSolver(eqx.Module):
-    """How the stage equations of a step are solved."""
+    """A solver of the stage equations of a step, the option `stage_solver`."""
 
     max_iterations: eqx.AbstractVar[int]
     tolerance: eqx.AbstractVar[FloatScalarLike]
@@ -63,16 +63,17 @@ class AbstractStageSolver(eqx.Module):
     def solve(
         self, stages: StageSystem, x0: Stages, lin: Linearisation, skip: Array
     ) -> Solved[Stages, Evaluation]:
-        """Solve the stage equations from `x0`; does nothing where `skip` is true."""
+        """Solve the stage equations from `x0`; do nothing where `skip` is true."""
 
     @abstractmethod
     def frozen_newton_map(
         self, stages: StageSystem, lin: Linearisation, x: Stages
     ) -> FrozenNewtonMap:
-        """An iteration whose fixed points solve the stage equations.
+        """Make an iteration whose fixed points solve the stage equations.
 
-        Its Jacobian is frozen, and it contracts at the solution `x`; derivatives of the
-        solution follow from it.
+        Its Jacobian is frozen, that is, constant. The iteration contracts at the
+        solution `x`, and the derivatives of the solution follow from it by the implicit
+        function theorem.
         """
 
 
@@ -83,7 +84,7 @@ def _iterated(
     scale: FloatScalar,
     skip: Array,
 ) -> Solved[Stages, Evaluation]:
-    """The iteration on the stages that both solvers make, with their own sweeps."""
+    """Run the iteration on the stages of a solver, whose own sweep is an argument."""
     return iterate(
         sweep,
         x0,
@@ -96,28 +97,31 @@ def _iterated(
 
 
 class SimplifiedNewton(AbstractStageSolver):
-    """Simplified Newton on the stage system, with its leading structure as Jacobian.
+    """Simplified Newton on the stage equations, with their leading part as Jacobian.
 
     The mass matrix M and the Schur complement of the constraints are inverted once a
     step, at its start; each iteration costs one evaluation of the stage equations and a
-    few small products. The error falls by a factor O(h²) where M is constant and the
-    constraints are linear in v, O(h) elsewhere.
+    few small products. An iteration reduces the error by a factor O(h²) where M is
+    constant and the constraints are linear in v, and by a factor O(h) elsewhere.
 
-    Where it does not converge, Newton's method with the exact Jacobian may. It takes
-    over for such a step, and `Solution.stats["num_newton_steps"]` counts them. A
-    program with both in it takes longer to compile, and runs slower also where one
-    would do. So a plain call of `integrate` is repeated with it if it has
-    failed; in a program of your own (`jax.jit`, `jax.vmap`, `jax.grad`) a step that is
-    not solved ends the run, unless you ask for the fallback.
+    Where this iteration does not converge, Newton's method with the exact Jacobian may.
+    With the fallback it takes over in such a step, and
+    `Solution.stats["num_newton_steps"]` counts these steps. A program that contains
+    both methods takes longer to compile, and runs slower even where the fallback is
+    never used. For this reason a plain call of `integrate` first runs without the
+    fallback, and is repeated with it if a step was not solved. In a program of your own
+    (`jax.jit`, `jax.vmap`, `jax.grad`) a step that is not solved ends the run, unless
+    you ask for the fallback.
 
     **Arguments:**
 
     - `max_iterations`: the number of iterations after which a step counts as failed.
     - `tolerance`: the size of the increment, relative to the velocities, at which to
         stop; 0, the default, iterates to round-off. Changing it recompiles nothing.
-    - `fallback`: whether `nhjax.Newton()` takes over a step that is not solved: True,
-        False, or None, the default, for plain calls alone. Derivatives of a run with it
-        use the exact Jacobian as those of `nhjax.Newton()` do.
+    - `fallback`: whether `nhjax.Newton()` takes over a step that is not solved. It is
+        True, False, or None, the default, which means in plain calls alone. Derivatives
+        of a run with the fallback use the exact Jacobian, as those of `nhjax.Newton()`
+        do.
 
     !!! example
 
@@ -141,7 +145,7 @@ class SimplifiedNewton(AbstractStageSolver):
     def solve(
         self, stages: StageSystem, x0: Stages, lin: Linearisation, skip: Array
     ) -> Solved[Stages, Evaluation]:
-        """Solve the stage equations from `x0`; does nothing where `skip` is true."""
+        """Solve the stage equations from `x0`; do nothing where `skip` is true."""
         structure = leading_structure(stages, x0, lin)
         scale = fibre_coordinate_scale(stages, x0, lin)
 
@@ -152,7 +156,8 @@ class SimplifiedNewton(AbstractStageSolver):
         solved = _iterated(self, sweep, x0, scale, skip)
         if not self.fallback:
             return solved
-        # What is not finite after one iteration is so at the state itself.
+        # If the first iterate is not finite, the functions of the system are not finite
+        # at the state itself, and Newton's method cannot help.
         hopeless = (solved.num_iterations <= 1) & ~all_finite(solved.x)
         ends = solved.converged | hopeless
 
@@ -171,9 +176,10 @@ class SimplifiedNewton(AbstractStageSolver):
     def frozen_newton_map(
         self, stages: StageSystem, lin: Linearisation, x: Stages
     ) -> FrozenNewtonMap:
-        """The iteration of `solve`, with the constraints' slopes at the solution.
+        """Make the iteration of `solve`, with the constraint Jacobians at the solution.
 
-        It need not contract where Newton's method took over, whose iteration does.
+        With the fallback it is the iteration of Newton's method, which contracts also
+        where Newton's method had to take over.
         """
         if self.fallback:
             return self._newton.frozen_newton_map(stages, lin, x)
@@ -182,16 +188,17 @@ class SimplifiedNewton(AbstractStageSolver):
 
 
 def leaves_steps_to_newton(solver: AbstractStageSolver) -> bool:
-    """Whether a plain call is to be repeated with a fallback if it fails."""
+    """Tell whether a plain call that fails is to be repeated with the fallback."""
     return isinstance(solver, SimplifiedNewton) and solver.fallback is None
 
 
 class Newton(AbstractStageSolver):
-    """Newton's method on the stage system with the exact dense Jacobian.
+    """Newton's method on the stage equations, with their exact dense Jacobian.
 
-    Dearer per iteration than `SimplifiedNewton`, but it converges for larger steps and
-    for stiff forces, and tells the round-off of these from an iteration that has not
-    converged. Both give the same trajectory to round-off.
+    An iteration costs more than one of `SimplifiedNewton`, but the method converges for
+    larger steps and for stiff forces. It also tells increments that are round-off,
+    magnified by stiff forces, from those of an iteration that has not converged. Both
+    solvers give the same trajectory to round-off.
 
     **Arguments:** `max_iterations` and `tolerance`, as for `SimplifiedNewton`.
 
@@ -212,7 +219,7 @@ class Newton(AbstractStageSolver):
     def solve(
         self, stages: StageSystem, x0: Stages, lin: Linearisation, skip: Array
     ) -> Solved[Stages, Evaluation]:
-        """Solve the stage equations from `x0`; does nothing where `skip` is true."""
+        """Solve the stage equations from `x0`; do nothing where `skip` is true."""
         _, unravel = ravel_pytree(x0)
         scale = fibre_coordinate_scale(stages, x0, lin)
 
@@ -228,8 +235,8 @@ class Newton(AbstractStageSolver):
             change = stage_residual(moved, x)[0] - r
             dz, noise = jnp.linalg.solve(jacobian, -jnp.stack([r, change], axis=1)).T
             x_next = unravel(z + dz)
-            # What round-off of the positions makes of the stages: stiff forces magnify
-            # it.
+            # This is how far the round-off of the positions moves the stages: stiff
+            # forces magnify it.
             noise = increment_size(stages, x, unravel(z + noise), lin) / nudge
             found = Sizes(
                 increment_size(stages, x, x_next, lin),
@@ -239,7 +246,8 @@ class Newton(AbstractStageSolver):
             return x_next, found, evaluation
 
         solved = _iterated(self, sweep, x0, scale, skip)
-        # Where forces grow without bound, increments are small far from any solution.
+        # Where forces grow without bound, increments are small even far from any
+        # solution, so that the residual is checked too.
         gross = matvec(lin.momentum_inverse, solved.aux.forces.residual)
         allowed = jnp.maximum(_GROSS, 1e3 * self.tolerance).astype(scale.dtype)
         size = jnp.maximum(scale, fibre_coordinate_size(stages, solved.x))
@@ -252,7 +260,7 @@ class Newton(AbstractStageSolver):
     def frozen_newton_map(
         self, stages: StageSystem, lin: Linearisation, x: Stages
     ) -> FrozenNewtonMap:
-        """Newton's iteration with the Jacobian at the solution."""
+        """Make Newton's iteration with its Jacobian fixed, that at the solution."""
         z, unravel = ravel_pytree(x)
         jacobian = jax.jacfwd(lambda z: stage_residual(stages, unravel(z))[0])(z)
         jacobian_inverse = jnp.linalg.inv(jacobian)

@@ -5,7 +5,11 @@ from .._system import State
 
 
 class StepRecord(eqx.Module):
-    """The collocation data of one step: all that dense output needs."""
+    """The data of one step that dense output needs to make its polynomials.
+
+    - `start`: the state at the start of the step.
+    - `velocity`, `force`, `multiplier`: the values at the s stages.
+    """
 
     start: State
     velocity: Float[Array, "s n"]

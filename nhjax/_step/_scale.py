@@ -1,4 +1,4 @@
-"""The size that the stages of a step are rounded by."""
+"""The scale of a step, to which the round-off of its stages is proportional."""
 
 import jax.numpy as jnp
 
@@ -12,11 +12,12 @@ from ._unknowns import Stages
 def fibre_coordinate_scale(
     stages: StageSystem, x0: Stages, lin: Linearisation
 ) -> FloatScalar:
-    """What the fibre coordinates of a step are rounded by, over the unit round-off.
+    """Estimate the round-off of the fibre coordinates of a step, in units of round-off.
 
-    Beside their own size, at the starting values x0, that of the terms that cancel in
-    them: forces and reactions over the step, and what the round-off of a holonomic
-    constraint, divided by h, makes of velocities. A system at rest has nothing else.
+    The estimate adds to the size of the coordinates themselves, at the starting values
+    x0, the size of the terms that cancel in them: the forces and reactions over the
+    step, and the effect on velocities of the round-off of holonomic constraints, which
+    are divided by h. For a system at rest these terms are all there is.
     """
     h = jnp.abs(stages.h)
     rate = max_norm(lin.acceleration)

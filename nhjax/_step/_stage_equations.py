@@ -1,4 +1,4 @@
-"""The equations of one step, as functions of its unknowns."""
+"""The equations of one step, as functions of the unknowns of the step."""
 
 import jax
 import jax.numpy as jnp
@@ -13,7 +13,7 @@ from ._unknowns import StageForces, Stages
 
 
 def stage_velocities(stages: StageSystem, x: Stages) -> Float[Array, "s n"]:
-    """The chart velocities dτ_Ξ⁻¹ D2H(Q^i, P^i) of a Hamiltonian system."""
+    """Compute the chart velocities dτ_Ξ⁻¹ D2H(Q^i, P^i) of a Hamiltonian system."""
     xi = stages.stage_increments(x)
     v = jax.vmap(lambda t, q, u: stages.system.velocity(t, q, u, stages.args))(
         stages.stage_times, positions(stages.chart, xi), x.momentum
@@ -22,7 +22,7 @@ def stage_velocities(stages: StageSystem, x: Stages) -> Float[Array, "s n"]:
 
 
 def stage_forces(stages: StageSystem, x: Stages) -> StageForces:
-    """n^i, Λ^i, and the residuals of the stage momenta."""
+    """Compute the forces n^i, multipliers Λ^i and residuals of the stage momenta."""
     h, a_hat, b = stages.h, stages.coefficients("a_hat"), stages.coefficients("b")
     multiplier = stages.multipliers(x)
     xi = stages.stage_increments(x)
@@ -53,14 +53,17 @@ def stage_forces(stages: StageSystem, x: Stages) -> StageForces:
 
 
 def node_positions(stages: StageSystem, x: Stages) -> PyTree[Array]:
-    """q^i at the nodes; the last is q_{k+1}."""
+    """Compute the positions q^i at the nodes, of which the last is q_{k+1}."""
     return positions(stages.chart, stages.node_increments(x))
 
 
 def node_residual(
     stages: StageSystem, x: Stages, force: Float[Array, "s n"]
 ) -> Float[Array, "r n"]:
-    """p(q^i, u^i) - Ad^*_{τ(Ξ^i)} (p_k + h Σ a_ij n^j) at the nodes."""
+    """Compute the residuals of the momentum equations at the nodes.
+
+    They are p(q^i, u^i) - Ad^*_{τ(Ξ^i)} (p_k + h Σ a_ij n^j).
+    """
     momentum = jax.vmap(lambda t, q, u: stages.system.momentum(t, q, u, stages.args))(
         stages.node_times, node_positions(stages, x), x.node_fibre_coordinate
     )
@@ -72,16 +75,16 @@ def node_residual(
 
 
 def node_constraint(stages: StageSystem, x: Stages) -> Float[Array, "r m"]:
-    """Φ(q^i, u^i) of the nonholonomic constraints at the nodes."""
+    """Compute the nonholonomic constraints Φ(q^i, u^i) at the nodes."""
     return jax.vmap(
         lambda t, q, u: stages.system.kinematic_constraint(t, q, u, stages.args)
     )(stages.node_times, node_positions(stages, x), x.node_fibre_coordinate)
 
 
 def holonomic_constraint(stages: StageSystem, x: Stages) -> Float[Array, "s k"]:
-    """Γ(Q^i) / h, i >= 2, and the tangency at the end of the step.
+    """Compute Γ(Q^i) / h for i >= 2, and the tangency dΓ/dt at the end of the step.
 
-    Divided by h they are of the size of velocities, as the tangency is.
+    The division by h makes the values the size of velocities, as the tangency is.
     """
     nodes = positions(stages.chart, stages.stage_increments(x)[1:])
     on_positions = jax.vmap(
@@ -95,7 +98,7 @@ def holonomic_constraint(stages: StageSystem, x: Stages) -> Float[Array, "s k"]:
 
 
 def constraint_jacobian(stages: StageSystem, x: Stages) -> Float[Array, "s-1 l n"]:
-    """B = ∂Φ/∂u of all constraints on velocities at the nodes i >= 2."""
+    """Compute B = ∂Φ/∂u of all constraints on velocities at the nodes i >= 2."""
     times, fibre = stages.stage_times[1:], x.node_fibre_coordinate
     if not stages.num_nonholonomic:
         fibre = jnp.broadcast_to(fibre, (stages.method.stages - 1, fibre.shape[1]))
@@ -110,7 +113,10 @@ def constraint_jacobian(stages: StageSystem, x: Stages) -> Float[Array, "s-1 l n
 def end_residual(
     stages: StageSystem, x: Stages
 ) -> tuple[Float[Array, " n"], Float[Array, " l"]]:
-    """Residuals of the equations of motion at the end, whose root is λ_c there."""
+    """Compute the residuals of the equations of motion at the end of the step.
+
+    Their root gives the continuous multiplier λ_c there.
+    """
     return motion_residual(
         stages.system,
         stages.t + stages.h,
@@ -123,6 +129,6 @@ def end_residual(
 
 
 def in_chart(stages: StageSystem, x: Stages) -> BoolScalar:
-    """Whether stages, nodes and end lie where the chart is invertible."""
+    """Tell whether stages, nodes and end lie where the chart is invertible."""
     increments = [stages.stage_increments(x), stages.increment(x)[None]]
     return stages.chart.in_domain(jnp.concatenate(increments))

@@ -1,4 +1,4 @@
-"""The stage equations as one system: their residual, and a sweep over them."""
+"""The residual of all stage equations, and a sweep of simplified Newton over them."""
 
 from typing import NamedTuple
 
@@ -24,9 +24,9 @@ from ._unknowns import StageForces, Stages
 
 
 class Evaluation(NamedTuple):
-    """What a solver leaves behind: the equations at the last iterate.
+    """The stage equations, evaluated by a stage solver at its last iterate.
 
-    `newton` is whether Newton's method had to solve what another solver could not.
+    `newton` tells whether Newton's method had to take over from simplified Newton.
     """
 
     forces: StageForces
@@ -37,9 +37,9 @@ class Evaluation(NamedTuple):
 def corrected(
     stages: StageSystem, structure: LeadingStructure, x: Stages
 ) -> tuple[Stages, Evaluation]:
-    """A sweep of simplified Newton over the stages, and what it evaluated at x."""
-    # Each residual is evaluated at the newest iterate (Gauss-Seidel): it costs the same
-    # as evaluating all of them at the last one, and contracts faster.
+    """Make a sweep of simplified Newton; return its result and the values at x."""
+    # Each residual is evaluated at the newest iterate (Gauss-Seidel): this costs the
+    # same as evaluating all of them at the last iterate, and contracts faster.
     forces = stage_forces(stages, x)
     x_next = structure.correct_stages(stages, x, forces.residual)
     r_nodes = node_residual(stages, x_next, forces.force)
@@ -60,7 +60,7 @@ def _constrain(stages: StageSystem, structure: LeadingStructure, x: Stages) -> S
 
 
 def _constraints(stages: StageSystem, x: Stages) -> tuple[Array, Array]:
-    """The nonholonomic constraints at the nodes and the holonomic ones, if any."""
+    """Compute the nonholonomic constraints at the nodes and the holonomic ones."""
     none = jnp.zeros((0,), stages.p.dtype)
     return (
         node_constraint(stages, x) if stages.num_nonholonomic else none,
@@ -71,7 +71,7 @@ def _constraints(stages: StageSystem, x: Stages) -> tuple[Array, Array]:
 def stage_residual(
     stages: StageSystem, x: Stages
 ) -> tuple[Float[Array, " k"], Evaluation]:
-    """All equations of a step in one vector."""
+    """Compute the residuals of all equations of a step, in one vector."""
     forces = stage_forces(stages, x)
     r_nodes = node_residual(stages, x, forces.force)
     parts = [forces.residual, r_nodes]
@@ -87,20 +87,20 @@ def stage_residual(
 
 
 def sizes(stages: StageSystem, x: Stages, x_next: Stages, lin: Linearisation) -> Sizes:
-    """The sizes of an increment and of the fibre coordinates that it leads to.
+    """Measure an increment and the fibre coordinates that it leads to.
 
-    Of the latter those at the end of the step tell enough: it costs time to look at
-    all of them.
+    Of the coordinates only those at the end of the step are measured: they are enough
+    to judge the increment, and to look at all of them would cost time.
     """
     increment = increment_size(stages, x, x_next, lin)
     return Sizes(increment, max_norm(x_next.node_fibre_coordinate[-1]))
 
 
 def fibre_coordinate_size(stages: StageSystem, x: Stages) -> FloatScalar:
-    """The size of the fibre coordinates, of the stages or of the nodes.
+    """Measure the fibre coordinates of the stages and of the nodes; take the smaller.
 
-    The smaller of the two: while an iteration is far from a solution, one of them can
-    be larger than anything that the other has to do with.
+    While an iteration is far from a solution, one of the two can be much larger than
+    any size that has to do with the other.
     """
     fibre = x.momentum if stages.hamiltonian else x.velocity
     return jnp.minimum(max_norm(fibre), max_norm(x.node_fibre_coordinate))
@@ -109,9 +109,9 @@ def fibre_coordinate_size(stages: StageSystem, x: Stages) -> FloatScalar:
 def increment_size(
     stages: StageSystem, x: Stages, x_next: Stages, lin: Linearisation
 ) -> FloatScalar:
-    """The size of an increment in fibre coordinates.
+    """Measure an increment by its largest change of fibre coordinates.
 
-    Not finite once the iterates have left the chart.
+    The size is infinite once the iterates have left the chart.
     """
     changes = [
         x_next.node_fibre_coordinate - x.node_fibre_coordinate,
@@ -121,12 +121,14 @@ def increment_size(
         changes[1] = matvec(lin.metric_inverse, changes[1])
         changes.append(x_next.momentum - x.momentum)
     if stages.constrained:
-        # Multipliers count by their effect on u, h N⁻¹ R δΛ, on its own: Λ can still be
-        # wrong where the stages and nodes happen to be right.
+        # Multipliers count by their effect h N⁻¹ R δΛ on u, separately from the changes
+        # of u itself: Λ can still be wrong where the stages and nodes happen to be
+        # right.
         before, after = map(stages.multiplier_change, (x, x_next))
         reaction = lin.reaction
         if reaction.shape[1] == 1:
-            # The largest entry of the column decides; it is the same for all iterates.
+            # With one constraint the largest entry of the column decides, and it is the
+            # same for all iterates.
             reaction = max_norm(reaction).reshape(1, 1)
         change = small_einsum("sl,nl->sn", after - before, reaction)
         changes.append(stages.h * change)

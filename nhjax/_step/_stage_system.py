@@ -1,4 +1,4 @@
-"""What the equations of one step are made of, and how their unknowns are laid out."""
+"""The data of the equations of one step, and the layout of their unknowns."""
 
 import equinox as eqx
 import jax
@@ -17,16 +17,17 @@ from ._unknowns import Stages
 class StageSystem(eqx.Module):
     """The discrete equations of one step from (q_k, p_k, λ_k).
 
-    The paper's four Summaries in the unknowns of `Stages`. With w^i the body force at
-    stage i (reactions included), n^i = Ad^*_{τ(Ξ^i)⁻¹} w^i and F^i the same force in
-    the chart, they read
+    These are the paper's four Summaries in the unknowns of `Stages`. With w^i the body
+    force at stage i (reactions included), n^i = Ad^*_{τ(Ξ^i)⁻¹} w^i and F^i the same
+    force in the chart, they read
 
     Π^i = base + h Σ â_ij F^j,    μ^i = Ad^*_{τ(Ξ^i)} (μ_k + h Σ a_ij n^j),
 
-    with the nonholonomic constraints at the nodes (q^i, μ^i), the holonomic ones at the
-    positions Q^i, i >= 2, and their tangency at the end. The constraints at the first
-    node hold by hypothesis H1; the last node is the end of the step by H3. The three
-    closures differ in the constant matrices of `method.closure_weights` alone.
+    together with the nonholonomic constraints at the nodes (q^i, μ^i), the holonomic
+    ones at the positions Q^i, i >= 2, and their tangency at the end. The constraints at
+    the first node hold by hypothesis H1; the last node is the end of the step by H3.
+    The three closures differ in the constant matrices of `method.closure_weights`
+    alone.
     """
 
     system: AbstractMechanicalSystem
@@ -48,12 +49,12 @@ class StageSystem(eqx.Module):
         y: State,
         args: Args,
     ) -> "StageSystem":
-        """The equations of a step of size h from the state y at t."""
+        """Make the equations of a step of size h from the state y at t."""
         return cls(system, method, t, h, y.q, y.p, y.multiplier, args)
 
     @property
     def num_holonomic(self) -> int:
-        """k, the number of holonomic constraints."""
+        """Return k, the number of holonomic constraints."""
         if self.system.holonomic is None:
             return 0
         return jax.eval_shape(
@@ -64,45 +65,55 @@ class StageSystem(eqx.Module):
 
     @property
     def num_nonholonomic(self) -> int:
-        """m, the number of nonholonomic constraints."""
+        """Return m, the number of nonholonomic constraints."""
         return self.multiplier.shape[0] - self.num_holonomic
 
     @property
     def constrained(self) -> bool:
-        """Whether there are constraints, and so multipliers."""
+        """Tell whether there are constraints, and so multipliers."""
         return self.multiplier.shape[0] > 0
 
     @property
     def symmetric(self) -> bool:
-        """Whether the continuous multiplier at the end of the step is an unknown."""
+        """Tell whether the symmetric closure is in use.
+
+        The continuous multiplier at the end of the step is then an unknown.
+        """
         return self.num_nonholonomic > 0 and self.method.closure == "symmetric"
 
     @property
     def hamiltonian(self) -> bool:
-        """Whether stage momenta are unknowns beside the stage velocities."""
+        """Tell whether the system is Hamiltonian.
+
+        The stage momenta are then unknowns, beside the stage velocities.
+        """
         return self.system.fibre_coordinate_name == "p"
 
     @property
     def chart(self) -> AbstractChart:
-        """The chart around q_k."""
+        """Return the chart around q_k, in which the step is written."""
         return chart_at(self.system.manifold_of(self.q), self.q)
 
     def coefficients(self, name: str) -> Array:
-        """The array `name` of the method, in the working precision."""
+        """Return the array `name` of the method in the working precision."""
         return jnp.asarray(getattr(self.method, name), self.p.dtype)
 
     def closure_weights(self, name: str) -> Array:
-        """The array `name` of the method's closure, in the working precision."""
+        """Return the array `name` of the closure's weights in the working precision."""
         return jnp.asarray(getattr(self.method.closure_weights, name), self.p.dtype)
 
     @property
     def stage_times(self) -> Float[Array, " s"]:
-        """t_k + h c_i."""
+        """Return the times t_k + h c_i of the stages."""
         return self.t + self.h * self.coefficients("c")
 
     @property
     def node_weights(self) -> Float[Array, "r s"]:
-        """Rows of a_ij at which node momenta are formed: i >= 2, or the weights b."""
+        """Return the rows of a_ij for the nodes at which momenta are formed.
+
+        With nonholonomic constraints these are the nodes i >= 2, otherwise only the end
+        of the step, whose row is that of the weights b.
+        """
         return (
             self.coefficients("a")[1:]
             if self.num_nonholonomic
@@ -111,7 +122,7 @@ class StageSystem(eqx.Module):
 
     @property
     def node_times(self) -> Float[Array, " r"]:
-        """Times of those nodes."""
+        """Return the times of the nodes at which momenta are formed."""
         nodes = (
             self.coefficients("c")[1:]
             if self.num_nonholonomic
@@ -120,14 +131,17 @@ class StageSystem(eqx.Module):
         return self.t + self.h * nodes
 
     def multipliers(self, x: Stages) -> Float[Array, "s l"]:
-        """Λ^1..Λ^s, from the unknowns of the closure and the holonomic ones."""
+        """Compute the multipliers Λ^1..Λ^s of all constraints at the stages.
+
+        They follow from the unknowns of the closure and the holonomic multipliers.
+        """
         change = self.multiplier_change(x)
         if not self.num_nonholonomic:
             return change
         return self._padded("start", self.multiplier) + change
 
     def multiplier_change(self, dx: Stages) -> Float[Array, "s l"]:
-        """The part of Λ that is linear in the unknowns."""
+        """Compute the part of the multipliers Λ that is linear in the unknowns."""
         change = self.free_multipliers(dx.closure, dx.holonomic)
         if self.symmetric:
             change = change + self._padded("end", dx.end_multiplier)
@@ -136,7 +150,7 @@ class StageSystem(eqx.Module):
     def free_multipliers(
         self, closure: Float[Array, "s-1 m"], holonomic: Float[Array, "s k"]
     ) -> Float[Array, "s l"]:
-        """E y beside the holonomic multipliers."""
+        """Join the nonholonomic multipliers E y and the holonomic multipliers."""
         if not self.num_nonholonomic:
             return holonomic
         kinematic = small_einsum("sr,rm->sm", self.closure_weights("E"), closure)
@@ -145,31 +159,35 @@ class StageSystem(eqx.Module):
         return jnp.concatenate([kinematic, holonomic], axis=1)
 
     def _padded(self, weights: str, multiplier: Float[Array, " l"]) -> Array:
-        """What a known multiplier adds to Λ; its holonomic part adds nothing."""
+        """Compute what a known multiplier, such as λ_k, adds to Λ.
+
+        Its holonomic part adds nothing.
+        """
         known = multiplier[: self.num_nonholonomic]
         part = jnp.outer(self.closure_weights(weights), known)
         return jnp.pad(part, ((0, 0), (0, self.num_holonomic)))
 
     def increment(self, x: Stages) -> Float[Array, " n"]:
-        """ξ = h Σ b_j H^j, which takes q_k to q_{k+1}."""
-        # h * (b @ H): rounding h b_j once and for all would bias every step.
+        """Compute the increment ξ = h Σ b_j H^j, which takes q_k to q_{k+1}."""
+        # The product is formed as h * (b @ H): coefficients h b_j, rounded once and for
+        # all, would bias every step in the same way.
         return self.h * small_einsum("s,sn->n", self.coefficients("b"), x.velocity)
 
     def stage_increments(self, x: Stages) -> Float[Array, "s n"]:
-        """Ξ^i = h Σ a_ij H^j."""
+        """Compute the increments Ξ^i = h Σ a_ij H^j of the stages."""
         return self.h * small_einsum("ij,jn->in", self.coefficients("a"), x.velocity)
 
     def node_increments(self, x: Stages) -> Float[Array, "r n"]:
-        """h Σ a_ij H^j at the nodes."""
+        """Compute the increments h Σ a_ij H^j of the nodes."""
         return self.h * small_einsum("ij,jn->in", self.node_weights, x.velocity)
 
 
 def nudged(stages: StageSystem, nudge: FloatScalar) -> StageSystem:
-    """The equations with q_k moved by about `nudge` times its size.
+    """Return the equations with q_k moved by about `nudge` times its size.
 
-    What that changes, over `nudge`, is what the round-off of positions may change,
-    over the unit round-off. The moves differ between coordinates, so that they do not
-    cancel in the distance of two.
+    The change of a solution by this move, divided by `nudge`, estimates its change by
+    the round-off of positions, divided by the unit round-off. The coordinates are moved
+    by different amounts, so that the moves do not cancel in the difference of two.
     """
     manifold, n = stages.chart.manifold, stages.p.shape[0]
     size = max_norm(*jax.tree.leaves(stages.q))

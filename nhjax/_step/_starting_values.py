@@ -1,4 +1,4 @@
-"""Where the iteration on the stages of a step starts."""
+"""The starting values of the iteration on the stages of a step."""
 
 import jax
 import jax.numpy as jnp
@@ -10,15 +10,17 @@ from ._unknowns import Stages
 
 
 def starting_values(stages: StageSystem, u: Array, lin: Linearisation) -> Stages:
-    """Stages to first order in h, from the acceleration and λ_c at the start.
+    """Compute the stages to first order in h, from acceleration and λ_c at the start.
 
-    They need no memory of the step before, so a step is a function of its state.
+    The values do not depend on the step before, so that a step is a function of its
+    state alone.
     """
     m, s = stages.num_nonholonomic, stages.method.stages
     push = stages.h * lin.acceleration
     stage_times = jnp.sum(stages.coefficients("a_hat"), axis=1)
     node_times = jnp.sum(stages.node_weights, axis=1)
-    # ν of the symmetric closure vanishes with h, all others are multipliers.
+    # The unknown ν of the symmetric closure vanishes with h, and starts from zero; all
+    # other unknowns of a closure are multipliers.
     free = (jnp.arange(s - 1) >= int(stages.symmetric)).astype(u.dtype)
     nothing = jnp.zeros((0,), u.dtype)
     fibre = u[None] + jnp.outer(stage_times, push)

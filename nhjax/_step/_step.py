@@ -1,4 +1,4 @@
-"""One step, and what is carried from step to step."""
+"""One step of a method, and the data that is carried from step to step."""
 
 from typing import Any, NamedTuple
 
@@ -38,10 +38,10 @@ from ._unknowns import Stages
 
 
 class StepState(eqx.Module):
-    """What is carried from step to step: a state and what is known there.
+    """The data that is carried from step to step: a state, and what is known there.
 
-    The compensations are the rounding errors of the running sums q and p; the
-    linearisation is both the Jacobian of the next step and the source of λ_c.
+    The compensations are the rounding errors of the running sums q and p. The
+    linearisation `lin` gives the Jacobian of the next step and the multiplier λ_c.
     """
 
     state: State
@@ -50,16 +50,27 @@ class StepState(eqx.Module):
     lin: Linearisation
 
     def differentiated_in_state(self) -> "StepState":
-        """The same, with the derivatives of the state alone.
+        """Return the same data, differentiable with respect to the state alone.
 
-        Those of the rest are zero: rounding errors have none, and the linearisation is
-        a Jacobian that the end of a step does not depend on.
+        The derivatives with respect to the other data are zero: rounding errors have
+        none, and the linearisation serves as a Jacobian, on which the end of a step
+        does not depend.
         """
         return eqx.tree_at(lambda x: x.state, jax.lax.stop_gradient(self), self.state)
 
 
 class StepOutcome(NamedTuple):
-    """A step: the next state, or the reason why there is none."""
+    """The outcome of a step: the next state or the reason why there is none.
+
+    - `step_state`: the data to carry to the next step.
+    - `record`, `stages`: the stages of the step, for dense output and for derivatives.
+    - `result`: whether the step was solved, and otherwise why not.
+    - `num_iterations`: how many iterations the stage solver made.
+    - `residual`: the residual of the stage equations, relative to the momenta.
+    - `constraint_violation`: the largest violation of a constraint at the end.
+    - `multiplier_defect`: the distance |Λ^s - λ_c| at the end.
+    - `newton`: whether Newton's method took over from simplified Newton.
+    """
 
     step_state: StepState
     record: StepRecord
@@ -69,7 +80,7 @@ class StepOutcome(NamedTuple):
     residual: FloatScalar
     constraint_violation: FloatScalar
     multiplier_defect: FloatScalar
-    newton: BoolScalar  # whether Newton's method had to take over
+    newton: BoolScalar
 
 
 def first_step_state(
@@ -79,9 +90,10 @@ def first_step_state(
     y0: State,
     args: Args,
 ) -> StepState:
-    """What the first step starts from at a consistent state.
+    """Make the data that the first step starts from, given a consistent state.
 
-    Closures that do not carry the multiplier report λ_c from the first state on.
+    With closures that do not carry the multiplier from step to step, the first state
+    already has the continuous multiplier λ_c.
     """
     lin = linearise(system, t, y0.q, system.fibre_coordinate(y0), args)
     multiplier = _continuous_multiplier(
@@ -103,8 +115,8 @@ def _continuous_multiplier(arguments: tuple[Any, ...]) -> Float[Array, " l"]:
 
 @_continuous_multiplier.def_jvp
 def _continuous_multiplier_jvp(primals, tangents):
-    # No derivative where there is no multiplier: NaN times zero would be NaN even for a
-    # lane that nothing asks for.
+    # The derivative is set to zero where the multiplier is not finite: NaN times zero
+    # would be NaN even for a lane on which nothing depends.
     (arguments,), (rates,) = primals, tangents
     multiplier = _continuous_multiplier(arguments)
     ok = jnp.all(jnp.isfinite(multiplier))
@@ -127,9 +139,9 @@ def step(
     args: Args,
     skip: BoolScalar,
 ) -> StepOutcome:
-    """One step of size h: (q_k, p_k, λ_k) -> (q_{k+1}, p_{k+1}, λ_{k+1}).
+    """Take one step of size h, from (q_k, p_k, λ_k) to (q_{k+1}, p_{k+1}, λ_{k+1}).
 
-    Where `skip` is true nothing is solved and the outcome is to be discarded.
+    Where `skip` is true nothing is solved, and the outcome is to be discarded.
     """
     state, lin = step_state.state, step_state.lin
     stages = StageSystem.at(system, method, t, h, state, args)
@@ -170,7 +182,7 @@ def _result(
     is_in_chart: BoolScalar,
 ) -> RESULTS:
     finite = all_finite(step_state.state) & all_finite(step_state.lin)
-    # What is not finite at the first iterate is so near the state itself.
+    # If the first iterate is not finite, the system is not finite near the state.
     failed = RESULTS.where(
         solved.num_iterations > 1,
         RESULTS.nonlinear_divergence,
@@ -180,7 +192,8 @@ def _result(
     converged = RESULTS.where(finite, RESULTS.successful, RESULTS.nonfinite_state)
     result = RESULTS.where(solved.converged, converged, failed)
     result = RESULTS.where(is_in_chart, result, RESULTS.left_chart)
-    # A singular M or C at the end is found at once: λ_c does not exist there.
+    # A singular M or C at the end of the step is reported now and not in the next step,
+    # because λ_c does not exist there.
     singular = lin.is_singular | (solved.converged & step_state.lin.is_singular)
     return RESULTS.where(singular, RESULTS.singular_stage_matrix, result)
 
@@ -188,6 +201,6 @@ def _result(
 def largest_violation(
     system: AbstractMechanicalSystem, t: FloatScalar, step_state: StepState, args: Args
 ) -> FloatScalar:
-    """The largest violation of any constraint at a state."""
+    """Compute the largest violation of any constraint at a state."""
     on_positions = system.position_constraint(t, step_state.state.q, args)
     return max_norm(step_state.lin.violation, on_positions)

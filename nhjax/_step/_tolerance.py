@@ -1,4 +1,4 @@
-"""The `tolerance` of a stage solver, as it is given and as it is used."""
+"""The check and the conversion of the `tolerance` of a stage solver."""
 
 from typing import Any
 
@@ -11,7 +11,7 @@ from .._system import real_scalar
 
 
 def check_tolerance(tolerance: Any) -> None:
-    """Raise for the `tolerance` of a solver that no increment could meet."""
+    """Raise a `ValueError` unless the `tolerance` of a solver is finite and >= 0."""
     if is_traced(tolerance):
         return
     if not np.all(np.isfinite(tolerance) & (np.asarray(tolerance) >= 0)):
@@ -22,10 +22,10 @@ def check_tolerance(tolerance: Any) -> None:
 
 
 def tolerance_array(tolerance: FloatScalarLike) -> FloatScalarLike:
-    """The `tolerance` of a solver as an array.
+    """Convert the `tolerance` of a solver to an array.
 
-    On the host where that is possible: the default solver is made on import, which must
-    not start JAX's backends, nor choose a precision.
+    A number becomes an array of NumPy on the host: the default solver is made when
+    nhjax is imported, which must not start JAX's backends, nor choose a precision.
     """
     if isinstance(tolerance, int | float) and not isinstance(tolerance, bool):
         return np.asarray(float(tolerance))

@@ -7,13 +7,15 @@ from jaxtyping import Array, Float
 
 
 class Stages(eqx.Module):
-    """The unknowns of one step; those that a system or closure lacks are empty.
+    """The unknowns of one step: stage velocities, node coordinates and multipliers.
+
+    Unknowns that a system or a closure does not have are arrays without entries.
 
     - `velocity`: H^1..H^s, the stage velocities in the chart (V^i on R^n).
     - `momentum`: the stage momenta in the body frame, of a Hamiltonian system; those of
         a Lagrangian one follow from the velocities.
-    - `node_fibre`: u^2..u^s (v or p) at the nodes, the last of them at the end of the
-        step; without nonholonomic constraints only u_{k+1}.
+    - `node_fibre_coordinate`: u^2..u^s (v or p) at the nodes, the last of them at the
+        end of the step; without nonholonomic constraints only u_{k+1}.
     - `closure`: y, which gives the nonholonomic multipliers
         Λ = (start) λ_k + (end) λ_{k+1} + E y.
     - `holonomic`: the holonomic multipliers Λ^1..Λ^s.
@@ -31,7 +33,7 @@ class Stages(eqx.Module):
 
 
 class StageForces(NamedTuple):
-    """The equations of the stages i = 1..s, evaluated."""
+    """The forces, multipliers and momenta at the stages i = 1..s, with residuals."""
 
     force: Float[Array, "s n"]  # n^i, the force W^i carried to the start of the step
     multiplier: Float[Array, "s l"]  # Λ^i

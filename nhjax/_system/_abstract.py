@@ -22,11 +22,10 @@ from ._state import check_time_and_state, State
 class AbstractMechanicalSystem(eqx.Module):
     """A mechanical system with constraints, written on TQ or on T*Q.
 
-    What differs between the two is the coordinate u on the fibres: the velocity of a
-    Lagrangian system, the momentum of a Hamiltonian one. In terms of (t, q, u) both are
-    the functions `velocity`, `momentum`, `free_force`, `constraint` and the metric K
-    that turns constraint derivatives into reactions; the equations of a step are
-    written with these alone.
+    The two kinds differ in the fibre coordinate u, the velocity of a Lagrangian and the
+    momentum of a Hamiltonian system. In terms of (t, q, u) both are `velocity`,
+    `momentum`, `free_force`, `constraint` and the metric K, which turns constraint
+    derivatives into reactions. The equations of a step are written in these alone.
     """
 
     nonholonomic: eqx.AbstractVar[PhaseFunction | None]
@@ -34,7 +33,8 @@ class AbstractMechanicalSystem(eqx.Module):
     force: eqx.AbstractVar[PhaseFunction | None]
     manifold: eqx.AbstractVar[AbstractLieGroup | None]
 
-    # The name of the generating function, and the letter of the fibre coordinate.
+    # The name of the function L or H that generates the motion, and the letter of the
+    # fibre coordinate.
     generator: eqx.AbstractClassVar[Literal["lagrangian", "hamiltonian"]]
     fibre_coordinate_name: eqx.AbstractClassVar[Literal["v", "p"]]
 
@@ -52,25 +52,25 @@ class AbstractMechanicalSystem(eqx.Module):
     def momentum(
         self, t: FloatScalarLike, q: PyTree[Array], u: Float[Array, " n"], args: Args
     ) -> Float[Array, " n"]:
-        """The momentum p."""
+        """Compute the momentum p at (t, q, u)."""
 
     @abstractmethod
     def velocity(
         self, t: FloatScalarLike, q: PyTree[Array], u: Float[Array, " n"], args: Args
     ) -> Float[Array, " n"]:
-        """The velocity v, left-trivialised."""
+        """Compute the velocity v at (t, q, u), left-trivialised on a group."""
 
     @abstractmethod
     def metric(
         self, t: FloatScalarLike, q: PyTree[Array], u: Float[Array, " n"], args: Args
     ) -> Float[Array, "n n"]:
-        """The metric K on the fibre, D2D2L or D2D2H."""
+        """Compute the metric K on the fibre, which is D2D2L or D2D2H."""
 
     @abstractmethod
     def free_force(
         self, t: FloatScalarLike, q: PyTree[Array], u: Float[Array, " n"], args: Args
     ) -> Float[Array, " n"]:
-        """The force without the reaction."""
+        """Compute the force on the system without the reaction of the constraints."""
 
     @abstractmethod
     def flat(
@@ -81,15 +81,15 @@ class AbstractMechanicalSystem(eqx.Module):
         derivative: Float[Array, " n"],
         args: Args,
     ) -> Float[Array, " n"]:
-        """The force along a constraint's derivative in u: D2Φ itself, or ♭_H D2Ψ."""
+        """Turn a constraint's derivative in u into a force: D2Φ itself, or ♭_H D2Ψ."""
 
     @abstractmethod
     def energy(self, t: FloatScalarLike, y: State, args: Args = None) -> FloatScalar:
-        """The energy of a state."""
+        """Compute the energy of the system in the state `y` at time `t`."""
 
     @classmethod
     def signatures(cls) -> dict[str, tuple[str, ...]]:
-        """The arguments of each function of the system, by position."""
+        """Map the name of each function of the system to the names of its arguments."""
         of_phase = ("t", "q", cls.fibre_coordinate_name, "args")
         return {
             cls.generator: of_phase,
@@ -101,7 +101,7 @@ class AbstractMechanicalSystem(eqx.Module):
     def functions(
         self, t: Any, q: PyTree[Any], u: Any, args: Args
     ) -> dict[str, tuple[Callable[..., Any], tuple[Any, ...]]]:
-        """The functions that the system has, with the arguments to call them with."""
+        """Map the name of each function that the system has to it and its arguments."""
         values = {"t": t, "q": q, self.fibre_coordinate_name: u, "args": args}
         return {
             name: (getattr(self, name), tuple(values[x] for x in arguments))
@@ -110,24 +110,24 @@ class AbstractMechanicalSystem(eqx.Module):
         }
 
     def fibre_coordinate(self, y: State) -> Float[Array, " n"]:
-        """The fibre coordinate u of a state, its v or its p."""
+        """Return the fibre coordinate u of a state, which is its v or its p."""
         return getattr(y, self.fibre_coordinate_name)
 
     def fibre_derivative(
         self, t: FloatScalarLike, q: PyTree[Array], u: Float[Array, " n"], args: Args
     ) -> Float[Array, " n"]:
-        """The fibre derivative D2L or D2H, which is the other one of v and p."""
+        """Compute the fibre derivative D2L(t, q, v) = p or D2H(t, q, p) = v."""
         other = self.momentum if self.fibre_coordinate_name == "v" else self.velocity
         return other(t, q, u, args)
 
     def manifold_of(self, q: PyTree[Array]) -> AbstractLieGroup:
-        """The configuration manifold; R^n with the length of `q` if none was given."""
+        """Return the configuration manifold; without one, R^n with n = len(q)."""
         return Euclidean(q.shape[0]) if self.manifold is None else self.manifold
 
     def position_constraint(
         self, t: FloatScalarLike, q: PyTree[Array], args: Args = None
     ) -> Float[Array, " k"]:
-        """The holonomic constraints Γ(t, q) with shape (k,), k = 0 if none."""
+        """Compute the holonomic constraints Γ(t, q), of shape (k,), k = 0 if none."""
         if self.holonomic is None:
             return jnp.zeros((0,), jax.tree.leaves(q)[0].dtype)
         return jnp.atleast_1d(self.holonomic(t, q, args))
@@ -139,7 +139,7 @@ class AbstractMechanicalSystem(eqx.Module):
         u: Float[Array, " n"],
         args: Args = None,
     ) -> Float[Array, " m"]:
-        """The nonholonomic constraints with shape (m,), m = 0 if there are none."""
+        """Compute the nonholonomic constraints, of shape (m,) with m = 0 if none."""
         if self.nonholonomic is None:
             return jnp.zeros((0,), u.dtype)
         return jnp.atleast_1d(self.nonholonomic(t, q, u, args))
@@ -151,7 +151,7 @@ class AbstractMechanicalSystem(eqx.Module):
         u: Float[Array, " n"],
         args: Args = None,
     ) -> Float[Array, " k"]:
-        """dΓ/dt of the holonomic constraints, with shape (k,)."""
+        """Compute the rates dΓ/dt of the holonomic constraints, of shape (k,)."""
         if self.holonomic is None:
             return jnp.zeros((0,), u.dtype)
         v = self.velocity(t, q, u, args)
@@ -169,10 +169,11 @@ class AbstractMechanicalSystem(eqx.Module):
         u: Float[Array, " n"],
         args: Args = None,
     ) -> Float[Array, " l"]:
-        """All constraints on velocities: the nonholonomic ones, then the tangency.
+        """Compute all constraints on velocities, of shape (l,) with l = m + k.
 
-        The reaction of a holonomic constraint is that of its tangency by Chetaev's
-        rule, so that these l = m + k rows determine all multipliers.
+        The m nonholonomic constraints come first, then the rates dΓ/dt of the k
+        holonomic ones (their tangency). By Chetaev's rule the reaction of a holonomic
+        constraint is that of its tangency: these rows determine all multipliers.
         """
         if self.holonomic is None:
             return self.kinematic_constraint(t, q, u, args)
@@ -190,7 +191,7 @@ class AbstractMechanicalSystem(eqx.Module):
         multiplier: Float[Array, " l"],
         args: Args = None,
     ) -> Float[Array, " n"]:
-        """The reaction of all constraints to their multipliers."""
+        """Compute the reaction force of all constraints, given their multipliers."""
         total, m = jnp.zeros_like(u), 0
         if self.nonholonomic is not None:
             phi, pullback = jax.vjp(
@@ -210,10 +211,10 @@ class AbstractMechanicalSystem(eqx.Module):
     def constraint_violation(
         self, t: FloatScalarLike, y: State, args: Args = None
     ) -> Float[Array, " c"]:
-        """What should vanish at a state, of shape (m + 2k,).
+        """Compute all constraint functions at a state, of shape (m + 2k,).
 
-        The values of the m nonholonomic constraints, of the time derivatives of the k
-        holonomic ones, and of the holonomic ones themselves.
+        They are the m nonholonomic constraints, the time derivatives of the k holonomic
+        ones and these themselves. All of them vanish at a consistent state.
         """
         check_time_and_state("constraint_violation", t, y)
         on_velocities = self.constraint(t, y.q, self.fibre_coordinate(y), args)

@@ -1,4 +1,4 @@
-"""What can be wrong with a single argument, whatever it is for."""
+"""Checks and conversions of single arguments, whatever function they belong to."""
 
 import reprlib
 from typing import Any, TypeAlias
@@ -17,7 +17,7 @@ Kind: TypeAlias = type | tuple[type, ...]
 
 
 def check_type(name: str, x: object, kind: Kind, advice: str = "") -> None:
-    """Raise a `TypeError` unless `x` is a `kind`, or one of several."""
+    """Raise a `TypeError` unless `x` is an instance of `kind`, or of one of several."""
     if isinstance(x, kind):
         return
     if isinstance(x, type):
@@ -33,7 +33,7 @@ def check_type(name: str, x: object, kind: Kind, advice: str = "") -> None:
 
 
 def check_flag(name: str, x: object) -> bool:
-    """`x` as a bool; a string such as "no" would count as true."""
+    """Return `x` as a bool, or raise a `TypeError` if it is anything else."""
     if not isinstance(x, bool | np.bool_):
         raise TypeError(
             f"`{name}` must be True or False, known when tracing, got "
@@ -43,7 +43,7 @@ def check_flag(name: str, x: object) -> bool:
 
 
 def floating(name: str, x: Any) -> Array:
-    """`x` as an array, or a `DTypeError` if it is not of float32 or float64."""
+    """Return `x` as an array of float32 or float64, or raise a `DTypeError`."""
     try:
         array = jnp.asarray(x)
     except (TypeError, ValueError):
@@ -60,7 +60,7 @@ def floating(name: str, x: Any) -> Array:
 
 
 def configuration(q: Any) -> PyTree[Array]:
-    """`q` as an array, or as a tuple (of tuples) of arrays on a product of groups."""
+    """Convert `q` to an array, or on a product of groups to a tuple of them."""
     if isinstance(q, tuple | list) and any(
         isinstance(part, tuple | list) or getattr(part, "ndim", 0) > 0 for part in q
     ):
@@ -69,7 +69,10 @@ def configuration(q: Any) -> PyTree[Array]:
 
 
 def real_scalar(name: str, x: FloatScalarLike, dtype: Any) -> FloatScalar:
-    """`x` as a scalar of `dtype`; integers are welcome."""
+    """Convert a real number (or an integer) to a scalar array of `dtype`.
+
+    Anything else raises a `DTypeError`, and an array that is no scalar a `ShapeError`.
+    """
     array = jnp.asarray(x) if eqx.is_array_like(x) else None
     if array is None or not (
         jnp.issubdtype(array.dtype, jnp.floating)
@@ -88,7 +91,7 @@ def real_scalar(name: str, x: FloatScalarLike, dtype: Any) -> FloatScalar:
 
 
 def finite(name: str, x: Any) -> Check:
-    """The check that every number in `x` is finite."""
+    """Make the check that every number in `x` is finite."""
     return Check(all_finite(x), _not_finite, (name, x))
 
 
@@ -97,13 +100,17 @@ def _not_finite(name: str, x: Any) -> NonFiniteError:
 
 
 def parameters(args: Args) -> Args:
-    """`args` with its floats as arrays, so that changing one recompiles nothing."""
+    """Convert the floats in `args` to arrays, so that changing one recompiles nothing.
+
+    What is not an array afterwards is compiled in; it raises a `TypeError` if it is not
+    hashable.
+    """
 
     def leaf(path, x):
         if eqx.is_array(x):
             return x
-        # Through `float`: a weakly-typed scalar takes part in float32 and float64
-        # arithmetic alike.
+        # An array made of a Python float is weakly typed, and takes part in float32 and
+        # float64 arithmetic alike.
         if isinstance(x, float):
             return jnp.asarray(float(x))
         try:
@@ -121,6 +128,6 @@ def parameters(args: Args) -> Args:
 
 
 def all_finite(tree: Any) -> Array:
-    """Whether every number in `tree` is finite."""
+    """Tell whether every number in `tree` is finite."""
     leaves = [jnp.all(jnp.isfinite(leaf)) for leaf in jax.tree.leaves(tree)]
     return jnp.all(jnp.stack(leaves))

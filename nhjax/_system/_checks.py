@@ -1,4 +1,4 @@
-"""What can be wrong with a state, or with the functions of a system."""
+"""Checks of the shapes and types of a state and of the functions of a system."""
 
 import reprlib
 
@@ -17,7 +17,7 @@ from ._state import State
 def require_manifold(
     system: AbstractMechanicalSystem, name: str, q: PyTree[Array]
 ) -> None:
-    """Raise for a tuple in a system that has no manifold to say what it is."""
+    """Raise a `ShapeError` if `q` is a tuple but the system has no manifold."""
     if system.manifold is None and isinstance(q, tuple):
         raise ShapeError(
             f"`{name}` is a tuple of {len(q)}, but the system has no `manifold`. Give "
@@ -29,7 +29,7 @@ def require_manifold(
 def check_functions(
     system: AbstractMechanicalSystem, t: Array, q: PyTree[Array], args: Args
 ) -> None:
-    """Raise unless the functions of the system return what they should."""
+    """Raise if a function of the system returns a wrong shape or dtype."""
     n, dtype = system.manifold_of(q).dim, jax.tree.leaves(q)[0].dtype
     u = jax.ShapeDtypeStruct((n,), dtype)
 
@@ -70,7 +70,7 @@ def check_functions(
 
 
 def check_state(system: AbstractMechanicalSystem, y0: State, args: Args) -> None:
-    """Raise unless `y0` can be a state of `system`."""
+    """Raise unless the shapes and dtypes of `y0` are those of a state of `system`."""
     parts = {name: getattr(y0, name) for name in ("p", "v", "q", "multiplier")}
     for name, x in parts.items():
         for leaf in jax.tree.leaves(x, is_leaf=lambda leaf: leaf is None):
@@ -114,6 +114,6 @@ def check_state(system: AbstractMechanicalSystem, y0: State, args: Args) -> None
             f"the system have shape {expected}. Use `initial_state` with this system."
         )
     for name, x in parts.items():
-        # Of traced parts the integration itself reports it, lane by lane.
+        # The integration itself reports traced parts that are not finite, lane by lane.
         if not is_traced(*jax.tree.leaves(x)):
             require(x, finite(f"y0.{name}", x))

@@ -1,4 +1,4 @@
-"""Systems as programs see them: with what their functions close over as leaves."""
+"""Conversion of a system, so that arrays its functions close over become its leaves."""
 
 from typing import TypeVar
 
@@ -14,9 +14,9 @@ S = TypeVar("S", bound=AbstractMechanicalSystem)
 
 
 def closure_converted(system: S, t: FloatScalar, y: State, args: Args) -> S:
-    """The system, with the arrays that its functions close over among its leaves.
+    """Return the system with the arrays that its functions close over as leaves.
 
-    Only leaves of what a step is given can be differentiated.
+    A step can be differentiated with respect to leaves of its arguments alone.
     """
     functions = system.functions(t, y.q, system.fibre_coordinate(y), args)
     return eqx.tree_at(

@@ -27,9 +27,9 @@ class HamiltonianSystem(AbstractMechanicalSystem):
     Ψ(t, q, p) = 0,    Γ(t, q) = 0,
 
     where ♭_H = (D2D2H)⁻¹ turns velocities into momenta. It is integrated by the paper's
-    Hamiltonian equations, with the stage momenta as unknowns; no Legendre transform is
-    inverted on the way. What the functions read beside their arguments is compiled in,
-    as for a `LagrangianSystem`.
+    Hamiltonian equations, with the stage momenta as unknowns, so that no Legendre
+    transform has to be inverted. Values that the functions read beside their arguments
+    are compiled in, as for a `LagrangianSystem`.
 
     **Arguments:**
 
@@ -66,7 +66,7 @@ class HamiltonianSystem(AbstractMechanicalSystem):
         u: Float[Array, " n"],
         args: Args = None,
     ) -> Float[Array, " n"]:
-        """The momentum, which is the fibre coordinate itself."""
+        """Return the momentum p, which is the fibre coordinate `u` itself."""
         return u
 
     def velocity(
@@ -76,7 +76,7 @@ class HamiltonianSystem(AbstractMechanicalSystem):
         u: Float[Array, " n"],
         args: Args = None,
     ) -> Float[Array, " n"]:
-        """The velocity v = D2H."""
+        """Compute the velocity v = D2H(t, q, u)."""
         return jax.grad(self.hamiltonian, argnums=2)(t, q, u, args)
 
     def metric(
@@ -86,7 +86,7 @@ class HamiltonianSystem(AbstractMechanicalSystem):
         u: Float[Array, " n"],
         args: Args = None,
     ) -> Float[Array, "n n"]:
-        """The metric D2D2H on momenta, the inverse of the mass matrix."""
+        """Compute the metric D2D2H on momenta, the inverse of the mass matrix."""
         return jax.jacfwd(self.velocity, argnums=2)(t, q, u, args)
 
     def free_force(
@@ -96,7 +96,7 @@ class HamiltonianSystem(AbstractMechanicalSystem):
         u: Float[Array, " n"],
         args: Args = None,
     ) -> Float[Array, " n"]:
-        """The force without the reaction, -L_q^* D1H + F."""
+        """Compute the force without the reaction of the constraints, -L_q^* D1H + F."""
         manifold = self.manifold_of(q)
         d1h = manifold.left_gradient(lambda g: self.hamiltonian(t, g, u, args), q)
         return -d1h if self.force is None else self.force(t, q, u, args) - d1h
@@ -109,12 +109,15 @@ class HamiltonianSystem(AbstractMechanicalSystem):
         derivative: Float[Array, " n"],
         args: Args = None,
     ) -> Float[Array, " n"]:
-        """♭_H D2Ψ, the covector (D2D2H)⁻¹ D2Ψ."""
+        """Compute ♭_H D2Ψ = (D2D2H)⁻¹ D2Ψ from a constraint's derivative D2Ψ."""
         return matvec(
             inverse(jacobian(lambda u: self.velocity(t, q, u, args), u)), derivative
         )
 
     def energy(self, t: FloatScalarLike, y: State, args: Args = None) -> FloatScalar:
-        """The energy H(t, q, p) of a state; arguments as for a `LagrangianSystem`."""
+        """Compute the energy H(t, q, p) of a state.
+
+        The arguments are those of `LagrangianSystem.energy`.
+        """
         check_time_and_state("energy", t, y)
         return self.hamiltonian(t, y.q, y.p, args)

@@ -31,11 +31,12 @@ class LagrangianSystem(AbstractMechanicalSystem):
     derivatives are taken by automatic differentiation. Array leaves of the functions
     (if they are `equinox.Module`s) are parameters that gradients reach.
 
-    What the functions read beside their arguments (globals, variables of enclosing
-    functions, attributes of objects) is compiled in. `integrate` and `initial_state`
-    compare it from call to call and compile anew if it has changed. A `jax.jit` of your
-    own does not; give what is to change as `args`, or as an array field of an
-    `equinox.Module`, which never compiles anew. `docs/systems.md` has the details.
+    Values that the functions read beside their arguments (globals, variables of
+    enclosing functions, attributes of objects) are compiled in. `integrate` and
+    `initial_state` compare them from call to call and compile anew if one has changed.
+    A `jax.jit` of your own does not do so: pass a value that is to change as `args`, or
+    as an array field of an `equinox.Module`, for which nothing is ever compiled anew.
+    `docs/systems.md` has the details.
 
     **Arguments:**
 
@@ -72,7 +73,7 @@ class LagrangianSystem(AbstractMechanicalSystem):
         u: Float[Array, " n"],
         args: Args = None,
     ) -> Float[Array, " n"]:
-        """The momentum p = D2L (the Legendre transform)."""
+        """Compute the momentum p = D2L(t, q, u), the Legendre transform of u."""
         return jax.grad(self.lagrangian, argnums=2)(t, q, u, args)
 
     def velocity(
@@ -82,7 +83,7 @@ class LagrangianSystem(AbstractMechanicalSystem):
         u: Float[Array, " n"],
         args: Args = None,
     ) -> Float[Array, " n"]:
-        """The velocity, which is the fibre coordinate itself."""
+        """Return the velocity v, which is the fibre coordinate `u` itself."""
         return u
 
     def metric(
@@ -92,7 +93,7 @@ class LagrangianSystem(AbstractMechanicalSystem):
         u: Float[Array, " n"],
         args: Args = None,
     ) -> Float[Array, "n n"]:
-        """The mass matrix M = D2D2L."""
+        """Compute the mass matrix M = D2D2L, the metric on velocities."""
         return jax.jacfwd(self.momentum, argnums=2)(t, q, u, args)
 
     def free_force(
@@ -102,7 +103,7 @@ class LagrangianSystem(AbstractMechanicalSystem):
         u: Float[Array, " n"],
         args: Args = None,
     ) -> Float[Array, " n"]:
-        """The force without the reaction, L_q^* D1L + F."""
+        """Compute the force without the reaction of the constraints, L_q^* D1L + F."""
         manifold = self.manifold_of(q)
         d1l = manifold.left_gradient(lambda g: self.lagrangian(t, g, u, args), q)
         return d1l if self.force is None else d1l + self.force(t, q, u, args)
@@ -115,11 +116,11 @@ class LagrangianSystem(AbstractMechanicalSystem):
         derivative: Float[Array, " n"],
         args: Args = None,
     ) -> Float[Array, " n"]:
-        """The derivative D2Φ itself, which is a covector already."""
+        """Return the derivative D2Φ itself, which is a covector already."""
         return derivative
 
     def energy(self, t: FloatScalarLike, y: State, args: Args = None) -> FloatScalar:
-        """The energy E = D2L(q, v)·v - L of a state.
+        """Compute the energy E = D2L(t, q, v)·v - L of a state.
 
         **Arguments:**
 

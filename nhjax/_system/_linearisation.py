@@ -13,21 +13,21 @@ from ._state import check_time_and_state, State
 
 
 class Linearisation(eqx.Module):
-    """What is known of the equations of motion at one state (t, q, u).
+    """The equations of motion, linearised at one state (t, q, u), and their solution.
 
     u is the fibre coordinate of the system, v or p. With N = ∂p/∂u, B = ∂Φ/∂u of the
     constraints on velocities, and R = ♭ Bᵀ their reactions, the motion satisfies
 
     N u̇ - R λ = ad*_v p + free force - ∂t p - D1p v,    B u̇ = -∂t Φ - D1Φ v,
 
-    so that C λ with C = B N⁻¹ R is known: C is the paper's compatibility matrix C^{ab}
-    (section 3). For a Lagrangian system N is the mass matrix M = D2D2L, R = Bᵀ and u̇
-    the acceleration; for a Hamiltonian one N = 1 and R = (D2D2H)⁻¹ Bᵀ. In both
-    N⁻¹ R = K⁻¹ Bᵀ with K the metric on the fibre.
+    which determines C λ with C = B N⁻¹ R, the paper's compatibility matrix C^{ab}
+    (section 3), and so the multiplier λ. For a Lagrangian system N is the mass matrix
+    M = D2D2L, R = Bᵀ, and u̇ is the acceleration; for a Hamiltonian one N = 1 and
+    R = (D2D2H)⁻¹ Bᵀ. In both cases N⁻¹ R = K⁻¹ Bᵀ with K the metric on the fibre.
 
     The same matrices are the leading structure of the stage system. Inverses are formed
-    once and multiplied with afterwards: the matrices are tiny, and a triangular solve
-    inside an iteration costs far more than a product.
+    once, and later computations multiply with them: the matrices are tiny, and a
+    triangular solve inside an iteration costs far more than a product.
     """
 
     metric_inverse: Matrix  # K⁻¹
@@ -41,14 +41,17 @@ class Linearisation(eqx.Module):
 
     @property
     def momentum_inverse(self) -> Matrix:
-        """N⁻¹: the inverse mass matrix, or the identity of a Hamiltonian system."""
+        """Return N⁻¹, the inverse mass matrix or, for a Hamiltonian system, identity.
+
+        A vector stands for the diagonal matrix with these entries.
+        """
         if self.fibre_coordinate_name == "v":
             return self.metric_inverse
         return jnp.ones_like(self.acceleration)
 
     @property
     def is_singular(self) -> Bool[Array, ""]:
-        """Whether K or C could not be inverted."""
+        """Tell whether the metric K or the compatibility matrix C is singular."""
         return ~(
             jnp.all(jnp.isfinite(self.metric_inverse))
             & jnp.all(jnp.isfinite(self.compliance_inverse))
@@ -57,7 +60,7 @@ class Linearisation(eqx.Module):
     def solve(
         self, momentum_residual: Float[Array, " n"], hidden_residual: Float[Array, " l"]
     ) -> tuple[Float[Array, " n"], Float[Array, " l"]]:
-        """(u̇, λ) with N u̇ - R λ = `momentum_residual`, B u̇ = `hidden_residual`."""
+        """Find (u̇, λ) with N u̇ - R λ and B u̇ equal to the two given residuals."""
         free = matvec(self.momentum_inverse, momentum_residual)
         hidden = hidden_residual - small_einsum("ln,n->l", self.jacobian, free)
         multiplier = small_einsum("kl,l->k", self.compliance_inverse, hidden)
@@ -67,7 +70,10 @@ class Linearisation(eqx.Module):
 def _momentum_and_constraint(
     system: AbstractMechanicalSystem, q: PyTree[Array], args: Args
 ) -> Callable[..., tuple[Array, Array]]:
-    """(p, Φ) on the chart around q, from whose derivatives the motion follows."""
+    """Make the function (t, ξ, u) -> (p, Φ) on the chart ξ -> q τ(ξ) around q.
+
+    The equations of motion follow from its derivatives.
+    """
     manifold = system.manifold_of(q)
 
     def pair(t, xi, u):
@@ -78,7 +84,7 @@ def _momentum_and_constraint(
 
 
 def _inertial_force(system, q, p: Array, v: Array) -> Array:
-    """ad*_v p, by which the body momentum turns."""
+    """Compute ad*_v p, the term in ṗ by which the body momentum turns."""
     manifold = system.manifold_of(q)
     return jnp.zeros_like(p) if manifold.is_flat else manifold.ad_dual(v, p)
 
@@ -91,7 +97,7 @@ def whole_force(
     multiplier: Float[Array, " l"],
     args: Args,
 ) -> Float[Array, " n"]:
-    """The whole force W on a system: the free force, and the constraints' reaction."""
+    """Compute the whole force W: the free force plus the reaction of constraints."""
     free = system.free_force(t, q, u, args)
     return free + system.reaction(t, q, u, multiplier, args)
 
@@ -105,10 +111,11 @@ def motion_residual(
     multiplier: Float[Array, " l"],
     args: Args,
 ) -> tuple[Float[Array, " n"], Float[Array, " l"]]:
-    """Residuals of the equations of motion and of the hidden constraint.
+    """Compute the residuals of the equations of motion and of the hidden constraint.
 
-    ṗ - ad*_v p - W and dΦ/dt along (q̇, u̇) = (q v, a). They vanish at the continuous
-    multiplier λ = λ_c(q, u).
+    These are ṗ - ad*_v p - W and dΦ/dt along (q̇, u̇) = (q v, a), where a is the given
+    `acceleration`. They vanish where the multiplier is the continuous multiplier
+    λ = λ_c(q, u) and a the acceleration that belongs to it.
     """
     v = system.velocity(t, q, u, args)
     (p, _), (p_dot, phi_dot) = jax.jvp(
@@ -127,7 +134,7 @@ def linearise(
     u: Float[Array, " n"],
     args: Args,
 ) -> Linearisation:
-    """The matrices, the acceleration and the continuous multiplier at (t, q, u)."""
+    """Linearise the equations of motion at (t, q, u), and solve them for u̇ and λ_c."""
     zero, v = jnp.zeros_like(u), system.velocity(t, q, u, args)
     (p, violation), (p_dot, phi_dot) = jax.jvp(
         _momentum_and_constraint(system, q, args),
@@ -159,7 +166,7 @@ def linearise(
 def continuous_multiplier(
     system: AbstractMechanicalSystem, t: FloatScalarLike, y: State, args: Args = None
 ) -> Float[Array, " l"]:
-    """The multiplier λ_c of the continuous equations of motion at a state.
+    """Compute the multiplier λ_c of the continuous equations of motion at a state.
 
     It follows from the hidden constraint dΦ/dt = 0, and for the rows of holonomic
     constraints, which come last, from d²Γ/dt² = 0 (the paper's section 3). Along a

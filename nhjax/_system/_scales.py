@@ -1,4 +1,4 @@
-"""The sizes by which violations and increments are judged to be round-off."""
+"""The sizes of the terms of constraints, which tell violations from round-off."""
 
 import jax
 import jax.numpy as jnp
@@ -18,10 +18,11 @@ def violation_scale(
     u: Float[Array, " n"],
     args: Args,
 ) -> Float[Array, " l"]:
-    """Row by row the size that the terms of an affine Φ may have at such a u.
+    """Estimate, row by row, how large the terms of Φ are for a u of the given size.
 
-    Not their size at u itself: a constraint such as v[1] has but one term, which is
-    round-off in a state that satisfies it.
+    The estimate treats Φ as affine in u. It is not the size of the terms at u itself: a
+    constraint such as v[1] has a single term, which is round-off in every state that
+    satisfies the constraint.
     """
     return velocity_scale(system, lin.jacobian, t, q, u, args)
 
@@ -34,7 +35,7 @@ def velocity_scale(
     u: Float[Array, " n"],
     args: Args,
 ) -> Float[Array, " l"]:
-    """The same from the derivatives of Φ in u alone."""
+    """Do what `violation_scale` does, given the Jacobian ∂Φ/∂u alone."""
     affine = _finite_or_zero(system.constraint(t, q, jnp.zeros_like(u), args))
     slopes = jnp.sum(jnp.abs(jacobian), axis=1)
     return slopes * max_norm(u) + affine
@@ -43,7 +44,10 @@ def velocity_scale(
 def position_scale(
     system: AbstractMechanicalSystem, t: FloatScalar, q: PyTree[Array], args: Args
 ) -> Float[Array, " k"]:
-    """Row by row the size that the terms of an affine Γ may have at such a q."""
+    """Estimate, row by row, how large the terms of Γ are for a q of the given size.
+
+    The estimate treats Γ as affine in q.
+    """
 
     def gamma(q):
         return system.position_constraint(t, q, args)

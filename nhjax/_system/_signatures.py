@@ -1,4 +1,4 @@
-"""Whether a function of the user takes the arguments that it will be called with."""
+"""The check that a user's function takes the arguments it will be called with."""
 
 import inspect
 from collections.abc import Callable
@@ -23,10 +23,11 @@ def check_signature(owner: Any, name: str, arguments: tuple[str, ...]) -> None:
 
 
 def _signature(function: Callable[..., Any]) -> inspect.Signature | None:
-    """The signature by which a function is called, None where it cannot be known.
+    """Find the signature by which a function is called, or None if it is not known.
 
-    Not that of a function that it wraps, whose arguments need not be the same, unless
-    it has none of its own, such as the outcome of `jax.jit`.
+    For a function that wraps another, the signature of the wrapper counts, since the
+    arguments of the wrapped function may differ. If the wrapper has no signature of its
+    own, as the result of `jax.jit`, that of the wrapped function is taken.
     """
     method, of = (
         getattr(function, "__func__", None),
@@ -40,7 +41,7 @@ def _signature(function: Callable[..., Any]) -> inspect.Signature | None:
             signature = inspect.signature(function, follow_wrapped=follow)
         except (TypeError, ValueError):
             continue
-        # Types would make a message long.
+        # Annotations are left out, since they would make the message long.
         bare = [
             parameter.replace(annotation=inspect.Parameter.empty)
             for parameter in signature.parameters.values()

@@ -27,7 +27,7 @@ class State(eqx.Module):
 
 
 def check_time_and_state(function: str, t: Any, y: Any, first: str = "") -> None:
-    """Raise a `TypeError` unless `y` is a state, and `t` is none."""
+    """Raise a `TypeError` if `y` is not a `State`, or if `t` is one."""
     advice = f"Call it as `{function}({first}t, y, args)`."
     if isinstance(t, State):
         raise TypeError(f"`t` must be a time, got an nhjax.State. {advice}")

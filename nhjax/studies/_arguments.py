@@ -5,7 +5,7 @@ from collections.abc import Iterable, Sequence
 
 
 class ArgumentError(ValueError):
-    """An argument of a study cannot be right.
+    """Raised if an argument of a study cannot be right.
 
     `argument` is its name, so that the command line can name its option.
     """
@@ -48,7 +48,7 @@ def check_positive(argument: str, *values: float) -> None:
 
 
 def check_at_least_one(argument: str, value: int) -> None:
-    """Raise for an integer below 1."""
+    """Raise an `ArgumentError` for an integer below 1."""
     if value < 1:
         raise ArgumentError(argument, f"must be at least 1, got {value}")
 
@@ -60,7 +60,7 @@ def check_step_sizes(dt: Sequence[float]) -> None:
 
 
 def whole_steps(final_time: float, dt: float) -> int:
-    """The number of steps to the final time, which `dt` has to divide."""
+    """Compute the number of steps to the final time, which `dt` has to divide."""
     ratio = final_time / dt
     num_steps = round(ratio)
     if num_steps < 1 or abs(ratio - num_steps) > 1e-9 * ratio:

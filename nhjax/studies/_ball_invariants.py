@@ -57,25 +57,25 @@ class BallInvariants(AbstractStudyResult):
 
     @property
     def final_time(self) -> float:
-        """The length of the shortest runs."""
+        """Return the length in time of the shortest runs."""
         return self.num_steps * min(self.dt)
 
     def of_stages(self, s: int) -> list[BallRun]:
-        """The runs with `s` stages, h falling."""
+        """Return the runs with `s` stages, with falling step size h."""
         return [run for run in self.runs if run.stages == s]
 
     def energy_slopes(self, s: int) -> np.ndarray:
-        """The order of the moving energy's largest error, NaN where there is none."""
+        """Return the order of the moving energy's largest error, or NaN."""
         errors = [max(run.energy_by_fifths()) for run in self.of_stages(s)]
         return slopes(self.dt, np.array(errors), floor=ENERGY_FLOOR)
 
     def circle_slopes(self, s: int) -> np.ndarray:
-        """The order of the distance from the circle, NaN where there is none."""
+        """Return the order of the distance from the circle; NaN if there is none."""
         errors = [run.circle_deviation for run in self.of_stages(s)]
         return slopes(self.dt, np.array(errors), floor=POSITION_FLOOR)
 
     def parameters(self) -> dict[str, Any]:
-        """Every parameter of the computation, initial data included."""
+        """Return every parameter of the computation, initial data included."""
         return {
             "stages": self.stages,
             "dt": self.dt,
@@ -91,7 +91,7 @@ class BallInvariants(AbstractStudyResult):
         }
 
     def summary(self) -> dict[str, Any]:
-        """The results in short, with timings."""
+        """Return the results in short, with timings."""
         entries = []
         for s in self.stages:
             for run, energy_slope, circle_slope in self._with_slopes(s):
@@ -112,7 +112,7 @@ class BallInvariants(AbstractStudyResult):
         return {"circle_deviation_at": self.final_time, "runs": entries}
 
     def arrays(self) -> dict[str, np.ndarray]:
-        """The data behind the figures."""
+        """Return the data behind the figures, by name."""
         data = {}
         for run in self.runs:
             key = f"s{run.stages}_h{run.dt:.6g}"
@@ -122,7 +122,7 @@ class BallInvariants(AbstractStudyResult):
         return data
 
     def table(self) -> str:
-        """The largest errors of each run, and the orders."""
+        """Write a table of the largest errors of each run, and of the orders."""
         header = ["s", "h"]
         header += [f"|Δ({name})|" for name in LINEAR_INTEGRALS]
         header += ["|ΔE_m| 1/5", "|ΔE_m| 5/5", "slope"]
@@ -253,7 +253,7 @@ def _runs(
     position: np.ndarray,
     progress: bool,
 ) -> list[BallRun]:
-    """One run for each step size, side by side."""
+    """Make one run for each step size, side by side."""
     y0 = ball.initial_state()
 
     def observe(t, y, args):

@@ -31,13 +31,13 @@ class BallRun:
     timing: Timing
 
     def deviations(self) -> np.ndarray:
-        """The integrals less their initial values."""
+        """Return the first integrals less their initial values."""
         return self.integrals - self.integrals[0]
 
     def largest_linear_errors(self) -> np.ndarray:
-        """The largest deviation of each linear integral, shape (3,)."""
+        """Return the largest deviation of each linear integral, of shape (3,)."""
         return np.max(np.abs(self.deviations()[:, :3]), axis=0)
 
     def energy_by_fifths(self) -> list[float]:
-        """The largest deviation of the moving energy in each fifth of the run."""
+        """Return the moving energy's largest deviation in each fifth of the run."""
         return largest_by_fifths(self.deviations()[1:, 3])

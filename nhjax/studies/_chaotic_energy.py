@@ -53,11 +53,11 @@ class ChaoticRun:
     timing: Timing
 
     def mean_squared_error(self) -> np.ndarray:
-        """μ(E, k) at the saved times."""
+        """Compute the mean squared energy error μ(E, k) at the saved times."""
         return np.mean((self.energies - self.energies[:, :1]) ** 2, axis=0)
 
     def window_means(self, times: Sequence[float]) -> np.ndarray:
-        """μ(E, k) averaged around each of `times`."""
+        """Average μ(E, k) over a window around each of `times`."""
         mu = self.mean_squared_error()
         return np.array(
             [np.mean(mu[np.abs(self.times - t) <= WINDOW + 1e-9]) for t in times]
@@ -80,11 +80,11 @@ class ChaoticEnergy(AbstractStudyResult):
     runs: list[ChaoticRun]
 
     def of_stages(self, s: int) -> list[ChaoticRun]:
-        """The runs with `s` stages, h falling."""
+        """Return the runs with `s` stages, with falling step size h."""
         return [run for run in self.runs if run.stages == s]
 
     def slopes(self, s: int) -> np.ndarray:
-        """log-log slopes of the window means, shape (step sizes, times).
+        """Return log-log slopes of the window means, of shape (step sizes, times).
 
         The first row is NaN: there is no larger step to compare with.
         """
@@ -92,7 +92,7 @@ class ChaoticEnergy(AbstractStudyResult):
         return slopes(self.dt, means)
 
     def parameters(self) -> dict[str, Any]:
-        """Every parameter of the computation, initial data included."""
+        """Return every parameter of the computation, initial data included."""
         return {
             "stages": self.stages,
             "dt": self.dt,
@@ -117,7 +117,7 @@ class ChaoticEnergy(AbstractStudyResult):
         }
 
     def summary(self) -> dict[str, Any]:
-        """The results in short, with timings."""
+        """Return the results in short, with timings."""
         entries = []
         for s in self.stages:
             for run, slope in zip(self.of_stages(s), self.slopes(s), strict=True):
@@ -142,7 +142,7 @@ class ChaoticEnergy(AbstractStudyResult):
         }
 
     def arrays(self) -> dict[str, np.ndarray]:
-        """The data behind the figure."""
+        """Return the data behind the figure, by name."""
         data = {}
         for run in self.runs:
             key = f"s{run.stages}_h{run.dt:.6g}"
@@ -152,7 +152,7 @@ class ChaoticEnergy(AbstractStudyResult):
         return data
 
     def table(self) -> str:
-        """μ/h^{4(s-1)} and the slopes of μ at the times."""
+        """Write a table of μ/h^{4(s-1)} and the slopes of μ at the times."""
         header = ["s", "h", "4(s-1)"]
         header += [f"μ/h^4(s-1) t={t:g}" for t in self.times]
         header += [f"slope t={t:g}" for t in self.times]
@@ -172,7 +172,7 @@ class ChaoticEnergy(AbstractStudyResult):
         return format_table(header, rows)
 
     def figures(self) -> "dict[str, Figure]":
-        """μ against time in both normalisations, ours and the paper's."""
+        """Draw μ against time in both normalisations, ours and the paper's."""
         curves = [
             (run.stages, run.dt, run.times, run.mean_squared_error())
             for run in self.runs

@@ -17,7 +17,7 @@ Curve = tuple[int, float, np.ndarray, np.ndarray]
 
 
 def chaotic_figure(curves: list[Curve], title: str) -> "Figure":
-    """μ against time, a column for each s: ours above, the paper's below.
+    """Draw μ against time, a column for each s: ours above, the paper's below.
 
     `curves` holds (s, h, times, μ).
     """
@@ -64,7 +64,7 @@ def _panel(ax: "Axes", curves: list[Curve], power: int) -> None:
 
 
 def _smoothed(x: np.ndarray) -> np.ndarray:
-    """Running means over a fortieth of the run."""
+    """Compute running means over a fortieth of the run."""
     width = max(1, len(x) // 40)
     kernel = np.ones(width)
     return np.convolve(x, kernel, "same") / np.convolve(np.ones(len(x)), kernel, "same")

@@ -54,19 +54,19 @@ class CVTRun:
 
     @property
     def key(self) -> str:
-        """A name for files and arrays."""
+        """Return the name of the run for files and arrays."""
         return f"{self.regime}_s{self.stages}_h{self.dt:.6g}"
 
     def deviations(self) -> np.ndarray:
-        """The energies less their initial values."""
+        """Return the energies less their initial values."""
         return self.energies - self.energies[0]
 
     def by_fifths(self) -> list[float]:
-        """Max |E - E0| over each fifth of the run."""
+        """Return max |E - E0| of the total energy over each fifth of the run."""
         return largest_by_fifths(self.deviations()[1:, 0])
 
     def ranges(self) -> dict[str, tuple[float, float]]:
-        """The least and the greatest deviation of each energy."""
+        """Return the least and the greatest deviation of each energy."""
         low, high = self.deviations().min(axis=0), self.deviations().max(axis=0)
         return {
             name: (float(low[i]), float(high[i])) for i, name in enumerate(ENERGIES)
@@ -86,7 +86,7 @@ class CVTEnergy(AbstractStudyResult):
     runs: list[CVTRun]
 
     def parameters(self) -> dict[str, Any]:
-        """Every parameter of the computation, initial data included."""
+        """Return every parameter of the computation, initial data included."""
         regimes = dict.fromkeys(run.regime for run in self.runs)
         examples = {name: REGIMES[name](self.epsilon) for name in regimes}
         return {
@@ -106,7 +106,7 @@ class CVTEnergy(AbstractStudyResult):
         }
 
     def summary(self) -> dict[str, Any]:
-        """The results in short, with timings."""
+        """Return the results in short, with timings."""
         return {
             "runs": [
                 {
@@ -125,7 +125,7 @@ class CVTEnergy(AbstractStudyResult):
         }
 
     def arrays(self) -> dict[str, np.ndarray]:
-        """The data behind the figures."""
+        """Return the data behind the figures, by name."""
         data = {}
         for run in self.runs:
             data[f"{run.key}_times"] = run.times
@@ -133,7 +133,7 @@ class CVTEnergy(AbstractStudyResult):
         return data
 
     def table(self) -> str:
-        """Energy errors by fifths of the run, and the ranges of E_d and E_p."""
+        """Write a table of energy errors by fifths of the run, and E_d, E_p ranges."""
         header = ["regime", "s", "h"]
         header += [f"max|E-E0| {i}/5" for i in range(1, 6)]
         header += ["range of ΔE_d", "range of ΔE_p", "run s"]
@@ -152,7 +152,7 @@ class CVTEnergy(AbstractStudyResult):
         return format_table(header, rows)
 
     def figures(self) -> "dict[str, Figure]":
-        """For each regime and step size: short and long term, as in the paper."""
+        """Draw short and long term for each regime and step size, as in the paper."""
         cases = dict.fromkeys((run.regime, run.dt) for run in self.runs)
         return {
             f"{self.name}-{regime}-h{h:.4g}": self._figure(regime, h)
@@ -261,7 +261,7 @@ def _runs(
     epsilon: float,
     progress: bool,
 ) -> list[CVTRun]:
-    """One run for each regime, side by side."""
+    """Make one run for each regime, side by side."""
     cvt = ContinuouslyVariableTransmission(epsilon)
     system = cvt.system
 

@@ -31,15 +31,15 @@ class ExactExample(Protocol):
 
     @property
     def system(self) -> LagrangianSystem:
-        """The system to integrate."""
+        """Return the system to integrate."""
         ...
 
     def initial_state(self) -> State:
-        """Where to start."""
+        """Return the initial state."""
         ...
 
     def exact(self, t: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """(q, v, λ) at `t`."""
+        """Compute (q, v, λ) of the exact solution at time `t`."""
         ...
 
 
@@ -63,12 +63,12 @@ class AbstractOrderStudy(AbstractStudyResult):
     timings: list[Timing]
 
     def slopes(self) -> np.ndarray:
-        """Observed orders, of the shape of `errors`, NaN where round-off rules."""
+        """Return observed orders, shaped as `errors`; NaN where round-off rules."""
         # The errors of a run to T = 3 level off below 1e-14.
         return np.stack([slopes(self.dt, e, floor=1e-13) for e in self.errors])
 
     def orders(self) -> np.ndarray:
-        """The order at the smallest step sizes above round-off.
+        """Return the order at the smallest step sizes whose errors exceed round-off.
 
         The shape is (stages, quantities).
         """
@@ -79,7 +79,7 @@ class AbstractOrderStudy(AbstractStudyResult):
         return last
 
     def parameters(self) -> dict[str, Any]:
-        """Every parameter of the computation, initial data included."""
+        """Return every parameter of the computation, initial data included."""
         return {
             "stages": self.stages,
             "dt": self.dt,
@@ -94,7 +94,7 @@ class AbstractOrderStudy(AbstractStudyResult):
         }
 
     def summary(self) -> dict[str, Any]:
-        """The results in short, with timings."""
+        """Return the results in short, with timings."""
         orders = self.orders()
         return {
             "quantities": self.quantities,
@@ -112,7 +112,7 @@ class AbstractOrderStudy(AbstractStudyResult):
         }
 
     def arrays(self) -> dict[str, np.ndarray]:
-        """The data behind the figure."""
+        """Return the data behind the figure, by name."""
         return {
             "stages": np.array(self.stages),
             "dt": np.array(self.dt),
@@ -121,7 +121,7 @@ class AbstractOrderStudy(AbstractStudyResult):
         }
 
     def table(self) -> str:
-        """Errors and slopes at every step size, then the orders."""
+        """Write a table of errors and slopes at every step size, then the orders."""
         symbols = [SYMBOLS[name][0] for name in self.quantities]
         header = ["s", "h"]
         for symbol in symbols:
@@ -146,7 +146,7 @@ class AbstractOrderStudy(AbstractStudyResult):
         return f"{format_table(header, rows)}\n\nobserved (expected) orders\n{summary}"
 
     def figures(self) -> "dict[str, Figure]":
-        """Error against step size, like the paper's order plots."""
+        """Draw the errors against the step size, like the paper's order plots."""
         from matplotlib.figure import Figure
 
         columns = math.ceil(len(self.quantities) / 2)
@@ -201,7 +201,7 @@ def order_study(
     closure: str,
     progress: bool,
 ) -> _Study:
-    """The `study` of an example, for each s and h.
+    """Run the order study of an example for each number of stages and step size.
 
     **Raises:** `ArgumentError` for arguments that cannot be right, and
     `nhjax.IntegrationError` if a step cannot be solved.
@@ -261,7 +261,7 @@ def _final_values(
     dt: tuple[float, ...],
     num_steps: list[int],
 ) -> tuple[list[tuple[np.ndarray, ...]], Timing]:
-    """The quantities at the end of the run with each step size."""
+    """Compute the quantities at the end of the run with each step size."""
     # The length of a run is static in `integrate`. One compiled program serves every
     # step size if all runs are of as many steps; what comes after the end is left.
     system = example.system

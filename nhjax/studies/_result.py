@@ -1,4 +1,4 @@
-"""What every study returns, and how it is written to files."""
+"""The interface of the results that studies return, and the files made of them."""
 
 import abc
 import dataclasses
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 @dataclasses.dataclass(frozen=True)
 class Timing:
-    """Wall-clock seconds of one compiled program."""
+    """The wall-clock seconds that it took to compile and to run one program."""
 
     compile_seconds: float
     run_seconds: float
@@ -35,23 +35,23 @@ class AbstractStudyResult(abc.ABC):
 
     @abc.abstractmethod
     def parameters(self) -> dict[str, Any]:
-        """Every parameter of the computation, initial data included."""
+        """Return every parameter of the computation, initial data included."""
 
     @abc.abstractmethod
     def summary(self) -> dict[str, Any]:
-        """The results in short, with timings."""
+        """Return the results in short, with timings."""
 
     @abc.abstractmethod
     def arrays(self) -> dict[str, np.ndarray]:
-        """The data behind the figures."""
+        """Return the data behind the figures, by name."""
 
     @abc.abstractmethod
     def table(self) -> str:
-        """The results in short, to read."""
+        """Write the results in short as a table of text."""
 
     @abc.abstractmethod
     def figures(self) -> "dict[str, Figure]":
-        """The figures by file name, without suffix."""
+        """Draw the figures; return them by file name, without suffix."""
 
 
 def write(result: AbstractStudyResult, directory: str | Path) -> dict[str, Any]:
@@ -87,7 +87,7 @@ def write(result: AbstractStudyResult, directory: str | Path) -> dict[str, Any]:
 
 
 def system_parameters(example: Any) -> dict[str, Any]:
-    """The parameters of an example of the gallery, all but the initial data."""
+    """Return the parameters of an example of the gallery, without the initial data."""
     values = {
         field.name: getattr(example, field.name)
         for field in dataclasses.fields(example)
@@ -100,7 +100,7 @@ def system_parameters(example: Any) -> dict[str, Any]:
 
 
 def initial_data(example: Any) -> dict[str, Any]:
-    """Where an example of the gallery starts."""
+    """Return the initial data of an example of the gallery."""
     return {
         "q0": jax.tree.map(np.asarray, example.q0),
         "v0": np.asarray(example.v0),
@@ -109,7 +109,7 @@ def initial_data(example: Any) -> dict[str, Any]:
 
 
 def environment() -> dict[str, Any]:
-    """The versions, the precision and the device that the numbers depend on."""
+    """Return the versions, the precision and the device that the numbers depend on."""
     device = jax.devices()[0]
     packages = ("nhjax", "jax", "jaxlib", "equinox", "numpy", "matplotlib")
     return {
@@ -122,7 +122,7 @@ def environment() -> dict[str, Any]:
 
 
 def _plain(x: Any) -> Any:
-    """`x` in terms of JSON, with null for what is not a finite number."""
+    """Convert `x` to values of JSON, with null for numbers that are not finite."""
     if isinstance(x, Mapping):
         return {str(key): _plain(value) for key, value in x.items()}
     if isinstance(x, list | tuple | np.ndarray):

@@ -1,4 +1,4 @@
-"""How studies compute: compile and run apart, with a progress meter or none."""
+"""Helpers of studies, which compile and run a program and time both separately."""
 
 import time
 from collections.abc import Callable
@@ -11,7 +11,7 @@ from ._result import Timing
 
 
 def compile_and_run(function: Callable[..., Any], *args: Any) -> tuple[Any, Timing]:
-    """`function(*args)` as one compiled program, and what it took."""
+    """Compile and run `function(*args)` as one program; return its value and times."""
     start = time.perf_counter()
     program = jax.jit(function).lower(*args).compile()
     compiled = time.perf_counter()
@@ -22,5 +22,5 @@ def compile_and_run(function: Callable[..., Any], *args: Any) -> tuple[Any, Timi
 
 
 def meter(progress: bool, description: str) -> AbstractProgressMeter:
-    """A bar on the standard error stream if `progress`."""
+    """Make a progress meter: a bar on the standard error stream, or none."""
     return TqdmProgressMeter(description) if progress else NoProgressMeter()

@@ -1,4 +1,4 @@
-"""Tables of numbers as text, and the numbers that sum up a run."""
+"""Functions that write tables of numbers as text, and that sum up a run."""
 
 from collections.abc import Sequence
 
@@ -7,7 +7,7 @@ import numpy as np
 from ..diagnostics import convergence_order
 
 
-# Names of quantities, in tables and in figures.
+# The symbols of quantities, in tables and in figures.
 SYMBOLS = {
     "q": ("q", "$q$"),
     "g": ("g", "$g$"),
@@ -19,7 +19,7 @@ SYMBOLS = {
 
 
 def format_table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """Right-aligned columns under a ruled header."""
+    """Write a table as text, with right-aligned columns under a ruled header."""
     widths = [max(map(len, column)) for column in zip(header, *rows, strict=True)]
     ruler = ["-" * width for width in widths]
     return "\n".join(
@@ -29,19 +29,19 @@ def format_table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
 
 
 def format_slope(x: float) -> str:
-    """A slope, or a dash where there is none."""
+    """Write a slope with two decimals, or a dash where there is none."""
     return f"{x:.2f}" if np.isfinite(x) else "-"
 
 
 def largest_by_fifths(error: np.ndarray) -> list[float]:
-    """Max |error| over each fifth of a run."""
+    """Compute max |error| over each fifth of a run."""
     return [float(np.max(part)) for part in np.array_split(np.abs(error), 5)]
 
 
 def slopes(
     step_sizes: Sequence[float] | np.ndarray, errors: np.ndarray, floor: float = 0.0
 ) -> np.ndarray:
-    """Observed orders, aligned with `errors`; NaN where there is none.
+    """Compute observed orders, aligned with `errors`; NaN where there is none.
 
     The first row has no predecessor, and errors at or below `floor` are round-off.
     """

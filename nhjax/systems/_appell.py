@@ -45,15 +45,15 @@ class Appell(AbstractConstrainedExample):
         require_positive(mass=self.mass, ratio=self.ratio)
 
     def lagrangian(self, t: FloatScalarLike, q: Array, v: Array, args: Args) -> Array:
-        """L = m/2 (ẋ² + ẏ² + ż²) - mgz."""
+        """Compute the Lagrangian L = m/2 (ẋ² + ẏ² + ż²) - mgz."""
         return 0.5 * self.mass * (v @ v) - self.mass * self.gravity * q[2]
 
     def constraint(self, t: FloatScalarLike, q: Array, v: Array, args: Args) -> Array:
-        """Φ = ½ (ẋ² + ẏ² - κ²ż²)."""
+        """Compute the constraint Φ = ½ (ẋ² + ẏ² - κ²ż²)."""
         return 0.5 * (v[0] ** 2 + v[1] ** 2 - self.ratio**2 * v[2] ** 2)
 
     def invariants(self, t: FloatScalarLike, q: Array, v: Array) -> dict[str, Array]:
-        """Energy, and the direction of motion ẋ/ż, ẏ/ż."""
+        """Compute the energy, and the direction of motion ẋ/ż, ẏ/ż."""
         return {
             "energy": self.energy(t, q, v),
             "slope_x": v[0] / v[2],
@@ -61,7 +61,7 @@ class Appell(AbstractConstrainedExample):
         }
 
     def exact(self, t: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """(q, v, λ) at `t`, for consistent data while ż keeps its sign."""
+        """Compute (q, v, λ) at `t`, for consistent data while ż keeps its sign."""
         q0, v0 = self._consistent_data()
         require_nonzero("v0[2]", v0[2], "the constraint is singular there")
         weight = float(self.mass) * float(self.gravity)

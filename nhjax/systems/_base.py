@@ -1,4 +1,4 @@
-"""What every example of the gallery shares."""
+"""The base classes and helpers that all examples of the gallery share."""
 
 import abc
 import math
@@ -24,7 +24,7 @@ NODES, WEIGHTS = np.polynomial.legendre.leggauss(20)
 
 
 def parameter(value: ArrayLike) -> Array:
-    """Make `value` an array leaf.
+    """Convert a parameter of an example to an array, which is a leaf.
 
     A Python or NumPy scalar becomes a weakly-typed float, so that it takes part in
     float32 and float64 arithmetic alike, strict dtype promotion included.
@@ -35,7 +35,7 @@ def parameter(value: ArrayLike) -> Array:
 
 
 def coordinates(value: ArrayLike | tuple[float, ...]) -> Array:
-    """Make a floating array of a tuple or an array of coordinates."""
+    """Convert to a floating array a tuple or an array of coordinates."""
     array = jnp.asarray(value)
     if not jnp.issubdtype(array.dtype, jnp.inexact):
         array = array.astype(jnp.result_type(float))
@@ -43,7 +43,7 @@ def coordinates(value: ArrayLike | tuple[float, ...]) -> Array:
 
 
 def pair(value: tuple) -> tuple[Array, Array]:
-    """Make floating arrays of an element of a product of two groups."""
+    """Convert to floating arrays an element of a product of two groups."""
     first, second = value
     return coordinates(first), coordinates(second)
 
@@ -56,7 +56,7 @@ def require_positive(**parameters: Array) -> None:
 
 
 def require_shape(shape: tuple[int, ...], **parameters: Array) -> None:
-    """Raise for a parameter that has not the `shape`."""
+    """Raise for a parameter whose shape is not `shape`."""
     for name, value in parameters.items():
         if value.shape != shape:
             raise ValueError(f"`{name}` must have shape {shape}, got {value.shape}.")
@@ -85,14 +85,14 @@ def require_consistent(name: str, violation: ArrayLike, scale: ArrayLike) -> Non
 
 
 def on_host(tree: PyTree[Array]) -> PyTree[np.ndarray]:
-    """The arrays of `tree` in float64 on the host, where exact solutions live."""
+    """Convert the arrays of `tree` to float64 on the host, for exact solutions."""
     return jax.tree.map(lambda x: np.asarray(x, dtype=np.float64), tree)
 
 
 def integral(
     integrand: Callable[[np.ndarray], np.ndarray], t: float, rate: float
 ) -> np.ndarray:
-    """Integrate over [0, t] to round-off.
+    """Integrate a function of time over [0, t] to round-off.
 
     `integrand` maps an array of times to values along its last axes; `rate` is the
     inverse of the shortest time scale on which it varies.
@@ -105,7 +105,7 @@ def integral(
 
 
 class AbstractExample(eqx.Module):
-    """A mechanical system with parameters and default initial data.
+    """An example of the gallery: a system with parameters and default initial data.
 
     On a Lie group `q` is an element, a tuple of arrays on a product, and `v` the body
     velocity.
@@ -116,24 +116,24 @@ class AbstractExample(eqx.Module):
 
     @abc.abstractmethod
     def lagrangian(self, t: FloatScalarLike, q: Any, v: Array, args: Args) -> Array:
-        """The Lagrangian L(t, q, v)."""
+        """Compute the Lagrangian L(t, q, v)."""
 
     @abc.abstractmethod
     def invariants(self, t: FloatScalarLike, q: Any, v: Array) -> dict[str, Array]:
-        """The conserved quantities at one point (q, v); `jax.vmap` it over many."""
+        """Compute the conserved quantities at one point (q, v), by name."""
 
     @property
     @abc.abstractmethod
     def system(self) -> LagrangianSystem:
-        """The system to integrate; its leaves are the parameters."""
+        """Return the system to integrate, whose leaves are the parameters."""
 
     def energy(self, t: FloatScalarLike, q: Any, v: Array) -> Array:
-        """The energy D2L · v - L at one point."""
+        """Compute the energy D2L · v - L at one point (q, v)."""
         value, momentum = jax.value_and_grad(self.lagrangian, argnums=2)(t, q, v, None)
         return momentum @ v - value
 
     def initial_state(self, dtype: DTypeLike | None = None) -> State:
-        """The consistent state at (`q0`, `v0`).
+        """Make the consistent state at (`q0`, `v0`).
 
         `dtype` defaults to JAX's default float.
         """
@@ -144,14 +144,14 @@ class AbstractExample(eqx.Module):
 
 
 class AbstractNonholonomicExample(AbstractExample):
-    """An example with nonholonomic constraints."""
+    """An example of the gallery with nonholonomic constraints."""
 
     @abc.abstractmethod
     def constraint(self, t: FloatScalarLike, q: Any, v: Array, args: Args) -> Array:
-        """The constraint Φ(t, q, v), a scalar or of shape (m,)."""
+        """Compute the constraint Φ(t, q, v), a scalar or of shape (m,)."""
 
     def _consistent_data(self) -> tuple[Any, np.ndarray]:
-        """(q0, v0) in float64 on the host, where they satisfy the constraint."""
+        """Return (q0, v0) in float64 on the host, if they satisfy the constraint."""
         time = jnp.asarray(0.0, dtype=self.v0.dtype)
         violation = self.constraint(time, self.q0, self.v0, None)
         require_consistent("v0", violation, self.v0)
@@ -159,25 +159,25 @@ class AbstractNonholonomicExample(AbstractExample):
 
 
 class AbstractConstrainedExample(AbstractNonholonomicExample):
-    """An example with nonholonomic constraints on a vector space."""
+    """An example of the gallery with nonholonomic constraints on a vector space."""
 
     @property
     def system(self) -> LagrangianSystem:
-        """The system to integrate; its leaves are the parameters."""
+        """Return the system to integrate, whose leaves are the parameters."""
         return LagrangianSystem(self.lagrangian, nonholonomic=self.constraint)
 
 
 class AbstractConstrainedGroupExample(AbstractNonholonomicExample):
-    """An example with nonholonomic constraints on a Lie group."""
+    """An example of the gallery with nonholonomic constraints on a Lie group."""
 
     @property
     @abc.abstractmethod
     def manifold(self) -> AbstractLieGroup:
-        """The configuration manifold, with the example's retraction."""
+        """Return the configuration manifold, with the example's retraction."""
 
     @property
     def system(self) -> LagrangianSystem:
-        """The system to integrate; its leaves are the parameters."""
+        """Return the system to integrate, whose leaves are the parameters."""
         return LagrangianSystem(
             self.lagrangian, nonholonomic=self.constraint, manifold=self.manifold
         )

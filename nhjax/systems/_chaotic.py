@@ -56,24 +56,27 @@ class ChaoticSystem(AbstractConstrainedExample):
                 )
 
     def lagrangian(self, t: FloatScalarLike, q: Array, v: Array, args: Args) -> Array:
-        """L = ½ |v|² - ½ (|q|² + q²_{m+2} q²_{m+3} + Σ q²_{1+i} q²_{m+1+i})."""
+        """Compute the Lagrangian L(t, q, v).
+
+        L = ½ |v|² - ½ (|q|² + q²_{m+2} q²_{m+3} + Σ q²_{1+i} q²_{m+1+i}).
+        """
         squares = q**2
         first, second = squares[1 : self.m + 1], squares[self.m + 1 :]
         potential = jnp.sum(squares) + second[0] * second[1] + first @ second
         return 0.5 * (v @ v) - 0.5 * potential
 
     def constraint(self, t: FloatScalarLike, q: Array, v: Array, args: Args) -> Array:
-        """Φ = v_1 + Σ_{i=m+2..n} q_i v_i."""
+        """Compute the constraint Φ = v_1 + Σ_{i=m+2..n} q_i v_i."""
         return v[0] + q[self.m + 1 :] @ v[self.m + 1 :]
 
     def invariants(self, t: FloatScalarLike, q: Array, v: Array) -> dict[str, Array]:
-        """Energy."""
+        """Compute the energy, which is conserved."""
         return {"energy": self.energy(t, q, v)}
 
     def ensemble(
         self, members: int, dtype: DTypeLike | None = None
     ) -> tuple[Array, Array]:
-        """Initial data (q0, v0), each of shape (J + 1, n), on one energy surface.
+        """Make initial data (q0, v0), each of shape (J + 1, n), on one energy surface.
 
         `members` is the paper's J: row j = 0..J has q_1 = cos(jπ/2J) and
         v_2 = sin(jπ/2J). For m = 3 these are the paper's data, of energy 3.06; for
@@ -88,7 +91,7 @@ class ChaoticSystem(AbstractConstrainedExample):
         return jnp.asarray(q0, dtype), jnp.asarray(v0, dtype)
 
     def _member(self, angles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Initial data at `angles` on the circle q_1² + v_2² = 1."""
+        """Make initial data at `angles` on the circle q_1² + v_2² = 1."""
         q = np.ones((*angles.shape, 2 * self.m + 1))
         q[..., 0] = np.cos(angles)
         q[..., 1 : self.m + 1] = np.arange(self.m, 0, -1) / 5

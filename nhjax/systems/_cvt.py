@@ -44,33 +44,36 @@ class ContinuouslyVariableTransmission(AbstractConstrainedExample):
 
     @classmethod
     def low(cls, epsilon: ArrayLike = 0.5) -> "ContinuouslyVariableTransmission":
-        """The paper's low energy: the driver oscillates."""
+        """Make the example with the paper's low energy: the driver oscillates."""
         return cls(epsilon, v0=(0.0, 0.6 * math.sqrt(10.0), 0.0))
 
     @classmethod
     def high(cls, epsilon: ArrayLike = 0.5) -> "ContinuouslyVariableTransmission":
-        """The paper's high energy: the driver rotates."""
+        """Make the example with the paper's high energy: the driver rotates."""
         return cls(epsilon, v0=(0.0, math.sqrt(8.0), 0.0))
 
     def lagrangian(self, t: FloatScalarLike, q: Array, v: Array, args: Args) -> Array:
-        """L = ½ (ẋ² + ẏ² + ż²) - ½ (x² + z² - 2 cos y + ε sin 2y)."""
+        """Compute the Lagrangian L(t, q, v).
+
+        L = ½ (ẋ² + ẏ² + ż²) - ½ (x² + z² - 2 cos y + ε sin 2y).
+        """
         springs = 0.5 * (q[0] ** 2 + q[2] ** 2)
         return 0.5 * (v @ v) - springs - self._driver_potential(q)
 
     def constraint(self, t: FloatScalarLike, q: Array, v: Array, args: Args) -> Array:
-        """Φ = ż + sin(y) ẋ."""
+        """Compute the constraint Φ = ż + sin(y) ẋ."""
         return v[2] + jnp.sin(q[1]) * v[0]
 
     def driver_energy(self, q: Array, v: Array) -> Array:
-        """E_d = ½ ẏ² - cos y + ½ ε sin 2y."""
+        """Compute the energy of the driver, E_d = ½ ẏ² - cos y + ½ ε sin 2y."""
         return 0.5 * v[1] ** 2 + self._driver_potential(q)
 
     def passenger_energy(self, q: Array, v: Array) -> Array:
-        """E_p = ½ (ẋ² + ż² + x² + z²)."""
+        """Compute the energy of the passenger, E_p = ½ (ẋ² + ż² + x² + z²)."""
         return 0.5 * (v[0] ** 2 + v[2] ** 2 + q[0] ** 2 + q[2] ** 2)
 
     def invariants(self, t: FloatScalarLike, q: Array, v: Array) -> dict[str, Array]:
-        """Energy, and the energies of driver and passenger."""
+        """Compute the energy, and the energies of driver and passenger."""
         return {
             "energy": self.energy(t, q, v),
             "driver_energy": self.driver_energy(q, v),
@@ -78,7 +81,7 @@ class ContinuouslyVariableTransmission(AbstractConstrainedExample):
         }
 
     def exact_driver(self, t: float) -> tuple[float, float]:
-        """(y, ẏ) at `t`, for ε = 0 and any (`q0`, `v0`) but the upright equilibrium.
+        """Compute (y, ẏ) at `t` for ε = 0, except at the upright equilibrium.
 
         With k² = (1 + E_d)/2 the pendulum is sin(y/2) = k sn(t + t0 | k²) where it
         oscillates, k <= 1, and y/2 = ±am(k(t + t0) | 1/k²) where it rotates.

@@ -59,7 +59,7 @@ class DoublePendulum(AbstractExample):
         lengths: ArrayLike | tuple[float, float] = (1.0, 1.0),
         gravity: ArrayLike = 1.0,
     ) -> "DoublePendulum":
-        """A pendulum whose rods make `angles` with the downward vertical."""
+        """Make a pendulum whose rods form `angles` with the downward vertical."""
         angle, rate = coordinates(angles), coordinates(rates)
         length = coordinates(lengths)
         sin, cos = jnp.sin(angle), jnp.cos(angle)
@@ -70,21 +70,21 @@ class DoublePendulum(AbstractExample):
 
     @property
     def system(self) -> LagrangianSystem:
-        """The system to integrate; its leaves are the parameters."""
+        """Return the system to integrate, whose leaves are the parameters."""
         return LagrangianSystem(self.lagrangian, holonomic=self.holonomic)
 
     def lagrangian(self, t: FloatScalarLike, q: Array, v: Array, args: Args) -> Array:
-        """L = m₁/2 |ṙ₁|² + m₂/2 |ṙ₂|² - m₁ g y₁ - m₂ g y₂."""
+        """Compute the Lagrangian L = m₁/2 |ṙ₁|² + m₂/2 |ṙ₂|² - m₁ g y₁ - m₂ g y₂."""
         masses = self.masses.astype(v.dtype)
         kinetic = 0.5 * (masses @ jnp.sum(v.reshape(2, 2) ** 2, axis=1))
         return kinetic - self.gravity * (masses @ q[1::2])
 
     def holonomic(self, t: FloatScalarLike, q: Array, args: Args) -> Array:
-        """Φ = (|r₁|² - l₁², |r₂ - r₁|² - l₂²)."""
+        """Compute the constraints Φ = (|r₁|² - l₁², |r₂ - r₁|² - l₂²)."""
         first, second = q[:2], q[2:] - q[:2]
         squares = jnp.stack([first @ first, second @ second])
         return squares - self.lengths.astype(q.dtype) ** 2
 
     def invariants(self, t: FloatScalarLike, q: Array, v: Array) -> dict[str, Array]:
-        """Energy."""
+        """Compute the energy, which is conserved."""
         return {"energy": self.energy(t, q, v)}

@@ -53,16 +53,19 @@ class HeavyTop(AbstractExample):
 
     @property
     def manifold(self) -> SO3:
-        """SO(3)."""
+        """Return the group SO(3) with the retraction of the example."""
         return SO3(self.retraction)
 
     @property
     def system(self) -> LagrangianSystem:
-        """The system to integrate; its leaves are the parameters."""
+        """Return the system to integrate, whose leaves are the parameters."""
         return LagrangianSystem(self.lagrangian, manifold=self.manifold)
 
     def lagrangian(self, t: FloatScalarLike, q: Array, v: Array, args: Args) -> Array:
-        """ℓ = m/2 |ω × X|² + ½ (J₁ω₁² + J₂ω₂² + J₃ω₃²) - m g e₃·(R X)."""
+        """Compute the left-trivialised Lagrangian.
+
+        ℓ = m/2 |ω × X|² + ½ (J₁ω₁² + J₂ω₂² + J₃ω₃²) - m g e₃·(R X).
+        """
         centre = self.centre.astype(v.dtype)
         velocity = jnp.cross(v, centre)
         translation = 0.5 * self.mass * (velocity @ velocity)
@@ -71,24 +74,24 @@ class HeavyTop(AbstractExample):
         return translation + rotation - self.mass * self.gravity * height
 
     def body_momentum(self, v: Array) -> Array:
-        """The body angular momentum about the pivot."""
+        """Compute the body angular momentum about the pivot."""
         centre = self.centre.astype(v.dtype)
         orbital = self.mass * jnp.cross(centre, jnp.cross(v, centre))
         return orbital + self.moments.astype(v.dtype) * v
 
     def axis_momentum(self, v: Array) -> Array:
-        """J₃ω₃, which is conserved for Lagrange's top."""
+        """Compute J₃ω₃, which is conserved for Lagrange's top."""
         return self.moments.astype(v.dtype)[2] * v[2]
 
     def invariants(self, t: FloatScalarLike, q: Array, v: Array) -> dict[str, Array]:
-        """Energy, and the vertical component of the spatial angular momentum."""
+        """Compute the energy and the vertical angular momentum in space."""
         return {
             "energy": self.energy(t, q, v),
             "vertical_momentum": self.manifold.Ad(q, self.body_momentum(v))[2],
         }
 
     def on_se3(self) -> "HeavyTopSE3":
-        """The same top, with the same motion, on SE(3)."""
+        """Return the same top, with the same motion, on SE(3)."""
         position = self.manifold.Ad(self.q0, self.centre)
         velocity = jnp.cross(self.v0, self.centre)
         return HeavyTopSE3(
@@ -143,28 +146,31 @@ class HeavyTopSE3(AbstractExample):
 
     @property
     def manifold(self) -> SE3:
-        """SE(3)."""
+        """Return the group SE(3) with the retraction of the example."""
         return SE3(self.retraction)
 
     @property
     def system(self) -> LagrangianSystem:
-        """The system to integrate; its leaves are the parameters."""
+        """Return the system to integrate, whose leaves are the parameters."""
         return LagrangianSystem(
             self.lagrangian, holonomic=self.holonomic, manifold=self.manifold
         )
 
     def lagrangian(self, t: FloatScalarLike, q: Array, v: Array, args: Args) -> Array:
-        """ℓ = m/2 |v|² + ½ (J₁ω₁² + J₂ω₂² + J₃ω₃²) - m g e₃·x."""
+        """Compute the left-trivialised Lagrangian.
+
+        ℓ = m/2 |v|² + ½ (J₁ω₁² + J₂ω₂² + J₃ω₃²) - m g e₃·x.
+        """
         translation = 0.5 * self.mass * (v[:3] @ v[:3])
         rotation = 0.5 * (self.moments.astype(v.dtype) @ v[3:] ** 2)
         return translation + rotation - self.mass * self.gravity * q[6]
 
     def holonomic(self, t: FloatScalarLike, q: Array, args: Args) -> Array:
-        """Φ = x - R X."""
+        """Compute the constraint Φ = x - R X."""
         return q[4:] - SO3().Ad(q[:4], self.centre.astype(q.dtype))
 
     def invariants(self, t: FloatScalarLike, q: Array, v: Array) -> dict[str, Array]:
-        """Energy, and the vertical component of the spatial angular momentum."""
+        """Compute the energy and the vertical angular momentum in space."""
         velocity = SO3().Ad(q[:4], v[:3])
         orbital = self.mass * (q[4] * velocity[1] - q[5] * velocity[0])
         spin = SO3().Ad(q[:4], self.moments.astype(v.dtype) * v[3:])
@@ -174,7 +180,7 @@ class HeavyTopSE3(AbstractExample):
         }
 
     def axis_momentum(self, v: Array) -> Array:
-        """J₃ω₃, which is conserved for Lagrange's top."""
+        """Compute J₃ω₃, which is conserved for Lagrange's top."""
         return self.moments.astype(v.dtype)[2] * v[5]
 
 

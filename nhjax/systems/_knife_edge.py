@@ -52,17 +52,20 @@ class KnifeEdge(AbstractConstrainedExample):
         require_positive(mass=self.mass, inertia=self.inertia)
 
     def lagrangian(self, t: FloatScalarLike, q: Array, v: Array, args: Args) -> Array:
-        """L = m/2 (ẋ² + ẏ²) + I/2 θ̇² + mGx."""
+        """Compute the Lagrangian L = m/2 (ẋ² + ẏ²) + I/2 θ̇² + mGx."""
         translation = 0.5 * self.mass * (v[0] ** 2 + v[1] ** 2)
         rotation = 0.5 * self.inertia * v[2] ** 2
         return translation + rotation + self.mass * self.gravity * q[0]
 
     def constraint(self, t: FloatScalarLike, q: Array, v: Array, args: Args) -> Array:
-        """Φ = -sin θ ẋ + cos θ ẏ."""
+        """Compute the constraint Φ = -sin θ ẋ + cos θ ẏ."""
         return jnp.cos(q[2]) * v[1] - jnp.sin(q[2]) * v[0]
 
     def invariants(self, t: FloatScalarLike, q: Array, v: Array) -> dict[str, Array]:
-        """Energy, turning rate θ̇, and uθ̇ - G sin θ with u the speed of the edge."""
+        """Compute the energy, the turning rate θ̇, and uθ̇ - G sin θ.
+
+        Here u is the speed of the edge.
+        """
         speed = v[0] * jnp.cos(q[2]) + v[1] * jnp.sin(q[2])
         return {
             "energy": self.energy(t, q, v),
@@ -71,7 +74,7 @@ class KnifeEdge(AbstractConstrainedExample):
         }
 
     def exact(self, t: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """(q, v, λ) at `t`, for consistent data with θ̇ != 0."""
+        """Compute (q, v, λ) at `t`, for consistent data with θ̇ != 0."""
         (x0, y0, heading0), (dx0, dy0, omega) = self._consistent_data()
         m, gravity = float(self.mass), float(self.gravity)
         require_nonzero("v0[2]", omega, "the knife edge moves along a straight line")

@@ -1,4 +1,4 @@
-"""Linear equations with known coefficients, and with them attitudes, to round-off."""
+"""Solutions to round-off of linear equations with given coefficients, and attitudes."""
 
 import math
 from collections.abc import Callable
@@ -11,7 +11,7 @@ from ._base import NODES, WEIGHTS
 
 
 def _integration_matrix() -> np.ndarray:
-    """The weights that integrate the interpolant from -1 to each of the nodes."""
+    """Compute the weights that integrate the interpolant from -1 to each node."""
     degrees = np.arange(NODES.size)
     projection = legendre.legvander(NODES, NODES.size - 1).T * WEIGHTS
     projection *= (degrees + 0.5)[:, None]
@@ -24,7 +24,7 @@ _INTEGRATION = _integration_matrix()
 def linear_flow(
     matrix: Callable[[np.ndarray], np.ndarray], start: np.ndarray, t: float, rate: float
 ) -> np.ndarray:
-    """The solution at `t` of u' = A u, u(0) = `start`, of shape (n,) or (n, k).
+    """Compute the solution at `t` of u' = A u, u(0) = `start`, of shape (n,) or (n, k).
 
     Gauss collocation of order 40 on panels of length 1/`rate`. `matrix` maps times of
     shape (k,) to A of shape (k, n, n); `rate` is the inverse of the shortest time scale
@@ -50,7 +50,7 @@ def attitude(
     t: float,
     rate: float,
 ) -> np.ndarray:
-    """The attitude at `t` of a body that turns with a known angular velocity.
+    """Compute the attitude at `t` of a body that turns with a known angular velocity.
 
     `quaternion` is the attitude (w, x, y, z) at time 0; `body_velocity` maps times of
     shape (k,) to body angular velocities of shape (3, k); `rate` is as for
@@ -69,7 +69,7 @@ def attitude_in_space(
     t: float,
     rate: float,
 ) -> np.ndarray:
-    """As `attitude`, for a known spatial angular velocity."""
+    """Compute what `attitude` does, for a known spatial angular velocity."""
 
     def matrix(times):
         return 0.5 * _product_matrix(space_velocity(times), -1.0)
@@ -78,12 +78,12 @@ def attitude_in_space(
 
 
 def rotation(quaternion: np.ndarray) -> np.ndarray:
-    """The matrix of a quaternion (w, x, y, z), on the host."""
+    """Compute the rotation matrix of a quaternion (w, x, y, z), on the host."""
     return Rotation.from_quat(np.roll(quaternion, -1)).as_matrix()
 
 
 def _product_matrix(omega: np.ndarray, side: float) -> np.ndarray:
-    """The quaternion product with (0, ω) from the right (1) or the left (-1)."""
+    """Make the matrix of the product with (0, ω) from the right (1) or left (-1)."""
     a, b, c = omega
     zero = np.zeros_like(a)
     rows = (

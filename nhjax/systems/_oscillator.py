@@ -40,19 +40,19 @@ class HarmonicOscillator(AbstractExample):
 
     @property
     def system(self) -> LagrangianSystem:
-        """The system to integrate; its leaves are the parameters."""
+        """Return the system to integrate, whose leaves are the parameters."""
         return LagrangianSystem(self.lagrangian)
 
     def lagrangian(self, t: FloatScalarLike, q: Array, v: Array, args: Args) -> Array:
-        """L = m/2 |v|² - k/2 |q|²."""
+        """Compute the Lagrangian L = m/2 |v|² - k/2 |q|²."""
         return 0.5 * self.mass * (v @ v) - 0.5 * self.stiffness * (q @ q)
 
     def invariants(self, t: FloatScalarLike, q: Array, v: Array) -> dict[str, Array]:
-        """Energy."""
+        """Compute the energy, which is conserved."""
         return {"energy": self.energy(t, q, v)}
 
     def exact(self, t: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """(q, v, λ) at `t`; λ is empty."""
+        """Compute (q, v, λ) at time `t`; λ is empty without constraints."""
         q0 = np.asarray(self.q0, dtype=np.float64)
         v0 = np.asarray(self.v0, dtype=np.float64)
         nu = math.sqrt(float(self.stiffness) / float(self.mass))

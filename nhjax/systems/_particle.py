@@ -50,16 +50,16 @@ class NonholonomicParticle(AbstractConstrainedExample):
         require_positive(mass=self.mass, stiffness=self.stiffness)
 
     def lagrangian(self, t: FloatScalarLike, q: Array, v: Array, args: Args) -> Array:
-        """L = m/2 (ẋ² + ẏ² + ż²) - k/2 (x² + y²)."""
+        """Compute the Lagrangian L = m/2 (ẋ² + ẏ² + ż²) - k/2 (x² + y²)."""
         potential = 0.5 * self.stiffness * (q[0] ** 2 + q[1] ** 2)
         return 0.5 * self.mass * (v @ v) - potential
 
     def constraint(self, t: FloatScalarLike, q: Array, v: Array, args: Args) -> Array:
-        """Φ = ż - y ẋ."""
+        """Compute the constraint Φ = ż - y ẋ."""
         return v[2] - q[1] * v[0]
 
     def exact(self, t: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """(q, v, λ) at `t`, for every consistent (`q0`, `v0`)."""
+        """Compute (q, v, λ) at `t`, for every consistent (`q0`, `v0`)."""
         (x0, y0, z0), (dx0, dy0, _) = self._consistent_data()
         mass, stiffness = float(self.mass), float(self.stiffness)
         nu = math.sqrt(stiffness / mass)
@@ -86,7 +86,7 @@ class NonholonomicParticle(AbstractConstrainedExample):
         return np.array([x, y, z]), np.array([dx, dy, y * dx]), np.array([multiplier])
 
     def invariants(self, t: FloatScalarLike, q: Array, v: Array) -> dict[str, Array]:
-        """Energy, and the energies of the driver y and of the passenger (x, z)."""
+        """Compute the energy, and those of the driver y and the passenger (x, z)."""
         driver = 0.5 * (self.mass * v[1] ** 2 + self.stiffness * q[1] ** 2)
         passenger = 0.5 * self.mass * (v[0] ** 2 + v[2] ** 2)
         passenger = passenger + 0.5 * self.stiffness * q[0] ** 2

@@ -52,24 +52,24 @@ class FreeRigidBody(AbstractExample):
 
     @property
     def manifold(self) -> SO3:
-        """SO(3)."""
+        """Return the group SO(3) with the retraction of the example."""
         return SO3(self.retraction)
 
     @property
     def system(self) -> LagrangianSystem:
-        """The system to integrate; its leaves are the parameters."""
+        """Return the system to integrate, whose leaves are the parameters."""
         return LagrangianSystem(self.lagrangian, manifold=self.manifold)
 
     def lagrangian(self, t: FloatScalarLike, q: Array, v: Array, args: Args) -> Array:
-        """ℓ = ½ (I₁ω₁² + I₂ω₂² + I₃ω₃²)."""
+        """Compute the Lagrangian ℓ = ½ (I₁ω₁² + I₂ω₂² + I₃ω₃²)."""
         return 0.5 * (self.moments.astype(v.dtype) @ v**2)
 
     def spatial_momentum(self, q: Array, v: Array) -> Array:
-        """The angular momentum in space, R Iω."""
+        """Compute the angular momentum in space, R Iω."""
         return self.manifold.Ad(q, self.moments.astype(v.dtype) * v)
 
     def invariants(self, t: FloatScalarLike, q: Array, v: Array) -> dict[str, Array]:
-        """Energy, and the spatial angular momentum."""
+        """Compute the energy, and the spatial angular momentum."""
         x, y, z = self.spatial_momentum(q, v)
         return {
             "energy": self.energy(t, q, v),
@@ -79,7 +79,7 @@ class FreeRigidBody(AbstractExample):
         }
 
     def exact(self, t: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """(q, v, λ) at `t`; λ is empty.
+        """Compute (q, v, λ) at time `t`; λ is empty without constraints.
 
         ω by Jacobi's elliptic functions; the attitude follows from ω by a linear
         equation, to round-off.
@@ -96,7 +96,7 @@ class FreeRigidBody(AbstractExample):
 def _euler_solution(
     moments: np.ndarray, omega0: np.ndarray
 ) -> tuple[Callable[[np.ndarray], np.ndarray], float]:
-    """The solution ω(t) of Euler's equations, and a bound of its rate and size.
+    """Find the solution ω(t) of Euler's equations, and a bound of its rate and size.
 
     With 3 the axis that ω turns about in the body, the largest or the smallest one, and
     2 the middle one, ω₁, ω₂, ω₃ are multiples of cn, sn, dn.
@@ -133,7 +133,7 @@ def _euler_solution(
 
 
 def _cn_sn_dn_axes(moments: np.ndarray, omega0: np.ndarray) -> list[int]:
-    """The axes 1, 2, 3 of the solution by cn, sn, dn."""
+    """Find the axes 1, 2, 3 of the solution by cn, sn, dn."""
     low, middle, high = np.argsort(moments)
     # The sign of L² - 2E I₂ tells on which side of the separatrix ω is.
     excess = moments * (moments - moments[middle]) * omega0**2

@@ -79,7 +79,7 @@ class RodSleigh(AbstractNonholonomicExample):
         length: ArrayLike = 1.0,
         angle: ArrayLike = 0.4,
     ) -> "RodSleigh":
-        """A sleigh that slides along its blade with `speed` while it turns.
+        """Make a sleigh that slides along its blade with `speed` while it turns.
 
         `position` is that of the blade, `rod` the direction of the rod.
         """
@@ -100,18 +100,18 @@ class RodSleigh(AbstractNonholonomicExample):
 
     @property
     def system(self) -> LagrangianSystem:
-        """The system to integrate; its leaves are the parameters."""
+        """Return the system to integrate, whose leaves are the parameters."""
         return LagrangianSystem(
             self.lagrangian, nonholonomic=self.constraint, holonomic=self.holonomic
         )
 
     def lagrangian(self, t: FloatScalarLike, q: Array, v: Array, args: Args) -> Array:
-        """L = m₁/2 |ṙ₁|² + m₂/2 |ṙ₂|²."""
+        """Compute the Lagrangian L = m₁/2 |ṙ₁|² + m₂/2 |ṙ₂|²."""
         first = 0.5 * self.mass1 * (v[:2] @ v[:2])
         return first + 0.5 * self.mass2 * (v[2:] @ v[2:])
 
     def constraint(self, t: FloatScalarLike, q: Array, v: Array, args: Args) -> Array:
-        """Φ = n·ṙ₁."""
+        """Compute the constraint Φ = n·ṙ₁."""
         dx, dy = (q[2:] - q[:2]) / self.length
         cos, sin = jnp.cos(self.angle), jnp.sin(self.angle)
         # The blade points along (c, s).
@@ -119,16 +119,16 @@ class RodSleigh(AbstractNonholonomicExample):
         return c * v[1] - s * v[0]
 
     def holonomic(self, t: FloatScalarLike, q: Array, args: Args) -> Array:
-        """Φ_hol = |r₂ - r₁|² - l²."""
+        """Compute the holonomic constraint Φ_hol = |r₂ - r₁|² - l²."""
         rod = q[2:] - q[:2]
         return rod @ rod - self.length**2
 
     def invariants(self, t: FloatScalarLike, q: Array, v: Array) -> dict[str, Array]:
-        """Energy."""
+        """Compute the energy, which is conserved."""
         return {"energy": self.energy(t, q, v)}
 
     def exact(self, t: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """(q, v, λ) at `t`, for consistent data with a turning rod and cos β != 0.
+        """Compute (q, v, λ) at `t`, for consistent data, a turning rod and cos β != 0.
 
         λ is (nonholonomic, holonomic); the motion is that of `equivalent_sleigh`.
         """
@@ -163,7 +163,7 @@ class RodSleigh(AbstractNonholonomicExample):
         )
 
     def equivalent_sleigh(self) -> ChaplyginSleigh:
-        """The Chaplygin sleigh with the same motion, its contact moved along n."""
+        """Make the Chaplygin sleigh with the same motion, its contact moved along n."""
         rod, swing = self.q0[2:] - self.q0[:2], self.v0[2:] - self.v0[:2]
         heading = jnp.arctan2(rod[1], rod[0]) + self.angle
         turn_rate = (rod[0] * swing[1] - rod[1] * swing[0]) / self.length**2
@@ -179,7 +179,7 @@ class RodSleigh(AbstractNonholonomicExample):
         )
 
     def _shift(self) -> Array:
-        """How far the centre of mass lies to the side of the blade, along n."""
+        """Compute how far the centre of mass lies to the side of the blade, along n."""
         offset = self.mass2 / (self.mass1 + self.mass2) * self.length
         return -offset * jnp.sin(self.angle)
 

@@ -58,18 +58,21 @@ class VerticalRollingDisc(AbstractConstrainedExample):
         )
 
     def lagrangian(self, t: FloatScalarLike, q: Array, v: Array, args: Args) -> Array:
-        """L = m/2 (ẋ² + ẏ²) + I/2 ψ̇² + J/2 φ̇²."""
+        """Compute the Lagrangian L = m/2 (ẋ² + ẏ²) + I/2 ψ̇² + J/2 φ̇²."""
         translation = 0.5 * self.mass * (v[0] ** 2 + v[1] ** 2)
         roll = 0.5 * self.roll_inertia * v[2] ** 2
         return translation + roll + 0.5 * self.heading_inertia * v[3] ** 2
 
     def constraint(self, t: FloatScalarLike, q: Array, v: Array, args: Args) -> Array:
-        """Φ = (ẋ - Rψ̇ cos φ, ẏ - Rψ̇ sin φ)."""
+        """Compute the constraints Φ = (ẋ - Rψ̇ cos φ, ẏ - Rψ̇ sin φ)."""
         speed = self.radius * v[2]
         return jnp.stack([v[0] - speed * jnp.cos(q[3]), v[1] - speed * jnp.sin(q[3])])
 
     def invariants(self, t: FloatScalarLike, q: Array, v: Array) -> dict[str, Array]:
-        """Energy, both rates, and φ̇ times the centre of the circle of the contact."""
+        """Compute the energy, both rates, and φ̇ times the centre of the circle.
+
+        The circle is that on which the contact moves.
+        """
         speed = self.radius * v[2]
         return {
             "energy": self.energy(t, q, v),
@@ -80,7 +83,7 @@ class VerticalRollingDisc(AbstractConstrainedExample):
         }
 
     def exact(self, t: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """(q, v, λ) at `t`, for consistent data with φ̇ != 0."""
+        """Compute (q, v, λ) at `t`, for consistent data with φ̇ != 0."""
         (x0, y0, roll0, heading0), (_, _, roll_rate, omega) = self._consistent_data()
         require_nonzero("v0[3]", omega, "the disc moves along a straight line")
         speed = float(self.radius) * roll_rate

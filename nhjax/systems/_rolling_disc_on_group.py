@@ -62,13 +62,13 @@ class RollingDisc(AbstractConstrainedGroupExample):
 
     @property
     def manifold(self) -> ProductGroup:
-        """SE(2) x SO(2)."""
+        """Return the group SE(2) x SO(2) with the retraction of the example."""
         return ProductGroup(SE2(self.retraction), SO2(self.retraction))
 
     def lagrangian(
         self, t: FloatScalarLike, q: tuple[Array, Array], v: Array, args: Args
     ) -> Array:
-        """ℓ = m/2 (v₁² + v₂²) + J/2 ω² + I/2 ψ̇²."""
+        """Compute the Lagrangian ℓ = m/2 (v₁² + v₂²) + J/2 ω² + I/2 ψ̇²."""
         translation = 0.5 * self.mass * (v[0] ** 2 + v[1] ** 2)
         heading = 0.5 * self.heading_inertia * v[2] ** 2
         return translation + heading + 0.5 * self.roll_inertia * v[3] ** 2
@@ -76,19 +76,19 @@ class RollingDisc(AbstractConstrainedGroupExample):
     def constraint(
         self, t: FloatScalarLike, q: tuple[Array, Array], v: Array, args: Args
     ) -> Array:
-        """φ = (v₁ - Rψ̇, v₂)."""
+        """Compute the constraints φ = (v₁ - Rψ̇, v₂)."""
         return jnp.stack([v[0] - self.radius * v[3], v[1]])
 
     def invariants(
         self, t: FloatScalarLike, q: tuple[Array, Array], v: Array
     ) -> dict[str, Array]:
-        """Those of `VerticalRollingDisc`."""
+        """Compute the conserved quantities of `VerticalRollingDisc`."""
         return self.in_coordinates().invariants(t, *_in_coordinates(q, v))
 
     def exact(
         self, t: float
     ) -> tuple[tuple[np.ndarray, np.ndarray], np.ndarray, np.ndarray]:
-        """(q, v, λ) at `t`, for consistent data with ω != 0."""
+        """Compute (q, v, λ) at `t`, for consistent data with ω != 0."""
         _, v = self._consistent_data()
         require_nonzero("v0[2]", v[2], "the disc moves along a straight line")
         (x, y, roll, heading), _, (pull_x, pull_y) = self.in_coordinates().exact(t)
@@ -100,7 +100,7 @@ class RollingDisc(AbstractConstrainedGroupExample):
         )
 
     def in_coordinates(self) -> VerticalRollingDisc:
-        """The same disc, with the same motion, on R⁴."""
+        """Return the same disc, with the same motion, on R⁴."""
         q0, v0 = _in_coordinates(self.q0, self.v0)
         return VerticalRollingDisc(
             self.mass,
@@ -113,7 +113,7 @@ class RollingDisc(AbstractConstrainedGroupExample):
 
 
 def _in_coordinates(q: tuple[Array, Array], v: Array) -> tuple[Array, Array]:
-    """The coordinates (x, y, ψ, φ) and their rates."""
+    """Compute the coordinates (x, y, ψ, φ) and their rates."""
     (x, y, heading), (roll,) = q
     ahead, left, heading_rate, roll_rate = v
     cos, sin = jnp.cos(heading), jnp.sin(heading)

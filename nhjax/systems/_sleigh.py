@@ -51,7 +51,10 @@ class ChaplyginSleigh(AbstractConstrainedExample):
         require_positive(mass=self.mass, inertia=self.inertia)
 
     def lagrangian(self, t: FloatScalarLike, q: Array, v: Array, args: Args) -> Array:
-        """L = m/2 [(ẋ - aθ̇ sin θ)² + (ẏ + aθ̇ cos θ)²] + J/2 θ̇²."""
+        """Compute the Lagrangian L(t, q, v).
+
+        L = m/2 [(ẋ - aθ̇ sin θ)² + (ẏ + aθ̇ cos θ)²] + J/2 θ̇².
+        """
         swing = self.offset * v[2]
         centre_vx = v[0] - swing * jnp.sin(q[2])
         centre_vy = v[1] + swing * jnp.cos(q[2])
@@ -59,15 +62,15 @@ class ChaplyginSleigh(AbstractConstrainedExample):
         return 0.5 * self.mass * (centre_vx**2 + centre_vy**2) + rotation
 
     def constraint(self, t: FloatScalarLike, q: Array, v: Array, args: Args) -> Array:
-        """Φ = -sin θ ẋ + cos θ ẏ."""
+        """Compute the constraint Φ = -sin θ ẋ + cos θ ẏ."""
         return jnp.cos(q[2]) * v[1] - jnp.sin(q[2]) * v[0]
 
     def invariants(self, t: FloatScalarLike, q: Array, v: Array) -> dict[str, Array]:
-        """Energy."""
+        """Compute the energy, which is conserved."""
         return {"energy": self.energy(t, q, v)}
 
     def exact(self, t: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """(q, v, λ) at `t`, for consistent data with θ̇ != 0 and `offset` != 0.
+        """Compute (q, v, λ) at `t`, for consistent data with θ̇ != 0 and `offset` != 0.
 
         u = √(2E/m) tanh τ and θ̇ = ±√(2E/I) sech τ with τ = κt + c; the heading is an
         elementary function and (x, y) a quadrature.

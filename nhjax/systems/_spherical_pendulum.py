@@ -62,7 +62,7 @@ class SphericalPendulum(AbstractExample):
         length: ArrayLike = 1.0,
         gravity: ArrayLike = 1.0,
     ) -> "SphericalPendulum":
-        """A pendulum at `angle` from the downward vertical and `azimuth` about it."""
+        """Make a pendulum at `angle` to the downward vertical and at an azimuth."""
         sin, cos = jnp.sin(parameter(angle)), jnp.cos(parameter(angle))
         east, north = jnp.cos(parameter(azimuth)), jnp.sin(parameter(azimuth))
         swing, turn = cos * parameter(angle_rate), sin * parameter(azimuth_rate)
@@ -74,26 +74,26 @@ class SphericalPendulum(AbstractExample):
 
     @property
     def system(self) -> LagrangianSystem:
-        """The system to integrate; its leaves are the parameters."""
+        """Return the system to integrate, whose leaves are the parameters."""
         return LagrangianSystem(self.lagrangian, holonomic=self.holonomic)
 
     def lagrangian(self, t: FloatScalarLike, q: Array, v: Array, args: Args) -> Array:
-        """L = m/2 (ẋ² + ẏ² + ż²) - m g z."""
+        """Compute the Lagrangian L = m/2 (ẋ² + ẏ² + ż²) - m g z."""
         return 0.5 * self.mass * (v @ v) - self.mass * self.gravity * q[2]
 
     def holonomic(self, t: FloatScalarLike, q: Array, args: Args) -> Array:
-        """Φ = x² + y² + z² - l²."""
+        """Compute the constraint Φ = x² + y² + z² - l²."""
         return q @ q - self.length**2
 
     def invariants(self, t: FloatScalarLike, q: Array, v: Array) -> dict[str, Array]:
-        """Energy, and the vertical angular momentum."""
+        """Compute the energy, and the vertical angular momentum."""
         return {
             "energy": self.energy(t, q, v),
             "vertical_momentum": self.mass * (q[0] * v[1] - q[1] * v[0]),
         }
 
     def exact(self, t: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """(q, v, λ) at `t`, for every consistent (`q0`, `v0`).
+        """Compute (q, v, λ) at `t`, for every consistent (`q0`, `v0`).
 
         The height is z = z₁ + (z₂ - z₁) sn². With it the multiplier is known, and x and
         y follow from the linear equation m ẍ = 2λx, to round-off.
@@ -122,7 +122,7 @@ class SphericalPendulum(AbstractExample):
 def _height(
     q0: np.ndarray, v0: np.ndarray, length: float, g: float
 ) -> Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]:
-    """The functions (z, ż) of time.
+    """Make the function that computes (z, ż) of times.
 
     l²ż² is a cubic in z with the leading coefficient 2g and the roots z₁ <= z₂ <= z₃.
     In powers of z - z₀ its small roots keep their digits.

@@ -65,24 +65,24 @@ class Suslov(AbstractConstrainedGroupExample):
 
     @property
     def manifold(self) -> SO3:
-        """SO(3)."""
+        """Return the group SO(3) with the retraction of the example."""
         return SO3(self.retraction)
 
     def lagrangian(self, t: FloatScalarLike, q: Array, v: Array, args: Args) -> Array:
-        """ℓ = ½ ω·Iω."""
+        """Compute the Lagrangian ℓ = ½ ω·Iω."""
         products = self.products.astype(v.dtype) @ v[:2]
         return 0.5 * (self.moments.astype(v.dtype) @ v**2) + products * v[2]
 
     def constraint(self, t: FloatScalarLike, q: Array, v: Array, args: Args) -> Array:
-        """φ = ω₃."""
+        """Compute the constraint φ = ω₃."""
         return v[2]
 
     def invariants(self, t: FloatScalarLike, q: Array, v: Array) -> dict[str, Array]:
-        """Energy."""
+        """Compute the energy, which is conserved."""
         return {"energy": self.energy(t, q, v)}
 
     def exact(self, t: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """(q, v, λ) at `t`, for consistent data and `products` != 0.
+        """Compute (q, v, λ) at `t`, for consistent data and `products` != 0.
 
         With √I₁₁ ω₁ = √(2E) cos α and √I₂₂ ω₂ = √(2E) sin α, α̇ = κ cos(α - α*): ω is
         made of tanh and sech. The attitude follows from ω by a linear equation, to

@@ -81,7 +81,7 @@ class TurntableBall(AbstractConstrainedGroupExample):
 
     @property
     def manifold(self) -> ProductGroup:
-        """SO(3) x R²."""
+        """Return the group SO(3) x R² with the retraction of the example."""
         return ProductGroup(SO3(self.retraction), Euclidean(2))
 
     @classmethod
@@ -92,7 +92,7 @@ class TurntableBall(AbstractConstrainedGroupExample):
         spin: float | Array = 0.0,
         **parameters: Any,
     ) -> "TurntableBall":
-        """A rolling ball at `position` (x, y) with `velocity` (v_x, v_y).
+        """Make a rolling ball at `position` (x, y) with `velocity` (v_x, v_y).
 
         `spin` is ω_ζ; `parameters` are those of the class.
         """
@@ -115,14 +115,14 @@ class TurntableBall(AbstractConstrainedGroupExample):
     def lagrangian(
         self, t: FloatScalarLike, q: tuple[Array, Array], v: Array, args: Args
     ) -> Array:
-        """ℓ = ½ (v_x² + v_y²) + r²/2 (a ω₁² + b ω₂² + c ω₃²)."""
+        """Compute the Lagrangian ℓ = ½ (v_x² + v_y²) + r²/2 (a ω₁² + b ω₂² + c ω₃²)."""
         rotation_energy = 0.5 * self.radius**2 * (self._moments(v) @ v[:3] ** 2)
         return 0.5 * (v[3:] @ v[3:]) + rotation_energy
 
     def constraint(
         self, t: FloatScalarLike, q: tuple[Array, Array], v: Array, args: Args
     ) -> Array:
-        """φ = (v_x + Ωy - r ω_η, v_y - Ωx + r ω_ξ)."""
+        """Compute the constraints φ = (v_x + Ωy - r ω_η, v_y - Ωx + r ω_ξ)."""
         x, y = q[1]
         omega = self.rolling_velocity(q, v)
         return jnp.stack(
@@ -133,13 +133,13 @@ class TurntableBall(AbstractConstrainedGroupExample):
         )
 
     def rolling_velocity(self, q: tuple[Array, Array], v: Array) -> Array:
-        """(ω_ξ, ω_η, ω_ζ), the angular velocity of which the constraints speak."""
+        """Compute (ω_ξ, ω_η, ω_ζ), the angular velocity in the constraints."""
         return self._in_frame(q, v[:3])
 
     def invariants(
         self, t: FloatScalarLike, q: tuple[Array, Array], v: Array
     ) -> dict[str, Array]:
-        """The moving energy and, in the space frame, the momentum about the contact.
+        """Compute the moving energy and the momentum about the contact, in space.
 
         Of a homogeneous ball the components of that momentum are r(1 + a) times those
         of `first_integrals` (r²a for the third).
@@ -157,7 +157,7 @@ class TurntableBall(AbstractConstrainedGroupExample):
         }
 
     def first_integrals(self, q: tuple[Array, Array], v: Array) -> Array:
-        """(ω_ζ, r ω_ξ - Ωx/(1 + a), r ω_η - Ωy/(1 + a)), for a = b = c."""
+        """Compute (ω_ζ, r ω_ξ - Ωx/(1 + a), r ω_η - Ωy/(1 + a)), for a = b = c."""
         omega = self.rolling_velocity(q, v)
         share = self.rate / (1.0 + self._moments(v)[0])
         return jnp.stack(
@@ -171,7 +171,7 @@ class TurntableBall(AbstractConstrainedGroupExample):
     def exact(
         self, t: float
     ) -> tuple[tuple[np.ndarray, np.ndarray], np.ndarray, np.ndarray]:
-        """(q, v, λ) at `t`, for consistent data and a = b = c.
+        """Compute (q, v, λ) at `t`, for consistent data and a = b = c.
 
         All but the attitude in closed form; the attitude from the known angular
         velocity by a linear equation, to round-off.

@@ -52,19 +52,22 @@ class Unicycle(AbstractConstrainedGroupExample):
 
     @property
     def manifold(self) -> SE2:
-        """SE(2)."""
+        """Return the group SE(2) with the retraction of the example."""
         return SE2(self.retraction)
 
     def lagrangian(self, t: FloatScalarLike, q: Array, v: Array, args: Args) -> Array:
-        """ℓ = m/2 (v₁² + v₂²) + I/2 ω² - k/2 (x² + y²)."""
+        """Compute the Lagrangian ℓ = m/2 (v₁² + v₂²) + I/2 ω² - k/2 (x² + y²)."""
         return _lagrangian(self, q, v)
 
     def constraint(self, t: FloatScalarLike, q: Array, v: Array, args: Args) -> Array:
-        """φ = v₂."""
+        """Compute the constraint φ = v₂."""
         return v[1]
 
     def invariants(self, t: FloatScalarLike, q: Array, v: Array) -> dict[str, Array]:
-        """Energy, the turning rate ω, and kY - mωv₁ with Y = y cos θ - x sin θ."""
+        """Compute the energy, the turning rate ω, and kY - mωv₁.
+
+        Here Y = y cos θ - x sin θ.
+        """
         sideways = q[1] * jnp.cos(q[2]) - q[0] * jnp.sin(q[2])
         return {
             "energy": self.energy(t, q, v),
@@ -73,7 +76,7 @@ class Unicycle(AbstractConstrainedGroupExample):
         }
 
     def exact(self, t: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """(q, v, λ) at `t`, for every consistent (`q0`, `v0`).
+        """Compute (q, v, λ) at `t`, for every consistent (`q0`, `v0`).
 
         In the body frame the contact (X, Y) obeys Ẋ = v₁ + ωY, Ẏ = -ωX, v̇₁ = -kX/m.
         """
@@ -97,7 +100,7 @@ class Unicycle(AbstractConstrainedGroupExample):
         )
 
     def in_coordinates(self) -> "UnicycleInCoordinates":
-        """The same unicycle, with the same motion, on R³."""
+        """Return the same unicycle, with the same motion, on R³."""
         return UnicycleInCoordinates(
             self.mass,
             self.inertia,
@@ -140,25 +143,25 @@ class UnicycleInCoordinates(AbstractConstrainedExample):
         require_positive(mass=self.mass, inertia=self.inertia, spring=self.spring)
 
     def lagrangian(self, t: FloatScalarLike, q: Array, v: Array, args: Args) -> Array:
-        """L = m/2 (ẋ² + ẏ²) + I/2 θ̇² - k/2 (x² + y²)."""
+        """Compute the Lagrangian L = m/2 (ẋ² + ẏ²) + I/2 θ̇² - k/2 (x² + y²)."""
         return _lagrangian(self, q, v)
 
     def constraint(self, t: FloatScalarLike, q: Array, v: Array, args: Args) -> Array:
-        """Φ = ẏ cos θ - ẋ sin θ."""
+        """Compute the constraint Φ = ẏ cos θ - ẋ sin θ."""
         return v[1] * jnp.cos(q[2]) - v[0] * jnp.sin(q[2])
 
     def invariants(self, t: FloatScalarLike, q: Array, v: Array) -> dict[str, Array]:
-        """Those of `Unicycle`."""
+        """Compute the conserved quantities of `Unicycle`."""
         return self.on_group().invariants(t, q, _turn(v, -q[2]))
 
     def exact(self, t: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """(q, v, λ) at `t`, for every consistent (`q0`, `v0`)."""
+        """Compute (q, v, λ) at `t`, for every consistent (`q0`, `v0`)."""
         self._consistent_data()
         q, (u, _, omega), multiplier = self.on_group().exact(t)
         return q, np.array([u * math.cos(q[2]), u * math.sin(q[2]), omega]), multiplier
 
     def on_group(self) -> Unicycle:
-        """The same unicycle, with the same motion, on SE(2)."""
+        """Return the same unicycle, with the same motion, on SE(2)."""
         return Unicycle(
             self.mass,
             self.inertia,
@@ -171,13 +174,13 @@ class UnicycleInCoordinates(AbstractConstrainedExample):
 def _lagrangian(
     unicycle: Unicycle | UnicycleInCoordinates, q: Array, v: Array
 ) -> Array:
-    # The same for body and for spatial velocities.
+    # The turn is the same for body and for spatial velocities.
     translation = 0.5 * unicycle.mass * (v[0] ** 2 + v[1] ** 2)
     rotation = 0.5 * unicycle.inertia * v[2] ** 2
     return translation + rotation - 0.5 * unicycle.spring * (q[0] ** 2 + q[1] ** 2)
 
 
 def _turn(v: Array, angle: Array) -> Array:
-    """The planar velocity `v` = (v₁, v₂, ω) turned by `angle`."""
+    """Turn the planar velocity `v` = (v₁, v₂, ω) by `angle`."""
     cos, sin = jnp.cos(angle), jnp.sin(angle)
     return jnp.stack([v[0] * cos - v[1] * sin, v[0] * sin + v[1] * cos, v[2]])
