@@ -192,7 +192,7 @@ def ball_invariants(
     retraction: str = "cayley",
     progress: bool = False,
 ) -> BallInvariants:
-    """First integrals of the homogeneous ball on a turntable.
+    """Compute the first integrals of the homogeneous ball on a turntable.
 
     The paper's fifth experiment: for one step size, Lobatto-3 and the Cayley map it
     plots the errors of the four first integrals against time. Three are linear and are

@@ -192,7 +192,7 @@ def chaotic_energy(
     save_every: int = 1,
     progress: bool = False,
 ) -> ChaoticEnergy:
-    """Mean squared energy error of an ensemble of the chaotic system.
+    """Compute the mean squared energy error of an ensemble of the chaotic system.
 
     The paper's third experiment, J + 1 motions of a system with 7 degrees of freedom on
     one energy surface. μ(E, k), the mean of (E_jk - E_0)² over the ensemble at step k,

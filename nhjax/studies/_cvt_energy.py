@@ -201,7 +201,7 @@ def cvt_energy(
     short_time: float = 100.0,
     progress: bool = False,
 ) -> CVTEnergy:
-    """Energies of the CVT, its driver and its passenger over a long time.
+    """Compute the energies of the CVT, its driver and passenger over a long time.
 
     The paper's second experiment: the driver oscillates at low energy and rotates at
     high energy. Driver and passenger conserve their energies one by one.

@@ -40,7 +40,7 @@ def particle_order(
     system: str = "particle",
     progress: bool = False,
 ) -> ParticleOrder:
-    """Orders of q, p and the multiplier on the nonholonomic particle.
+    """Measure the orders of q, p and the multiplier on the nonholonomic particle.
 
     The paper's first experiment, against the exact solution; the same for Chaplygin's
     sleigh, whose mass matrix depends on position.

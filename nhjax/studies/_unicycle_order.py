@@ -39,7 +39,7 @@ def unicycle_order(
     retraction: str = "cayley",
     progress: bool = False,
 ) -> UnicycleOrder:
-    """Orders of g, v, p and the multiplier on the unicycle, on SE(2).
+    """Measure the orders of g, v, p and the multiplier on the unicycle, on SE(2).
 
     The paper's fourth experiment. The paper takes the errors against its own method
     with h = 1e-4; here they are taken against the exact solution.
