@@ -71,7 +71,40 @@ def _constraints(stages: StageSystem, x: Stages) -> tuple[Array, Array]:
 def stage_residual(
     stages: StageSystem, x: Stages
 ) -> tuple[Float[Array, " k"], Evaluation]:
-    """Compute the residuals of all equations of a step, in one vector."""
+    """Evaluate all equations of a step (the paper's four summaries) in one vector.
+
+    A stage solver of a user's own looks for the stages at which it vanishes; see the
+    page on extending in the documentation.
+
+    **Arguments:**
+
+    - `stages`: the equations of the step, as `AbstractStageSolver.solve` is given them.
+    - `x`: the unknowns, of the same structure as the starting values that it is given.
+
+    **Returns:** the residuals, of shape (k,) with as many entries as `x` has numbers,
+    in the units of momenta and of the constraints; and what was evaluated on the way,
+    which belongs into the field `aux` of `Solved`.
+
+    !!! example
+
+        >>> import nhjax
+        >>> import equinox as eqx
+        >>> class Told(nhjax.AbstractStageSolver):
+        ...     solver: nhjax.Newton = nhjax.Newton()
+        ...     max_iterations: int = eqx.field(static=True, default=30)
+        ...     tolerance: float = 0.0
+        ...     def solve(self, stages, x0, lin, skip):
+        ...         r, _ = nhjax.stage_residual(stages, x0)
+        ...         assert r.shape == (20,)
+        ...         return self.solver.solve(stages, x0, lin, skip)
+        ...     def frozen_newton_map(self, stages, lin, x):
+        ...         return self.solver.frozen_newton_map(stages, lin, x)
+        >>> disc = nhjax.systems.VerticalRollingDisc()
+        >>> sol = nhjax.integrate(disc.system, nhjax.LobattoIIIAB(2),
+        ...     disc.initial_state(), dt=0.1, num_steps=1, stage_solver=Told())
+        >>> int(sol.stats["num_steps"])
+        1
+    """
     forces = stage_forces(stages, x)
     r_nodes = node_residual(stages, x, forces.force)
     parts = [forces.residual, r_nodes]
