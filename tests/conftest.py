@@ -1,5 +1,6 @@
 # ruff: noqa: E402 -- libraries read the environment when they are loaded.
 import gc
+import importlib.metadata
 import os
 
 
@@ -10,9 +11,11 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 # Nearly all the time goes into tracing and compiling programs that run once, hence the
 # compiler's older and quicker code generator, in one piece rather than in 32. The
 # backend reads this when it starts; what the environment says comes last and wins.
-QUICK_FLAGS = (
-    "--xla_cpu_use_fusion_emitters=false --xla_cpu_parallel_codegen_split_count=1"
-)
+QUICK_FLAGS = "--xla_cpu_parallel_codegen_split_count=1"
+# From 0.11.1 on there is no older code generator, and a flag that the compiler does not
+# know ends the process without a word.
+if tuple(map(int, importlib.metadata.version("jaxlib").split(".")[:3])) < (0, 11, 1):
+    QUICK_FLAGS = f"--xla_cpu_use_fusion_emitters=false {QUICK_FLAGS}"
 os.environ["XLA_FLAGS"] = f"{QUICK_FLAGS} {os.environ.get('XLA_FLAGS', '')}".strip()
 
 import jax
