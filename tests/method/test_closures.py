@@ -215,9 +215,9 @@ def test_too_few_stages_are_refused(kind: type, minimum: int):
     assert type(kind(np.int64(minimum)).stages) is int
 
 
-def test_an_unknown_multiplier_is_refused_with_the_choices():
+def test_an_unknown_closure_is_refused_with_the_choices():
     message = (
-        "^multiplier must be one of 'propagated', 'consistent', 'symmetric', got 'x'$"
+        "^closure must be one of 'propagated', 'consistent', 'symmetric', got 'x'$"
     )
     with pytest.raises(ValueError, match=message):
         LobattoIIIAB(3, closure="x")
