@@ -38,6 +38,7 @@ LONGEST = (
     "systems/test_group_systems.py",
     "test_fitting.py",
     "test_notebooks.py",
+    "test_as_users_run.py",
 )
 
 

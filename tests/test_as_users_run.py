@@ -1,4 +1,7 @@
-"""Every feature with the flags that users have: the other tests switch them off."""
+"""Every feature in brief, as users run it, and once more with all shapes checked.
+
+The other tests switch the compiler's optimisation off, and take annotations on trust.
+"""
 
 import os
 import subprocess
@@ -6,24 +9,46 @@ import sys
 
 import pytest
 
-from oracles import as_users_run
+from oracles import as_users_run, shapes
 
 
-@pytest.fixture(scope="module")
-def lines():
-    """What a program of its own prints, which covers all features."""
-    quick = ("XLA_FLAGS", "JAX_DISABLE_MOST_OPTIMIZATIONS")
-    environment = {key: x for key, x in os.environ.items() if key not in quick}
+QUICK = ("XLA_FLAGS", "JAX_DISABLE_MOST_OPTIMIZATIONS")
+
+
+def printed(program, **environment):
+    """The lines that a program of its own prints, which runs all features."""
+    others = {key: x for key, x in os.environ.items() if key not in QUICK}
     done = subprocess.run(
-        [sys.executable, as_users_run.__file__],
-        env=environment,
+        [sys.executable, program.__file__],
+        env=others | environment,
         capture_output=True,
         text=True,
-        check=True,
+        check=False,
     )
+    assert done.returncode == 0, done.stderr
     return done.stdout.splitlines()
 
 
+@pytest.fixture(scope="module")
+def with_flags_of_users():
+    return printed(as_users_run)
+
+
+@pytest.fixture(scope="module")
+def with_shapes_checked():
+    flags = os.environ.get("XLA_FLAGS", "")
+    return printed(shapes, XLA_FLAGS=flags, JAX_DISABLE_MOST_OPTIMIZATIONS="1")
+
+
+def assert_holds(name, lines):
+    assert name in lines, [line for line in lines if line.startswith(f"{name}:")]
+
+
 @pytest.mark.parametrize("name", as_users_run.FEATURES)
-def test_feature(name, lines):
-    assert name in lines, next(line for line in lines if line.startswith(name))
+def test_a_feature_with_the_flags_of_users(name, with_flags_of_users):
+    assert_holds(name, with_flags_of_users)
+
+
+@pytest.mark.parametrize("name", as_users_run.FEATURES)
+def test_a_feature_with_shapes_checked(name, with_shapes_checked):
+    assert_holds(name, with_shapes_checked)
