@@ -2,6 +2,7 @@
 import gc
 import importlib.metadata
 import os
+from pathlib import Path
 
 
 # Matrices of some 50 rows are solved in less time than threads take to meet, and the
@@ -25,6 +26,30 @@ import pytest
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_numpy_dtype_promotion", "strict")
 jax.config.update("jax_numpy_rank_promotion", "raise")
+
+
+# A file stays in one process: of two, those that take longest come first, lest one
+# process be left with one of them when all others are done.
+LONGEST = (
+    "integrate/test_gallery_derivatives.py",
+    "integrate/test_derivatives.py",
+    "integrate/test_num_steps.py",
+    "integrate/test_adjoints.py",
+    "step/test_accepted_steps.py",
+    "integrate/test_group_convergence.py",
+    "integrate/test_convergence.py",
+    "systems/test_group_systems.py",
+    "test_fitting.py",
+    "test_notebooks.py",
+    "test_as_users_run.py",
+)
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Put the longest files first, and leave all others in their order."""
+    here = Path(__file__).parent
+    rank = {here / name: number for number, name in enumerate(LONGEST)}
+    items.sort(key=lambda item: rank.get(item.path, len(rank)))
 
 
 @pytest.fixture(autouse=True, scope="session")

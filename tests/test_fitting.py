@@ -5,10 +5,8 @@ from functools import cache
 
 import numpy as np
 import pytest
-from notebook_runs import run_notebook
 
-
-FITS = {"fitting", "learning_potential", "steering_unicycle"}
+from oracles.notebook_runs import FITS, run_notebook
 
 
 @pytest.fixture(scope="module")

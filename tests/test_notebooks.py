@@ -1,8 +1,8 @@
 """The notebooks run from top to bottom, at small size."""
 
 import pytest
-from notebook_runs import NOTEBOOKS, run_notebook
-from test_fitting import FITS
+
+from oracles.notebook_runs import FITS, NOTEBOOKS, run_notebook
 
 
 @pytest.mark.parametrize("name", sorted(NOTEBOOKS.keys() - FITS))

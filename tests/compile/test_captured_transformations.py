@@ -1,0 +1,187 @@
+"""What functions close over under transformations, and what is not tracked."""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import nhjax
+from nhjax._compile._captured import captured, MOST_ENTRIES
+from oracles.falling import (
+    end,
+    falling,
+    traces,
+)
+
+
+GRAVITY: Any = 1.0
+COUNT = 0
+
+
+class Scaled(eqx.Module):
+    """A module whose array is an argument, and that reads a global besides."""
+
+    scale: jax.Array
+
+    def __call__(self, t, q, v, args):
+        return falling(v, q, self.scale * GRAVITY)
+
+
+class Planet:
+    """A plain object with an attribute."""
+
+    g = 1.0
+
+
+def reads_global(t, q, v, args):
+    return falling(v, q, GRAVITY)
+
+
+# Transformations ----------------------------------------------------------------------
+
+
+def test_leaves_of_a_module_are_arguments():
+    end(Scaled(jnp.asarray(1.0)))
+    checks = len(traces)
+    end(Scaled(jnp.asarray(1.0)))
+    checks = len(traces) - checks
+    count = len(traces)
+    for scale in (2.0, 3.0):
+        got = end(Scaled(jnp.asarray(scale)))
+        np.testing.assert_allclose(got[0], -0.5 * scale, rtol=1e-13)
+    assert len(traces) - count == 2 * checks
+
+
+def reached_with(g):
+    return reached_of(lambda t, q, v, args: falling(v, q, g))
+
+
+def reached_of(lagrangian):
+    system = nhjax.LagrangianSystem(lagrangian)
+    y0 = nhjax.initial_state(system, jnp.zeros(2), jnp.zeros(2))
+    sol = nhjax.integrate(system, nhjax.LobattoIIIAB(2), y0, dt=0.1, num_steps=10)
+    return sol.ys.q[-1, 0]
+
+
+def plain(function):
+    return function
+
+
+def one_of_a_batch(function):
+    return lambda x: jax.vmap(function)(jnp.stack([x, x]))[1]
+
+
+def pushed_forward(function):
+    return lambda x: jax.jvp(function, (x,), (1.0,))[1]
+
+
+@pytest.mark.parametrize("transform", [plain, jax.jit, one_of_a_batch])
+def test_functions_may_close_over_what_is_transformed(transform):
+    for g in (1.0, 3.0):
+        got = transform(reached_with)(jnp.asarray(g))
+        np.testing.assert_allclose(got, -0.5 * g, rtol=1e-13)
+
+
+@pytest.mark.parametrize("transform", [jax.grad, pushed_forward])
+def test_functions_may_close_over_what_is_differentiated(transform):
+    def square(x):
+        return reached_with(x**2)
+
+    for g in (1.0, 3.0):
+        got = transform(square)(jnp.asarray(g))
+        np.testing.assert_allclose(got, -g, rtol=1e-13)
+
+
+def test_a_tracer_of_an_earlier_transformation_is_not_used_again():
+    holder = []
+
+    def lagrangian(t, q, v, args):
+        return falling(v, q, holder[-1])
+
+    def loss(g):
+        holder.append(g)
+        return reached_of(lagrangian)
+
+    for g in (1.0, 3.0):
+        value, rate = jax.value_and_grad(loss)(g)
+        np.testing.assert_allclose((value, rate), (-0.5 * g, -0.5), rtol=1e-13)
+
+
+def test_under_a_jit_of_the_user_globals_are_those_of_the_trace(monkeypatch):
+    function = jax.jit(lambda x: x + reached_of(reads_global))
+    first = float(function(0.0))
+    monkeypatch.setitem(globals(), "GRAVITY", 3.0)
+    assert float(function(0.0)) == first
+
+
+# What is not tracked ------------------------------------------------------------------
+
+
+def test_what_functions_change_themselves_causes_no_retrace():
+    made: dict[str, Any] = {"g": 1.0}
+    calls: list[int] = []
+
+    def lagrangian(t, q, v, args):
+        global COUNT
+        COUNT += 1
+        calls.append(COUNT)
+        made.setdefault("potential", lambda q: made["g"] * q[0])
+        return 0.5 * v @ v - made["potential"](q)
+
+    end(lagrangian)
+    count = len(calls)
+    end(lagrangian)
+    checks = len(calls) - count
+    end(lagrangian)
+    assert len(calls) - count == 2 * checks
+    made["g"] = 3.0
+    np.testing.assert_allclose(end(lagrangian)[0], -1.5, rtol=1e-13)
+
+
+def test_circles_and_things_without_a_hash():
+    circle: list[Any] = [1.0]
+    circle.append({"again": circle, 3: {1, 2}, (1, 2): bytearray(b"x")})
+    planet: Any = Planet()
+    planet.itself, planet.objects = planet, np.array([1, "a", None], object)
+
+    def lagrangian(t, q, v, args):
+        return falling(v, q, circle[0] * planet.g)
+
+    first = end(lagrangian)[0]
+    planet.g = 3.0
+    np.testing.assert_allclose([first, end(lagrangian)[0]], [-0.5, -1.5], rtol=1e-13)
+
+
+def test_the_rest_of_a_huge_container_is_not_looked_at():
+    many = [float(i) for i in range(100_000)]
+    assert len(captured(lambda: many)) == MOST_ENTRIES
+
+
+def test_no_library_is_looked_into():
+    def function(q):
+        return jnp.sin(q) + np.pi + jax.nn.relu(q) + eqx.is_array(q)
+
+    # The function itself and four modules.
+    assert len(captured(function)) <= 6
+
+
+def test_a_list_that_tracing_fills_does_not_hide_what_comes_after_it():
+    log, constants = [], {"g": 9.81}
+
+    def lagrangian(t, q, v, args):
+        log.append((q.shape, v.dtype))
+        return 0.5 * v @ v - constants["g"] * q[0]
+
+    system = nhjax.LagrangianSystem(lagrangian)
+
+    def height():
+        y0 = nhjax.initial_state(system, jnp.zeros(1), jnp.zeros(1))
+        sol = nhjax.integrate(system, nhjax.LobattoIIIAB(2), y0, dt=0.1, num_steps=10)
+        return float(sol.ys.q[0, 0])
+
+    assert height() == pytest.approx(-0.5 * 9.81)
+    constants["g"] = 1.0
+    assert height() == pytest.approx(-0.5)

@@ -1,0 +1,272 @@
+"""Programs in one kernel give what they give elsewhere, and so do their derivatives."""
+
+import os
+import subprocess
+import sys
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import nhjax
+from nhjax import LobattoIIIAB, systems
+from nhjax._compile import as_cpu_kernel
+
+
+MARK = 'xla_cpu_small_call = "true"'
+
+
+def pendulum(parameters, x, empty, unused, count):
+    """Some steps of a pendulum, with all kinds of operands."""
+    del empty, unused
+
+    def step(x, k):
+        velocity = x[1] - 0.1 * parameters["g"] * jnp.sin(x[0])
+        x = jnp.stack([x[0] + 0.1 * velocity, velocity])
+        return x, (x[0], k + count)
+
+    return jax.lax.scan(step, x, jnp.arange(5, dtype=jnp.int32))
+
+
+OPERANDS = (
+    {"g": jnp.asarray(9.81)},
+    jnp.array([0.3, -0.2]),
+    jnp.zeros((0, 3)),
+    jnp.ones(2),
+    jnp.asarray(7, jnp.int32),
+)
+
+
+def in_kernel(*operands):
+    return as_cpu_kernel(pendulum, *operands)
+
+
+def height(function):
+    def loss(g, x):
+        parameters, _, *rest = OPERANDS
+        (end, (path, _)) = function(
+            eqx.tree_at(lambda p: p["g"], parameters, g), x, *rest
+        )
+        return jnp.sum(path**2) + end[1] ** 3
+
+    return loss
+
+
+def assert_same(got, expected):
+    for x, y in zip(jax.tree.leaves(got), jax.tree.leaves(expected), strict=True):
+        assert x.dtype == y.dtype
+        np.testing.assert_allclose(x, y, rtol=1e-13, atol=1e-14)
+
+
+@pytest.mark.parametrize("compiled", [False, True])
+def test_a_kernel_computes_what_its_function_does(compiled):
+    function = jax.jit(in_kernel) if compiled else in_kernel
+    assert_same(function(*OPERANDS), pendulum(*OPERANDS))
+
+
+def test_a_kernel_is_marked_as_one():
+    assert MARK in jax.jit(in_kernel).lower(*OPERANDS).as_text()
+
+
+@pytest.mark.parametrize(
+    "transform",
+    [
+        lambda f: jax.grad(f, argnums=(0, 1)),
+        lambda f: jax.jacfwd(f, argnums=(0, 1)),
+        lambda f: lambda *x: jax.jvp(f, x, (jnp.ones(()), jnp.ones(2))),
+        lambda f: lambda *x: jax.linearize(f, *x)[1](jnp.ones(()), jnp.ones(2)),
+        lambda f: jax.hessian(f, argnums=(0, 1)),
+        lambda f: jax.jacrev(jax.jacfwd(f, argnums=1), argnums=0),
+        lambda f: jax.jacrev(jax.grad(f, argnums=1), argnums=0),
+        lambda f: jax.grad(jax.checkpoint(f), argnums=1),
+    ],
+    ids=[
+        "grad",
+        "jacfwd",
+        "jvp",
+        "linearize",
+        "forward over reverse",
+        "reverse over forward",
+        "reverse over reverse",
+        "checkpoint",
+    ],
+)
+def test_derivatives_of_a_kernel(transform):
+    point = OPERANDS[0]["g"], OPERANDS[1]
+    got = jax.jit(transform(height(in_kernel)))(*point)
+    assert_same(got, transform(height(pendulum))(*point))
+
+
+def test_derivatives_keep_no_constants():
+    matrix = jnp.arange(16.0).reshape(4, 4)
+
+    def f(x):
+        return jnp.sin(jnp.sum(2 * matrix.T * x[None], axis=1))
+
+    def pulled(x):
+        return jax.vjp(lambda x: as_cpu_kernel(f, x), x)[1](x)
+
+    program = jax.make_jaxpr(pulled)(jnp.ones(4))
+    kernels = [x for x in program.eqns if x.primitive.name == "one_kernel"]
+    assert len(kernels) == 2
+    assert all(x.aval.shape != matrix.shape for x in kernels[0].outvars)
+    assert_same(jax.jit(pulled)(jnp.ones(4)), (jax.vjp(f, jnp.ones(4))[1](jnp.ones(4))))
+
+
+def test_a_loop_of_unknown_length_is_pushed_forward():
+    def grown(x):
+        return jax.lax.while_loop(lambda x: x < 10, lambda x: x * x, x)
+
+    got = jax.jit(lambda x: jax.jvp(lambda x: as_cpu_kernel(grown, x), (x,), (x,)))(2.0)
+    assert_same(got, jax.jvp(grown, (2.0,), (2.0,)))
+
+
+@pytest.mark.parametrize("axes", [(0, None), (None, 1), (0, 1)])
+def test_batches_of_kernels(axes):
+    g, x = jnp.array([9.0, 10.0, 11.0]), jnp.arange(6.0).reshape(2, 3) / 10
+    point = g if axes[0] == 0 else g[0], x if axes[1] == 1 else x[:, 0]
+
+    def both(f):
+        values = jax.vmap(height(f), in_axes=axes)
+        gradients = jax.vmap(jax.grad(height(f), argnums=(0, 1)), in_axes=axes)
+        return lambda *point: (values(*point), gradients(*point))
+
+    assert_same(jax.jit(both(in_kernel))(*point), both(pendulum)(*point))
+
+
+def test_batches_of_batches_of_kernels():
+    def nested(f):
+        inner = jax.vmap(height(f), in_axes=(None, 0))
+        return jax.vmap(inner, in_axes=(0, None))
+
+    g, x = jnp.array([9.0, 10.0]), jnp.arange(6.0).reshape(3, 2) / 10
+    assert_same(jax.jit(nested(in_kernel))(g, x), nested(pendulum)(g, x))
+
+
+def sorts(x):
+    return jnp.sort(x)
+
+
+def scatters(x):
+    return x.at[jnp.array([0, 2])].add(1.0)
+
+
+def multiplies(x):
+    return jnp.outer(x, x) @ jnp.outer(x, x)
+
+
+def sums_much(x):
+    return jnp.sum(jnp.tile(x, 1000)) + x
+
+
+def factorises(x):
+    return jnp.linalg.cholesky(jnp.diag(x + 2))
+
+
+def is_large(x):
+    return jnp.sin(jnp.tile(x, 1000))[:7] + x
+
+
+@pytest.mark.parametrize(
+    "function", [sorts, scatters, multiplies, sums_much, factorises, is_large]
+)
+def test_what_no_kernel_can_do_is_done_without(function):
+    x = jnp.linspace(0.0, 1.0, 7)
+    program = jax.jit(lambda x: as_cpu_kernel(function, x))
+    assert MARK not in program.lower(x).as_text()
+    assert_same(program(x), function(x))
+    xs = jnp.stack([x, x + 1, x + 2])
+    assert_same(jax.jit(jax.vmap(program))(xs), jnp.stack([function(x) for x in xs]))
+
+
+def test_random_keys_are_no_operands_of_a_kernel():
+    key = jax.random.key(0)
+    got = jax.jit(lambda key: as_cpu_kernel(lambda key: key, key))(key)
+    assert_same(jax.random.key_data(got), jax.random.key_data(key))
+
+
+def test_printing_stays(capfd):
+    def loud(x):
+        jax.debug.print("x = {}", x)
+        return 2 * x
+
+    assert as_cpu_kernel(loud, jnp.asarray(1.5)) == 3
+    jax.effects_barrier()
+    assert "x = 1.5" in capfd.readouterr().out
+
+
+@pytest.mark.parametrize("variable", ["0", None])
+def test_kernels_can_be_switched_off(monkeypatch, variable):
+    if variable is not None:
+        monkeypatch.setenv("NHJAX_ONE_KERNEL", variable)
+    text = jax.jit(lambda *x: as_cpu_kernel(pendulum, *x)).lower(*OPERANDS).as_text()
+    assert (MARK in text) == (variable is None)
+
+
+def test_a_run_is_one_kernel_and_one_with_a_factorisation_is_none():
+    def lowered(system):
+        y0 = nhjax.initial_state(system, q=jnp.ones(2), v=jnp.zeros(2))
+
+        def run(y0):
+            method = LobattoIIIAB(2)
+            return nhjax.integrate(
+                system, method, y0, dt=0.1, num_steps=3, throw=False
+            ).ys
+
+        return jax.jit(run).lower(y0).as_text()
+
+    def plain(t, q, v, args):
+        return 0.5 * v @ jnp.array([[2.0, 0.5], [0.5, 1.0]]) @ v - 0.5 * q @ q
+
+    def factorised(t, q, v, args):
+        root = jnp.linalg.cholesky(jnp.array([[2.0, 0.5], [0.5, 1.0]]) + 0 * q[0])
+        return 0.5 * jnp.sum((root.T @ v) ** 2) - 0.5 * q @ q
+
+    assert MARK in lowered(nhjax.LagrangianSystem(plain))
+    assert MARK not in lowered(nhjax.LagrangianSystem(factorised))
+
+
+@pytest.mark.parametrize(
+    ("example", "stages"),
+    [
+        (systems.TurntableBall(), 8),
+        (systems.HeavyTopSE3(), 8),
+        (systems.ChaoticSystem(50), 3),
+        (systems.ChaoticSystem(20), 8),
+    ],
+    ids=["ball", "top", "101 coordinates", "41 coordinates"],
+)
+def test_high_orders_and_many_coordinates_are_one_kernel(example, stages):
+    def run(y0):
+        method = LobattoIIIAB(stages)
+        return nhjax.integrate(
+            example.system, method, y0, dt=0.05, num_steps=3, throw=False
+        ).ys
+
+    assert MARK in jax.jit(run).lower(example.initial_state()).as_text()
+
+
+# The compiler of kernels aborts the process rather than raise, on parameters that turn
+# out to be unused or constant; and it depends on flags, of which the tests set some.
+USERS_PROGRAM = """
+import jax, jax.numpy as jnp, nhjax
+jax.config.update("jax_enable_x64", True)
+example = nhjax.systems.RodSleigh()
+
+def loss(q):
+    y0 = nhjax.initial_state(example.system, q, example.v0, project=True)
+    sol = nhjax.integrate(example.system, nhjax.LobattoIIIAB(2), y0, dt=0.1,
+        num_steps=10, saveat=nhjax.SaveAt(steps=True))
+    return jnp.sum(sol.ys.q)
+
+one = jax.jit(jax.grad(loss))(example.q0)
+many = jax.jit(jax.vmap(jax.grad(loss)))(jnp.stack([example.q0] * 40))
+assert jnp.allclose(many, one[None], rtol=1e-12, atol=1e-12)
+"""
+
+
+def test_gradients_with_the_compiler_as_users_have_it():
+    environment = {key: x for key, x in os.environ.items() if key != "XLA_FLAGS"}
+    subprocess.run([sys.executable, "-c", USERS_PROGRAM], check=True, env=environment)

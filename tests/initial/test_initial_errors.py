@@ -1,0 +1,356 @@
+"""Mistakes in initial states: an exception names the argument, its value, the remedy.
+
+Shapes, dtypes and types are known when tracing. Values are known only at run time under
+`jit` and `vmap`, where the message comes in a runtime error of the compiled program.
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import nhjax
+from oracles.mistakes import (
+    kinetic,
+    PARTICLE,
+    Q,
+    start,
+    system_with,
+    V,
+)
+
+
+# initial_state: what tracing finds ----------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("arguments", "exception", "message"),
+    [
+        ({"q": jnp.ones((2, 3))}, nhjax.ShapeError, r"`q`.*\(2, 3\).*jax.vmap"),
+        ({"q": jnp.ones(())}, nhjax.ShapeError, r"`q` has shape \(\)"),
+        ({"v": jnp.ones(2)}, nhjax.ShapeError, r"`v`.*\(2,\).*`v` of shape \(3,\)"),
+        (
+            {"v": None, "p": jnp.ones((3, 1))},
+            nhjax.ShapeError,
+            r"`p`.*\(3, 1\).*`p` of shape \(3,\)",
+        ),
+        ({"t": jnp.zeros(4)}, nhjax.ShapeError, r"`t` has shape \(4,\).*jax.vmap"),
+        ({"q": jnp.array([1, 0, 0])}, nhjax.DTypeError, r"`q`.*int64.*write 1.0 for 1"),
+        ({"v": jnp.array([1, 0, 0])}, nhjax.DTypeError, "`v` has dtype int64"),
+        (
+            {"v": V.astype(jnp.float32)},
+            nhjax.DTypeError,
+            "`v` has dtype float32, but `q` has float64",
+        ),
+        (
+            {"q": Q.astype(jnp.float32)},
+            nhjax.DTypeError,
+            "`v` has dtype float64, but `q` has float32",
+        ),
+        ({"q": Q.astype(complex)}, nhjax.DTypeError, "`q` has dtype complex128"),
+        ({"v": jnp.ones(3, bool)}, nhjax.DTypeError, "`v` has dtype bool"),
+        ({"q": Q.astype(jnp.float16)}, nhjax.DTypeError, r"`q`.*float16.*float32 or"),
+        ({"q": None}, nhjax.DTypeError, "`q` must be an array of floats, got None"),
+        ({"q": "rest"}, nhjax.DTypeError, "`q`.*got 'rest' of type str"),
+        ({"t": None}, nhjax.DTypeError, "`t` must be a real number, got None"),
+        ({"t": 1j}, nhjax.DTypeError, "`t` must be a real number, got 1j"),
+        ({"project": "yes"}, TypeError, "`project` must be True or False.*got 'yes'"),
+        ({"project": 1}, TypeError, "`project` must be True or False.*got 1 of.*int"),
+        (
+            {"args": {"mass": 1.0, "names": [2, {"a", "b"}]}},
+            TypeError,
+            r"`args\['names'\]\[1\]` is .*of type set: .*must be hashable",
+        ),
+        ({"v": None}, ValueError, "Give either `v` or `p`; got neither"),
+        ({"p": V}, ValueError, "Give either `v` or `p`; got both"),
+        (
+            {"system": kinetic},
+            TypeError,
+            "`system`.*nhjax.LagrangianSystem.*, got <func",
+        ),
+        ({"system": PARTICLE}, TypeError, r"NonholonomicParticle; pass .*`\.system`"),
+        (
+            {"system": nhjax.LagrangianSystem},
+            TypeError,
+            r"the class itself; write LagrangianSystem\(\.\.\.\)",
+        ),
+        (
+            {"system": system_with(manifold=nhjax.Euclidean(2))},
+            nhjax.ShapeError,
+            r"`q` has shape \(3,\).*Euclidean\(2\).*\(2,\)",
+        ),
+    ],
+)
+def test_initial_state_refuses(arguments, exception, message):
+    with pytest.raises(exception, match=message):
+        start(**arguments)
+
+
+@pytest.mark.parametrize(
+    ("functions", "exception", "message"),
+    [
+        (
+            {"lagrangian": lambda t, q, v, args: v * v},
+            nhjax.ShapeError,
+            r"`lagrangian.*shape \(\), a scalar, got shape \(3,\)",
+        ),
+        (
+            {"lagrangian": lambda t, q, v, args: None},
+            nhjax.ShapeError,
+            r"`lagrangian.*an array of shape \(\).*got None of type NoneType",
+        ),
+        (
+            {"lagrangian": lambda t, q, v, args: jnp.int32(1)},
+            nhjax.DTypeError,
+            "`lagrangian.*dtype int32, but `q` has float64",
+        ),
+        (
+            {"nonholonomic": lambda t, q, v, args: jnp.concatenate([v, v[:1]])},
+            nhjax.ShapeError,
+            r"`nonholonomic.*1 <= m <= 3, .*got shape \(4,\)",
+        ),
+        (
+            {"nonholonomic": lambda t, q, v, args: v[None]},
+            nhjax.ShapeError,
+            r"`nonholonomic.*got shape \(1, 3\)",
+        ),
+        (
+            {"nonholonomic": lambda t, q, v, args: v[:0]},
+            nhjax.ShapeError,
+            r"`nonholonomic.*got shape \(0,\)",
+        ),
+        (
+            {"nonholonomic": lambda t, q, v, args: [v[0], v[1]]},
+            nhjax.ShapeError,
+            "`nonholonomic.*of type list",
+        ),
+        (
+            {"force": lambda t, q, v, args: v[0]},
+            nhjax.ShapeError,
+            r"`force.*must return shape \(3,\), got shape \(\)",
+        ),
+    ],
+)
+def test_initial_state_refuses_functions(functions, exception, message):
+    with pytest.raises(exception, match=message):
+        start(system_with(**functions))
+
+
+# initial_state: what values decide ----------------------------------------------------
+
+
+def adjustable_lagrangian(t, q, v, args):
+    return 0.5 * args["mass"] @ v**2 - args["well"] * jnp.log(q[2])
+
+
+# One program in which `args` decides what is wrong.
+ADJUSTABLE = nhjax.LagrangianSystem(
+    adjustable_lagrangian,
+    nonholonomic=lambda t, q, v, args: args["rows"] @ v,
+    force=lambda t, q, v, args: args["force"],
+)
+ROWS = jnp.array([[1.0, 0.0, 1.0], [0.0, 1.0, 0.0]])
+GOOD = {
+    "q": jnp.array([1.0, 2.0, 3.0]),
+    "v": jnp.array([0.5, 0.0, -0.5]),
+    "t": jnp.asarray(0.0),
+    "args": {
+        "mass": jnp.array([1.0, 1.0, 2.0]),
+        "well": jnp.asarray(1.0),
+        "rows": ROWS,
+        "force": jnp.zeros(3),
+    },
+}
+
+
+def adjusted(**args):
+    return {"args": GOOD["args"] | args}
+
+
+# What is wrong; the exception; its message, which a compiled program gives as well.
+BY_VALUE = {
+    "q": (
+        {"q": jnp.array([jnp.inf, 2.0, 3.0])},
+        nhjax.NonFiniteError,
+        r"`q` is not finite: \[inf",
+    ),
+    "v": (
+        {"v": jnp.array([jnp.nan, 0.0, 0.0])},
+        nhjax.NonFiniteError,
+        r"`v` is not finite: \[nan",
+    ),
+    "t": (
+        {"t": jnp.asarray(jnp.nan)},
+        nhjax.NonFiniteError,
+        "`t` is not finite: nan",
+    ),
+    "second of two constraints": (
+        {"v": jnp.array([0.5, 0.25, -0.5])},
+        nhjax.ConstraintViolationError,
+        r"1 of 2 nonholonomic.*: Φ\[1\] = 0\.25 \(allowed .*`project=True`",
+    ),
+    "both constraints": (
+        {"v": jnp.array([0.5, 0.25, 0.0])},
+        nhjax.ConstraintViolationError,
+        r"2 of 2 .*Φ\[0\] = 0\.5 .*Φ\[1\] = 0\.25 ",
+    ),
+    "dependent": (
+        adjusted(rows=jnp.stack([ROWS[0], 2 * ROWS[0]])),
+        nhjax.DependentConstraintsError,
+        r"D2Φ has not full rank at q = \[1\. 2\. 3\.\].*admissibility.*fails for "
+        r"Φ\[0\] and Φ\[1\]\)\. Remove redundant",
+    ),
+    "no velocity": (
+        adjusted(rows=ROWS.at[1].set(0)),
+        nhjax.DependentConstraintsError,
+        r"Φ\[1\] does not depend on velocities there; pass .* as `holonomic`",
+    ),
+    "incompatible": (
+        adjusted(mass=jnp.array([1.0, 1.0, -1.0])),
+        nhjax.IncompatibleConstraintsError,
+        r"C = D2Φ M⁻¹ D2Φᵀ is singular at q = .*compatibility condition",
+    ),
+    "irregular": (
+        adjusted(mass=jnp.array([1.0, 1.0, 0.0])),
+        nhjax.IrregularLagrangianError,
+        "mass matrix D2D2L is singular at q = .*Give every coordinate a kinetic energy",
+    ),
+    "Lagrangian": (
+        {"q": jnp.array([1.0, 2.0, -3.0])},
+        nhjax.NonFiniteError,
+        "Lagrangian.* not finite at q = .*L = nan",
+    ),
+    "mass": (
+        adjusted(mass=jnp.array([1.0, 1.0, jnp.nan])),
+        nhjax.NonFiniteError,
+        "Lagrangian, its second derivatives in v.* not finite at q = ",
+    ),
+    "force": (
+        adjusted(force=jnp.array([0.0, jnp.inf, 0.0])),
+        nhjax.NonFiniteError,
+        r"forces D1L \+ F.* not finite at q = ",
+    ),
+}
+by_value = pytest.mark.parametrize("case", BY_VALUE.values(), ids=BY_VALUE.keys())
+
+
+def start_adjustable(q, v, t, args):
+    return nhjax.initial_state(ADJUSTABLE, q, v, t=t, args=args)
+
+
+@pytest.fixture(scope="module")
+def started():
+    """The same, compiled: for one state, and for a batch of them."""
+    batch = eqx.filter_jit(jax.vmap(lambda given: start_adjustable(**given)))
+    return jax.jit(start_adjustable), batch
+
+
+@by_value
+def test_initial_state_refuses_values(case):
+    wrong, exception, message = case
+    with pytest.raises(exception, match=message):
+        start_adjustable(**(GOOD | wrong))
+
+
+@by_value
+def test_initial_state_refuses_values_under_jit(case, started):
+    wrong, exception, message = case
+    with pytest.raises(RuntimeError, match=f"{exception.__name__}: .*{message}"):
+        jax.block_until_ready(started[0](**(GOOD | wrong)))
+
+
+@by_value
+def test_initial_state_refuses_one_lane_under_vmap(case, started):
+    wrong, exception, message = case
+    message = f"{exception.__name__}: lane 1: .*{message}"
+    lanes = jax.tree.map(lambda *x: jnp.stack(x), GOOD, GOOD | wrong, GOOD)
+    with pytest.raises(RuntimeError, match=message):
+        jax.block_until_ready(started[1](lanes))
+
+
+def test_a_failure_of_a_compiled_program_is_told_in_few_lines(started, caplog):
+    wrong = GOOD | {"v": jnp.array([0.5, 0.25, -0.5])}
+    with pytest.raises(nhjax.ConstraintViolationError) as eager:
+        start_adjustable(**wrong)
+    with pytest.raises((RuntimeError, ValueError)) as compiled:
+        jax.block_until_ready(started[0](**wrong))
+    line = f"ConstraintViolationError: {eager.value}"
+    text = str(compiled.value)
+    assert f"{line}\n" in f"{text}\n"
+    # The frames of Python from the main program to the call-back are left out.
+    before = text[: text.index(line)].splitlines()
+    assert len(before) == 2
+    assert "_within_a_compiled_program" in before[1]
+    # What JAX logs of it is that line, without a traceback.
+    (record,) = caplog.records
+    assert record.getMessage() == line
+    assert record.exc_info is None
+
+
+@pytest.mark.parametrize(
+    "transform",
+    [
+        lambda f: f(Q),
+        lambda f: jax.vmap(f)(jnp.stack([Q, Q])),
+        lambda f: jax.vmap(jax.jacfwd(f))(jnp.stack([Q, Q])),
+        lambda f: jax.jacrev(f)(Q),
+    ],
+    ids=["plain", "vmap", "vmap of jacfwd", "jacrev"],
+)
+def test_checks_that_hold_do_not_call_the_host(transform, monkeypatch):
+    pure_callback, traced, called = jax.pure_callback, [], []
+
+    def observed(function, *others, **options):
+        def call(*arguments):
+            called.append(function)
+            return function(*arguments)
+
+        traced.append(function)
+        return pure_callback(call, *others, **options)
+
+    monkeypatch.setattr(jax, "pure_callback", observed)
+    # What was traced before is traced again.
+    jax.clear_caches()
+    jax.block_until_ready(jax.jit(lambda: transform(lambda q: start(q=q + 0.0).v))())
+    assert traced
+    assert not called
+
+
+def test_initial_state_accepts_the_others(started):
+    expected = start_adjustable(**GOOD)
+    for got in (
+        started[0](**GOOD),
+        jax.tree.map(lambda x: x[0], started[1](jax.tree.map(lambda x: x[None], GOOD))),
+    ):
+        jax.tree.map(lambda x, y: np.testing.assert_array_equal(x, y), got, expected)
+
+
+def relativistic(t, q, v, args):
+    return -jnp.sqrt(1.0 - v @ v)
+
+
+def test_a_momentum_without_a_velocity():
+    # L = v - v²/2 + |v|³/6 has p = 1 - v + v²/2 >= 1/2.
+    def lagrangian(t, q, v, args):
+        return jnp.sum(v - v**2 / 2 + jnp.abs(v) ** 3 / 6)
+
+    with pytest.raises(nhjax.NewtonError, match=r"D2L.*= p.*p = \[0\.1.*Give `v`"):
+        start(system_with(lagrangian=lagrangian), v=None, p=0.1 * jnp.ones(3))
+
+
+def test_a_velocity_beyond_the_domain_is_not_called_irregular():
+    with pytest.raises(nhjax.NonFiniteError, match=r"v = \[0\.9.*L = nan"):
+        start(system_with(lagrangian=relativistic), v=0.9 * jnp.ones(3))
+
+
+def test_an_irregular_lagrangian_is_found_from_a_momentum_too():
+    system = system_with(lagrangian=lambda t, q, v, args: v[0] ** 2)
+    with pytest.raises(nhjax.IrregularLagrangianError, match=r"p = \[1\. 0\. 0\.\]"):
+        start(system, v=None, p=jnp.array([1.0, 0.0, 0.0]))
+
+
+def test_a_projection_that_cannot_succeed():
+    system = system_with(nonholonomic=lambda t, q, v, args: v @ v + 1.0)
+    with pytest.raises(nhjax.NewtonError, match=r"projected.*v = .*Φ = .*Start nearer"):
+        start(system, project=True)

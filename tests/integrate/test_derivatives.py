@@ -1,0 +1,219 @@
+"""Gradients of runs in all that is given, by any way, against differences."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import nhjax
+from nhjax import LobattoIIIAB, SaveAt, systems
+from oracles import helpers
+from oracles.driven import Driven
+from oracles.gradients import assert_gradient, split, STEPS
+from oracles.helpers import (
+    scalar,
+)
+
+
+# What is given, and what is saved -----------------------------------------------------
+
+
+GIVEN = {
+    "q": jnp.array([0.5, -0.3, 0.2]),
+    "v": jnp.array([0.4, 0.6, 1.0]),
+    "t0": jnp.asarray(0.2),
+    "dt": jnp.asarray(0.05),
+    "args": {"friction": jnp.asarray(0.1)},
+    "leaf": jnp.asarray([1.0, 1.5, 0.7]),
+    "closed over": jnp.asarray(0.4),
+    "ts": jnp.array([0.2531, 0.2563, 3.31, 8.222]),
+    "fn": jnp.asarray(1.3),
+}
+
+
+def driven(given, closure, saveat):
+    """A run in which everything plays a part, not all of it in plain sight."""
+    scale, args = given["fn"], given["args"]
+    # The masses are leaves of the system; over all else the functions close.
+    leaves = Driven(given["leaf"], given["closed over"])
+    beta = given["closed over"]
+
+    def force(t, q, v, args):
+        return leaves.friction(t, q, v, args) + beta * jnp.cos(t) * q
+
+    def constraint(t, q, v, args):
+        return leaves.constraint(t, q, v, args) - beta * q[1] * v[0]
+
+    def fn(t, y, args):
+        return scale * jnp.sin(t) * y.q, y, args["friction"] * y.p
+
+    system = nhjax.LagrangianSystem(
+        leaves.lagrangian, nonholonomic=constraint, force=force
+    )
+    t0 = given["t0"]
+    y0 = nhjax.initial_state(
+        system, given["q"], given["v"], t=t0, args=args, project=True
+    )
+    return nhjax.integrate(
+        system,
+        LobattoIIIAB(2, closure),
+        y0,
+        dt=given["dt"],
+        num_steps=STEPS,
+        t0=t0,
+        args=args,
+        saveat=saveat(given["ts"], fn),
+    )
+
+
+def samples(given):
+    """Two in one step, and the ends."""
+    sol = driven(
+        given, "symmetric", lambda ts, fn: SaveAt(t0=True, ts=ts, t1=True, fn=fn)
+    )
+    return scalar((sol.ts, sol.ys))
+
+
+def thinned_nodes(given):
+    """Each 67th and the last."""
+    sol = driven(given, "consistent", lambda ts, fn: SaveAt(steps=67, t1=True, fn=fn))
+    return scalar((sol.ts, sol.ys))
+
+
+def dense_output(given):
+    """In the middle of two steps, and at the end."""
+    sol = driven(given, "symmetric", lambda ts, fn: SaveAt(t1=True, dense=True, fn=fn))
+    between = jax.vmap(sol.evaluate)(given["ts"][1:])
+    return scalar((sol.ys, between, sol.evaluate(sol.t1)))
+
+
+@pytest.mark.parametrize("loss", [samples, thinned_nodes, dense_output])
+def test_the_gradient_in_all_that_is_given(loss):
+    assert_gradient(loss, GIVEN, epsilon=3e-5)
+
+
+def momenta(matrix, q):
+    """A metric on momenta that varies."""
+    return matrix + 0.2 * jnp.outer(jnp.sin(q), jnp.sin(q))
+
+
+def test_the_gradient_of_a_hamiltonian_system_given_velocities():
+    metric = jnp.eye(3) + 0.1 * jnp.cos(np.add.outer(np.arange(3.0), np.arange(3.0)))
+    given = {
+        "q": jnp.array([0.5, -0.3, 0.2]),
+        "v": jnp.array([0.4, 0.6, 1.0]),
+        "metric": metric,
+        "dt": jnp.asarray(0.05),
+        "slope": jnp.asarray(0.8),
+    }
+
+    def loss(given):
+        matrix = 0.5 * (given["metric"] + given["metric"].T)
+
+        def hamiltonian(t, q, p, args):
+            return 0.5 * p @ momenta(matrix, q) @ p + 0.25 * jnp.sum(q**4)
+
+        def constraint(t, q, p, args):
+            v = momenta(matrix, q) @ p
+            return v[2] - given["slope"] * q[1] * v[0]
+
+        system = nhjax.HamiltonianSystem(hamiltonian, nonholonomic=constraint)
+        y0 = nhjax.initial_state(system, given["q"], v=given["v"], project=True)
+        method = LobattoIIIAB(2, "propagated")
+        ys = nhjax.integrate(system, method, y0, dt=given["dt"], num_steps=STEPS).ys
+        return scalar(ys)
+
+    assert_gradient(loss, given)
+
+
+def test_the_gradient_of_a_hamiltonian_system_on_a_group():
+    suslov = systems.Suslov()
+    given = {
+        "inverse": jnp.linalg.inv(
+            jnp.array([[1, 0, 0.3], [0, 1.5, -0.2], [0.3, -0.2, 2]])
+        ),
+        "xi": jnp.zeros(3),
+        "p": jnp.array([0.6, 0.9, 0.1]),
+    }
+
+    def loss(given):
+        matrix = 0.5 * (given["inverse"] + given["inverse"].T)
+        system = nhjax.HamiltonianSystem(
+            lambda t, g, p, args: 0.5 * p @ matrix @ p + g[0] * g[3],
+            nonholonomic=lambda t, g, p, args: matrix[2] @ p,
+            manifold=suslov.manifold,
+        )
+        q = suslov.manifold.act(suslov.q0, given["xi"])
+        y0 = nhjax.initial_state(system, q, p=given["p"], project=True)
+        ys = nhjax.integrate(system, LobattoIIIAB(2), y0, dt=0.05, num_steps=STEPS).ys
+        return scalar(ys)
+
+    assert_gradient(loss, given)
+
+
+# Initial states -----------------------------------------------------------------------
+
+
+def test_the_gradient_of_an_initial_state_given_momenta():
+    sleigh = systems.ChaplyginSleigh()
+    given, joined = split(sleigh)
+    given["p"] = jnp.array([0.2, 0.5, 0.4])
+
+    def loss(given):
+        sleigh = joined(given)
+        return scalar(
+            nhjax.initial_state(sleigh.system, sleigh.q0, p=given["p"], project=True)
+        )
+
+    assert_gradient(loss, given, epsilon=3e-4, rtol=1e-10)
+
+
+@pytest.mark.parametrize(
+    "example", [systems.Appell(), systems.RodSleigh()], ids=["nonlinear", "holonomic"]
+)
+def test_the_gradient_of_a_projected_initial_state(example):
+    # Far from the constraints, so that the projection has something to do.
+    example = eqx.tree_at(
+        lambda e: (e.q0, e.v0), example, (1.1 * example.q0 + 0.05, example.v0 + 0.1)
+    )
+    given, joined = split(example)
+
+    def loss(given):
+        example = joined(given)
+        return scalar(
+            nhjax.initial_state(example.system, example.q0, example.v0, project=True)
+        )
+
+    assert_gradient(loss, given, epsilon=3e-4, rtol=1e-10)
+
+
+def test_the_gradient_of_a_consistent_state_of_explicit_parts():
+    # y0 by its parts, as they come from an earlier solution.
+    system, y0, args = helpers.problem("driven")
+    method = LobattoIIIAB(2, "propagated")
+
+    def loss(y0):
+        return scalar(
+            nhjax.integrate(system, method, y0, dt=0.05, num_steps=STEPS, args=args).ys
+        )
+
+    # More than this off the constraints the start is refused.
+    assert_gradient(loss, y0, epsilon=3e-5)
+
+
+# float32 ------------------------------------------------------------------------------
+
+
+def test_single_precision():
+    particle = systems.NonholonomicParticle()
+
+    def loss(dt, dtype):
+        y0 = particle.initial_state(dtype)
+        sol = nhjax.integrate(particle.system, LobattoIIIAB(2), y0, dt=dt, num_steps=50)
+        return jnp.sum(jnp.sin(sol.ys.q))
+
+    single = jax.jit(jax.grad(loss), static_argnums=1)(jnp.float32(0.05), jnp.float32)
+    double = jax.jit(jax.grad(loss), static_argnums=1)(0.05, jnp.float64)
+    assert single.dtype == jnp.float32
+    np.testing.assert_allclose(single, double, rtol=1e-4)

@@ -1,0 +1,130 @@
+"""A run that fails names its lane and step, and leaves the others as they are."""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import nhjax
+from nhjax import SaveAt
+from nhjax.systems import (
+    Appell,
+    NonholonomicParticle,
+)
+
+
+PARTICLE = NonholonomicParticle()
+STEPS, DT = 20, 0.1
+
+
+def run(**others: Any) -> nhjax.Solution:
+    arguments: dict[str, Any] = {
+        "system": PARTICLE.system,
+        "method": nhjax.LobattoIIIAB(3),
+        "y0": PARTICLE.initial_state(),
+        "dt": DT,
+        "num_steps": STEPS,
+    }
+    return nhjax.integrate(**(arguments | others))
+
+
+def assert_trees_equal(got, expected):
+    jax.tree.map(np.testing.assert_array_equal, got, expected)
+
+
+# Failures -----------------------------------------------------------------------------
+
+
+APPELL = Appell()
+
+
+@eqx.filter_jit
+@jax.vmap
+def fall(speed) -> nhjax.Solution:
+    """Particles of Appell's: those that rise come to an apex where D2Φ vanishes."""
+    v = speed * jnp.array([0.3, 0.4, 1.0])
+    y0 = nhjax.initial_state(APPELL.system, APPELL.q0, v)
+    return run(
+        system=APPELL.system,
+        y0=y0,
+        dt=0.05,
+        throw=False,
+        saveat=SaveAt(t0=True, steps=True),
+    )
+
+
+@pytest.fixture(scope="module")
+def falls():
+    failing = fall(jnp.array([-1.0, 0.5, -0.5, 0.25]))
+    return failing, fall(jnp.array([-1.0, -0.7, -0.5, -0.2]))
+
+
+def test_a_failing_lane_leaves_the_others_untouched(falls):
+    failing, benign = falls
+    assert benign.failures() == []
+    good = jnp.array([0, 2])
+    for part in (lambda s: s.ts, lambda s: s.ys, lambda s: s.stats):
+        assert_trees_equal(
+            jax.tree.map(lambda x: x[good], part(failing)),
+            jax.tree.map(lambda x: x[good], part(benign)),
+        )
+
+
+def test_a_failure_is_reported_with_lane_and_step(falls):
+    failing, _ = falls
+    (first, k1, reason), (second, k2, _) = failing.failures()
+    assert (first, second) == (1, 3)
+    # ż = ż_0 - t / (1 + κ²) vanishes at t = 1.25 ż_0, in the steps 12 and 6.
+    assert 10 <= k1 <= 12
+    assert 4 <= k2 <= 6
+    assert "smaller `dt`" in reason
+    np.testing.assert_array_equal(failing.stats["failed_step"], [-1, k1, -1, k2])
+    np.testing.assert_array_equal(failing.stats["num_steps"], [20, k1, 20, k2])
+    failed = jax.vmap(lambda r: r != nhjax.RESULTS.successful)(failing.result)
+    np.testing.assert_array_equal(failed, [False, True, False, True])
+    for value in failing.stats.values():
+        assert value.shape == (4,)
+        assert jnp.all(jnp.isfinite(value))
+
+
+def test_a_failed_lane_stays_at_its_last_good_state(falls):
+    failing, _ = falls
+    for lane, k, _ in failing.failures():
+        states = jax.tree.map(lambda x, lane=lane: np.asarray(x[lane]), failing.ys)
+        last = jax.tree.map(lambda x, k=k: x[k], states)
+        rest = jax.tree.map(lambda x, k=k: x[k:], states)
+        assert_trees_equal(
+            rest,
+            jax.tree.map(lambda x, k=k: np.tile(x, (STEPS + 1 - k, 1)), last),
+        )
+        assert np.all(last.q != states.q[k - 1])
+        start = eqx.tree_at(lambda a: a.v0, APPELL, jnp.asarray(states.v[0]))
+        q, v, multiplier = start.exact(0.05 * k)
+        np.testing.assert_allclose(last.q, q, rtol=1e-12)
+        np.testing.assert_allclose(last.v, v, rtol=1e-11)
+        np.testing.assert_allclose(last.multiplier, multiplier, rtol=1e-11)
+
+
+def test_a_lane_without_a_number_fails_alone():
+    y0 = PARTICLE.initial_state()
+
+    def one(factor):
+        scaled = eqx.tree_at(lambda y: y.q, y0, y0.q * factor)
+        return run(y0=scaled, num_steps=3, throw=False)
+
+    sol = jax.vmap(one)(jnp.array([1.0, jnp.nan]))
+    assert [(lane, k) for lane, k, _ in sol.failures()] == [(1, 0)]
+    assert "from the start" in sol.failures()[0][2]
+    np.testing.assert_array_equal(sol.stats["num_steps"], [3, 0])
+    assert jnp.all(jnp.isfinite(sol.ys.q[0]))
+
+
+def test_a_solver_that_gives_up():
+    solver = nhjax.SimplifiedNewton(max_iterations=2, fallback=False)
+    sol = run(stage_solver=solver, throw=False, num_steps=2)
+    assert sol.result == nhjax.RESULTS.nonlinear_max_iterations
+    assert "within the `max_iterations`" in sol.failures()[0][2]
+    assert_trees_equal(jax.tree.map(lambda x: x[0], sol.ys), PARTICLE.initial_state())

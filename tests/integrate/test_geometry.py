@@ -1,0 +1,299 @@
+"""Geometric properties: constraints, symmetry in time, energy over long times."""
+
+from functools import cache
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import nhjax
+from oracles import helpers
+from oracles.helpers import CLOSURES, GALLERY, integrate_recorded, problem, recorded
+
+
+EVERYTHING = [*GALLERY, "driven"]
+CONSTRAINED = [name for name in EVERYTHING if name != "oscillator"]
+
+every_closure = pytest.mark.parametrize("closure", CLOSURES)
+every_number_of_stages = pytest.mark.parametrize("stages", [2, 3, 4, 5])
+symmetric_closures = pytest.mark.parametrize("closure", ["propagated", "symmetric"])
+
+
+def node(states, k):
+    return jax.tree.map(lambda x: x[k], states)
+
+
+# Constraints
+
+
+def relative_violation(name, sol):
+    """|Φ_a| / (Σ_j |D2Φ_aj| max |v|) at every node.
+
+    The maximum of v, since its components come out of one linear system: Σ |D2Φ_j v_j|
+    itself is round-off where the sleigh passes θ = 0.
+    """
+    system, _, args = problem(name)
+
+    def at_node(t, y):
+        B = jax.jacfwd(system.constraint, argnums=2)(t, y.q, y.v, args)
+        size = jnp.sum(jnp.abs(B), axis=1) * jnp.max(jnp.abs(y.v))
+        return jnp.abs(system.constraint_violation(t, y, args)) / size
+
+    return jax.vmap(at_node)(sol.ts, sol.ys)
+
+
+@every_closure
+@pytest.mark.parametrize("name", CONSTRAINED)
+def test_constraints_hold_at_every_node(name, closure):
+    sol = recorded(name, 3, closure, "simplified")
+    assert np.max(relative_violation(name, sol)) <= 1e-14
+
+
+@every_closure
+@every_number_of_stages
+def test_constraints_hold_at_every_node_for_any_number_of_stages(stages, closure):
+    sol = recorded("side by side", stages, closure, "simplified")
+    assert np.max(relative_violation("side by side", sol)) <= 1e-14
+
+
+@every_closure
+@pytest.mark.parametrize("name", CONSTRAINED)
+def test_stats_report_the_largest_violation(name, closure):
+    system, _, args = problem(name)
+    sol = recorded(name, 3, closure, "simplified")
+    found = jax.vmap(lambda t, y: system.constraint_violation(t, y, args))(
+        sol.ts, sol.ys
+    )
+    largest = np.max(np.abs(found[1:]))
+    reported = sol.stats["max_constraint_violation"]
+    np.testing.assert_allclose(reported, largest, rtol=0, atol=1e-15)
+    assert reported <= 2e-15
+
+
+# Symmetry in time
+
+
+def there_and_back(name, stages, closure, steps):
+    """The distance to the start after `steps` steps of h and as many of -h."""
+    y0 = problem(name)[1]
+    there = recorded(name, stages, closure, "simplified")
+    back = integrate_recorded(
+        name,
+        stages,
+        closure,
+        "simplified",
+        node(there.ys, steps),
+        dt=-helpers.RECORDED_STEP,
+        t0=there.ts[steps],
+        throw=False,  # Appell's system is singular some time before the start.
+    )
+    assert not 0 <= back.stats["failed_step"] < steps
+    end = node(back.ys, steps)
+    return {
+        field: np.max(np.abs(getattr(end, field) - getattr(y0, field)), initial=0.0)
+        for field in ("q", "v", "p", "multiplier")
+    }
+
+
+def assert_returns(name, stages, closure):
+    for field, distance in there_and_back(name, stages, closure, 1).items():
+        assert distance <= 1e-13, f"{field} after one step: {distance:.1e}"
+    # The stage equations know λ through h λ D2Φ beside p: its round-off is that of
+    # p / h, and the propagated one keeps all it has collected.
+    momentum = np.max(np.abs(problem(name)[1].p))
+    for field, distance in there_and_back(
+        name, stages, closure, helpers.RECORDED_STEPS
+    ).items():
+        size = momentum / helpers.RECORDED_STEP if field == "multiplier" else 1.0
+        assert distance <= 1e-13 * size, f"{field} after all steps: {distance:.1e}"
+
+
+@symmetric_closures
+@pytest.mark.parametrize("name", EVERYTHING)
+def test_a_step_of_minus_h_undoes_a_step_of_h(name, closure):
+    assert_returns(name, 3, closure)
+
+
+@symmetric_closures
+@every_number_of_stages
+def test_a_step_of_minus_h_undoes_a_step_of_h_for_any_number_of_stages(stages, closure):
+    assert_returns("side by side", stages, closure)
+
+
+# At s = 3 Appell's motion is integrated exactly, and the oscillator has no multiplier.
+@pytest.mark.parametrize("name", [name for name in CONSTRAINED if name != "Appell"])
+def test_the_consistent_closure_is_not_symmetric(name):
+    distance = there_and_back(name, 3, "consistent", helpers.RECORDED_STEPS)
+    assert distance["q"] > 1e-10
+
+
+# Long times
+
+
+@cache
+def sleigh_energy_error(closure):
+    sleigh = nhjax.systems.ChaplyginSleigh()
+    system, y0 = sleigh.system, sleigh.initial_state()
+    sol = nhjax.integrate(
+        system,
+        nhjax.LobattoIIIAB(4, closure),
+        y0,
+        dt=0.1,
+        num_steps=2000,
+        saveat=nhjax.SaveAt(steps=True, fn=system.energy),
+    )
+    assert sol.stats["max_constraint_violation"] <= 2e-15
+    return np.abs(np.asarray(sol.ys) - np.asarray(system.energy(0.0, y0)))
+
+
+@pytest.mark.parametrize("closure", ["consistent", "symmetric"])
+def test_energy_of_the_sleigh_stays_where_it_was(closure):
+    assert np.max(sleigh_energy_error(closure)) <= 1e-10
+
+
+def test_a_propagated_multiplier_spoils_the_energy_of_the_sleigh():
+    # The motion is attracting; the propagated multiplier carries a mode that grows.
+    error = sleigh_energy_error("propagated")
+    assert np.max(error[:100]) <= 1e-9
+    assert np.max(error) > 1e-3
+
+
+def test_two_stage_lobatto_on_the_oscillator_is_periodic():
+    # With h = 2 sin(π/N) the discrete orbit closes after exactly N steps.
+    oscillator, count = nhjax.systems.HarmonicOscillator(), 4000
+    y0 = oscillator.initial_state()
+    sol = nhjax.integrate(
+        oscillator.system,
+        nhjax.LobattoIIIAB(2),
+        y0,
+        dt=2 * np.sin(np.pi / count),
+        num_steps=count,
+    )
+    for field in ("q", "v", "p"):
+        end, start = getattr(sol.ys, field)[0], getattr(y0, field)
+        np.testing.assert_allclose(end, start, rtol=0, atol=1e-14, err_msg=field)
+
+
+@cache
+def long_run(name, closure, solver):
+    system, y0, args = problem(name)
+    return nhjax.integrate(
+        system,
+        nhjax.LobattoIIIAB(4, closure),
+        y0,
+        dt=0.1,
+        num_steps=200,
+        args=args,
+        stage_solver=helpers.SOLVERS[solver],
+        saveat=nhjax.SaveAt(steps=True),
+    )
+
+
+@pytest.mark.parametrize(
+    ("name", "closure"),
+    [
+        ("sleigh", "propagated"),
+        ("sleigh", "symmetric"),
+        ("chaotic", "consistent"),
+    ],
+)
+def test_both_solvers_give_the_same_trajectory_to_round_off(name, closure):
+    runs = [long_run(name, closure, solver).ys for solver in helpers.SOLVERS]
+    fields = ["q", "v", "p"]
+    # On the sleigh the propagated multiplier amplifies round-off: see above.
+    fields += [] if closure == "propagated" else ["multiplier"]
+    for field in fields:
+        simplified, dense = (getattr(run, field) for run in runs)
+        np.testing.assert_allclose(simplified, dense, rtol=0, atol=2e-14, err_msg=field)
+
+
+# Energies of the continuously variable transmission over T = 2000 at h = 0.1, ε = 1/2.
+
+
+def cvt_energies(t, y, example):
+    energy = example.system.energy(t, y)
+    return energy, example.driver_energy(y.q, y.v), example.passenger_energy(y.q, y.v)
+
+
+@cache
+def cvt_errors(regime, stages, closure):
+    """E - E_0 for the whole, the driver and the passenger, at every step."""
+    example = GALLERY[f"CVT {regime}"]
+    sol = nhjax.integrate(
+        example.system,
+        nhjax.LobattoIIIAB(stages, closure),
+        example.initial_state(),
+        dt=0.1,
+        num_steps=20_000,
+        args=example,
+        saveat=nhjax.SaveAt(t0=True, steps=True, fn=cvt_energies),
+    )
+    return [np.asarray(energy)[1:] - np.asarray(energy)[0] for energy in sol.ys]
+
+
+def largest_by_fifth(error):
+    return np.max(np.abs(error.reshape(5, -1)), axis=1)
+
+
+@pytest.mark.parametrize(
+    ("regime", "stages", "closure", "expected"),
+    [
+        ("high", 3, "propagated", [1.6e-4, 3.2e-4, 5.0e-4, 6.5e-4, 8.6e-4]),
+        ("low", 3, "propagated", [1.44e-5] * 5),
+        ("high", 4, "propagated", [3.2e-7] * 5),
+        ("high", 2, "propagated", [2.6e-2, 2.6e-2, 2.6e-2, 2.6e-2, 2.5e-2]),
+    ],
+)
+def test_energy_error_of_the_cvt_by_fifths_of_the_run(
+    regime, stages, closure, expected
+):
+    # Measured once with an independent implementation (dense Newton).
+    error, _, _ = cvt_errors(regime, stages, closure)
+    np.testing.assert_allclose(largest_by_fifth(error), expected, rtol=0.1)
+
+
+@pytest.mark.parametrize(
+    ("regime", "stages", "closure", "first", "last"),
+    [
+        ("high", 3, "consistent", 1.1e-3, 5.5e-3),
+        ("high", 3, "symmetric", 2.9e-5, 3.7e-5),
+        ("low", 3, "consistent", 1.4e-4, 7.4e-4),
+        ("low", 3, "symmetric", 6.2e-6, 6.3e-6),
+        ("high", 4, "consistent", 5.6e-6, 2.7e-5),
+        ("high", 4, "symmetric", 2.2e-7, 1.6e-7),
+    ],
+)
+def test_energy_error_of_the_cvt_in_the_first_and_last_fifth(
+    regime, stages, closure, first, last
+):
+    # Measured once with an independent implementation (dense Newton).
+    error, _, _ = cvt_errors(regime, stages, closure)
+    found = largest_by_fifth(error)[[0, -1]]
+    np.testing.assert_allclose(found, [first, last], rtol=0.1)
+
+
+def test_three_propagated_stages_make_the_energy_of_the_cvt_drift_linearly():
+    error, _, _ = cvt_errors("high", 3, "propagated")
+    by_fifth = largest_by_fifth(error)
+    np.testing.assert_allclose(by_fifth / by_fifth[0], [1, 2, 3, 4, 5], rtol=0.1)
+
+
+@pytest.mark.parametrize("regime", ["low", "high"])
+def test_four_propagated_stages_make_no_drift(regime):
+    error, _, _ = cvt_errors(regime, 4, "propagated")
+    by_fifth = largest_by_fifth(error)
+    np.testing.assert_allclose(by_fifth / by_fifth[0], 1, rtol=0.1)
+
+
+@pytest.mark.parametrize(
+    ("regime", "driver", "passenger"),
+    [
+        ("low", (-2.5e-3, 4.3e-3), (-1.26e-2, 1.3e-3)),
+        ("high", (-5.3e-3, 1.26e-2), (-2.5e-2, 1.3e-3)),
+    ],
+)
+def test_range_of_the_energies_of_driver_and_passenger(regime, driver, passenger):
+    _, driver_error, passenger_error = cvt_errors(regime, 2, "propagated")
+    for error, expected in ((driver_error, driver), (passenger_error, passenger)):
+        np.testing.assert_allclose([error.min(), error.max()], expected, rtol=0.1)

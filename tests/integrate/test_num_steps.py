@@ -1,0 +1,235 @@
+"""Runs of any length by one compiled program, where nothing saved depends on it."""
+
+import re
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import nhjax
+from nhjax import SaveAt
+from nhjax.systems import NonholonomicParticle
+
+
+PARTICLE = NonholonomicParticle()
+REVERSIBLE = nhjax.ReversibleAdjoint()
+ADJOINTS = [
+    nhjax.DirectAdjoint(),
+    nhjax.RecursiveCheckpointAdjoint(),
+    REVERSIBLE,
+]
+traces: list[int] = []
+
+
+def counted(t, q, v, args):
+    traces.append(1)
+    return 0.5 * (v @ v) - 0.5 * (q[0] ** 2 + q[1] ** 2)
+
+
+SYSTEM = nhjax.LagrangianSystem(counted, nonholonomic=PARTICLE.constraint)
+
+
+def run(num_steps: Any, y0: Any = None, **others: Any) -> nhjax.Solution:
+    arguments: dict[str, Any] = {"dt": 0.1} | others
+    return nhjax.integrate(
+        SYSTEM,
+        nhjax.LobattoIIIAB(3),
+        PARTICLE.initial_state() if y0 is None else y0,
+        num_steps=num_steps,
+        **arguments,
+    )
+
+
+def assert_same(got, expected):
+    jax.tree.map(np.testing.assert_array_equal, got, expected)
+
+
+def static(num_steps: int, **others: Any) -> nhjax.Solution:
+    """As under the user's own `jit`, where an int stays known."""
+    return jax.jit(lambda y0: run(num_steps, y0, **others))(PARTICLE.initial_state())
+
+
+def norms(t, y, args):
+    return y.q @ y.q
+
+
+# Compiled once ------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "saveat",
+    [SaveAt(t1=True), SaveAt(t0=True, t1=True), SaveAt(t1=True, fn=norms)],
+    ids=["end", "both ends", "function"],
+)
+@pytest.mark.parametrize("adjoint", ADJOINTS, ids=lambda x: type(x).__name__)
+def test_another_length_retraces_nothing(saveat, adjoint):
+    run(3, saveat=saveat, adjoint=adjoint)
+    count = len(traces)
+    ends = [run(n, saveat=saveat, adjoint=adjoint).t1 for n in (1, 7, 20)]
+    assert len(traces) == count
+    np.testing.assert_allclose(ends, [0.1, 0.7, 2.0])
+
+
+@pytest.mark.parametrize("num_steps", [1, 2, 33])
+def test_the_numbers_are_those_of_a_known_length(num_steps):
+    got, expected = run(num_steps), static(num_steps)
+    assert_same((got.ys, got.ts, got.t1), (expected.ys, expected.ts, expected.t1))
+    assert_same(got.stats, expected.stats)
+
+
+def test_an_array_is_a_length_under_jit():
+    program = jax.jit(lambda n: run(n))
+    first = program(3)
+    count = len(traces)
+    assert_same(program(20).ys, run(20).ys)
+    assert_same(first.ys, run(3).ys)
+    assert len(traces) == count
+    for length in (np.asarray(20), jnp.asarray(20, jnp.int16), np.int64(20)):
+        assert_same(run(length).ys, run(20).ys)
+
+
+def test_members_of_a_batch_have_lengths_of_their_own():
+    lengths = jnp.array([5, 1, 20])
+    batch = jax.jit(jax.vmap(lambda n: run(n)))(lengths)
+    np.testing.assert_array_equal(batch.stats["num_steps"], lengths)
+    for lane, length in enumerate((5, 1, 20)):
+        member = jax.tree.map(lambda x, lane=lane: x[lane], batch.ys)
+        assert_same(member, run(length).ys)
+
+
+def test_a_batch_in_step_has_lengths_of_its_own(monkeypatch):
+    monkeypatch.setenv("NHJAX_ONE_KERNEL", "0")
+    batch = jax.jit(jax.vmap(lambda n: run(n)))(jnp.array([5, 20]))
+    for lane, length in enumerate((5, 20)):
+        np.testing.assert_allclose(batch.ys.q[lane], run(length).ys.q, rtol=1e-13)
+
+
+def test_a_length_that_is_traced_is_one_kernel():
+    program = jax.jit(lambda n: run(n, throw=False).ys.q)
+    assert re.search("xla_cpu_small_call", program.lower(3).as_text())
+
+
+def test_a_chunk_from_state_to_state_saves_at_any_number_of_them():
+    @jax.jit
+    def chunk(y0, t0):
+        sol = run(4, y0, t0=t0, saveat=SaveAt(steps=True))
+        return jax.tree.map(lambda x: x[-1], sol.ys), sol.t1, sol.ys.q
+
+    y, t, q = chunk(PARTICLE.initial_state(), 0.0)
+    pieces, count = [q], len(traces)
+    for _ in range(2):
+        y, t, q = chunk(y, t)
+        pieces.append(q)
+    assert len(traces) == count
+    whole = run(12, saveat=SaveAt(steps=True)).ys.q
+    np.testing.assert_allclose(np.concatenate(pieces), whole, rtol=1e-13)
+
+
+# Derivatives --------------------------------------------------------------------------
+
+
+def end(dt, num_steps, adjoint):
+    ys = run(num_steps, dt=dt, adjoint=adjoint).ys
+    return jnp.sum(jnp.sin(ys.q)) + jnp.sum(ys.p)
+
+
+@pytest.fixture(scope="module")
+def pushed():
+    """A rate by forward mode through a run of a length that is known."""
+    return jax.jvp(lambda x: end(x, 8, ADJOINTS[0]), (0.1,), (1.0,))
+
+
+@pytest.fixture(scope="module")
+def reversible():
+    """The gradient by the reversible adjoint, one program for all lengths."""
+    return jax.jit(lambda x, n: jax.grad(end)(x, n, REVERSIBLE))
+
+
+@pytest.mark.parametrize("adjoint", ADJOINTS[:2], ids=["direct", "checkpoints"])
+def test_forward_mode_of_a_traced_length(adjoint, pushed):
+    got = jax.jit(lambda n: jax.jvp(lambda x: end(x, n, adjoint), (0.1,), (1.0,)))(8)
+    np.testing.assert_allclose(got, pushed, rtol=1e-12)
+
+
+def test_the_reversible_adjoint_has_gradients_of_a_traced_length(reversible):
+    for num_steps in (1, 8):
+        expected = jax.grad(lambda x, n=num_steps: end(x, n, ADJOINTS[0]))(0.1)
+        got = reversible(0.1, num_steps)
+        np.testing.assert_allclose(got, expected, rtol=1e-11)
+
+
+def test_gradients_of_members_of_several_lengths(reversible):
+    lengths = jnp.array([3, 8])
+    gradient = jax.vmap(lambda n: jax.grad(end)(0.1, n, REVERSIBLE))
+    got = jax.jit(gradient)(lengths)
+    for lane, num_steps in enumerate((3, 8)):
+        expected = reversible(0.1, num_steps)
+        np.testing.assert_allclose(got[lane], expected, rtol=1e-11)
+
+
+@pytest.mark.parametrize("adjoint", ADJOINTS[:2], ids=["direct", "checkpoints"])
+def test_reverse_mode_of_a_traced_length_is_refused(adjoint):
+    with pytest.raises(ValueError, match="Reverse-mode differentiation does not work"):
+        jax.jit(jax.grad(end), static_argnums=2)(0.1, 8, adjoint)
+
+
+@pytest.mark.parametrize("adjoint", ADJOINTS, ids=lambda x: type(x).__name__)
+def test_an_int_stays_known_inside_a_gradient(adjoint):
+    assert np.isfinite(jax.grad(end)(0.1, 4, adjoint))
+
+    # Also where a function alone knows what is differentiated.
+    def loss(friction):
+        system = nhjax.LagrangianSystem(counted, force=lambda t, q, v, a: -friction * v)
+        y0 = nhjax.initial_state(SYSTEM, PARTICLE.q0, PARTICLE.v0)
+        y0 = nhjax.State(y0.q, y0.v, y0.p, jnp.zeros(0))
+        sol = nhjax.integrate(
+            system, nhjax.LobattoIIIAB(2), y0, dt=0.1, num_steps=4, adjoint=adjoint
+        )
+        return jnp.sum(sol.ys.q)
+
+    assert jax.grad(loss)(0.1) < 0
+
+
+# What cannot be -----------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("options", "reason"),
+    [
+        ({"saveat": SaveAt(steps=2, t1=True)}, r"`SaveAt\(steps=...\)` depends on it"),
+        ({"saveat": SaveAt(dense=True)}, r"`SaveAt\(dense=True\)` depends on it"),
+        ({"saveat": SaveAt(ts=[0.1])}, r"`SaveAt\(ts=...\)` depends on it"),
+        ({"progress_meter": nhjax.TextProgressMeter()}, "`progress_meter` depends on"),
+    ],
+)
+def test_a_length_on_which_the_output_depends_must_be_known(options, reason):
+    for number in (jnp.asarray(4), np.asarray(4)):
+        with pytest.raises(TypeError, match=f"known when tracing.*because.*{reason}"):
+            run(number, **options)
+    with pytest.raises(TypeError, match=f"known when tracing.*because.*{reason}"):
+        jax.jit(lambda n: run(n, **options).t1)(4)
+
+
+@pytest.mark.parametrize(
+    ("num_steps", "exception", "message"),
+    [
+        (jnp.asarray(4.0), TypeError, "must be an int, or an integer array.*float64"),
+        (jnp.asarray(True), TypeError, "must be an int, or an integer array.*bool"),
+        (jnp.array([4]), nhjax.ShapeError, r"shape \(1,\), but a scalar.*jax.vmap"),
+        (jnp.asarray(0), ValueError, "must be in 1.*, got 0"),
+        (np.asarray(-3), ValueError, "must be in 1.*, got -3"),
+        (jnp.asarray(2**31), ValueError, "must be in 1.*, got 2147483648"),
+        ("4", TypeError, "must be an int, or an integer array.*got '4' of type str"),
+    ],
+)
+def test_lengths_that_are_none(num_steps, exception, message):
+    with pytest.raises(exception, match=f"`num_steps` .*{message}"):
+        run(num_steps)
+
+
+@pytest.mark.parametrize("num_steps", [0, -1, 2**31])
+def test_lengths_that_are_none_at_run_time(num_steps):
+    with pytest.raises((RuntimeError, ValueError), match="`num_steps` must be in 1"):
+        jax.block_until_ready(jax.jit(lambda n: run(n).ys.q)(num_steps))

@@ -1,0 +1,1 @@
+"""What tests compare with, and the systems, runs and figures that several share."""

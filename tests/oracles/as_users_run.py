@@ -1,0 +1,232 @@
+"""Every feature in brief, as a program of its own: each prints its name if it holds."""
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+
+
+jax.config.update("jax_enable_x64", True)
+
+import jax.numpy as jnp  # noqa: E402
+import numpy as np  # noqa: E402
+
+import nhjax  # noqa: E402
+from nhjax import LobattoIIIAB, SaveAt, systems  # noqa: E402
+
+
+PARTICLE = systems.NonholonomicParticle()
+DT, STEPS = 0.1, 10
+TWO = LobattoIIIAB(2)
+FEATURES: dict[str, Callable[[], None]] = {}
+
+
+def feature(function: Callable[[], None]) -> Callable[[], None]:
+    """A feature that is tested under the name of its function."""
+    FEATURES[function.__name__] = function
+    return function
+
+
+def close(got, expected, atol=1e-12):
+    """Compare trees."""
+    pairs = zip(jax.tree.leaves(got), jax.tree.leaves(expected), strict=True)
+    for x, y in pairs:
+        np.testing.assert_allclose(x, y, rtol=0, atol=atol)
+
+
+def run(example: Any = PARTICLE, method: Any = None, **options: Any) -> nhjax.Solution:
+    """A few steps from the state of an example."""
+    arguments: dict[str, Any] = {"y0": example.initial_state(), "dt": DT}
+    arguments |= {"num_steps": STEPS} | options
+    system = arguments.pop("system", example.system)
+    return nhjax.integrate(system, method or LobattoIIIAB(4), **arguments)
+
+
+def assert_exact(example, sol, atol=1e-7):
+    """Compare the end of a run with the exact solution; constraints hold."""
+    q, v, _ = example.exact(DT * STEPS)
+    close(jax.tree.map(lambda x: x[-1], (sol.ys.q, sol.ys.v)), (q, v), atol)
+    assert float(sol.stats["max_constraint_violation"]) < 1e-13
+    assert sol.result == nhjax.RESULTS.successful
+
+
+def of_dt(adjoint=None):
+    """A scalar function of the step size."""
+
+    def loss(dt):
+        options = {} if adjoint is None else {"adjoint": adjoint}
+        return jnp.sum(jnp.sin(run(method=TWO, dt=dt, **options).ys.q))
+
+    return loss
+
+
+@feature
+def propagated_closure():
+    assert_exact(PARTICLE, run(method=LobattoIIIAB(4, "propagated")))
+
+
+@feature
+def consistent_closure():
+    assert_exact(PARTICLE, run(method=LobattoIIIAB(4, "consistent")))
+
+
+@feature
+def symmetric_closure():
+    assert_exact(PARTICLE, run())
+
+
+@feature
+def newtons_method():
+    close(run(stage_solver=nhjax.Newton()).ys, run().ys)
+
+
+@feature
+def gauss_without_constraints():
+    oscillator = systems.HarmonicOscillator()
+    assert_exact(oscillator, run(oscillator, nhjax.Gauss(4)))
+
+
+@feature
+def a_constraint_nonlinear_in_velocities():
+    appell = systems.Appell()
+    assert_exact(appell, run(appell))
+
+
+@feature
+def holonomic_constraints():
+    pendulum = systems.SphericalPendulum()
+    assert_exact(pendulum, run(pendulum))
+
+
+@feature
+def both_kinds_of_constraints():
+    sleigh = systems.RodSleigh()
+    assert_exact(sleigh, run(sleigh))
+
+
+@feature
+def a_hamiltonian_system():
+    pendulum = systems.SphericalPendulum()
+    system = nhjax.HamiltonianSystem(
+        lambda t, q, p, args: 0.5 * p @ p + q[2], holonomic=pendulum.holonomic
+    )
+    y0 = nhjax.initial_state(system, pendulum.q0, p=pendulum.v0)
+    assert_exact(pendulum, run(pendulum, system=system, y0=y0))
+
+
+@feature
+def a_group():
+    suslov = systems.Suslov()
+    assert_exact(suslov, run(suslov), 1e-6)
+
+
+@feature
+def a_product_of_groups():
+    ball = systems.TurntableBall(retraction=nhjax.Exponential())
+    assert_exact(ball, run(ball), 1e-6)
+
+
+@feature
+def a_projected_start():
+    q = PARTICLE.q0 + 0.1
+    y = nhjax.initial_state(PARTICLE.system, q, PARTICLE.v0, project=True)
+    assert abs(float(PARTICLE.constraint(0.0, y.q, y.v, None))) < 1e-14
+
+
+@feature
+def time_force_and_args():
+    system = nhjax.LagrangianSystem(
+        lambda t, q, v, args: 0.5 * v @ v,
+        nonholonomic=lambda t, q, v, args: v[1] - jnp.cos(t),
+        force=lambda t, q, v, args: -args["friction"] * v,
+    )
+    args = {"friction": 0.5}
+    y0 = nhjax.initial_state(system, jnp.zeros(2), jnp.ones(2), args=args)
+    sol = run(system=system, y0=y0, args=args)
+    close(sol.ys.v[-1], jnp.array([np.exp(-0.5), np.cos(1.0)]), 1e-9)
+
+
+@feature
+def dense_output_and_samples():
+    ts = jnp.array([0.05, 0.33, 1.0])
+    dense = jax.vmap(run(saveat=SaveAt(dense=True)).evaluate)(ts)
+    sampled = run(saveat=SaveAt(ts=ts)).ys
+    close(sampled, dense)
+    close(dense.q[1], PARTICLE.exact(0.33)[0], 1e-5)
+
+
+@feature
+def saved_functions():
+    system = PARTICLE.system
+    saveat = SaveAt(
+        t0=True, steps=2, t1=True, fn=lambda t, y, args: system.energy(t, y)
+    )
+    energies = run(saveat=saveat).ys
+    assert energies.shape == (6,)
+    close(energies, jnp.full(6, energies[0]), 1e-5)
+
+
+@feature
+def batches():
+    dts = jnp.array([0.1, 0.05, -0.1])
+    batch = jax.jit(jax.vmap(lambda dt: run(dt=dt).ys))(dts)
+    close(jax.tree.map(lambda x: x[0], batch), run().ys)
+
+
+@feature
+def gradients_and_forward_mode():
+    loss = of_dt(nhjax.DirectAdjoint())
+    gradient = jax.jit(jax.grad(loss))(DT)
+    _, rate = jax.jit(lambda x: jax.jvp(loss, (x,), (1.0,)))(DT)
+    close(gradient, rate, 1e-11)
+    close(gradient, (loss(DT + 1e-5) - loss(DT - 1e-5)) / 2e-5, 1e-7)
+
+
+@feature
+def gradients_of_a_batch_by_the_reversible_adjoint():
+    loss, dts = of_dt(nhjax.ReversibleAdjoint()), jnp.array([DT, 0.5 * DT])
+    batch = jax.jit(jax.vmap(jax.grad(loss)))(dts)
+    expected = [(loss(dt + 1e-5) - loss(dt - 1e-5)) / 2e-5 for dt in dts]
+    close(batch, jnp.stack(expected), 1e-7)
+
+
+@feature
+def gradients_on_a_group_by_checkpoints():
+    suslov, adjoint = systems.Suslov(), nhjax.RecursiveCheckpointAdjoint()
+
+    def loss(dt):
+        return jnp.sum(jnp.sin(run(suslov, TWO, dt=dt, adjoint=adjoint).ys.q))
+
+    gradient = jax.jit(jax.grad(loss))(DT)
+    close(gradient, (loss(DT + 1e-5) - loss(DT - 1e-5)) / 2e-5, 1e-7)
+
+
+@feature
+def single_precision():
+    sol = run(y0=PARTICLE.initial_state(jnp.float32))
+    assert sol.ys.q.dtype == jnp.float32
+    close(sol.ys.q[-1].astype(float), PARTICLE.exact(1.0)[0], 1e-5)
+
+
+@feature
+def a_failure_is_told():
+    y0 = PARTICLE.initial_state()
+    wrong = nhjax.State(y0.q, y0.v + 1.0, y0.p, y0.multiplier)
+    sol = run(y0=wrong, throw=False)
+    assert sol.result == nhjax.RESULTS.inconsistent_start
+    try:
+        jax.block_until_ready(jax.jit(lambda y0: run(y0=y0).ys.q)(wrong))
+    except RuntimeError as error:
+        assert "step 0: The initial state violates" in str(error)  # noqa: PT017
+    else:
+        raise AssertionError("nothing was raised")
+
+
+if __name__ == "__main__":
+    for name, function in FEATURES.items():
+        try:
+            function()
+        except Exception as error:
+            print(f"{name}: {type(error).__name__}: {error}".replace("\n", " "))
+        else:
+            print(name, flush=True)

@@ -1,0 +1,34 @@
+"""Running the notebooks of the repository."""
+
+from pathlib import Path
+
+import nbformat
+import pytest
+from nbclient import NotebookClient
+
+
+NOTEBOOKS = {
+    path.stem: path
+    for path in sorted((Path(__file__).parents[2] / "notebooks").glob("*.ipynb"))
+}
+# Those whose results are compared with the truth.
+FITS = {"fitting", "learning_potential", "steering_unicycle"}
+
+
+def run_notebook(name: str, folder: Path) -> list:
+    """The outputs of the notebook `name`, at small size, run in `folder`."""
+    notebook = nbformat.read(NOTEBOOKS[name], as_version=4)
+    for cell in notebook.cells:
+        assert not cell.get("outputs"), "clear the outputs before storing a notebook"
+    resources = {"metadata": {"path": str(folder)}}
+    with pytest.MonkeyPatch.context() as environment:
+        environment.setenv("NHJAX_SMALL", "1")
+        # As readers run them: the tests' own flags make other programs.
+        environment.delenv("XLA_FLAGS", raising=False)
+        # The kernel chooses the backend that puts figures into the notebook.
+        environment.delenv("MPLBACKEND", raising=False)
+        NotebookClient(notebook, timeout=300, resources=resources).execute()
+    outputs = [out for cell in notebook.cells for out in cell.get("outputs", [])]
+    kinds = {mime for out in outputs for mime in out.get("data", {})}
+    assert "image/png" in kinds
+    return outputs

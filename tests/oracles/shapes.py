@@ -1,0 +1,34 @@
+"""Annotations of shapes that are checked while functions run.
+
+As a program it does so while every feature runs.
+"""
+
+import runpy
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from beartype import beartype, BeartypeConf
+from beartype.roar import BeartypeDecorHintException
+from jaxtyping import install_import_hook
+
+
+# An int is a float, as type checkers have it.
+_checked = beartype(conf=BeartypeConf(is_pep484_tower=True))
+
+
+def checked(function: Callable[..., Any]) -> Callable[..., Any]:
+    """The function with its annotations checked, where the checker knows their kind.
+
+    It knows no generic named tuples.
+    """
+    try:
+        return _checked(function)
+    except BeartypeDecorHintException:
+        return function
+
+
+if __name__ == "__main__":
+    with install_import_hook("nhjax", "shapes.checked"):
+        features = Path(__file__).with_name("as_users_run.py")
+        runpy.run_path(str(features), run_name="__main__")

@@ -1,0 +1,178 @@
+"""Every step satisfies the paper's equations, checked by an independent residual."""
+
+import numpy as np
+import pytest
+
+import nhjax
+from oracles import helpers, paper_equations as paper, paper_mechanics as mechanics
+from oracles.driven import FIELD, FRICTION
+from oracles.helpers import CLOSURES, GALLERY, recorded, SOLVERS
+
+
+TOLERANCE = 1e-14
+
+
+def parameters(example, *names):
+    """Parameters of a gallery example as Python floats."""
+    return [float(getattr(example, name)) for name in names]
+
+
+MECHANICS = {
+    "particle": mechanics.Particle(
+        *parameters(GALLERY["particle"], "mass", "stiffness")
+    ),
+    "chaotic": mechanics.Chaotic(),
+    "sleigh": mechanics.Sleigh(
+        *parameters(GALLERY["sleigh"], "mass", "inertia", "offset"),
+    ),
+    "Appell": mechanics.AppellSystem(
+        *parameters(GALLERY["Appell"], "mass", "gravity", "ratio")
+    ),
+    "rolling disc": mechanics.Disc(
+        *parameters(
+            GALLERY["rolling disc"],
+            "mass",
+            "roll_inertia",
+            "heading_inertia",
+            "radius",
+        )
+    ),
+    "driven": mechanics.Driven(FIELD, FRICTION),
+}
+SIZES = {"particle": 3, "chaotic": 7, "sleigh": 3, "Appell": 3, "rolling disc": 4}
+SIDE_BY_SIDE = (*helpers.BESIDE, "driven")
+MECHANICS["side by side"] = mechanics.SideBySide(
+    [(MECHANICS[name], SIZES.get(name, 3)) for name in SIDE_BY_SIDE]
+)
+
+
+def run_of(sol, h=helpers.RECORDED_STEP):
+    """Nodes from the saved states, stages from the records of dense output."""
+    records = sol.interpolation.records
+    return paper.Run(
+        t=np.asarray(sol.ts),
+        h=h,
+        q=np.asarray(sol.ys.q),
+        v=np.asarray(sol.ys.v),
+        p=np.asarray(sol.ys.p),
+        multiplier=np.asarray(sol.ys.multiplier),
+        V=np.asarray(records.velocity),
+        W=np.asarray(records.force),
+        Lambda=np.asarray(records.multiplier),
+    )
+
+
+def part_of(run, name):
+    """One of the systems side by side."""
+    sizes = [SIZES.get(part, 3) for part in SIDE_BY_SIDE]
+    k = SIDE_BY_SIDE.index(name)
+    at = slice(sum(sizes[:k]), sum(sizes[: k + 1]))
+    rows = slice(k, k + 1)
+    return paper.Run(
+        t=run.t,
+        h=run.h,
+        q=run.q[:, at],
+        v=run.v[:, at],
+        p=run.p[:, at],
+        multiplier=run.multiplier[:, rows],
+        V=run.V[..., at],
+        W=run.W[..., at],
+        Lambda=run.Lambda[..., rows],
+    )
+
+
+def assert_equations_hold(name, run, closure):
+    for equation, residual in paper.residuals(MECHANICS[name], run, closure).items():
+        assert residual <= TOLERANCE, f"{name}: {equation}: {residual:.1e}"
+
+
+every_closure = pytest.mark.parametrize("closure", CLOSURES)
+every_solver = pytest.mark.parametrize("solver", SOLVERS)
+
+
+@every_closure
+@every_solver
+@pytest.mark.parametrize("stages", [2, 3, 4, 5])
+def test_every_equation_of_the_paper_holds_to_round_off(stages, solver, closure):
+    run = run_of(recorded("side by side", stages, closure, solver))
+    for name in SIDE_BY_SIDE:
+        assert_equations_hold(name, part_of(run, name), closure)
+
+
+@pytest.mark.parametrize(
+    ("name", "closure"),
+    [
+        *((name, closure) for name in ("particle", "sleigh") for closure in CLOSURES),
+        ("chaotic", "symmetric"),
+        ("Appell", "symmetric"),
+        ("rolling disc", "symmetric"),
+        ("driven", "symmetric"),
+    ],
+)
+def test_every_equation_of_the_paper_holds_for_a_system_on_its_own(name, closure):
+    run = run_of(recorded(name, 3, closure, "simplified"))
+    assert_equations_hold(name, run, closure)
+
+
+def test_the_equations_hold_backwards_from_a_later_time():
+    system, y0, args = helpers.problem("driven")
+    later = nhjax.initial_state(system, y0.q, y0.v, t=0.7, args=args, project=True)
+    sol = helpers.integrate_recorded(
+        "driven", 3, "symmetric", "simplified", later, dt=-0.08, t0=0.7
+    )
+    assert_equations_hold("driven", run_of(sol, h=-0.08), "symmetric")
+
+
+def test_the_equations_hold_for_large_steps():
+    start = helpers.problem("side by side")[1]
+    sol = helpers.integrate_recorded(
+        "side by side", 4, "symmetric", "dense", start, dt=0.4
+    )
+    for name in ("particle", "chaotic", "sleigh"):
+        assert_equations_hold(name, part_of(run_of(sol, h=0.4), name), "symmetric")
+
+
+@every_closure
+def test_records_start_at_the_saved_nodes(closure):
+    sol = recorded("sleigh", 3, closure, "simplified")
+    assert sol.interpolation is not None
+    starts = sol.interpolation.records.start
+    for name in ("q", "v", "p", "multiplier"):
+        nodes = getattr(sol.ys, name)
+        np.testing.assert_array_equal(getattr(starts, name), nodes[:-1], err_msg=name)
+
+
+@every_closure
+@pytest.mark.parametrize("array", ["q", "v", "p", "multiplier", "V", "W", "Lambda"])
+def test_the_residuals_see_an_error_in_each_array(array, closure):
+    run = run_of(recorded("particle", 3, closure, "simplified"))
+    wrong = run.perturbed(array, 1e-11)
+    assert max(paper.residuals(MECHANICS["particle"], wrong, closure).values()) > 1e-13
+
+
+def test_the_residuals_tell_the_closures_apart():
+    runs = {c: run_of(recorded("sleigh", 3, c, "simplified")) for c in CLOSURES}
+    for taken in CLOSURES:
+        for claimed in CLOSURES:
+            found = paper.residuals(MECHANICS["sleigh"], runs[taken], claimed)
+            assert (max(found.values()) <= TOLERANCE) == (taken == claimed)
+
+
+def test_coefficients_from_the_definitions_are_the_published_ones():
+    # Hairer, Lubich and Wanner, "Geometric Numerical Integration", tables II.1.1, 1.2.
+    a = [[0, 0, 0], [5 / 24, 1 / 3, -1 / 24], [1 / 6, 2 / 3, 1 / 6]]
+    a_hat = [[1 / 6, -1 / 6, 0], [1 / 6, 1 / 3, 0], [1 / 6, 5 / 6, 0]]
+    pair = paper.lobatto(3)
+    np.testing.assert_allclose(pair.a, a, rtol=0, atol=3e-16)
+    np.testing.assert_allclose(pair.a_hat, a_hat, rtol=0, atol=3e-16)
+    np.testing.assert_allclose(paper.lobatto(2).a, [[0, 0], [0.5, 0.5]], atol=3e-16)
+    np.testing.assert_allclose(paper.lobatto(2).a_hat, [[0.5, 0], [0.5, 0]], atol=3e-16)
+
+
+@pytest.mark.parametrize("stages", range(2, 8))
+def test_coefficients_of_the_library_are_those_of_the_definitions(stages):
+    pair, method = paper.lobatto(stages), nhjax.LobattoIIIAB(stages)
+    for name in ("a", "a_hat", "b", "c"):
+        np.testing.assert_allclose(
+            getattr(method, name), getattr(pair, name), rtol=0, atol=1e-15, err_msg=name
+        )

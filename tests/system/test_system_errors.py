@@ -1,0 +1,105 @@
+"""Mistakes in the functions of a system name the function and its arguments."""
+
+import functools
+
+import equinox as eqx
+import jax
+import pytest
+
+import nhjax
+from oracles.mistakes import (
+    kinetic,
+    start,
+    system_with,
+)
+
+
+# LagrangianSystem, methods, solvers ---------------------------------------------------
+
+
+@pytest.mark.parametrize("name", ["lagrangian", "nonholonomic", "force"])
+def test_functions_must_be_functions(name):
+    with pytest.raises(TypeError, match=rf"`{name}`.*\(t, q, v, args\), got 3"):
+        system_with(**{name: 3})
+
+
+class Methods(eqx.Module):
+    """A function of a system may be a method, or the module itself."""
+
+    def short(self, t, q, v):
+        return 0.5 * v @ v
+
+    def __call__(self, t, q, v, args, more):
+        return 0.5 * v @ v
+
+
+@pytest.mark.parametrize(
+    ("name", "function", "message"),
+    [
+        ("lagrangian", lambda t, q, v: 0.5 * v @ v, r"\(t, q, v, args\).*\(t, q, v\)`"),
+        (
+            "nonholonomic",
+            lambda t, q, args: q,
+            r"\(t, q, v, args\), but `<lambda>\(t, q, args\)`",
+        ),
+        (
+            "holonomic",
+            lambda t, q, v, a: q @ q,
+            r"\(t, q, args\), but `<lambda>\(t, q, v, a\)` does not",
+        ),
+        ("force", lambda v: v, r"\(t, q, v, args\), but `<lambda>\(v\)` does not"),
+        ("force", jax.jit(lambda t, q, v: v), r".*but `<lambda>\(t, q, v\)` does not"),
+        ("lagrangian", Methods().short, r".*but `short\(t, q, v\)` does not"),
+        ("lagrangian", Methods(), r".*but `Methods\(t, q, v, args, more\)` does not"),
+        (
+            "force",
+            lambda t, q, v, args, *, gain: v,
+            r".*but `<lambda>\(t, q, v, args, \*, gain\)` does not",
+        ),
+    ],
+)
+def test_functions_must_take_the_arguments_they_are_called_with(
+    name, function, message
+):
+    with pytest.raises(
+        TypeError, match=rf"LagrangianSystem: `{name}` must take {message}"
+    ):
+        system_with(**{name: function})
+
+
+def test_functions_of_momenta_must_take_the_arguments_they_are_called_with():
+    message = (
+        r"HamiltonianSystem: `hamiltonian` must take \(t, q, p, args\), but .*p\)`"
+    )
+    with pytest.raises(TypeError, match=message):
+        nhjax.HamiltonianSystem(lambda t, q, p: 0.5 * p @ p)  # pyright: ignore
+
+
+def test_functions_whose_arguments_cannot_be_known_are_accepted():
+    def without_args(function):
+        @functools.wraps(function)
+        def called(t, q, v, args):
+            return function(t, q, v)
+
+        return called
+
+    for lagrangian in (
+        without_args(lambda t, q, v: 0.5 * v @ v),
+        functools.partial(lambda mass, t, q, v, args: mass * v @ v, 2.0),
+        lambda *anything: kinetic(*anything),
+        max,
+    ):
+        system_with(lagrangian=lagrangian)
+
+
+def test_an_error_inside_a_function_is_its_own():
+    def lagrangian(t, q, v, args):
+        return kinetic(t, q, v)  # pyright: ignore[reportCallIssue]
+
+    with pytest.raises(TypeError, match=r"^kinetic\(\) missing 1 required positional"):
+        start(system_with(lagrangian=lagrangian))
+
+
+def test_manifold_must_be_one():
+    with pytest.raises(TypeError, match=r"`manifold`.*nhjax\.Euclidean\(3\), got 3"):
+        system_with(manifold=3)
