@@ -4,9 +4,9 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Int
+from jaxtyping import Array, Bool, Float, Int
 
-from .._custom_types import Args, BoolScalar, FloatScalar, FloatScalarLike
+from .._custom_types import Args, FloatScalar, FloatScalarLike
 from .._errors import Check, require
 from .._method import AbstractMethod
 from .._numerics import max_norm, root
@@ -114,8 +114,8 @@ def _outside(
 
 
 def step_position(
-    t: Array, t0: FloatScalar, dt: FloatScalar, num_steps: int
-) -> tuple[Array, BoolScalar]:
+    t: Float[Array, "*k"], t0: FloatScalar, dt: FloatScalar, num_steps: int
+) -> tuple[Float[Array, "*k"], Bool[Array, "*k"]]:
     """Convert times to units of steps; tell which lie in the run, up to round-off."""
     position = (t - t0) / dt
     # The times themselves are rounded, by an error in proportion to the largest of

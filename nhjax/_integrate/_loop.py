@@ -42,4 +42,12 @@ class Loop(eqx.Module):
     def empty_rows(self, carry: Carry) -> Rows:
         """Make buffers of zeros for all rows that the run saves."""
         k = jnp.zeros((), jnp.int32)
-        return self.saving.empty(jax.eval_shape(lambda: self.step(carry, k)[1]))
+
+        def row() -> Rows:
+            if self.saving.num_records:
+                return self.step(carry, k)[1]
+            # A step is dear to trace, and its shapes matter to dense output alone.
+            t, args = self.stepping.time(k), self.stepping.args
+            return self.saving.rows(t, carry.step_state.state, args, None, k)
+
+        return self.saving.empty(jax.eval_shape(row))

@@ -33,7 +33,7 @@ class RecordPlaces(NamedTuple):
     """
 
     number: int
-    slots: Int[Array, " num_steps+1"] | None
+    slots: Int[Array, " nodes"] | None
 
 
 def record_places(
@@ -67,14 +67,19 @@ class Saving(eqx.Module):
     stride: int = eqx.field(static=True)
     num_saved: int = eqx.field(static=True)
     num_records: int = eqx.field(static=True)
-    record_slots: Int[Array, " num_steps+1"] | None
+    record_slots: Int[Array, " nodes"] | None
 
     def saved(self, t: FloatScalar, y: State, args: Args) -> PyTree[Array]:
         """Compute the entry that is saved of a state: its time, and `fn` at it."""
         return t, jax.tree.map(jnp.asarray, self.fn(t, y, args))
 
     def rows(
-        self, t: FloatScalar, y: State, args: Args, taken: Taken, k: Int[Array, ""]
+        self,
+        t: FloatScalar,
+        y: State,
+        args: Args,
+        taken: Taken | None,
+        k: Int[Array, ""],
     ) -> Rows:
         """Compute the rows that step k saves, which leads to the state y at t."""
         return Rows(self._state_row(t, y, args, k), self._record_row(taken))
@@ -92,8 +97,8 @@ class Saving(eqx.Module):
         )
         return jax.lax.cond(self._slot(k) < self.num_saved, save, lambda: nothing)
 
-    def _record_row(self, taken: Taken) -> StepRecord | None:
-        if not self.num_records:
+    def _record_row(self, taken: Taken | None) -> StepRecord | None:
+        if taken is None or not self.num_records:
             return None
         # After a failure the records are those of a system at rest, so that dense
         # output stays at the last good state.

@@ -53,8 +53,8 @@ class LeadingStructure(eqx.Module):
         self,
         stages: StageSystem,
         x: Stages,
-        kinematic: Float[Array, "r m"],
-        holonomic: Float[Array, "s k"],
+        kinematic: Float[Array, "r m"] | Float[Array, "0"],
+        holonomic: Float[Array, "s k"] | Float[Array, "0"],
     ) -> Stages:
         """Change the free multipliers so that the linearised constraints hold."""
         residual = jnp.concatenate([kinematic.reshape(-1), holonomic.reshape(-1)])
@@ -122,9 +122,7 @@ def leading_structure(
     )
 
 
-def _schur(
-    stages: StageSystem, blocks: Float[Array, "s-1 s l l"]
-) -> Float[Array, "c c"]:
+def _schur(stages: StageSystem, blocks: Float[Array, "r s l l"]) -> Float[Array, "c c"]:
     """Assemble the derivative of the constraints by h δy and h δΛ.
 
     `blocks` are the products B_i K⁻¹ B_jᵀ for i >= 2 and all j.

@@ -97,7 +97,7 @@ def holonomic_constraint(stages: StageSystem, x: Stages) -> Float[Array, "s k"]:
     return jnp.concatenate([on_positions / stages.h, tangency[None]])
 
 
-def constraint_jacobian(stages: StageSystem, x: Stages) -> Float[Array, "s-1 l n"]:
+def constraint_jacobian(stages: StageSystem, x: Stages) -> Float[Array, "r l n"]:
     """Compute B = ∂Φ/∂u of all constraints on velocities at the nodes i >= 2."""
     times, fibre = stages.stage_times[1:], x.node_fibre_coordinate
     if not stages.num_nonholonomic:

@@ -148,7 +148,7 @@ class StageSystem(eqx.Module):
         return change
 
     def free_multipliers(
-        self, closure: Float[Array, "s-1 m"], holonomic: Float[Array, "s k"]
+        self, closure: Float[Array, "c m"], holonomic: Float[Array, "s k"]
     ) -> Float[Array, "s l"]:
         """Join the nonholonomic multipliers E y and the holonomic multipliers."""
         if not self.num_nonholonomic:

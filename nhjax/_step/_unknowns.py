@@ -24,12 +24,12 @@ class Stages(eqx.Module):
     """
 
     velocity: Float[Array, "s n"]
-    momentum: Float[Array, "s n"]
+    momentum: Float[Array, "s p"]
     node_fibre_coordinate: Float[Array, "r n"]
-    closure: Float[Array, "s-1 m"]
+    closure: Float[Array, "c m"]
     holonomic: Float[Array, "s k"]
-    end_acceleration: Float[Array, " n"]
-    end_multiplier: Float[Array, " l"]
+    end_acceleration: Float[Array, " a"]
+    end_multiplier: Float[Array, " e"]
 
 
 class StageForces(NamedTuple):

@@ -101,7 +101,7 @@ def integral(
     edges = np.linspace(0.0, t, panels + 1)
     half_width = 0.5 * t / panels
     times = 0.5 * (edges[1:] + edges[:-1])[:, None] + half_width * NODES
-    return half_width * np.sum(integrand(times) * WEIGHTS, axis=(-2, -1))
+    return np.asarray(half_width * np.sum(integrand(times) * WEIGHTS, axis=(-2, -1)))
 
 
 class AbstractExample(eqx.Module):

@@ -146,10 +146,11 @@ def test_projection_reaches_positions_and_velocities(kind):
         system = nhjax.HamiltonianSystem(
             lambda t, q, p, args: 0.5 * p @ p + q[2], holonomic=PENDULUM.holonomic
         )
-    given = {name: jnp.array([0.5, 0.1, 0.7])}
-    y = nhjax.initial_state(system, 1.3 * PENDULUM.q0, project=True, **given)
+    u = jnp.array([0.5, 0.1, 0.7])
+    v, p = (u, None) if name == "v" else (None, u)
+    y = nhjax.initial_state(system, 1.3 * PENDULUM.q0, v, p, project=True)
     np.testing.assert_allclose(y.q, PENDULUM.q0, atol=1e-15)
-    expected = given[name] - (given[name] @ PENDULUM.q0) * PENDULUM.q0
+    expected = u - (u @ PENDULUM.q0) * PENDULUM.q0
     np.testing.assert_allclose(getattr(y, name), expected, atol=1e-15)
     assert np.max(np.abs(system.constraint_violation(0.0, y))) < 1e-15
 
