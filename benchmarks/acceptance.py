@@ -17,6 +17,7 @@ count by what they do in a step: |u̇| is at least |u| / h.
 """
 
 import argparse
+import json
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -39,7 +40,7 @@ from nhjax._system import position_scale, violation_scale
 
 from ._bicycle import bicycle
 from ._random_systems import random_systems
-from ._report import markdown_table, number, write
+from ._report import markdown_table, number, RESULTS, write
 
 
 SMALLEST, LARGEST, SIZES = 0.004, 4.0, 10
@@ -355,6 +356,11 @@ def main() -> None:
     parser.add_argument("--stages", type=int, nargs="+", default=[2, 3, 4, 5, 6])
     parser.add_argument("--num-steps", type=int, default=200, help="of each size")
     parser.add_argument("--starts", type=int, default=3000, help="of steep systems")
+    parser.add_argument(
+        "--keep",
+        action="store_true",
+        help="keep the rows of the saved table that are not measured now",
+    )
     options = parser.parse_args()
     jax.config.update("jax_enable_x64", True)
     # The programs run for seconds and would be optimised for minutes.
@@ -378,6 +384,8 @@ def main() -> None:
             for stages in options.stages:
                 data.append(measure_starts(name, stages, options.starts))
                 print(data[-1], flush=True)
+    if options.keep:
+        data = with_saved(data)
     rows = []
     for row in data:
         figures = [row[key] for key in COLUMNS.values()]
@@ -387,6 +395,14 @@ def main() -> None:
     text = "\n\n".join([(__doc__ or "").strip(), summary(data)])
     text += "\n\n" + markdown_table(header, rows)
     write("acceptance", "Are accepted steps solved?", text, {"rows": data})
+
+
+def with_saved(data: list[dict]) -> list[dict]:
+    """The rows, after those of the saved table of other systems or stages."""
+    measured = {(row["system"], row["stages"]) for row in data}
+    saved = json.loads((RESULTS / "acceptance.json").read_text())["rows"]
+    others = [row for row in saved if (row["system"], row["stages"]) not in measured]
+    return others + data
 
 
 def summary(data: list[dict]) -> str:

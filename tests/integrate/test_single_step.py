@@ -67,6 +67,17 @@ def test_a_scan_over_steps_has_the_gradient_of_integrate():
     assert abs(values[0][1]) > 1e-2
 
 
+def test_forward_and_reverse_mode_agree():
+    particle = SYSTEMS["nonholonomic"]
+    system, y0 = particle.system, particle.initial_state()
+
+    def end(h):
+        return nhjax.step(system, LobattoIIIAB(2), 0.0, h, y0).p
+
+    forward, reverse = (mode(end)(H) for mode in (jax.jacfwd, jax.jacrev))
+    np.testing.assert_allclose(forward, reverse, rtol=1e-12)
+
+
 def test_members_of_a_batch_step_on_their_own():
     system, y0 = SYSTEMS["nonholonomic"].system, SYSTEMS["nonholonomic"].initial_state()
     sizes = jnp.array([0.05, 0.1, -0.1])
