@@ -157,29 +157,6 @@ def is_symmetric(t: Tableau) -> bool:
     )
 
 
-def is_symplectic_pair(t: Tableau, a_hat: Matrix) -> bool:
-    """Tell whether b_i â_ij + b_j a_ji = b_i b_j, so that the pair is symplectic.
-
-    See Hairer, Lubich, Wanner, VI.4.1.
-
-    **Arguments:**
-
-    - `t`: the tableau (a, b).
-    - `a_hat`: the coefficients of the other method, an s x s mp matrix; its weights are
-        those of `t`.
-
-    **Returns:**
-
-    A bool.
-    """
-    s, a, b = t.stages, t.mp_a, t.mp_b
-    return all(
-        abs(b[i] * a_hat[i, j] + b[j] * a[j, i] - b[i] * b[j]) <= t.tolerance
-        for i in range(s)
-        for j in range(s)
-    )
-
-
 @lru_cache(maxsize=128)
 def stability_at_infinity(t: Tableau) -> float:
     """Compute R_A(∞), the limit of the stability function of a tableau as z → ∞.

@@ -12,7 +12,6 @@ import numpy as np
 import pytest
 
 from nhjax._method import AbstractMethod, Gauss, LobattoIIIAB, PartitionedRungeKutta
-from nhjax._method._conditions import is_symplectic_pair
 from nhjax._method._tableau import gauss_tableau, lobatto_tableau
 from oracles.tableaux import (
     assert_holds_exactly_up_to,
@@ -22,6 +21,7 @@ from oracles.tableaux import (
     exact,
     EXPLICIT_EULER,
     IMPLICIT_EULER,
+    is_symplectic_pair,
     mixed_defect,
     RADAU_IIA,
     RK4,

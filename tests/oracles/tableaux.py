@@ -5,10 +5,12 @@ Of the float64 coefficients, so that the only error in them is their own roundin
 
 from collections.abc import Callable
 from fractions import Fraction
+from typing import Any
 
 import numpy as np
 
 from nhjax._method import PartitionedRungeKutta
+from nhjax._method._tableau import Tableau
 
 
 STAGES = range(2, 9)
@@ -72,3 +74,16 @@ def assert_holds_exactly_up_to(
     for k in range(first, order + 1):
         assert defect(k) <= TWO_ULP, k
     assert defect(order + 1) > 2**10 * TWO_ULP
+
+
+def is_symplectic_pair(t: Tableau, a_hat: Any) -> bool:
+    """Whether b_i â_ij + b_j a_ji = b_i b_j (Hairer, Lubich, Wanner, VI.4.1).
+
+    `a_hat` is the mp matrix of the other method, whose weights are those of `t`.
+    """
+    s, a, b = t.stages, t.mp_a, t.mp_b
+    return all(
+        abs(b[i] * a_hat[i, j] + b[j] * a[j, i] - b[i] * b[j]) <= t.tolerance
+        for i in range(s)
+        for j in range(s)
+    )
