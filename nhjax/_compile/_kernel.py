@@ -87,8 +87,7 @@ _kernel.multiple_results = True
 @_kernel.def_impl
 def _run(*operands, program):
     if jax.config.jax_disable_jit:  # pyright: ignore[reportAttributeAccessIssue]
-        # `jax.jit` would call this very rule again. A kernel comes here all the same if
-        # it was traced before.
+        # A kernel that was traced before. `jax.jit` would call this very rule again.
         return jax.extend.core.jaxpr_as_fun(program)(*operands)
     return jax.jit(lambda *x: _kernel.bind(*x, program=program))(*operands)
 

@@ -67,7 +67,7 @@ def solved_runs(stages, closure):
 
 @cache
 def solved_errors(part, stages, closure):
-    """Errors of q, v, p, `ys.multiplier` and `continuous_multiplier` by number of steps."""
+    """Errors of q, v, p, and of both multipliers, by number of steps."""
     example, at, row = PARTS[part]
     errors = {}
     for ts, y, continuous in solved_runs(stages, closure):
