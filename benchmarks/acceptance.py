@@ -384,8 +384,11 @@ def main() -> None:
             for stages in options.stages:
                 data.append(measure_starts(name, stages, options.starts))
                 print(data[-1], flush=True)
-    if options.keep:
-        data = with_saved(data)
+    save(with_saved(data) if options.keep else data)
+
+
+def save(data: list[dict]) -> None:
+    """Print and save the table of all rows."""
     rows = []
     for row in data:
         figures = [row[key] for key in COLUMNS.values()]
