@@ -1,14 +1,19 @@
-from collections.abc import Callable
-from typing import NamedTuple
-
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PyTree
 
 from .._compile import tracked_jit
-from .._custom_types import Args, BoolScalar, FloatScalar, FloatScalarLike
+from .._custom_types import Args, BoolScalar, FloatScalarLike
 from .._errors import DTypeError, require, ShapeError
-from .._numerics import conditioning, inverse, max_norm, Rank, root, those_that_count
+from .._numerics import (
+    conditioning,
+    inverse,
+    max_norm,
+    nan_unless,
+    Rank,
+    root,
+    those_that_count,
+)
 from .._system import (
     AbstractMechanicalSystem,
     all_finite,
@@ -26,10 +31,10 @@ from .._system import (
     real_scalar,
     require_manifold,
     State,
-    velocity_scale,
     violation_scale,
 )
 from ._checks import Found, judged
+from ._projection import project_fibre_coordinate, project_position
 
 
 def initial_state(
@@ -108,7 +113,7 @@ def initial_state(
     if throw:
         return require(found.state, *checks)
     good = jnp.all(jnp.stack([jnp.asarray(check.ok) for check in inputs + checks]))
-    return jax.tree.map(lambda x: jnp.where(good, x, jnp.nan), found.state)
+    return nan_unless(good, found.state)
 
 
 @tracked_jit("system", "args")
@@ -127,14 +132,14 @@ def _solve(system, t, q, v, p, args, project: bool) -> Found:
         if system.holonomic is not None:
             guess = given if is_fibre else jnp.zeros_like(given)
             start = q
-            nearest = _project_position(system, t, q, guess, args)
+            nearest = project_position(system, t, q, guess, args)
             q, projected = manifold.act(q, nearest.x), nearest.found
             starts.append(Rank(nearest.jacobian, start, ~projected))
     u = given
     if not is_fibre:
         u, legendre_solved = _inverse_legendre(system, t, q, given, args)
     if project and (system.nonholonomic is not None or system.holonomic is not None):
-        nearest = _project_fibre(system, t, q, u, args)
+        nearest = project_fibre_coordinate(system, t, q, u, args)
         starts.append(Rank(nearest.jacobian, q, projected & ~nearest.found))
         u, projected = nearest.x, projected & nearest.found
     lin = linearise(system, t, q, u, args)
@@ -180,90 +185,6 @@ def _inverse_legendre(
         jnp.where(jnp.isfinite(scale), scale, 0),
     )
     return solved.x, solved.converged
-
-
-class _Nearest(NamedTuple):
-    """The result of a search for the nearest point on a constraint.
-
-    - `x`: the point at which the search ended.
-    - `found`: whether it is a solution.
-    - `jacobian`: the Jacobian of the constraint where the search started.
-    """
-
-    x: Float[Array, " n"]
-    found: BoolScalar
-    jacobian: Float[Array, "m n"]
-
-
-def _project_position(system, t, q, u, args) -> _Nearest:
-    """Project q onto Γ = 0: find the stationary point of ½ ξᵀ M ξ on Γ(t, q τ(ξ)) = 0.
-
-    M is the mass matrix at (t, q, u).
-    """
-    manifold = system.manifold_of(q)
-    mass = system.metric(t, q, u, args)
-    if system.fibre_coordinate_name == "p":
-        mass = inverse(mass)
-
-    def gamma(xi):
-        return system.position_constraint(t, manifold.act(q, xi), args)
-
-    def sizes(_):
-        return max_norm(*jax.tree.leaves(q)), position_scale(system, t, q, args)
-
-    return _nearest(mass, gamma, jnp.zeros_like(u), sizes)
-
-
-def _project_fibre(system, t, q, u, args) -> _Nearest:
-    """Project u onto Φ = 0: find the stationary point w of ½ (w-u)ᵀ K (w-u) there.
-
-    The constraint is Φ(t, q, w) = 0, and K the metric on the fibre at (t, q, u).
-    """
-
-    def phi(w):
-        return system.constraint(t, q, w, args)
-
-    def sizes(jacobian):
-        return max_norm(u), velocity_scale(system, jacobian, t, q, u, args)
-
-    return _nearest(system.metric(t, q, u, args), phi, u, sizes)
-
-
-def _nearest(
-    metric: Float[Array, "n n"],
-    constraint: Callable[[Float[Array, " n"]], Float[Array, " m"]],
-    x: Float[Array, " n"],
-    sizes: Callable[[Float[Array, "m n"]], tuple[FloatScalar, Float[Array, " m"]]],
-) -> _Nearest:
-    """Find the stationary point y of ½ (y-x)ᵀ K (y-x) on constraint(y) = 0.
-
-    **Arguments:**
-
-    - `metric`: the matrix K.
-    - `constraint`: the function that is to vanish.
-    - `x`: the point from which the search starts.
-    - `sizes`: called as `sizes(jacobian)`, the sizes of y and of the terms of the
-        constraint, to which their round-off is proportional.
-    """
-    jacobian = jax.jacrev(constraint)(x)
-    size, terms = sizes(jacobian)
-    # The round-off of the constraint moves y too. If y is zero, nothing else does.
-    reaction = inverse(metric) @ jacobian.T
-    response = reaction @ inverse(jacobian @ reaction)
-    scale = size + max_norm(jnp.abs(response) @ terms)
-
-    def stationarity(z):
-        y, multiplier = z
-        value, pullback = jax.vjp(constraint, y)
-        return metric @ (y - x) - pullback(multiplier)[0], value
-
-    solved = root(
-        stationarity,
-        (x, jnp.zeros_like(constraint(x))),
-        jnp.where(jnp.isfinite(scale), scale, size),
-        judged=lambda z: z[0],
-    )
-    return _Nearest(solved.x[0], solved.converged, jacobian)
 
 
 def _check_inputs(system, q, v, p, t):

@@ -8,7 +8,7 @@ from jaxtyping import Array, Int
 from ._checks import known
 from ._progress_meter import AbstractProgressMeter
 from ._saving import Rows, Saving
-from ._stepping import Carry, Stepping
+from ._stepping import Carry, Stepping, Taken
 
 
 class Loop(eqx.Module):
@@ -32,8 +32,11 @@ class Loop(eqx.Module):
         carry, taken = self.stepping.advance(carry, k)
         if not self.meter.silent:
             self.meter.report(k, known(self.num_steps))
+        return carry, self._rows(carry, taken, k)
+
+    def _rows(self, carry: Carry, taken: Taken | None, k: Int[Array, ""]) -> Rows:
         t, args = self.stepping.time(k + 1), self.stepping.args
-        return carry, self.saving.rows(t, carry.step_state.state, args, taken, k)
+        return self.saving.rows(t, carry.step_state.state, args, taken, k)
 
     def write(self, buffers: Rows, rows: Rows, k: Int[Array, ""]) -> Rows:
         """Write the rows of step k to the buffers of all rows."""
@@ -44,10 +47,9 @@ class Loop(eqx.Module):
         k = jnp.zeros((), jnp.int32)
 
         def row() -> Rows:
-            if self.saving.num_records:
-                return self.step(carry, k)[1]
-            # A step is dear to trace, and its shapes matter to dense output alone.
-            t, args = self.stepping.time(k), self.stepping.args
-            return self.saving.rows(t, carry.step_state.state, args, None, k)
+            # A step is dear to trace, and its shapes matter to records alone.
+            needs_step = self.saving.num_records > 0
+            taken = self.stepping.advance(carry, k)[1] if needs_step else None
+            return self._rows(carry, taken, k)
 
         return self.saving.empty(jax.eval_shape(row))

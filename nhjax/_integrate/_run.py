@@ -72,8 +72,7 @@ def run(
     if ts is not None and sampled is not None and places.slots is not None:
         row = places.slots[sampled]
         records = jax.tree.map(lambda x: x[row], rows.record)
-        sample = partial(_sample, stepping, saving)
-        on_the_way = [jax.vmap(sample)(ts, sampled, records)]
+        on_the_way = [jax.vmap(partial(_sample, loop))(ts, sampled, records)]
     ends = saveat.saves_end(num_steps)
     last = [_one(saving.saved(t1, end, args))] if ends else []
     pieces = first + on_the_way + last
@@ -93,19 +92,11 @@ def _one(saved: PyTree[Array]) -> PyTree[Array]:
 
 
 def _sample(
-    stepping: Stepping,
-    saving: Saving,
-    t: FloatScalar,
-    k: Int[Array, ""],
-    record: StepRecord,
+    loop: Loop, t: FloatScalar, k: Int[Array, ""], record: StepRecord
 ) -> PyTree[Array]:
     """Compute what is saved at a time t that lies inside of step k."""
-    system, method, h, args = (
-        stepping.system,
-        stepping.method,
-        stepping.dt,
-        stepping.args,
-    )
-    start = stepping.time(k)
-    y = interpolate(system, method, record, start, h, (t - start) / h, args)
-    return saving.saved(t, y, args)
+    run = loop.stepping
+    start, h = run.time(k), run.dt
+    theta = (t - start) / h
+    y = interpolate(run.system, run.method, record, start, h, theta, run.args)
+    return loop.saving.saved(t, y, run.args)

@@ -1,10 +1,10 @@
 """The function `nhjax.step`, for users who write their own time loop."""
 
 import jax
-import jax.numpy as jnp
 
 from .._custom_types import Args, FloatScalarLike
 from .._method import AbstractMethod
+from .._numerics import nan_unless
 from .._results import RESULTS
 from .._step import AbstractStageSolver, SimplifiedNewton
 from .._system import AbstractMechanicalSystem, State
@@ -71,5 +71,4 @@ def step(
     end = jax.tree.map(lambda x: x[0], sol.ys)
     if throw:
         return end
-    solved = sol.result == RESULTS.successful
-    return jax.tree.map(lambda x: jnp.where(solved, x, jnp.nan), end)
+    return nan_unless(sol.result == RESULTS.successful, end)

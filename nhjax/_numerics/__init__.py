@@ -13,6 +13,7 @@ from ._implicit import (
     frozen as frozen,
     has_tangent as has_tangent,
     nan_gradient_unless as nan_gradient_unless,
+    nan_unless as nan_unless,
     root as root,
     solve_contraction as solve_contraction,
     zero_unless as zero_unless,

@@ -65,7 +65,7 @@ def solve_contraction(contraction: Callable[[X], X], b: X, *, max_iterations: in
             tolerance=tolerance,
             noise_units=_NOISIEST,
         )
-        return [jnp.where(solved.converged, x, jnp.nan) for x in solved.x]
+        return nan_unless(solved.converged, solved.x)
 
     x = jax.lax.custom_linear_solve(
         operator, _mixed(_not_empty(b)), solve=refine, transpose_solve=refine
@@ -223,6 +223,11 @@ def has_tangent(tangents: PyTree[Any]) -> PyTree[bool]:
 def zero_unless(ok: BoolScalar, tree: X) -> X:
     """Replace the numbers of a tree by zeros where `ok` is false; `None` stays."""
     return jax.tree.map(lambda x: jnp.where(ok, x, jnp.zeros_like(x)), tree)
+
+
+def nan_unless(ok: BoolScalar, tree: X) -> X:
+    """Replace the numbers of a tree by NaN where `ok` is false; `None` stays."""
+    return jax.tree.map(lambda x: jnp.where(ok, x, jnp.nan), tree)
 
 
 def frozen(tree: T) -> T:

@@ -1,6 +1,7 @@
 """The chart around the start of a step, on a vector space or on a Lie group."""
 
 from abc import abstractmethod
+from typing import TypeAlias
 
 import equinox as eqx
 import jax
@@ -10,6 +11,11 @@ from jaxtyping import Array, Float, PyTree
 from .._custom_types import BoolScalar
 from .._manifold import AbstractLieGroup
 from .._numerics import two_sum
+
+
+# Vectors and covectors of the Lie algebra: one, and one for each stage or node.
+Vector: TypeAlias = Float[Array, " n"]
+Vectors: TypeAlias = Float[Array, "r n"]
 
 
 class AbstractChart(eqx.Module):
@@ -23,25 +29,17 @@ class AbstractChart(eqx.Module):
     origin: eqx.AbstractVar[PyTree[Array]]
 
     @abstractmethod
-    def body_velocities(
-        self, xi: Float[Array, "r n"], velocity: Float[Array, "r n"]
-    ) -> Float[Array, "r n"]:
+    def body_velocities(self, xi: Vectors, velocity: Vectors) -> Vectors:
         """Compute the body velocities dτ_Ξ H of the chart velocities H."""
 
     @abstractmethod
-    def chart_velocities(
-        self, xi: Float[Array, "r n"], body_velocity: Float[Array, "r n"]
-    ) -> Float[Array, "r n"]:
+    def chart_velocities(self, xi: Vectors, body_velocity: Vectors) -> Vectors:
         """Compute the chart velocities dτ_Ξ⁻¹ η of the body velocities η."""
 
     @abstractmethod
     def to_chart(
-        self,
-        xi: Float[Array, "r n"],
-        velocity: Float[Array, "r n"],
-        momentum: Float[Array, "r n"],
-        force: Float[Array, "r n"],
-    ) -> tuple[Float[Array, "r n"], Float[Array, "r n"]]:
+        self, xi: Vectors, velocity: Vectors, momentum: Vectors, force: Vectors
+    ) -> tuple[Vectors, Vectors]:
         """Compute (Π, F), the momenta and forces with respect to the coordinates Ξ.
 
         They are Π = dτ_Ξ^* μ and F = dτ_Ξ^* w + (ddτ_Ξ)^*(H, Π) for body momenta μ and
@@ -49,24 +47,17 @@ class AbstractChart(eqx.Module):
         """
 
     @abstractmethod
-    def to_start(
-        self, xi: Float[Array, "r n"], covector: Float[Array, "r n"]
-    ) -> Float[Array, "r n"]:
+    def to_start(self, xi: Vectors, covector: Vectors) -> Vectors:
         """Compute Ad^*_{τ(Ξ)⁻¹} w: carry body covectors from g_k τ(Ξ) to g_k."""
 
     @abstractmethod
-    def to_end(
-        self, xi: Float[Array, " n"], covector: Float[Array, " n"]
-    ) -> Float[Array, " n"]:
+    def to_end(self, xi: Vector, covector: Vector) -> Vector:
         """Compute Ad^*_{τ(Ξ)} μ: carry a body covector from g_k to g_k τ(Ξ)."""
 
     @abstractmethod
     def carry(
-        self,
-        xi: Float[Array, " n"],
-        momentum: Float[Array, " n"],
-        compensation: Float[Array, " n"],
-    ) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
+        self, xi: Vector, momentum: Vector, compensation: Vector
+    ) -> tuple[Vector, Vector]:
         """Apply Ad^*_{τ(ξ)} to a compensated sum; return a compensated sum.
 
         A compensated sum is a number and the rounding error it has accumulated.
@@ -74,12 +65,8 @@ class AbstractChart(eqx.Module):
 
     @abstractmethod
     def base_momentum(
-        self,
-        xi: Float[Array, " n"],
-        momentum: Float[Array, " n"],
-        transported: Float[Array, " n"],
-        chart_force: Float[Array, " n"],
-    ) -> Float[Array, " n"]:
+        self, xi: Vector, momentum: Vector, transported: Vector, chart_force: Vector
+    ) -> Vector:
         """Compute the constant term of the stage momenta Π^i = base + h Σ â_ij F^j.
 
         It is dτ_ξ^* μ_{k+1} - h Σ b_j F^j, with
@@ -94,7 +81,7 @@ class AbstractChart(eqx.Module):
         """
 
     @abstractmethod
-    def in_domain(self, xi: Float[Array, "r n"]) -> BoolScalar:
+    def in_domain(self, xi: Vectors) -> BoolScalar:
         """Tell whether all Ξ^i lie where the retraction τ is invertible."""
 
 
@@ -108,60 +95,41 @@ class FlatChart(AbstractChart):
     manifold: AbstractLieGroup
     origin: PyTree[Array]
 
-    def body_velocities(
-        self, xi: Float[Array, "r n"], velocity: Float[Array, "r n"]
-    ) -> Float[Array, "r n"]:
+    def body_velocities(self, xi: Vectors, velocity: Vectors) -> Vectors:
         """Return the chart velocities H, which are the body velocities here."""
         return velocity
 
-    def chart_velocities(
-        self, xi: Float[Array, "r n"], body_velocity: Float[Array, "r n"]
-    ) -> Float[Array, "r n"]:
+    def chart_velocities(self, xi: Vectors, body_velocity: Vectors) -> Vectors:
         """Return the body velocities η, which are the chart velocities here."""
         return body_velocity
 
     def to_chart(
-        self,
-        xi: Float[Array, "r n"],
-        velocity: Float[Array, "r n"],
-        momentum: Float[Array, "r n"],
-        force: Float[Array, "r n"],
-    ) -> tuple[Float[Array, "r n"], Float[Array, "r n"]]:
+        self, xi: Vectors, velocity: Vectors, momentum: Vectors, force: Vectors
+    ) -> tuple[Vectors, Vectors]:
         """Return the momenta μ and the forces w unchanged."""
         return momentum, force
 
-    def to_start(
-        self, xi: Float[Array, "r n"], covector: Float[Array, "r n"]
-    ) -> Float[Array, "r n"]:
+    def to_start(self, xi: Vectors, covector: Vectors) -> Vectors:
         """Return the covectors w unchanged."""
         return covector
 
-    def to_end(
-        self, xi: Float[Array, " n"], covector: Float[Array, " n"]
-    ) -> Float[Array, " n"]:
+    def to_end(self, xi: Vector, covector: Vector) -> Vector:
         """Return the covector μ unchanged."""
         return covector
 
     def carry(
-        self,
-        xi: Float[Array, " n"],
-        momentum: Float[Array, " n"],
-        compensation: Float[Array, " n"],
-    ) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
+        self, xi: Vector, momentum: Vector, compensation: Vector
+    ) -> tuple[Vector, Vector]:
         """Return the compensated sum unchanged."""
         return momentum, compensation
 
     def base_momentum(
-        self,
-        xi: Float[Array, " n"],
-        momentum: Float[Array, " n"],
-        transported: Float[Array, " n"],
-        chart_force: Float[Array, " n"],
-    ) -> Float[Array, " n"]:
+        self, xi: Vector, momentum: Vector, transported: Vector, chart_force: Vector
+    ) -> Vector:
         """Return μ_k, because the two sums are the same here and cancel."""
         return momentum
 
-    def in_domain(self, xi: Float[Array, "r n"]) -> BoolScalar:
+    def in_domain(self, xi: Vectors) -> BoolScalar:
         """Return True, because the chart is the whole space."""
         return jnp.asarray(True)
 
@@ -172,25 +140,17 @@ class CurvedChart(AbstractChart):
     manifold: AbstractLieGroup
     origin: PyTree[Array]
 
-    def body_velocities(
-        self, xi: Float[Array, "r n"], velocity: Float[Array, "r n"]
-    ) -> Float[Array, "r n"]:
+    def body_velocities(self, xi: Vectors, velocity: Vectors) -> Vectors:
         """Compute the body velocities dτ_Ξ H of the chart velocities H."""
         return jax.vmap(self.manifold.dtau)(xi, velocity)
 
-    def chart_velocities(
-        self, xi: Float[Array, "r n"], body_velocity: Float[Array, "r n"]
-    ) -> Float[Array, "r n"]:
+    def chart_velocities(self, xi: Vectors, body_velocity: Vectors) -> Vectors:
         """Compute the chart velocities dτ_Ξ⁻¹ η of the body velocities η."""
         return jax.vmap(self.manifold.dtau_inv)(xi, body_velocity)
 
     def to_chart(
-        self,
-        xi: Float[Array, "r n"],
-        velocity: Float[Array, "r n"],
-        momentum: Float[Array, "r n"],
-        force: Float[Array, "r n"],
-    ) -> tuple[Float[Array, "r n"], Float[Array, "r n"]]:
+        self, xi: Vectors, velocity: Vectors, momentum: Vectors, force: Vectors
+    ) -> tuple[Vectors, Vectors]:
         """Compute (Π, F), the momenta and forces with respect to the coordinates Ξ."""
 
         def one(xi, velocity, momentum, force):
@@ -200,24 +160,17 @@ class CurvedChart(AbstractChart):
 
         return jax.vmap(one)(xi, velocity, momentum, force)
 
-    def to_start(
-        self, xi: Float[Array, "r n"], covector: Float[Array, "r n"]
-    ) -> Float[Array, "r n"]:
+    def to_start(self, xi: Vectors, covector: Vectors) -> Vectors:
         """Compute Ad^*_{τ(Ξ)⁻¹} w: carry body covectors from g_k τ(Ξ) to g_k."""
         return jax.vmap(self.manifold.to_start)(xi, covector)
 
-    def to_end(
-        self, xi: Float[Array, " n"], covector: Float[Array, " n"]
-    ) -> Float[Array, " n"]:
+    def to_end(self, xi: Vector, covector: Vector) -> Vector:
         """Compute Ad^*_{τ(Ξ)} μ: carry a body covector from g_k to g_k τ(Ξ)."""
         return self.manifold.to_end(xi, covector)
 
     def carry(
-        self,
-        xi: Float[Array, " n"],
-        momentum: Float[Array, " n"],
-        compensation: Float[Array, " n"],
-    ) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
+        self, xi: Vector, momentum: Vector, compensation: Vector
+    ) -> tuple[Vector, Vector]:
         """Apply Ad^*_{τ(ξ)} to a compensated sum; return a compensated sum.
 
         The rounding errors of plain products with Ad^* would add up over the steps, as
@@ -227,17 +180,13 @@ class CurvedChart(AbstractChart):
         return two_sum(momentum, change + self.manifold.to_end(xi, compensation))
 
     def base_momentum(
-        self,
-        xi: Float[Array, " n"],
-        momentum: Float[Array, " n"],
-        transported: Float[Array, " n"],
-        chart_force: Float[Array, " n"],
-    ) -> Float[Array, " n"]:
+        self, xi: Vector, momentum: Vector, transported: Vector, chart_force: Vector
+    ) -> Vector:
         """Compute dτ_ξ^* μ_{k+1} - h Σ b_j F^j, the constant term of Π^i."""
         end = self.to_end(xi, momentum + transported)
         return self.manifold.dtau_dual(xi, end) - chart_force
 
-    def in_domain(self, xi: Float[Array, "r n"]) -> BoolScalar:
+    def in_domain(self, xi: Vectors) -> BoolScalar:
         """Tell whether all Ξ^i lie where the retraction τ is invertible."""
         return jnp.all(jax.vmap(self.manifold.in_chart)(xi))
 
@@ -248,6 +197,6 @@ def chart_at(manifold: AbstractLieGroup, origin: PyTree[Array]) -> AbstractChart
     return kind(manifold, origin)
 
 
-def positions(chart: AbstractChart, xi: Float[Array, "r n"]) -> PyTree[Array]:
+def positions(chart: AbstractChart, xi: Vectors) -> PyTree[Array]:
     """Compute the positions g_k τ(Ξ^i), one for each row of Ξ."""
     return jax.vmap(lambda xi: chart.manifold.act(chart.origin, xi))(xi)

@@ -12,32 +12,9 @@ import nhjax
 from nhjax import SaveAt
 from nhjax.systems import (
     ChaoticSystem,
-    NonholonomicParticle,
 )
 from oracles.driven import Driven
-
-
-PARTICLE = NonholonomicParticle()
-STEPS, DT = 20, 0.1
-
-
-def run(**others: Any) -> nhjax.Solution:
-    arguments: dict[str, Any] = {
-        "system": PARTICLE.system,
-        "method": nhjax.LobattoIIIAB(3),
-        "y0": PARTICLE.initial_state(),
-        "dt": DT,
-        "num_steps": STEPS,
-    }
-    return nhjax.integrate(**(arguments | others))
-
-
-def assert_trees_close(got, expected, rtol, atol=0.0):
-    jax.tree.map(
-        lambda x, y: np.testing.assert_allclose(x, y, rtol=rtol, atol=atol),
-        got,
-        expected,
-    )
+from oracles.particle_run import assert_trees_close, DT, PARTICLE, run
 
 
 # Transformations ----------------------------------------------------------------------

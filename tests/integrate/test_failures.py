@@ -1,7 +1,5 @@
 """A run that fails names its lane and step, and leaves the others as they are."""
 
-from typing import Any
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -12,27 +10,8 @@ import nhjax
 from nhjax import SaveAt
 from nhjax.systems import (
     Appell,
-    NonholonomicParticle,
 )
-
-
-PARTICLE = NonholonomicParticle()
-STEPS, DT = 20, 0.1
-
-
-def run(**others: Any) -> nhjax.Solution:
-    arguments: dict[str, Any] = {
-        "system": PARTICLE.system,
-        "method": nhjax.LobattoIIIAB(3),
-        "y0": PARTICLE.initial_state(),
-        "dt": DT,
-        "num_steps": STEPS,
-    }
-    return nhjax.integrate(**(arguments | others))
-
-
-def assert_trees_equal(got, expected):
-    jax.tree.map(np.testing.assert_array_equal, got, expected)
+from oracles.particle_run import assert_trees_equal, PARTICLE, run, STEPS
 
 
 # Failures -----------------------------------------------------------------------------

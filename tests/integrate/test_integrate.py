@@ -1,7 +1,5 @@
 """The time loop: explicit time, reports, progress meters and single precision."""
 
-from typing import Any
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -12,36 +10,9 @@ import nhjax
 from nhjax import SaveAt
 from nhjax.systems import (
     HarmonicOscillator,
-    NonholonomicParticle,
 )
 from oracles import helpers
-
-
-PARTICLE = NonholonomicParticle()
-STEPS, DT = 20, 0.1
-
-
-def run(**others: Any) -> nhjax.Solution:
-    arguments: dict[str, Any] = {
-        "system": PARTICLE.system,
-        "method": nhjax.LobattoIIIAB(3),
-        "y0": PARTICLE.initial_state(),
-        "dt": DT,
-        "num_steps": STEPS,
-    }
-    return nhjax.integrate(**(arguments | others))
-
-
-def assert_trees_equal(got, expected):
-    jax.tree.map(np.testing.assert_array_equal, got, expected)
-
-
-def assert_trees_close(got, expected, rtol, atol=0.0):
-    jax.tree.map(
-        lambda x, y: np.testing.assert_allclose(x, y, rtol=rtol, atol=atol),
-        got,
-        expected,
-    )
+from oracles.particle_run import assert_trees_close, DT, PARTICLE, run, STEPS
 
 
 # Time ---------------------------------------------------------------------------------

@@ -10,10 +10,9 @@ import pytest
 
 import nhjax
 from nhjax import SaveAt
-from nhjax.systems import NonholonomicParticle
+from oracles.particle_run import assert_trees_equal, PARTICLE
 
 
-PARTICLE = NonholonomicParticle()
 REVERSIBLE = nhjax.ReversibleAdjoint()
 ADJOINTS = [
     nhjax.DirectAdjoint(),
@@ -40,10 +39,6 @@ def run(num_steps: Any, y0: Any = None, **others: Any) -> nhjax.Solution:
         num_steps=num_steps,
         **arguments,
     )
-
-
-def assert_same(got, expected):
-    jax.tree.map(np.testing.assert_array_equal, got, expected)
 
 
 def static(num_steps: int, **others: Any) -> nhjax.Solution:
@@ -75,19 +70,21 @@ def test_another_length_retraces_nothing(saveat, adjoint):
 @pytest.mark.parametrize("num_steps", [1, 2, 33])
 def test_the_numbers_are_those_of_a_known_length(num_steps):
     got, expected = run(num_steps), static(num_steps)
-    assert_same((got.ys, got.ts, got.t1), (expected.ys, expected.ts, expected.t1))
-    assert_same(got.stats, expected.stats)
+    assert_trees_equal(
+        (got.ys, got.ts, got.t1), (expected.ys, expected.ts, expected.t1)
+    )
+    assert_trees_equal(got.stats, expected.stats)
 
 
 def test_an_array_is_a_length_under_jit():
     program = jax.jit(lambda n: run(n))
     first = program(3)
     count = len(traces)
-    assert_same(program(20).ys, run(20).ys)
-    assert_same(first.ys, run(3).ys)
+    assert_trees_equal(program(20).ys, run(20).ys)
+    assert_trees_equal(first.ys, run(3).ys)
     assert len(traces) == count
     for length in (np.asarray(20), jnp.asarray(20, jnp.int16), np.int64(20)):
-        assert_same(run(length).ys, run(20).ys)
+        assert_trees_equal(run(length).ys, run(20).ys)
 
 
 def test_members_of_a_batch_have_lengths_of_their_own():
@@ -96,7 +93,7 @@ def test_members_of_a_batch_have_lengths_of_their_own():
     np.testing.assert_array_equal(batch.stats["num_steps"], lengths)
     for lane, length in enumerate((5, 1, 20)):
         member = jax.tree.map(lambda x, lane=lane: x[lane], batch.ys)
-        assert_same(member, run(length).ys)
+        assert_trees_equal(member, run(length).ys)
 
 
 def test_a_batch_in_step_has_lengths_of_its_own(monkeypatch):

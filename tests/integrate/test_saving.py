@@ -1,45 +1,21 @@
 """What a run saves: the ends, steps, samples, and functions of the state."""
 
 import re
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-import nhjax
 from nhjax import SaveAt
-from nhjax.systems import (
-    NonholonomicParticle,
+from oracles.particle_run import (
+    assert_trees_close,
+    assert_trees_equal,
+    DT,
+    PARTICLE,
+    run,
+    STEPS,
 )
-
-
-PARTICLE = NonholonomicParticle()
-STEPS, DT = 20, 0.1
-
-
-def run(**others: Any) -> nhjax.Solution:
-    arguments: dict[str, Any] = {
-        "system": PARTICLE.system,
-        "method": nhjax.LobattoIIIAB(3),
-        "y0": PARTICLE.initial_state(),
-        "dt": DT,
-        "num_steps": STEPS,
-    }
-    return nhjax.integrate(**(arguments | others))
-
-
-def assert_trees_equal(got, expected):
-    jax.tree.map(np.testing.assert_array_equal, got, expected)
-
-
-def assert_trees_close(got, expected, rtol, atol=0.0):
-    jax.tree.map(
-        lambda x, y: np.testing.assert_allclose(x, y, rtol=rtol, atol=atol),
-        got,
-        expected,
-    )
 
 
 @pytest.fixture(scope="module")

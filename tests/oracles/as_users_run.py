@@ -226,6 +226,8 @@ if __name__ == "__main__":
     for name, function in FEATURES.items():
         try:
             function()
+        # Whatever is wrong with a feature, the others are tried too; the test of this
+        # one fails, since its name does not stand alone on a line.
         except Exception as error:
             print(f"{name}: {type(error).__name__}: {error}".replace("\n", " "))
         else:
