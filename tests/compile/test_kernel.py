@@ -1,9 +1,5 @@
 """Programs in one kernel give what they give elsewhere, and so do their derivatives."""
 
-import os
-import subprocess
-import sys
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -246,27 +242,3 @@ def test_high_orders_and_many_coordinates_are_one_kernel(example, stages):
         ).ys
 
     assert MARK in jax.jit(run).lower(example.initial_state()).as_text()
-
-
-# The compiler of kernels aborts the process rather than raise, on parameters that turn
-# out to be unused or constant; and it depends on flags, of which the tests set some.
-USERS_PROGRAM = """
-import jax, jax.numpy as jnp, nhjax
-jax.config.update("jax_enable_x64", True)
-example = nhjax.systems.RodSleigh()
-
-def loss(q):
-    y0 = nhjax.initial_state(example.system, q, example.v0, project=True)
-    sol = nhjax.integrate(example.system, nhjax.LobattoIIIAB(2), y0, dt=0.1,
-        num_steps=10, saveat=nhjax.SaveAt(steps=True))
-    return jnp.sum(sol.ys.q)
-
-one = jax.jit(jax.grad(loss))(example.q0)
-many = jax.jit(jax.vmap(jax.grad(loss)))(jnp.stack([example.q0] * 40))
-assert jnp.allclose(many, one[None], rtol=1e-12, atol=1e-12)
-"""
-
-
-def test_gradients_with_the_compiler_as_users_have_it():
-    environment = {key: x for key, x in os.environ.items() if key != "XLA_FLAGS"}
-    subprocess.run([sys.executable, "-c", USERS_PROGRAM], check=True, env=environment)

@@ -191,6 +191,21 @@ def gradients_of_a_batch_by_the_reversible_adjoint():
 
 
 @feature
+def gradients_of_an_ensemble_in_its_projected_starts():
+    """Of 40 members: parameters that turn out unused or constant abort the compiler."""
+    sleigh = systems.RodSleigh()
+
+    def loss(q):
+        y0 = nhjax.initial_state(sleigh.system, q, sleigh.v0, project=True)
+        sol = run(sleigh, TWO, y0=y0, saveat=SaveAt(steps=True))
+        return jnp.sum(sol.ys.q)
+
+    one = jax.jit(jax.grad(loss))(sleigh.q0)
+    many = jax.jit(jax.vmap(jax.grad(loss)))(jnp.stack([sleigh.q0] * 40))
+    close(many, jnp.broadcast_to(one, many.shape))
+
+
+@feature
 def gradients_on_a_group_by_checkpoints():
     suslov, adjoint = systems.Suslov(), nhjax.RecursiveCheckpointAdjoint()
 
