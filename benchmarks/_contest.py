@@ -122,13 +122,16 @@ def seconds_at(
 
 
 def kind(method: str) -> str:
-    """What competes as one: a package, for ensembles with each layout apart."""
-    words, layouts = method.split(), ("vmap", "stacked", "devices")
-    return " ".join([words[0], *(x for x in words if x in layouts)])
+    """What competes as one: a package, that on several cores apart."""
+    words = method.split()
+    return " ".join([words[0], *(x for x in words if x in ("devices", "threads"))])
 
 
 def contests(case: Measured) -> list[dict[str, Any]]:
-    """For each accuracy the fastest of each kind, and nhjax's time over it."""
+    """For each accuracy the fastest of each kind, and nhjax's time over it.
+
+    "others" is the fastest of all that is not nhjax, under the fastest of nhjax.
+    """
     ladders = by_method(case.runs)
     kinds = list(dict.fromkeys(kind(method) for method in ladders))
     outcomes = []
@@ -144,8 +147,26 @@ def contests(case: Measured) -> list[dict[str, Any]]:
                 entry = best.setdefault(name, {"method": method, "rung": rung})
                 entry[of] = seconds
                 entry[f"ratio_{of}"] = quotient(best["nhjax"][of], seconds)
-        outcomes.append({"accuracy": accuracy, "best": best})
+        others = fastest_of_others(best)
+        outcomes.append({"accuracy": accuracy, "best": best, "others": others})
     return outcomes
+
+
+def fastest_of_others(best: dict[str, dict[str, Any]]) -> dict[str, Any]:
+    """The method that is the fastest of all others, and nhjax's best time over its."""
+    mine = [entry for name, entry in best.items() if name.startswith("nhjax")]
+    names = [name for name in best if not name.startswith("nhjax")]
+    found: dict[str, Any] = {}
+    for of in ("seconds", "fastest"):
+        if not names:
+            break
+        name = min(names, key=lambda name, of=of: best[name][of])
+        seconds = best[name][of]
+        # The method is that of the median.
+        found.setdefault("method", best[name]["method"])
+        found[of] = seconds
+        found[f"ratio_{of}"] = quotient(min(entry[of] for entry in mine), seconds)
+    return found
 
 
 def contest_table(case: Measured) -> str:
@@ -163,10 +184,21 @@ def contest_table(case: Measured) -> str:
             row += [method if reached else "", ms(entry["seconds"])]
             if name != "nhjax":
                 header.append("nhjax over it")
-                ratio, other = entry["ratio_seconds"], entry["ratio_fastest"]
-                row.append("" if math.isnan(ratio) else f"{ratio:.2f} ({other:.2f})")
+                row.append(ratios(entry))
+        others = outcome["others"]
+        if others:
+            header += ["fastest of the others", "[ms]", "fastest nhjax over it"]
+            reached = math.isfinite(others["seconds"])
+            row += [others["method"] if reached else "", ms(others["seconds"])]
+            row.append(ratios(others))
         rows.append(row)
     return markdown_table(header, rows)
+
+
+def ratios(entry: dict[str, Any]) -> str:
+    """The ratio of medians, and that of the fastest in brackets, or nothing."""
+    ratio, other = entry["ratio_seconds"], entry["ratio_fastest"]
+    return "" if math.isnan(ratio) else f"{ratio:.2f} ({other:.2f})"
 
 
 def quotient(a: float, b: float) -> float:
@@ -226,11 +258,13 @@ def draw(cases: list[Measured], path: Path) -> None:
                 stages = int(method.split("s=")[1].split(",")[0])
                 shade = str(0.75 - 0.1 * (stages - 2))
             style = {"color": shade if mine else colours[method], "linewidth": 1}
-            style |= {"marker": "o" if mine else "x", "markersize": 4}
-            spread = "devices" in method
+            heyoka = method.startswith("heyoka")
+            style |= {"marker": "o" if mine else "+" if heyoka else "x"}
+            style |= {"markersize": 4}
+            spread = "devices" in method or "threads" in method
             style |= {"linestyle": ":" if spread else "-"}
             # One name for all tolerances of an s, and one for all that is spread.
-            label = kind(method) if spread else method.split(",")[0]
+            label = kind(method) if mine and spread else method.split(",")[0]
             style |= {"label": None if label in named else label}
             named.add(label)
             ax.loglog(x, np.maximum(y, 1e-17), **style)
