@@ -102,7 +102,7 @@ class Problem(NamedTuple):
         if isinstance(self.example, systems.ChaoticSystem):
             return self.example.ensemble(number - 1)
         scale = jnp.linspace(0.5, 1.5, number)[:, None]
-        q, v = q0 * scale, v0 * scale[::-1]
+        q, v = q0[None] * scale, v0[None] * scale[::-1]
         if isinstance(self.example, systems.NonholonomicParticle):
             v = v.at[:, 2].set(q[:, 1] * v[:, 0])
         return q, v

@@ -3,6 +3,8 @@
 A ladder is a method with step sizes or tolerances from coarse to fine.
 """
 
+import importlib.util
+import os
 import time
 from collections.abc import Callable, Iterator
 from functools import partial
@@ -213,6 +215,53 @@ def diffrax_runs(case: Case, limit: int) -> Iterator[Run]:
                 ends = from_diffrax(layout, end)
                 case.judge(run, *case.problem.from_state(ends))
                 yield run
+
+
+def cores() -> int:
+    """How many cores this process may use."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
+def heyoka_runs(case: Case, limit: int, longest: float) -> Iterator[Run]:
+    """Its layouts, nothing where heyoka is not installed.
+
+    A ladder of `ensemble_propagate_until` ends where a run takes too long.
+    """
+    if importlib.util.find_spec("heyoka") is None:
+        return
+    from . import _heyoka
+
+    y0 = case.problem.to_state(case.q, case.v)
+    threads = min(2, cores())
+    for layout in _heyoka.layouts(case.members, threads):
+        prepare = _heyoka.heyoka_run(case.name, layout, y0, case.t, threads)
+        # The time grows unlike a power of the error: with few rungs, interpolated
+        # times would be too short.
+        number = 3 if "ensemble" in layout else max(limit, 6)
+        for tolerance in thinned(_heyoka.TOLERANCES, number):
+            call, seconds = prepare(tolerance)
+            start = time.perf_counter()
+            end = call()
+            if "ensemble" in layout and time.perf_counter() - start > longest:
+                break
+            if not np.all(np.isfinite(end)):
+                continue
+            name = "heyoka" if case.members == 1 else f"heyoka {layout}"
+            run = Run(name, tolerance, call, seconds)
+            case.judge(run, *case.problem.from_state(end))
+            yield run
+
+
+def heyoka_note() -> str:
+    """Version and sizes that the times of heyoka depend on."""
+    if importlib.util.find_spec("heyoka") is None:
+        return "heyoka is not installed."
+    from . import _heyoka
+
+    lanes, threads = _heyoka.batch_size(), min(2, cores())
+    return f"heyoka {_heyoka.VERSION}: batches of {lanes}, at most {threads} threads."
 
 
 def _blocked(program: Callable, *args: Any) -> Any:
