@@ -115,7 +115,10 @@ def iterate(
     so fast that nothing but noise can slow them down. An increment that is not finite,
     or far larger than the first one and the iterate, ends the iteration as well.
     """
-    aux_shape = jax.eval_shape(lambda x: sweep(x)[2], x)
+    # The sweep is traced once, for the shapes and for the loop: to trace it is most of
+    # the work of tracing a step.
+    sweep = jax.jit(sweep, inline=True)
+    aux_shape = jax.eval_shape(sweep, x)[2]
     aux = jax.tree.map(lambda s: jnp.zeros(s.shape, s.dtype), aux_shape)
     dtype = jnp.result_type(*[leaf.dtype for leaf in jax.tree.leaves(x)])
     eps = float(jnp.finfo(dtype).eps)
