@@ -180,8 +180,7 @@ def _idle_after_the_end(loop: Loop) -> _Advance:
         # copy them.
         carry, buffers = state
         nothing = jax.tree.map(
-            lambda x: jnp.zeros(x.shape, x.dtype),
-            jax.eval_shape(lambda: loop.step(carry, k)[1]),
+            lambda x: jnp.zeros(x.shape, x.dtype), loop.row_shapes(carry)
         )
         carry, rows = jax.lax.cond(
             k < loop.num_steps,

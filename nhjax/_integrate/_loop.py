@@ -34,7 +34,7 @@ class Loop(eqx.Module):
             self.meter.report(k, known(self.num_steps))
         return carry, self._rows(carry, taken, k)
 
-    def _rows(self, carry: Carry, taken: Taken | None, k: Int[Array, ""]) -> Rows:
+    def _rows(self, carry: Carry, taken: Taken, k: Int[Array, ""]) -> Rows:
         t, args = self.stepping.time(k + 1), self.stepping.args
         return self.saving.rows(t, carry.step_state.state, args, taken, k)
 
@@ -42,14 +42,16 @@ class Loop(eqx.Module):
         """Write the rows of step k to the buffers of all rows."""
         return self.saving.write(buffers, rows, k)
 
-    def empty_rows(self, carry: Carry) -> Rows:
-        """Make buffers of zeros for all rows that the run saves."""
+    def row_shapes(self, carry: Carry) -> Rows:
+        """Find the shapes of the rows that a step saves."""
         k = jnp.zeros((), jnp.int32)
 
-        def row() -> Rows:
-            # A step is dear to trace, and its shapes matter to records alone.
-            needs_step = self.saving.num_records > 0
-            taken = self.stepping.advance(carry, k)[1] if needs_step else None
-            return self._rows(carry, taken, k)
+        def rows() -> Rows:
+            # No step is taken for this, since a step is dear to trace.
+            return self._rows(carry, self.stepping.nothing_taken(carry), k)
 
-        return self.saving.empty(jax.eval_shape(row))
+        return jax.eval_shape(rows)
+
+    def empty_rows(self, carry: Carry) -> Rows:
+        """Make buffers of zeros for all rows that the run saves."""
+        return self.saving.empty(self.row_shapes(carry))

@@ -78,7 +78,7 @@ class Saving(eqx.Module):
         t: FloatScalar,
         y: State,
         args: Args,
-        taken: Taken | None,
+        taken: Taken,
         k: Int[Array, ""],
     ) -> Rows:
         """Compute the rows that step k saves, which leads to the state y at t."""
@@ -97,8 +97,8 @@ class Saving(eqx.Module):
         )
         return jax.lax.cond(self._slot(k) < self.num_saved, save, lambda: nothing)
 
-    def _record_row(self, taken: Taken | None) -> StepRecord | None:
-        if taken is None or not self.num_records:
+    def _record_row(self, taken: Taken) -> StepRecord | None:
+        if not self.num_records:
             return None
         # After a failure the records are those of a system at rest, so that dense
         # output stays at the last good state.

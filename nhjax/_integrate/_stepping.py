@@ -85,6 +85,16 @@ class Stepping(eqx.Module):
         arguments = StepArguments(self.system, t, h, start, self.args)
         return primitive_step(arguments, self.method, self.stage_solver, skip)
 
+    def nothing_taken(self, carry: Carry) -> Taken:
+        """Make the record of a step that was not taken, all zeros at the stages."""
+        state = carry.step_state.state
+
+        def at_stages(x: Array) -> Array:
+            return jnp.zeros((self.method.stages, *x.shape), x.dtype)
+
+        stages = map(at_stages, (state.v, state.p, state.multiplier))
+        return Taken(StepRecord(state, *stages), jnp.zeros((), bool))
+
     def advance(self, carry: Carry, k: Int[Array, ""]) -> tuple[Carry, Taken]:
         """Take step k; a trajectory that has failed keeps its last good state."""
         alive = carry.result == RESULTS.successful
