@@ -2,6 +2,7 @@
 
 from functools import cache
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -30,9 +31,14 @@ FLOOR = 2e-14
 every_stages = pytest.mark.parametrize("stages", COUNTS)
 
 
+@eqx.filter_jit
+def matrix_of_each(group, q):
+    return jax.vmap(group.matrix)(q)
+
+
 def matrices(group, q):
     """Elements as flat rows of matrices: q and -q are the same rotation."""
-    rows = jax.vmap(group.matrix)(jax.tree.map(jnp.asarray, q))
+    rows = matrix_of_each(group, jax.tree.map(jnp.asarray, q))
     return np.asarray(rows).reshape(rows.shape[0], -1)
 
 

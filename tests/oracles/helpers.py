@@ -15,7 +15,11 @@ from oracles.driven import ARGS, DRIVEN, driven_state
 CVT = systems.ContinuouslyVariableTransmission
 
 CLOSURES = ("propagated", "consistent", "symmetric")
-SOLVERS = {"simplified": nhjax.SimplifiedNewton(), "dense": nhjax.Newton()}
+# Without the fallback a run that ends early is not compiled again, with Newton's method.
+SOLVERS = {
+    "simplified": nhjax.SimplifiedNewton(fallback=False),
+    "dense": nhjax.Newton(),
+}
 
 GALLERY = {
     "particle": systems.NonholonomicParticle(1.7, 0.6),

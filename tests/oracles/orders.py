@@ -47,11 +47,15 @@ def trajectories(system, method, y0, counts, args=None, stage_solver=None):
     if stage_solver is None:
         stage_solver = solver_for(method.stages)
     sol = runs_of_all_steps(system, method, y0, dts, max(counts), args, stage_solver)
+    # Each index into an array of JAX would be a program of its own.
+    ts, ys, failed = jax.tree.map(
+        np.asarray, (sol.ts, sol.ys, sol.stats["failed_step"])
+    )
     lanes = []
     for lane, count in enumerate(counts):
-        assert not 0 <= sol.stats["failed_step"][lane] < count
-        y, continuous = jax.tree.map(lambda x, k=lane, n=count: x[k, :n], sol.ys)
-        lanes.append((np.asarray(sol.ts[lane, :count]), y, continuous))
+        assert not 0 <= failed[lane] < count
+        y, continuous = jax.tree.map(lambda x, k=lane, n=count: x[k, :n], ys)
+        lanes.append((ts[lane, :count], y, continuous))
     return lanes
 
 
