@@ -89,7 +89,7 @@ def there_and_back(name, stages, closure, steps):
         "simplified",
         node(there.ys, steps),
         dt=-helpers.RECORDED_STEP,
-        t0=np.asarray(there.ts)[steps],
+        t0=float(there.ts[steps]),
         throw=False,  # Appell's system is singular some time before the start.
     )
     assert not 0 <= back.stats["failed_step"] < steps

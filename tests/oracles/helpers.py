@@ -15,7 +15,7 @@ from oracles.driven import ARGS, DRIVEN, driven_state
 CVT = systems.ContinuouslyVariableTransmission
 
 CLOSURES = ("propagated", "consistent", "symmetric")
-# Without the fallback a run that ends early is not compiled again, with Newton's method.
+# A run that ends early is not compiled again, with Newton's method.
 SOLVERS = {
     "simplified": nhjax.SimplifiedNewton(fallback=False),
     "dense": nhjax.Newton(),
