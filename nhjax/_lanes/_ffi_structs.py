@@ -1,0 +1,114 @@
+"""The structures of XLA's foreign function interface, as far as a handler reads them.
+
+They are those of the header `xla/ffi/api/c_api.h` in `jax.ffi.include_dir()`, as types
+of LLVM, which lays them out as the platform's C compiler does. What is listed here
+stays where it is: within a major version of the interface structures only grow at their
+ends, so that code which was compiled with an older header keeps working, and each tells
+its size. Names do change: these are those of version 0.3, and 0.5 has the same fields
+in the same places. A test compares them with the installed header.
+"""
+
+# The lowest version of the interface that has all that the handler uses. A runtime
+# refuses a handler that claims a version newer than its own.
+MAJOR, MINOR = 0, 1
+
+# Values of the interface's enumerations.
+EXTENSION_METADATA = 1
+INVALID_ARGUMENT, RESOURCE_EXHAUSTED = 3, 8
+
+_HEAD = {"struct_size": "i64", "extension_start": "ptr"}
+_LIST = {"size": "i64", "types": "ptr"}
+
+# Fields of each structure in their order, up to the last one that is used.
+STRUCTS: dict[str, dict[str, str]] = {
+    "XLA_FFI_Extension_Base": {"struct_size": "i64", "type": "i32", "next": "ptr"},
+    "XLA_FFI_Api_Version": {**_HEAD, "major_version": "i32", "minor_version": "i32"},
+    "XLA_FFI_Metadata": {
+        "struct_size": "i64",
+        "api_version": "%XLA_FFI_Api_Version",
+        "traits": "i32",
+    },
+    "XLA_FFI_Metadata_Extension": {
+        "extension_base": "%XLA_FFI_Extension_Base",
+        "metadata": "ptr",
+    },
+    "XLA_FFI_Buffer": {
+        **_HEAD,
+        "dtype": "i32",
+        "data": "ptr",
+        "rank": "i64",
+        "dims": "ptr",
+    },
+    "XLA_FFI_Args": {**_HEAD, **_LIST, "args": "ptr"},
+    "XLA_FFI_Rets": {**_HEAD, **_LIST, "rets": "ptr"},
+    "XLA_FFI_CallFrame": {
+        **_HEAD,
+        "api": "ptr",
+        "ctx": "ptr",
+        "stage": "i32",
+        "args": "%XLA_FFI_Args",
+        "rets": "%XLA_FFI_Rets",
+    },
+    "XLA_FFI_Error_Create_Args": {**_HEAD, "message": "ptr", "errc": "i32"},
+    "XLA_FFI_Error_Destroy_Args": {**_HEAD, "error": "ptr"},
+    "XLA_FFI_ThreadPool_Schedule_Args": {
+        **_HEAD,
+        "ctx": "ptr",
+        "task": "ptr",
+        "data": "ptr",
+    },
+    "XLA_FFI_ThreadPool_NumThreads_Args": {
+        **_HEAD,
+        "ctx": "ptr",
+        "num_threads": "ptr",
+    },
+    "XLA_FFI_Api": {
+        **_HEAD,
+        "api_version": "%XLA_FFI_Api_Version",
+        "internal_api": "ptr",
+        "XLA_FFI_Error_Create": "ptr",
+        "XLA_FFI_Error_GetMessage": "ptr",
+        "XLA_FFI_Error_Destroy": "ptr",
+        "XLA_FFI_Handler_Register": "ptr",
+        "XLA_FFI_Stream_Get": "ptr",
+        "XLA_FFI_Type_Register": "ptr",
+        "XLA_FFI_ExecutionContext_Get": "ptr",
+        "XLA_FFI_State_Set": "ptr",
+        "XLA_FFI_State_Get": "ptr",
+        "XLA_FFI_DeviceMemory_Allocate": "ptr",
+        "XLA_FFI_DeviceMemory_Free": "ptr",
+        "XLA_FFI_ThreadPool_Schedule": "ptr",
+        "XLA_FFI_ThreadPool_NumThreads": "ptr",
+    },
+}
+
+
+def type_definitions(structs: dict[str, dict[str, str]]) -> str:
+    """Return the text that defines the structures as types of LLVM."""
+    return "\n".join(
+        f"%{name} = type {{ {', '.join(fields.values())} }}"
+        for name, fields in structs.items()
+    )
+
+
+def size_of(struct: str) -> str:
+    """Return the constant that is the size of a structure."""
+    return f"ptrtoint (ptr getelementptr (%{struct}, ptr null, i32 1) to i64)"
+
+
+def field(pointer: str, struct: str, *path: str) -> str:
+    """Return the instruction that finds the address of a field.
+
+    **Arguments:**
+
+    - `pointer`: the address of the structure.
+    - `struct`: its name.
+    - `path`: the name of the field; if that is a structure itself, followed by the name
+        of a field of it.
+    """
+    indices, current = ["i32 0"], struct
+    for name in path:
+        names = list(STRUCTS[current])
+        indices.append(f"i32 {names.index(name)}")
+        current = STRUCTS[current][name].removeprefix("%")
+    return f"getelementptr inbounds %{struct}, ptr {pointer}, {', '.join(indices)}"

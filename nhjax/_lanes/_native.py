@@ -1,0 +1,191 @@
+"""Text of LLVM IR to native code: optimised, compiled and loaded by llvmlite.
+
+llvmlite is imported when a function of this module first needs it, so that nhjax can be
+imported without it.
+
+The code is position-independent and of the small code model, linked by JITLink: the
+constants of a kernel then lie within reach of short addresses. The large code model,
+which llvmlite calls the default of a JIT, loads the address of each constant first;
+this made kernels a tenth to a third slower, and their compilation too.
+"""
+
+import platform
+import sys
+from collections.abc import Sequence
+from functools import lru_cache
+from typing import Any, NamedTuple
+
+import numpy as np
+
+
+class Target(NamedTuple):
+    """A machine to compile for: LLVM's triple, name of the CPU, and features of it."""
+
+    triple: str
+    cpu: str
+    features: str = ""
+
+
+# Where the call works: little-endian machines of 64 bits, with the functions of POSIX
+# that the handler calls. Elsewhere members run without lanes.
+_PLATFORMS = {("linux", "x86_64"), ("linux", "aarch64"), ("darwin", "arm64")}
+
+# The level of LLVM's passes on the IR. The kernels are simplified when they are made:
+# level 1 gave the same speed as 3 in half of the time, and no passes at all gave code
+# that is 5 to 15 percent slower.
+_PASSES = 1
+# The levels of the code generator for modules of fewer characters than this, and for
+# longer ones. Level 1 takes half of the time of 2; a short kernel was 6 percent slower
+# with it, and a long one 2 percent faster.
+_LONG_TEXT = 1_000_000
+_GENERATION_OF_SHORT, _GENERATION_OF_LONG = 2, 1
+
+
+@lru_cache(maxsize=1)
+def is_available() -> bool:
+    """Tell whether programs can be compiled and called, with llvmlite and here."""
+    if (sys.platform, platform.machine()) not in _PLATFORMS:
+        return False
+    if sys.maxsize < 2**32:
+        # A Python of 32 bits.
+        return False
+    try:
+        _llvm()
+    except (ImportError, OSError):
+        # It is not there, or cannot be loaded on this system.
+        return False
+    return True
+
+
+@lru_cache(maxsize=1)
+def _llvm() -> Any:
+    from llvmlite import binding
+
+    binding.initialize_native_target()
+    binding.initialize_native_asmprinter()
+    return binding
+
+
+@lru_cache(maxsize=1)
+def host() -> Target:
+    """Return the machine that this process runs on."""
+    llvm = _llvm()
+    return Target(
+        llvm.get_process_triple(),
+        llvm.get_host_cpu_name(),
+        llvm.get_host_cpu_features().flatten(),
+    )
+
+
+@lru_cache(maxsize=1)
+def version() -> str:
+    """Return the versions of llvmlite and LLVM, which the code depends on."""
+    import llvmlite
+
+    return f"{llvmlite.__version__} {_llvm().llvm_version_info}"
+
+
+def host_width(dtype: Any) -> int:
+    """Return the number of members that fill a vector of this machine's."""
+    features = _llvm().get_host_cpu_features()
+    bits = 128
+    if features.get("avx512f") and features.get("avx512dq"):
+        bits = 512
+    elif features.get("avx2"):
+        bits = 256
+    return bits // (8 * np.dtype(dtype).itemsize)
+
+
+def object_code(texts: Sequence[str], exported: str, target: Target) -> bytes:
+    """Compile modules, which may refer to each other, to one object file.
+
+    **Arguments:**
+
+    - `texts`: the modules, in LLVM IR. They may declare the same functions.
+    - `exported`: the one function that is seen from outside.
+    - `target`: the machine, which need not be this one.
+    """
+    module, machine = _optimised(texts, exported, target)
+    return machine.emit_object(module)
+
+
+def assembly(texts: Sequence[str], exported: str, target: Target) -> str:
+    """Compile modules to the text of an assembler, to be read."""
+    module, machine = _optimised(texts, exported, target)
+    return machine.emit_assembly(module)
+
+
+def load(code: bytes, name: str, symbol: str, imports: dict[str, int]) -> int:
+    """Load an object file of this machine's, and return the address of a function.
+
+    It stays until the process ends.
+
+    **Arguments:**
+
+    - `code`: the object file. Functions that it calls are looked up in the process.
+    - `name`: a name that no other file has.
+    - `symbol`: the name of the function.
+    - `imports`: the addresses of other symbols that the file refers to.
+    """
+    builder = _llvm().JITLibraryBuilder().add_object_img(code).add_current_process()
+    for imported, address in imports.items():
+        builder.import_symbol(imported, address)
+    library = builder.export_symbol(symbol).link(_linker(), name)
+    # Otherwise the code would be unmapped together with this object.
+    library.detach()
+    return library[symbol]
+
+
+@lru_cache(maxsize=1)
+def _linker() -> Any:
+    # llvmlite frees nothing when Python ends, so that this lives as long as XLA.
+    return _llvm().create_lljit_compiler(
+        _machine(host(), _GENERATION_OF_SHORT), use_jit_link=True
+    )
+
+
+def _machine(target: Target, level: int) -> Any:
+    llvm = _llvm()
+    if target.triple != host().triple:
+        llvm.initialize_all_targets()
+        llvm.initialize_all_asmprinters()
+    return llvm.Target.from_triple(target.triple).create_target_machine(
+        cpu=target.cpu,
+        features=target.features,
+        opt=level,
+        reloc="pic",
+        codemodel="small",
+        jit=True,
+    )
+
+
+def _optimised(texts: Sequence[str], exported: str, target: Target) -> tuple[Any, Any]:
+    """Return the optimised module, and the machine that makes code of it."""
+    llvm = _llvm()
+    is_long = sum(map(len, texts)) >= _LONG_TEXT
+    machine = _machine(target, _GENERATION_OF_LONG if is_long else _GENERATION_OF_SHORT)
+    # In the context that all modules share their types and constants would never be
+    # freed.
+    context = llvm.create_context()
+    module, *others = [llvm.parse_assembly(text, context) for text in texts]
+    # Without these the passes would lay out structures as for no machine at all.
+    for part in (module, *others):
+        part.triple = machine.triple
+        part.data_layout = str(machine.target_data)
+    for other in others:
+        module.link_in(other)
+    module.verify()
+    for function in module.functions:
+        if not function.is_declaration:
+            # Tables for exceptions are not needed: nothing raises one.
+            function.add_function_attribute("nounwind")
+            # Of a function that nobody else calls no copy stays where it is inlined.
+            if function.name != exported:
+                function.linkage = "internal"
+    options = llvm.create_pipeline_tuning_options(speed_level=_PASSES)
+    # The lanes are vectors already.
+    options.loop_vectorization = options.loop_interleaving = False
+    options.slp_vectorization = options.loop_unrolling = False
+    builder = llvm.create_pass_builder(machine, options)
+    builder.getModulePassManager().run(module, builder)
+    return module, machine

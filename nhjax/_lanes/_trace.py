@@ -1,0 +1,61 @@
+"""The graph of a whole program, from its operands to its results."""
+
+import math
+from typing import Any, NamedTuple
+
+from ._branches import BRANCHES
+from ._buffers import Buffer, InMemory, Value
+from ._builder import Builder, Operation
+from ._elementwise import ELEMENTWISE
+from ._graph import dtype_name, Region
+from ._indexing import INDEXING
+from ._memory import LARGE, places
+from ._reductions import REDUCTIONS
+from ._scans import SCANS
+from ._shaping import SHAPING
+
+
+# A scan of at most so many rounds is unrolled.
+UNROLLED = 8
+
+OPERATIONS: dict[str, Operation] = {
+    **ELEMENTWISE,
+    **SHAPING,
+    **REDUCTIONS,
+    **INDEXING,
+    **SCANS,
+    **BRANCHES,
+}
+
+
+class Traced(NamedTuple):
+    """A finished graph: its root, and the memory of the results."""
+
+    root: Region
+    results: list[Buffer]
+
+
+def trace(program: Any) -> Traced:
+    """Make the graph of a closed jaxpr of one member."""
+    builder = Builder(OPERATIONS, UNROLLED)
+    root = builder.graph.root
+    args = []
+    for index, variable in enumerate(program.jaxpr.invars):
+        aval = variable.aval
+        dtype = dtype_name(aval.dtype)
+        buffer = Buffer("operand", dtype, math.prod(aval.shape), root, index)
+        array: Value = InMemory(buffer, aval.shape)
+        if buffer.size <= LARGE:
+            array = builder.memory.registers(array)
+        args.append(array)
+    values = builder.run(program.jaxpr, program.consts, args)
+    results = []
+    for index, (variable, value) in enumerate(
+        zip(program.jaxpr.outvars, values, strict=True)
+    ):
+        dtype = dtype_name(variable.aval.dtype)
+        buffer = Buffer("result", dtype, value.size, root, index)
+        if value.size:
+            builder.memory.write(buffer, places(value.shape), value)
+        results.append(buffer)
+    return Traced(root, results)

@@ -1,0 +1,170 @@
+"""Native kernels that XLA calls: from one thread or many, in one process or more."""
+
+import os
+import subprocess
+import sys
+import threading
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from nhjax import _lanes
+from oracles import lane_processes
+from oracles.lane_kernels import kernel_ir, SHARED, TRIPLE, WIDTH
+
+
+def call(name, *operands, shape=None):
+    """Call a kernel by its name, compiled by JAX."""
+    shape = operands[0].shape if shape is None else shape
+    out = jax.ShapeDtypeStruct(shape, jnp.float64)
+    return jax.jit(lambda *x: jax.ffi.ffi_call(name, out)(*x))(*operands)
+
+
+def printed(*command, **environment):
+    """The last line that a process of its own prints."""
+    others = {key: x for key, x in os.environ.items() if key not in ("XLA_FLAGS",)}
+    done = subprocess.run(
+        [sys.executable, "-W", "ignore", lane_processes.__file__, *map(str, command)],
+        env=others | environment,
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=300,
+    )
+    assert done.returncode == 0, done.stderr
+    return done.stdout.splitlines()[-1]
+
+
+@pytest.fixture(scope="module")
+def triple():
+    return _lanes.registered(kernel_ir(TRIPLE), 1, 1, WIDTH, True)
+
+
+@pytest.mark.parametrize("members", [0, 1, WIDTH - 1, WIDTH, WIDTH + 1, 100_000])
+def test_every_number_of_members(triple, members):
+    x = jnp.arange(members, dtype=jnp.float64)
+    np.testing.assert_array_equal(call(triple, x), 3 * np.arange(members))
+
+
+def test_subnormal_numbers_are_those_of_xla(triple):
+    """XLA flushes them to zero, in the threads of its pool and in the caller's."""
+    x = jnp.full(100_000, 5e-324)
+    np.testing.assert_array_equal(call(triple, x), jax.jit(lambda x: 3 * x)(x))
+
+
+@pytest.mark.parametrize("members", [1, WIDTH + 1, 1000])
+def test_an_operand_that_all_members_share(members):
+    name = _lanes.registered(kernel_ir(SHARED), 2, 1, WIDTH, True)
+    x = jnp.arange(members, dtype=jnp.float64)
+    shared = jnp.full(1, 5.0)
+    np.testing.assert_array_equal(call(name, x, shared), np.arange(members) + 5)
+
+
+@pytest.mark.parametrize("members", [0, 1, 1000])
+def test_arrays_without_elements(members):
+    """A kernel that does not touch its arrays, which have no elements."""
+    kernel = kernel_ir("")
+    name = _lanes.registered(kernel, 1, 1, WIDTH, True)
+    x = jnp.zeros((members, 0))
+    assert call(name, x).shape == (members, 0)
+
+
+def test_one_member_without_a_batch():
+    name = _lanes.registered(kernel_ir(TRIPLE, width=1), 1, 1, 1, False)
+    np.testing.assert_array_equal(call(name, jnp.full(1, 2.0)), [6.0])
+
+
+def test_wrong_numbers_of_arrays_are_an_error_of_jax(triple):
+    x = jnp.ones(3)
+    with pytest.raises(jax.errors.JaxRuntimeError, match="unexpected numbers"):
+        call(triple, x, x)
+
+
+def test_equal_programs_are_compiled_once(triple):
+    before = _lanes.held()
+    assert _lanes.registered(kernel_ir(TRIPLE), 1, 1, WIDTH, True) == triple
+    assert _lanes.held() == before
+    assert before.bytes > 0
+    others = [(1, 1, WIDTH, False), (1, 1, WIDTH + 1, True), (2, 1, WIDTH, True)]
+    names = {_lanes.registered(kernel_ir(TRIPLE), *other) for other in others}
+    assert len(names | {triple}) == 4
+
+
+def test_what_is_held_grows_by_each_program():
+    before = _lanes.held()
+    unused = "@grows = global i32 0\n"
+    _lanes.registered(kernel_ir(TRIPLE, before=unused), 1, 1, WIDTH, True)
+    after = _lanes.held()
+    assert after.programs == before.programs + 1
+    assert after.bytes > before.bytes
+
+
+def test_a_module_of_a_million_characters():
+    """Its code is generated at another level than that of shorter modules."""
+    comment = f"; {'.' * 1_000_000}\n"
+    name = _lanes.registered(kernel_ir(TRIPLE, before=comment), 1, 1, WIDTH, True)
+    x = np.arange(1001.0)
+    np.testing.assert_array_equal(call(name, x), 3 * x)
+
+
+def test_text_that_is_not_a_kernel_is_refused():
+    with pytest.raises(RuntimeError, match="parsing"):
+        _lanes.registered("this is not LLVM IR", 1, 1, WIDTH, True)
+
+
+def test_threads_that_want_the_same_program_at_once():
+    kernel = kernel_ir(TRIPLE, before="@at_once = global i32 0\n")
+    before = _lanes.held().programs
+    start, names = threading.Barrier(8), []
+
+    def want():
+        start.wait()
+        name = _lanes.registered(kernel, 1, 1, WIDTH, True)
+        x = np.arange(1000.0)
+        np.testing.assert_array_equal(call(name, x), 3 * x)
+        names.append(name)
+
+    threads = [threading.Thread(target=want) for _ in range(8)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert len(names) == 8
+    assert len(set(names)) == 1
+    assert _lanes.held().programs == before + 1
+
+
+def test_calls_from_more_threads_than_the_pool_has():
+    assert printed("many_callers", NPROC="2") == "calls: 160"
+
+
+@pytest.mark.parametrize("threads", [1, 2, 4])
+def test_no_more_threads_than_the_pool_has(threads):
+    # The pool's threads take part if they are there: the blocks last for 0.8 s in all.
+    assert printed("threads", 1, NPROC=str(threads)) == f"most: {threads}"
+
+
+def test_several_devices_share_the_pool():
+    flags = "--xla_force_host_platform_device_count=2"
+    most = int(printed("threads", 2, NPROC="4", XLA_FLAGS=flags).split()[-1])
+    # The second device's own thread may come when there are four at work.
+    assert 2 <= most <= 5
+
+
+def test_a_child_of_a_process_that_forks():
+    assert printed("forked") == "child: 0"
+
+
+def test_an_executable_from_jaxs_cache(tmp_path):
+    assert printed("cached", tmp_path) == "hits: 0"
+    assert list(tmp_path.iterdir())
+    assert printed("cached", tmp_path) != "hits: 0"
+
+
+def test_an_executable_that_was_saved(tmp_path):
+    path = tmp_path / "executable"
+    printed("saved", path)
+    assert printed("loaded", path, "registered") == "ran"
+    assert printed("loaded", path, "not") == "refused: True"

@@ -1,0 +1,104 @@
+"""Loops and branches whose lanes go different ways."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+
+from nhjax._lanes import member_ir
+from oracles import lanes_run
+from oracles.lanes_samples import (
+    assert_as_jax,
+    count,
+    MEMBERS,
+    repeated,
+    sample,
+    WIDTHS,
+)
+
+
+@WIDTHS
+def test_lanes_leave_a_loop_one_by_one(width):
+    def function(times, x):
+        return repeated(times, lambda k, x: jnp.sin(x) + k.astype(float), x)
+
+    assert_as_jax(function, width, count(30), sample(3))
+
+
+# Under `jax.vmap` lanes that have ended run inner loops on, and both sides of a branch
+# run, so that JAX itself would never end here.
+
+
+@WIDTHS
+def test_a_lane_that_has_ended_does_not_keep_an_inner_loop_running(width):
+    def function(times, x):
+        def body(k, x):
+            x = lax.while_loop(lambda y: (y > 1) | (k >= times), lambda y: y / 2, x)
+            return x + 3
+
+        return repeated(times, body, x)
+
+    times, x = count(9), sample()
+    expected = x.copy()
+    for member in range(MEMBERS):
+        for _ in range(times[member]):
+            while expected[member] > 1:
+                expected[member] /= 2
+            expected[member] += 3
+    got = lanes_run.run_batched(function, width, times, x)
+    np.testing.assert_array_equal(got, expected)
+
+
+@WIDTHS
+def test_a_loop_runs_for_the_lanes_that_take_its_branch(width):
+    def function(p, x):
+        def endless_elsewhere(x):
+            return lax.while_loop(lambda y: (y < 50) | ~p, lambda y: y + 1, x)
+
+        return lax.cond(p, endless_elsewhere, lambda x: x * 2, x)
+
+    p, x = np.arange(MEMBERS) % 3 == 0, np.floor(sample())
+    got = lanes_run.run_batched(function, width, p, x)
+    np.testing.assert_array_equal(got, np.where(p, 50, x * 2))
+
+
+@WIDTHS
+def test_a_loop_equal_in_all_lanes_does_not_run_in_a_branch_of_none(width):
+    """Its predicate is one for all lanes, so that no mask could end it."""
+
+    def function(p, x):
+        def endless(x):
+            return lax.while_loop(
+                lambda s: s[0] < 9, lambda s: (s[0] * 2, s[1]), (0, x)
+            )
+
+        return lax.cond(p, endless, lambda x: (0, x * 2), x)
+
+    x = sample()
+    zeros, got = lanes_run.run_batched(function, width, np.zeros(MEMBERS, bool), x)
+    np.testing.assert_array_equal(zeros, 0)
+    np.testing.assert_array_equal(got, x * 2)
+
+
+@WIDTHS
+def test_what_is_equal_in_all_lanes_differs_after_a_loop_that_they_leave(width):
+    def function(times):
+        return repeated(times, lambda k, x: x + k.astype(float), jnp.zeros(()))
+
+    assert_as_jax(function, width, count(12))
+
+
+def test_a_branch_equal_in_all_lanes_is_a_real_one():
+    def function(p, x):
+        return lax.cond(p, lambda x: jnp.sin(x), lambda x: jnp.exp(x), x)
+
+    shapes = (jax.ShapeDtypeStruct((), bool), jax.ShapeDtypeStruct((), np.float64))
+    program = jax.make_jaxpr(function)(*shapes)
+    shared = member_ir(program, (False, True), 8)
+    member = shared[shared.index("@member") : shared.index("@kernel")]
+    assert "phi <8 x double>" in member
+    assert "select <8 x i1>" not in member
+    x = sample()
+    for p in (False, True):
+        got = lanes_run.run(program, [np.asarray(p), x], [False, True], 8)[0]
+        np.testing.assert_allclose(got, np.sin(x) if p else np.exp(x), rtol=1e-15)

@@ -1,0 +1,66 @@
+"""Random programs in lanes, against the same programs in JAX, number by number.
+
+JAX runs them one operation after the other, so that nothing is fused or reordered, and
+the results have to be equal to the last bit; only a NaN has no sign. To run thousands:
+`NHJAX_FUZZ=5000 pytest tests/lanes/test_fuzz.py`.
+"""
+
+import os
+
+import hypothesis
+import jax
+import jax.numpy as jnp
+import numpy as np
+from hypothesis import HealthCheck, strategies as st
+
+from oracles import lanes_run
+from oracles.random_programs import programs
+from oracles.random_steps import evaluate, numbers
+
+
+EXAMPLES = int(os.environ.get("NHJAX_FUZZ", "200"))
+MEMBERS = 6
+
+
+def assert_identical(got, expected, name):
+    assert got.dtype == expected.dtype
+    assert got.shape == expected.shape
+    if got.dtype.kind == "f":
+        is_nan = np.isnan(expected)
+        np.testing.assert_array_equal(np.isnan(got), is_nan, err_msg=name)
+        bits = f"int{8 * got.dtype.itemsize}"
+        got, expected = (np.where(is_nan, 0, x).view(bits) for x in (got, expected))
+    np.testing.assert_array_equal(got, expected, err_msg=name)
+
+
+@hypothesis.settings(
+    max_examples=EXAMPLES,
+    deadline=None,
+    derandomize="NHJAX_FUZZ" not in os.environ,
+    suppress_health_check=[HealthCheck.too_slow, HealthCheck.data_too_large],
+)
+@hypothesis.given(
+    programs(),
+    st.integers(0, 2**32),
+    st.sampled_from((1, 4, 8)),
+    st.lists(st.booleans(), min_size=6, max_size=6),
+)
+def test_lanes_compute_what_jax_does(program, seed, width, batched):
+    kinds, steps = program
+    # At least one operand has the members.
+    is_batched = [True, *batched][: len(kinds)]
+    operands = [numbers(kind, MEMBERS, seed + i) for i, kind in enumerate(kinds)]
+    operands = [x if b else x[0] for x, b in zip(operands, is_batched, strict=True)]
+
+    def function(*values):
+        return evaluate(steps, list(values))[len(kinds) :]
+
+    axes = [0 if b else None for b in is_batched]
+    with jax.disable_jit():
+        expected = jax.vmap(function, in_axes=axes)(*map(jnp.asarray, operands))
+    shapes = [jax.ShapeDtypeStruct(kind.shape, kind.dtype) for kind in kinds]
+    closed = jax.make_jaxpr(function)(*shapes)
+    got = lanes_run.run(closed, operands, is_batched, width, contract=False)
+    names = [step.name for step in steps for _ in step.kinds]
+    for name, one, other in zip(names, got, expected, strict=True):
+        assert_identical(one, np.asarray(other), name)
