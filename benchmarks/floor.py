@@ -273,7 +273,7 @@ def report(rows: list[dict[str, Any]]) -> str:
     sections.append(markdown_table(header, against))
     sections.append(
         "`C++, k`: k trajectories at once, one in each lane of a vector, which iterate "
-        "until the slowest of the k has converged; nhjax runs a batch one by one. "
+        "until the slowest of the k has converged, as those of nhjax do. "
         "`most in a batch` is the mean over the steps of the iterations of the slowest "
         "of all. `ratio` is that of the medians, `fastest` that of the fastest of "
         "seven, which what else runs on the machine disturbs less."

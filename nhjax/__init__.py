@@ -1,6 +1,7 @@
 """High-order geometric integrators for nonholonomic mechanical systems, in JAX."""
 
 from . import plot as plot, systems as systems
+from ._compile import engines as engines, EngineUse as EngineUse
 from ._errors import (
     ConstraintViolationError as ConstraintViolationError,
     DependentConstraintsError as DependentConstraintsError,

@@ -10,13 +10,9 @@ from pathlib import Path
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 # Nearly all the time goes into tracing and compiling programs that run once, hence the
-# compiler's older and quicker code generator, in one piece rather than in 32, without
-# a search of loops for invariants that takes a fifth of the time. The backend reads
-# this when it starts; what the environment says comes last and wins.
-QUICK_FLAGS = (
-    "--xla_cpu_parallel_codegen_split_count=1 "
-    "--xla_disable_hlo_passes=while-loop-invariant-code-motion"
-)
+# compiler's older and quicker code generator, in one piece rather than in 32. The
+# backend reads this when it starts; what the environment says comes last and wins.
+QUICK_FLAGS = "--xla_cpu_parallel_codegen_split_count=1"
 # From 0.11.1 on there is no older code generator, and a flag that the compiler does not
 # know ends the process without a word.
 if tuple(map(int, importlib.metadata.version("jaxlib").split(".")[:3])) < (0, 11, 1):

@@ -1,9 +1,11 @@
-"""Compilation of programs into one kernel, and anew when what they read changes."""
+"""Compilation of whole programs by three engines, anew when what they read changes."""
 
 from ._elementary import (
     CALLING as CALLING,
     ELEMENTWISE as ELEMENTWISE,
     LARGEST_REDUCTION as LARGEST_REDUCTION,
 )
+from ._engine import engines as engines, EngineUse as EngineUse
+from ._ensemble import ensemble as ensemble
 from ._kernel import as_cpu_kernel as as_cpu_kernel
 from ._tracked_jit import tracked_jit as tracked_jit

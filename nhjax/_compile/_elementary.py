@@ -35,6 +35,7 @@ _MOVING = """
     broadcast_in_dim dynamic_slice dynamic_update_slice empty empty2 iota
     reshape
 """.split()  # noqa: SIM905
+_ARITHMETIC = {"add", "add_any", "div", "mul", "neg", "sub"}
 # These operations contain programs, whose operations are examined in turn.
 CALLING = """
     checkpoint closed_call custom_jvp_call custom_vjp_call jit remat2
@@ -72,3 +73,17 @@ def _programs(params: PyTree[Any]) -> Iterator[Any]:
         leaf = getattr(leaf, "jaxpr", leaf)
         if hasattr(leaf, "eqns"):
             yield leaf
+
+
+def array_size(program: Any) -> float:
+    """Compute the root of the mean square of the sizes of arrays in arithmetic."""
+    sizes = [size * size for size in _arithmetic_sizes(program)]
+    return math.sqrt(sum(sizes) / len(sizes)) if sizes else 0.0
+
+
+def _arithmetic_sizes(program: Any) -> Iterator[int]:
+    for equation in program.eqns:
+        if equation.primitive.name in _ARITHMETIC:
+            yield _size(equation.outvars[0])
+        for part in _programs(equation.params):
+            yield from _arithmetic_sizes(part)

@@ -56,16 +56,37 @@ def assert_same(got, expected):
         np.testing.assert_allclose(x, y, rtol=1e-13, atol=1e-14)
 
 
+@pytest.fixture(params=("lanes", "kernels", "xla"))
+def engine(request, monkeypatch):
+    """The first engine that may be taken; programs of others are forgotten."""
+    monkeypatch.setenv("NHJAX_ENGINE", request.param)
+    jax.clear_caches()
+    yield request.param
+    jax.clear_caches()
+
+
+@pytest.mark.usefixtures("engine")
 @pytest.mark.parametrize("compiled", [False, True])
 def test_a_kernel_computes_what_its_function_does(compiled):
     function = jax.jit(in_kernel) if compiled else in_kernel
     assert_same(function(*OPERANDS), pendulum(*OPERANDS))
 
 
-def test_a_kernel_is_marked_as_one():
-    assert MARK in jax.jit(in_kernel).lower(*OPERANDS).as_text()
+def test_the_engine_is_that_of_the_environment(engine):
+    (use,) = nhjax.engines(in_kernel, *OPERANDS)
+    assert (use.engine, use.members) == (engine, None)
+    text = jax.jit(lambda *x: in_kernel(*x)).lower(*OPERANDS).as_text()
+    assert (MARK in text) == (engine == "kernels")
+    assert ("nhjax_lanes_" in text) == (engine == "lanes")
 
 
+def test_an_unknown_engine_is_named_with_those_that_there_are(monkeypatch):
+    monkeypatch.setenv("NHJAX_ENGINE", "lane")
+    with pytest.raises(ValueError, match="is 'lane', which is none of 'lanes'"):
+        nhjax.engines(in_kernel, *OPERANDS)
+
+
+@pytest.mark.usefixtures("engine")
 @pytest.mark.parametrize(
     "transform",
     [
@@ -193,16 +214,8 @@ def test_printing_stays(capfd):
     assert "x = 1.5" in capfd.readouterr().out
 
 
-@pytest.mark.parametrize("variable", ["0", None])
-def test_kernels_can_be_switched_off(monkeypatch, variable):
-    if variable is not None:
-        monkeypatch.setenv("NHJAX_ONE_KERNEL", variable)
-    text = jax.jit(lambda *x: as_cpu_kernel(pendulum, *x)).lower(*OPERANDS).as_text()
-    assert (MARK in text) == (variable is None)
-
-
-def test_a_run_is_one_kernel_and_one_with_a_factorisation_is_none():
-    def lowered(system):
+def test_a_run_is_compiled_as_a_whole_and_one_with_a_factorisation_is_not():
+    def taken(system):
         y0 = nhjax.initial_state(system, q=jnp.ones(2), v=jnp.zeros(2))
 
         def run(y0):
@@ -211,7 +224,7 @@ def test_a_run_is_one_kernel_and_one_with_a_factorisation_is_none():
                 system, method, y0, dt=0.1, num_steps=3, throw=False
             ).ys
 
-        return jax.jit(run).lower(y0).as_text()
+        return nhjax.engines(run, y0)
 
     def plain(t, q, v, args):
         return 0.5 * v @ jnp.array([[2.0, 0.5], [0.5, 1.0]]) @ v - 0.5 * q @ q
@@ -220,8 +233,12 @@ def test_a_run_is_one_kernel_and_one_with_a_factorisation_is_none():
         root = jnp.linalg.cholesky(jnp.array([[2.0, 0.5], [0.5, 1.0]]) + 0 * q[0])
         return 0.5 * jnp.sum((root.T @ v) ** 2) - 0.5 * q @ q
 
-    assert MARK in lowered(nhjax.LagrangianSystem(plain))
-    assert MARK not in lowered(nhjax.LagrangianSystem(factorised))
+    (use,) = taken(nhjax.LagrangianSystem(plain))
+    assert use.engine == "lanes"
+    # The operations within are compiled apart.
+    use, *_ = taken(nhjax.LagrangianSystem(factorised))
+    assert use.engine == "xla"
+    assert "calls a library" in use.reason
 
 
 @pytest.mark.parametrize(

@@ -1,6 +1,5 @@
 """Runs of any length by one compiled program, where nothing saved depends on it."""
 
-import re
 from typing import Any
 
 import jax
@@ -97,15 +96,17 @@ def test_members_of_a_batch_have_lengths_of_their_own():
 
 
 def test_a_batch_in_step_has_lengths_of_its_own(monkeypatch):
-    monkeypatch.setenv("NHJAX_ONE_KERNEL", "0")
+    monkeypatch.setenv("NHJAX_ENGINE", "xla")
     batch = jax.jit(jax.vmap(lambda n: run(n)))(jnp.array([5, 20]))
     for lane, length in enumerate((5, 20)):
         np.testing.assert_allclose(batch.ys.q[lane], run(length).ys.q, rtol=1e-13)
 
 
-def test_a_length_that_is_traced_is_one_kernel():
-    program = jax.jit(lambda n: run(n, throw=False).ys.q)
-    assert re.search("xla_cpu_small_call", program.lower(3).as_text())
+@pytest.mark.parametrize("engine", ["lanes", "kernels"])
+def test_a_run_whose_length_is_traced_is_compiled_as_a_whole(monkeypatch, engine):
+    monkeypatch.setenv("NHJAX_ENGINE", engine)
+    (use,) = nhjax.engines(lambda n: run(n, throw=False).ys.q, 3)
+    assert use.engine == engine
 
 
 def test_a_chunk_from_state_to_state_saves_at_any_number_of_them():

@@ -1,5 +1,6 @@
 """Every feature in brief, as a program of its own: each prints its name if it holds."""
 
+import os
 from collections.abc import Callable
 from typing import Any
 
@@ -192,7 +193,10 @@ def gradients_of_a_batch_by_the_reversible_adjoint():
 
 @feature
 def gradients_of_an_ensemble_in_its_projected_starts():
-    """Of 40 members: parameters that turn out unused or constant abort the compiler."""
+    """Of 40 members, by every engine.
+
+    Kernels whose parameters turn out to be unused or constant abort XLA's compiler.
+    """
     sleigh = systems.RodSleigh()
 
     def loss(q):
@@ -200,9 +204,13 @@ def gradients_of_an_ensemble_in_its_projected_starts():
         sol = run(sleigh, TWO, y0=y0, saveat=SaveAt(steps=True))
         return jnp.sum(sol.ys.q)
 
-    one = jax.jit(jax.grad(loss))(sleigh.q0)
-    many = jax.jit(jax.vmap(jax.grad(loss)))(jnp.stack([sleigh.q0] * 40))
-    close(many, jnp.broadcast_to(one, many.shape))
+    for engine in ("kernels", "lanes"):
+        os.environ["NHJAX_ENGINE"] = engine
+        one = jax.jit(jax.grad(loss))(sleigh.q0)
+        many = jax.jit(jax.vmap(jax.grad(loss)))(jnp.stack([sleigh.q0] * 40))
+        close(many, jnp.broadcast_to(one, many.shape))
+        jax.clear_caches()
+    del os.environ["NHJAX_ENGINE"]
 
 
 @feature

@@ -1,0 +1,196 @@
+"""Ensembles in the lanes of vectors beside one kernel for each member, in one run.
+
+For every system of the gallery and every kind of output or derivative, an ensemble is
+compiled by both engines (see `nhjax.engines`) and run in turn; every member has a step
+size of its own. Times are of the processor, the fastest of seven runs; compile times
+are those of the first call, from the trace on. Agreement is the largest difference of
+any number that comes out, relative to the largest of its array, and the number of
+members whose counts of iterations differ.
+
+    taskset -c 0 python -m benchmarks.engines --kinds end rows
+"""
+
+import argparse
+import os
+import time
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import nhjax
+from nhjax import SaveAt, systems
+
+from ._report import markdown_table, write
+
+
+ENGINES = ("kernels", "lanes")
+REPEATS = 7
+ADJOINTS = {
+    "direct": nhjax.DirectAdjoint(),
+    "checkpoints": nhjax.RecursiveCheckpointAdjoint(),
+    "reversible": nhjax.ReversibleAdjoint(),
+}
+KINDS = ("end", "rows", "dense", "jvp", *ADJOINTS)
+
+
+def gallery() -> dict[str, Any]:
+    """All examples with their default parameters, by name."""
+    classes = {
+        name: value
+        for name, value in vars(systems).items()
+        if isinstance(value, type) and hasattr(value, "lagrangian")
+    }
+    low = systems.ContinuouslyVariableTransmission.low
+    return {
+        name: low() if name == "ContinuouslyVariableTransmission" else value()
+        for name, value in sorted(classes.items())
+    }
+
+
+def program(
+    example: Any, kind: str, stages: int, num_steps: int
+) -> Callable[[Any, Any], Any]:
+    """A function of one member's state and step size."""
+    method = nhjax.LobattoIIIAB(stages)
+
+    def run(y0, dt, **options):
+        return nhjax.integrate(
+            example.system,
+            method,
+            y0,
+            dt=dt,
+            num_steps=num_steps,
+            throw=False,
+            **options,
+        )
+
+    def values(y0, dt):
+        if kind == "dense":
+            sol = run(y0, dt, saveat=SaveAt(dense=True))
+            ys = jax.vmap(sol.evaluate)(dt * jnp.linspace(0.5, num_steps - 0.5, 5))
+        else:
+            saveat = SaveAt(steps=True) if kind == "rows" else SaveAt(t1=True)
+            sol = run(y0, dt, saveat=saveat)
+            ys = sol.ys
+        return ys, sol.stats["num_iterations"]
+
+    def pushed(y0, dt):
+        def function(dt):
+            sol = run(y0, dt)
+            return sol.ys, sol.stats["num_iterations"]
+
+        (ys, count), (rates, _) = jax.jvp(function, (dt,), (jnp.ones_like(dt),))
+        return (ys, rates), count
+
+    def gradient(y0, dt):
+        def loss(y0, dt):
+            ys = run(y0, dt, adjoint=ADJOINTS[kind]).ys
+            return sum(jnp.sum(x**2) for x in jax.tree.leaves(ys))
+
+        return jax.value_and_grad(loss, argnums=(0, 1))(y0, dt), jnp.zeros((), int)
+
+    if kind in ADJOINTS:
+        return gradient
+    return pushed if kind == "jvp" else values
+
+
+def compiled(engine: str, function: Callable[..., Any], *args: Any):
+    """The compiled function, seconds of the processor, and the engine that it took."""
+    os.environ["NHJAX_ENGINE"] = engine
+    jax.clear_caches()
+    start = time.process_time()
+    ready = jax.jit(jax.vmap(function)).lower(*args).compile()
+    seconds = time.process_time() - start
+    uses = nhjax.engines(jax.vmap(function), *args)
+    took = {use.engine for use in uses if use.members is not None}
+    return ready, seconds, "/".join(sorted(took))
+
+
+def fastest(functions: list[Callable[[], Any]]) -> list[float]:
+    """Seconds of the processor of each, the fastest of runs in turn."""
+    best = [np.inf] * len(functions)
+    for _ in range(REPEATS):
+        for k, function in enumerate(functions):
+            start = time.process_time()
+            jax.block_until_ready(function())
+            best[k] = min(best[k], time.process_time() - start)
+    return best
+
+
+def difference(got: Any, expected: Any) -> float:
+    """The largest difference of two trees, relative to the largest of each array."""
+    worst = 0.0
+    for x, y in zip(jax.tree.leaves(got), jax.tree.leaves(expected), strict=True):
+        x, y = np.asarray(x), np.asarray(y)
+        if x.size and x.dtype.kind == "f":
+            size = np.max(np.abs(y)) or 1.0
+            worst = max(worst, float(np.max(np.abs(x - y)) / size))
+    return worst
+
+
+def case(
+    name: str, example: Any, kind: str, options: argparse.Namespace
+) -> dict[str, Any]:
+    """Both engines on one system and one kind of output."""
+    members, steps = options.members, options.num_steps
+    y0 = example.initial_state()
+    y0 = jax.tree.map(lambda x: jnp.broadcast_to(x, (members, *x.shape)), y0)
+    dt = jnp.linspace(0.8, 1.0, members) * options.final_time / steps
+    function = program(example, kind, options.stages, steps)
+    ready, seconds, took = zip(
+        *[compiled(engine, function, y0, dt) for engine in ENGINES], strict=True
+    )
+    results = [run(y0, dt) for run in ready]
+    times = fastest([lambda run=run: run(y0, dt) for run in ready])
+    (kernels, counts), (lanes, lane_counts) = results
+    return {
+        "system": name,
+        "kind": kind,
+        "engines": took,
+        "compile": seconds,
+        "microseconds": [1e6 * x / members / steps for x in times],
+        "ratio": times[1] / times[0],
+        "difference": difference(lanes, kernels),
+        "different_counts": int(np.sum(np.asarray(counts) != np.asarray(lane_counts))),
+    }
+
+
+def main() -> None:
+    """Print and save the table."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--systems", nargs="+", default=list(gallery()))
+    parser.add_argument("--kinds", nargs="+", default=list(KINDS), choices=KINDS)
+    parser.add_argument("--stages", type=int, default=3)
+    parser.add_argument("--members", type=int, default=64)
+    parser.add_argument("--num-steps", type=int, default=40)
+    parser.add_argument("--final-time", type=float, default=2.0)
+    options = parser.parse_args()
+    jax.config.update("jax_enable_x64", True)
+    rows, data = [], []
+    for name in options.systems:
+        for kind in options.kinds:
+            x = case(name, gallery()[name], kind, options)
+            data.append(x)
+            rows.append(
+                [name, kind, x["engines"][1]]
+                + [f"{t:.2f}" for t in x["microseconds"]]
+                + [f"{x['ratio']:.2f}"]
+                + [f"{t:.1f}" for t in x["compile"]]
+                + [f"{x['difference']:.1e}", str(x["different_counts"])]
+            )
+            print(*rows[-1], sep="\t", flush=True)
+    header = ["system", "kind", "engine", "kernels [µs/step]", "lanes [µs/step]"]
+    header += ["ratio", "compile kernels [s]", "compile lanes [s]"]
+    header += ["difference", "other counts"]
+    text = (
+        f"{options.members} members, s = {options.stages}, {options.num_steps} steps "
+        f"to t = {options.final_time:g} at most.\n\n{markdown_table(header, rows)}"
+    )
+    write("engines", "Ensembles by engine", text, {"rows": data})
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,121 @@
+"""Derivatives of programs that are compiled as a whole, forward and transposed."""
+
+from typing import Any
+
+import jax
+import jax.core
+import jax.extend
+import jax.numpy as jnp
+from jax.interpreters import ad
+
+from ._kernel import call, kernel
+from ._marks import merged, split
+
+
+def differentiated(operands, tangents, *, program):
+    """Compute values and tangents in two kernels, the second linear in the tangents.
+
+    There are two kernels so that reverse mode can keep the results of the first and
+    transpose the second.
+    """
+    run = jax.extend.core.jaxpr_as_fun(program)
+    is_moving = [not isinstance(tangent, ad.Zero) for tangent in tangents]
+    rates, _ = split(is_moving, tangents)
+    is_smooth = [jnp.issubdtype(x.dtype, jnp.inexact) for x in program.out_avals]
+    treedef = None
+
+    def linearised(*operands):
+        nonlocal treedef
+        moving, fixed = split(is_moving, operands)
+
+        def values(*moving):
+            return split(is_smooth, run(*merged(is_moving, moving, fixed)))
+
+        smooth, push, rest = jax.linearize(values, *moving, has_aux=True)
+        residuals, treedef = jax.tree.flatten(push)
+        return [*merged(is_smooth, smooth, rest), *residuals]
+
+    try:
+        whole = jax.make_jaxpr(linearised)(*operands)
+    except ValueError:
+        # What JAX cannot linearise, such as a while loop, has forward mode at least.
+        all_rates = [ad.instantiate_zeros(tangent) for tangent in tangents]
+        return jax.jvp(run, operands, all_rates)
+    size = len(program.out_avals)
+    # Residuals that depend on no operand are computed again and not kept: in a loop
+    # they would be kept once for each round.
+    fixed, is_varying = _fixed_part(whole)
+    is_kept = [True] * size + is_varying[size:]
+    results = call(
+        lambda *operands: split(
+            is_kept, jax.extend.core.jaxpr_as_fun(whole)(*operands)
+        )[0],
+        list(operands),
+    )
+    out, residuals = results[:size], results[size:]
+
+    def push(*given):
+        residuals, rates = given[: -sum(is_moving)], given[-sum(is_moving) :]
+        everything = merged(
+            is_kept[size:], residuals, _constants(whole, fixed, is_kept)
+        )
+        return list(jax.tree.unflatten(treedef, everything)(*rates))
+
+    changes = call(push, [*residuals, *rates])
+    zeros = [ad.Zero(aval.to_tangent_aval()) for aval in program.out_avals]
+    return out, merged(is_smooth, changes, split(is_smooth, zeros)[1])
+
+
+def _fixed_part(program) -> tuple[list[Any], list[bool]]:
+    """Find the operations that depend on no operand, and the results that do on one."""
+    traced = [isinstance(const, jax.core.Tracer) for const in program.consts]
+    varying = {*program.jaxpr.invars, *split(traced, program.jaxpr.constvars)[0]}
+
+    def varies(x) -> bool:
+        return not isinstance(x, jax.extend.core.Literal) and x in varying
+
+    fixed = []
+    for equation in program.eqns:
+        if equation.effects or any(map(varies, equation.invars)):
+            varying.update(equation.outvars)
+        else:
+            fixed.append(equation)
+    return fixed, list(map(varies, program.jaxpr.outvars))
+
+
+def _constants(program, fixed: list[Any], is_kept: list[bool]) -> list[Any]:
+    """Compute the results of a program that are not kept, from its fixed operations."""
+    jaxpr = program.jaxpr
+    part = jaxpr.replace(
+        invars=[],
+        eqns=fixed,
+        outvars=split(is_kept, jaxpr.outvars)[1],
+        debug_info=jaxpr.debug_info.with_unknown_names(),
+    )
+    return jax.core.eval_jaxpr(part, program.consts)
+
+
+ad.primitive_jvps[kernel] = differentiated
+
+
+def transposed(cotangents, *operands, program):
+    run = jax.extend.core.jaxpr_as_fun(program)
+    is_linear = [ad.is_undefined_primal(x) for x in operands]
+    linear, known = split(is_linear, operands)
+    is_asked = [not isinstance(cotangent, ad.Zero) for cotangent in cotangents]
+    asked, _ = split(is_asked, cotangents)
+
+    def pull(*given):
+        known, asked = given[: -sum(is_asked)], given[-sum(is_asked) :]
+
+        def push(*rates):
+            return split(is_asked, run(*merged(is_linear, rates, known)))[0]
+
+        transpose = jax.linear_transpose(push, *(x.aval for x in linear))
+        return list(transpose(list(asked)))
+
+    pulled = call(pull, [*known, *asked])
+    return merged(is_linear, pulled, [None] * len(known))
+
+
+ad.primitive_transposes[kernel] = transposed

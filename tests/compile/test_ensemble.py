@@ -1,0 +1,123 @@
+"""Ensembles of programs give what their members give, and so do their derivatives."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import nhjax
+from nhjax._compile import as_cpu_kernel
+
+
+def wanders(g, x, k):
+    """Some steps of a pendulum, with an integer among operands and results."""
+
+    def step(x, i):
+        velocity = x[1] - 0.1 * g * jnp.sin(x[0])
+        return jnp.stack([x[0] + 0.1 * velocity, velocity]), i + k
+
+    return jax.lax.scan(step, x, jnp.arange(3, dtype=jnp.int32))
+
+
+def in_kernel(g, x, k):
+    return as_cpu_kernel(wanders, g, x, k)
+
+
+G = jnp.array([9.0, 10.0, 11.0, 12.0])
+X = jnp.arange(8.0).reshape(4, 2) / 10
+K = jnp.arange(4, dtype=jnp.int32)
+AXES = [(0, None, None), (None, 0, None), (0, 0, 0), (0, 1, None), (None, None, 0)]
+
+
+def operands(axes):
+    g = G if axes[0] == 0 else G[0]
+    x = X[0] if axes[1] is None else jnp.moveaxis(X, 0, axes[1])
+    return g, x, K if axes[2] == 0 else K[0]
+
+
+def assert_same(got, expected):
+    for x, y in zip(jax.tree.leaves(got), jax.tree.leaves(expected), strict=True):
+        assert x.dtype == y.dtype
+        np.testing.assert_allclose(x, y, rtol=1e-13, atol=1e-14)
+
+
+def cost(function, axes, k):
+    def of_all(g, x):
+        end, _ = jax.vmap(function, in_axes=axes)(g, x, k)
+        return jnp.sum(end**3)
+
+    return of_all
+
+
+@pytest.mark.parametrize("axes", AXES)
+@pytest.mark.parametrize("compiled", [False, True])
+def test_an_ensemble_computes_what_its_members_do(axes, compiled):
+    got = jax.vmap(in_kernel, in_axes=axes)
+    got = jax.jit(got) if compiled else got
+    assert_same(got(*operands(axes)), jax.vmap(wanders, axes)(*operands(axes)))
+
+
+@pytest.mark.parametrize("axes", AXES)
+@pytest.mark.parametrize(
+    "transform",
+    [
+        lambda f: jax.grad(f, argnums=(0, 1)),
+        lambda f: lambda *x: jax.jvp(f, x, jax.tree.map(jnp.ones_like, x)),
+        lambda f: lambda *x: jax.linearize(f, *x)[1](*jax.tree.map(jnp.ones_like, x)),
+        lambda f: jax.hessian(f, argnums=(0, 1)),
+        lambda f: jax.jacrev(jax.grad(f, argnums=1), argnums=0),
+    ],
+    ids=["grad", "jvp", "linearize", "hessian", "reverse over reverse"],
+)
+def test_derivatives_of_an_ensemble(axes, transform):
+    """An operand that the members share has the sum of their gradients."""
+    g, x, k = operands(axes)
+    got = jax.jit(transform(cost(in_kernel, axes, k)))(g, x)
+    assert_same(got, jax.jit(transform(cost(wanders, axes, k)))(g, x))
+
+
+def batched(shape, inner, outer, dtype):
+    """Make numbers of this shape, with axes for the members where these are given."""
+    shape = list(shape)
+    for axis, size in ((inner, 4), (outer, 3)):
+        if axis is not None:
+            shape.insert(axis, size)
+    numbers = np.arange(np.prod(shape, dtype=int)).reshape(shape)
+    return jnp.asarray(numbers / 9 if dtype == "float64" else numbers, dtype)
+
+
+@pytest.mark.parametrize("outer", [(0, None, None), (None, 0, None), (0, 1, None)])
+@pytest.mark.parametrize("inner", [(None, 0, None), (0, 1, None), (0, None, 0)])
+def test_ensembles_of_ensembles(outer, inner):
+    types = ("float64", "float64", "int32")
+    given = map(batched, ((), (2,), ()), inner, outer, types)
+
+    def nested(f):
+        return jax.jit(jax.vmap(jax.vmap(f, in_axes=inner), in_axes=outer))
+
+    given = list(given)
+    assert_same(nested(in_kernel)(*given), nested(wanders)(*given))
+
+
+@pytest.mark.parametrize("members", [0, 1])
+def test_an_ensemble_of_few_or_no_members(members):
+    g, x = jnp.ones(members), jnp.ones((members, 2))
+    got = jax.jit(jax.vmap(in_kernel, (0, 0, None)))(g, x, K[1])
+    assert_same(got, jax.vmap(wanders, (0, 0, None))(g, x, K[1]))
+
+
+def test_operands_without_elements():
+    def function(x, empty):
+        return 2 * x, jnp.sin(empty)
+
+    def run(f):
+        inner = jax.vmap(f, in_axes=(0, None))
+        return jax.vmap(inner, in_axes=(None, 0))(G, jnp.zeros((3, 0, 2)))
+
+    assert_same(run(lambda *x: as_cpu_kernel(function, *x)), run(function))
+
+
+def test_a_function_that_cannot_be_an_ensemble_is_batched_by_jax(monkeypatch):
+    monkeypatch.setenv("NHJAX_ENGINE", "xla")
+    (use,) = nhjax.engines(jax.vmap(in_kernel, (0, 0, None)), *operands((0, 0, None)))
+    assert use == nhjax.EngineUse("xla", "chosen", 4)

@@ -1,0 +1,95 @@
+"""Ensembles in lanes are those of XLA to round-off, whatever their members do."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import nhjax
+from benchmarks.engines import difference, gallery, program
+from nhjax import LobattoIIIAB, systems
+
+
+GALLERY = gallery()
+PARTICLE = systems.NonholonomicParticle()
+# Iterations end in round-off: one more or less in a few of all steps.
+LARGEST_DIFFERENCE_OF_COUNTS = 0.05
+
+
+def ensemble(example, members, num_steps):
+    """States and step sizes of members that end at times around t = 2."""
+    y0 = example.initial_state()
+    y0 = jax.tree.map(lambda x: np.broadcast_to(x, (members, *x.shape)), y0)
+    return y0, np.linspace(0.8, 1.0, members) * 2.0 / num_steps
+
+
+def by_engine(engine, monkeypatch, function, *args):
+    monkeypatch.setenv("NHJAX_ENGINE", engine)
+    # A function of its own, as programs that have been compiled keep their engine.
+    return jax.jit(jax.vmap(lambda *args: function(*args)))(*args)
+
+
+@pytest.mark.parametrize("name", GALLERY)
+def test_an_ensemble_in_lanes_is_that_of_xla(name, monkeypatch):
+    num_steps = 20
+    function = program(GALLERY[name], "end", 2, num_steps)
+    args = ensemble(GALLERY[name], 9, num_steps)
+    lanes, lane_counts = by_engine("lanes", monkeypatch, function, *args)
+    expected, counts = by_engine("xla", monkeypatch, function, *args)
+    assert difference(lanes, expected) < 1e-12
+    spread = np.abs(np.asarray(lane_counts) / np.asarray(counts) - 1)
+    assert np.all(spread <= LARGEST_DIFFERENCE_OF_COUNTS)
+
+
+@pytest.mark.parametrize("kind", ["rows", "dense", "jvp", "checkpoints", "reversible"])
+def test_output_and_derivatives_in_lanes_are_those_of_xla(kind, monkeypatch):
+    function = program(PARTICLE, kind, 2, 10)
+    args = ensemble(PARTICLE, 5, 10)
+    lanes, _ = by_engine("lanes", monkeypatch, function, *args)
+    expected, _ = by_engine("xla", monkeypatch, function, *args)
+    assert difference(lanes, expected) < 1e-12
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, 1e200, 1e308, -0.0])
+@pytest.mark.parametrize("name", ["NonholonomicParticle", "ChaplyginSleigh"])
+def test_a_wild_member_changes_no_other(name, value):
+    """Of 11 members, which fill a vector and a part of one, some are wild."""
+    example, wild = GALLERY[name], [1, 4, 10]
+
+    @jax.jit
+    @jax.vmap
+    def run(y0, dt):
+        sol = nhjax.integrate(
+            example.system, LobattoIIIAB(2), y0, dt=dt, num_steps=10, throw=False
+        )
+        return sol.ys, sol.stats["num_iterations"], sol.stats["failed_step"]
+
+    y0, dt = ensemble(example, 11, 10)
+    expected = run(y0, dt)
+    q = np.array(y0.q)
+    q[wild] = value
+    got = run(nhjax.State(jnp.asarray(q), y0.v, y0.p, y0.multiplier), dt)
+    others = [k for k in range(11) if k not in wild]
+    for x, y in zip(jax.tree.leaves(got), jax.tree.leaves(expected), strict=True):
+        np.testing.assert_array_equal(np.asarray(x)[others], np.asarray(y)[others])
+
+
+@pytest.mark.parametrize("members", [1, 7, 8, 9, 1000])
+def test_ensembles_of_any_size_end_as_their_members_do(members):
+    @jax.jit
+    @jax.vmap
+    def run(dt):
+        return nhjax.integrate(
+            PARTICLE.system,
+            LobattoIIIAB(2),
+            PARTICLE.initial_state(),
+            dt=dt,
+            num_steps=3,
+            throw=False,
+        ).ys.q
+
+    dt = jnp.linspace(0.1, 0.2, members)
+    q = run(dt)
+    # The lanes of a vector compute alike, wherever a member is.
+    np.testing.assert_array_equal(q[::-1], run(dt[::-1]))
+    np.testing.assert_array_equal(q[:1], run(dt[:1]))
