@@ -240,12 +240,25 @@ def _scatter(
     for place, (shift, is_inside) in located.items():
         for inner in np.ndindex(window.shape):
             offset = int(window[inner])
-            number: Any = updates[place + inner]
             old: Any = read(shift, offset)
-            if op is not None:
-                number = builder.graph.op(op, old, number)
+            number = _combined(builder, equation, op, old, updates[place + inner])
             write(shift, offset, builder.graph.select(is_inside, number, old))
     return result
+
+
+def _combined(
+    builder: Builder, equation: Any, op: str | None, old: Node, new: Node
+) -> Node:
+    """Make what a scatter stores where one number stands and another one comes."""
+    if op is not None:
+        return builder.graph.op(op, old, new)
+    # `x.at[index].apply(function)` is a scatter whose numbers come from a program.
+    jaxpr = equation.params["update_jaxpr"]
+    if jaxpr is None:
+        return new
+    pair = [builder.full((), old), builder.full((), new)]
+    out = builder.run(jaxpr, equation.params["update_consts"], pair)[0]
+    return builder.memory.registers(out)[()]
 
 
 def _target(

@@ -41,6 +41,17 @@ def test_stores_in_branches(width):
 
 
 @WIDTHS
+def test_a_function_is_applied_at_an_index(width):
+    def function(i, x):
+        x = x.at[1].apply(jnp.sin)
+        x = x.at[jnp.stack([i, i + 1])].apply(lambda x: 2 * x + 1, mode="drop")
+        # Twice at the same place.
+        return x.at[jnp.stack([i, i])].apply(jnp.cos, mode="clip")
+
+    assert_as_jax(function, width, count(6), sample(4))
+
+
+@WIDTHS
 def test_two_versions_of_an_array(width):
     def function(i, x):
         changed = x.at[i].set(7.0)
