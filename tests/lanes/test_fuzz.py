@@ -6,13 +6,16 @@ the results have to be equal to the last bit; only a NaN has no sign. To run tho
 """
 
 import os
+import sys
 
 import hypothesis
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 from hypothesis import HealthCheck, strategies as st
 
+from nhjax._lanes import _memory
 from oracles import lanes_run
 from oracles.random_programs import programs
 from oracles.random_steps import evaluate, numbers
@@ -33,19 +36,24 @@ def assert_identical(got, expected, name):
     np.testing.assert_array_equal(got, expected, err_msg=name)
 
 
-@hypothesis.settings(
-    max_examples=EXAMPLES,
-    deadline=None,
-    derandomize="NHJAX_FUZZ" not in os.environ,
-    suppress_health_check=[HealthCheck.too_slow, HealthCheck.data_too_large],
-)
-@hypothesis.given(
-    programs(),
-    st.integers(0, 2**32),
-    st.sampled_from((1, 4, 8)),
-    st.lists(st.booleans(), min_size=6, max_size=6),
-)
-def test_lanes_compute_what_jax_does(program, seed, width, batched):
+def fuzzed(examples):
+    """Make a test of a function that is given programs with their data."""
+    settings = hypothesis.settings(
+        max_examples=examples,
+        deadline=None,
+        derandomize="NHJAX_FUZZ" not in os.environ,
+        suppress_health_check=[HealthCheck.too_slow, HealthCheck.data_too_large],
+    )
+    given = hypothesis.given(
+        programs(),
+        st.integers(0, 2**32),
+        st.sampled_from((1, 4, 8)),
+        st.lists(st.booleans(), min_size=6, max_size=6),
+    )
+    return lambda test: settings(given(test))
+
+
+def compare(program, seed, width, batched):
     kinds, steps = program
     # At least one operand has the members.
     is_batched = [True, *batched][: len(kinds)]
@@ -64,3 +72,20 @@ def test_lanes_compute_what_jax_does(program, seed, width, batched):
     names = [step.name for step in steps for _ in step.kinds]
     for name, one, other in zip(names, got, expected, strict=True):
         assert_identical(one, np.asarray(other), name)
+
+
+@fuzzed(EXAMPLES)
+def test_lanes_compute_what_jax_does(program, seed, width, batched):
+    compare(program, seed, width, batched)
+
+
+@fuzzed(max(EXAMPLES // 4, 1))
+def test_arrays_in_memory_hold_what_those_of_jax_do(program, seed, width, batched):
+    names = [name for name in sys.modules if name.startswith("nhjax._lanes.")]
+    with pytest.MonkeyPatch.context() as patch:
+        # Nearly all arrays of these programs are large then, and copied in loops.
+        patch.setattr(_memory, "_UNROLLED", 1)
+        for name in names:
+            if hasattr(sys.modules[name], "LARGE"):
+                patch.setattr(sys.modules[name], "LARGE", 1)
+        compare(program, seed, width, batched)

@@ -25,6 +25,7 @@ class Programs(Steps):
         """Append a number of steps."""
         makers = [
             self.binary,
+            self.stretched,
             self.unary,
             self.comparison,
             self.select,

@@ -130,6 +130,23 @@ class Steps:
             second = self.find(lambda other: other == kind)
             self.add(name, getattr(lax, name), (first, second), kind)
 
+    def stretched(self) -> None:
+        """Append an operation on arrays that have axes of length one."""
+        name = self.choose(_BINARY)
+        dtypes = _BINARY[name]
+        first = self.find(lambda k: k.shape == (2, 3) and k.dtype in dtypes)
+        if first is None:
+            return
+        kind = self.kinds[first]
+        second = self.find(lambda other: other == kind)
+        axis, is_both = self.choose((0, 1)), self.draw(st.booleans())
+
+        def stretch(x, y):
+            x = lax.slice_in_dim(x, 0, 1, axis=1 - axis) if is_both else x
+            return getattr(lax, name)(lax.slice_in_dim(y, 1, 2, axis=axis), x)
+
+        self.add(f"stretched {name}", stretch, (first, second), kind)
+
     def unary(self) -> None:
         name = self.choose([*_UNARY, "integer_pow", "is_finite"])
         dtypes = _UNARY.get(name, FLOATS)
