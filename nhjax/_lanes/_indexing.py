@@ -241,7 +241,8 @@ def _scatter(
         for inner in np.ndindex(window.shape):
             offset = int(window[inner])
             old: Any = read(shift, offset)
-            number = _combined(builder, equation, op, old, updates[place + inner])
+            new: Any = updates[place + inner]
+            number = _combined(builder, equation, op, old, new)
             write(shift, offset, builder.graph.select(is_inside, number, old))
     return result
 
@@ -258,7 +259,7 @@ def _combined(
         return new
     pair = [builder.full((), old), builder.full((), new)]
     out = builder.run(jaxpr, equation.params["update_consts"], pair)[0]
-    return builder.memory.registers(out)[()]
+    return builder.memory.registers(out).item()
 
 
 def _target(
