@@ -26,6 +26,11 @@ DTYPES = frozenset(
 )
 
 
+# LLVM takes some 20 s for so many, and minutes for more. XLA, which has loops over
+# arrays, takes a few seconds then.
+MOST_NODES = 200_000
+
+
 @cache
 def dtype_name(dtype: Any) -> str:
     """Return the name of a dtype that lanes can hold."""
@@ -150,6 +155,8 @@ class Graph:
     def next_number(self) -> int:
         """Return the number for the next node."""
         self.count += 1
+        if self.count > MOST_NODES:
+            raise Unsupported(f"more than {MOST_NODES} operations on numbers")
         return self.count
 
     def constant(self, value: Any, dtype: str, is_structural: bool = False) -> Node:
