@@ -10,6 +10,7 @@ a loop stands before it. It never leaves the side of a branch in which it was ma
 that side may not be taken.
 """
 
+import sys
 from collections.abc import Iterable, Sequence
 from functools import cache
 from typing import Any, Protocol
@@ -24,11 +25,6 @@ DTYPES = frozenset(
     bool int8 int16 int32 int64 uint8 uint16 uint32 uint64 float32 float64
     """.split()  # noqa: SIM905
 )
-
-
-# LLVM takes some 20 s for so many, and minutes for more. XLA, which has loops over
-# arrays, takes a few seconds then.
-MOST_NODES = 200_000
 
 
 @cache
@@ -147,6 +143,7 @@ class Graph:
 
     def __init__(self, simplify: Simplify):
         self.simplify = simplify
+        self.most_nodes = sys.maxsize
         self.root = Region(None, None, is_side=False)
         self.region = self.root
         self.count = 0
@@ -155,8 +152,8 @@ class Graph:
     def next_number(self) -> int:
         """Return the number for the next node."""
         self.count += 1
-        if self.count > MOST_NODES:
-            raise Unsupported(f"more than {MOST_NODES} operations on numbers")
+        if self.count > self.most_nodes:
+            raise Unsupported(f"more than {self.most_nodes} operations on numbers")
         return self.count
 
     def constant(self, value: Any, dtype: str, is_structural: bool = False) -> Node:

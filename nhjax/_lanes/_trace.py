@@ -3,6 +3,8 @@
 import math
 from typing import Any, NamedTuple
 
+import jax
+
 from ._branches import BRANCHES
 from ._buffers import Buffer, InMemory, Value
 from ._builder import Builder, Operation
@@ -17,6 +19,11 @@ from ._shaping import SHAPING
 
 # A scan of at most so many rounds is unrolled.
 UNROLLED = 8
+# More nodes than this are refused, unless the program has a twentieth as many of JAX's
+# operations: LLVM takes some 10 s for so many, and minutes for more. XLA, which has
+# loops over arrays, takes a few seconds where arrays are large, but longer than LLVM
+# where there are many small ones.
+MOST_NODES, NODES_OF_AN_OPERATION = 100_000, 20
 
 OPERATIONS: dict[str, Operation] = {
     **ELEMENTWISE,
@@ -38,6 +45,9 @@ class Traced(NamedTuple):
 def trace(program: Any) -> Traced:
     """Make the graph of a closed jaxpr of one member."""
     builder = Builder(OPERATIONS, UNROLLED)
+    builder.graph.most_nodes = max(
+        MOST_NODES, NODES_OF_AN_OPERATION * _operations(program.jaxpr)
+    )
     root = builder.graph.root
     args = []
     for index, variable in enumerate(program.jaxpr.invars):
@@ -59,3 +69,13 @@ def trace(program: Any) -> Traced:
             builder.memory.write(buffer, places(value.shape), value)
         results.append(buffer)
     return Traced(root, results)
+
+
+def _operations(jaxpr: Any) -> int:
+    """Count the operations of a jaxpr and of those within."""
+    count = len(jaxpr.eqns)
+    for equation in jaxpr.eqns:
+        for part in jax.tree.leaves(equation.params):
+            part = getattr(part, "jaxpr", part)
+            count += _operations(part) if hasattr(part, "eqns") else 0
+    return count

@@ -10,7 +10,7 @@ import pytest
 from jax import lax
 
 from nhjax._compile import _elementary
-from nhjax._lanes import _graph, Unsupported
+from nhjax._lanes import _trace, Unsupported
 from oracles import lanes_run
 from oracles.random_steps import Kind, numbers
 
@@ -274,7 +274,7 @@ def test_what_is_not_supported_says_so(function, reason):
 
 
 def test_programs_that_take_long_to_compile_are_refused(monkeypatch):
-    monkeypatch.setattr(_graph, "MOST_NODES", 100)
+    monkeypatch.setattr(_trace, "MOST_NODES", 100)
     lanes_run.run_batched(lambda x: jnp.sin(x), 4, np.ones((2, 10)))
     with pytest.raises(Unsupported, match="more than 100 operations"):
         lanes_run.run_batched(lambda x: jnp.outer(x, x), 4, np.ones((2, 20)))
