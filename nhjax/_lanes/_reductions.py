@@ -1,7 +1,7 @@
 """Operations that combine many numbers into one: reductions, sums, products."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from functools import partial
 from typing import Any
 
@@ -59,7 +59,7 @@ def _reduce(builder: Builder, equation: Any, values: list[Value]) -> Value:
     return out.reshape(shape)
 
 
-def _folded(builder: Builder, op: str, numbers: Sequence[Node]) -> Node | None:
+def _folded(builder: Builder, op: str, numbers: Iterable[Node]) -> Node | None:
     total = None
     for number in numbers:
         total = number if total is None else builder.graph.op(op, total, number)

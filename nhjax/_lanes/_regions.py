@@ -1,8 +1,12 @@
 """Loops and branches while they are made: nodes go into their regions meanwhile."""
 
 from collections.abc import Callable, Sequence
+from typing import TypeVar
 
 from ._graph import BranchInfo, Graph, LoopInfo, Node, Region
+
+
+T = TypeVar("T")
 
 
 class LoopInMaking:
@@ -79,7 +83,7 @@ class BranchInMaking:
         self.info.regions = [Region(graph.region, self.node, True) for _ in range(2)]
         self.node.attr = self.info
 
-    def on_side(self, side: int, function: Callable[[], Sequence]) -> Sequence:
+    def on_side(self, side: int, function: Callable[[], T]) -> T:
         """Call a function whose nodes go into one of the sides."""
         self.graph.region = self.info.regions[side]
         try:

@@ -12,8 +12,8 @@ from nhjax import LobattoIIIAB, systems
 
 GALLERY = gallery()
 PARTICLE = systems.NonholonomicParticle()
-# Iterations end in round-off: one more or less in a few of all steps.
-LARGEST_DIFFERENCE_OF_COUNTS = 0.05
+# Iterations end in round-off: some steps have one more or one less.
+LARGEST_DIFFERENCE_OF_COUNTS, OF_A_MEMBER = 0.03, 0.15
 
 
 def ensemble(example, members, num_steps):
@@ -37,8 +37,9 @@ def test_an_ensemble_in_lanes_is_that_of_xla(name, monkeypatch):
     lanes, lane_counts = by_engine("lanes", monkeypatch, function, *args)
     expected, counts = by_engine("xla", monkeypatch, function, *args)
     assert difference(lanes, expected) < 1e-12
-    spread = np.abs(np.asarray(lane_counts) / np.asarray(counts) - 1)
-    assert np.all(spread <= LARGEST_DIFFERENCE_OF_COUNTS)
+    change = np.asarray(lane_counts) / np.asarray(counts) - 1
+    assert np.abs(np.mean(change)) <= LARGEST_DIFFERENCE_OF_COUNTS
+    assert np.all(np.abs(change) <= OF_A_MEMBER)
 
 
 @pytest.mark.parametrize("kind", ["rows", "dense", "jvp", "checkpoints", "reversible"])
