@@ -4,6 +4,7 @@ from collections.abc import Callable
 from functools import partial
 from typing import Any
 
+import jax
 import numpy as np
 
 from ._buffers import InMemory, Value
@@ -132,12 +133,24 @@ def _taken(nodes: Any, aval: Any) -> np.ndarray:
     return out.reshape(aval.shape)
 
 
+def _expanded(builder: Builder, equation: Any, values: list[Value]) -> list[Value]:
+    """Run the program of an operation that JAX writes out when it compiles."""
+    expand = partial(equation.primitive.to_lojax, **equation.params)
+    avals = [variable.aval for variable in equation.invars]
+    args = [
+        jax.ShapeDtypeStruct(a.shape, a.dtype, weak_type=a.weak_type) for a in avals
+    ]
+    program = jax.make_jaxpr(expand)(*args)
+    return builder.run(program.jaxpr, program.consts, values)
+
+
 _CALLS = """
     checkpoint closed_call core_call custom_jvp_call custom_vjp_call
     custom_vjp_call_jaxpr jit one_kernel pjit remat remat2
 """.split()  # noqa: SIM905
 BRANCHES: dict[str, Operation] = {
     **dict.fromkeys(_CALLS, _call),
+    "call_hi_primitive": _expanded,
     "cond": _cond,
     "custom_linear_solve": _linear_solve,
 }

@@ -84,7 +84,14 @@ class Builder:
             raise Unsupported(f"the primitive {name}")
         for variable in equation.outvars:
             dtype_name(variable.aval.dtype)
-        outs = operation(self, equation, values)
+        try:
+            outs = operation(self, equation, values)
+        except KeyError as error:
+            # Another release of JAX may have other parameters.
+            parameter = error.args[0]
+            if not isinstance(parameter, str) or parameter in equation.params:
+                raise
+            raise Unsupported(f"{name} without its {parameter}") from error
         return list(outs) if equation.primitive.multiple_results else [outs]
 
     def last_uses(self, jaxpr: Any) -> list[list[Any]]:

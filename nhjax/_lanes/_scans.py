@@ -58,11 +58,10 @@ def _merged(marks: Sequence[bool], marked: Sequence, others: Sequence) -> list:
 
 
 def _scan(builder: Builder, equation: Any, values: list[Value]) -> list[Value]:
-    params = equation.params
-    size = params["num_consts"] + params["num_carry"]
-    consts, carry = values[: params["num_consts"]], values[params["num_consts"] : size]
-    rows = values[size:]
-    length = params["length"]
+    params, length = equation.params, equation.params["length"]
+    first, count = _sizes(params)
+    consts, carry = values[:first], values[first : first + count]
+    rows = values[first + count :]
     with builder.held([*consts, *rows]):
         is_short = length <= 1 or (
             length <= builder.unroll and not _has_loop(params["jaxpr"].jaxpr, builder)
@@ -70,6 +69,15 @@ def _scan(builder: Builder, equation: Any, values: list[Value]) -> list[Value]:
         if is_short:
             return _unrolled(builder, equation, consts, carry, rows)
         return _scanned(builder, equation, consts, carry, rows)
+
+
+def _sizes(params: dict[str, Any]) -> tuple[int, int]:
+    """Count the operands of a scan that are the same in each round, and its carry."""
+    if "num_carry" in params:
+        return params["num_consts"], params["num_carry"]
+    # Since JAX 0.12 a scan has the trees of its operands, without leaves, instead.
+    consts, carry, _ = params["ft_in"].unpack()
+    return len(consts), len(carry)
 
 
 def _has_loop(jaxpr: Any, builder: Builder) -> bool:
@@ -115,7 +123,7 @@ def _unrolled(
     builder: Builder, equation: Any, consts: list, carry: list, rows: list
 ) -> list[Value]:
     params = equation.params
-    body, length, count = params["jaxpr"], params["length"], params["num_carry"]
+    body, length, count = params["jaxpr"], params["length"], len(carry)
     order = range(length - 1, -1, -1) if params["reverse"] else range(length)
     saved: dict[int, list[Value]] = {}
     for index in order:
@@ -156,7 +164,7 @@ def _scanned(
     builder: Builder, equation: Any, consts: list, carry: list, rows: list
 ) -> list[Value]:
     params, graph, memory = equation.params, builder.graph, builder.memory
-    body, length, count = params["jaxpr"], params["length"], params["num_carry"]
+    body, length, count = params["jaxpr"], params["length"], len(carry)
     stored = {index - len(consts) for index in updated(body.jaxpr)}
     of_carry = [
         value.size > 0 and (value.size > LARGE or index in stored)

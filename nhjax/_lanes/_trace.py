@@ -9,6 +9,7 @@ from ._branches import BRANCHES
 from ._buffers import Buffer, InMemory, Value
 from ._builder import Builder, Operation
 from ._elementwise import ELEMENTWISE
+from ._gathers import GATHERS
 from ._graph import dtype_name, Region
 from ._indexing import INDEXING
 from ._memory import LARGE, places
@@ -30,6 +31,7 @@ OPERATIONS: dict[str, Operation] = {
     **SHAPING,
     **REDUCTIONS,
     **INDEXING,
+    **GATHERS,
     **SCANS,
     **BRANCHES,
 }

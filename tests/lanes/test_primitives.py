@@ -280,6 +280,16 @@ def test_programs_that_take_long_to_compile_are_refused(monkeypatch):
         lanes_run.run_batched(lambda x: jnp.outer(x, x), 4, np.ones((2, 20)))
 
 
+def test_parameters_of_another_release_are_refused_by_name():
+    program = jax.make_jaxpr(lambda x: lax.rev(x, (0,)))(np.zeros(3))
+    (equation,) = program.eqns
+    params = {f"{key}_elsewhere": value for key, value in equation.params.items()}
+    equation = equation.replace(params=params)
+    jaxpr = program.jaxpr.replace(eqns=[equation])
+    with pytest.raises(Unsupported, match="rev without its dimensions"):
+        _trace.trace(program.replace(jaxpr=jaxpr))
+
+
 def test_effects_are_refused():
     def function(x):
         jax.debug.print("{}", x)
