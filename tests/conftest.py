@@ -84,3 +84,12 @@ def few_compiled_programs():
     if not MAPS.exists() or MAPS.read_bytes().count(b"\n") > MANY_MAPS:
         jax.clear_caches()
         gc.collect()
+
+
+@pytest.fixture(params=("lanes", "kernels", "xla"))
+def engine(request, monkeypatch):
+    """The first engine that may be taken; programs of others are forgotten."""
+    monkeypatch.setenv("NHJAX_ENGINE", request.param)
+    jax.clear_caches()
+    yield request.param
+    jax.clear_caches()

@@ -15,7 +15,7 @@ from jax.interpreters import ad, batching, mlir
 
 from .._lanes import target, Unsupported
 from ._engine import chosen_engine, note
-from ._kernel import kernel
+from ._kernel import kernel, never_high
 from ._kernel_derivatives import differentiated, transposed
 from ._lowering import (
     is_within_kernel,
@@ -27,6 +27,7 @@ from ._marks import merged, split
 
 ensemble = jax.extend.core.Primitive("ensemble")
 ensemble.multiple_results = True
+ensemble.is_high = never_high
 
 
 @ensemble.def_impl

@@ -51,8 +51,18 @@ def call(flat: Callable[..., list[Any]], leaves: list[Any]) -> list[Any]:
     return kernel.bind(*leaves, program=program)
 
 
+def never_high(*_: Any, **__: Any) -> bool:
+    """Tell JAX not to write out operations in a program before it is lowered.
+
+    Since JAX 0.12 it would ask a primitive for a rule to do so (`to_lojax`) if its
+    program has such operations. Here they are written out while a program is lowered.
+    """
+    return False
+
+
 kernel = jax.extend.core.Primitive("one_kernel")
 kernel.multiple_results = True
+kernel.is_high = never_high
 
 
 @kernel.def_impl

@@ -121,3 +121,24 @@ def test_a_function_that_cannot_be_an_ensemble_is_batched_by_jax(monkeypatch):
     monkeypatch.setenv("NHJAX_ENGINE", "xla")
     (use,) = nhjax.engines(jax.vmap(in_kernel, (0, 0, None)), *operands((0, 0, None)))
     assert use == nhjax.EngineUse("xla", "chosen", 4)
+
+
+@pytest.mark.usefixtures("engine")
+def test_operations_that_jax_writes_out_when_it_compiles():
+    # Since JAX 0.12 a search in a table is such an operation.
+    table = jnp.linspace(0.0, 1.0, 9)
+
+    def read(x):
+        return as_cpu_kernel(lambda x: 2 * jnp.interp(x, table, table**2), x)
+
+    x = jnp.array([0.05, 0.3, 0.95])
+    # The secants of 2 x² between k/8 and (k+1)/8 have the slopes (2k+1)/4.
+    slopes = jnp.array([0.25, 1.25, 3.75])
+    values = slopes * x - jnp.array([0.0, 0.1875, 1.75])
+    total = jax.grad(lambda x: jnp.sum(read(x)))
+    for transform in (lambda f: f, jax.jit, jax.vmap, lambda f: jax.jit(jax.vmap(f))):
+        np.testing.assert_allclose(transform(read)(x), values, rtol=1e-14)
+    for transform in (lambda f: f, jax.jit):
+        np.testing.assert_allclose(transform(total)(x), slopes, rtol=1e-14)
+    jacobian = jax.jit(jax.vmap(jax.vjp(jax.vmap(read), x)[1]))(jnp.eye(3))[0]
+    np.testing.assert_allclose(jacobian, jnp.diag(slopes), rtol=1e-14)

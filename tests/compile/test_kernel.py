@@ -56,15 +56,6 @@ def assert_same(got, expected):
         np.testing.assert_allclose(x, y, rtol=1e-13, atol=1e-14)
 
 
-@pytest.fixture(params=("lanes", "kernels", "xla"))
-def engine(request, monkeypatch):
-    """The first engine that may be taken; programs of others are forgotten."""
-    monkeypatch.setenv("NHJAX_ENGINE", request.param)
-    jax.clear_caches()
-    yield request.param
-    jax.clear_caches()
-
-
 @pytest.mark.usefixtures("engine")
 @pytest.mark.parametrize("compiled", [False, True])
 def test_a_kernel_computes_what_its_function_does(compiled):

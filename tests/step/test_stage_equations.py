@@ -81,9 +81,9 @@ def part_of(run, name):
     )
 
 
-def assert_equations_hold(name, run, closure):
+def assert_equations_hold(name, run, closure, tolerance=TOLERANCE):
     for equation, residual in paper.residuals(MECHANICS[name], run, closure).items():
-        assert residual <= TOLERANCE, f"{name}: {equation}: {residual:.1e}"
+        assert residual <= tolerance, f"{name}: {equation}: {residual:.1e}"
 
 
 every_closure = pytest.mark.parametrize("closure", CLOSURES)
@@ -129,7 +129,10 @@ def test_the_equations_hold_for_large_steps():
         "side by side", 4, "symmetric", "dense", start, dt=0.4
     )
     for name in ("particle", "chaotic", "sleigh"):
-        assert_equations_hold(name, part_of(run_of(sol, h=0.4), name), "symmetric")
+        run = part_of(run_of(sol, h=0.4), name)
+        # Round-off of a step is larger by its size: with three releases of JAX and of
+        # its compiler the largest residual is 0.9e-14, 1.0e-14 and 1.5e-14.
+        assert_equations_hold(name, run, "symmetric", tolerance=3e-14)
 
 
 @every_closure
@@ -163,10 +166,10 @@ def test_coefficients_from_the_definitions_are_the_published_ones():
     a = [[0, 0, 0], [5 / 24, 1 / 3, -1 / 24], [1 / 6, 2 / 3, 1 / 6]]
     a_hat = [[1 / 6, -1 / 6, 0], [1 / 6, 1 / 3, 0], [1 / 6, 5 / 6, 0]]
     pair = paper.lobatto(3)
-    np.testing.assert_allclose(pair.a, a, rtol=0, atol=3e-16)
-    np.testing.assert_allclose(pair.a_hat, a_hat, rtol=0, atol=3e-16)
-    np.testing.assert_allclose(paper.lobatto(2).a, [[0, 0], [0.5, 0.5]], atol=3e-16)
-    np.testing.assert_allclose(paper.lobatto(2).a_hat, [[0.5, 0], [0.5, 0]], atol=3e-16)
+    np.testing.assert_allclose(pair.a, a, rtol=0, atol=5e-16)
+    np.testing.assert_allclose(pair.a_hat, a_hat, rtol=0, atol=5e-16)
+    np.testing.assert_allclose(paper.lobatto(2).a, [[0, 0], [0.5, 0.5]], atol=5e-16)
+    np.testing.assert_allclose(paper.lobatto(2).a_hat, [[0.5, 0], [0.5, 0]], atol=5e-16)
 
 
 @pytest.mark.parametrize("stages", range(2, 8))
