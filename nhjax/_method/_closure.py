@@ -29,11 +29,16 @@ class ClosureWeights:
     - `E`: shape (s, s-1), the weights of the unknowns y.
     - `start`: shape (s,), the weights of the multiplier λ_k at t_k.
     - `end`: shape (s,), the weights of the continuous multiplier λ_c(q_{k+1}, p_{k+1}).
+    - `response`: shape (s-1,), the change of y which, with a change of λ_{k+1} by one,
+        leaves Σ_j a_ij Λ^j, i >= 2, as they are.
+    - `stage_response`: shape (s,), by how much Σ_j â_ij Λ^j change then.
     """
 
     E: np.ndarray
     start: np.ndarray
     end: np.ndarray
+    response: np.ndarray
+    stage_response: np.ndarray
 
 
 @lru_cache(maxsize=128)
@@ -74,8 +79,14 @@ def make_closure_weights(t: Tableau, symmetric: bool) -> ClosureWeights:
     else:
         for i in range(1, s):
             e[i, i - 1] = CONTEXT.one
+    # These two are part of a Jacobian, for which float64 is enough.
+    weights, last = to_float64(e), to_float64(end)
+    a, a_hat = (np.array(x, dtype=np.float64) for x in (t.a[1:], t.a_hat))
+    response = -np.linalg.solve(a @ weights, a @ last)
     return ClosureWeights(
-        E=to_float64(e),
+        E=weights,
         start=to_float64([CONTEXT.one] + [CONTEXT.mpf(0)] * (s - 1)),
-        end=to_float64(end),
+        end=last,
+        response=response,
+        stage_response=a_hat @ (weights @ response + last),
     )

@@ -83,15 +83,48 @@ class LeadingStructure(eqx.Module):
         )
 
     def correct_end(
-        self, x: Stages, residual: tuple[Float[Array, " n"], Float[Array, " l"]]
+        self,
+        stages: StageSystem,
+        x: Stages,
+        residual: tuple[Float[Array, " n"], Float[Array, " l"]],
     ) -> Stages:
-        """Move the acceleration and λ_c at the end towards those of (q, u) there."""
+        """Move the acceleration and λ_c at the end towards those of (q, u) there.
+
+        The unknowns of the closure change with λ_c, so that to leading order the nodes
+        stay as they are. Otherwise their constraints, which have just been solved,
+        would not hold any more, and another sweep would be needed.
+        """
         momentum_residual, hidden_residual = residual
         da, dlam = self.end.solve(-momentum_residual, -hidden_residual)
+        dlam_closure = dlam[: stages.num_nonholonomic]
+        response, on_stages = map(
+            stages.closure_weights, ("response", "stage_response")
+        )
+
+        def pushed(u: Array, reaction: Array) -> Array:
+            reaction = reaction[-1, :, : stages.num_nonholonomic]
+            push = stages.h * small_einsum("nm,m->n", reaction, dlam_closure)
+            return u + jnp.outer(on_stages, push)
+
+        momentum = x.momentum
+        if stages.hamiltonian:
+            momentum = pushed(momentum, self.reaction)
         return eqx.tree_at(
-            lambda z: (z.end_acceleration, z.end_multiplier),
+            lambda z: (
+                z.velocity,
+                z.momentum,
+                z.closure,
+                z.end_acceleration,
+                z.end_multiplier,
+            ),
             x,
-            (x.end_acceleration + da, x.end_multiplier + dlam),
+            (
+                pushed(x.velocity, self.velocity_reaction),
+                momentum,
+                x.closure + jnp.outer(response, dlam_closure),
+                x.end_acceleration + da,
+                x.end_multiplier + dlam,
+            ),
         )
 
 

@@ -55,7 +55,7 @@ def _constrain(stages: StageSystem, structure: LeadingStructure, x: Stages) -> S
     if stages.symmetric:
         # λ_c depends on v_{k+1} at zeroth order: it must see the new velocity, or the
         # two errors would feed each other and contract only as the root of the rate.
-        x = structure.correct_end(x, end_residual(stages, x))
+        x = structure.correct_end(stages, x, end_residual(stages, x))
     return x
 
 

@@ -241,3 +241,17 @@ def test_an_unknown_closure_is_refused_with_the_choices():
 def test_malformed_tableaux_are_refused(a: list, b: list, message: str):
     with pytest.raises(ValueError, match=message):
         PartitionedRungeKutta(a, b)
+
+
+@pytest.mark.parametrize("s", STAGES)
+def test_the_response_of_a_closure_leaves_the_momenta_of_nodes(s: int):
+    # With λ_{k+1} changed by one, and y by the response, the multipliers change by z.
+    method = LobattoIIIAB(s, "symmetric")
+    closure = method.closure_weights
+    z = closure.E @ closure.response + closure.end
+    np.testing.assert_allclose(method.a[1:] @ z, 0, atol=1e-14)
+    np.testing.assert_allclose(method.a_hat @ z, closure.stage_response, atol=1e-14)
+    assert np.max(np.abs(closure.stage_response)) > 1e-3
+    for carried in ("propagated", "consistent"):
+        weights = LobattoIIIAB(s, carried).closure_weights
+        np.testing.assert_array_equal(weights.response, np.zeros(s - 1))
