@@ -12,6 +12,8 @@ import jax
 import jax.core
 import jax.extend
 
+from ._shortened import shortened
+
 
 T = TypeVar("T")
 
@@ -43,7 +45,11 @@ def as_cpu_kernel(function: Callable[..., T], *args: Any) -> T:
 
 def call(flat: Callable[..., list[Any]], leaves: list[Any]) -> list[Any]:
     """Compute `flat(*leaves)` in a kernel, or without one if it has effects."""
-    program = jax.make_jaxpr(flat)(*leaves)
+    return run(shortened(jax.make_jaxpr(flat)(*leaves)), leaves)
+
+
+def run(program: Any, leaves: list[Any]) -> list[Any]:
+    """Compute a program in a kernel, or without one if it has effects."""
     # A primitive needs all traced values as operands, and may not print, for instance.
     captured = any(isinstance(const, jax.core.Tracer) for const in program.consts)
     if program.effects or captured:

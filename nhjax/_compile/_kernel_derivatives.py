@@ -8,8 +8,9 @@ import jax.extend
 import jax.numpy as jnp
 from jax.interpreters import ad
 
-from ._kernel import call, kernel
+from ._kernel import call, kernel, run as run_kernel
 from ._marks import merged, split
+from ._shortened import shortened
 
 
 def differentiated(operands, tangents, *, program):
@@ -46,19 +47,16 @@ def differentiated(operands, tangents, *, program):
     # they would be kept once for each round.
     fixed, is_varying = _fixed_part(whole)
     is_kept = [True] * size + is_varying[size:]
-    results = call(
-        lambda *operands: split(
-            is_kept, jax.extend.core.jaxpr_as_fun(whole)(*operands)
-        )[0],
-        list(operands),
-    )
+    kept, fixed_results = split(is_kept, whole.jaxpr.outvars)
+    results = run_kernel(shortened(_part(whole, outvars=kept)), list(operands))
     out, residuals = results[:size], results[size:]
 
     def push(*given):
         residuals, rates = given[: -sum(is_moving)], given[-sum(is_moving) :]
-        everything = merged(
-            is_kept[size:], residuals, _constants(whole, fixed, is_kept)
-        )
+        constants = jax.extend.core.jaxpr_as_fun(
+            _part(whole, invars=[], eqns=fixed, outvars=fixed_results)
+        )()
+        everything = merged(is_kept[size:], residuals, constants)
         return list(jax.tree.unflatten(treedef, everything)(*rates))
 
     changes = call(push, [*residuals, *rates])
@@ -83,16 +81,11 @@ def _fixed_part(program) -> tuple[list[Any], list[bool]]:
     return fixed, list(map(varies, program.jaxpr.outvars))
 
 
-def _constants(program, fixed: list[Any], is_kept: list[bool]) -> list[Any]:
-    """Compute the results of a program that are not kept, from its fixed operations."""
+def _part(program, **fields: list[Any]):
+    """Make a program of a part of another one's operations, operands or results."""
     jaxpr = program.jaxpr
-    part = jaxpr.replace(
-        invars=[],
-        eqns=fixed,
-        outvars=split(is_kept, jaxpr.outvars)[1],
-        debug_info=jaxpr.debug_info.with_unknown_names(),
-    )
-    return jax.core.eval_jaxpr(part, program.consts)
+    names = jaxpr.debug_info.with_unknown_names()
+    return program.replace(jaxpr=jaxpr.replace(debug_info=names, **fields))
 
 
 ad.primitive_jvps[kernel] = differentiated

@@ -105,6 +105,9 @@ class Stepping(eqx.Module):
             outcome.step_state,
             carry.step_state,
         )
+        # A loop is differentiated again and again until it is known which parts of its
+        # carry have derivatives: here it is known from the first time on.
+        step_state = step_state.differentiated_in_state()
         result = RESULTS.where(alive, outcome.result, carry.result)
         stats = updated_statistics(carry.stats, outcome, alive, good, k)
         carry = Carry(step_state, result, jax.lax.stop_gradient(stats))

@@ -20,11 +20,11 @@ from ._shaping import SHAPING
 
 # A scan of at most so many rounds is unrolled.
 UNROLLED = 8
-# More nodes than this are refused, unless the program has a twentieth as many of JAX's
+# More nodes than this are refused, unless the program has a fortieth as many of JAX's
 # operations: LLVM takes some 10 s for so many, and minutes for more. XLA, which has
 # loops over arrays, takes a few seconds where arrays are large, but longer than LLVM
 # where there are many small ones.
-MOST_NODES, NODES_OF_AN_OPERATION = 100_000, 20
+MOST_NODES, NODES_OF_AN_OPERATION = 100_000, 40
 
 OPERATIONS: dict[str, Operation] = {
     **ELEMENTWISE,

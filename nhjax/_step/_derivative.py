@@ -8,7 +8,13 @@ import jax
 from .._compile import as_cpu_kernel
 from .._custom_types import Args, BoolScalar, FloatScalar
 from .._method import AbstractMethod
-from .._numerics import frozen, has_tangent, solve_contraction, zero_unless
+from .._numerics import (
+    ClosureConverted,
+    frozen,
+    has_tangent,
+    solve_contraction,
+    zero_unless,
+)
 from .._results import RESULTS
 from .._system import AbstractMechanicalSystem, linearise, State
 from ._end import end_state
@@ -73,13 +79,17 @@ def _differentiable_step_jvp(primals, tangents):
     def change(perturbed, x, rates):
         rates = zero_unless(ok, rates)
 
-        def corrected(perturbed, x):
+        def sweep(perturbed, x):
             arguments = eqx.combine(perturbed, fixed)
             return frozen_newton_map(_stage_system(arguments, method), x)
 
-        def end(perturbed, x):
-            return _end(eqx.combine(perturbed, fixed), method, x)
-
+        # The program of a sweep is made once, and differentiated twice.
+        corrected = ClosureConverted(sweep, perturbed, x)
+        end = ClosureConverted(
+            lambda perturbed, x: _end(eqx.combine(perturbed, fixed), method, x),
+            perturbed,
+            x,
+        )
         _, b = jax.jvp(lambda theta: corrected(theta, x), (perturbed,), (rates,))
         _, contraction = jax.linearize(lambda x: corrected(perturbed, x), x)
         # This iteration starts from zero, while that of the step starts from a good

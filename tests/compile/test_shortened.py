@@ -1,0 +1,149 @@
+"""Programs lose what is repeated and what nothing uses, and compute the same."""
+
+import jax
+import jax.extend
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax import lax
+
+from nhjax._compile import shortened
+
+
+X = np.linspace(-1.0, 2.0, 5)
+
+
+def program_of(function, *args):
+    return jax.make_jaxpr(function)(*(args or (X,)))
+
+
+def operations(program):
+    return [equation.primitive.name for equation in program.eqns]
+
+
+def results(program, *args):
+    return jax.extend.core.jaxpr_as_fun(program)(*(args or (X,)))
+
+
+def test_what_is_repeated_is_computed_once():
+    def function(x):
+        return jnp.sin(2 * x) + jnp.cos(jnp.sin(2 * x)), jnp.sin(2 * x)
+
+    program = program_of(function)
+    short = shortened(program)
+    assert sorted(operations(short)) == ["add", "cos", "mul", "sin"]
+    for one, other in zip(results(short), results(program), strict=True):
+        np.testing.assert_array_equal(one, other)
+
+
+def test_what_nothing_uses_goes():
+    def function(x):
+        jnp.exp(jnp.cos(x))
+        return jnp.sin(x)
+
+    assert operations(shortened(program_of(function))) == ["sin"]
+
+
+def test_results_may_be_operands_constants_and_the_same_twice():
+    def function(x):
+        return x, jnp.sin(x), 1.0, jnp.sin(x)
+
+    short = shortened(program_of(function))
+    assert operations(short) == ["sin"]
+    same, one, constant, other = results(short)
+    np.testing.assert_array_equal(same, X)
+    np.testing.assert_array_equal(one, np.asarray(other))
+    assert constant == 1.0
+
+
+@pytest.mark.parametrize(
+    "function",
+    [
+        lambda x: (x * 0.0, x * -0.0),
+        lambda x: (x < 1, x < 2),
+        lambda x: (jnp.sum(x, axis=0), jnp.max(x, axis=0)),
+        lambda x: (x.astype("float32"), x.astype("int32")),
+        lambda x: (x - 1, 1 - x),
+    ],
+)
+def test_what_differs_stays(function):
+    program = program_of(function)
+    short = shortened(program)
+    assert operations(short) == operations(program)
+    for one, other in zip(results(short), results(program), strict=True):
+        np.testing.assert_array_equal(np.signbit(one), np.signbit(other))
+        np.testing.assert_array_equal(one, other)
+
+
+def _scan(x):
+    step = lambda c, y: (jnp.sin(c) + jnp.sin(c) * y, jnp.cos(c))  # noqa: E731
+    return lax.scan(step, 0.5, x)
+
+
+def _while(x):
+    return lax.while_loop(
+        lambda c: c[0] < 3, lambda c: (c[0] + c[1], c[1]), (x[0], 1.5)
+    )
+
+
+def _cond(x):
+    return lax.cond(x[0] < 0, lambda x: jnp.sin(x) + jnp.sin(x), jnp.cos, x)
+
+
+def _jitted(x):
+    return jax.jit(lambda x: jnp.sin(x) * jnp.sin(x))(x)
+
+
+def _remat(x):
+    return jax.checkpoint(lambda x: jnp.sin(x) * jnp.sin(x))(x)
+
+
+def _solve(x):
+    solve = lambda _, b: b / (4 + 0 * jnp.sin(1.0) * jnp.sin(1.0))  # noqa: E731
+    return lax.custom_linear_solve(lambda y: 4 * y, x, solve, solve)
+
+
+@jax.custom_jvp
+def _with_rule(x):
+    return jnp.sin(x) * jnp.sin(x)
+
+
+@_with_rule.defjvp
+def _rule(primals, tangents):
+    return _with_rule(*primals), 3 * tangents[0]
+
+
+INNER = [_scan, _while, _cond, _jitted, _remat, _solve, _with_rule]
+
+
+@pytest.mark.parametrize("function", INNER)
+def test_programs_within_are_shortened_too(function):
+    program = program_of(function)
+    short = shortened(program)
+    for one, other in zip(results(short), results(program), strict=True):
+        np.testing.assert_array_equal(one, other)
+    text = str(short)
+    assert text.count("sin") < str(program).count("sin") or "sin" not in text
+
+
+@pytest.mark.parametrize("function", [f for f in INNER if f is not _while])
+def test_shortened_programs_have_the_same_derivatives(function):
+    program = program_of(function)
+
+    def cost(program):
+        return lambda x: sum(jnp.sum(y) for y in results(program, x))
+
+    for of in (jax.grad, lambda f: jax.jacfwd(f)):
+        expected = of(cost(program))(X)
+        np.testing.assert_array_equal(of(cost(shortened(program)))(X), expected)
+
+
+def test_effects_stay(capfd):
+    def function(x):
+        jax.debug.print("seen {}", x[0])
+        jax.debug.print("seen {}", x[0])
+        return x
+
+    results(shortened(program_of(function)))
+    jax.effects_barrier()
+    assert capfd.readouterr().out.count("seen -1.0") == 2
