@@ -270,6 +270,21 @@ inline T step(State<T>& y, double h) {
         EACH(k) a_end[k] += free[k];
         add_reaction(B[2], d_end, a_end);
 
+        // The multipliers move along by z = (1/2, -1/4, 1/2) of it, for which A z = 0 at
+        // the nodes, and Â z = (1/8, 0, -1/8) and b Â z = 0 at the stages.
+        d_nu += .5 * d_end;
+        d_middle -= .25 * d_end;
+        Vector<T> at_end;
+        EACH(k) at_end[k] = y.lambda * 0.;
+        add_reaction(B[2], T(.125 * h * d_end), at_end);
+        EACH(k) {
+            if (k == 0 || k > M) {
+                H_next[0][k] += at_end[k];
+                H_next[2][k] -= at_end[k];
+                q[1][k] += h * (A[1][0] - A[1][2]) * at_end[k];
+            }
+        }
+
         // The size of the increment, and whether to stop.
         for (int i = 0; i < S; ++i)
             EACH(k) change = larger(change, absolute(T(H_next[i][k] - H[i][k])));
