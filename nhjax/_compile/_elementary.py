@@ -35,6 +35,7 @@ _MOVING = """
     broadcast_in_dim dynamic_slice dynamic_update_slice empty empty2 iota
     reshape
 """.split()  # noqa: SIM905
+ARITHMETIC_AND_SHAPES = (*ELEMENTWISE, *_REDUCING, *_SHAPING, *_MOVING)
 _ARITHMETIC = {"add", "add_any", "div", "mul", "neg", "sub"}
 # These operations contain programs, whose operations are examined in turn.
 CALLING = """

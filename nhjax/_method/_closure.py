@@ -87,6 +87,6 @@ def make_closure_weights(t: Tableau, symmetric: bool) -> ClosureWeights:
         E=weights,
         start=to_float64([CONTEXT.one] + [CONTEXT.mpf(0)] * (s - 1)),
         end=last,
-        response=response,
-        stage_response=a_hat @ (weights @ response + last),
+        response=to_float64(list(response)),
+        stage_response=to_float64(list(a_hat @ (weights @ response + last))),
     )

@@ -64,6 +64,7 @@ def test_results_may_be_operands_constants_and_the_same_twice():
         lambda x: (jnp.sum(x, axis=0), jnp.max(x, axis=0)),
         lambda x: (x.astype("float32"), x.astype("int32")),
         lambda x: (x - 1, 1 - x),
+        lambda x: (jnp.take(x, 7, fill_value=0.0), jnp.take(x, 7, fill_value=-0.0)),
     ],
 )
 def test_what_differs_stays(function):
@@ -147,3 +148,56 @@ def test_effects_stay(capfd):
     results(shortened(program_of(function)))
     jax.effects_barrier()
     assert capfd.readouterr().out.count("seen -1.0") == 2
+
+
+def test_operations_under_other_settings_of_jax_stay():
+    def function(key):
+        with jax.threefry_partitionable(False):
+            one = jax.random.bits(key, (2,))
+        with jax.threefry_partitionable(True):
+            return one, jax.random.bits(key, (2,))
+
+    key = jax.random.PRNGKey(0)
+    program = program_of(function, key)
+    one, other = results(shortened(program), key)
+    for got, expected in zip((one, other), results(program, key), strict=True):
+        np.testing.assert_array_equal(got, expected)
+    assert np.any(one != other)
+
+
+def test_a_result_without_a_name_does_not_stand_for_one_with_a_name():
+    def function(x):
+        first, _ = lax.split(x, (2, 3))
+        _, second = lax.split(x, (2, 3))
+        return jnp.sum(first) * second
+
+    program = program_of(function)
+    splits = [e for e in program.eqns if e.primitive.name == "split"]
+    variables = [list(e.outvars) for e in splits]
+    for place, outvars in zip((1, 0), variables, strict=True):
+        outvars[place] = jax.extend.core.DropVar(outvars[place].aval)
+    named = dict(zip(map(id, splits), variables, strict=True))
+    equations = [e.replace(outvars=named.get(id(e), e.outvars)) for e in program.eqns]
+    short = shortened(program.replace(jaxpr=program.jaxpr.replace(eqns=equations)))
+    np.testing.assert_array_equal(results(short)[0], function(X))
+    operands = [v for e in short.eqns for v in e.invars]
+    assert not any(isinstance(v, jax.extend.core.DropVar) for v in operands)
+    # With names, one is enough.
+    assert operations(shortened(program)).count("split") == 1
+
+
+def test_a_program_that_stands_at_many_places_stays_one():
+    function = lambda x: jnp.sin(x) * jnp.sin(x)  # noqa: E731
+    for _ in range(14):
+        inner = jax.jit(function)
+        function = lambda x, inner=inner: inner(x) + inner(x + 1)  # noqa: E731
+    short = shortened(program_of(function))
+    depth, programs = 0, [short]
+    while programs:
+        inner = [
+            e.params["jaxpr"] for p in programs for e in p.eqns if "jaxpr" in e.params
+        ]
+        programs = list({id(p): p for p in inner}.values())
+        assert len(programs) <= 1
+        depth += 1
+    assert depth == 15
