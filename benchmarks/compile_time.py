@@ -1,0 +1,100 @@
+"""What the first call costs: time of the processor to trace, lower and compile a run.
+
+Programs in the lanes of vectors are compiled to native code while they are lowered. The
+bicycle has eight coordinates and five constraints, written as a user would write them.
+
+    python -m benchmarks.compile_time
+"""
+
+import argparse
+import itertools
+import time
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+import nhjax
+from nhjax import systems
+
+from ._bicycle import bicycle
+from ._report import markdown_table, write
+
+
+NUM_STEPS = 20
+KINDS = ("run", "ensemble", "gradient")
+
+
+def cases() -> list[tuple[str, Any, nhjax.State, int, str]]:
+    """The name, system, state, number of stages and kind of each program."""
+    chaotic, top = systems.ChaoticSystem(), systems.HeavyTopSE3()
+    riding, upright = bicycle(5.0)
+    found = [
+        ("chaotic", chaotic.system, chaotic.initial_state(), s, kind)
+        for s in (3, 8)
+        for kind in KINDS
+    ]
+    found += [
+        ("heavy top on SE(3)", top.system, top.initial_state(), 3, kind)
+        for kind in KINDS
+    ]
+    return [*found, *(("bicycle", riding, upright, 3, kind) for kind in KINDS)]
+
+
+def program(system: Any, stages: int, kind: str) -> Callable[[Any, Any], Any]:
+    """A function of a state and a step size, or of those of an ensemble."""
+
+    def run(y0, dt):
+        return nhjax.integrate(
+            system,
+            nhjax.LobattoIIIAB(stages),
+            y0,
+            dt=dt,
+            num_steps=NUM_STEPS,
+            throw=False,
+        ).ys
+
+    def loss(y0, dt):
+        return sum(jnp.sum(leaf**2) for leaf in jax.tree.leaves(run(y0, dt)))
+
+    functions = {
+        "run": run,
+        "ensemble": jax.vmap(run, in_axes=(None, 0)),
+        "gradient": jax.grad(loss, argnums=(0, 1)),
+    }
+    return functions[kind]
+
+
+def main() -> None:
+    """Print and save the table."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--systems", nargs="+", help="a part of the names")
+    options = parser.parse_args()
+    jax.config.update("jax_enable_x64", True)
+    jax.jit(jnp.sin).lower(0.1).compile()
+    rows, data = [], []
+    for name, system, y0, stages, kind in cases():
+        if options.systems and name not in options.systems:
+            continue
+        dt = jnp.full((8,), 0.05) if kind == "ensemble" else jnp.asarray(0.05)
+        times = [time.process_time()]
+        traced = jax.jit(program(system, stages, kind)).trace(y0, dt)
+        times.append(time.process_time())
+        lowered = traced.lower()
+        times.append(time.process_time())
+        lowered.compile()
+        times.append(time.process_time())
+        parts = [after - before for before, after in itertools.pairwise(times)]
+        row = [name, str(stages), kind, *(f"{x:.1f}" for x in (*parts, sum(parts)))]
+        print(*row, sep="\t", flush=True)
+        rows.append(row)
+        data.append({"system": name, "stages": stages, "kind": kind, "seconds": parts})
+        jax.clear_caches()
+    header = ["system", "stages", "program", "trace", "lower", "compile", "all"]
+    text = "Seconds of the processor.\n\n" + markdown_table(header, rows)
+    write("compile_time", "Time of the first call", text, {"rows": data})
+
+
+if __name__ == "__main__":
+    main()
