@@ -23,6 +23,10 @@ import jax
 import pytest
 
 
+# Python's collector looks for cycles each time that 700 objects have been made, which
+# takes a third of the time of a long trace; what is traced here stays in caches anyway.
+gc.set_threshold(100_000)
+
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_numpy_dtype_promotion", "strict")
 jax.config.update("jax_numpy_rank_promotion", "raise")
