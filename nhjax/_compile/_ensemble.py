@@ -14,7 +14,7 @@ import jax.numpy as jnp
 from jax.interpreters import ad, batching, mlir
 
 from .._lanes import target, Unsupported
-from ._engine import chosen_engine, note
+from ._engine import note
 from ._kernel import kernel, never_high
 from ._kernel_derivatives import differentiated, transposed
 from ._lowering import (
@@ -174,7 +174,7 @@ def _lowered(ctx, *operands, program, is_batched):
         else:
             note("lanes", "the first choice", members)
             return jax.ffi.ffi_lowering(name)(ctx, *operands)
-    against = "chosen" if chosen_engine() == "xla" else reason_against_kernel(program)
+    against = reason_against_kernel(program)
     if against is not None or is_within_kernel():
         note("xla", against or reason, members)
         lower = _together_by_xla

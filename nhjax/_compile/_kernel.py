@@ -45,11 +45,12 @@ def as_cpu_kernel(function: Callable[..., T], *args: Any) -> T:
 
 def call(flat: Callable[..., list[Any]], leaves: list[Any]) -> list[Any]:
     """Compute `flat(*leaves)` in a kernel, or without one if it has effects."""
-    return run(shortened(jax.make_jaxpr(flat)(*leaves)), leaves)
+    return run_program(jax.make_jaxpr(flat)(*leaves), leaves)
 
 
-def run(program: Any, leaves: list[Any]) -> list[Any]:
+def run_program(program: Any, leaves: list[Any]) -> list[Any]:
     """Compute a program in a kernel, or without one if it has effects."""
+    program = shortened(program)
     # A primitive needs all traced values as operands, and may not print, for instance.
     captured = any(isinstance(const, jax.core.Tracer) for const in program.consts)
     if program.effects or captured:

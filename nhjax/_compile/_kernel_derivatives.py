@@ -8,9 +8,8 @@ import jax.extend
 import jax.numpy as jnp
 from jax.interpreters import ad
 
-from ._kernel import call, kernel, run as run_kernel
+from ._kernel import call, kernel, run_program
 from ._marks import merged, split
-from ._shortened import shortened
 
 
 def differentiated(operands, tangents, *, program):
@@ -48,7 +47,7 @@ def differentiated(operands, tangents, *, program):
     fixed, is_varying = _fixed_part(whole)
     is_kept = [True] * size + is_varying[size:]
     kept, fixed_results = split(is_kept, whole.jaxpr.outvars)
-    results = run_kernel(shortened(_part(whole, outvars=kept)), list(operands))
+    results = run_program(_part(whole, outvars=kept), list(operands))
     out, residuals = results[:size], results[size:]
 
     def push(*given):

@@ -51,7 +51,9 @@ def reason_against_lanes() -> str | None:
 
 
 def reason_against_kernel(program: Any) -> str | None:
-    """Say why XLA cannot compile a program into one kernel; `None` if it can."""
+    """Say why XLA is not asked for one kernel, or cannot make it; `None` if it can."""
+    if chosen_engine() == "xla":
+        return "chosen"
     # The dtype of random keys has no attribute `kind`, which gives None here.
     kinds = {getattr(aval.dtype, "kind", None) for aval in program.in_avals}
     if not kinds <= set("fiub"):
@@ -80,7 +82,7 @@ def _lowered(ctx, *operands, program):
         else:
             note("lanes", "the first choice", None)
             return jax.ffi.ffi_lowering(name)(ctx, *operands)
-    against = "chosen" if chosen_engine() == "xla" else reason_against_kernel(program)
+    against = reason_against_kernel(program)
     if against is not None:
         note("xla", against, None)
         return _by_xla(ctx, *operands, program=program)

@@ -103,7 +103,7 @@ def _variables(operands: Any) -> list[Any]:
 def _is_repeatable(equation: Any) -> bool:
     # A result without a name cannot be used by another operation.
     return equation.primitive.name in _REPEATABLE and not any(
-        type(variable).__name__ == "DropVar" for variable in equation.outvars
+        isinstance(variable, jax.extend.core.DropVar) for variable in equation.outvars
     )
 
 

@@ -6,7 +6,7 @@ from contextlib import contextmanager
 from typing import Any, TypeAlias
 
 import numpy as np
-from jax.extend.core import Literal
+from jax.extend.core import DropVar, Literal
 
 from ._buffers import hold, InMemory, Registers, release, Value
 from ._graph import dtype_name, Graph, Node
@@ -69,7 +69,7 @@ class Builder:
             for variable, value in zip(equation.outvars, outs, strict=True):
                 if tuple(value.shape) != tuple(variable.aval.shape):
                     raise AssertionError(equation.primitive.name, value.shape)
-                if type(variable).__name__ != "DropVar":
+                if not isinstance(variable, DropVar):
                     bind(variable, value)
         outs = [read(variable) for variable in jaxpr.outvars]
         for value in env.values():

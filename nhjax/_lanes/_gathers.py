@@ -3,7 +3,7 @@
 import math
 from collections.abc import Callable, Sequence
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
@@ -19,23 +19,37 @@ from ._unsupported import Unsupported
 _Mode = jax.lax.GatherScatterMode
 
 
+class _Axes(NamedTuple):
+    """The axes of an array on which its windows start at places of their own.
+
+    - `indexed`: those whose starts are the entries of an index.
+    - `batched`: those that go along with the axes `sources` of the array of indices.
+    """
+
+    indexed: Sequence[int]
+    batched: Sequence[int]
+    sources: Sequence[int]
+
+
 def _located(
     builder: Builder,
     shape: Sequence[int],
     sizes: Sequence[int],
-    index: Sequence[Node],
-    axes: Sequence[int],
-    fixed: dict[int, int],
+    indices: np.ndarray,
+    place: tuple[int, ...],
+    axes: _Axes,
 ) -> tuple[Node, Node]:
     """Find where a window starts in memory, and whether it lies in the array.
 
-    `index` are the starts on some `axes`, and `fixed` those on axes of batches. If the
-    window lies outside, the start is that of the nearest one inside.
+    Its index stands at `place` in the array of indices. If the window lies outside, the
+    start is that of the nearest one inside.
     """
     graph = builder.graph
-    starts: list[Node | int] = [fixed.get(axis, 0) for axis in range(len(shape))]
+    starts: list[Node | int] = [0] * len(shape)
+    for axis, source in zip(axes.batched, axes.sources, strict=True):
+        starts[axis] = place[source]
     is_inside = graph.constant(True, "bool")
-    for axis, node in zip(axes, index, strict=True):
+    for axis, node in zip(axes.indexed, indices[place], strict=True):
         start, most = as_index(builder, node), shape[axis] - sizes[axis]
         is_low = graph.op("ge", start, builder.integer(0))
         is_high = graph.op("le", start, builder.integer(most))
@@ -67,29 +81,20 @@ def _gather(builder: Builder, equation: Any, values: list[Value]) -> Value:
     batch = indices.shape[:-1]
     fill = _fill(builder, equation, value)
     out = np.empty((*batch, *window.shape), object)
+    axes = _Axes(
+        numbers.start_index_map,
+        numbers.operand_batching_dims,
+        numbers.start_indices_batching_dims,
+    )
     for place in np.ndindex(batch):
-        fixed = _fixed(
-            numbers.operand_batching_dims, numbers.start_indices_batching_dims, place
-        )
-        shift, is_inside = _located(
-            builder,
-            value.shape,
-            sizes,
-            list(indices[place]),
-            numbers.start_index_map,
-            fixed,
-        )
+        shift, is_inside = _located(builder, value.shape, sizes, indices, place, axes)
         for inner in np.ndindex(window.shape):
             number = _number(builder, value, shift, int(window[inner]))
             if is_filled:
                 number = builder.graph.select(is_inside, number, fill)
             out[place + inner] = number
-    axes = range(len(batch), out.ndim)
-    return np.moveaxis(out, list(axes), list(numbers.offset_dims))
-
-
-def _fixed(axes: Sequence[int], sources: Sequence[int], place: tuple) -> dict[int, int]:
-    return {axis: place[source] for axis, source in zip(axes, sources, strict=True)}
+    inner_axes = list(range(len(batch), out.ndim))
+    return np.moveaxis(out, inner_axes, list(numbers.offset_dims))
 
 
 def _number(builder: Builder, value: Value, shift: Node, offset: int) -> Node:
@@ -128,8 +133,8 @@ def _scatter(
         raise Unsupported("a scatter of this size")
     indices, updates = map(builder.memory.registers, (indices, updates))
     batch = indices.shape[:-1]
-    axes = list(range(len(batch), updates.ndim))
-    updates = np.moveaxis(updates, list(numbers.update_window_dims), axes)
+    inner_axes = list(range(len(batch), updates.ndim))
+    updates = np.moveaxis(updates, list(numbers.update_window_dims), inner_axes)
     left_out = (*numbers.inserted_window_dims, *numbers.operand_batching_dims)
     sizes, inner_sizes = [], iter(updates.shape[len(batch) :])
     for axis in range(len(value.shape)):
@@ -137,18 +142,13 @@ def _scatter(
     window = places(value.shape)[tuple(map(slice, sizes))]
     window = window.reshape(updates.shape[len(batch) :])
     located = {}
+    axes = _Axes(
+        numbers.scatter_dims_to_operand_dims,
+        numbers.operand_batching_dims,
+        numbers.scatter_indices_batching_dims,
+    )
     for place in np.ndindex(batch):
-        fixed = _fixed(
-            numbers.operand_batching_dims, numbers.scatter_indices_batching_dims, place
-        )
-        shift, is_inside = _located(
-            builder,
-            value.shape,
-            sizes,
-            list(indices[place]),
-            numbers.scatter_dims_to_operand_dims,
-            fixed,
-        )
+        shift, is_inside = _located(builder, value.shape, sizes, indices, place, axes)
         if is_clipped:
             is_inside = builder.graph.constant(True, "bool")
         located[place] = shift, is_inside

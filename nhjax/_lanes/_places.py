@@ -155,18 +155,22 @@ class Places:
         return out
 
     def _gather(self, pointer: str, buffer: Buffer) -> str:
-        kind = vector(memory_type(buffer.dtype), self.width)
-        name = f"llvm.masked.gather.{suffix(buffer.dtype, self.width, True)}"
-        name = f"{name}.v{self.width}p0"
-        pointers, mask = f"<{self.width} x ptr>", f"<{self.width} x i1>"
+        name, kind = self._masked("gather", buffer)
+        pointers, flags = f"<{self.width} x ptr>", f"<{self.width} x i1>"
         self.text.declare(
-            name, f"declare {kind} @{name}({pointers}, i32, {mask}, {kind})"
+            name, f"declare {kind} @{name}({pointers}, i32, {flags}, {kind})"
         )
         align = bits(buffer.dtype) // 8
         return self.text.value(
             f"call {kind} @{name}({pointers} {pointer}, i32 {align}, "
-            f"{mask} splat (i1 true), {kind} poison)"
+            f"{flags} splat (i1 true), {kind} poison)"
         )
+
+    def _masked(self, operation: str, buffer: Buffer) -> tuple[str, str]:
+        """Return the name of LLVM's masked gather or scatter, and the type it moves."""
+        name = f"llvm.masked.{operation}.{suffix(buffer.dtype, self.width, True)}"
+        kind = vector(memory_type(buffer.dtype), self.width)
+        return f"{name}.v{self.width}p0", kind
 
     def store(self, node: Node, mask: str | None) -> None:
         """Write a store, for the lanes of a mask if there is one."""
@@ -194,9 +198,7 @@ class Places:
     def _scatter(
         self, value: str, pointer: str, buffer: Buffer, mask: str | None
     ) -> None:
-        kind = vector(memory_type(buffer.dtype), self.width)
-        name = f"llvm.masked.scatter.{suffix(buffer.dtype, self.width, True)}"
-        name = f"{name}.v{self.width}p0"
+        name, kind = self._masked("scatter", buffer)
         pointers, flags = f"<{self.width} x ptr>", f"<{self.width} x i1>"
         self.text.declare(
             name, f"declare void @{name}({kind}, {pointers}, i32, {flags})"

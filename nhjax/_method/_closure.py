@@ -81,12 +81,11 @@ def make_closure_weights(t: Tableau, symmetric: bool) -> ClosureWeights:
             e[i, i - 1] = CONTEXT.one
     # These two are part of a Jacobian, for which float64 is enough.
     weights, last = to_float64(e), to_float64(end)
-    a, a_hat = (np.array(x, dtype=np.float64) for x in (t.a[1:], t.a_hat))
-    response = -np.linalg.solve(a @ weights, a @ last)
+    response = -np.linalg.solve(t.a[1:] @ weights, t.a[1:] @ last)
     return ClosureWeights(
         E=weights,
         start=to_float64([CONTEXT.one] + [CONTEXT.mpf(0)] * (s - 1)),
         end=last,
         response=to_float64(list(response)),
-        stage_response=to_float64(list(a_hat @ (weights @ response + last))),
+        stage_response=to_float64(list(t.a_hat @ (weights @ response + last))),
     )
