@@ -182,8 +182,18 @@ def test_a_result_without_a_name_does_not_stand_for_one_with_a_name():
     np.testing.assert_array_equal(results(short)[0], function(X))
     operands = [v for e in short.eqns for v in e.invars]
     assert not any(isinstance(v, jax.extend.core.DropVar) for v in operands)
-    # With names, one is enough.
+
+
+def test_results_with_names_come_from_one_operation():
+    def function(x):
+        first, rest = lax.split(x, (2, 3))
+        start, second = lax.split(x, (2, 3))
+        return jnp.sum(first * start) * (rest + second)
+
+    program = program_of(function)
+    assert operations(program).count("split") == 2
     assert operations(shortened(program)).count("split") == 1
+    np.testing.assert_array_equal(results(shortened(program))[0], function(X))
 
 
 def test_a_program_that_stands_at_many_places_stays_one():
