@@ -111,8 +111,8 @@ def _key(equation: Any, operands: list[Any]) -> Hashable:
     """Make what two operations have in common only if they compute the same."""
     params = tuple((name, _exact(equation.params[name])) for name in equation.params)
     # The context holds settings of JAX, such as where an operation is computed.
-    context = getattr(equation, "ctx", None)
-    return equation.primitive, tuple(map(_operand, operands)), params, id(context)
+    context = _exact(getattr(equation, "ctx", None))
+    return equation.primitive, tuple(map(_operand, operands)), params, context
 
 
 def _operand(variable: Any) -> Hashable:
