@@ -1,6 +1,15 @@
 """High-order geometric integrators for nonholonomic mechanical systems, in JAX."""
 
 from . import plot as plot, systems as systems
+from ._analysis import (
+    check_system as check_system,
+    linear_stability as linear_stability,
+    LinearStability as LinearStability,
+    Motion as Motion,
+    motion as motion,
+    steady_motion as steady_motion,
+    SystemReport as SystemReport,
+)
 from ._compile import engines as engines, EngineUse as EngineUse
 from ._errors import (
     ConstraintViolationError as ConstraintViolationError,

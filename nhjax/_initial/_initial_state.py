@@ -95,10 +95,9 @@ def initial_state(
         >>> [float(x) for x in y0.v]
         [1.0, 1.0, 0.0]
     """
-    check_type("system", system, (LagrangianSystem, HamiltonianSystem))
     check_flag("project", project)
     throw = check_flag("throw", throw)
-    q, v, p, t = _check_inputs(system, q, v, p, t)
+    q, v, p, t = checked_inputs(system, q, v, p, t)
     args = parameters(args)
     check_functions(system, t, q, args)
     inputs = [
@@ -187,7 +186,9 @@ def _inverse_legendre(
     return solved.x, solved.converged
 
 
-def _check_inputs(system, q, v, p, t):
+def checked_inputs(system, q, v, p, t):
+    """Convert what `initial_state` is given to arrays, or raise for what is wrong."""
+    check_type("system", system, (LagrangianSystem, HamiltonianSystem))
     if (v is None) == (p is None):
         given = "neither" if v is None else "both"
         raise ValueError(f"Give either `v` or `p`; got {given} of them.")

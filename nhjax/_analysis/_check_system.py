@@ -1,0 +1,233 @@
+"""A report on a system: its dimensions, how well it is posed, what does not change."""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, PyTree
+
+from .._compile import tracked_jit
+from .._custom_types import Args, FloatScalarLike
+from .._initial import checked_inputs
+from .._numerics import conditioning, dependent_rows, inverse, max_norm
+from .._system import AbstractMechanicalSystem, parameters
+
+
+# Derivatives that vanish at this many states vanish everywhere, but for functions that
+# are made to deceive.
+_SAMPLES = 3
+_SPREAD = 0.3
+
+_MASS, _JACOBIAN = "mass matrix", "Jacobian of the nonholonomic constraints"
+
+
+class SystemReport(eqx.Module):
+    """What `check_system` found out about a system; its `str` is a table.
+
+    - `dimension`: the number n of coordinates.
+    - `num_nonholonomic`, `num_holonomic`: the numbers m and k of constraints.
+    - `mass_condition`, `compatibility_condition`: the condition numbers of M = ∂p/∂v
+        and of C = B M⁻¹ Bᵀ, after their rows and columns are scaled to size one.
+        Infinite ones tell that the system has no motion there.
+    - `violations`: the constraint functions by name, "Φ[0]" for nonholonomic ones and
+        "Γ[0]", "dΓ[0]/dt" for holonomic ones.
+    - `dependent`: the names of constraints that depend on each other, if any do.
+    - `depends_on_time`: the names of the functions that depend on t.
+    - `ignorable`: the indices of coordinates that no function depends on.
+    - `constant`: those of the mass matrix and the Jacobian of the nonholonomic
+        constraints that depend on nothing.
+    """
+
+    dimension: int
+    num_nonholonomic: int
+    num_holonomic: int
+    mass_condition: float
+    compatibility_condition: float
+    violations: dict[str, float]
+    dependent: tuple[str, ...]
+    depends_on_time: tuple[str, ...]
+    ignorable: tuple[int, ...]
+    constant: tuple[str, ...]
+
+    @property
+    def degrees_of_freedom(self) -> int:
+        """Return the dimension n - m - k of the velocities that are permitted."""
+        return self.dimension - self.num_nonholonomic - self.num_holonomic
+
+    def __str__(self) -> str:
+        worst = max(self.violations, key=lambda x: abs(self.violations[x]), default="")
+        rows = {
+            "coordinates n": self.dimension,
+            "nonholonomic constraints m": self.num_nonholonomic,
+            "holonomic constraints k": self.num_holonomic,
+            "degrees of freedom n - m - k": self.degrees_of_freedom,
+            "condition number of M": f"{self.mass_condition:.3g}",
+            "condition number of C": f"{self.compatibility_condition:.3g}",
+            "largest violation": f"{worst} = {self.violations[worst]:.3g}"
+            if worst
+            else "none",
+            "dependent constraints": _listed(self.dependent),
+            "depend on time": _listed(self.depends_on_time),
+            "ignorable coordinates": _listed(self.ignorable),
+            "constant": _listed(self.constant),
+        }
+        return "\n".join(f"{name:30} {value}" for name, value in rows.items())
+
+
+def _listed(names: tuple[Any, ...]) -> str:
+    return ", ".join(map(str, names)) or "none"
+
+
+def check_system(
+    system: AbstractMechanicalSystem,
+    q: PyTree[Array],
+    v: Float[Array, " n"] | None = None,
+    p: Float[Array, " n"] | None = None,
+    *,
+    t: FloatScalarLike = 0.0,
+    args: Args = None,
+) -> SystemReport:
+    """Report on a system at a configuration and a velocity or momentum.
+
+    It is for a model that one has just written: `print(nhjax.check_system(...))`. The
+    state need not be consistent, and nothing is raised for a system without motion,
+    such as one of dependent constraints: the report says so.
+
+    **Arguments:**
+
+    - `system`: the mechanical system.
+    - `q`: the configuration, as for `initial_state`.
+    - `v`, `p`: the velocity of a Lagrangian system, or the momentum of a Hamiltonian
+        one, shape (n,).
+    - `t`, `args`: passed on to the functions of the system.
+
+    **Returns:** a `SystemReport`. What a function depends on is found from derivatives
+    at three states around the given one.
+
+    **Raises:** as `initial_state` does for wrong types and shapes; `ValueError` if a
+    Lagrangian system is given `p`, or a Hamiltonian one `v`.
+
+    !!! example
+
+        >>> import jax.numpy as jnp, nhjax
+        >>> disc = nhjax.systems.VerticalRollingDisc()
+        >>> report = nhjax.check_system(disc.system, disc.q0, disc.v0)
+        >>> report.degrees_of_freedom, report.ignorable, report.constant
+        (2, (0, 1, 2), ('mass matrix',))
+    """
+    q, v, p, t = checked_inputs(system, q, v, p, t)
+    name = system.fibre_coordinate_name
+    u = {"v": v, "p": p}[name]
+    if u is None:
+        raise ValueError(
+            f"Give `{name}`, the fibre coordinate of a {type(system).__name__}."
+        )
+    args = parameters(args)
+    found = jax.tree.map(np.asarray, _measured(system, t, q, u, args))
+    count, k = found["constraints"].size, found["positions"].size
+    m = count - k
+    letters = [f"Φ[{i}]" for i in range(m)] + [f"Γ[{i}]" for i in range(k)]
+    rates = letters[:m] + [f"d{name}/dt" for name in letters[m:]]
+    values = [*found["constraints"], *found["positions"]]
+    changes = {key: _changes(found[key]) for key in (_MASS, _JACOBIAN)}
+    rank_is_full = found["rank"] > 10 * u.size * np.finfo(u.dtype).eps
+    rows = [] if rank_is_full else dependent_rows(found["jacobian"])
+    moving = np.any(_changes(found["of positions"]), axis=0)
+    return SystemReport(
+        dimension=u.size,
+        num_nonholonomic=m,
+        num_holonomic=k,
+        mass_condition=_condition(found["regularity"]),
+        compatibility_condition=_condition(found["compatibility"]),
+        violations=dict(zip(rates + letters[m:], map(float, values), strict=True)),
+        dependent=tuple(letters[i] for i in rows),
+        depends_on_time=tuple(
+            name
+            for name in system.functions(t, q, u, args)
+            if np.any(_changes(found["of time"][name]))
+        ),
+        ignorable=tuple(int(i) for i in np.flatnonzero(~moving)),
+        constant=tuple(
+            name
+            for name, changed in changes.items()
+            if not np.any(changed) and (name == _MASS or m > 0)
+        ),
+    )
+
+
+def _changes(derivatives: np.ndarray) -> np.ndarray:
+    """Tell what changes, from derivatives at several states along the first axis.
+
+    A number that is not finite counts as a change.
+    """
+    return np.any(~(derivatives == 0), axis=0)
+
+
+def _condition(reciprocal: np.ndarray) -> float:
+    eps = np.finfo(reciprocal.dtype).eps
+    return float(1 / reciprocal) if reciprocal > eps else float("inf")
+
+
+@tracked_jit("system", "args")
+def _measured(system, t, q, u, args) -> dict[str, Any]:
+    manifold, fibre = system.manifold_of(q), system.fibre_coordinate_name
+    zero = jnp.zeros_like(u)
+
+    def metric(t, xi, u):
+        return system.metric(t, manifold.act(q, xi), u, args)
+
+    def slopes(t, xi, u):
+        g = manifold.act(q, xi)
+        return jax.jacfwd(system.kinematic_constraint, argnums=2)(t, g, u, args)
+
+    def on_chart(name):
+        arguments, function = system.signatures()[name], getattr(system, name)
+
+        def value(t, xi, u):
+            given = {"t": t, "q": manifold.act(q, xi), fibre: u, "args": args}
+            return jnp.atleast_1d(function(*(given[x] for x in arguments)))
+
+        return value
+
+    functions = {name: on_chart(name) for name in system.functions(t, q, u, args)}
+
+    def sample(xi, w):
+        point = (t, xi, u + w)
+        by_time = {
+            name: jax.jacfwd(function)(*point) for name, function in functions.items()
+        }
+        by_position = [
+            jax.jacfwd(function, argnums=1)(*point) for function in functions.values()
+        ]
+        second = {
+            key: max_norm(*jax.tree.leaves(jax.jacfwd(x, argnums=(0, 1, 2))(*point)))
+            for key, x in ((_MASS, metric), (_JACOBIAN, slopes))
+        }
+        return by_time, jnp.concatenate(by_position), second
+
+    size = 1 + jnp.abs(u)
+    keys = jax.random.split(jax.random.key(0), 2)
+    shape = (_SAMPLES, u.shape[0])
+    xi, w = (_SPREAD * jax.random.normal(key, shape, u.dtype) for key in keys)
+    by_time, by_position, second = jax.vmap(sample)(xi, w * size[None])
+    mass = metric(t, zero, u)
+    inverse_mass = inverse(mass)
+    rows = jax.jacfwd(system.constraint, argnums=2)(t, q, u, args)
+    if fibre == "p":
+        # The metric is D2D2H, whose inverse is ∂p/∂v.
+        mass, inverse_mass = inverse_mass, mass
+        rows = rows @ mass
+    compatibility = rows @ inverse_mass @ rows.T
+    return {
+        "constraints": system.constraint(t, q, u, args),
+        "positions": system.position_constraint(t, q, args),
+        "regularity": conditioning(mass),
+        "compatibility": conditioning(compatibility),
+        "jacobian": rows,
+        "rank": conditioning(rows),
+        "of time": by_time,
+        "of positions": by_position,
+        **second,
+    }

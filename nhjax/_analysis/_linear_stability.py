@@ -1,0 +1,227 @@
+"""The constrained motion, linearised about a steady motion, and its eigenvalues."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Complex, Float
+
+from .._compile import as_cpu_kernel, tracked_jit
+from .._custom_types import Args, BoolScalar, FloatScalarLike
+from .._errors import Check, DependentConstraintsError, require
+from .._numerics import conditioning
+from .._system import (
+    AbstractMechanicalSystem,
+    parameters,
+    State,
+)
+from ._arguments import checked_time
+from ._perturbation import check_independent, Indices, perturbed, rates_of_change
+
+
+class LinearStability(eqx.Module):
+    """The constrained motion, linearised about a steady motion: ż = A z.
+
+    - `matrix`: A, shape (d, d).
+    - `basis`: the perturbation (ξ, w) of the state that belongs to each z, as columns,
+        shape (2n, d). The first n rows are the change ξ of the configuration, which
+        becomes q + ξ or, on a group, q τ(ξ); the last n rows are the change w of the
+        velocity, or for a Hamiltonian system of the momentum.
+    """
+
+    matrix: Float[Array, "d d"]
+    basis: Float[Array, "2*n d"]
+
+    @property
+    def eigenvalues(self) -> Complex[Array, " d"]:
+        """Return the eigenvalues of A, in 1/s: growth rates + i angular frequencies."""
+        return jnp.linalg.eigvals(self.matrix)
+
+    @property
+    def modes(self) -> tuple[Complex[Array, " d"], Complex[Array, "2*n d"]]:
+        """Return the eigenvalues, and the perturbation of each mode as a column."""
+        values, vectors = jnp.linalg.eig(self.matrix)
+        return values, self.basis.astype(vectors.dtype) @ vectors
+
+
+def linear_stability(
+    system: AbstractMechanicalSystem,
+    t: FloatScalarLike,
+    y: State,
+    args: Args = None,
+    *,
+    positions: Sequence[int] | None = None,
+    velocities: Sequence[int] | None = None,
+) -> LinearStability:
+    """Linearise the constrained equations of motion about a steady motion.
+
+    With x = (q, u) and the equations of motion ẋ = f(x), whose multipliers follow from
+    the hidden constraints, a perturbation that satisfies the constraints to first order
+    is δx = Z z, and ż = A z with A = W Df(x) Z for any W with W Z = 1. On a group
+    perturbations are left-trivialised, ξ̇ = δv - ad_v ξ.
+
+    The motion is an equilibrium, or it is steady up to symmetries: the state changes,
+    but the equations of the perturbations do not, as for a wheel that rolls at constant
+    speed. About any other motion A holds for an instant, and its eigenvalues have no
+    meaning for stability. `steady_motion` finds steady motions.
+
+    **Arguments:**
+
+    - `system`: the mechanical system.
+    - `t`: the time at which functions that depend on time are taken.
+    - `y`: a consistent state on the steady motion.
+    - `args`: passed on to the functions of the system.
+    - `positions`, `velocities`: the indices of the independent coordinates and of the
+        independent velocities (of momenta for a Hamiltonian system), which are then z.
+        All other velocities follow from the constraints, so that there are n - m - k of
+        them. Positions that neither are independent nor follow from the holonomic
+        constraints are not perturbed: use it for coordinates that the motion does not
+        depend on, such as where a wheel is. By default z are coordinates in an
+        orthonormal basis of all perturbations that the constraints permit.
+
+    **Returns:** a `LinearStability` with the matrix A, its eigenvalues and its modes,
+    differentiable with respect to `y` and `args`. The eigenvalues themselves are
+    computed by a library that JAX has on a CPU only.
+
+    **Raises:** `TypeError` if `system` is no system or `y` no `State`; `ValueError` if
+    only one of `positions` and `velocities` is given, an index is out of range or
+    occurs twice, their number does not fit, or they do not determine the other
+    velocities; `DependentConstraintsError` if the constraints are dependent.
+
+    !!! example
+
+        >>> import nhjax
+        >>> pendulum = nhjax.systems.SphericalPendulum(
+        ...     q0=(0.0, 0.0, -1.0), v0=(0.0, 0.0, 0.0), gravity=4.0)
+        >>> y = pendulum.initial_state()
+        >>> stability = nhjax.linear_stability(pendulum.system, 0.0, y)
+        >>> [round(abs(float(x.imag)), 4) for x in stability.eigenvalues]
+        [2.0, 2.0, 2.0, 2.0]
+    """
+    t = checked_time("linear_stability", system, t, y)
+    independent = check_independent(system, t, y, args, positions, velocities)
+    slopes = _slopes(system, t, y, parameters(args))
+    found, determined = _reduced(slopes, independent)
+    return require(found, Check(determined, _not_determined, (independent,)))
+
+
+def _not_determined(independent: tuple[Indices, Indices] | None) -> ValueError:
+    if independent is None:
+        return DependentConstraintsError(
+            "The constraints are dependent at `y`: they leave more perturbations than "
+            "n - m - k. Remove redundant constraints."
+        )
+    positions, velocities = independent
+    return ValueError(
+        f"`positions` = {positions} and `velocities` = {velocities} do not determine "
+        "the other velocities at `y`: choose coordinates that the constraints leave "
+        "independent."
+    )
+
+
+class _Slopes(NamedTuple):
+    """The derivatives of the equations with respect to perturbations x = (ξ, w)."""
+
+    rates: Float[Array, "2*n 2*n"]
+    on_velocities: Float[Array, "l 2*n"]
+    on_positions: Float[Array, "k n"]
+
+
+@tracked_jit("system", "args")
+def _slopes(system, t, y, args) -> _Slopes:
+    dim, count = y.p.shape[0], y.multiplier.shape[0]
+
+    def equations(x):
+        q, u = perturbed(system, y, x)
+        return jnp.concatenate(
+            [
+                rates_of_change(system, t, y, args)(x),
+                system.constraint(t, q, u, args),
+                system.position_constraint(t, q, args),
+            ]
+        )
+
+    zero = jnp.zeros(2 * dim, y.p.dtype)
+    slopes = jax.jacfwd(lambda x: as_cpu_kernel(equations, x))(zero)
+    rates, on_velocities, rest = jnp.split(slopes, [2 * dim, 2 * dim + count])
+    return _Slopes(rates, on_velocities, rest[:, :dim])
+
+
+@eqx.filter_jit
+def _reduced(
+    slopes: _Slopes, independent: tuple[Indices, Indices] | None
+) -> tuple[LinearStability, BoolScalar]:
+    """Restrict the linear equations to the perturbations that are permitted."""
+    if independent is None:
+        dim = slopes.on_positions.shape[1]
+        rows = jnp.pad(slopes.on_positions, ((0, 0), (0, dim)))
+        found = _orthonormal(jnp.concatenate([slopes.on_velocities, rows]))
+    else:
+        found = _independent(slopes.on_velocities, slopes.on_positions, *independent)
+    matrix = found.left @ slopes.rates @ found.basis
+    return LinearStability(matrix, found.basis), found.determined
+
+
+class _Perturbations(NamedTuple):
+    """A basis Z of the perturbations that are permitted, and a W with W Z = 1.
+
+    `determined` tells whether the constraints determine all others.
+    """
+
+    basis: Float[Array, "2*n d"]
+    left: Float[Array, "d 2*n"]
+    determined: BoolScalar
+
+
+def _is_regular(matrix: Array) -> BoolScalar:
+    eps = jnp.finfo(matrix.dtype).eps
+    return ~(conditioning(matrix) <= 10 * matrix.shape[1] * eps)
+
+
+def _orthonormal(rows: Array) -> _Perturbations:
+    """Compute an orthonormal basis of the kernel of `rows`.
+
+    The basis is defined up to a rotation, which no derivative of a singular value
+    decomposition settles: the one that is found is held, and its derivative is that by
+    which it stays in the kernel.
+    """
+    count = rows.shape[0]
+    _, _, right = jnp.linalg.svd(jax.lax.stop_gradient(rows), full_matrices=True)
+    kernel = right[count:].T
+    normal = jnp.linalg.solve(rows @ rows.T, rows @ kernel)
+    basis = kernel - rows.T @ normal
+    left = jnp.linalg.solve(kernel.T @ basis, kernel.T)
+    return _Perturbations(basis, left, _is_regular(rows))
+
+
+def _independent(
+    on_velocities: Array,
+    on_positions: Array,
+    positions: tuple[int, ...],
+    velocities: tuple[int, ...],
+) -> _Perturbations:
+    """Compute the perturbations of the chosen coordinates, and what picks these."""
+    dim, dtype = on_positions.shape[1], on_positions.dtype
+    count, others = len(positions), len(velocities)
+    unit = jnp.eye(dim, dtype=dtype)
+    q_rows, u_rows = (
+        unit[jnp.asarray(positions, int)],
+        unit[jnp.asarray(velocities, int)],
+    )
+    # The smallest change of positions: those that no constraint ties stay as they are.
+    wanted = jnp.concatenate(
+        [jnp.eye(count, dtype=dtype), jnp.zeros((on_positions.shape[0], count), dtype)]
+    )
+    moved = jnp.concatenate([q_rows, on_positions])
+    xi = moved.T @ jnp.linalg.solve(moved @ moved.T, wanted)
+    xi = jnp.concatenate([xi, jnp.zeros((dim, others), dtype)], axis=1)
+    kept = jnp.eye(count + others, dtype=dtype)[count:]
+    right = jnp.concatenate([kept, -on_velocities[:, :dim] @ xi])
+    following = jnp.concatenate([u_rows, on_velocities[:, dim:]])
+    w = jnp.linalg.solve(following, right)
+    zero = jnp.zeros_like
+    left = jnp.block([[q_rows, zero(q_rows)], [zero(u_rows), u_rows]])
+    regular = _is_regular(moved) & _is_regular(following)
+    return _Perturbations(jnp.concatenate([xi, w]), left, regular)

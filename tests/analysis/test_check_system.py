@@ -1,0 +1,102 @@
+"""The report on a system, for systems whose properties are known."""
+
+import jax.numpy as jnp
+import pytest
+
+import nhjax
+from nhjax.systems import HeavyTop, RollingDisc, SphericalPendulum, VerticalRollingDisc
+from oracles.driven import ARGS, DRIVEN
+from oracles.forms import in_space
+
+
+def report_of(example):
+    return nhjax.check_system(example.system, example.q0, example.v0)
+
+
+def test_a_disc_in_coordinates_and_on_its_group():
+    report = report_of(VerticalRollingDisc())
+    assert report.dimension == 4
+    assert (report.num_nonholonomic, report.num_holonomic) == (2, 0)
+    assert report.degrees_of_freedom == 2
+    # Its place and its roll angle; the heading turns the constraints.
+    assert report.ignorable == (0, 1, 2)
+    assert report.constant == ("mass matrix",)
+    assert report.depends_on_time == report.dependent == ()
+    # On the group nothing depends on the configuration at all.
+    report = report_of(RollingDisc())
+    assert report.ignorable == (0, 1, 2, 3)
+    assert len(report.constant) == 2
+
+
+def test_a_pendulum_on_its_sphere():
+    pendulum = SphericalPendulum(2.0, q0=(0.0, 0.6, -0.8), v0=(1.0, 0.0, 0.0))
+    report = report_of(pendulum)
+    assert (report.num_nonholonomic, report.num_holonomic) == (0, 1)
+    assert report.ignorable == ()
+    assert set(report.violations) == {"dΓ[0]/dt", "Γ[0]"}
+    report = nhjax.check_system(
+        pendulum.system, jnp.asarray([0.0, 0.6, -0.7]), pendulum.v0
+    )
+    assert report.violations["Γ[0]"] == pytest.approx(0.6**2 + 0.7**2 - 1)
+    assert "largest violation              Γ[0] = -0.15" in str(report)
+
+
+def test_what_depends_on_time():
+    report = nhjax.check_system(
+        DRIVEN.system, jnp.ones(3), jnp.ones(3), t=0.3, args=ARGS
+    )
+    assert report.depends_on_time == ("lagrangian", "nonholonomic")
+    # The mass grows, the constraint turns.
+    assert report.constant == ()
+    assert report.ignorable == ()
+
+
+def test_conditioning_of_the_masses():
+    body = HeavyTop()
+    assert report_of(body).mass_condition == pytest.approx(1.0)
+
+    def coupled(t, q, v, args):
+        return 0.5 * (v @ v) + 0.999 * v[0] * v[1]
+
+    system = nhjax.LagrangianSystem(coupled)
+    report = nhjax.check_system(system, jnp.zeros(2), jnp.ones(2))
+    assert report.mass_condition == pytest.approx(1.999 / 0.001)
+    assert report.compatibility_condition == 1.0
+
+
+def test_a_singular_mass_matrix_and_dependent_constraints_are_reported():
+    def lagrangian(t, q, v, args):
+        return 0.5 * v[0] ** 2 - q @ q
+
+    def twice(t, q, v, args):
+        return jnp.stack([v[0] - v[2], v[1], 2 * v[0] - 2 * v[2]])
+
+    system = nhjax.LagrangianSystem(lagrangian, nonholonomic=twice)
+    report = nhjax.check_system(system, jnp.zeros(3), jnp.ones(3))
+    assert report.mass_condition == float("inf")
+    assert report.dependent == ("Φ[0]", "Φ[2]")
+    assert "dependent constraints          Φ[0], Φ[2]" in str(report)
+
+
+def test_a_hamiltonian_system_is_like_its_lagrangian():
+    start = in_space("nonholonomic", in_time=True)
+    y = start.y0
+    one = nhjax.check_system(start.forms["lagrangian"], y.q, y.v, t=0.3)
+    p = start.forms["lagrangian"].momentum(jnp.asarray(0.3), y.q, y.v, None)
+    other = nhjax.check_system(start.forms["hamiltonian"], y.q, p=p, t=0.3)
+    assert one.mass_condition > 1
+    assert other.depends_on_time == ("hamiltonian", "nonholonomic", "force")
+    for name in ("dimension", "num_nonholonomic", "ignorable", "constant"):
+        assert getattr(one, name) == getattr(other, name)
+    for name in ("mass_condition", "compatibility_condition"):
+        assert getattr(one, name) == pytest.approx(getattr(other, name), rel=1e-9)
+
+
+def test_wrong_arguments_are_named():
+    disc = VerticalRollingDisc()
+    with pytest.raises(ValueError, match="Give `v`, the fibre coordinate"):
+        nhjax.check_system(disc.system, disc.q0, p=disc.v0)
+    with pytest.raises(nhjax.ShapeError, match="`v` has shape"):
+        nhjax.check_system(disc.system, disc.q0, jnp.ones(3))
+    with pytest.raises(TypeError, match="`system` must be"):
+        nhjax.check_system(disc, disc.q0, disc.v0)  # pyright: ignore[reportArgumentType]
