@@ -178,7 +178,7 @@ def integrate(
     if not is_tracing() and leaves_steps_to_newton(stage_solver) and is_unsolved(sol):
         # Silently: the meter has shown its run already.
         sol = run_with(replace(stage_solver, fallback=True), NoProgressMeter())
-    return raise_failures(sol) if throw else sol
+    return raise_failures(sol, dt) if throw else sol
 
 
 def _zero_step() -> ValueError:

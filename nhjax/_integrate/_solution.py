@@ -1,5 +1,5 @@
 import functools
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -31,8 +31,10 @@ class Solution(eqx.Module):
         `max_constraint_violation` (the largest |Φ| at the nodes, the initial state
         included),
         `max_multiplier_defect` (the largest |Λ^s - λ_c|, the distance of the last stage
-        multiplier of a step from the continuous multiplier), and
-        `failed_step` (the index of the step that failed, -1 if none did).
+        multiplier of a step from the continuous multiplier),
+        `failed_step` (the index of the step that failed, -1 if none did), and
+        `worst_coordinate` (the index of the coordinate whose momentum equations had
+        the largest residual in the step that failed, -1 if none failed).
     - `result`: a member of `nhjax.RESULTS`, which says how the run ended.
     - `interpolation`: the collocation polynomials, with `SaveAt(dense=True)`; None
         without.
@@ -95,13 +97,26 @@ class Solution(eqx.Module):
         message of its `RESULTS`. `lane` is None for a solution without a batch, an
         index for a batch, and a tuple of indices for a batch of batches.
         """
-        codes, steps = self.result._value, self.stats["failed_step"]
-        if is_traced(codes, steps):
+        outcome = _outcome(self)
+        if is_traced(*outcome):
             raise RuntimeError(
                 "Solution.failures() needs a computed solution, outside jit and vmap; "
                 "inside them use `sol.result` and `sol.stats['failed_step']`."
             )
-        return _failures(codes, steps)
+        return _failures(outcome)
+
+
+class _Outcome(NamedTuple):
+    """How runs ended: codes of `RESULTS`, and where."""
+
+    codes: Array
+    steps: Array
+    coordinates: Array
+
+
+def _outcome(sol: Solution) -> _Outcome:
+    stats = sol.stats
+    return _Outcome(sol.result._value, stats["failed_step"], stats["worst_coordinate"])
 
 
 def is_unsolved(sol: Solution) -> bool:
@@ -114,40 +129,49 @@ def is_unsolved(sol: Solution) -> bool:
     return any(bool(sol.result == result) for result in unsolved)
 
 
-def raise_failures(sol: Solution) -> Solution:
-    """Return `sol`, or raise an `IntegrationError` with lane, step and reason."""
-    codes, steps = sol.result._value, sol.stats["failed_step"]
-    bad = codes != _messages().index("")
-    if is_traced(codes, steps):
-        return raise_where(sol, bad, _failure, (codes, steps))
+def raise_failures(sol: Solution, dt: FloatScalarLike | None = None) -> Solution:
+    """Return `sol`, or raise an `IntegrationError` with lane, step and reason.
+
+    With the size `dt` of the steps, the message says which to try.
+    """
+    outcome = _outcome(sol)
+    bad = outcome.codes != _messages().index("")
+    if is_traced(*outcome, dt):
+        return raise_where(sol, bad, _failure, (outcome, dt))
     if np.any(bad):
-        raise _failure(bad, (codes, steps))
+        raise _failure(bad, (outcome, dt))
     return sol
 
 
-def _failure(bad: Any, values: tuple[Any, Any]) -> IntegrationError:
-    del bad
-    return IntegrationError(_failure_message(_failures(*values)))
+def _failure(bad: Any, values: tuple[_Outcome, Any]) -> IntegrationError:
+    outcome, dt = values
+    first = tuple(np.argwhere(bad)[0])
+    size = None if dt is None else float(np.broadcast_to(dt, np.shape(bad))[first])
+    return IntegrationError(_failure_message(_failures(outcome), size))
 
 
 def _failures(
-    codes: Any, steps: Any
+    outcome: _Outcome,
 ) -> list[tuple[int | tuple[int, ...] | None, int, str]]:
-    codes, steps = np.asarray(codes), np.asarray(steps)
+    codes, steps, coordinates = map(np.asarray, outcome)
     messages, failures = _messages(), []
     for index in np.ndindex(codes.shape):
-        message = messages[int(codes[index])]
+        message, coordinate = messages[int(codes[index])], int(coordinates[index])
+        if message and coordinate >= 0:
+            message += f" The largest residual was that of coordinate {coordinate}."
         if message:
             failures.append((lane_name(index), int(steps[index]), message))
     return failures
 
 
 def _failure_message(
-    failures: list[tuple[int | tuple[int, ...] | None, int, str]],
+    failures: list[tuple[int | tuple[int, ...] | None, int, str]], dt: float | None
 ) -> str:
     lane, k, reason = failures[0]
     where = "" if lane is None else f"lane {lane}, "
     others = f" ({len(failures) - 1} more lanes failed)" if failures[1:] else ""
+    if dt is not None and "smaller `dt`" in reason:
+        reason += f" The present one is {dt:.6g}: try {0.5 * dt:.6g}."
     return (
         f"Integration failed in {where}step {k}{others}: {reason} "
         "With `throw=False` the part before the failure is returned."

@@ -29,6 +29,7 @@ def first_statistics(violation: FloatScalar, is_good: BoolScalar) -> Statistics:
         "max_constraint_violation": violation,
         "max_multiplier_defect": zero,
         "failed_step": jnp.where(is_good, none - 1, none),
+        "worst_coordinate": none - 1,
     }
 
 
@@ -53,6 +54,7 @@ def updated_statistics(
     def larger(name, value):
         return jnp.where(good, jnp.maximum(stats[name], value), stats[name])
 
+    failed = alive & ~good
     return {
         "num_steps": stats["num_steps"] + good.astype(jnp.int32),
         "num_iterations": stats["num_iterations"]
@@ -66,5 +68,8 @@ def updated_statistics(
         "max_multiplier_defect": larger(
             "max_multiplier_defect", outcome.multiplier_defect
         ),
-        "failed_step": jnp.where(alive & ~good, k, stats["failed_step"]),
+        "failed_step": jnp.where(failed, k, stats["failed_step"]),
+        "worst_coordinate": jnp.where(
+            failed, outcome.worst_coordinate, stats["worst_coordinate"]
+        ),
     }

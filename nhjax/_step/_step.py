@@ -67,6 +67,8 @@ class StepOutcome(NamedTuple):
     - `result`: whether the step was solved, and otherwise why not.
     - `num_iterations`: how many iterations the stage solver made.
     - `residual`: the residual of the stage equations, relative to the momenta.
+    - `worst_coordinate`: the index of the coordinate whose equations have the largest
+        residual.
     - `constraint_violation`: the largest violation of a constraint at the end.
     - `multiplier_defect`: the distance |Λ^s - λ_c| at the end.
     - `newton`: whether Newton's method took over from simplified Newton.
@@ -78,6 +80,7 @@ class StepOutcome(NamedTuple):
     result: RESULTS
     num_iterations: Int[Array, ""]
     residual: FloatScalar
+    worst_coordinate: Int[Array, ""]
     constraint_violation: FloatScalar
     multiplier_defect: FloatScalar
     newton: BoolScalar
@@ -169,10 +172,17 @@ def step(
         result=_result(solved, lin, next_state, in_chart(stages, x)),
         num_iterations=solved.num_iterations,
         residual=relative(residual, scale),
+        worst_coordinate=_worst_column(forces.residual, solved.aux.node_residual),
         constraint_violation=largest_violation(system, t + h, next_state, args),
         multiplier_defect=max_norm(forces.multiplier[-1] - lin_next.multiplier),
         newton=solved.aux.newton,
     )
+
+
+def _worst_column(*residuals: Float[Array, "_ n"]) -> Int[Array, ""]:
+    """Find the column with the largest number; NaN counts as larger than any."""
+    sizes = jnp.max(jnp.abs(jnp.concatenate(residuals)), axis=0)
+    return jnp.argmax(sizes).astype(jnp.int32)
 
 
 def _result(

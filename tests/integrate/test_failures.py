@@ -107,3 +107,36 @@ def test_a_solver_that_gives_up():
     assert sol.result == nhjax.RESULTS.nonlinear_max_iterations
     assert "within the `max_iterations`" in sol.failures()[0][2]
     assert_trees_equal(jax.tree.map(lambda x: x[0], sol.ys), PARTICLE.initial_state())
+
+
+def test_a_failure_names_the_coordinate_and_a_step_to_try():
+    # Three oscillators that know nothing of each other, the second one very stiff.
+    stiffness = jnp.asarray([1.0, 1e9, 2.0])
+
+    def lagrangian(t, q, v, args):
+        return 0.5 * (v @ v) - 0.25 * jnp.sum(stiffness * q**4)
+
+    system = nhjax.LagrangianSystem(lagrangian)
+    y0 = nhjax.initial_state(system, jnp.ones(3), jnp.zeros(3))
+    solver = nhjax.SimplifiedNewton(fallback=False)
+
+    def run_with(dt, **options):
+        return nhjax.integrate(
+            system,
+            nhjax.LobattoIIIAB(3),
+            y0,
+            dt=dt,
+            num_steps=2,
+            stage_solver=solver,
+            **options,
+        )
+
+    stats = run_with(0.25, throw=False).stats
+    assert (stats["failed_step"], stats["worst_coordinate"]) == (0, 1)
+    assert run_with(1e-6).stats["worst_coordinate"] == -1
+    message = r"of coordinate 1\. The present one is 0\.25: try 0\.125\."
+    with pytest.raises(nhjax.IntegrationError, match=message):
+        run_with(0.25)
+    # Each lane has a step of its own.
+    with pytest.raises(Exception, match=f"lane 1, step 0: .*{message}"):
+        jax.vmap(run_with)(jnp.asarray([1e-6, 0.25]))
