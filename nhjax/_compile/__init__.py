@@ -7,6 +7,6 @@ from ._elementary import (
 )
 from ._engine import engines as engines, EngineUse as EngineUse
 from ._ensemble import ensemble as ensemble
-from ._kernel import as_cpu_kernel as as_cpu_kernel
+from ._kernel import as_cpu_kernel as as_cpu_kernel, Programs as Programs
 from ._shortened import shortened as shortened
 from ._tracked_jit import tracked_jit as tracked_jit

@@ -4,8 +4,8 @@ A member of an ensemble is integrated by one such program. How it is compiled de
 the device and on what the program holds: `_lowering` and `_ensemble` decide.
 """
 
-from collections.abc import Callable
-from typing import Any, TypeVar
+from collections.abc import Callable, Hashable
+from typing import Any, NamedTuple, TypeVar
 
 import equinox as eqx
 import jax
@@ -18,18 +18,64 @@ from ._shortened import shortened
 T = TypeVar("T")
 
 
-def as_cpu_kernel(function: Callable[..., T], *args: Any) -> T:
+class Programs:
+    """The programs of functions that have been traced already, by what they are given.
+
+    What functions of a user read may change from one call of `integrate` to the next,
+    so that programs are kept while one run is traced and differentiated, not longer.
+    """
+
+    def __init__(self):
+        self._known: dict[Hashable, _Traced] = {}
+
+    def find(self, key: Hashable) -> "_Traced | None":
+        """Return the program that was kept for this key, if there is one."""
+        return self._known.get(key)
+
+    def keep(self, key: Hashable, traced: "_Traced") -> None:
+        """Keep a program, unless it contains what belongs to another trace."""
+        if not _captures(traced.program):
+            self._known[key] = traced
+
+
+class _Traced(NamedTuple):
+    """The program of a function: its arrays, their structure, and its other results."""
+
+    program: Any
+    structure: Any
+    rest: Any
+
+
+def as_cpu_kernel(
+    function: Callable[..., T], *args: Any, programs: Programs | None = None
+) -> T:
     """Compute `function(*args)`, in one kernel of the CPU if that is possible.
 
     The call can be transformed like the function itself. The programs of its
     derivatives, forward and transposed, go into kernels too. A batch of calls is an
-    ensemble, whose members run in the lanes of vectors where that is possible.
+    ensemble, whose members run in the lanes of vectors where that is possible. With
+    `programs` the function is traced once for each kind of arguments, and must depend
+    on nothing but these.
     """
     # Who asks for no compilation wants to look at one operation after the other.
     if jax.config.jax_disable_jit:  # pyright: ignore[reportAttributeAccessIssue]
         return function(*args)
     dynamic, static = eqx.partition(args, eqx.is_array)
     leaves, treedef = jax.tree.flatten(dynamic)
+    others, structure = jax.tree.flatten(static)
+    key = function, treedef, structure, *others, *map(jax.typeof, leaves)
+    traced = None if programs is None else programs.find(key)
+    if traced is None:
+        traced = _traced(function, static, treedef, leaves)
+        if programs is not None:
+            programs.keep(key, traced)
+    out = run_program(traced.program, leaves)
+    return eqx.combine(jax.tree.unflatten(traced.structure, out), traced.rest)
+
+
+def _traced(
+    function: Callable[..., Any], static: Any, treedef: Any, leaves: list[Any]
+) -> _Traced:
     kept = []
 
     def flat(*leaves):
@@ -38,9 +84,8 @@ def as_cpu_kernel(function: Callable[..., T], *args: Any) -> T:
         kept.append((jax.tree.structure(arrays), rest))
         return jax.tree.leaves(arrays)
 
-    out = call(flat, leaves)
-    structure, rest = kept[0]
-    return eqx.combine(jax.tree.unflatten(structure, out), rest)
+    program = shortened(jax.make_jaxpr(flat)(*leaves))
+    return _Traced(program, *kept[0])
 
 
 def call(flat: Callable[..., list[Any]], leaves: list[Any]) -> list[Any]:
@@ -52,10 +97,13 @@ def run_program(program: Any, leaves: list[Any]) -> list[Any]:
     """Compute a program in a kernel, or without one if it has effects."""
     program = shortened(program)
     # A primitive needs all traced values as operands, and may not print, for instance.
-    captured = any(isinstance(const, jax.core.Tracer) for const in program.consts)
-    if program.effects or captured:
+    if program.effects or _captures(program):
         return jax.extend.core.jaxpr_as_fun(program)(*leaves)
     return kernel.bind(*leaves, program=program)
+
+
+def _captures(program: Any) -> bool:
+    return any(isinstance(const, jax.core.Tracer) for const in program.consts)
 
 
 def never_high(*_: Any, **__: Any) -> bool:

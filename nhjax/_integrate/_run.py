@@ -5,7 +5,7 @@ from functools import partial
 import jax
 from jaxtyping import Array, Int, PyTree
 
-from .._compile import as_cpu_kernel, tracked_jit
+from .._compile import as_cpu_kernel, Programs, tracked_jit
 from .._custom_types import Args, FloatScalar, IntScalar
 from .._method import AbstractMethod
 from .._numerics import ClosureConverted, nan_gradient_unless
@@ -41,7 +41,7 @@ def run(
     check_saved(saveat.fn, t0, y0, args)
     # Arrays that the user's functions close over become leaves, for derivatives.
     system = closure_converted(system, t0, y0, args)
-    stepping = Stepping(system, method, stage_solver, t0, dt, args)
+    stepping = Stepping(system, method, stage_solver, t0, dt, args, Programs())
     ts, sampled = saveat.ts, None
     if ts is not None:
         length = known(num_steps)

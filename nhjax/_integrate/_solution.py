@@ -109,9 +109,9 @@ class Solution(eqx.Module):
 class _Outcome(NamedTuple):
     """How runs ended: codes of `RESULTS`, and where."""
 
-    codes: Array
-    steps: Array
-    coordinates: Array
+    codes: Any
+    steps: Any
+    coordinates: Any
 
 
 def _outcome(sol: Solution) -> _Outcome:

@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Int
 
+from .._compile import Programs
 from .._custom_types import Args, BoolScalar, FloatScalar
 from .._method import AbstractMethod
 from .._numerics import max_norm
@@ -50,7 +51,11 @@ class Taken(NamedTuple):
 
 
 class Stepping(eqx.Module):
-    """The system, method and options of a run, with functions that take its steps."""
+    """The system, method and options of a run, with functions that take its steps.
+
+    `programs` keeps the program of a step, which is the same for each way in which the
+    run is differentiated.
+    """
 
     system: AbstractMechanicalSystem
     method: AbstractMethod = eqx.field(static=True)
@@ -58,6 +63,7 @@ class Stepping(eqx.Module):
     t0: FloatScalar
     dt: FloatScalar
     args: Args
+    programs: Programs
 
     def time(self, k: Int[Array, ""] | int) -> FloatScalar:
         """Compute the time t_k as a product, since a running sum of dt would drift."""
@@ -83,7 +89,8 @@ class Stepping(eqx.Module):
         """Take one step of size h from t; h may be negative, to go back."""
         start = step_state.differentiated_in_state()
         arguments = StepArguments(self.system, t, h, start, self.args)
-        return primitive_step(arguments, self.method, self.stage_solver, skip)
+        given = arguments, self.method, self.stage_solver, skip, self.programs
+        return primitive_step(*given)
 
     def nothing_taken(self, carry: Carry) -> Taken:
         """Make the record of a step that was not taken, all zeros at the stages."""

@@ -5,7 +5,7 @@ from functools import partial
 import equinox as eqx
 import jax
 
-from .._compile import as_cpu_kernel
+from .._compile import as_cpu_kernel, Programs
 from .._custom_types import Args, BoolScalar, FloatScalar
 from .._method import AbstractMethod
 from .._numerics import (
@@ -45,6 +45,7 @@ def differentiable_step(
     method: AbstractMethod,
     solver: AbstractStageSolver,
     skip: BoolScalar,
+    programs: Programs,
 ) -> StepOutcome:
     """Take one step as `step` does, with a derivative that skips the iterations.
 
@@ -57,6 +58,7 @@ def differentiable_step(
     and the end of the step follows from x and θ. All derivatives are zero where the
     step failed.
     """
+    del programs
     system, t, h = arguments.system, arguments.t, arguments.h
     return step(
         system, method, solver, t, h, arguments.step_state, arguments.args, skip
@@ -65,7 +67,8 @@ def differentiable_step(
 
 @differentiable_step.def_jvp
 def _differentiable_step_jvp(primals, tangents):
-    arguments, method, solver, skip = primals
+    arguments, method, solver, skip, _ = primals
+    # The program that the derivative was asked of is found again.
     outcome = primitive_step(*primals)
     x, ok = outcome.stages, ~skip & (outcome.result == RESULTS.successful)
     perturbed, fixed = eqx.partition(arguments, has_tangent(tangents[0]))
@@ -108,10 +111,19 @@ def _differentiable_step_jvp(primals, tangents):
     )
 
 
-# When JAX splits a scan into a known and a linear part, it drops the derivative rules
-# of functions, but not those of primitives. Without its rule a step could be
-# differentiated in reverse mode only once, and not again.
-primitive_step = partial(as_cpu_kernel, differentiable_step)
+def primitive_step(
+    arguments: StepArguments,
+    method: AbstractMethod,
+    solver: AbstractStageSolver,
+    skip: BoolScalar,
+    programs: Programs,
+) -> StepOutcome:
+    """Take one step by `differentiable_step`, in a program that is traced once."""
+    # When JAX splits a scan into a known and a linear part, it drops the derivative
+    # rules of functions, but not those of primitives. Without its rule a step could be
+    # differentiated in reverse mode only once, and not again.
+    given = arguments, method, solver, skip, programs
+    return as_cpu_kernel(differentiable_step, *given, programs=programs)
 
 
 def _stage_system(arguments: StepArguments, method: AbstractMethod) -> StageSystem:

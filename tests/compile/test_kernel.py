@@ -8,7 +8,7 @@ import pytest
 
 import nhjax
 from nhjax import LobattoIIIAB, systems
-from nhjax._compile import as_cpu_kernel
+from nhjax._compile import as_cpu_kernel, Programs
 
 
 MARK = 'xla_cpu_small_call = "true"'
@@ -250,3 +250,36 @@ def test_high_orders_and_many_coordinates_are_one_kernel(example, stages):
         ).ys
 
     assert MARK in jax.jit(run).lower(example.initial_state()).as_text()
+
+
+def test_a_function_is_traced_once_for_each_kind_of_arguments():
+    traced = []
+
+    def scaled(x, factor):
+        traced.append(x.shape)
+        return factor * jnp.sin(x)
+
+    programs = Programs()
+
+    def value(x, factor=2.0):
+        return jnp.sum(as_cpu_kernel(scaled, x, factor, programs=programs))
+
+    x = jnp.arange(3.0)
+    np.testing.assert_allclose(value(x), 2 * np.sum(np.sin(x)), rtol=1e-15)
+    found = jax.grad(lambda x: value(x) + value(x + 1))(x)
+    np.testing.assert_allclose(found, 2 * (np.cos(x) + np.cos(x + 1)), rtol=1e-15)
+    assert traced == [(3,)]
+    value(x[:2])
+    value(x, 3.0)
+    assert traced == [(3,), (2,), (3,)]
+
+
+def test_a_program_with_what_another_trace_computed_is_not_kept():
+    programs = Programs()
+
+    def value(x):
+        return as_cpu_kernel(lambda y, x=x: x * y, jnp.ones(()), programs=programs)
+
+    assert float(jax.jit(value)(2.0)) == 2.0
+    assert float(jax.jit(value)(3.0)) == 3.0
+    assert float(jax.grad(value)(2.0)) == 1.0
