@@ -13,6 +13,7 @@ from ._rigid_body import FreeRigidBody as FreeRigidBody
 from ._rod_sleigh import RodSleigh as RodSleigh
 from ._rolling_disc import VerticalRollingDisc as VerticalRollingDisc
 from ._rolling_disc_on_group import RollingDisc as RollingDisc
+from ._rolling_torus import RollingTorus as RollingTorus
 from ._sleigh import ChaplyginSleigh as ChaplyginSleigh
 from ._spherical_pendulum import SphericalPendulum as SphericalPendulum
 from ._suslov import Suslov as Suslov

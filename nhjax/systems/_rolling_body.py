@@ -2,7 +2,6 @@
 
 import abc
 import dataclasses
-from collections.abc import Sequence
 from typing import Self
 
 import equinox as eqx
@@ -91,8 +90,8 @@ class AbstractRollingBody(AbstractConstrainedGroupExample):
 
     def rolling(
         self,
-        attitude: Sequence[float] | Array,
-        angular_velocity: Sequence[float] | Array,
+        attitude: tuple[float, ...] | Array,
+        angular_velocity: tuple[float, ...] | Array,
         contact: tuple[float, float] | Array = (0.0, 0.0),
     ) -> Self:
         """Make the same body with other initial data, which are consistent.
@@ -100,9 +99,9 @@ class AbstractRollingBody(AbstractConstrainedGroupExample):
         `attitude` is a quaternion, `angular_velocity` ω is in body axes, and `contact`
         is where on the plane the body touches it.
         """
-        quaternion = coordinates(tuple(attitude))
+        quaternion = coordinates(attitude)
         quaternion = quaternion / jnp.sqrt(quaternion @ quaternion)
-        omega = coordinates(tuple(angular_velocity))
+        omega = coordinates(angular_velocity)
         lowest = self.lowest_point(up_in_body(quaternion)).astype(omega.dtype)
         place = jnp.pad(coordinates(contact), (0, 1))
         q0 = jnp.concatenate([quaternion, place - SO3().Ad(quaternion, lowest)])
