@@ -2,6 +2,8 @@
 
 from ._appell import Appell as Appell
 from ._chaotic import ChaoticSystem as ChaoticSystem
+from ._chaplygin_sphere import ChaplyginSphere as ChaplyginSphere
+from ._chaplygin_top import ChaplyginTop as ChaplyginTop
 from ._cvt import ContinuouslyVariableTransmission as ContinuouslyVariableTransmission
 from ._double_pendulum import DoublePendulum as DoublePendulum
 from ._heavy_top import HeavyTop as HeavyTop, HeavyTopSE3 as HeavyTopSE3

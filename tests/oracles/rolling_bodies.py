@@ -254,3 +254,23 @@ def errors_of(body, start, duration, finest):
         }
 
     return errors_at
+
+
+def assert_newton_and_euler(example, body, states, accelerations, atol=1e-11):
+    """Check v̇, ω̇ and the force of the plane at `states`, (quaternion, ω, contact)s.
+
+    `accelerations` maps a system and states (q, v) to (v̇, λ, violation).
+    """
+    expected = [body.accelerations(matrix_of(state[0]), state[1]) for state in states]
+    v_dot, omega_dot, force = map(np.array, zip(*expected, strict=True))
+    poses = [pose_and_twist(body, *state) for state in states]
+    q, v = map(np.array, zip(*poses, strict=True))
+    slope, multiplier, violation = accelerations(example.system, q, v)
+    np.testing.assert_allclose(violation, 0.0, rtol=0, atol=1e-14)
+    for found, wanted in (
+        (slope[:, :3], v_dot),
+        (slope[:, 3:], omega_dot),
+        (multiplier, force),
+    ):
+        scale = np.max(np.abs(wanted), axis=1, keepdims=True)
+        np.testing.assert_allclose(found / scale, wanted / scale, rtol=0, atol=atol)

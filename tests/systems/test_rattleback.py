@@ -14,12 +14,12 @@ import nhjax
 from nhjax.systems import Rattleback
 from oracles.machines import accelerations, assert_orders, drifts, runs, stack
 from oracles.rolling_bodies import (
+    assert_newton_and_euler,
     ellipsoid,
     errors_of,
     kane_levinson,
     kane_levinson_field,
     matrix_of,
-    pose_and_twist,
     random_states,
     RollingBody,
 )
@@ -70,20 +70,8 @@ def errors_at():
 
 @pytest.mark.parametrize("stone", STONES.values(), ids=STONES)
 def test_accelerations_and_forces_are_those_of_newton_and_euler(stone):
-    body = newton_euler(stone)
-    states = list(random_states(20))
-    expected = [body.accelerations(matrix_of(state[0]), state[1]) for state in states]
-    v_dot, omega_dot, force = map(np.array, zip(*expected, strict=True))
-    q, v = stack([pose_and_twist(body, *state) for state in states])
-    slope, multiplier, violation = accelerations(stone.system, q, v)
-    np.testing.assert_allclose(violation, 0.0, rtol=0, atol=1e-15)
-    for found, wanted in (
-        (slope[:, :3], v_dot),
-        (slope[:, 3:], omega_dot),
-        (multiplier, force),
-    ):
-        scale = np.max(np.abs(wanted), axis=1, keepdims=True)
-        np.testing.assert_allclose(found / scale, wanted / scale, rtol=0, atol=1e-11)
+    body, states = newton_euler(stone), list(random_states(20))
+    assert_newton_and_euler(stone, body, states, accelerations)
 
 
 def test_accelerations_are_those_of_the_papers_equations():

@@ -12,6 +12,7 @@ import nhjax
 from nhjax.systems import RollingTorus
 from oracles.machines import accelerations, assert_orders, drifts, runs, stack
 from oracles.rolling_bodies import (
+    assert_newton_and_euler,
     errors_of,
     matrix_of,
     pose_and_twist,
@@ -75,18 +76,7 @@ def test_accelerations_and_forces_are_those_of_newton_and_euler(body):
     for quaternion, omega, contact in random_states(20, tilt=1.2):
         turned = Rotation.from_quat(np.roll(quaternion, -1)) * upright
         states.append((np.roll(turned.as_quat(), 1), omega, contact))
-    expected = [oracle.accelerations(matrix_of(state[0]), state[1]) for state in states]
-    v_dot, omega_dot, force = map(np.array, zip(*expected, strict=True))
-    q, v = stack([pose_and_twist(oracle, *state) for state in states])
-    slope, multiplier, violation = accelerations(body.system, q, v)
-    np.testing.assert_allclose(violation, 0.0, rtol=0, atol=1e-14)
-    for found, wanted in (
-        (slope[:, :3], v_dot),
-        (slope[:, 3:], omega_dot),
-        (multiplier, force),
-    ):
-        scale = np.max(np.abs(wanted), axis=1, keepdims=True)
-        np.testing.assert_allclose(found / scale, wanted / scale, rtol=0, atol=1e-11)
+    assert_newton_and_euler(body, oracle, states, accelerations)
 
 
 def steady_rates(body):
