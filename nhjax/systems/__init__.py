@@ -1,6 +1,7 @@
 """The gallery: mechanical systems with their references, one file each."""
 
 from ._appell import Appell as Appell
+from ._ball_in_bowl import BallInBowl as BallInBowl
 from ._chaotic import ChaoticSystem as ChaoticSystem
 from ._chaplygin_sphere import ChaplyginSphere as ChaplyginSphere
 from ._chaplygin_top import ChaplyginTop as ChaplyginTop
