@@ -4,7 +4,6 @@ from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
 from .._custom_types import Args, FloatScalarLike
@@ -88,7 +87,7 @@ class Rattleback(AbstractRollingBody):
             return
         if not self.product**2 < self.moments[0] * self.moments[1]:
             raise ValueError(
-                "`product` must be smaller than the mean of its two `moments`, "
+                "`product` must be smaller than the geometric mean of its `moments`, "
                 f"√(J₁₁ J₂₂), got {self.product}."
             )
 
@@ -105,10 +104,10 @@ class Rattleback(AbstractRollingBody):
         about the horizontal first axis by α, and then about its second one by -β.
         `parameters` are those of the class.
         """
-        lean, pitch = jnp.deg2rad(coordinates(tilts)) * jnp.asarray([0.5, -0.5])
+        lean, pitch = 0.5 * jnp.deg2rad(coordinates(tilts))
         zero = jnp.zeros_like(lean)
         first = jnp.stack([jnp.cos(lean), jnp.sin(lean), zero, zero])
-        second = jnp.stack([jnp.cos(pitch), zero, jnp.sin(pitch), zero])
+        second = jnp.stack([jnp.cos(pitch), zero, -jnp.sin(pitch), zero])
         omega = jnp.stack([zero, zero, jnp.asarray(spin, lean.dtype)])
         return cls(**parameters).rolling(SO3().compose(first, second), omega)
 
@@ -120,10 +119,8 @@ class Rattleback(AbstractRollingBody):
     @property
     def inertia(self) -> Float[Array, "3 3"]:
         """Return the matrix J of inertia about the centre of mass, in body axes."""
-        off_diagonal = np.zeros((3, 3))
-        off_diagonal[0, 1] = off_diagonal[1, 0] = 1.0
-        unit = jnp.asarray(off_diagonal, self.moments.dtype)
-        return jnp.diag(self.moments) + self.product * unit
+        principal = jnp.diag(self.moments)
+        return principal.at[0, 1].set(self.product).at[1, 0].set(self.product)
 
     @property
     def system(self) -> LagrangianSystem:
@@ -154,9 +151,8 @@ class Rattleback(AbstractRollingBody):
 
     def points(self, t: FloatScalarLike, q: Array) -> dict[str, Array]:
         """Compute where the centre of mass, the contact and the two ends are [m]."""
-        tip = jnp.stack([self.semiaxes[0], jnp.zeros_like(self.semiaxes[0])] * 2)[:3]
-        tip = tip.at[2].set(0.0).astype(q.dtype)
-        middle = jnp.zeros_like(tip).at[2].set(self.depth)
+        middle = jnp.zeros_like(q[4:]).at[2].set(self.depth)
+        tip = jnp.zeros_like(middle).at[0].set(self.semiaxes[0].astype(q.dtype))
         return {
             "centre_of_mass": q[4:],
             "contact": self.contact_point(q),

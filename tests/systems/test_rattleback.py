@@ -108,6 +108,22 @@ def test_tilts_are_the_papers_angles():
     np.testing.assert_allclose(up, expected, rtol=0, atol=1e-15)
 
 
+def test_a_stone_at_rest_rocks_as_its_radii_of_curvature_say():
+    a, b, c, h, m, g, e = 0.2, 0.03, 0.02, 0.01, 1.0, 9.81, 1e-5
+    rocking = []
+    for turn in (*np.eye(2), *-np.eye(2)):
+        quaternion = (np.cos(e / 2), *(np.sin(e / 2) * turn), 0.0)
+        rolling = Rattleback().rolling(quaternion, (0.0, 0.0, 0.0))
+        rocking.append((rolling.q0, rolling.v0))
+    slope, _, _ = accelerations(Rattleback().system, *stack(rocking))
+    stiffness = -(slope[:2, 3:5] - slope[2:, 3:5]).T / (2 * e)
+    # About the first axis it rolls along the second one, and the reverse.
+    lever = m * g * np.diag([b**2 / c - (c - h), a**2 / c - (c - h)])
+    inertia = np.array([[2e-4, 2e-5], [2e-5, 1.6e-3]]) + m * (c - h) ** 2 * np.eye(2)
+    expected = np.linalg.solve(inertia, lever)
+    np.testing.assert_allclose(stiffness, expected, rtol=2e-6, atol=0)
+
+
 @pytest.mark.parametrize("stages", [2, 3])
 def test_order_is_that_of_the_method(runs_of, errors_at, stages):
     assert_orders(runs_of[1][stages], 2 * stages - 2, errors_at, floor=1e-11)
