@@ -55,6 +55,13 @@ def require_positive(**parameters: Array) -> None:
             raise ValueError(f"`{name}` must be positive, got {value}.")
 
 
+def require_not_negative(**parameters: Array) -> None:
+    """Raise for a parameter that is negative, unless it is being traced."""
+    for name, value in parameters.items():
+        if not is_traced(value) and not np.all(np.asarray(value) >= 0):
+            raise ValueError(f"`{name}` must not be negative, got {value}.")
+
+
 def require_shape(shape: tuple[int, ...], **parameters: Array) -> None:
     """Raise for a parameter whose shape is not `shape`."""
     for name, value in parameters.items():

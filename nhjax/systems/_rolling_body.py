@@ -1,0 +1,117 @@
+"""What all rigid bodies that roll on a horizontal plane share."""
+
+import abc
+import dataclasses
+from typing import Self
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from .._custom_types import Args, FloatScalarLike
+from .._manifold import AbstractRetraction, SE3, SO3
+from .._system import LagrangianSystem
+from ._base import AbstractConstrainedGroupExample, coordinates
+
+
+Vector3 = Float[Array, "3"]
+Pose = Float[Array, "7"]
+Twist = Float[Array, "6"]
+
+
+class AbstractRollingBody(AbstractConstrainedGroupExample):
+    """A rigid body that rolls without slipping on the plane z = 0, on SE(3).
+
+    ℓ = m/2 |v|² + ½ ω·(J ω) - m g z,  Φ = z + e₃·(R s),  φ = (R (v + ω × s))₁₂,
+
+    with q = (R, x): the attitude, a quaternion, and the position of the centre of mass
+    [m]; (v, ω) are their body velocities [m/s, 1/s]. The lowest point of the body is s,
+    seen from the centre of mass in body axes: Φ is its height, and φ the horizontal
+    velocity of the material point that is there. The multipliers are the force of the
+    plane in space: its horizontal components, and the normal one [N].
+    """
+
+    mass: eqx.AbstractVar[Array]
+    retraction: eqx.AbstractVar[AbstractRetraction]
+
+    # An abstract field `gravity` would come second among the arguments of all bodies.
+    @property
+    @abc.abstractmethod
+    def weight(self) -> Array:
+        """Return the weight m g."""
+
+    @property
+    @abc.abstractmethod
+    def inertia(self) -> Float[Array, "3 3"]:
+        """Return the matrix J of inertia about the centre of mass, in body axes."""
+
+    @abc.abstractmethod
+    def lowest_point(self, up: Vector3) -> Vector3:
+        """Compute s, where `up` is the upward vertical; both in body axes."""
+
+    @property
+    def manifold(self) -> SE3:
+        """Return the group SE(3) with the retraction of the example."""
+        return SE3(self.retraction)
+
+    @property
+    def system(self) -> LagrangianSystem:
+        """Return the system to integrate, whose leaves are the parameters."""
+        return LagrangianSystem(
+            self.lagrangian,
+            nonholonomic=self.constraint,
+            holonomic=self.holonomic,
+            manifold=self.manifold,
+        )
+
+    def lagrangian(self, t: FloatScalarLike, q: Pose, v: Twist, args: Args) -> Array:
+        """Compute the Lagrangian ℓ = m/2 |v|² + ½ ω·(J ω) - m g z."""
+        translation = 0.5 * self.mass * (v[:3] @ v[:3])
+        rotation = 0.5 * (v[3:] @ (self.inertia.astype(v.dtype) @ v[3:]))
+        return translation + rotation - self.weight * q[6]
+
+    def constraint(self, t: FloatScalarLike, q: Pose, v: Twist, args: Args) -> Array:
+        """Compute the constraints φ: the horizontal velocity at the contact."""
+        slip = v[:3] + jnp.cross(v[3:], self._contact(q))
+        return SO3().Ad(q[:4], slip)[:2]
+
+    def holonomic(self, t: FloatScalarLike, q: Pose, args: Args) -> Array:
+        """Compute the constraint Φ, the height of the lowest point."""
+        return self.contact_point(q)[2]
+
+    def contact_point(self, q: Pose) -> Vector3:
+        """Compute the lowest point of the body, in space."""
+        return q[4:] + SO3().Ad(q[:4], self._contact(q))
+
+    def contact_momentum(self, q: Pose, v: Twist) -> Vector3:
+        """Compute the angular momentum about the point of contact, in body axes."""
+        orbital = self.mass * jnp.cross(v[:3], self._contact(q))
+        return orbital + self.inertia.astype(v.dtype) @ v[3:]
+
+    def rolling(
+        self,
+        attitude: tuple[float, ...] | Array,
+        angular_velocity: tuple[float, ...] | Array,
+        contact: tuple[float, float] | Array = (0.0, 0.0),
+    ) -> Self:
+        """Make the same body with other initial data, which are consistent.
+
+        `attitude` is a quaternion, `angular_velocity` ω is in body axes, and `contact`
+        is where on the plane the body touches it.
+        """
+        quaternion = coordinates(attitude)
+        quaternion = quaternion / jnp.sqrt(quaternion @ quaternion)
+        omega = coordinates(angular_velocity)
+        lowest = self.lowest_point(up_in_body(quaternion)).astype(omega.dtype)
+        place = jnp.pad(coordinates(contact), (0, 1))
+        q0 = jnp.concatenate([quaternion, place - SO3().Ad(quaternion, lowest)])
+        v0 = jnp.concatenate([-jnp.cross(omega, lowest), omega])
+        return dataclasses.replace(self, q0=q0, v0=v0)
+
+    def _contact(self, q: Pose) -> Vector3:
+        return self.lowest_point(up_in_body(q[:4])).astype(q.dtype)
+
+
+def up_in_body(quaternion: Float[Array, "4"]) -> Vector3:
+    """Compute the upward vertical Rᵀ e₃ in body axes."""
+    return SO3().Ad_dual(quaternion, jnp.zeros_like(quaternion[1:]).at[2].set(1.0))
