@@ -1,5 +1,6 @@
 """The gallery: mechanical systems with their references, one file each."""
 
+from ._andrews_squeezer import AndrewsSqueezer as AndrewsSqueezer
 from ._appell import Appell as Appell
 from ._chaotic import ChaoticSystem as ChaoticSystem
 from ._cvt import ContinuouslyVariableTransmission as ContinuouslyVariableTransmission
