@@ -2,6 +2,7 @@
 
 from ._andrews_squeezer import AndrewsSqueezer as AndrewsSqueezer
 from ._appell import Appell as Appell
+from ._car_axis import CarAxis as CarAxis
 from ._chaotic import ChaoticSystem as ChaoticSystem
 from ._cvt import ContinuouslyVariableTransmission as ContinuouslyVariableTransmission
 from ._double_pendulum import DoublePendulum as DoublePendulum

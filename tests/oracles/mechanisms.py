@@ -21,7 +21,7 @@ def _library_motion(system, t, q, v, args):
 
 def library_motion(example, t, q, v, args=None):
     """(a, λ) of an example by the library, at one state."""
-    t, q, v = jax.tree.map(lambda x: jnp.asarray(x, float), (t, q, v))
+    t, q, v = jnp.asarray(t, float), jnp.asarray(q, float), jnp.asarray(v, float)
     return jax.tree.map(np.asarray, _library_motion(example.system, t, q, v, args))
 
 
