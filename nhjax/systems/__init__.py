@@ -10,6 +10,7 @@ from ._heavy_top import HeavyTop as HeavyTop, HeavyTopSE3 as HeavyTopSE3
 from ._knife_edge import KnifeEdge as KnifeEdge
 from ._oscillator import HarmonicOscillator as HarmonicOscillator
 from ._particle import NonholonomicParticle as NonholonomicParticle
+from ._pendulum_chain import PendulumChain as PendulumChain
 from ._rigid_body import FreeRigidBody as FreeRigidBody
 from ._rod_sleigh import RodSleigh as RodSleigh
 from ._rolling_disc import VerticalRollingDisc as VerticalRollingDisc
