@@ -6,6 +6,7 @@ from ._car_axis import CarAxis as CarAxis
 from ._chaotic import ChaoticSystem as ChaoticSystem
 from ._cvt import ContinuouslyVariableTransmission as ContinuouslyVariableTransmission
 from ._double_pendulum import DoublePendulum as DoublePendulum
+from ._four_bar import FourBar as FourBar
 from ._heavy_top import HeavyTop as HeavyTop, HeavyTopSE3 as HeavyTopSE3
 from ._knife_edge import KnifeEdge as KnifeEdge
 from ._oscillator import HarmonicOscillator as HarmonicOscillator
@@ -16,6 +17,7 @@ from ._rod_sleigh import RodSleigh as RodSleigh
 from ._rolling_disc import VerticalRollingDisc as VerticalRollingDisc
 from ._rolling_disc_on_group import RollingDisc as RollingDisc
 from ._sleigh import ChaplyginSleigh as ChaplyginSleigh
+from ._slider_crank import SliderCrank as SliderCrank
 from ._spherical_pendulum import SphericalPendulum as SphericalPendulum
 from ._suslov import Suslov as Suslov
 from ._turntable_ball import TurntableBall as TurntableBall

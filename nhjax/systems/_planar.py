@@ -4,6 +4,11 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 
+def direction(angles: Float[Array, "*batch"]) -> Float[Array, "*batch 2"]:
+    """Compute the unit vectors at angles from the horizontal."""
+    return jnp.stack([jnp.cos(angles), jnp.sin(angles)], axis=-1)
+
+
 def turned(
     angles: Float[Array, "*batch"], vectors: Float[Array, "*batch 2"]
 ) -> Float[Array, "*batch 2"]:
