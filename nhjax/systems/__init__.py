@@ -14,10 +14,12 @@ from ._particle import NonholonomicParticle as NonholonomicParticle
 from ._pendulum_chain import PendulumChain as PendulumChain
 from ._rigid_body import FreeRigidBody as FreeRigidBody
 from ._rod_sleigh import RodSleigh as RodSleigh
+from ._roller_racer import RollerRacer as RollerRacer
 from ._rolling_disc import VerticalRollingDisc as VerticalRollingDisc
 from ._rolling_disc_on_group import RollingDisc as RollingDisc
 from ._sleigh import ChaplyginSleigh as ChaplyginSleigh
 from ._slider_crank import SliderCrank as SliderCrank
+from ._snakeboard import Snakeboard as Snakeboard
 from ._spherical_pendulum import SphericalPendulum as SphericalPendulum
 from ._suslov import Suslov as Suslov
 from ._turntable_ball import TurntableBall as TurntableBall
