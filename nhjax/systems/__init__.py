@@ -20,6 +20,7 @@ from ._rolling_disc_on_group import RollingDisc as RollingDisc
 from ._sleigh import ChaplyginSleigh as ChaplyginSleigh
 from ._slider_crank import SliderCrank as SliderCrank
 from ._snakeboard import Snakeboard as Snakeboard
+from ._spatial_slider_crank import SpatialSliderCrank as SpatialSliderCrank
 from ._spherical_pendulum import SphericalPendulum as SphericalPendulum
 from ._suslov import Suslov as Suslov
 from ._turntable_ball import TurntableBall as TurntableBall
