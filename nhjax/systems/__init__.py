@@ -6,6 +6,7 @@ from ._car_axis import CarAxis as CarAxis
 from ._chaotic import ChaoticSystem as ChaoticSystem
 from ._cvt import ContinuouslyVariableTransmission as ContinuouslyVariableTransmission
 from ._double_pendulum import DoublePendulum as DoublePendulum
+from ._flyball_governor import FlyballGovernor as FlyballGovernor
 from ._four_bar import FourBar as FourBar
 from ._heavy_top import HeavyTop as HeavyTop, HeavyTopSE3 as HeavyTopSE3
 from ._knife_edge import KnifeEdge as KnifeEdge
