@@ -77,11 +77,11 @@ class Runs(NamedTuple):
         return [np.max(np.abs(getattr(x, name)[-1] - expected)) for x in self.lanes]
 
 
-def runs(example, stages, counts, duration, args=None, y0=None):
+def runs(example, stages, counts, duration, args=None, solver=None):
     """Runs from the initial state of an example, as one program."""
-    y0 = example.initial_state() if y0 is None else y0
+    y0, method = example.initial_state(), nhjax.LobattoIIIAB(stages)
+    solver = nhjax.SimplifiedNewton() if solver is None else solver
     dts = duration / jnp.asarray(counts, float)
-    method, solver = nhjax.LobattoIIIAB(stages), nhjax.SimplifiedNewton()
     sol = runs_of_all_steps(example.system, method, y0, dts, max(counts), args, solver)
     ts, (y, multipliers), stats = jax.tree.map(np.asarray, (sol.ts, sol.ys, sol.stats))
     lanes, violations = [], []
