@@ -69,3 +69,11 @@ def test_steering_reaches_the_pose_with_stationary_effort(results_of):
     assert np.all(np.array(results["fine_misses"]) < 1e-6)
     # A step that ends the search is what the null space still has of the controls.
     assert np.all(np.array(results["last_steps"]) < 1e-3)
+
+
+def test_rattleback_turns_back_by_design(results_of):
+    results = results_of("rattleback")
+    assert results["first"] > 2 and results["last"] < -2
+    # The motion itself does, and not only its discretisation.
+    assert abs(results["mean_of_finer_run"] - results["last"]) < 0.1
+    np.testing.assert_allclose(results["slope"], results["difference"], rtol=1e-4)

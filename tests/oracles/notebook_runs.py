@@ -12,7 +12,7 @@ NOTEBOOKS = {
     for path in sorted((Path(__file__).parents[2] / "notebooks").glob("*.ipynb"))
 }
 # Those whose results are compared with the truth.
-FITS = {"fitting", "learning_potential", "steering_unicycle"}
+FITS = {"fitting", "learning_potential", "rattleback", "steering_unicycle"}
 
 
 def run_notebook(name: str, folder: Path) -> list:

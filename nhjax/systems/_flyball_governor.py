@@ -1,0 +1,221 @@
+"""Watt's flyball governor."""
+
+import math
+from typing import Any, Literal
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, ArrayLike, Float
+
+from .._custom_types import Args, FloatScalarLike
+from .._errors import is_traced
+from .._system import LagrangianSystem
+from ._base import (
+    AbstractExample,
+    coordinates,
+    parameter,
+    require_positive,
+    require_shape,
+)
+
+
+class FlyballGovernor(AbstractExample):
+    """A turning shaft with two hinged rods, whose flyballs lift a slider on the shaft.
+
+    L = (J_s + J_m)/2 φ̇² + m/2 ṡ² - m g s + Σ_{k=1,2} (m_r/2 |ċ_k|² + M/2 |ḃ_k|²
+    + B/2 |u̇_k|² + A/2 φ̇² sin² β_k - g (m_r c_k + M b_k) · e_z) - V,
+
+    with q = (φ, β₁, β₂, s): the angle of the shaft and those of the rods below the
+    horizontal [rad], and the height of the slider [m], which turns with the shaft.
+    Along u_k = ± cos β_k e(φ) - sin β_k e_z lie from its hinge at the radius a and the
+    height h the centre c_k = ½ l u_k of a rod and its ball b_k = l u_k.
+
+    A coupler of length d ties the middle of each rod to the slider at the radius a. It
+    either is a rigid rod (`couplers="rods"`), V = 0 and Φ_k = d_k² - d² with d_k the
+    distance of its ends, or a spring with a damper (`"springs"`), V = Σ K/2 (d_k - d)²
+    and forces -C ḋ_k, for which the published ones are stiff.
+
+    In `args` may be a torque on the shaft [N m], a scalar.
+
+    **Parameters:** `shaft_inertia` J_s, `slider_inertia` J_m, `rod_inertias` (A, B)
+    along and across a rod [kg m²]; `slider_mass` m, `rod_mass` m_r, `ball_mass` M [kg];
+    `rod_length` l, `coupler_length` d, `arm` a, `height` h [m]; `stiffness` K [N/m],
+    `damping` C [N s/m]; `gravity` g [m/s²]; `couplers`.
+
+    **Source:** González, Dopico, Lugrís and Cuadrado, *A benchmarking system for MBS
+    simulation software* (2006), problem A05, and the problem "stiff flyball governor"
+    of the IFToMM library of computational benchmark problems.
+
+    !!! example
+
+        >>> from nhjax.systems import FlyballGovernor
+        >>> governor = FlyballGovernor.turning(angle=0.6, rate=5.0)
+        >>> system, y0 = governor.system, governor.initial_state()
+    """
+
+    shaft_inertia: Array = eqx.field(converter=parameter, default=5e-6)
+    slider_inertia: Array = eqx.field(converter=parameter, default=5e-3)
+    rod_inertias: Array = eqx.field(converter=coordinates, default=(5e-6, 0.0250025))
+    slider_mass: Array = eqx.field(converter=parameter, default=3.0)
+    rod_mass: Array = eqx.field(converter=parameter, default=0.3)
+    ball_mass: Array = eqx.field(converter=parameter, default=5.0)
+    rod_length: Array = eqx.field(converter=parameter, default=1.0)
+    coupler_length: Array = eqx.field(converter=parameter, default=0.5)
+    arm: Array = eqx.field(converter=parameter, default=0.05)
+    height: Array = eqx.field(converter=parameter, default=1.0)
+    stiffness: Array = eqx.field(converter=parameter, default=8e5)
+    damping: Array = eqx.field(converter=parameter, default=4e4)
+    gravity: Array = eqx.field(converter=parameter, default=9.81)
+    couplers: Literal["rods", "springs"] = eqx.field(
+        static=True, default="rods", kw_only=True
+    )
+    q0: Array = eqx.field(
+        converter=coordinates,
+        default=(0.0, math.pi / 6, math.pi / 6, 0.5),
+        kw_only=True,
+    )
+    v0: Array = eqx.field(
+        converter=coordinates, default=(2 * math.pi, 0.0, 0.0, 0.0), kw_only=True
+    )
+
+    def __check_init__(self) -> None:
+        require_shape((2,), rod_inertias=self.rod_inertias)
+        require_shape((4,), q0=self.q0, v0=self.v0)
+        require_positive(
+            shaft_inertia=self.shaft_inertia,
+            slider_inertia=self.slider_inertia,
+            rod_inertias=self.rod_inertias,
+            slider_mass=self.slider_mass,
+            rod_mass=self.rod_mass,
+            ball_mass=self.ball_mass,
+            rod_length=self.rod_length,
+            coupler_length=self.coupler_length,
+        )
+        if self.couplers not in ("rods", "springs"):
+            raise ValueError(
+                f'`couplers` must be "rods" or "springs", got {self.couplers!r}.'
+            )
+
+    @classmethod
+    def turning(
+        cls,
+        angle: ArrayLike,
+        rate: ArrayLike,
+        angle_rate: ArrayLike = 0.0,
+        **parameters: Any,
+    ) -> "FlyballGovernor":
+        """Make a governor with both rods at `angle`, the shaft turning at `rate`.
+
+        The slider hangs below the middles of the rods, at the length of the couplers.
+        `parameters` are those of the class.
+        """
+        governor = cls(**parameters)
+        dtype = governor.q0.dtype
+        beta, dbeta, dphi = (jnp.asarray(x, dtype) for x in (angle, angle_rate, rate))
+        half, coupler = 0.5 * governor.rod_length, governor.coupler_length
+
+        def slider(beta):
+            fall = jnp.sqrt(coupler**2 - (half * jnp.cos(beta)) ** 2)
+            return governor.height - half * jnp.sin(beta) - fall
+
+        s, ds = jax.jvp(slider, (beta,), (dbeta,))
+        if not is_traced(s) and not jnp.isfinite(s):
+            raise ValueError(
+                f"`coupler_length` {coupler} does not reach from rod to slider."
+            )
+        merged: dict[str, Any] = dict(parameters)
+        merged.update(
+            q0=jnp.stack([jnp.zeros_like(beta), beta, beta, s]),
+            v0=jnp.stack([dphi, dbeta, dbeta, ds]),
+        )
+        return cls(**merged)
+
+    @property
+    def system(self) -> LagrangianSystem:
+        """Return the system to integrate, whose leaves are the parameters."""
+        rigid = self.couplers == "rods"
+        return LagrangianSystem(
+            self.lagrangian,
+            holonomic=self.holonomic if rigid else None,
+            force=self.force,
+        )
+
+    def lagrangian(self, t: FloatScalarLike, q: Array, v: Array, args: Args) -> Array:
+        """Compute the Lagrangian, kinetic energy less that of weight and springs."""
+        hinges_and_rods, rates = jax.jvp(self._rods, (q,), (v,))
+        axial, transverse = self.rod_inertias.astype(v.dtype)
+        inertia = self.shaft_inertia + self.slider_inertia
+        twice = inertia * v[0] ** 2 + self.slider_mass * v[3] ** 2
+        weight = self.slider_mass * q[3]
+        for mass, share in ((self.rod_mass, 0.5), (self.ball_mass, 1.0)):
+            reach = share * self.rod_length
+            (hinge, rod), (dhinge, drod) = hinges_and_rods, rates
+            twice = twice + mass * jnp.sum((dhinge + reach * drod) ** 2)
+            weight = weight + mass * jnp.sum((hinge + reach * rod)[:, 2])
+        twice = twice + transverse * jnp.sum(rates[1] ** 2)
+        twice = twice + axial * v[0] ** 2 * jnp.sum(jnp.sin(q[1:3]) ** 2)
+        return 0.5 * twice - self.gravity * weight - self._strain(q)
+
+    def holonomic(self, t: FloatScalarLike, q: Array, args: Args) -> Array:
+        """Compute the constraints Φ_k = d_k² - d² of rigid couplers."""
+        return self._square_distances(q) - self.coupler_length**2
+
+    def force(self, t: FloatScalarLike, q: Array, v: Array, args: Args) -> Array:
+        """Compute the forces of the dampers, and the torque in `args` on the shaft."""
+        torque = jnp.zeros_like(v[0]) if args is None else jnp.asarray(args, v.dtype)
+        driving = jnp.zeros_like(v).at[0].set(torque)
+        if self.couplers == "rods":
+            return driving
+
+        def distances(q):
+            return jnp.sqrt(self._square_distances(q))
+
+        _, rates = jax.jvp(distances, (q,), (v,))
+        (resisting,) = jax.vjp(distances, q)[1](-self.damping * rates)
+        return driving + resisting
+
+    def invariants(self, t: FloatScalarLike, q: Array, v: Array) -> dict[str, Array]:
+        """Compute the vertical angular momentum, and the energy with rigid couplers."""
+        momentum = jax.grad(self.lagrangian, argnums=2)(t, q, v, None)
+        conserved = {"vertical_momentum": momentum[0]}
+        if self.couplers == "springs":
+            return conserved
+        return conserved | {"energy": self.energy(t, q, v)}
+
+    def points(self, t: FloatScalarLike, q: Array) -> dict[str, Array]:
+        """Compute hinges, middles of rods, balls, and joints of the slider, (3,)."""
+        hinges, rods = self._rods(q)
+        lifted = hinges.at[:, 2].set(q[3])
+        places = {
+            "hinge": hinges,
+            "middle": hinges + 0.5 * self.rod_length * rods,
+            "ball": hinges + self.rod_length * rods,
+            "slider": lifted,
+        }
+        return {
+            f"{name}_{k + 1}": place[k]
+            for name, place in places.items()
+            for k in (0, 1)
+        }
+
+    def _rods(self, q: Array) -> tuple[Float[Array, "2 3"], Float[Array, "2 3"]]:
+        """Compute the hinges, and the unit vectors u_k along the rods from there."""
+        outward = jnp.stack([jnp.cos(q[0]), jnp.sin(q[0])])
+        radial = jnp.stack([outward, -outward])
+        cos, sin = jnp.cos(q[1:3])[:, None], jnp.sin(q[1:3])[:, None]
+        hinges = self.height * jnp.ones_like(sin)
+        hinges = jnp.concatenate([self.arm * radial, hinges], axis=1)
+        return hinges, jnp.concatenate([cos * radial, -sin], axis=1)
+
+    def _square_distances(self, q: Array) -> Float[Array, " 2"]:
+        """Compute d_k², from the middles of the rods to the slider."""
+        half = 0.5 * self.rod_length
+        fall = self.height - q[3] - half * jnp.sin(q[1:3])
+        return (half * jnp.cos(q[1:3])) ** 2 + fall**2
+
+    def _strain(self, q: Array) -> Array:
+        if self.couplers == "rods":
+            return jnp.zeros_like(q[0])
+        stretch = jnp.sqrt(self._square_distances(q)) - self.coupler_length
+        return 0.5 * self.stiffness * jnp.sum(stretch**2)

@@ -1,0 +1,181 @@
+"""The snakeboard."""
+
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, ArrayLike, Float
+
+from .._custom_types import Args, FloatScalarLike
+from .._system import LagrangianSystem
+from ._base import (
+    AbstractNonholonomicExample,
+    coordinates,
+    parameter,
+    require_positive,
+    require_shape,
+)
+from ._gait import Sinusoid
+from ._planar import direction
+
+
+class Snakeboard(AbstractNonholonomicExample):
+    """A board on two steered axles, which a rotor and the steering propel.
+
+    L = m/2 (ẋ² + ẏ²) + J/2 θ̇² + J_r/2 (θ̇ + ψ̇)² + J_w/2 ((θ̇ + φ̇_b)² + (θ̇ + φ̇_f)²),
+    Φ = (-sin(θ + φ_b) ẋ + cos(θ + φ_b) ẏ - l cos φ_b θ̇,
+         -sin(θ + φ_f) ẋ + cos(θ + φ_f) ẏ + l cos φ_f θ̇),
+
+    with q = (x, y, θ, ψ, φ_b, φ_f): the centre [m] and heading [rad] of the board, and
+    the angles of rotor, rear and front axle relative to it [rad]. The axles lie l
+    behind and ahead of the centre, and do not slip sideways. Where φ_b = φ_f = π/2 the
+    constraints are dependent.
+
+    The joints either are prescribed by a `gait`, Γ = (ψ, φ_b, φ_f) - gait(t), or with
+    `gait=None` move freely under the torques (τ_ψ, τ_b, τ_f) [N m] in `args`, of shape
+    (3,) or `None`. By default the rotor turns to and fro in step with the steering,
+    which drives the board ahead from rest; other ratios of the frequencies turn it on
+    the spot or park it.
+
+    **Parameters:** `mass` m [kg]; `inertia` J of the board, `rotor_inertia` J_r and
+    `axle_inertia` J_w about the vertical [kg m²]; `half_length` l [m]; `gait`, a
+    function of time.
+
+    **Source:** Lewis, Ostrowski, Murray and Burdick, *Nonholonomic mechanics and
+    locomotion: the snakeboard example* (1994); Bloch, Krishnaprasad, Marsden and
+    Murray, *Nonholonomic mechanical systems with symmetry* (1996).
+
+    !!! example
+
+        >>> from nhjax.systems import Snakeboard
+        >>> board = Snakeboard.driving((0.7, 0.3, -0.3), (1.0, 1.0, 1.0))
+        >>> system, y0 = board.system, board.initial_state()
+    """
+
+    mass: Array = eqx.field(converter=parameter, default=6.0)
+    inertia: Array = eqx.field(converter=parameter, default=0.016)
+    rotor_inertia: Array = eqx.field(converter=parameter, default=0.072)
+    axle_inertia: Array = eqx.field(converter=parameter, default=0.0013)
+    half_length: Array = eqx.field(converter=parameter, default=0.2)
+    gait: Callable[[Array], Array] | None = eqx.field(
+        default=Sinusoid((0.7, 0.3, -0.3), (1.0, 1.0, 1.0), (0.0, 0.0, 0.0)),
+        kw_only=True,
+    )
+    q0: Array = eqx.field(converter=coordinates, default=(0.0,) * 6, kw_only=True)
+    v0: Array = eqx.field(
+        converter=coordinates, default=(0.0, 0.0, 0.0, 0.7, 0.3, -0.3), kw_only=True
+    )
+
+    def __check_init__(self) -> None:
+        require_positive(
+            mass=self.mass,
+            inertia=self.inertia,
+            rotor_inertia=self.rotor_inertia,
+            axle_inertia=self.axle_inertia,
+            half_length=self.half_length,
+        )
+        require_shape((6,), q0=self.q0, v0=self.v0)
+
+    @classmethod
+    def rolling(
+        cls,
+        speed: ArrayLike,
+        joints: ArrayLike | tuple[float, ...] = (0.0, 0.0, 0.0),
+        joint_rates: ArrayLike | tuple[float, ...] = (0.0, 0.0, 0.0),
+        **parameters: Any,
+    ) -> "Snakeboard":
+        """Make a board at the origin whose centre moves ahead at `speed`, θ = 0.
+
+        Its sideways velocity and its turning follow from the constraints. `parameters`
+        are those of the class; without a `gait` among them the joints move freely.
+        """
+        merged: dict[str, Any] = {"gait": None} | parameters
+        board, angles = cls(**merged), coordinates(joints)
+        rear, front = jnp.tan(angles[1]), jnp.tan(angles[2])
+        ahead = jnp.asarray(speed, angles.dtype)
+        turning = ahead * (front - rear) / (2 * board.half_length)
+        body = jnp.stack([ahead, 0.5 * ahead * (rear + front), turning])
+        q0 = jnp.concatenate([jnp.zeros_like(body), angles])
+        v0 = jnp.concatenate([body, coordinates(joint_rates)])
+        merged.update(q0=q0, v0=v0)
+        return cls(**merged)
+
+    @classmethod
+    def driving(
+        cls,
+        amplitudes: ArrayLike | tuple[float, ...],
+        rates: ArrayLike | tuple[float, ...],
+        phases: ArrayLike | tuple[float, ...] = (0.0, 0.0, 0.0),
+        speed: ArrayLike = 0.0,
+        **parameters: Any,
+    ) -> "Snakeboard":
+        """Make a board with the gait (ψ, φ_b, φ_f) = amplitudes sin(rates t + phases).
+
+        It starts at t = 0 at the origin, its centre ahead at `speed`.
+        """
+        gait = Sinusoid(amplitudes, rates, phases)
+        start = jnp.zeros((), gait.phase.dtype)
+        joints, joint_rates = jax.jvp(gait, (start,), (jnp.ones_like(start),))
+        return cls.rolling(speed, joints, joint_rates, gait=gait, **parameters)
+
+    @property
+    def system(self) -> LagrangianSystem:
+        """Return the system to integrate, whose leaves are the parameters."""
+        if self.gait is None:
+            return LagrangianSystem(
+                self.lagrangian, nonholonomic=self.constraint, force=self.force
+            )
+        return LagrangianSystem(
+            self.lagrangian, nonholonomic=self.constraint, holonomic=self.holonomic
+        )
+
+    def lagrangian(self, t: FloatScalarLike, q: Array, v: Array, args: Args) -> Array:
+        """Compute the Lagrangian, which is the kinetic energy."""
+        turning, (rotor, rear, front) = v[2], v[2] + v[3:]
+        spinning = self.inertia * turning**2 + self.rotor_inertia * rotor**2
+        steering = self.axle_inertia * (rear**2 + front**2)
+        return 0.5 * (self.mass * (v[:2] @ v[:2]) + spinning + steering)
+
+    def constraint(self, t: FloatScalarLike, q: Array, v: Array, args: Args) -> Array:
+        """Compute the sideways velocities of the rear and the front axle."""
+        _, velocities = jax.jvp(self._axles, (q,), (v,))
+        left = direction(q[2] + q[4:] + 0.5 * jnp.pi)
+        return jnp.sum(left * velocities, axis=1)
+
+    def holonomic(self, t: FloatScalarLike, q: Array, args: Args) -> Array:
+        """Compute the constraints Γ = (ψ, φ_b, φ_f) - gait(t)."""
+        if self.gait is None:
+            raise ValueError("The joints of this snakeboard move freely: no `gait`.")
+        return q[3:] - self.gait(jnp.asarray(t, q.dtype))
+
+    def force(self, t: FloatScalarLike, q: Array, v: Array, args: Args) -> Array:
+        """Compute the force (0, 0, 0, τ_ψ, τ_b, τ_f), with the torques in `args`."""
+        torques = jnp.zeros_like(v[3:]) if args is None else jnp.asarray(args, v.dtype)
+        return jnp.concatenate([jnp.zeros_like(v[:3]), torques])
+
+    def invariants(self, t: FloatScalarLike, q: Array, v: Array) -> dict[str, Array]:
+        """Compute the energy and the momenta of the joints, which no torque moves.
+
+        With a gait nothing is conserved.
+        """
+        if self.gait is not None:
+            return {}
+        rotor, rear, front = v[2] + v[3:]
+        return {
+            "energy": self.energy(t, q, v),
+            "rotor_momentum": self.rotor_inertia * rotor,
+            "rear_momentum": self.axle_inertia * rear,
+            "front_momentum": self.axle_inertia * front,
+        }
+
+    def points(self, t: FloatScalarLike, q: Array) -> dict[str, Array]:
+        """Compute the places of centre, axles and one end of the rotor, (2,)."""
+        rear, front = self._axles(q)
+        rotor = q[:2] + self.half_length * direction(q[2] + q[3])
+        return {"centre": q[:2], "rear": rear, "front": front, "rotor_end": rotor}
+
+    def _axles(self, q: Array) -> Float[Array, "2 2"]:
+        board = self.half_length * direction(q[2])
+        return jnp.stack([q[:2] - board, q[:2] + board])
