@@ -1,0 +1,227 @@
+"""Pictures and animations of the machines of the gallery.
+
+    python docs/machines.py                      writes docs/machines.png
+    python docs/machines.py --animate Rattleback writes docs/Rattleback.gif
+
+A picture has the paths of some points over the run, and what connects the points at a
+few times. `MACHINES` is also the list that the benchmarks go through.
+"""
+
+import argparse
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from matplotlib.animation import FuncAnimation, PillowWriter
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+import nhjax
+from nhjax import systems
+from nhjax.systems import Rattleback, RollingTorus, WhippleBicycle
+
+
+DOCS = Path(__file__).parent
+TIMES_SHOWN = 7
+
+
+class Machine(NamedTuple):
+    """A machine of the gallery, a run of it, and what of it is drawn.
+
+    - `rods`: the names of points that are connected, one after the other.
+    - `traced`: the names of points whose paths are drawn.
+    """
+
+    example: Any
+    duration: float
+    num_steps: int
+    rods: tuple[str, ...]
+    traced: tuple[str, ...]
+    args: Any = None
+
+    @property
+    def name(self) -> str:
+        """The name of its class."""
+        return type(self.example).__name__
+
+
+MACHINES = (
+    Machine(
+        WhippleBicycle.running(5.0, lean_rate=0.3),
+        4.0,
+        200,
+        ("rear_contact", "rear_hub", "rear_frame", "head", "front_hub"),
+        ("rear_contact", "front_contact"),
+    ),
+    Machine(
+        systems.CarWithTrailers(num_trailers=2),
+        8.0,
+        200,
+        ("front_axle", "rear_axle", "hitch_1", "axle_1", "hitch_2", "axle_2"),
+        ("rear_axle", "axle_2"),
+    ),
+    Machine(
+        systems.TwoWheeledRobot(),
+        6.0,
+        200,
+        ("left_wheel", "axle", "centre", "axle", "right_wheel"),
+        ("centre",),
+    ),
+    Machine(
+        systems.Snakeboard(),
+        12.0,
+        300,
+        ("rear", "centre", "front"),
+        ("centre",),
+    ),
+    Machine(
+        systems.RollerRacer(),
+        12.0,
+        300,
+        ("seat", "pivot", "handlebar"),
+        ("seat",),
+    ),
+    Machine(
+        Rattleback.spinning(5.0, (0.5, 0.5)),
+        2.0,
+        500,
+        ("back", "centre_of_mass", "front"),
+        ("contact",),
+    ),
+    Machine(RollingTorus(), 4.0, 300, ("contact", "centre", "rim"), ("contact", "rim")),
+    Machine(
+        systems.ChaplyginSphere(), 6.0, 300, ("pole_1", "centre", "pole_2"), ("contact",)
+    ),
+    Machine(
+        systems.ChaplyginTop(), 4.0, 300, ("contact", "centre", "pole"), ("contact",)
+    ),
+    Machine(systems.BallInBowl(), 8.0, 400, ("centre", "pole"), ("contact",)),
+    Machine(systems.SliderCrank(), 2.0, 200, ("axle", "pin", "slider"), ("pin",)),
+    Machine(systems.FourBar(), 3.0, 200, ("O", "A", "B", "C"), ("A", "B")),
+    Machine(
+        systems.AndrewsSqueezer(),
+        0.03,
+        600,
+        ("O", "P", "B", "D", "A", "C"),
+        ("P", "D"),
+    ),
+    Machine(
+        systems.CarAxis(),
+        3.0,
+        300,
+        ("left_wheel", "left_end", "right_end", "right_wheel"),
+        ("left_end", "right_end"),
+    ),
+    Machine(
+        systems.PendulumChain(num_links=5),
+        4.0,
+        400,
+        ("pivot", *(f"mass_{k}" for k in range(1, 6))),
+        ("mass_5",),
+    ),
+    Machine(
+        systems.SpatialSliderCrank(), 2.0, 300, ("axle", "pin", "slider"), ("pin",)
+    ),
+    Machine(
+        systems.FlyballGovernor(),
+        1.0,
+        300,
+        ("ball_1", "middle_1", "slider_1", "slider_2", "middle_2", "ball_2"),
+        ("ball_1",),
+    ),
+)
+
+
+def run(machine: Machine) -> dict[str, np.ndarray]:
+    """The points of a machine along its run, each of shape (times, 2) or (times, 3)."""
+    example, args = machine.example, machine.args
+
+    def points(t, y, args):
+        return example.points(t, y.q)
+
+    sol = nhjax.integrate(
+        example.system,
+        nhjax.LobattoIIIAB(3),
+        example.initial_state(),
+        dt=machine.duration / machine.num_steps,
+        num_steps=machine.num_steps,
+        args=args,
+        saveat=nhjax.SaveAt(t0=True, steps=True, fn=points),
+    )
+    return jax.tree.map(np.asarray, sol.ys)
+
+
+def draw(figure: Figure, place: Any, machine: Machine) -> None:
+    """Draw the paths of a machine, and the machine at some times."""
+    points = run(machine)
+    ax = axes_for(figure, place, points)
+    for name in machine.traced:
+        ax.plot(*points[name].T, linewidth=0.8, color="tab:blue")
+    shown = np.linspace(0, machine.num_steps, TIMES_SHOWN).astype(int)
+    for k, shade in zip(shown, np.linspace(0.75, 0.0, TIMES_SHOWN), strict=True):
+        rods = np.array([points[name][k] for name in machine.rods])
+        ax.plot(*rods.T, "o-", color=str(shade), linewidth=1.0, markersize=2)
+    ax.set_title(machine.name, fontsize=9)
+
+
+def axes_for(figure: Figure, place: Any, points: dict[str, np.ndarray]) -> Axes:
+    """Axes of equal units for points of the plane or of space."""
+    everything = np.concatenate(list(points.values()))
+    if everything.shape[1] == 2:
+        ax = figure.add_subplot(place, aspect="equal", adjustable="datalim")
+    else:
+        ax = figure.add_subplot(place, projection="3d")
+        low, high = everything.min(axis=0), everything.max(axis=0)
+        size, middle = np.max(high - low), (high + low) / 2
+        ax.set_box_aspect((1, 1, 1))  # pyright: ignore[reportArgumentType]
+        for axis, centre in zip("xyz", middle, strict=True):
+            limits = (centre - size / 2, centre + size / 2)
+            getattr(ax, f"set_{axis}lim")(*limits)
+    ax.tick_params(labelsize=6)
+    return ax
+
+
+def animate(machine: Machine, path: Path, frames: int = 100) -> None:
+    """Write an animation of a machine."""
+    points = run(machine)
+    figure = Figure(figsize=(4, 4), layout="constrained")
+    ax = axes_for(figure, 111, points)
+    for name in machine.traced:
+        ax.plot(*points[name].T, linewidth=0.6, color="tab:blue")
+    lines = ax.plot(*np.array([points[name][0] for name in machine.rods]).T, "ko-")
+    shown = np.linspace(0, machine.num_steps, frames).astype(int)
+
+    def show(frame):
+        rods = np.array([points[name][shown[frame]] for name in machine.rods]).T
+        lines[0].set_data(*rods[:2])
+        if len(rods) == 3:
+            lines[0].set_3d_properties(rods[2])
+        return lines
+
+    animation = FuncAnimation(figure, show, frames=frames)
+    animation.save(path, writer=PillowWriter(fps=25), dpi=80)
+
+
+def main() -> None:
+    """Write the picture of all machines, or the animation of one."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--animate", choices=[machine.name for machine in MACHINES])
+    name = parser.parse_args().animate
+    jax.config.update("jax_enable_x64", True)
+    if name:
+        (machine,) = (machine for machine in MACHINES if machine.name == name)
+        animate(machine, DOCS / f"{name}.gif")
+        return
+    columns = 4
+    rows = -(-len(MACHINES) // columns)
+    figure = Figure(figsize=(3 * columns, 2.8 * rows), layout="constrained")
+    for place, machine in enumerate(MACHINES, 1):
+        draw(figure, (rows, columns, place), machine)
+        jax.clear_caches()
+    figure.savefig(DOCS / "machines.png", dpi=80)
+
+
+if __name__ == "__main__":
+    main()
