@@ -1,6 +1,7 @@
 """The gallery: mechanical systems with their references, one file each."""
 
 from ._appell import Appell as Appell
+from ._bicycle_steering import LeanToSteer as LeanToSteer, SteerTorque as SteerTorque
 from ._chaotic import ChaoticSystem as ChaoticSystem
 from ._cvt import ContinuouslyVariableTransmission as ContinuouslyVariableTransmission
 from ._double_pendulum import DoublePendulum as DoublePendulum
@@ -20,3 +21,4 @@ from ._unicycle import (
     Unicycle as Unicycle,
     UnicycleInCoordinates as UnicycleInCoordinates,
 )
+from ._whipple_bicycle import WhippleBicycle as WhippleBicycle
