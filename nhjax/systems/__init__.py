@@ -2,6 +2,7 @@
 
 from ._appell import Appell as Appell
 from ._bicycle_steering import LeanToSteer as LeanToSteer, SteerTorque as SteerTorque
+from ._car_with_trailers import CarWithTrailers as CarWithTrailers
 from ._chaotic import ChaoticSystem as ChaoticSystem
 from ._cvt import ContinuouslyVariableTransmission as ContinuouslyVariableTransmission
 from ._double_pendulum import DoublePendulum as DoublePendulum
