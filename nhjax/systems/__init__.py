@@ -18,6 +18,7 @@ from ._sleigh import ChaplyginSleigh as ChaplyginSleigh
 from ._spherical_pendulum import SphericalPendulum as SphericalPendulum
 from ._suslov import Suslov as Suslov
 from ._turntable_ball import TurntableBall as TurntableBall
+from ._two_wheeled_robot import TwoWheeledRobot as TwoWheeledRobot
 from ._unicycle import (
     Unicycle as Unicycle,
     UnicycleInCoordinates as UnicycleInCoordinates,

@@ -150,3 +150,66 @@ class Train:
             second = self.accelerations(y[:size], speed, rate, drive, torque)
             forces.append(second[1])
         return tuple(map(np.array, (q, v, forces)))
+
+
+class Robot:
+    """A robot on two driven wheels: its state is (q, speed, turn rate).
+
+    With the forces of the ground ahead on the wheels eliminated by their rotation,
+    Newton's and Euler's laws for the whole robot are equations of speed and turn rate
+    (Dhaouadi and Abu Hatab, 2013).
+    """
+
+    def __init__(self, robot):
+        self.m, self.I = float(robot.mass), float(robot.inertia)
+        self.d, self.b = float(robot.offset), float(robot.half_track)
+        self.r, self.mw = float(robot.radius), float(robot.wheel_mass)
+        self.Iw, self.Im = float(robot.axle_inertia), float(robot.wheel_inertia)
+
+    def changes(self, speed, turn, on_right, on_left):
+        """The rates of speed and turn rate."""
+        m = self.m + 2 * self.mw
+        whole = self.I + self.m * self.d**2 + 2 * self.mw * self.b**2 + 2 * self.Im
+        rolling = 2 * self.Iw / self.r**2
+        ahead = (on_right + on_left) / self.r + self.m * self.d * turn**2
+        moment = self.b * (on_right - on_left) / self.r - self.m * self.d * turn * speed
+        return ahead / (m + rolling), moment / (whole + self.b**2 * rolling)
+
+    def accelerations(self, q, speed, turn, on_right=0.0, on_left=0.0):
+        """(q̈, forces of the ground: aside, ahead on the right and the left wheel)."""
+        push, twist = self.changes(speed, turn, on_right, on_left)
+        axle = push * along(q[2]) + speed * turn * left(q[2])
+        wheels = np.array([push + self.b * twist, push - self.b * twist]) / self.r
+        ahead = (np.array([on_right, on_left]) - self.Iw * wheels) / self.r
+        # Newton's law to the left of the heading, where the wheels balance.
+        aside = (self.m + 2 * self.mw) * speed * turn + self.m * self.d * twist
+        return np.concatenate([axle, [twist], wheels]), np.array([aside, *ahead])
+
+    def velocity(self, q, speed, turn):
+        wheels = np.array([speed + self.b * turn, speed - self.b * turn]) / self.r
+        return np.concatenate([speed * along(q[2]), [turn], wheels])
+
+    def trajectory(self, q0, speed, turn, times, torques):
+        """(q, v, forces of the ground) at the times, by SciPy."""
+
+        def field(t, y):
+            q, (speed, turn) = y[:5], y[5:]
+            changes = self.changes(speed, turn, *torques)
+            return np.concatenate([self.velocity(q, speed, turn), changes])
+
+        solution = solve_ivp(
+            field,
+            (0.0, times[-1]),
+            np.concatenate([q0, [speed, turn]]),
+            method="DOP853",
+            t_eval=times,
+            rtol=3e-14,
+            atol=1e-14,
+        )
+        q, v, forces = [], [], []
+        for y in solution.y.T:
+            speed, turn = y[5:]
+            q.append(y[:5])
+            v.append(self.velocity(y[:5], speed, turn))
+            forces.append(self.accelerations(y[:5], speed, turn, *torques)[1])
+        return tuple(map(np.array, (q, v, forces)))
