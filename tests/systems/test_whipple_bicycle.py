@@ -12,7 +12,7 @@ import nhjax
 from nhjax._system._linearisation import linearise
 from nhjax.systems import LeanToSteer, SteerTorque, WhippleBicycle
 from oracles import bicycle as oracle
-from oracles.orders import assert_order, rms, runs_of_all_steps, solver_for
+from oracles.orders import assert_order, rms, runs_of_all_steps
 
 
 # Meijaard et al. (2007), section 5(b): M, C1, K0 and K2.
@@ -268,11 +268,12 @@ def test_the_speeds_at_which_it_is_as_stable_as_not_are_the_printed(
     assert speed == pytest.approx(printed, rel=0, abs=4e-12)
 
 
-STEERED = LeanToSteer(lean_gain=-3.0, lean_rate_gain=20.0)
+GAINS = np.array([-3.0, 5.0])
+STEERED = LeanToSteer(*GAINS)
 
 
 def test_a_rider_who_steers_into_the_fall_gives_that_torque():
-    parameters, gains = oracle.BENCHMARK, np.array([-3.0, 20.0])
+    parameters = oracle.BENCHMARK
 
     def found(*where):
         bicycle = WhippleBicycle.running(4.0, *where[2:], lean=where[0], steer=where[1])
@@ -281,10 +282,10 @@ def test_a_rider_who_steers_into_the_fall_gives_that_torque():
         return np.asarray(q), np.asarray(v), motion(steered, q, v, None)[0]
 
     q, v, acceleration = found(0.3, -0.2, 0.5, -0.4)
-    expected, _ = oracle.accelerations(parameters, q, v, float(gains @ [q[3], v[3]]))
+    expected, _ = oracle.accelerations(parameters, q, v, float(GAINS @ [q[3], v[3]]))
     np.testing.assert_allclose(acceleration, expected, rtol=0, atol=1e-11)
     small = 1e-4 * np.array([0.3, -0.2, 0.5, -0.4])
-    linear = oracle.linear_motion(parameters, 4.0, gains)[2:] @ small
+    linear = oracle.linear_motion(parameters, 4.0, GAINS)[2:] @ small
     acceleration = found(*small)[2][jnp.array([3, 5])]
     np.testing.assert_allclose(acceleration, linear, rtol=1e-6)
 
@@ -299,14 +300,17 @@ def test_the_default_lean_to_steer_makes_slow_running_stable():
 
 
 # The run of the library of benchmarks of IFToMM: 5 s from 4.6 m/s with a lean rate of
-# 0.5 rad/s, and its half with half of the step.
-NUM_STEPS, STEP_SIZES = {2: 500, 3: 200}, {2: (0.01, 0.005), 3: (0.025, 0.0125)}
+# 0.5 rad/s, and its half with half of the step; with two stages a rider steers.
+BICYCLES = {2: WhippleBicycle(steering=STEERED), 3: WhippleBicycle()}
+NUM_STEPS = {2: 1000, 3: 200}
+STEP_SIZES = {2: (0.005, 0.0025), 3: (0.025, 0.0125)}
+DURATION, FINEST = 2.5, 0.0025
 
 
 @cache
 def runs(stages):
     """Times, states and continuous multipliers, with one lane for each step size."""
-    bicycle = WhippleBicycle()
+    bicycle = BICYCLES[stages]
     sol = runs_of_all_steps(
         bicycle.system,
         nhjax.LobattoIIIAB(stages),
@@ -314,60 +318,90 @@ def runs(stages):
         jnp.array(STEP_SIZES[stages]),
         NUM_STEPS[stages],
         None,
-        solver_for(stages),
+        nhjax.SimplifiedNewton(),
     )
     assert np.all(np.asarray(sol.stats["failed_step"]) == -1)
     return jax.tree.map(np.asarray, (sol.ts, *sol.ys))
 
 
+def rider(_, q, v):
+    """The torque of `STEERED`."""
+    return float(GAINS @ [q[3], v[3]])
+
+
 @cache
-def reference():
-    """The motion by Kane's method, at the nodes of all runs of 2.5 s."""
-    bicycle = WhippleBicycle()
-    times = np.arange(1001) * 0.0025
-    q, v = oracle.trajectory(
-        oracle.BENCHMARK, np.asarray(bicycle.q0), np.asarray(bicycle.v0), times
-    )
+def reference(stages):
+    """The motion by Kane's method at all nodes, and the forces of the ground."""
+    bicycle = BICYCLES[stages]
+    start = np.asarray(bicycle.q0), np.asarray(bicycle.v0)
+    torque = (lambda t, q, v: 0.0) if bicycle.steering is None else rider
+    times = np.arange(1001) * FINEST
+    q, v = oracle.trajectory(oracle.BENCHMARK, *start, times, torque)
     reactions = [
-        forces(oracle.accelerations(oracle.BENCHMARK, *state)[1])
+        forces(oracle.accelerations(oracle.BENCHMARK, *state, torque(0.0, *state))[1])
         for state in zip(q, v, strict=True)
     ]
     return q, v, np.array(reactions)
 
 
-@pytest.mark.parametrize("stages", [2, 3])
+@pytest.mark.parametrize("stages", [2, 3], ids=["steered-2", "free-3"])
 @pytest.mark.parametrize("part", range(3), ids=["q", "v", "multiplier"])
 def test_the_motion_converges_to_that_of_kanes_method(stages, part):
     _, states, continuous = runs(stages)
     found = (states.q, states.v, continuous)[part]
     counts, errors = [], []
     for lane, h in enumerate(STEP_SIZES[stages]):
-        count, stride = round(2.5 / h), round(h / 0.0025)
-        expected = reference()[part][stride::stride]
+        count, stride = round(DURATION / h), round(h / FINEST)
+        expected = reference(stages)[part][stride::stride]
         counts.append(count)
         errors.append(rms(found[lane, :count] - expected))
     assert_order(2 * stages - 2, counts, errors, floor=1e-11)
 
 
-def test_constraints_hold_and_energy_stays_in_a_run_of_five_seconds():
-    bicycle = WhippleBicycle()
+@cache
+def checks(stages):
+    """Energy, slip and depth at the nodes of the longest run, and energy before it."""
+    bicycle = BICYCLES[stages]
 
     @jax.jit
     @jax.vmap
-    def checks(q, v):
-        energy = bicycle.invariants(0.0, q, v)["energy"]
-        return (
-            energy,
-            bicycle.constraint(0.0, q, v, None),
-            bicycle.holonomic(0.0, q, None),
-        )
+    def at(q, v):
+        slip = bicycle.constraint(0.0, q, v, None)
+        return bicycle.energy(0.0, q, v), slip, bicycle.holonomic(0.0, q, None)
 
-    energy, slip, depth = checks(*(x[0] for x in (runs(3)[1].q, runs(3)[1].v)))
+    _, states, _ = runs(stages)
+    start = float(bicycle.energy(0.0, bicycle.q0, bicycle.v0))
+    return *map(np.asarray, at(states.q[0], states.v[0])), start
+
+
+@pytest.mark.parametrize("stages", [2, 3], ids=["steered-2", "free-3"])
+def test_constraints_hold_in_a_run_of_five_seconds(stages):
+    _, slip, depth, _ = checks(stages)
     np.testing.assert_allclose(slip, 0.0, atol=2e-13)
     np.testing.assert_allclose(depth, 0.0, atol=2e-15)
-    start = float(bicycle.energy(0.0, bicycle.q0, bicycle.v0))
+
+
+def test_energy_stays_in_a_run_of_five_seconds():
+    energy, _, _, start = checks(3)
     # The library of benchmarks allows 1e-5.
-    assert np.max(np.abs(np.asarray(energy) / start - 1)) < 5e-7
+    assert np.max(np.abs(energy / start - 1)) < 5e-7
+
+
+def test_the_rider_does_the_work_that_becomes_energy():
+    bicycle = BICYCLES[2]
+    q, v, _ = reference(2)
+    power = np.array([rider(0.0, *x) * x[1][5] for x in zip(q, v, strict=True)])
+    # Simpson's rule.
+    work = np.array([1.0, *[4.0, 2.0] * 499, 4.0, 1.0]) @ power * FINEST / 3
+    start, end = (float(bicycle.energy(0.0, q[k], v[k])) for k in (0, -1))
+    assert abs(work) > 0.1
+    assert end - start == pytest.approx(work, rel=1e-6)
+    _, states, _ = runs(2)
+    coarse, fine = (
+        float(bicycle.energy(0.0, states.q[lane, k], states.v[lane, k]))
+        for lane, k in ((0, 499), (1, 999))
+    )
+    assert (4 * fine - coarse) / 3 - start == pytest.approx(work, rel=1e-3)
 
 
 @pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
