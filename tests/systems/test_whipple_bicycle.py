@@ -22,7 +22,8 @@ MATRICES = (
     [[-80.95, -2.59951685249872], [-2.59951685249872, -0.80329488458618]],
     [[0.0, 76.59734589573222], [0.0, 2.65431523794604]],
 )
-# Table 2: the two real eigenvalues and the pair, which is real in the first row.
+# Table 2: the two real eigenvalues and the pair, which is real in the first row. In 50
+# digits, the linear equations have these to 1e-13 but for 18.15788466125202 at 7 m/s.
 EIGENVALUES = (
     (-5.53094371765393, -3.13164324790656, (3.13164324790656, 5.53094371765393)),
     (-7.11008014637442, -3.13423125066578, 3.52696170990070 + 0.8077402751993j),
@@ -246,7 +247,7 @@ def printed_eigenvalues():
 
 def test_eigenvalues_are_those_of_table_2_of_meijaard(multipliers):
     found = multipliers(np.arange(11.0), 0.015)
-    np.testing.assert_allclose(found, printed_eigenvalues(), rtol=0, atol=4e-12)
+    np.testing.assert_allclose(found, printed_eigenvalues(), rtol=0, atol=2e-12)
 
 
 @pytest.mark.parametrize(
