@@ -38,7 +38,6 @@ from nhjax._step._stage_system import nudged, StageSystem
 from nhjax._step._unknowns import Stages
 from nhjax._system import position_scale, violation_scale
 
-from ._bicycle import bicycle
 from ._random_systems import random_systems
 from ._report import markdown_table, number, RESULTS, write
 
@@ -51,7 +50,7 @@ NUDGE = 2.0**-26
 
 
 def gallery() -> dict[str, Callable]:
-    """The systems of the gallery and a bicycle, each with a state to start from."""
+    """The systems of the gallery, each with a state to start from."""
 
     def of(example):
         return lambda: (example().system, example().initial_state())
@@ -80,7 +79,7 @@ def gallery() -> dict[str, Callable]:
     ]
     named |= {example.__name__: example for example in others}
     made = {name: of(example) for name, example in named.items()}
-    return made | {"Whipple bicycle": bicycle}
+    return made | {"Whipple bicycle": of(systems.WhippleBicycle)}
 
 
 class Judged(NamedTuple):

@@ -18,7 +18,6 @@ import jax.numpy as jnp
 import nhjax
 from nhjax import systems
 
-from ._bicycle import bicycle
 from ._report import markdown_table, write
 
 
@@ -29,7 +28,8 @@ KINDS = ("run", "ensemble", "gradient")
 def cases() -> list[tuple[str, Any, nhjax.State, int, str]]:
     """The name, system, state, number of stages and kind of each program."""
     chaotic, top = systems.ChaoticSystem(), systems.HeavyTopSE3()
-    riding, upright = bicycle(5.0)
+    riding = systems.WhippleBicycle.running(speed=5.0, lean_rate=0.5)
+    upright = riding.initial_state()
     found = [
         ("chaotic", chaotic.system, chaotic.initial_state(), s, kind)
         for s in (3, 8)
@@ -39,7 +39,7 @@ def cases() -> list[tuple[str, Any, nhjax.State, int, str]]:
         ("heavy top on SE(3)", top.system, top.initial_state(), 3, kind)
         for kind in KINDS
     ]
-    return [*found, *(("bicycle", riding, upright, 3, kind) for kind in KINDS)]
+    return [*found, *(("bicycle", riding.system, upright, 3, kind) for kind in KINDS)]
 
 
 def program(system: Any, stages: int, kind: str) -> Callable[[Any, Any], Any]:

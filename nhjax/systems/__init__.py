@@ -3,7 +3,9 @@
 from ._andrews_squeezer import AndrewsSqueezer as AndrewsSqueezer
 from ._appell import Appell as Appell
 from ._ball_in_bowl import BallInBowl as BallInBowl
+from ._bicycle_steering import LeanToSteer as LeanToSteer, SteerTorque as SteerTorque
 from ._car_axis import CarAxis as CarAxis
+from ._car_with_trailers import CarWithTrailers as CarWithTrailers
 from ._chaotic import ChaoticSystem as ChaoticSystem
 from ._chaplygin_sphere import ChaplyginSphere as ChaplyginSphere
 from ._chaplygin_top import ChaplyginTop as ChaplyginTop
@@ -30,7 +32,9 @@ from ._spatial_slider_crank import SpatialSliderCrank as SpatialSliderCrank
 from ._spherical_pendulum import SphericalPendulum as SphericalPendulum
 from ._suslov import Suslov as Suslov
 from ._turntable_ball import TurntableBall as TurntableBall
+from ._two_wheeled_robot import TwoWheeledRobot as TwoWheeledRobot
 from ._unicycle import (
     Unicycle as Unicycle,
     UnicycleInCoordinates as UnicycleInCoordinates,
 )
+from ._whipple_bicycle import WhippleBicycle as WhippleBicycle

@@ -1,0 +1,91 @@
+"""Rigid motions of the bodies and wheels of a machine, and their rates, in space."""
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+
+class Frame(NamedTuple):
+    """A rigid motion: what is at c in the body goes to origin + rotation c in space.
+
+    A rate of it has the same two parts.
+    """
+
+    rotation: Float[Array, "3 3"]
+    origin: Float[Array, "3"]
+
+    def move(self, point: Float[Array, "3"]) -> Float[Array, "3"]:
+        """Compute where a point of the body goes, or how fast for a rate."""
+        return self.origin + self.rotation @ point
+
+
+def angular_velocity(
+    frame: Frame, rate: Frame, spin: Float[Array, ""]
+) -> Float[Array, "3"]:
+    """Compute the angular velocity, in the axes of a moving frame, of a wheel on it.
+
+    The wheel turns at the rate `spin` about the second axis of the frame; zero for the
+    frame itself.
+    """
+    skew = frame.rotation.T @ rate.rotation
+    return jnp.stack([skew[2, 1], skew[0, 2] + spin, skew[1, 0]])
+
+
+def down(rotation: Float[Array, "3 3"]) -> Float[Array, "3"]:
+    """Compute the direction from the hub of a wheel to its point with largest z.
+
+    Its axle is the second axis of the frame with `rotation`.
+    """
+    axle = rotation[:, 1]
+    below = jnp.asarray([0, 0, 1], axle.dtype) - axle[2] * axle
+    return below / jnp.sqrt(below @ below)
+
+
+def contact_point(
+    hub: Float[Array, "3"], radius: Float[Array, ""], frame: Frame
+) -> Float[Array, "3"]:
+    """Compute the point with largest z of a wheel on a frame."""
+    return frame.move(hub) + radius * down(frame.rotation)
+
+
+def contact_velocity(
+    hub: Float[Array, "3"],
+    radius: Float[Array, ""],
+    frame: Frame,
+    rate: Frame,
+    spin: Float[Array, ""],
+) -> Float[Array, "3"]:
+    """Compute the velocity of the point of the wheel that is its contact point."""
+    turning = frame.rotation @ angular_velocity(frame, rate, spin)
+    return rate.move(hub) + jnp.cross(turning, radius * down(frame.rotation))
+
+
+def about_x(angle: Float[Array, ""]) -> Float[Array, "3 3"]:
+    """Compute the rotation by `angle` about the first axis."""
+    c, s = jnp.cos(angle), jnp.sin(angle)
+    one, zero = jnp.ones_like(c), jnp.zeros_like(c)
+    return jnp.stack([one, zero, zero, zero, c, -s, zero, s, c]).reshape(3, 3)
+
+
+def about_y(angle: Float[Array, ""]) -> Float[Array, "3 3"]:
+    """Compute the rotation by `angle` about the second axis."""
+    c, s = jnp.cos(angle), jnp.sin(angle)
+    one, zero = jnp.ones_like(c), jnp.zeros_like(c)
+    return jnp.stack([c, zero, s, zero, one, zero, -s, zero, c]).reshape(3, 3)
+
+
+def about_z(angle: Float[Array, ""]) -> Float[Array, "3 3"]:
+    """Compute the rotation by `angle` about the third axis."""
+    c, s = jnp.cos(angle), jnp.sin(angle)
+    one, zero = jnp.ones_like(c), jnp.zeros_like(c)
+    return jnp.stack([c, -s, zero, s, c, zero, zero, zero, one]).reshape(3, 3)
+
+
+def about_axis(axis: Float[Array, "3"], angle: Float[Array, ""]) -> Float[Array, "3 3"]:
+    """Compute the rotation by `angle` about a unit vector, exactly 1 at 0."""
+    x, y, z = axis
+    zero = jnp.zeros_like(x)
+    skew = jnp.stack([zero, -z, y, z, zero, -x, -y, x, zero]).reshape(3, 3)
+    turn = jnp.sin(angle) * skew + (1 - jnp.cos(angle)) * (skew @ skew)
+    return jnp.eye(3, dtype=axis.dtype) + turn

@@ -1,0 +1,155 @@
+"""A robot on two wheels that motors drive, in the plane."""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, ArrayLike, Float
+
+from .._custom_types import Args, FloatScalarLike
+from .._system import LagrangianSystem
+from ._base import (
+    AbstractNonholonomicExample,
+    coordinates,
+    parameter,
+    require_positive,
+    require_shape,
+)
+
+
+class TwoWheeledRobot(AbstractNonholonomicExample):
+    """A robot with two driven wheels on one axle (a differential drive), on R⁵.
+
+    L = m/2 |ċ|² + I/2 θ̇² + Σ (m_w/2 |ẇ|² + I_m/2 θ̇² + I_w/2 φ̇²),
+
+    q = (x, y, θ, φ_R, φ_L): the middle r of the axle [m], the heading, and the angles
+    of the right and of the left wheel [rad], which grow as the robot goes ahead. The
+    centre of mass of the platform is c = r + d e, those of the wheels are w = r ∓ b n,
+    with the heading e and n to its left. The wheels roll and do not slip sideways:
+
+    Φ = (n·ṙ, e·ṙ + b θ̇ - ρ φ̇_R, e·ṙ - b θ̇ - ρ φ̇_L).
+
+    The multipliers are the forces of the ground [N]: on both wheels together to the
+    left, and ahead on the right and on the left wheel. Castors are left out.
+
+    `args` is None or a pair of the torques of the motors on the right and on the left
+    wheel [N m]; without them energy is conserved.
+
+    **Parameters:** `mass` m of the platform [kg], its `inertia` I about its centre of
+    mass [kg m²] and the `offset` d of this ahead of the axle [m]; `half_track` b, half
+    of the distance of the wheels, and their `radius` ρ [m]; of each wheel `wheel_mass`
+    m_w [kg] and, with the rotor of its motor, `axle_inertia` I_w about the axle and
+    `wheel_inertia` I_m about a diameter [kg m²].
+
+    **Source:** Yamamoto and Yun, *Coordinating locomotion and manipulation of a mobile
+    manipulator* (1994); Dhaouadi and Abu Hatab, *Dynamic modelling of
+    differential-drive mobile robots using Lagrange and Newton-Euler methodologies*
+    (2013).
+
+    !!! example
+
+        >>> from nhjax.systems import TwoWheeledRobot
+        >>> robot = TwoWheeledRobot.rolling(speed=1.0, turn_rate=0.5)
+        >>> system, y0 = robot.system, robot.initial_state()
+    """
+
+    mass: Array = eqx.field(converter=parameter, default=30.0)
+    inertia: Array = eqx.field(converter=parameter, default=15.625)
+    offset: Array = eqx.field(converter=parameter, default=0.3)
+    half_track: Array = eqx.field(converter=parameter, default=0.75)
+    radius: Array = eqx.field(converter=parameter, default=0.15)
+    wheel_mass: Array = eqx.field(converter=parameter, default=1.0)
+    axle_inertia: Array = eqx.field(converter=parameter, default=0.005)
+    wheel_inertia: Array = eqx.field(converter=parameter, default=0.0025)
+    q0: Array = eqx.field(converter=coordinates, default=(0.0,) * 5, kw_only=True)
+    v0: Array = eqx.field(
+        converter=coordinates,
+        default=(0.6, 0.0, 0.4, (0.6 + 0.75 * 0.4) / 0.15, (0.6 - 0.75 * 0.4) / 0.15),
+        kw_only=True,
+    )
+
+    def __check_init__(self) -> None:
+        require_shape((5,), q0=self.q0, v0=self.v0)
+        require_positive(
+            mass=self.mass,
+            inertia=self.inertia,
+            half_track=self.half_track,
+            radius=self.radius,
+            wheel_mass=self.wheel_mass,
+            axle_inertia=self.axle_inertia,
+            wheel_inertia=self.wheel_inertia,
+        )
+
+    @classmethod
+    def rolling(
+        cls,
+        speed: ArrayLike = 0.6,
+        turn_rate: ArrayLike = 0.4,
+        heading: ArrayLike = 0.0,
+        **parameters: Any,
+    ) -> "TwoWheeledRobot":
+        """Make a robot that rolls with the speed of the middle of its axle [m/s]."""
+        robot = cls(**parameters)
+        ahead, turn = parameter(speed), parameter(turn_rate)
+        zero, angle = jnp.zeros_like(ahead), parameter(heading)
+        right = (ahead + robot.half_track * turn) / robot.radius
+        left = (ahead - robot.half_track * turn) / robot.radius
+        dx, dy = ahead * jnp.cos(angle), ahead * jnp.sin(angle)
+        parameters.update(
+            q0=jnp.stack([zero, zero, angle, zero, zero]),
+            v0=jnp.stack([dx, dy, turn, right, left]),
+        )
+        return cls(**parameters)
+
+    @property
+    def system(self) -> LagrangianSystem:
+        """Return the system to integrate, whose leaves are the parameters."""
+        return LagrangianSystem(
+            self.lagrangian, nonholonomic=self.constraint, force=self.force
+        )
+
+    def lagrangian(self, t: FloatScalarLike, q: Array, v: Array, args: Args) -> Array:
+        """Compute the Lagrangian, the kinetic energy of the platform and the wheels."""
+        _, velocities = jax.jvp(self._centres, (q,), (v,))
+        centre, right, left = (jnp.sum(velocity**2) for velocity in velocities)
+        moving = self.mass * centre + self.wheel_mass * (right + left)
+        turning = (self.inertia + 2 * self.wheel_inertia) * v[2] ** 2
+        return 0.5 * (moving + turning + self.axle_inertia * (v[3] ** 2 + v[4] ** 2))
+
+    def constraint(self, t: FloatScalarLike, q: Array, v: Array, args: Args) -> Array:
+        """Compute Φ, the velocities at which the wheels would slip."""
+        cos, sin = jnp.cos(q[2]), jnp.sin(q[2])
+        ahead, aside = v[0] * cos + v[1] * sin, v[1] * cos - v[0] * sin
+        swing = self.half_track * v[2]
+        right = ahead + swing - self.radius * v[3]
+        return jnp.stack([aside, right, ahead - swing - self.radius * v[4]])
+
+    def force(self, t: FloatScalarLike, q: Array, v: Array, args: Args) -> Array:
+        """Compute the generalised force of `args`, the torques of the motors."""
+        force = jnp.zeros_like(v)
+        if args is None:
+            return force
+        right, left = args
+        return force.at[3].set(right).at[4].set(left)
+
+    def invariants(self, t: FloatScalarLike, q: Array, v: Array) -> dict[str, Array]:
+        """Compute the energy, which is conserved without torques."""
+        return {"energy": self.energy(t, q, v)}
+
+    def points(self, t: FloatScalarLike, q: Array) -> dict[str, Float[Array, "2"]]:
+        """Compute the middle of the axle, the centre of mass and the wheels."""
+        centre, right, left = self._centres(q)
+        return {
+            "axle": q[:2],
+            "centre": centre,
+            "right_wheel": right,
+            "left_wheel": left,
+        }
+
+    def _centres(self, q: Array) -> tuple[Array, Array, Array]:
+        """Compute where the platform's centre and the right and left wheel are."""
+        cos, sin = jnp.cos(q[2]), jnp.sin(q[2])
+        aside = self.half_track * jnp.stack([-sin, cos])
+        centre = q[:2] + self.offset * jnp.stack([cos, sin])
+        return centre, q[:2] - aside, q[:2] + aside
