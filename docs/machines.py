@@ -4,7 +4,7 @@
     python docs/machines.py --animate Rattleback writes docs/Rattleback.gif
 
 A picture has the paths of some points over the run, and what connects the points at a
-few times. `MACHINES` is also the list that the benchmarks go through.
+few times. `machines` is also the list that the benchmarks go through.
 """
 
 import argparse
@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from matplotlib.animation import FuncAnimation, PillowWriter
 from matplotlib.axes import Axes
@@ -47,91 +46,103 @@ class Machine(NamedTuple):
         return type(self.example).__name__
 
 
-MACHINES = (
-    Machine(
-        WhippleBicycle.running(5.0, lean_rate=0.3),
-        4.0,
-        200,
-        ("rear_contact", "rear_hub", "rear_frame", "head", "front_hub"),
-        ("rear_contact", "front_contact"),
-    ),
-    Machine(
-        systems.CarWithTrailers(num_trailers=2),
-        8.0,
-        200,
-        ("front_axle", "rear_axle", "hitch_1", "axle_1", "hitch_2", "axle_2"),
-        ("rear_axle", "axle_2"),
-    ),
-    Machine(
-        systems.TwoWheeledRobot(),
-        6.0,
-        200,
-        ("left_wheel", "axle", "centre", "axle", "right_wheel"),
-        ("centre",),
-    ),
-    Machine(
-        systems.Snakeboard(),
-        12.0,
-        300,
-        ("rear", "centre", "front"),
-        ("centre",),
-    ),
-    Machine(
-        systems.RollerRacer(),
-        12.0,
-        300,
-        ("seat", "pivot", "handlebar"),
-        ("seat",),
-    ),
-    Machine(
-        Rattleback.spinning(5.0, (0.5, 0.5)),
-        2.0,
-        500,
-        ("back", "centre_of_mass", "front"),
-        ("contact",),
-    ),
-    Machine(RollingTorus(), 4.0, 300, ("contact", "centre", "rim"), ("contact", "rim")),
-    Machine(
-        systems.ChaplyginSphere(), 6.0, 300, ("pole_1", "centre", "pole_2"), ("contact",)
-    ),
-    Machine(
-        systems.ChaplyginTop(), 4.0, 300, ("contact", "centre", "pole"), ("contact",)
-    ),
-    Machine(systems.BallInBowl(), 8.0, 400, ("centre", "pole"), ("contact",)),
-    Machine(systems.SliderCrank(), 2.0, 200, ("axle", "pin", "slider"), ("pin",)),
-    Machine(systems.FourBar(), 3.0, 200, ("O", "A", "B", "C"), ("A", "B")),
-    Machine(
-        systems.AndrewsSqueezer(),
-        0.03,
-        600,
-        ("O", "P", "B", "D", "A", "C"),
-        ("P", "D"),
-    ),
-    Machine(
-        systems.CarAxis(),
-        3.0,
-        300,
-        ("left_wheel", "left_end", "right_end", "right_wheel"),
-        ("left_end", "right_end"),
-    ),
-    Machine(
-        systems.PendulumChain(num_links=5),
-        4.0,
-        400,
-        ("pivot", *(f"mass_{k}" for k in range(1, 6))),
-        ("mass_5",),
-    ),
-    Machine(
-        systems.SpatialSliderCrank(), 2.0, 300, ("axle", "pin", "slider"), ("pin",)
-    ),
-    Machine(
-        systems.FlyballGovernor(),
-        1.0,
-        300,
-        ("ball_1", "middle_1", "slider_1", "slider_2", "middle_2", "ball_2"),
-        ("ball_1",),
-    ),
-)
+def machines() -> tuple[Machine, ...]:
+    """All machines, with data of JAX's default precision."""
+    return (
+        Machine(
+            WhippleBicycle.running(5.0, lean_rate=0.3),
+            4.0,
+            200,
+            ("rear_contact", "rear_hub", "rear_frame", "head", "front_hub"),
+            ("rear_contact", "front_contact"),
+        ),
+        Machine(
+            systems.CarWithTrailers(num_trailers=2),
+            8.0,
+            200,
+            ("front_axle", "rear_axle", "hitch_1", "axle_1", "hitch_2", "axle_2"),
+            ("rear_axle", "axle_2"),
+        ),
+        Machine(
+            systems.TwoWheeledRobot(),
+            6.0,
+            200,
+            ("left_wheel", "axle", "centre", "axle", "right_wheel"),
+            ("centre",),
+        ),
+        Machine(
+            systems.Snakeboard(),
+            12.0,
+            300,
+            ("rear", "centre", "front"),
+            ("centre",),
+        ),
+        Machine(
+            systems.RollerRacer(),
+            12.0,
+            300,
+            ("seat", "pivot", "handlebar"),
+            ("seat",),
+        ),
+        Machine(
+            Rattleback.spinning(5.0, (0.5, 0.5)),
+            2.0,
+            500,
+            ("back", "centre_of_mass", "front"),
+            ("contact",),
+        ),
+        Machine(
+            RollingTorus(), 4.0, 300, ("contact", "centre", "rim"), ("contact", "rim")
+        ),
+        Machine(
+            systems.ChaplyginSphere(),
+            6.0,
+            300,
+            ("pole_1", "centre", "pole_2"),
+            ("contact",),
+        ),
+        Machine(
+            systems.ChaplyginTop(),
+            4.0,
+            300,
+            ("contact", "centre", "pole"),
+            ("contact",),
+        ),
+        Machine(systems.BallInBowl(), 8.0, 400, ("centre", "pole"), ("contact",)),
+        Machine(systems.SliderCrank(), 2.0, 200, ("axle", "pin", "slider"), ("pin",)),
+        Machine(systems.FourBar(), 3.0, 200, ("O", "A", "B", "C"), ("A", "B")),
+        Machine(
+            systems.AndrewsSqueezer(),
+            0.03,
+            600,
+            ("O", "P", "B", "D", "A", "C"),
+            ("P", "D"),
+        ),
+        Machine(
+            systems.CarAxis(),
+            3.0,
+            300,
+            ("left_wheel", "left_end", "right_end", "right_wheel"),
+            ("left_end", "right_end"),
+        ),
+        Machine(
+            systems.PendulumChain(num_links=5),
+            4.0,
+            400,
+            ("pivot", *(f"mass_{k}" for k in range(1, 6))),
+            ("mass_5",),
+        ),
+        Machine(
+            systems.SpatialSliderCrank(), 2.0, 300, ("axle", "pin", "slider"), ("pin",)
+        ),
+        Machine(
+            systems.FlyballGovernor(),
+            1.0,
+            300,
+            ("ball_1", "middle_1", "slider_1", "slider_2", "middle_2", "ball_2"),
+            ("ball_1",),
+        ),
+    )
 
 
 def run(machine: Machine) -> dict[str, np.ndarray]:
@@ -153,7 +164,7 @@ def run(machine: Machine) -> dict[str, np.ndarray]:
     return jax.tree.map(np.asarray, sol.ys)
 
 
-def draw(figure: Figure, place: Any, machine: Machine) -> None:
+def draw(figure: Figure, place: tuple[int, int, int], machine: Machine) -> None:
     """Draw the paths of a machine, and the machine at some times."""
     points = run(machine)
     ax = axes_for(figure, place, points)
@@ -166,13 +177,15 @@ def draw(figure: Figure, place: Any, machine: Machine) -> None:
     ax.set_title(machine.name, fontsize=9)
 
 
-def axes_for(figure: Figure, place: Any, points: dict[str, np.ndarray]) -> Axes:
+def axes_for(
+    figure: Figure, place: tuple[int, int, int], points: dict[str, np.ndarray]
+) -> Axes:
     """Axes of equal units for points of the plane or of space."""
     everything = np.concatenate(list(points.values()))
     if everything.shape[1] == 2:
-        ax = figure.add_subplot(place, aspect="equal", adjustable="datalim")
+        ax = figure.add_subplot(*place, aspect="equal", adjustable="datalim")
     else:
-        ax = figure.add_subplot(place, projection="3d")
+        ax = figure.add_subplot(*place, projection="3d")
         low, high = everything.min(axis=0), everything.max(axis=0)
         size, middle = np.max(high - low), (high + low) / 2
         ax.set_box_aspect((1, 1, 1))  # pyright: ignore[reportArgumentType]
@@ -187,7 +200,7 @@ def animate(machine: Machine, path: Path, frames: int = 100) -> None:
     """Write an animation of a machine."""
     points = run(machine)
     figure = Figure(figsize=(4, 4), layout="constrained")
-    ax = axes_for(figure, 111, points)
+    ax = axes_for(figure, (1, 1, 1), points)
     for name in machine.traced:
         ax.plot(*points[name].T, linewidth=0.6, color="tab:blue")
     lines = ax.plot(*np.array([points[name][0] for name in machine.rods]).T, "ko-")
@@ -207,17 +220,18 @@ def animate(machine: Machine, path: Path, frames: int = 100) -> None:
 def main() -> None:
     """Write the picture of all machines, or the animation of one."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--animate", choices=[machine.name for machine in MACHINES])
+    parser.add_argument("--animate", help="the name of a machine's class")
     name = parser.parse_args().animate
     jax.config.update("jax_enable_x64", True)
+    gallery = machines()
     if name:
-        (machine,) = (machine for machine in MACHINES if machine.name == name)
+        (machine,) = (machine for machine in gallery if machine.name == name)
         animate(machine, DOCS / f"{name}.gif")
         return
     columns = 4
-    rows = -(-len(MACHINES) // columns)
+    rows = -(-len(gallery) // columns)
     figure = Figure(figsize=(3 * columns, 2.8 * rows), layout="constrained")
-    for place, machine in enumerate(MACHINES, 1):
+    for place, machine in enumerate(gallery, 1):
         draw(figure, (rows, columns, place), machine)
         jax.clear_caches()
     figure.savefig(DOCS / "machines.png", dpi=80)

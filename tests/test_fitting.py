@@ -73,7 +73,8 @@ def test_steering_reaches_the_pose_with_stationary_effort(results_of):
 
 def test_rattleback_turns_back_by_design(results_of):
     results = results_of("rattleback")
-    assert results["first"] > 2 and results["last"] < -2
+    assert results["first"] > 2
+    assert results["last"] < -2
     # The motion itself does, and not only its discretisation.
     assert abs(results["mean_of_finer_run"] - results["last"]) < 0.1
     np.testing.assert_allclose(results["slope"], results["difference"], rtol=1e-4)

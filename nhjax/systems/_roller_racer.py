@@ -55,7 +55,7 @@ class RollerRacer(AbstractNonholonomicExample):
     inertias: Array = eqx.field(converter=coordinates, default=(1.0, 0.1))
     distances: Array = eqx.field(converter=coordinates, default=(0.6, 0.2))
     gait: Callable[[Array], Array] | None = eqx.field(
-        default=Sinusoid(0.6, 4.0, 0.0), kw_only=True
+        default_factory=lambda: Sinusoid(0.6, 4.0, 0.0), kw_only=True
     )
     q0: Array = eqx.field(converter=coordinates, default=(0.0,) * 4, kw_only=True)
     v0: Array = eqx.field(

@@ -60,7 +60,9 @@ class Snakeboard(AbstractNonholonomicExample):
     axle_inertia: Array = eqx.field(converter=parameter, default=0.0013)
     half_length: Array = eqx.field(converter=parameter, default=0.2)
     gait: Callable[[Array], Array] | None = eqx.field(
-        default=Sinusoid((0.7, 0.3, -0.3), (1.0, 1.0, 1.0), (0.0, 0.0, 0.0)),
+        default_factory=lambda: Sinusoid(
+            (0.7, 0.3, -0.3), (1.0, 1.0, 1.0), (0.0, 0.0, 0.0)
+        ),
         kw_only=True,
     )
     q0: Array = eqx.field(converter=coordinates, default=(0.0,) * 6, kw_only=True)
