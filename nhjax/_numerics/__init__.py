@@ -25,7 +25,7 @@ from ._iteration import (
     Sizes as Sizes,
     Solved as Solved,
 )
-from ._max_norm import max_norm as max_norm, relative as relative
+from ._max_norm import max_norm as max_norm, relative as relative, unit as unit
 from ._rank import (
     conditioning as conditioning,
     dependent_rows as dependent_rows,

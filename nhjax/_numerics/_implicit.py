@@ -1,6 +1,7 @@
 """Derivatives by the implicit function theorem, also where they are not defined."""
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any, TypeVar
 
 import equinox as eqx
@@ -14,7 +15,7 @@ from .._compile import shortened
 from .._custom_types import BoolScalar, FloatScalar
 from ._contraction import with_small_products
 from ._iteration import dense_increment, iterate, Sizes, Solved
-from ._max_norm import max_norm
+from ._max_norm import max_norm, unit
 
 
 # Terms of the Neumann series below this many units of round-off are left out.
@@ -27,7 +28,13 @@ T = TypeVar("T")
 X = TypeVar("X", bound=PyTree[Array])
 
 
-def solve_contraction(contraction: Callable[[X], X], b: X, *, max_iterations: int) -> X:
+def solve_contraction(
+    contraction: Callable[[X], X],
+    b: X,
+    units: list[FloatScalar],
+    *,
+    max_iterations: int,
+) -> X:
     """Solve x = G x + b for a linear G that contracts; x is NaN if it does not.
 
     Both x and the solution of the transposed equation are sums of the Neumann series,
@@ -37,6 +44,10 @@ def solve_contraction(contraction: Callable[[X], X], b: X, *, max_iterations: in
     factors of that iteration, and takes about as many evaluations as the nonlinear
     iteration did. Derivatives of every order follow from the equation, not from the
     iterations.
+
+    Terms are judged by their largest number, in the `units` of the leaves of x. The
+    unknowns of the transposed equation have the inverse units, so that products of the
+    two have none.
     """
     given, treedef = jax.tree.flatten(b)
 
@@ -49,14 +60,18 @@ def solve_contraction(contraction: Callable[[X], X], b: X, *, max_iterations: in
     def operator(x):
         return _minus(x, _not_empty(contraction(full(x))))
 
-    def refine(matvec, b):
+    def refine(weights, matvec, b):
+
+        def size(x):
+            pairs = zip(weights, x, strict=True)
+            return max_norm(*(weight * leaf for weight, leaf in pairs))
 
         def sweep(x):
             increment = _minus(b, matvec(x))
             x = [x + dx for x, dx in zip(x, increment, strict=True)]
-            return x, Sizes(max_norm(*increment), max_norm(*x)), None
+            return x, Sizes(size(increment), size(x)), None
 
-        scale = max_norm(*b)
+        scale = size(b)
         tolerance = _UNITS_LEFT * float(jnp.finfo(scale.dtype).eps)
         solved = iterate(
             sweep,
@@ -68,8 +83,13 @@ def solve_contraction(contraction: Callable[[X], X], b: X, *, max_iterations: in
         )
         return nan_unless(solved.converged, solved.x)
 
+    pairs = zip(given, units, strict=True)
+    scales = [unit(jax.lax.stop_gradient(one)) for x, one in pairs if x.size]
     x = jax.lax.custom_linear_solve(
-        operator, _mixed(_not_empty(b)), solve=refine, transpose_solve=refine
+        operator,
+        _mixed(_not_empty(b)),
+        solve=partial(refine, [1 / one for one in scales]),
+        transpose_solve=partial(refine, scales),
     )
     return full(_mixed(x))
 

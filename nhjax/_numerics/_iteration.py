@@ -155,13 +155,16 @@ def _progress(rules: _Rules, before: _Progress, sizes: Sizes) -> _Progress:
     # Sizes are compared without forming quotients, which would have to be computed one
     # after the other.
     measure = jnp.where(size > 0, size, before.first)
-    stalls = increment >= before.smallest
-    more = jnp.minimum(rules.growth * before.believed, rules.noisiest)
-    believed = jnp.where(stalls, more, before.believed)
     magnified = measure
     if sizes.noise is not None:
         noise = jnp.minimum(sizes.noise, _LARGEST_NOISE * measure)
         magnified = jnp.maximum(measure, noise)
+    # Increments that cannot be noise tell nothing of how large it is: those of an
+    # iteration that approaches the solution in circles rise and fall on their way.
+    may_be_noise = increment <= rules.noisiest * magnified
+    stalls = may_be_noise & (increment >= before.smallest)
+    more = jnp.minimum(rules.growth * before.believed, rules.noisiest)
+    believed = jnp.where(stalls, more, before.believed)
     stagnant = stalls & (increment <= believed * magnified)
     converged = (increment <= rules.floor * measure) | stagnant
     count = before.iterations + 1

@@ -21,6 +21,7 @@ from ._end import end_state
 from ._newton import AbstractStageSolver
 from ._record import StepRecord
 from ._stage_equations import stage_forces
+from ._stage_iteration import unknown_units
 from ._stage_system import StageSystem
 from ._step import step, StepOutcome, StepState
 from ._unknowns import Stages
@@ -98,7 +99,8 @@ def _differentiable_step_jvp(primals, tangents):
         # This iteration starts from zero, while that of the step starts from a good
         # guess, so that it is allowed twice as many iterations.
         limit = 2 * solver.max_iterations
-        dx = solve_contraction(contraction, b, max_iterations=limit)
+        units = unknown_units(*given[:2])
+        dx = solve_contraction(contraction, b, units, max_iterations=limit)
         _, dend = jax.jvp(end, (perturbed, x), (rates, zero_unless(ok, dx)))
         return zero_unless(ok, (dx, *dend))
 

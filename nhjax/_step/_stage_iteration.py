@@ -1,5 +1,6 @@
 """The residual of all stage equations, and a sweep of simplified Newton over them."""
 
+import dataclasses
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -7,7 +8,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
 from .._custom_types import BoolScalar, FloatScalar
-from .._numerics import matvec, max_norm, Sizes, small_einsum
+from .._numerics import matvec, max_norm, Sizes, small_einsum, unit
 from .._system import Linearisation
 from ._leading_structure import LeadingStructure
 from ._stage_equations import (
@@ -169,3 +170,24 @@ def increment_size(
     if stages.chart.manifold.is_flat:
         return size
     return jnp.where(in_chart(stages, x_next), size, jnp.inf)
+
+
+def unknown_units(stages: StageSystem, lin: Linearisation) -> list[FloatScalar]:
+    """Return the size of each field of `Stages` that changes u by one.
+
+    As in `increment_size`, multipliers count by the effect h N⁻¹ R δΛ on u. By their
+    own size the round-off of a multiplier, which grows like 1 / h, could not be told
+    from an iteration that does not converge.
+    """
+    h = jnp.abs(stages.h)
+    one = jnp.ones_like(h)
+    velocity = 1 / unit(max_norm(lin.metric_inverse)) if stages.hamiltonian else one
+    multiplier = 1 / unit(h * max_norm(lin.reaction))
+    sizes = {
+        "velocity": velocity,
+        "closure": multiplier,
+        "holonomic": multiplier,
+        "end_acceleration": 1 / unit(h),
+        "end_multiplier": multiplier,
+    }
+    return [sizes.get(field.name, one) for field in dataclasses.fields(Stages)]

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, PyTree
 
 from .._custom_types import Args, FloatScalar
-from .._numerics import max_norm
+from .._numerics import max_norm, unit
 from ._abstract import AbstractMechanicalSystem
 from ._linearisation import Linearisation
 
@@ -22,7 +22,8 @@ def violation_scale(
 
     The estimate treats Φ as affine in u. It is not the size of the terms at u itself: a
     constraint such as v[1] has a single term, which is round-off in every state that
-    satisfies the constraint.
+    satisfies the constraint. Where u vanishes nothing tells the size of velocities, and
+    one unit of theirs stands for it: terms that cancel leave round-off there too.
     """
     return velocity_scale(system, lin.jacobian, t, q, u, args)
 
@@ -38,7 +39,7 @@ def velocity_scale(
     """Do what `violation_scale` does, given the Jacobian ∂Φ/∂u alone."""
     affine = _finite_or_zero(system.constraint(t, q, jnp.zeros_like(u), args))
     slopes = jnp.sum(jnp.abs(jacobian), axis=1)
-    return slopes * max_norm(u) + affine
+    return slopes * unit(max_norm(u)) + affine
 
 
 def position_scale(
@@ -46,7 +47,7 @@ def position_scale(
 ) -> Float[Array, " k"]:
     """Estimate, row by row, how large the terms of Γ are for a q of the given size.
 
-    The estimate treats Γ as affine in q.
+    The estimate treats Γ as affine in q. Where q vanishes one unit stands for its size.
     """
 
     def gamma(q):
@@ -59,7 +60,8 @@ def position_scale(
         lambda slope: jnp.sum(jnp.abs(slope), axis=tuple(range(1, slope.ndim))),
         jax.jacrev(gamma)(q),
     )
-    return sum(jax.tree.leaves(slopes)) * max_norm(*jax.tree.leaves(q)) + constant
+    size = unit(max_norm(*jax.tree.leaves(q)))
+    return sum(jax.tree.leaves(slopes)) * size + constant
 
 
 def _finite_or_zero(x: Array) -> Array:

@@ -175,3 +175,24 @@ def test_a_projection_from_where_a_constraint_has_no_gradient():
     message = r"DΓ has not full rank at q = \[0\. 0\. 0\.\].*Γ\[0\] has no gradient"
     with pytest.raises(nhjax.DependentConstraintsError, match=message):
         nhjax.initial_state(SPHERE, jnp.zeros(3), jnp.zeros(3), project=True)
+
+
+def test_terms_that_cancel_at_the_origin_are_no_violation():
+    # 0.1 + 0.2 - 0.3 is one unit of round-off, and nothing tells the size of q.
+    system = nhjax.LagrangianSystem(
+        lambda t, q, v, args: 0.5 * (v @ v),
+        holonomic=lambda t, q, args: q[0] - q[1] + (0.1 + 0.2 - 0.3),
+    )
+    y = nhjax.initial_state(system, jnp.zeros(2), jnp.ones(2))
+    np.testing.assert_array_equal(y.q, 0)
+    with pytest.raises(nhjax.ConstraintViolationError, match="holonomic"):
+        nhjax.initial_state(system, jnp.asarray([1e-11, 0.0]), jnp.ones(2))
+
+
+def test_a_rate_that_is_round_off_is_no_violation_at_rest():
+    racer = systems.RollerRacer(
+        gait=lambda t: 0.6 * jnp.sin(4 * t + 0.5 * jnp.pi),
+        q0=(0.0, 0.0, 0.0, 0.6),
+        v0=(0.0, 0.0, 0.0, 0.0),
+    )
+    np.testing.assert_array_equal(racer.initial_state().v, 0)

@@ -250,6 +250,13 @@ def test_eigenvalues_are_those_of_table_2_of_meijaard(multipliers):
     np.testing.assert_allclose(found, printed_eigenvalues(), rtol=0, atol=2e-12)
 
 
+def test_small_steps_have_derivatives_also_at_rest(multipliers):
+    # At rest the derivatives of multipliers are smaller than their round-off, which
+    # grows like 1 / h.
+    found = multipliers(np.arange(11.0), 0.004)
+    np.testing.assert_allclose(found, printed_eigenvalues(), rtol=0, atol=1e-9)
+
+
 @pytest.mark.parametrize(
     ("printed", "first"),
     [(WEAVE, "complex"), (CAPSIZE, "real")],

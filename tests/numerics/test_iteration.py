@@ -1,0 +1,59 @@
+"""Iterations that come to their end in unusual ways."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from nhjax._numerics import iterate, Sizes
+
+
+def circling(rate, angle, units):
+    """An iteration whose error turns by `angle` as it contracts, seen from aside."""
+    turn = rate * np.array(
+        [[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]
+    )
+
+    def sweep(x):
+        after = jnp.asarray(turn) @ x
+        # Only one component is measured, which rises and falls.
+        return after, Sizes(jnp.abs(after[0] - x[0])), None
+
+    return iterate(
+        sweep,
+        jnp.asarray([1.0, 0.3]),
+        jnp.asarray(1.0),
+        max_iterations=200,
+        noise_units=units,
+    )
+
+
+@pytest.mark.parametrize("angle", [0.7, 1.4, 1.9, 2.6])
+@pytest.mark.parametrize("rate", [0.3, 0.5, 0.7])
+def test_an_iteration_in_circles_is_not_taken_for_noise_on_its_way(rate, angle):
+    solved = circling(rate, angle, 400)
+    assert solved.converged
+    # What is left of the error is of the size of what is believed to be noise.
+    assert float(jnp.max(jnp.abs(solved.x))) < 100 * np.finfo(float).eps / (1 - rate)
+
+
+def test_noise_that_never_falls_ends_an_iteration():
+    def sweep(k):
+        # Some 150 units of round-off, with both signs.
+        return k + 1, Sizes(150 * 2.2e-16 * (1.5 + jnp.sin(k))), None
+
+    solved = iterate(
+        sweep, jnp.asarray(0.0), jnp.asarray(1.0), max_iterations=50, noise_units=400
+    )
+    assert solved.converged
+    assert int(solved.num_iterations) < 20
+
+
+def test_increments_that_do_not_fall_and_are_no_noise_never_end_well():
+    def sweep(k):
+        return k + 1, Sizes(1e-10 * (1.5 + jnp.sin(k))), None
+
+    solved = iterate(
+        sweep, jnp.asarray(0.0), jnp.asarray(1.0), max_iterations=50, noise_units=400
+    )
+    assert not solved.converged
+    assert solved.exhausted
