@@ -66,26 +66,31 @@ def program(system: Any, stages: int, kind: str) -> Callable[[Any, Any], Any]:
     return functions[kind]
 
 
+def compiled(function: Callable[..., Any], *args: Any) -> tuple[Any, list[float]]:
+    """A compiled program, and the seconds to trace, to lower and to compile it."""
+    times = [time.process_time()]
+    traced = jax.jit(function).trace(*args)
+    times.append(time.process_time())
+    lowered = traced.lower()
+    times.append(time.process_time())
+    program = lowered.compile()
+    times.append(time.process_time())
+    return program, [after - before for before, after in itertools.pairwise(times)]
+
+
 def main() -> None:
     """Print and save the table."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--systems", nargs="+", help="a part of the names")
-    options = parser.parse_args()
+    names = parser.parse_args().systems
     jax.config.update("jax_enable_x64", True)
     jax.jit(jnp.sin).lower(0.1).compile()
     rows, data = [], []
     for name, system, y0, stages, kind in cases():
-        if options.systems and name not in options.systems:
+        if names and name not in names:
             continue
         dt = jnp.full((8,), 0.05) if kind == "ensemble" else jnp.asarray(0.05)
-        times = [time.process_time()]
-        traced = jax.jit(program(system, stages, kind)).trace(y0, dt)
-        times.append(time.process_time())
-        lowered = traced.lower()
-        times.append(time.process_time())
-        lowered.compile()
-        times.append(time.process_time())
-        parts = [after - before for before, after in itertools.pairwise(times)]
+        _, parts = compiled(program(system, stages, kind), y0, dt)
         row = [name, str(stages), kind, *(f"{x:.1f}" for x in (*parts, sum(parts)))]
         print(*row, sep="\t", flush=True)
         rows.append(row)

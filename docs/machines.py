@@ -210,7 +210,7 @@ def animate(machine: Machine, path: Path, frames: int = 100) -> None:
         rods = np.array([points[name][shown[frame]] for name in machine.rods]).T
         lines[0].set_data(*rods[:2])
         if len(rods) == 3:
-            lines[0].set_3d_properties(rods[2])
+            lines[0].set_3d_properties(rods[2])  # pyright: ignore
         return lines
 
     animation = FuncAnimation(figure, show, frames=frames)

@@ -31,7 +31,7 @@ class ChaplyginTop(AbstractRollingBody):
     `moments` (I₁, I₂, I₃) about the centre of mass [kg m²]; `gravity` g [m/s²];
     `retraction`, that of SE(3).
 
-    **Source:** Routh, *Advanced Rigid Dynamics*, article 243; Chaplygin, *On a motion
+    **Source:** Routh, *Advanced Rigid Dynamics*; Chaplygin, *On a motion
     of a heavy body of revolution on a horizontal plane* (1897), in English in Regular
     and Chaotic Dynamics 7 (2002); Bustamante and Lynch, *Nonholonomic Noetherian
     symmetries and integrals of the Routh sphere and Chaplygin ball*, arXiv:1908.09781.

@@ -77,7 +77,7 @@ def test_integrals_of_routh_are_constant_by_the_independent_equations():
         # m s × v with v = -ω × s, about the contact.
         momentum = moments * w + cross(s, cross(w, s))
         assert momentum @ s == pytest.approx(jellett, rel=1e-12)
-        # As Bustamante and Lynch print it, for m = r = 1 and over √I₁.
+        # The usual form for m = r = 1, here times √I₁.
         sin, f = np.hypot(*rotation[2, :2]), rotation[2, 2] - 0.25
         value = moments[2] + sin**2 + moments[2] / moments[0] * f**2
         assert w[2] * np.sqrt(moments[0] * value) == pytest.approx(routh, rel=1e-12)
