@@ -162,7 +162,7 @@ def _changes(derivatives: np.ndarray) -> np.ndarray:
 
     A number that is not finite counts as a change.
     """
-    return np.any(~(derivatives == 0), axis=0)
+    return np.asarray(np.any(~(derivatives == 0), axis=0))
 
 
 def _condition(reciprocal: np.ndarray) -> float:

@@ -32,7 +32,7 @@ class LinearStability(eqx.Module):
     """
 
     matrix: Float[Array, "d d"]
-    basis: Float[Array, "2*n d"]
+    basis: Float[Array, "x d"]
 
     @property
     def eigenvalues(self) -> Complex[Array, " d"]:
@@ -40,7 +40,7 @@ class LinearStability(eqx.Module):
         return jnp.linalg.eigvals(self.matrix)
 
     @property
-    def modes(self) -> tuple[Complex[Array, " d"], Complex[Array, "2*n d"]]:
+    def modes(self) -> tuple[Complex[Array, " d"], Complex[Array, "x d"]]:
         """Return the eigenvalues, and the perturbation of each mode as a column."""
         values, vectors = jnp.linalg.eig(self.matrix)
         return values, self.basis.astype(vectors.dtype) @ vectors
@@ -124,8 +124,8 @@ def _not_determined(independent: tuple[Indices, Indices] | None) -> ValueError:
 class _Slopes(NamedTuple):
     """The derivatives of the equations with respect to perturbations x = (ξ, w)."""
 
-    rates: Float[Array, "2*n 2*n"]
-    on_velocities: Float[Array, "l 2*n"]
+    rates: Float[Array, "x x"]
+    on_velocities: Float[Array, "l x"]
     on_positions: Float[Array, "k n"]
 
 
@@ -170,8 +170,8 @@ class _Perturbations(NamedTuple):
     `determined` tells whether the constraints determine all others.
     """
 
-    basis: Float[Array, "2*n d"]
-    left: Float[Array, "d 2*n"]
+    basis: Float[Array, "x d"]
+    left: Float[Array, "d x"]
     determined: BoolScalar
 
 

@@ -54,7 +54,7 @@ class Motion(eqx.Module):
         return b @ jnp.linalg.solve(self.mass_matrix, b.T)
 
     @property
-    def constrained_mass_matrix(self) -> Float[Array, "n+l n+l"]:
+    def constrained_mass_matrix(self) -> Float[Array, "r r"]:
         """Return [[M, -Bᵀ], [B, 0]], the matrix of the equations for (v̇, λ)."""
         b = self.constraint_jacobian
         zero = jnp.zeros((b.shape[0], b.shape[0]), b.dtype)

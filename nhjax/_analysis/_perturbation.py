@@ -15,7 +15,7 @@ Indices = tuple[int, ...]
 
 
 def perturbed(
-    system: AbstractMechanicalSystem, y: State, x: Float[Array, " 2*n"]
+    system: AbstractMechanicalSystem, y: State, x: Float[Array, " x"]
 ) -> tuple[PyTree[Array], Float[Array, " n"]]:
     """Perturb (q, u) of a state by x = (ξ, w), to (q τ(ξ), u + w)."""
     xi, w = jnp.split(x, 2)
@@ -24,7 +24,7 @@ def perturbed(
 
 def rates_of_change(
     system: AbstractMechanicalSystem, t: FloatScalar, y: State, args: Args
-) -> Callable[[Float[Array, " 2*n"]], Float[Array, " 2*n"]]:
+) -> Callable[[Float[Array, " x"]], Float[Array, " x"]]:
     """Make the function x -> (v - v_0 - ad_v₀ ξ, u̇) of perturbations x = (ξ, w).
 
     Its derivative at zero is that of the equations of motion: in the frame of a body

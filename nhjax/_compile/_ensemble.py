@@ -14,6 +14,7 @@ import jax.numpy as jnp
 from jax.interpreters import ad, batching, mlir
 
 from .._lanes import target, Unsupported
+from ._collection import rare_collections
 from ._engine import note
 from ._kernel import kernel, never_high
 from ._kernel_derivatives import differentiated, transposed
@@ -163,6 +164,7 @@ def _one_by_one(*operands, program, is_batched):
     return jax.lax.map(member, batched)
 
 
+@rare_collections()
 def _lowered(ctx, *operands, program, is_batched):
     members = _members(ctx.avals_in, is_batched)
     reason = reason_against_lanes()

@@ -8,10 +8,12 @@ import jax.extend
 import jax.numpy as jnp
 from jax.interpreters import ad
 
+from ._collection import rare_collections
 from ._kernel import call, kernel, run_program
 from ._marks import merged, split
 
 
+@rare_collections()
 def differentiated(operands, tangents, *, program):
     """Compute values and tangents in two kernels, the second linear in the tangents.
 
@@ -90,6 +92,7 @@ def _part(program, **fields: list[Any]):
 ad.primitive_jvps[kernel] = differentiated
 
 
+@rare_collections()
 def transposed(cotangents, *operands, program):
     run = jax.extend.core.jaxpr_as_fun(program)
     is_linear = [ad.is_undefined_primal(x) for x in operands]

@@ -23,6 +23,7 @@ from jax.interpreters import mlir
 from jaxlib.mlir import ir
 
 from .._lanes import is_available, single_target, Unsupported
+from ._collection import rare_collections
 from ._elementary import array_size, is_elementary, LARGEST_REDUCTION
 from ._engine import chosen_engine, note
 from ._kernel import kernel
@@ -68,6 +69,7 @@ def reason_against_kernel(program: Any) -> str | None:
 _SMALL_ARRAYS = 40
 
 
+@rare_collections()
 def _lowered(ctx, *operands, program):
     if is_within_kernel():
         return _by_xla(ctx, *operands, program=program)

@@ -9,6 +9,7 @@ from typing import Any, TypeVar
 import equinox as eqx
 
 from ._captured import all_of, captured, Entry, Place, Unrepeatable
+from ._collection import rare_collections
 
 
 T = TypeVar("T")
@@ -63,7 +64,8 @@ def tracked_jit(*tracked: str) -> Callable[[Callable[..., T]], Callable[..., T]]
         @eqx.filter_jit
         def compiled(key: _Key, *args: Any) -> T:
             key.is_traced = True
-            return function(*args)
+            with rare_collections():
+                return function(*args)
 
         @wraps(function)
         def call(*args: Any) -> T:

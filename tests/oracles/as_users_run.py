@@ -225,6 +225,30 @@ def gradients_on_a_group_by_checkpoints():
 
 
 @feature
+def accelerations_and_a_report():
+    pendulum = systems.SphericalPendulum()
+    y0 = pendulum.initial_state()
+    motion = nhjax.motion(pendulum.system, 0.0, y0)
+    close(motion.multiplier, pendulum.exact(0.0)[2])
+    report = nhjax.check_system(pendulum.system, pendulum.q0, pendulum.v0)
+    assert report.degrees_of_freedom == 2
+    close(motion.constraint_jacobian[0], 2 * y0.q)
+    assert motion.constrained_mass_matrix.shape == (4, 4)
+    close(motion.reaction_of_each[0], motion.reaction)
+    assert motion.compatibility_matrix.shape == (1, 1)
+
+
+@feature
+def a_steady_motion_and_its_stability():
+    pendulum = systems.SphericalPendulum.swinging(0.3, gravity=4.0)
+    y0, hanging = pendulum.initial_state(), {"positions": (0, 1), "velocities": (0, 1)}
+    y = nhjax.steady_motion(pendulum.system, 0.0, y0, **hanging)
+    for chosen in ({}, hanging):
+        stability = nhjax.linear_stability(pendulum.system, 0.0, y, **chosen)
+        close(jnp.sort(jnp.abs(stability.eigenvalues)), jnp.full(4, 2.0), 1e-12)
+
+
+@feature
 def single_precision():
     sol = run(y0=PARTICLE.initial_state(jnp.float32))
     assert sol.ys.q.dtype == jnp.float32

@@ -9,20 +9,7 @@ import numpy as np
 from scipy.integrate import solve_ivp
 
 import nhjax
-from nhjax._system._linearisation import linearise
 from oracles.orders import runs_of_all_steps, slopes
-
-
-@eqx.filter_jit
-def _library_motion(system, t, q, v, args):
-    solved = linearise(system, t, q, v, args)
-    return solved.acceleration, solved.multiplier
-
-
-def library_motion(example, t, q, v, args=None):
-    """(a, λ) of an example by the library, at one state."""
-    t, q, v = jnp.asarray(t, float), jnp.asarray(q, float), jnp.asarray(v, float)
-    return jax.tree.map(np.asarray, _library_motion(example.system, t, q, v, args))
 
 
 def assert_motion(found, expected, tolerance=1e-11):

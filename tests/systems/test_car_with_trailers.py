@@ -9,16 +9,10 @@ import numpy as np
 import pytest
 
 import nhjax
-from nhjax._system._linearisation import linearise
 from nhjax.systems import CarWithTrailers
 from oracles.cars import Train
+from oracles.library_motion import library_motion
 from oracles.orders import assert_order, rms, runs_of_all_steps, solver_for
-
-
-@eqx.filter_jit
-def motion(car, q, v, args):
-    lin = linearise(car.system, jnp.asarray(0.0), q, v, args)
-    return lin.acceleration, lin.multiplier
 
 
 def some_car(num_trailers, seed, same_trailers=False):
@@ -61,7 +55,7 @@ def test_accelerations_and_forces_of_the_ground_are_those_of_the_reduced_equatio
         np.asarray(car.q0), speed, rate, drive, torque
     )
     args = (jnp.asarray(drive), jnp.asarray(torque))
-    acceleration, multiplier = motion(car, car.q0, v, args)
+    acceleration, multiplier = library_motion(car, 0.0, car.q0, v, args)
     np.testing.assert_allclose(acceleration, expected, rtol=0, atol=2e-12)
     scale = np.max(np.abs(ground))
     np.testing.assert_allclose(multiplier, ground, rtol=0, atol=1e-12 * scale)
@@ -85,7 +79,7 @@ def test_a_turning_car_goes_on_turning_on_circles(steer):
     car = CarWithTrailers.turning(
         3, 6.0, steer, trailer_length=(3.0, 2.0, 4.0), trailer_hitch=(1.0, 0.0, 0.5)
     )
-    acceleration, multiplier = motion(car, car.q0, car.v0, None)
+    acceleration, multiplier = library_motion(car, 0.0, car.q0, car.v0, None)
     np.testing.assert_allclose(acceleration[2:], 0.0, rtol=0, atol=1e-12)
     rate = 6.0 * np.tan(steer) / 2.7
     np.testing.assert_allclose(

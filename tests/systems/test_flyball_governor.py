@@ -6,13 +6,13 @@ import pytest
 import nhjax
 from nhjax.systems import FlyballGovernor
 from oracles import governor
+from oracles.library_motion import library_motion
 from oracles.mechanisms import (
     assert_motion,
     assert_order,
     assert_single_precision,
     flow,
     invariants,
-    library_motion,
     runs,
 )
 

@@ -8,13 +8,13 @@ import pytest
 
 from nhjax.systems import RollerRacer, Snakeboard
 from oracles import locomotion
+from oracles.library_motion import library_motion
 from oracles.mechanisms import (
     assert_motion,
     assert_order,
     assert_single_precision,
     flow,
     invariants,
-    library_motion,
     runs,
 )
 

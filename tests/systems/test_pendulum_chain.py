@@ -5,13 +5,13 @@ import numpy as np
 import pytest
 
 from nhjax.systems import DoublePendulum, PendulumChain
+from oracles.library_motion import library_motion
 from oracles.mechanisms import (
     assert_motion,
     assert_order,
     assert_single_precision,
     flow,
     invariants,
-    library_motion,
     runs,
 )
 from oracles.pendula import Chain

@@ -5,13 +5,13 @@ import pytest
 from scipy.integrate import quad
 
 from nhjax.systems import SpatialSliderCrank
+from oracles.library_motion import library_motion
 from oracles.mechanisms import (
     assert_motion,
     assert_order,
     assert_single_precision,
     flow,
     invariants,
-    library_motion,
     runs,
 )
 from oracles.spatial_linkage import SpatialSliderCrank as Oracle

@@ -2,23 +2,16 @@
 
 from functools import cache
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import nhjax
-from nhjax._system._linearisation import linearise
 from nhjax.systems import TwoWheeledRobot
 from oracles.cars import Robot
+from oracles.library_motion import library_motion
 from oracles.orders import assert_order, rms, runs_of_all_steps, solver_for
-
-
-@eqx.filter_jit
-def motion(robot, q, v, args):
-    lin = linearise(robot.system, jnp.asarray(0.0), q, v, args)
-    return lin.acceleration, lin.multiplier
 
 
 def some_robot(seed):
@@ -42,7 +35,7 @@ def test_accelerations_and_forces_of_the_ground_are_those_of_the_reduced_equatio
         np.asarray(robot.q0), speed, turn, *torques
     )
     args = tuple(map(jnp.asarray, torques))
-    acceleration, multiplier = motion(robot, robot.q0, robot.v0, args)
+    acceleration, multiplier = library_motion(robot, 0.0, robot.q0, robot.v0, args)
     scale = np.max(np.abs(expected))
     np.testing.assert_allclose(acceleration, expected, rtol=0, atol=1e-13 * scale)
     scale = np.max(np.abs(ground))
@@ -135,7 +128,7 @@ def test_without_torques_energy_stays_and_no_wheel_slips():
 
 def test_with_its_centre_over_the_axle_it_goes_on_along_a_circle():
     robot = TwoWheeledRobot.rolling(0.8, 1.1, offset=0.0)
-    acceleration, multiplier = motion(robot, robot.q0, robot.v0, None)
+    acceleration, multiplier = library_motion(robot, 0.0, robot.q0, robot.v0, None)
     np.testing.assert_allclose(acceleration[2:], 0.0, rtol=0, atol=1e-15)
     whole = float(robot.mass + 2 * robot.wheel_mass)
     np.testing.assert_allclose(

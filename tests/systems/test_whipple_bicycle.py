@@ -2,16 +2,15 @@
 
 from functools import cache
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import nhjax
-from nhjax._system._linearisation import linearise
 from nhjax.systems import LeanToSteer, SteerTorque, WhippleBicycle
 from oracles import bicycle as oracle
+from oracles.library_motion import library_motion, motion_at
 from oracles.orders import assert_order, rms, runs_of_all_steps
 
 
@@ -68,12 +67,6 @@ ACCELERATIONS = {
 HEIGHT = 0.2440472102925
 
 
-@eqx.filter_jit
-def motion(bicycle, q, v, args):
-    lin = linearise(bicycle.system, jnp.asarray(0.0), q, v, args)
-    return lin.acceleration, lin.multiplier
-
-
 def forces(on_wheels):
     rear, front = on_wheels
     return np.concatenate([rear[:2], front])
@@ -116,7 +109,7 @@ def test_accelerations_and_forces_of_the_ground_are_those_of_kanes_method(seed):
     expected, on_wheels = oracle.accelerations(
         parameters, np.asarray(q), np.asarray(v), torque
     )
-    acceleration, multiplier = motion(bicycle, q, v, jnp.asarray(torque))
+    acceleration, multiplier = library_motion(bicycle, 0.0, q, v, jnp.asarray(torque))
     scale = np.max(np.abs(expected))
     np.testing.assert_allclose(acceleration, expected, rtol=0, atol=1e-12 * scale)
     weight = float(bicycle.gravity * bicycle.rear_frame_mass)
@@ -163,7 +156,7 @@ def test_the_state_of_table_1_of_basu_mandal_is_consistent():
 def test_accelerations_are_those_of_table_1_of_basu_mandal():
     bicycle = table_1()
     q, v = bicycle.q0, bicycle.v0
-    a, _ = motion(bicycle, q, v, None)
+    a, _ = library_motion(bicycle, 0.0, q, v, None)
     names = ("thetadd", "psidd", "phidd", "psifdd", "betardd", "betafdd")
     # The digits of the state that are not printed amount to some 5e-13.
     np.testing.assert_allclose(
@@ -210,7 +203,7 @@ def multipliers():
             lean, steer, *rates = z
             start = WhippleBicycle.running(speed, *rates, lean=lean, steer=steer)
             q, v = start.q0, start.v0
-            multiplier = linearise(system, jnp.asarray(0.0), q, v, None).multiplier
+            _, multiplier = motion_at(system, 0.0, q, v)
             p = system.momentum(0.0, q, v)
             y = nhjax.State(q, v, p, jax.lax.stop_gradient(multiplier))
             y = nhjax.step(system, method, 0.0, h, y, throw=False)
@@ -287,7 +280,7 @@ def test_a_rider_who_steers_into_the_fall_gives_that_torque():
         bicycle = WhippleBicycle.running(4.0, *where[2:], lean=where[0], steer=where[1])
         q, v = bicycle.q0, bicycle.v0
         steered = WhippleBicycle(steering=STEERED)
-        return np.asarray(q), np.asarray(v), motion(steered, q, v, None)[0]
+        return np.asarray(q), np.asarray(v), library_motion(steered, 0.0, q, v)[0]
 
     q, v, acceleration = found(0.3, -0.2, 0.5, -0.4)
     expected, _ = oracle.accelerations(parameters, q, v, float(GAINS @ [q[3], v[3]]))

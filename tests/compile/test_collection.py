@@ -1,0 +1,59 @@
+"""Garbage is collected rarely inside of a block, and as before after it."""
+
+import gc
+import threading
+
+import pytest
+
+from nhjax._compile._collection import rare_collections
+
+
+@pytest.fixture(autouse=True)
+def as_python_starts():
+    before = gc.get_threshold()
+    gc.set_threshold(700, 10, 10)
+    yield
+    gc.set_threshold(*before)
+
+
+def test_collections_are_rarer_inside_and_as_before_afterwards():
+    with rare_collections():
+        first, *rest = gc.get_threshold()
+        with rare_collections():
+            assert gc.get_threshold() == (first, *rest)
+        assert gc.get_threshold() == (first, *rest)
+    assert first > 10_000
+    assert rest == [10, 10]
+    assert gc.get_threshold() == (700, 10, 10)
+
+
+def test_an_error_puts_them_back():
+    with pytest.raises(KeyError), rare_collections():
+        raise KeyError
+    assert gc.get_threshold() == (700, 10, 10)
+
+
+@pytest.mark.parametrize("first", [0, 1_000_000])
+def test_a_collector_that_is_off_or_rarer_is_left_alone(first):
+    gc.set_threshold(first, 10, 10)
+    with rare_collections():
+        assert gc.get_threshold() == (first, 10, 10)
+    assert gc.get_threshold() == (first, 10, 10)
+
+
+def test_the_last_of_several_threads_puts_them_back():
+    entered, leave = threading.Event(), threading.Event()
+
+    def other():
+        with rare_collections():
+            entered.set()
+            leave.wait(10)
+
+    thread = threading.Thread(target=other)
+    with rare_collections():
+        thread.start()
+        assert entered.wait(10)
+    assert gc.get_threshold()[0] > 10_000
+    leave.set()
+    thread.join()
+    assert gc.get_threshold() == (700, 10, 10)
