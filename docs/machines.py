@@ -38,7 +38,6 @@ class Machine(NamedTuple):
     num_steps: int
     rods: tuple[str, ...]
     traced: tuple[str, ...]
-    args: Any = None
 
     @property
     def name(self) -> str:
@@ -147,7 +146,7 @@ def machines() -> tuple[Machine, ...]:
 
 def run(machine: Machine) -> dict[str, np.ndarray]:
     """The points of a machine along its run, each of shape (times, 2) or (times, 3)."""
-    example, args = machine.example, machine.args
+    example = machine.example
 
     def points(t, y, args):
         return example.points(t, y.q)
@@ -158,7 +157,6 @@ def run(machine: Machine) -> dict[str, np.ndarray]:
         example.initial_state(),
         dt=machine.duration / machine.num_steps,
         num_steps=machine.num_steps,
-        args=args,
         saveat=nhjax.SaveAt(t0=True, steps=True, fn=points),
     )
     return jax.tree.map(np.asarray, sol.ys)

@@ -78,3 +78,4 @@ def test_rattleback_turns_back_by_design(results_of):
     # The motion itself does, and not only its discretisation.
     assert abs(results["mean_of_finer_run"] - results["last"]) < 0.1
     np.testing.assert_allclose(results["slope"], results["difference"], rtol=1e-4)
+    assert results["smallest_force"] > 0

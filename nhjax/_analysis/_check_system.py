@@ -10,13 +10,13 @@ from jaxtyping import Array, Float, PyTree
 
 from .._compile import tracked_jit
 from .._custom_types import Args, FloatScalarLike
+from .._errors import is_traced, require
 from .._initial import checked_inputs
 from .._numerics import conditioning, dependent_rows, inverse, max_norm
-from .._system import AbstractMechanicalSystem, parameters
+from .._system import AbstractMechanicalSystem, check_functions, finite, parameters
 
 
-# Derivatives that vanish at this many states vanish everywhere, but for functions that
-# are made to deceive.
+# Derivatives that vanish at this many states near the given one vanish near it.
 _SAMPLES = 3
 _SPREAD = 0.3
 
@@ -35,7 +35,8 @@ class SystemReport(eqx.Module):
         "Γ[0]", "dΓ[0]/dt" for holonomic ones.
     - `dependent`: the names of constraints that depend on each other, if any do.
     - `depends_on_time`: the names of the functions that depend on t.
-    - `ignorable`: the indices of coordinates that no function depends on.
+    - `ignorable`: the indices of coordinates that no function depends on near the given
+        state; one that drops out by terms that cancel is not found.
     - `constant`: those of the mass matrix and the Jacobian of the nonholonomic
         constraints that depend on nothing.
     """
@@ -56,8 +57,13 @@ class SystemReport(eqx.Module):
         """Return the dimension n - m - k of the velocities that are permitted."""
         return self.dimension - self.num_nonholonomic - self.num_holonomic
 
+    def _size(self, name: str) -> float:
+        # What is no number is worse than any.
+        size = abs(self.violations[name])
+        return size if size == size else float("inf")
+
     def __str__(self) -> str:
-        worst = max(self.violations, key=lambda x: abs(self.violations[x]), default="")
+        worst = max(self.violations, key=self._size, default="")
         rows = {
             "coordinates n": self.dimension,
             "nonholonomic constraints m": self.num_nonholonomic,
@@ -106,8 +112,9 @@ def check_system(
     **Returns:** a `SystemReport`. What a function depends on is found from derivatives
     at three states around the given one.
 
-    **Raises:** as `initial_state` does for wrong types and shapes; `ValueError` if a
-    Lagrangian system is given `p`, or a Hamiltonian one `v`.
+    **Raises:** as `initial_state` does for wrong types and shapes, also of what the
+    functions return; `ValueError` if a Lagrangian system is given `p`, or a Hamiltonian
+    one `v`; `TypeError` under `jit`, `vmap` or `grad`.
 
     !!! example
 
@@ -118,13 +125,21 @@ def check_system(
         (2, (0, 1, 2), ('mass matrix',))
     """
     q, v, p, t = checked_inputs(system, q, v, p, t)
-    name = system.fibre_coordinate_name
-    u = {"v": v, "p": p}[name]
+    fibre = system.fibre_coordinate_name
+    u = {"v": v, "p": p}[fibre]
     if u is None:
         raise ValueError(
-            f"Give `{name}`, the fibre coordinate of a {type(system).__name__}."
+            f"Give `{fibre}`, the fibre coordinate of a {type(system).__name__}."
         )
     args = parameters(args)
+    if is_traced(*jax.tree.leaves((q, u, t, args))):
+        raise TypeError(
+            "`check_system` looks at numbers and makes text of them: call it outside "
+            "of `jax.jit`, `jax.vmap` and `jax.grad`."
+        )
+    for name, x in (("q", q), (fibre, u), ("t", t)):
+        require(x, finite(name, x))
+    check_functions(system, t, q, args)
     found = jax.tree.map(np.asarray, _measured(system, t, q, u, args))
     count, k = found["constraints"].size, found["positions"].size
     m = count - k
@@ -132,8 +147,9 @@ def check_system(
     rates = letters[:m] + [f"d{name}/dt" for name in letters[m:]]
     values = [*found["constraints"], *found["positions"]]
     changes = {key: _changes(found[key]) for key in (_MASS, _JACOBIAN)}
-    rank_is_full = found["rank"] > 10 * u.size * np.finfo(u.dtype).eps
-    rows = [] if rank_is_full else dependent_rows(found["jacobian"])
+    # Rows that are not finite show in the condition number of C.
+    deficient = found["rank"] <= 10 * u.size * np.finfo(u.dtype).eps
+    rows = dependent_rows(found["jacobian"]) if deficient else []
     moving = np.any(_changes(found["of positions"]), axis=0)
     return SystemReport(
         dimension=u.size,

@@ -6,14 +6,21 @@ from typing import NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Complex, Float
 
 from .._compile import as_cpu_kernel, tracked_jit
 from .._custom_types import Args, BoolScalar, FloatScalarLike
-from .._errors import Check, DependentConstraintsError, require
-from .._numerics import conditioning
+from .._errors import (
+    Check,
+    DependentConstraintsError,
+    IrregularLagrangianError,
+    require,
+)
+from .._numerics import conditioning, max_norm, unit
 from .._system import (
     AbstractMechanicalSystem,
+    check_flag,
     parameters,
     State,
 )
@@ -54,6 +61,7 @@ def linear_stability(
     *,
     positions: Sequence[int] | None = None,
     velocities: Sequence[int] | None = None,
+    must_be_steady: bool = True,
 ) -> LinearStability:
     """Linearise the constrained equations of motion about a steady motion.
 
@@ -62,10 +70,12 @@ def linear_stability(
     is δx = Z z, and ż = A z with A = W Df(x) Z for any W with W Z = 1. On a group
     perturbations are left-trivialised, ξ̇ = δv - ad_v ξ.
 
-    The motion is an equilibrium, or it is steady up to symmetries: the state changes,
-    but the equations of the perturbations do not, as for a wheel that rolls at constant
-    speed. About any other motion A holds for an instant, and its eigenvalues have no
-    meaning for stability. `steady_motion` finds steady motions.
+    The motion is an equilibrium, or it is steady in these coordinates: all velocities
+    are constant, those of the body on a group, or at least the independent ones that
+    are chosen, as for a bicycle that runs in a circle. A body of revolution that rolls
+    on a circle is not steady in this sense, since its axes turn against the motion.
+    About any other motion A holds for an instant, and its eigenvalues have no meaning
+    for stability. `steady_motion` finds steady motions.
 
     **Arguments:**
 
@@ -80,6 +90,8 @@ def linear_stability(
         constraints are not perturbed: use it for coordinates that the motion does not
         depend on, such as where a wheel is. By default z are coordinates in an
         orthonormal basis of all perturbations that the constraints permit.
+    - `must_be_steady`: raise unless the motion is steady. Without it the matrix is that
+        of the instant, for instance to linearise along a trajectory.
 
     **Returns:** a `LinearStability` with the matrix A, its eigenvalues and its modes,
     differentiable with respect to `y` and `args`. The eigenvalues themselves are
@@ -88,7 +100,9 @@ def linear_stability(
     **Raises:** `TypeError` if `system` is no system or `y` no `State`; `ValueError` if
     only one of `positions` and `velocities` is given, an index is out of range or
     occurs twice, their number does not fit, or they do not determine the other
-    velocities; `DependentConstraintsError` if the constraints are dependent.
+    velocities, or if the motion is not steady; `DependentConstraintsError` if the
+    constraints are dependent; `IrregularLagrangianError` if the mass matrix or the
+    compatibility matrix is singular; `ShapeError` if `y` is no state of this system.
 
     !!! example
 
@@ -100,11 +114,58 @@ def linear_stability(
         >>> [round(abs(float(x.imag)), 4) for x in stability.eigenvalues]
         [2.0, 2.0, 2.0, 2.0]
     """
-    t = checked_time("linear_stability", system, t, y)
+    args = parameters(args)
+    t = checked_time("linear_stability", system, t, y, args)
     independent = check_independent(system, t, y, args, positions, velocities)
-    slopes = _slopes(system, t, y, parameters(args))
+    must_be_steady = check_flag("must_be_steady", must_be_steady)
+    slopes = _slopes(system, t, y, args)
     found, determined = _reduced(slopes, independent)
-    return require(found, Check(determined, _not_determined, (independent,)))
+    checks = [
+        Check(jnp.all(jnp.isfinite(slopes.rates)), _singular, (y.q,)),
+        Check(determined, _not_determined, (independent,)),
+    ]
+    if must_be_steady:
+        size = max_norm(*jax.tree.leaves(y.q), y.v, y.p)
+        drift, allowed = _drift(slopes, size, independent)
+        checks.append(Check(jnp.all(drift <= allowed), _not_steady, (drift, allowed)))
+    return require(found, *checks)
+
+
+def _drift(
+    slopes: "_Slopes", size: Array, independent: tuple[Indices, Indices] | None
+) -> tuple[Array, Array]:
+    """Find how fast what must be constant changes, and how fast it may.
+
+    The bound is for states that were computed or printed with some digits.
+    """
+    dim = slopes.on_positions.shape[1]
+    drift = jnp.abs(slopes.drift)
+    if independent is None:
+        chosen = jnp.arange(dim, 2 * dim)
+    else:
+        positions, velocities = independent
+        chosen = jnp.asarray((*positions, *(dim + i for i in velocities)), int)
+    terms = jnp.sum(jnp.abs(slopes.rates), axis=1) * unit(size)
+    small = float(jnp.finfo(drift.dtype).eps) ** 0.25
+    return drift[chosen], small * (1 + terms[chosen])
+
+
+def _singular(q: object) -> IrregularLagrangianError:
+    return IrregularLagrangianError(
+        "The mass matrix D2D2L (or D2D2H) or the compatibility matrix C is singular at "
+        f"q = {q}, or a function of the system is not finite there: there is no motion "
+        "to linearise. `nhjax.check_system` tells which."
+    )
+
+
+def _not_steady(drift: np.ndarray, allowed: np.ndarray) -> ValueError:
+    worst = int(np.argmax(drift / allowed))
+    return ValueError(
+        "The motion is not steady: a velocity or chosen position changes at the rate "
+        f"{float(drift[worst]):.3g} (allowed {float(allowed[worst]):.1g}). Find a "
+        "steady motion with `nhjax.steady_motion`, choose `positions` and `velocities` "
+        "that are constant, or pass `must_be_steady=False`."
+    )
 
 
 def _not_determined(independent: tuple[Indices, Indices] | None) -> ValueError:
@@ -125,6 +186,7 @@ class _Slopes(NamedTuple):
     """The derivatives of the equations with respect to perturbations x = (ξ, w)."""
 
     rates: Float[Array, "x x"]
+    drift: Float[Array, " x"]  # (v, u̇), of which the steady part must vanish
     on_velocities: Float[Array, "l x"]
     on_positions: Float[Array, "k n"]
 
@@ -143,10 +205,15 @@ def _slopes(system, t, y, args) -> _Slopes:
             ]
         )
 
+    def value_twice(x):
+        value = as_cpu_kernel(equations, x)
+        return value, value
+
     zero = jnp.zeros(2 * dim, y.p.dtype)
-    slopes = jax.jacfwd(lambda x: as_cpu_kernel(equations, x))(zero)
+    slopes, value = jax.jacfwd(value_twice, has_aux=True)(zero)
+    drift = jnp.concatenate([y.v, value[dim : 2 * dim]])
     rates, on_velocities, rest = jnp.split(slopes, [2 * dim, 2 * dim + count])
-    return _Slopes(rates, on_velocities, rest[:, :dim])
+    return _Slopes(rates, drift, on_velocities, rest[:, :dim])
 
 
 @eqx.filter_jit

@@ -85,7 +85,8 @@ def motion(
     **Returns:** a `Motion`. Its numbers are not finite where the mass matrix or the
     compatibility matrix is singular.
 
-    **Raises:** `TypeError` if `system` is no system or `y` no `State`.
+    **Raises:** `TypeError` if `system` is no system or `y` no `State`; `ShapeError` if
+    `y` is no state of this system, or many.
 
     !!! example
 
@@ -94,8 +95,9 @@ def motion(
         >>> nhjax.motion(disc.system, 0.0, disc.initial_state()).reaction.shape
         (4,)
     """
-    t = checked_time("motion", system, t, y)
-    return _motion(system, t, y, parameters(args))
+    args = parameters(args)
+    t = checked_time("motion", system, t, y, args)
+    return _motion(system, t, y, args)
 
 
 @tracked_jit("system", "args")

@@ -1,6 +1,7 @@
 """Steady motions: equilibria, and motions that are steady up to symmetries."""
 
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -8,16 +9,16 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from .._compile import as_cpu_kernel, tracked_jit
-from .._custom_types import Args, BoolScalar, FloatScalarLike
+from .._custom_types import Args, FloatScalarLike
 from .._errors import Check, NewtonError, require
-from .._numerics import iterate, max_norm, Sizes
+from .._numerics import iterate, max_norm, Sizes, Solved, unit
 from .._system import (
     AbstractMechanicalSystem,
     linearise,
     parameters,
     State,
 )
-from ._arguments import checked_time
+from ._arguments import checked_count, checked_time
 from ._perturbation import indices, perturbed
 
 
@@ -59,12 +60,15 @@ def steady_motion(
     - `held_positions`, `held_velocities`: the indices of what keeps its value in `y`.
     - `max_iterations`: the largest number of iterations.
 
-    **Returns:** a consistent `State`, differentiable with respect to `y` and `args` by
-    the implicit function theorem.
+    **Returns:** a consistent `State`, twice differentiable with respect to `y` and
+    `args` by the implicit function theorem, where the steady motion is the only one
+    with the held values, or one of a family that differs in what nothing depends on. In
+    other families its derivative is that of one more increment of Newton's method.
 
     **Raises:** `NewtonError` if there is none near to `y`; `ValueError` or `TypeError`
     if an index is wrong; `TypeError` if `system` is no system or `y` no `State`. Under
     `jit` what depends on values comes as an error of JAX with the same message.
+    `ShapeError` if `y` is no state of this system, or many.
 
     !!! example
 
@@ -75,7 +79,11 @@ def steady_motion(
         >>> [round(float(x), 6) for x in y.q]
         [0.0, 0.0, -1.0]
     """
-    t, dim = checked_time("steady_motion", system, t, y), y.p.shape[0]
+    args, max_iterations = (
+        parameters(args),
+        checked_count("max_iterations", max_iterations),
+    )
+    t, dim = checked_time("steady_motion", system, t, y, args), y.p.shape[0]
     steady = (
         indices("positions", positions, dim),
         indices("velocities", velocities, dim),
@@ -84,15 +92,15 @@ def steady_motion(
         *indices("held_positions", held_positions, dim),
         *(dim + i for i in indices("held_velocities", held_velocities, dim)),
     )
-    found, residual, solved = _steady(
-        system, t, y, parameters(args), steady, held, int(max_iterations)
+    found, residual, solved, count = _steady(
+        system, t, y, args, steady, held, max_iterations
     )
-    return require(found, Check(solved, _not_found, (max_iterations, residual, found)))
+    return require(found, Check(solved, _not_found, (count, residual, found)))
 
 
-def _not_found(max_iterations: int, residual: np.ndarray, y: State) -> NewtonError:
+def _not_found(count: np.ndarray, residual: np.ndarray, y: State) -> NewtonError:
     return NewtonError(
-        f"No steady motion was found from `y` in {max_iterations} iterations: Newton's "
+        f"No steady motion was found from `y` in {int(count)} iterations: Newton's "
         f"method stopped at q = {y.q}, v = {y.v} with the residual "
         f"{float(residual):.3g}. Start nearer to one, or leave out an index whose rate "
         "follows from others."
@@ -119,8 +127,9 @@ def _steady(system, t, y, args, steady, held, max_iterations):
         return as_cpu_kernel(residual, x)
 
     free = jnp.ones(2 * y.p.shape[0], y.p.dtype).at[jnp.asarray(held, int)].set(0)
-    size = max_norm(*jax.tree.leaves(y.q), system.fibre_coordinate(y))
-    x, left, solved = _nearest_root(in_one_program, free, size, max_iterations)
+    positions_now = y.q if system.manifold_of(y.q).is_flat else jnp.ones_like(y.p)
+    start = jnp.concatenate([positions_now, system.fibre_coordinate(y)])
+    x, left, solved = _nearest_root(in_one_program, free, start, max_iterations)
     q, u = perturbed(system, y, x)
 
     def multiplier(q, u):
@@ -132,44 +141,58 @@ def _steady(system, t, y, args, steady, held, max_iterations):
         p=system.momentum(t, q, u, args),
         multiplier=as_cpu_kernel(multiplier, q, u),
     )
-    return found, max_norm(left), solved
+    return found, max_norm(left), solved.converged, solved.num_iterations
 
 
 def _nearest_root(
     residual: Callable[[Array], Array],
     free: Float[Array, " k"],
-    size: Array,
+    start: Float[Array, " k"],
     max_iterations: int,
-) -> tuple[Float[Array, " k"], Array, BoolScalar]:
+) -> tuple[Float[Array, " k"], Array, Solved[Array, Any]]:
     """Find a root by Newton's method from zero, with the smallest increments.
 
     Only components at which `free` is one are changed. There may be fewer equations
-    than unknowns, and equations may depend on each other at the root. Returned are the
-    root, the residual there, and whether the method has converged.
+    than unknowns, and equations may depend on each other at the root. `start` are the
+    numbers to which the unknowns are increments. Returned are the root, the residual
+    there, and how the method ended.
     """
+
+    def value_twice(x):
+        value = residual(x)
+        return value, value
 
     def sweep(x):
         slopes, value = jax.jacfwd(value_twice, has_aux=True)(x)
         # Where the equations are dependent, the pseudo-inverse leaves them out.
         inverse = jnp.linalg.pinv(slopes * free[None, :])
         increment = inverse @ value
-        # How large the equations' terms are for unknowns of the given size.
-        terms = size * jnp.sum(jnp.abs(slopes), axis=1)
-        return x - increment, Sizes(max_norm(increment)), (inverse, terms)
-
-    def value_twice(x):
-        value = residual(x)
-        return value, value
+        return x - increment, Sizes(max_norm(increment)), (inverse, slopes)
 
     fixed = jax.lax.stop_gradient
-    size = fixed(size)
-    zero = jnp.zeros_like(free)
-    solved = iterate(sweep, zero, size, max_iterations=max_iterations)
-    # One more step, as a function of what the residual depends on, has the derivative
-    # that the implicit function theorem gives.
-    x, (inverse, terms) = fixed((solved.x, solved.aux))
-    left = residual(x)
+    start = fixed(start)
+    solved = iterate(
+        sweep,
+        jnp.zeros_like(free),
+        unit(max_norm(start)),
+        max_iterations=max_iterations,
+    )
+    x, (inverse, slopes) = fixed((solved.x, solved.aux))
+
+    # With the slopes frozen, each step more makes one more order of derivatives right.
+    def refined(x, _):
+        left = residual(x)
+        return x - inverse @ left, left
+
+    x, left = jax.lax.scan(refined, x, length=2)
     # Increments vanish also where all that may change has no influence.
-    eps = float(jnp.finfo(left.dtype).eps)
-    is_root = jnp.all(jnp.abs(left) <= eps**0.5 * terms)
-    return x - inverse @ left, left, solved.converged & is_root
+    # How large the terms of the equations are tells the size of what they depend on.
+    sizes = jnp.where(
+        jnp.any(slopes != 0, axis=0), jnp.abs(start) + jnp.abs(fixed(x)), 0
+    )
+    eps = float(jnp.finfo(x.dtype).eps)
+    # At rest, and at the origin, nothing does: there it is a small part of a unit.
+    sizes = jnp.maximum(jnp.max(sizes.reshape(2, -1), axis=1), eps**0.5)
+    sizes = jnp.repeat(sizes, x.size // 2)
+    is_root = jnp.all(jnp.abs(left[0]) <= eps**0.5 * (jnp.abs(slopes) @ sizes))
+    return x, left[0], solved._replace(converged=solved.converged & is_root)

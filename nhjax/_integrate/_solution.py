@@ -157,7 +157,8 @@ def _failures(
     messages, failures = _messages(), []
     for index in np.ndindex(codes.shape):
         message, coordinate = messages[int(codes[index])], int(coordinates[index])
-        if message and coordinate >= 0:
+        # Other failures are not those of single equations.
+        if "stage equations" in message and coordinate >= 0:
             message += f" The largest residual was that of coordinate {coordinate}."
         if message:
             failures.append((lane_name(index), int(steps[index]), message))

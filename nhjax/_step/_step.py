@@ -180,9 +180,10 @@ def step(
 
 
 def _worst_column(*residuals: Float[Array, "_ n"]) -> Int[Array, ""]:
-    """Find the column with the largest number; NaN counts as larger than any."""
+    """Find the column with the largest number, or -1 if none is a number."""
     sizes = jnp.max(jnp.abs(jnp.concatenate(residuals)), axis=0)
-    return jnp.argmax(sizes).astype(jnp.int32)
+    worst = jnp.argmax(sizes).astype(jnp.int32)
+    return jnp.where(jnp.any(jnp.isfinite(sizes)), worst, -1)
 
 
 def _result(

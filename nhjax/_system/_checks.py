@@ -69,51 +69,58 @@ def check_functions(
             )
 
 
-def check_state(system: AbstractMechanicalSystem, y0: State, args: Args) -> None:
-    """Raise unless the shapes and dtypes of `y0` are those of a state of `system`."""
-    parts = {name: getattr(y0, name) for name in ("p", "v", "q", "multiplier")}
+def check_state(
+    system: AbstractMechanicalSystem, y: State, args: Args, called: str = "y0"
+) -> None:
+    """Raise unless the shapes and dtypes of `y` are those of a state of `system`.
+
+    Messages call it `called`.
+    """
+    parts = {name: getattr(y, name) for name in ("p", "v", "q", "multiplier")}
     for name, x in parts.items():
         for leaf in jax.tree.leaves(x, is_leaf=lambda leaf: leaf is None):
             if not eqx.is_array(leaf):
                 raise TypeError(
-                    f"`y0.{name}` must be an array, got {reprlib.repr(leaf)} of type "
-                    f"{type(leaf).__name__}. Use `initial_state`."
+                    f"`{called}.{name}` must be an array, got {reprlib.repr(leaf)} of "
+                    f"type {type(leaf).__name__}. Use `initial_state`."
                 )
-            floating(f"y0.{name}", leaf)
-            if leaf.dtype != y0.p.dtype:
+            floating(f"{called}.{name}", leaf)
+            if leaf.dtype != y.p.dtype:
                 raise DTypeError(
-                    f"`y0.{name}` has dtype {leaf.dtype} and `y0.p` {y0.p.dtype}: all "
-                    "parts of a state must agree. Use `initial_state`."
+                    f"`{called}.{name}` has dtype {leaf.dtype} and `{called}.p` "
+                    f"{y.p.dtype}: all parts of a state must agree. Use "
+                    "`initial_state`."
                 )
-    require_manifold(system, "y0.q", y0.q)
+    require_manifold(system, f"{called}.q", y.q)
     advice = (
-        "For many trajectories use `jax.vmap` over `y0`; the last state of a solution "
-        "is `jax.tree.map(lambda x: x[-1], sol.ys)`."
+        f"For many trajectories use `jax.vmap` over `{called}`; the last state of a "
+        "solution is `jax.tree.map(lambda x: x[-1], sol.ys)`."
     )
     for name in ("q", "p") if system.manifold is None else ("p",):
         if jnp.ndim(parts[name]) != 1:
             raise ShapeError(
-                f"`y0.{name}` has shape {parts[name].shape}, but a state has shape "
-                f"(n,). {advice}"
+                f"`{called}.{name}` has shape {parts[name].shape}, but a state has "
+                f"shape (n,). {advice}"
             )
-    manifold = system.manifold_of(y0.q)
-    manifold.check(y0.q)
+    manifold = system.manifold_of(y.q)
+    manifold.check(y.q)
     for name in ("v", "p"):
         shape = parts[name].shape
         if shape != (manifold.dim,):
             raise ShapeError(
-                f"`y0.{name}` has shape {shape}, but `y0.q` needs ({manifold.dim},). "
-                "Use `initial_state`."
+                f"`{called}.{name}` has shape {shape}, but `{called}.q` needs "
+                f"({manifold.dim},). Use `initial_state`."
             )
-    t = jnp.zeros((), y0.v.dtype)
-    u = system.fibre_coordinate(y0)
-    expected = eqx.filter_eval_shape(system.constraint, t, y0.q, u, args).shape
-    if y0.multiplier.shape != expected:
+    t = jnp.zeros((), y.v.dtype)
+    u = system.fibre_coordinate(y)
+    expected = eqx.filter_eval_shape(system.constraint, t, y.q, u, args).shape
+    if y.multiplier.shape != expected:
         raise ShapeError(
-            f"`y0.multiplier` has shape {y0.multiplier.shape}, but the constraints of "
-            f"the system have shape {expected}. Use `initial_state` with this system."
+            f"`{called}.multiplier` has shape {y.multiplier.shape}, but the "
+            f"constraints of the system have shape {expected}. Use `initial_state` "
+            "with this system."
         )
     for name, x in parts.items():
         # The integration itself reports traced parts that are not finite, lane by lane.
         if not is_traced(*jax.tree.leaves(x)):
-            require(x, finite(f"y0.{name}", x))
+            require(x, finite(f"{called}.{name}", x))

@@ -62,6 +62,12 @@ def require_not_negative(**parameters: Array) -> None:
             raise ValueError(f"`{name}` must not be negative, got {value}.")
 
 
+def require_possible(possible: Array, message: str) -> None:
+    """Raise with the message if a motion is not possible, unless it is being traced."""
+    if not is_traced(possible) and not np.all(np.asarray(possible)):
+        raise ValueError(message)
+
+
 def require_shape(shape: tuple[int, ...], **parameters: Array) -> None:
     """Raise for a parameter whose shape is not `shape`."""
     for name, value in parameters.items():

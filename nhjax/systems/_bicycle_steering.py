@@ -10,6 +10,8 @@ from ._base import parameter
 class SteerTorque(eqx.Module):
     """The torque of a rider on the handlebar: `args`, in N m, positive to the right.
 
+    Without `args` there is none.
+
     !!! example
 
         >>> from nhjax.systems import SteerTorque, WhippleBicycle
@@ -21,8 +23,8 @@ class SteerTorque(eqx.Module):
     def __call__(
         self, t: FloatScalarLike, q: Array, v: Array, args: Args
     ) -> FloatScalarLike:
-        """Return the torque, which is `args`."""
-        return args
+        """Return the torque, which is `args`, or zero where that is None."""
+        return 0.0 if args is None else args
 
 
 class LeanToSteer(eqx.Module):

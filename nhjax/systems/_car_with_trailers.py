@@ -14,8 +14,10 @@ from ._base import (
     coordinates,
     parameter,
     require_positive,
+    require_possible,
     require_shape,
 )
+from ._planar import direction
 
 
 class CarWithTrailers(AbstractNonholonomicExample):
@@ -121,6 +123,11 @@ class CarWithTrailers(AbstractNonholonomicExample):
             # share · sin - hitch · curvature · cos = length · curvature.
             swing = hitch * curvature
             sine = length * curvature / jnp.hypot(share, swing)
+            require_possible(
+                jnp.abs(sine) < 1,
+                f"`steer` = {steer} is too sharp: a trailer of length {length} cannot "
+                "follow the car on so narrow a circle.",
+            )
             angle = jnp.arctan2(swing, share) + jnp.arcsin(sine)
             share = share * jnp.cos(angle) + swing * jnp.sin(angle)
             headings.append(headings[-1] - angle)
@@ -185,7 +192,7 @@ class CarWithTrailers(AbstractNonholonomicExample):
         if args is None:
             return force
         drive, torque = args
-        return force.at[:2].set(drive * _along(q[2])).at[3].set(torque)
+        return force.at[:2].set(drive * direction(q[2])).at[3].set(torque)
 
     def invariants(self, t: FloatScalarLike, q: Array, v: Array) -> dict[str, Array]:
         """Compute the energy and the momentum of the front wheels, J (θ̇₀ + δ̇).
@@ -204,16 +211,16 @@ class CarWithTrailers(AbstractNonholonomicExample):
         points = {"rear_axle": rear, "front_axle": front, "centre": centre}
         for i, (length, _) in enumerate(_hitches(self, q.dtype)):
             points[f"axle_{i + 1}"], points[f"centre_{i + 1}"] = axles[i], centres[i]
-            points[f"hitch_{i + 1}"] = axles[i] + length * _along(q[4 + i])
+            points[f"hitch_{i + 1}"] = axles[i] + length * direction(q[4 + i])
         return points
 
 
 def _axles(car: CarWithTrailers, q: Array) -> list[Float[Array, "2"]]:
     """Compute the rear and the front axle of the car and those of the trailers."""
-    axle, along = q[:2], _along(q[2])
+    axle, along = q[:2], direction(q[2])
     axles = [axle, axle + car.wheelbase * along]
     for i, (length, hitch) in enumerate(_hitches(car, q.dtype)):
-        behind = _along(q[4 + i])
+        behind = direction(q[4 + i])
         axle = axle - hitch * along - length * behind
         axles.append(axle)
         along = behind
@@ -225,7 +232,7 @@ def _centres(car: CarWithTrailers, q: Array) -> list[Float[Array, "2"]]:
     rear, _, *axles = _axles(car, q)
     ahead = [car.centre, *_of_trailers(car, "trailer_centre", q.dtype)]
     each = zip([rear, *axles], ahead, [q[2], *q[4:]], strict=True)
-    return [axle + distance * _along(heading) for axle, distance, heading in each]
+    return [axle + distance * direction(heading) for axle, distance, heading in each]
 
 
 def _hitches(car: CarWithTrailers, dtype: DTypeLike) -> list[tuple[Array, Array]]:
@@ -243,7 +250,3 @@ def _of_trailers(car: CarWithTrailers, name: str, dtype: DTypeLike) -> list[Arra
         return [value] * car.num_trailers
     require_shape((car.num_trailers,), **{name: value})
     return list(value)
-
-
-def _along(heading: Float[Array, ""]) -> Float[Array, "2"]:
-    return jnp.stack([jnp.cos(heading), jnp.sin(heading)])

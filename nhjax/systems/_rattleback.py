@@ -4,6 +4,7 @@ from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
 from .._custom_types import Args, FloatScalarLike
@@ -89,6 +90,12 @@ class Rattleback(AbstractRollingBody):
             raise ValueError(
                 "`product` must be smaller than the geometric mean of its `moments`, "
                 f"√(J₁₁ J₂₂), got {self.product}."
+            )
+        principal = np.linalg.eigvalsh(np.asarray(self.inertia))
+        if principal[2] > principal[0] + principal[1]:
+            raise ValueError(
+                "No body has `moments` and `product` of inertia of which the largest "
+                f"principal one exceeds the sum of the others, got {principal}."
             )
 
     @classmethod

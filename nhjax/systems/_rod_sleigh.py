@@ -17,6 +17,7 @@ from ._base import (
     require_consistent,
     require_positive,
 )
+from ._planar import direction
 from ._sleigh import ChaplyginSleigh
 
 
@@ -83,12 +84,12 @@ class RodSleigh(AbstractNonholonomicExample):
 
         `position` is that of the blade, `rod` the direction of the rod.
         """
-        length, direction = parameter(length), parameter(rod)
-        heading = direction + parameter(angle)
+        length, rod_angle = parameter(length), parameter(rod)
+        heading = rod_angle + parameter(angle)
         first = coordinates(position)
-        along = length * _unit(direction)
-        across = length * _unit(direction + 0.5 * math.pi)
-        slide = parameter(speed) * _unit(heading)
+        along = length * direction(rod_angle)
+        across = length * direction(rod_angle + 0.5 * math.pi)
+        slide = parameter(speed) * direction(heading)
         return cls(
             mass1,
             mass2,
@@ -167,7 +168,7 @@ class RodSleigh(AbstractNonholonomicExample):
         rod, swing = self.q0[2:] - self.q0[:2], self.v0[2:] - self.v0[:2]
         heading = jnp.arctan2(rod[1], rod[0]) + self.angle
         turn_rate = (rod[0] * swing[1] - rod[1] * swing[0]) / self.length**2
-        along, normal = _unit(heading), _unit(heading + 0.5 * math.pi)
+        along, normal = direction(heading), direction(heading + 0.5 * math.pi)
         mass, shift = self.mass1 + self.mass2, self._shift()
         speed = self.v0[:2] @ along - shift * turn_rate
         return ChaplyginSleigh(
@@ -182,7 +183,3 @@ class RodSleigh(AbstractNonholonomicExample):
         """Compute how far the centre of mass lies to the side of the blade, along n."""
         offset = self.mass2 / (self.mass1 + self.mass2) * self.length
         return -offset * jnp.sin(self.angle)
-
-
-def _unit(angle: Array) -> Array:
-    return jnp.stack([jnp.cos(angle), jnp.sin(angle)])

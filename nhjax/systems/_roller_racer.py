@@ -9,12 +9,13 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
 from .._custom_types import Args, FloatScalarLike
-from .._errors import is_traced
 from .._system import LagrangianSystem
 from ._base import (
     AbstractNonholonomicExample,
     coordinates,
+    require_not_negative,
     require_positive,
+    require_possible,
     require_shape,
 )
 from ._gait import Sinusoid
@@ -67,8 +68,7 @@ class RollerRacer(AbstractNonholonomicExample):
         require_shape((2,), **pairs, distances=self.distances)
         require_shape((4,), q0=self.q0, v0=self.v0)
         require_positive(masses=self.masses[:1], inertias=self.inertias)
-        if not is_traced(self.masses) and self.masses[1] < 0:
-            raise ValueError(f"`masses` must not be negative, got {self.masses}.")
+        require_not_negative(masses=self.masses)
 
     @classmethod
     def rolling(
@@ -88,7 +88,13 @@ class RollerRacer(AbstractNonholonomicExample):
         phi, dphi = (jnp.asarray(x, behind.dtype) for x in (angle, angle_rate))
         velocity = jnp.asarray(speed, behind.dtype)
         turning = velocity * jnp.sin(phi) - ahead * dphi
-        turning = turning / (behind * jnp.cos(phi) + ahead)
+        lever = behind * jnp.cos(phi) + ahead
+        require_possible(
+            jnp.abs(lever) > 1e-8 * (behind + ahead),
+            f"`angle` = {phi} makes both axles meet in a point, about which the racer "
+            "can turn at any rate: nothing determines its turning.",
+        )
+        turning = turning / lever
         zero = jnp.zeros_like(phi)
         q0 = jnp.stack([zero, zero, zero, phi])
         v0 = jnp.stack([velocity, zero, turning, dphi])

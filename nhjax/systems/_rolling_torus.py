@@ -9,7 +9,13 @@ from jaxtyping import Array, ArrayLike, Float
 from .._custom_types import FloatScalarLike
 from .._errors import is_traced
 from .._manifold import AbstractRetraction, Cayley, SO3
-from ._base import coordinates, parameter, require_not_negative, require_positive
+from ._base import (
+    coordinates,
+    parameter,
+    require_not_negative,
+    require_positive,
+    require_possible,
+)
 from ._rolling_body import AbstractRollingBody
 
 
@@ -122,6 +128,11 @@ class RollingTorus(AbstractRollingBody):
         momentum = body.diametral_inertia * cos + body.axial_inertia * roll
         moment = body.weight * body.radius * cos
         rate = jnp.sqrt(moment / (body.mass * path * height + sin * momentum))
+        require_possible(
+            jnp.isfinite(rate),
+            f"There is no steady motion with `tilt` = {angle} and `radius_of_path` = "
+            f"{path} of this torus: the square of its rate would not be positive.",
+        )
         return cls.steady(angle, rate, **parameters)
 
     @property

@@ -15,6 +15,7 @@ from ._base import (
     coordinates,
     parameter,
     require_positive,
+    require_possible,
     require_shape,
 )
 from ._gait import Sinusoid
@@ -95,6 +96,11 @@ class Snakeboard(AbstractNonholonomicExample):
         """
         merged: dict[str, Any] = {"gait": None} | parameters
         board, angles = cls(**merged), coordinates(joints)
+        require_possible(
+            jnp.abs(jnp.cos(angles[1:])) > 1e-8,
+            f"`joints` = {angles} set an axle along the board, with which it cannot "
+            "move ahead.",
+        )
         rear, front = jnp.tan(angles[1]), jnp.tan(angles[2])
         ahead = jnp.asarray(speed, angles.dtype)
         turning = ahead * (front - rear) / (2 * board.half_length)

@@ -16,8 +16,10 @@ from ._base import (
     coordinates,
     parameter,
     require_positive,
+    require_possible,
     require_shape,
 )
+from ._bicycle_start import rolling_start
 from ._frames import (
     about_axis,
     about_x,
@@ -132,7 +134,13 @@ class WhippleBicycle(AbstractNonholonomicExample):
         Pitch and all other rates follow from the constraints.
         """
         given = (lean, steer, lean_rate, steer_rate, speed)
-        q0, v0 = _rolling(cls(**parameters), *(parameter(x) for x in given))
+        bicycle = cls(**parameters)
+        q0, v0, touches = rolling_start(bicycle, *(parameter(x) for x in given))
+        require_possible(
+            touches,
+            "No pitch was found at which both wheels touch the ground with `lean` = "
+            f"{lean} and `steer` = {steer}.",
+        )
         parameters.update(q0=q0, v0=v0)
         return cls(**parameters)
 
@@ -260,39 +268,3 @@ def _frames(bicycle: WhippleBicycle, q: Array) -> tuple[Frame, Frame]:
 def _in_plane(q: Array, x: Array, z: Array) -> Float[Array, "3"]:
     """Return (x, 0, z), a point of the plane in which the upright bicycle lies."""
     return jnp.stack([x, jnp.zeros_like(x), z]).astype(q.dtype)
-
-
-@eqx.filter_jit
-def _rolling(
-    bicycle: WhippleBicycle,
-    lean: Array,
-    steer: Array,
-    lean_rate: Array,
-    steer_rate: Array,
-    speed: Array,
-) -> tuple[Array, Array]:
-    """Compute (q0, v0): the pitch by Newton's method, the other rates linearly."""
-
-    def at(pitch):
-        angles = jnp.stack([lean, pitch, steer])
-        return jnp.concatenate([jnp.zeros(3), angles, jnp.zeros(2)])
-
-    def depth(pitch):
-        return bicycle.holonomic(0.0, at(pitch), None)[0]
-
-    def improve(_, pitch):
-        value, slope = jax.jvp(depth, (pitch,), (jnp.ones_like(pitch),))
-        return pitch - value / slope
-
-    q0 = at(jax.lax.fori_loop(0, 12, improve, jnp.zeros_like(lean)))
-
-    def slip(v):
-        _, sinking = jax.jvp(lambda q: bicycle.holonomic(0.0, q, None), (q0,), (v,))
-        return jnp.concatenate([bicycle.constraint(0.0, q0, v, None), sinking])
-
-    roll_rate = -speed / bicycle.rear_radius
-    given = jnp.stack([lean_rate, steer_rate, roll_rate])
-    free, bound = jnp.asarray([3, 5, 6]), jnp.asarray([0, 1, 2, 4, 7])
-    v0 = jnp.zeros(8).at[free].set(given)
-    slopes = jax.jacfwd(slip)(v0)
-    return q0, v0.at[bound].set(jnp.linalg.solve(slopes[:, bound], -slip(v0)))

@@ -1,5 +1,6 @@
 """The report on a system, for systems whose properties are known."""
 
+import jax
 import jax.numpy as jnp
 import pytest
 
@@ -100,3 +101,21 @@ def test_wrong_arguments_are_named():
         nhjax.check_system(disc.system, disc.q0, jnp.ones(3))
     with pytest.raises(TypeError, match="`system` must be"):
         nhjax.check_system(disc, disc.q0, disc.v0)  # pyright: ignore[reportArgumentType]
+
+
+def test_what_is_not_finite_and_wrong_shapes_are_told():
+    def hidden(t, q, v, args):
+        return jnp.stack([v[0] - 1, v[1] + 0 * jnp.sqrt(q[0] - 5)])
+
+    system = nhjax.LagrangianSystem(
+        lambda t, q, v, args: 0.5 * (v @ v), nonholonomic=hidden
+    )
+    report = nhjax.check_system(system, jnp.zeros(2), jnp.zeros(2))
+    assert "largest violation              Φ[1] = nan" in str(report)
+    with pytest.raises(nhjax.NonFiniteError, match="`q` is not finite"):
+        nhjax.check_system(system, jnp.full(2, jnp.nan), jnp.zeros(2))
+    vector = nhjax.LagrangianSystem(lambda t, q, v, args: v)
+    with pytest.raises(nhjax.ShapeError, match="must return shape"):
+        nhjax.check_system(vector, jnp.zeros(2), jnp.zeros(2))
+    with pytest.raises(TypeError, match=r"outside of `jax\.jit`"):
+        jax.jit(lambda q: nhjax.check_system(system, q, q).dimension)(jnp.zeros(2))

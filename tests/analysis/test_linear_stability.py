@@ -6,7 +6,12 @@ import numpy as np
 import pytest
 
 import nhjax
-from nhjax.systems import ChaplyginSleigh, FreeRigidBody, SphericalPendulum
+from nhjax.systems import (
+    ChaplyginSleigh,
+    FreeRigidBody,
+    RollingTorus,
+    SphericalPendulum,
+)
 from oracles.polar_pendulum import GRAVITY, polar_pendulum
 
 
@@ -136,3 +141,43 @@ def test_indices_are_integers():
             positions=(0.5,),  # pyright: ignore[reportArgumentType]
             velocities=(0, 1),
         )
+
+
+def test_a_motion_that_is_not_steady_is_refused():
+    pendulum = SphericalPendulum()
+    y = pendulum.initial_state()
+    with pytest.raises(ValueError, match=r"not steady: .* changes at the rate"):
+        nhjax.linear_stability(pendulum.system, 0.0, y)
+    instant = nhjax.linear_stability(pendulum.system, 0.0, y, must_be_steady=False)
+    assert np.all(np.isfinite(instant.matrix))
+    # Its body axes turn against the motion, which is steady in space.
+    torus = RollingTorus.steady(1.0, 2.0, tube_radius=0.1)
+    with pytest.raises(ValueError, match="not steady"):
+        nhjax.linear_stability(torus.system, 0.0, torus.initial_state())
+
+
+def test_a_system_without_motion_is_refused():
+    def half(t, q, v, args):
+        return 0.5 * v[0] ** 2 - q @ q
+
+    system = nhjax.LagrangianSystem(half)
+    y = nhjax.State(jnp.zeros(2), jnp.zeros(2), jnp.zeros(2), jnp.zeros(0))
+    with pytest.raises(nhjax.IrregularLagrangianError, match="singular at"):
+        nhjax.linear_stability(system, 0.0, y)
+
+
+def test_stability_in_single_precision_and_of_many_states():
+    def frequencies(gravity):
+        pendulum = SphericalPendulum(
+            gravity=gravity, q0=(0.0, 0.0, -1.0), v0=(0.0, 0.0, 0.0)
+        )
+        y = pendulum.initial_state(gravity.dtype)
+        matrix = nhjax.linear_stability(pendulum.system, 0.0, y).matrix
+        return jnp.trace(matrix @ matrix)
+
+    gravities = jnp.asarray([1.0, 2.0, 5.0])
+    many = jax.jit(jax.vmap(frequencies))(gravities)
+    np.testing.assert_allclose(many, -4 * gravities, rtol=1e-13)
+    single = frequencies(jnp.asarray(2.0, jnp.float32))
+    assert single.dtype == jnp.float32
+    np.testing.assert_allclose(single, -8.0, rtol=1e-5)

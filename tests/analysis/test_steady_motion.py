@@ -121,3 +121,79 @@ def test_wrong_arguments_are_named():
         )
     with pytest.raises(TypeError, match=r"`y` must be an nhjax\.State"):
         nhjax.steady_motion(system, 0.0, y.q, positions=(0,), velocities=(0,))  # pyright: ignore[reportArgumentType]
+
+
+def force_of(q, args):
+    return jnp.stack([args - q[0] ** 3, -q[1]])
+
+
+FORCED = nhjax.LagrangianSystem(
+    lambda t, q, v, args: 0.5 * (v @ v), force=lambda t, q, v, args: force_of(q, args)
+)
+
+
+def test_derivatives_of_second_order():
+    def root(x):
+        y = nhjax.initial_state(FORCED, jnp.ones(2), jnp.zeros(2), args=x)
+        found = nhjax.steady_motion(
+            FORCED, 0.0, y, x, positions=(0, 1), velocities=(0, 1)
+        )
+        return found.q[0]
+
+    x = jnp.asarray(2.0)
+    np.testing.assert_allclose(root(x), np.cbrt(2.0), rtol=1e-14)
+    slope = np.cbrt(2.0) / 6
+    np.testing.assert_allclose(jax.grad(root)(x), slope, rtol=1e-13)
+    second = -np.cbrt(2.0) / 18
+    np.testing.assert_allclose(jax.hessian(root)(x), second, rtol=1e-12)
+    many = jax.jit(jax.vmap(root))(jnp.asarray([1.0, 2.0, 8.0]))
+    np.testing.assert_allclose(many, [1.0, np.cbrt(2.0), 2.0], rtol=1e-13)
+
+
+def test_a_search_may_start_at_rest_at_the_origin():
+    def lagrangian(t, q, v, args):
+        return 0.5 * (v @ v) - 1.5 * (q @ q) - 9.81 * q[0] - 0.1 * q[0] ** 4
+
+    system = nhjax.LagrangianSystem(lagrangian)
+    for dtype, tolerance in ((jnp.float64, 1e-13), (jnp.float32, 1e-5)):
+        zero = jnp.zeros(2, dtype)
+        y = nhjax.initial_state(system, zero, zero)
+        found = nhjax.steady_motion(system, 0.0, y, positions=(0, 1), velocities=(0, 1))
+        assert found.q.dtype == dtype
+        force = jax.grad(lagrangian, argnums=1)(0.0, found.q, zero, None)
+        np.testing.assert_allclose(force, 0, rtol=0, atol=10 * tolerance)
+
+
+def test_forces_that_contradict_each_other_have_no_equilibrium():
+    # A place on which nothing depends says nothing of how small a force must be.
+    system = nhjax.LagrangianSystem(
+        lambda t, q, v, args: 0.5 * (v @ v),
+        force=lambda t, q, v, args: jnp.stack([1.0 - q[0], 1.05 - q[0], 0 * q[0]]),
+    )
+    y = nhjax.initial_state(
+        system,
+        jnp.asarray([1.0, 0.0, 100.0], jnp.float32),
+        jnp.zeros(3, jnp.float32),
+    )
+    with pytest.raises(nhjax.NewtonError, match=r"residual 0\.025"):
+        nhjax.steady_motion(system, 0.0, y, positions=(0, 1), velocities=(0, 1))
+
+
+@pytest.mark.parametrize("count", [0, 2.7, "x", True])
+def test_the_number_of_iterations_is_checked(count):
+    system = polar_pendulum()["lagrangian"]
+    y = nhjax.initial_state(system, jnp.asarray([0.5, 0.0]), jnp.asarray([0.0, 1.0]))
+    with pytest.raises(ValueError, match="`max_iterations` must be an int >= 1"):
+        nhjax.steady_motion(
+            system, 0.0, y, positions=(0,), velocities=(0,), max_iterations=count
+        )
+
+
+def test_a_state_of_another_system_is_refused():
+    pendulum = SphericalPendulum().initial_state()
+    many = jax.tree.map(lambda x: x[None], pendulum)
+    system = polar_pendulum()["lagrangian"]
+    with pytest.raises(nhjax.ShapeError, match=r"`y\.multiplier` has shape \(1,\)"):
+        nhjax.motion(system, 0.0, pendulum)
+    with pytest.raises(nhjax.ShapeError, match=r"use `jax\.vmap` over `y`"):
+        nhjax.linear_stability(SphericalPendulum().system, 0.0, many)

@@ -241,7 +241,8 @@ def accelerations_and_a_report():
 @feature
 def a_steady_motion_and_its_stability():
     pendulum = systems.SphericalPendulum.swinging(0.3, gravity=4.0)
-    y0, hanging = pendulum.initial_state(), {"positions": (0, 1), "velocities": (0, 1)}
+    y0 = pendulum.initial_state()
+    hanging: dict[str, Any] = {"positions": (0, 1), "velocities": (0, 1)}
     y = nhjax.steady_motion(pendulum.system, 0.0, y0, **hanging)
     for chosen in ({}, hanging):
         stability = nhjax.linear_stability(pendulum.system, 0.0, y, **chosen)

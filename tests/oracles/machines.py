@@ -38,7 +38,7 @@ def _integrate(system, method, y0, dts, num_steps, args) -> Any:
             dt=dt,
             num_steps=num_steps,
             args=args,
-            throw=False,  # An error names no lane.
+            throw=False,  # The assertion below tells.
             saveat=nhjax.SaveAt(steps=True),
         )
 
