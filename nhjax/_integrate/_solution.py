@@ -34,7 +34,8 @@ class Solution(eqx.Module):
         multiplier of a step from the continuous multiplier),
         `failed_step` (the index of the step that failed, -1 if none did), and
         `worst_coordinate` (the index of the coordinate whose momentum equations had
-        the largest residual in the step that failed, -1 if none failed).
+        the largest residual in the step that failed, or one that is not a number; -1
+        if none failed).
     - `result`: a member of `nhjax.RESULTS`, which says how the run ended.
     - `interpolation`: the collocation polynomials, with `SaveAt(dense=True)`; None
         without.
@@ -159,7 +160,10 @@ def _failures(
         message, coordinate = messages[int(codes[index])], int(coordinates[index])
         # Other failures are not those of single equations.
         if "stage equations" in message and coordinate >= 0:
-            message += f" The largest residual was that of coordinate {coordinate}."
+            message += (
+                " The largest residual, or one that is not a number, was that of "
+                f"coordinate {coordinate}."
+            )
         if message:
             failures.append((lane_name(index), int(steps[index]), message))
     return failures

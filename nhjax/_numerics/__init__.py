@@ -25,7 +25,12 @@ from ._iteration import (
     Sizes as Sizes,
     Solved as Solved,
 )
-from ._max_norm import max_norm as max_norm, relative as relative, unit as unit
+from ._max_norm import (
+    largest_column as largest_column,
+    max_norm as max_norm,
+    relative as relative,
+    unit as unit,
+)
 from ._rank import (
     conditioning as conditioning,
     dependent_rows as dependent_rows,

@@ -4,7 +4,7 @@ from functools import reduce
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array
+from jaxtyping import Array, Float, Int
 
 from .._custom_types import FloatScalar, FloatScalarLike
 
@@ -19,15 +19,35 @@ def max_norm(*arrays: Array) -> FloatScalar:
     on the stages.
     """
     dtype = jnp.result_type(*arrays)
-    bits = {2: jnp.int16, 4: jnp.int32, 8: jnp.int64}[dtype.itemsize]
+    largest = [jnp.max(_pattern(x.astype(dtype)), initial=0) for x in arrays]
+    return jax.lax.bitcast_convert_type(reduce(jnp.maximum, largest), dtype)
 
-    def pattern(x):
-        pattern = jax.lax.bitcast_convert_type(jnp.abs(x.astype(dtype)), bits)
-        return jnp.max(pattern, initial=0)
 
-    return jax.lax.bitcast_convert_type(
-        reduce(jnp.maximum, map(pattern, arrays)), dtype
-    )
+def _pattern(x: Array) -> Array:
+    bits = {2: jnp.int16, 4: jnp.int32, 8: jnp.int64}[x.dtype.itemsize]
+    return jax.lax.bitcast_convert_type(jnp.abs(x), bits)
+
+
+def largest_column(*arrays: Float[Array, "_ n"]) -> tuple[FloatScalar, Int[Array, ""]]:
+    """Compute max |x| over matrices of n columns, and the column in which it is.
+
+    The last bits of each pattern are replaced by the number of its column, so that one
+    maximum finds both; the value is rounded down by as many bits. A search for the
+    column after the maximum took a tenth of the time of a step. Of numbers some of
+    which are NaN, the column is that of a NaN.
+    """
+    columns = arrays[0].shape[1]
+    mask = (1 << max(columns - 1, 0).bit_length()) - 1
+
+    def marked(x):
+        pattern = _pattern(x)
+        numbers = jnp.arange(columns, dtype=pattern.dtype)[None]
+        return jnp.max((pattern & ~mask) | numbers, initial=0)
+
+    largest = reduce(jnp.maximum, map(marked, arrays))
+    value = jax.lax.bitcast_convert_type(largest & ~mask, arrays[0].dtype)
+    column = (largest & mask).astype(jnp.int32)
+    return value, column
 
 
 def unit(scale: FloatScalarLike) -> FloatScalar:

@@ -12,6 +12,7 @@ from .._method import AbstractMethod
 from .._numerics import (
     frozen,
     has_tangent,
+    largest_column,
     max_norm,
     relative,
     small_einsum,
@@ -163,7 +164,7 @@ def step(
     end = end_state(stages, q, u, p, forces.multiplier[-1], lambda: lin_next.multiplier)
     next_state = StepState(end, q_compensation, p_compensation, lin_next)
 
-    residual = max_norm(forces.residual, solved.aux.node_residual)
+    residual, worst = largest_column(forces.residual, solved.aux.node_residual)
     scale = max_norm(forces.momentum) + max_norm(h * forces.force)
     return StepOutcome(
         step_state=next_state,
@@ -172,18 +173,11 @@ def step(
         result=_result(solved, lin, next_state, in_chart(stages, x)),
         num_iterations=solved.num_iterations,
         residual=relative(residual, scale),
-        worst_coordinate=_worst_column(forces.residual, solved.aux.node_residual),
+        worst_coordinate=worst,
         constraint_violation=largest_violation(system, t + h, next_state, args),
         multiplier_defect=max_norm(forces.multiplier[-1] - lin_next.multiplier),
         newton=solved.aux.newton,
     )
-
-
-def _worst_column(*residuals: Float[Array, "_ n"]) -> Int[Array, ""]:
-    """Find the column with the largest number, or -1 if none is a number."""
-    sizes = jnp.max(jnp.abs(jnp.concatenate(residuals)), axis=0)
-    worst = jnp.argmax(sizes).astype(jnp.int32)
-    return jnp.where(jnp.any(jnp.isfinite(sizes)), worst, -1)
 
 
 def _result(
