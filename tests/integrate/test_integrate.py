@@ -76,9 +76,11 @@ def test_stats():
         "max_constraint_violation",
         "max_multiplier_defect",
         "failed_step",
+        "worst_coordinate",
     }
     assert int(stats["num_steps"]) == STEPS
     assert int(stats["failed_step"]) == -1
+    assert int(stats["worst_coordinate"]) == -1
     assert 2 * STEPS <= int(stats["num_iterations"]) <= 20 * STEPS
     assert 0 < float(stats["max_residual"]) < 1e-14
     system = PARTICLE.system
