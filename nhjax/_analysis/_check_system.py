@@ -12,8 +12,9 @@ from .._compile import tracked_jit
 from .._custom_types import Args, FloatScalarLike
 from .._errors import is_traced, require
 from .._initial import checked_inputs
-from .._numerics import conditioning, dependent_rows, inverse, max_norm
+from .._numerics import conditioning, dependent_rows, inverse, is_deficient, max_norm
 from .._system import AbstractMechanicalSystem, check_functions, finite, parameters
+from ._motion import in_velocities
 
 
 # Derivatives that vanish at this many states near the given one vanish near it.
@@ -148,8 +149,7 @@ def check_system(
     values = [*found["constraints"], *found["positions"]]
     changes = {key: _changes(found[key]) for key in (_MASS, _JACOBIAN)}
     # Rows that are not finite show in the condition number of C.
-    deficient = found["rank"] <= 10 * u.size * np.finfo(u.dtype).eps
-    rows = dependent_rows(found["jacobian"]) if deficient else []
+    rows = dependent_rows(found["jacobian"]) if found["deficient"] else []
     moving = np.any(_changes(found["of positions"]), axis=0)
     return SystemReport(
         dimension=u.size,
@@ -189,7 +189,6 @@ def _condition(reciprocal: np.ndarray) -> float:
 @tracked_jit("system", "args")
 def _measured(system, t, q, u, args) -> dict[str, Any]:
     manifold, fibre = system.manifold_of(q), system.fibre_coordinate_name
-    zero = jnp.zeros_like(u)
 
     def metric(t, xi, u):
         return system.metric(t, manifold.act(q, xi), u, args)
@@ -228,21 +227,16 @@ def _measured(system, t, q, u, args) -> dict[str, Any]:
     shape = (_SAMPLES, u.shape[0])
     xi, w = (_SPREAD * jax.random.normal(key, shape, u.dtype) for key in keys)
     by_time, by_position, second = jax.vmap(sample)(xi, w * size[None])
-    mass = metric(t, zero, u)
-    inverse_mass = inverse(mass)
     rows = jax.jacfwd(system.constraint, argnums=2)(t, q, u, args)
-    if fibre == "p":
-        # The metric is D2D2H, whose inverse is ∂p/∂v.
-        mass, inverse_mass = inverse_mass, mass
-        rows = rows @ mass
-    compatibility = rows @ inverse_mass @ rows.T
+    mass, rows = in_velocities(system, metric(t, jnp.zeros_like(u), u), rows)
+    compatibility = rows @ inverse(mass) @ rows.T
     return {
         "constraints": system.constraint(t, q, u, args),
         "positions": system.position_constraint(t, q, args),
         "regularity": conditioning(mass),
         "compatibility": conditioning(compatibility),
         "jacobian": rows,
-        "rank": conditioning(rows),
+        "deficient": is_deficient(rows),
         "of time": by_time,
         "of positions": by_position,
         **second,

@@ -17,7 +17,7 @@ from .._errors import (
     IrregularLagrangianError,
     require,
 )
-from .._numerics import conditioning, max_norm, unit
+from .._numerics import jacobian_and_value, max_norm, unit
 from .._system import (
     AbstractMechanicalSystem,
     check_flag,
@@ -25,6 +25,7 @@ from .._system import (
     State,
 )
 from ._arguments import checked_time
+from ._permitted import independent_basis, orthonormal_basis
 from ._perturbation import check_independent, Indices, perturbed, rates_of_change
 
 
@@ -119,20 +120,19 @@ def linear_stability(
     independent = check_independent(system, t, y, args, positions, velocities)
     must_be_steady = check_flag("must_be_steady", must_be_steady)
     slopes = _slopes(system, t, y, args)
-    found, determined = _reduced(slopes, independent)
+    reduced = _reduced(slopes, y, independent)
     checks = [
-        Check(jnp.all(jnp.isfinite(slopes.rates)), _singular, (y.q,)),
-        Check(determined, _not_determined, (independent,)),
+        Check(reduced.has_motion, _singular, (y.q,)),
+        Check(reduced.determined, _not_determined, (independent,)),
     ]
     if must_be_steady:
-        size = max_norm(*jax.tree.leaves(y.q), y.v, y.p)
-        drift, allowed = _drift(slopes, size, independent)
-        checks.append(Check(jnp.all(drift <= allowed), _not_steady, (drift, allowed)))
-    return require(found, *checks)
+        drift = reduced.drift, reduced.allowed
+        checks.append(Check(reduced.is_steady, _not_steady, drift))
+    return require(reduced.found, *checks)
 
 
 def _drift(
-    slopes: "_Slopes", size: Array, independent: tuple[Indices, Indices] | None
+    slopes: "_Slopes", y: State, independent: tuple[Indices, Indices] | None
 ) -> tuple[Array, Array]:
     """Find how fast what must be constant changes, and how fast it may.
 
@@ -145,7 +145,8 @@ def _drift(
     else:
         positions, velocities = independent
         chosen = jnp.asarray((*positions, *(dim + i for i in velocities)), int)
-    terms = jnp.sum(jnp.abs(slopes.rates), axis=1) * unit(size)
+    size = unit(max_norm(*jax.tree.leaves(y.q), y.v, y.p))
+    terms = jnp.sum(jnp.abs(slopes.rates), axis=1) * size
     small = float(jnp.finfo(drift.dtype).eps) ** 0.25
     return drift[chosen], small * (1 + terms[chosen])
 
@@ -205,90 +206,45 @@ def _slopes(system, t, y, args) -> _Slopes:
             ]
         )
 
-    def value_twice(x):
-        value = as_cpu_kernel(equations, x)
-        return value, value
-
-    zero = jnp.zeros(2 * dim, y.p.dtype)
-    slopes, value = jax.jacfwd(value_twice, has_aux=True)(zero)
+    slopes, value, _ = jacobian_and_value(
+        lambda x: (as_cpu_kernel(equations, x), None), jnp.zeros(2 * dim, y.p.dtype)
+    )
     drift = jnp.concatenate([y.v, value[dim : 2 * dim]])
     rates, on_velocities, rest = jnp.split(slopes, [2 * dim, 2 * dim + count])
     return _Slopes(rates, drift, on_velocities, rest[:, :dim])
 
 
+class _Reduced(NamedTuple):
+    """The linear equations, and what tells whether they mean anything."""
+
+    found: LinearStability
+    has_motion: BoolScalar
+    determined: BoolScalar
+    is_steady: BoolScalar
+    drift: Array
+    allowed: Array
+
+
 @eqx.filter_jit
 def _reduced(
-    slopes: _Slopes, independent: tuple[Indices, Indices] | None
-) -> tuple[LinearStability, BoolScalar]:
+    slopes: _Slopes, y: State, independent: tuple[Indices, Indices] | None
+) -> _Reduced:
     """Restrict the linear equations to the perturbations that are permitted."""
     if independent is None:
         dim = slopes.on_positions.shape[1]
         rows = jnp.pad(slopes.on_positions, ((0, 0), (0, dim)))
-        found = _orthonormal(jnp.concatenate([slopes.on_velocities, rows]))
+        found = orthonormal_basis(jnp.concatenate([slopes.on_velocities, rows]))
     else:
-        found = _independent(slopes.on_velocities, slopes.on_positions, *independent)
+        found = independent_basis(
+            slopes.on_velocities, slopes.on_positions, *independent
+        )
     matrix = found.left @ slopes.rates @ found.basis
-    return LinearStability(matrix, found.basis), found.determined
-
-
-class _Perturbations(NamedTuple):
-    """A basis Z of the perturbations that are permitted, and a W with W Z = 1.
-
-    `determined` tells whether the constraints determine all others.
-    """
-
-    basis: Float[Array, "x d"]
-    left: Float[Array, "d x"]
-    determined: BoolScalar
-
-
-def _is_regular(matrix: Array) -> BoolScalar:
-    eps = jnp.finfo(matrix.dtype).eps
-    return ~(conditioning(matrix) <= 10 * matrix.shape[1] * eps)
-
-
-def _orthonormal(rows: Array) -> _Perturbations:
-    """Compute an orthonormal basis of the kernel of `rows`.
-
-    The basis is defined up to a rotation, which no derivative of a singular value
-    decomposition settles: the one that is found is held, and its derivative is that by
-    which it stays in the kernel.
-    """
-    count = rows.shape[0]
-    _, _, right = jnp.linalg.svd(jax.lax.stop_gradient(rows), full_matrices=True)
-    kernel = right[count:].T
-    normal = jnp.linalg.solve(rows @ rows.T, rows @ kernel)
-    basis = kernel - rows.T @ normal
-    left = jnp.linalg.solve(kernel.T @ basis, kernel.T)
-    return _Perturbations(basis, left, _is_regular(rows))
-
-
-def _independent(
-    on_velocities: Array,
-    on_positions: Array,
-    positions: tuple[int, ...],
-    velocities: tuple[int, ...],
-) -> _Perturbations:
-    """Compute the perturbations of the chosen coordinates, and what picks these."""
-    dim, dtype = on_positions.shape[1], on_positions.dtype
-    count, others = len(positions), len(velocities)
-    unit = jnp.eye(dim, dtype=dtype)
-    q_rows, u_rows = (
-        unit[jnp.asarray(positions, int)],
-        unit[jnp.asarray(velocities, int)],
+    drift, allowed = _drift(slopes, y, independent)
+    return _Reduced(
+        found=LinearStability(matrix, found.basis),
+        has_motion=jnp.all(jnp.isfinite(slopes.rates)),
+        determined=found.determined,
+        is_steady=jnp.all(drift <= allowed),
+        drift=drift,
+        allowed=allowed,
     )
-    # The smallest change of positions: those that no constraint ties stay as they are.
-    wanted = jnp.concatenate(
-        [jnp.eye(count, dtype=dtype), jnp.zeros((on_positions.shape[0], count), dtype)]
-    )
-    moved = jnp.concatenate([q_rows, on_positions])
-    xi = moved.T @ jnp.linalg.solve(moved @ moved.T, wanted)
-    xi = jnp.concatenate([xi, jnp.zeros((dim, others), dtype)], axis=1)
-    kept = jnp.eye(count + others, dtype=dtype)[count:]
-    right = jnp.concatenate([kept, -on_velocities[:, :dim] @ xi])
-    following = jnp.concatenate([u_rows, on_velocities[:, dim:]])
-    w = jnp.linalg.solve(following, right)
-    zero = jnp.zeros_like
-    left = jnp.block([[q_rows, zero(q_rows)], [zero(u_rows), u_rows]])
-    regular = _is_regular(moved) & _is_regular(following)
-    return _Perturbations(jnp.concatenate([xi, w]), left, regular)

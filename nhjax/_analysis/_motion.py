@@ -116,11 +116,8 @@ def _motion(system, t, y, args) -> Motion:
         (t, jnp.zeros_like(u), u),
         (jnp.ones_like(t), velocity, lin.acceleration),
     )
-    mass, jacobian = system.metric(t, y.q, u, args), lin.jacobian
-    if system.fibre_coordinate_name == "p":
-        # The metric is D2D2H, whose inverse is ∂p/∂v.
-        mass = inverse(mass)
-        jacobian = jacobian @ mass
+    metric = system.metric(t, y.q, u, args)
+    mass, jacobian = in_velocities(system, metric, lin.jacobian)
     return Motion(
         acceleration=acceleration,
         momentum_rate=momentum_rate,
@@ -129,3 +126,16 @@ def _motion(system, t, y, args) -> Motion:
         mass_matrix=mass,
         constraint_jacobian=jacobian,
     )
+
+
+def in_velocities(
+    system: AbstractMechanicalSystem,
+    metric: Float[Array, "n n"],
+    jacobian: Float[Array, "l n"],
+) -> tuple[Float[Array, "n n"], Float[Array, "l n"]]:
+    """Return ∂p/∂v and ∂Φ/∂v, given the metric K and ∂Φ/∂u of the system."""
+    if system.fibre_coordinate_name == "v":
+        return metric, jacobian
+    # The metric is D2D2H, whose inverse is ∂p/∂v.
+    mass = inverse(metric)
+    return mass, jacobian @ mass

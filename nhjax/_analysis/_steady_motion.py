@@ -11,7 +11,7 @@ from jaxtyping import Array, Float
 from .._compile import as_cpu_kernel, tracked_jit
 from .._custom_types import Args, FloatScalarLike
 from .._errors import Check, NewtonError, require
-from .._numerics import iterate, max_norm, Sizes, Solved, unit
+from .._numerics import iterate, jacobian_and_value, max_norm, Sizes, Solved, unit
 from .._system import (
     AbstractMechanicalSystem,
     linearise,
@@ -158,12 +158,8 @@ def _nearest_root(
     there, and how the method ended.
     """
 
-    def value_twice(x):
-        value = residual(x)
-        return value, value
-
     def sweep(x):
-        slopes, value = jax.jacfwd(value_twice, has_aux=True)(x)
+        slopes, value, _ = jacobian_and_value(lambda x: (residual(x), None), x)
         # Where the equations are dependent, the pseudo-inverse leaves them out.
         inverse = jnp.linalg.pinv(slopes * free[None, :])
         increment = inverse @ value

@@ -62,12 +62,14 @@ def as_cpu_kernel(
         return function(*args)
     dynamic, static = eqx.partition(args, eqx.is_array)
     leaves, treedef = jax.tree.flatten(dynamic)
-    others, structure = jax.tree.flatten(static)
-    key = function, treedef, structure, *others, *map(jax.typeof, leaves)
-    traced = None if programs is None else programs.find(key)
-    if traced is None:
+    if programs is None:
         traced = _traced(function, static, treedef, leaves)
-        if programs is not None:
+    else:
+        others, structure = jax.tree.flatten(static)
+        key = function, treedef, structure, *others, *map(jax.typeof, leaves)
+        traced = programs.find(key)
+        if traced is None:
+            traced = _traced(function, static, treedef, leaves)
             programs.keep(key, traced)
     out = run_program(traced.program, leaves)
     return eqx.combine(jax.tree.unflatten(traced.structure, out), traced.rest)

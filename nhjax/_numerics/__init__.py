@@ -34,6 +34,7 @@ from ._max_norm import (
 from ._rank import (
     conditioning as conditioning,
     dependent_rows as dependent_rows,
+    is_deficient as is_deficient,
     Rank as Rank,
     those_that_count as those_that_count,
 )

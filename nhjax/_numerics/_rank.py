@@ -25,8 +25,7 @@ class Rank(NamedTuple):
     @property
     def deficient(self) -> BoolScalar:
         """Tell whether the rank matters and is not full."""
-        n, eps = self.jacobian.shape[1], jnp.finfo(self.jacobian.dtype).eps
-        return self.counts & (conditioning(self.jacobian) <= 10 * n * eps)
+        return self.counts & is_deficient(self.jacobian)
 
 
 def those_that_count(ranks: list[Rank]) -> list[Rank]:
@@ -66,6 +65,12 @@ def conditioning(matrix: Float[Array, "k l"]) -> FloatScalar:
     singular = jnp.linalg.svd(scaled, compute_uv=False)
     # The test is "== 0" and not "> 0", so that NaN does not count as singular.
     return jnp.where(singular[0] == 0, 0, singular[-1] / singular[0])
+
+
+def is_deficient(matrix: Float[Array, "k l"]) -> BoolScalar:
+    """Tell whether the rows are dependent up to round-off; NaN does not count so."""
+    eps = jnp.finfo(matrix.dtype).eps
+    return conditioning(matrix) <= 10 * matrix.shape[1] * eps
 
 
 def dependent_rows(jacobian: np.ndarray) -> list[int]:

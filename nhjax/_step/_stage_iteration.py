@@ -185,9 +185,11 @@ def unknown_units(stages: StageSystem, lin: Linearisation) -> list[FloatScalar]:
     multiplier = 1 / unit(h * max_norm(lin.reaction))
     sizes = {
         "velocity": velocity,
+        "momentum": one,
+        "node_fibre_coordinate": one,
         "closure": multiplier,
         "holonomic": multiplier,
         "end_acceleration": 1 / unit(h),
         "end_multiplier": multiplier,
     }
-    return [sizes.get(field.name, one) for field in dataclasses.fields(Stages)]
+    return [sizes[field.name] for field in dataclasses.fields(Stages)]

@@ -7,7 +7,6 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike
 
 from .._custom_types import Args, FloatScalarLike
-from .._errors import is_traced
 from .._manifold import AbstractRetraction, Cayley, Euclidean, ProductGroup, SO3
 from .._system import LagrangianSystem
 from ._base import (
@@ -17,6 +16,7 @@ from ._base import (
     parameter,
     require_not_negative,
     require_positive,
+    require_possible,
 )
 from ._bowl import Bowl, Shape, Vector3
 
@@ -147,17 +147,16 @@ class BallInBowl(AbstractConstrainedGroupExample):
         """
         path, rate = parameter(radius_of_path), parameter(path_rate)
         require_positive(radius_of_path=path)
-        if not is_traced(rate) and rate == 0:
-            raise ValueError(
-                "`path_rate` must be nonzero: nothing determines the spin."
-            )
+        require_possible(
+            rate != 0, "`path_rate` must be nonzero: nothing determines the spin."
+        )
         place = jnp.stack([path, jnp.zeros_like(path)])
         velocity = jnp.stack([jnp.zeros_like(path), rate * path])
         ball = cls.rolling(place, velocity, **parameters)
-        if not is_traced(ball.curvature) and ball.curvature == 0:
-            raise ValueError(
-                "`curvature` must be nonzero: nothing determines the spin."
-            )
+        require_possible(
+            ball.curvature != 0,
+            "`curvature` must be nonzero: nothing determines the spin.",
+        )
         return cls.rolling(place, velocity, _steady_spin(ball, rate), **parameters)
 
     def lagrangian(self, t: FloatScalarLike, q: Element, v: Array, args: Args) -> Array:

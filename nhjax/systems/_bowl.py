@@ -6,7 +6,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from .._errors import is_traced
+from ._base import require_possible
 
 
 Shape = Literal["paraboloid", "sphere"]
@@ -45,9 +45,9 @@ class Bowl(eqx.Module):
         if self.shape == "paraboloid":
             return 0.5 * self.curvature * square
         root = 1 - self.curvature**2 * square
-        if not is_traced(root) and not root > 0:
-            raise ValueError(
-                "`position` must be nearer to the axis than the radius "
-                f"{1 / self.curvature} of the sphere, got {jnp.sqrt(square)}."
-            )
+        require_possible(
+            root > 0,
+            "`position` must be nearer to the axis than the radius "
+            f"{1 / self.curvature} of the sphere, got {jnp.sqrt(square)}.",
+        )
         return self.curvature * square / (1 + jnp.sqrt(root))

@@ -5,13 +5,13 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike
 
 from .._custom_types import Args, FloatScalarLike
-from .._errors import is_traced
 from .._system import LagrangianSystem
 from ._base import (
     AbstractExample,
     coordinates,
     parameter,
     require_positive,
+    require_possible,
     require_shape,
 )
 
@@ -69,13 +69,10 @@ class CarAxis(AbstractExample):
         )
         require_shape((4,), q0=self.q0, v0=self.v0)
         amplitude, length = self.amplitude, self.length
-        if (
-            not (is_traced(amplitude) or is_traced(length))
-            and not abs(amplitude) < length
-        ):
-            raise ValueError(
-                f"`amplitude` must be less than `length` {length}, got {amplitude}."
-            )
+        require_possible(
+            abs(amplitude) < length,
+            f"`amplitude` must be less than `length` {length}, got {amplitude}.",
+        )
 
     @classmethod
     def level(cls, **parameters: ArrayLike) -> "CarAxis":

@@ -5,9 +5,14 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from .._custom_types import FloatScalarLike
-from .._errors import is_traced
 from .._manifold import AbstractRetraction, Cayley, SO3
-from ._base import coordinates, parameter, require_positive, require_shape
+from ._base import (
+    coordinates,
+    parameter,
+    require_positive,
+    require_possible,
+    require_shape,
+)
 from ._rolling_body import AbstractRollingBody
 
 
@@ -68,13 +73,11 @@ class ChaplyginTop(AbstractRollingBody):
             moments=self.moments,
             gravity=self.gravity,
         )
-        if is_traced(self.offset) or is_traced(self.radius):
-            return
-        if not abs(self.offset) < self.radius:
-            raise ValueError(
-                f"`offset` must be smaller than `radius` = {self.radius}, got "
-                f"{self.offset}."
-            )
+        require_possible(
+            abs(self.offset) < self.radius,
+            f"`offset` must be smaller than `radius` = {self.radius}, got "
+            f"{self.offset}.",
+        )
 
     @property
     def weight(self) -> Array:

@@ -9,13 +9,13 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
 from .._custom_types import Args, FloatScalarLike
-from .._errors import is_traced
 from .._system import LagrangianSystem
 from ._base import (
     AbstractExample,
     coordinates,
     parameter,
     require_positive,
+    require_possible,
     require_shape,
 )
 
@@ -120,10 +120,10 @@ class FlyballGovernor(AbstractExample):
             return governor.height - half * jnp.sin(beta) - fall
 
         s, ds = jax.jvp(slider, (beta,), (dbeta,))
-        if not is_traced(s) and not jnp.isfinite(s):
-            raise ValueError(
-                f"`coupler_length` {coupler} does not reach from rod to slider."
-            )
+        require_possible(
+            jnp.isfinite(s),
+            f"`coupler_length` {coupler} does not reach from rod to slider.",
+        )
         merged: dict[str, Any] = dict(parameters)
         merged.update(
             q0=jnp.stack([jnp.zeros_like(beta), beta, beta, s]),

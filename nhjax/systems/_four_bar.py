@@ -9,13 +9,13 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
 from .._custom_types import Args, FloatScalarLike
-from .._errors import is_traced
 from .._system import LagrangianSystem
 from ._base import (
     AbstractExample,
     coordinates,
     parameter,
     require_positive,
+    require_possible,
     require_shape,
 )
 from ._planar import direction, kinetic_energy
@@ -76,8 +76,9 @@ class FourBar(AbstractExample):
         square = side @ side
         distance = jnp.sqrt(square)
         cosine = (square + second**2 - third**2) / (2 * distance * second)
-        if not is_traced(cosine) and not abs(cosine) < 1:
-            raise ValueError(f"`angle` {angle} leaves the bars too short to close.")
+        require_possible(
+            abs(cosine) < 1, f"`angle` {angle} leaves the bars too short to close."
+        )
         coupler = jnp.arctan2(side[1], side[0]) + jnp.arccos(cosine)
         arm = second * direction(coupler) - side
         rocker = jnp.arctan2(arm[1], arm[0])

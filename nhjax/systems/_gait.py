@@ -1,11 +1,16 @@
 """Joints that move as given functions of time, which machines propel themselves by."""
 
+import abc
+from collections.abc import Callable
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from ._base import coordinates
+from .._custom_types import Args, FloatScalarLike
+from .._system import LagrangianSystem
+from ._base import AbstractNonholonomicExample, coordinates
 
 
 class Sinusoid(eqx.Module):
@@ -21,3 +26,33 @@ class Sinusoid(eqx.Module):
             lambda x: x.astype(t.dtype), (self.amplitude, self.rate, self.phase)
         )
         return amplitude * jnp.sin(rate * t + phase)
+
+    def at_start(self) -> tuple[Array, Array]:
+        """Compute the angles and their rates at t = 0."""
+        start = jnp.zeros((), self.phase.dtype)
+        return jax.jvp(self, (start,), (jnp.ones_like(start),))
+
+
+class AbstractGaitMachine(AbstractNonholonomicExample):
+    """A machine whose joints move by a `gait`, or freely under torques without one."""
+
+    gait: eqx.AbstractVar[Callable[[Array], Array] | None]
+
+    @abc.abstractmethod
+    def holonomic(self, t: FloatScalarLike, q: Array, args: Args) -> Array:
+        """Compute the constraints that hold the joints to the gait."""
+
+    @abc.abstractmethod
+    def force(self, t: FloatScalarLike, q: Array, v: Array, args: Args) -> Array:
+        """Compute the force of the torques on the joints."""
+
+    @property
+    def system(self) -> LagrangianSystem:
+        """Return the system to integrate, whose leaves are the parameters."""
+        if self.gait is None:
+            return LagrangianSystem(
+                self.lagrangian, nonholonomic=self.constraint, force=self.force
+            )
+        return LagrangianSystem(
+            self.lagrangian, nonholonomic=self.constraint, holonomic=self.holonomic
+        )

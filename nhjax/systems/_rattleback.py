@@ -4,11 +4,9 @@ from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
 from .._custom_types import Args, FloatScalarLike
-from .._errors import is_traced
 from .._manifold import AbstractRetraction, Cayley, SO3
 from .._system import LagrangianSystem
 from ._base import (
@@ -16,6 +14,7 @@ from ._base import (
     parameter,
     require_not_negative,
     require_positive,
+    require_possible,
     require_shape,
 )
 from ._rolling_body import AbstractRollingBody
@@ -84,19 +83,17 @@ class Rattleback(AbstractRollingBody):
         )
         if self.damping is not None:
             require_not_negative(damping=self.damping)
-        if is_traced(self.moments) or is_traced(self.product):
-            return
-        if not self.product**2 < self.moments[0] * self.moments[1]:
-            raise ValueError(
-                "`product` must be smaller than the geometric mean of its `moments`, "
-                f"√(J₁₁ J₂₂), got {self.product}."
-            )
-        principal = np.linalg.eigvalsh(np.asarray(self.inertia))
-        if principal[2] > principal[0] + principal[1]:
-            raise ValueError(
-                "No body has `moments` and `product` of inertia of which the largest "
-                f"principal one exceeds the sum of the others, got {principal}."
-            )
+        require_possible(
+            self.product**2 < self.moments[0] * self.moments[1],
+            "`product` must be smaller than the geometric mean of its `moments`, "
+            f"√(J₁₁ J₂₂), got {self.product}.",
+        )
+        principal = jnp.linalg.eigvalsh(self.inertia)
+        require_possible(
+            principal[2] <= principal[0] + principal[1],
+            "No body has `moments` and `product` of inertia of which the largest "
+            f"principal one exceeds the sum of the others, got {principal}.",
+        )
 
     @classmethod
     def spinning(

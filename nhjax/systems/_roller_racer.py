@@ -9,20 +9,18 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
 from .._custom_types import Args, FloatScalarLike
-from .._system import LagrangianSystem
 from ._base import (
-    AbstractNonholonomicExample,
     coordinates,
     require_not_negative,
     require_positive,
     require_possible,
     require_shape,
 )
-from ._gait import Sinusoid
+from ._gait import AbstractGaitMachine, Sinusoid
 from ._planar import direction, kinetic_energy
 
 
-class RollerRacer(AbstractNonholonomicExample):
+class RollerRacer(AbstractGaitMachine):
     """Two bodies on an axle each, joined by a pivot that its rider turns to and fro.
 
     L = m₁/2 |ṙ₁|² + I₁/2 θ̇² + m₂/2 |ṙ₂|² + I₂/2 (θ̇ + φ̇)²,
@@ -112,20 +110,8 @@ class RollerRacer(AbstractNonholonomicExample):
     ) -> "RollerRacer":
         """Make a racer with the gait φ = amplitude sin(rate t + phase)."""
         gait = Sinusoid(amplitude, rate, phase)
-        start = jnp.zeros((), gait.phase.dtype)
-        angle, angle_rate = jax.jvp(gait, (start,), (jnp.ones_like(start),))
+        angle, angle_rate = gait.at_start()
         return cls.rolling(speed, angle, angle_rate, gait=gait, **parameters)
-
-    @property
-    def system(self) -> LagrangianSystem:
-        """Return the system to integrate, whose leaves are the parameters."""
-        if self.gait is None:
-            return LagrangianSystem(
-                self.lagrangian, nonholonomic=self.constraint, force=self.force
-            )
-        return LagrangianSystem(
-            self.lagrangian, nonholonomic=self.constraint, holonomic=self.holonomic
-        )
 
     def lagrangian(self, t: FloatScalarLike, q: Array, v: Array, args: Args) -> Array:
         """Compute the Lagrangian, which is the kinetic energy."""

@@ -7,7 +7,6 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
 from .._custom_types import FloatScalarLike
-from .._errors import is_traced
 from .._manifold import AbstractRetraction, Cayley, SO3
 from ._base import (
     coordinates,
@@ -89,8 +88,9 @@ class RollingTorus(AbstractRollingBody):
         `parameters` are those of the class.
         """
         angle, rate = parameter(tilt), parameter(turn_rate)
-        if not is_traced(rate) and rate == 0:
-            raise ValueError("`turn_rate` must be nonzero: nothing determines ω₃.")
+        require_possible(
+            rate != 0, "`turn_rate` must be nonzero: nothing determines ω₃."
+        )
         _require_between("tilt", angle, jnp.pi, "π")
         body = cls(**parameters)
         sin, cos = jnp.sin(angle), jnp.cos(angle)
@@ -169,5 +169,7 @@ class RollingTorus(AbstractRollingBody):
 
 
 def _require_between(name: str, angle: Array, bound: float, text: str) -> None:
-    if not is_traced(angle) and not 0 < angle < bound:
-        raise ValueError(f"`{name}` must lie between 0 and {text}, got {angle}.")
+    require_possible(
+        (angle > 0) & (angle < bound),
+        f"`{name}` must lie between 0 and {text}, got {angle}.",
+    )

@@ -8,9 +8,14 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
 from .._custom_types import Args, FloatScalarLike
-from .._errors import is_traced
 from .._system import LagrangianSystem
-from ._base import AbstractExample, coordinates, parameter, require_positive
+from ._base import (
+    AbstractExample,
+    coordinates,
+    parameter,
+    require_positive,
+    require_possible,
+)
 from ._planar import direction, kinetic_energy
 
 
@@ -73,10 +78,9 @@ class SliderCrank(AbstractExample):
         theta, dtheta = parameter(angle), parameter(rate)
         crank, rod = engine.crank_length, engine.rod_length
         sine = (engine.offset - crank * jnp.sin(theta)) / rod
-        if not is_traced(sine) and not abs(sine) < 1:
-            raise ValueError(
-                f"`angle` {angle} leaves the rod too short for the slider."
-            )
+        require_possible(
+            abs(sine) < 1, f"`angle` {angle} leaves the rod too short for the slider."
+        )
         phi = jnp.arcsin(sine)
         dphi = -crank * jnp.cos(theta) * dtheta / (rod * jnp.cos(phi))
         x = crank * jnp.cos(theta) + rod * jnp.cos(phi)

@@ -9,20 +9,18 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
 from .._custom_types import Args, FloatScalarLike
-from .._system import LagrangianSystem
 from ._base import (
-    AbstractNonholonomicExample,
     coordinates,
     parameter,
     require_positive,
     require_possible,
     require_shape,
 )
-from ._gait import Sinusoid
+from ._gait import AbstractGaitMachine, Sinusoid
 from ._planar import direction
 
 
-class Snakeboard(AbstractNonholonomicExample):
+class Snakeboard(AbstractGaitMachine):
     """A board on two steered axles, which a rotor and the steering propel.
 
     L = m/2 (ẋ² + ẏ²) + J/2 θ̇² + J_r/2 (θ̇ + ψ̇)² + J_w/2 ((θ̇ + φ̇_b)² + (θ̇ + φ̇_f)²),
@@ -124,20 +122,8 @@ class Snakeboard(AbstractNonholonomicExample):
         It starts at t = 0 at the origin, its centre ahead at `speed`.
         """
         gait = Sinusoid(amplitudes, rates, phases)
-        start = jnp.zeros((), gait.phase.dtype)
-        joints, joint_rates = jax.jvp(gait, (start,), (jnp.ones_like(start),))
+        joints, joint_rates = gait.at_start()
         return cls.rolling(speed, joints, joint_rates, gait=gait, **parameters)
-
-    @property
-    def system(self) -> LagrangianSystem:
-        """Return the system to integrate, whose leaves are the parameters."""
-        if self.gait is None:
-            return LagrangianSystem(
-                self.lagrangian, nonholonomic=self.constraint, force=self.force
-            )
-        return LagrangianSystem(
-            self.lagrangian, nonholonomic=self.constraint, holonomic=self.holonomic
-        )
 
     def lagrangian(self, t: FloatScalarLike, q: Array, v: Array, args: Args) -> Array:
         """Compute the Lagrangian, which is the kinetic energy."""

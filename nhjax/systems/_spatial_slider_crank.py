@@ -9,13 +9,13 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
 from .._custom_types import Args, FloatScalarLike
-from .._errors import is_traced
 from .._system import LagrangianSystem
 from ._base import (
     AbstractExample,
     coordinates,
     parameter,
     require_positive,
+    require_possible,
     require_shape,
 )
 
@@ -102,10 +102,10 @@ class SpatialSliderCrank(AbstractExample):
             return jnp.stack([theta, tilt, swing, jnp.sqrt(square)])
 
         q0, v0 = jax.jvp(closed, (theta,), (dtheta,))
-        if not is_traced(q0) and not jnp.all(jnp.isfinite(q0)):
-            raise ValueError(
-                f"`angle` {angle} leaves the rod too short for the slider."
-            )
+        require_possible(
+            jnp.isfinite(q0),
+            f"`angle` {angle} leaves the rod too short for the slider.",
+        )
         merged: dict[str, Any] = dict(parameters)
         merged.update(q0=q0, v0=v0)
         return cls(**merged)

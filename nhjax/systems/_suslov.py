@@ -8,12 +8,12 @@ import numpy as np
 from jaxtyping import Array
 
 from .._custom_types import Args, FloatScalarLike
-from .._errors import is_traced
 from .._manifold import AbstractRetraction, Cayley, SO3
 from ._base import (
     AbstractConstrainedGroupExample,
     coordinates,
     require_positive,
+    require_possible,
     require_shape,
 )
 from ._linear_flow import attitude
@@ -57,11 +57,11 @@ class Suslov(AbstractConstrainedGroupExample):
         require_positive(moments=self.moments)
         # The determinant of the inertia matrix, over I₁₁ I₂₂.
         determinant = self.moments[2] - jnp.sum(self.products**2 / self.moments[:2])
-        if not is_traced(determinant) and determinant <= 0:
-            raise ValueError(
-                f"`products` are too large for `moments`, got {self.products} and "
-                f"{self.moments}: the inertia matrix must be positive definite."
-            )
+        require_possible(
+            determinant > 0,
+            f"`products` are too large for `moments`, got {self.products} and "
+            f"{self.moments}: the inertia matrix must be positive definite.",
+        )
 
     @property
     def manifold(self) -> SO3:
