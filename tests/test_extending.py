@@ -7,6 +7,7 @@ from typing import Any
 import pytest
 
 import nhjax
+from oracles.pages import blocks
 
 
 PAGE = Path(__file__).parents[1] / "docs" / "extending.md"
@@ -18,11 +19,7 @@ def _sections():
         r"^## (.+)$", PAGE.read_text(encoding="utf-8"), flags=re.MULTILINE
     )
     titles, texts = sections[::2], sections[1::2]
-    return _blocks(opening), dict(zip(titles, map(_blocks, texts), strict=True))
-
-
-def _blocks(text):
-    return re.findall(r"^```python\n(.*?)^```$", text, re.MULTILINE | re.DOTALL)
+    return blocks(opening), dict(zip(titles, map(blocks, texts), strict=True))
 
 
 OPENING, SECTIONS = _sections()

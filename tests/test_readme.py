@@ -6,13 +6,11 @@ from pathlib import Path
 import matplotlib
 import pytest
 
+from oracles.pages import blocks
+
 
 ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
-
-
-def _blocks(language):
-    return re.findall(rf"^```{language}\n(.*?)^```$", README, re.MULTILINE | re.DOTALL)
 
 
 @pytest.fixture
@@ -28,7 +26,7 @@ def _closed_figures():
 def test_python_blocks_run_as_printed(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     namespace = {}
-    for block in _blocks("python"):
+    for block in blocks(README, "python"):
         exec(compile(block, "README.md", "exec"), namespace)
     assert namespace["sol"].ys.q.shape == (1001, 3)
     assert namespace["sol"].stats["max_constraint_violation"] < 1e-13
@@ -37,7 +35,7 @@ def test_python_blocks_run_as_printed(tmp_path, monkeypatch):
 
 
 def test_commands_are_those_of_the_continuous_integration():
-    commands = [line for block in _blocks("bash") for line in block.splitlines()]
+    commands = [line for block in blocks(README, "bash") for line in block.splitlines()]
     assert commands[-1].startswith("pytest")
     run = (ROOT / ".ci" / "run").read_text(encoding="utf-8").splitlines()
     for command in commands:

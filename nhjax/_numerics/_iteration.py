@@ -192,9 +192,9 @@ def dense_increment(
 
 
 def jacobian_and_value(
-    residual: Callable[[Float[Array, " k"]], tuple[Float[Array, " k"], Aux]],
+    residual: Callable[[Float[Array, " k"]], tuple[Float[Array, " m"], Aux]],
     x: Float[Array, " k"],
-) -> tuple[Float[Array, "k k"], Float[Array, " k"], Aux]:
+) -> tuple[Float[Array, "m k"], Float[Array, " m"], Aux]:
     """Compute a residual, its `aux`, and its exact Jacobian by autodiff."""
 
     def evaluated_twice_is_once(x):

@@ -8,7 +8,8 @@ force of the ground on the front one.
 import math
 
 import numpy as np
-from scipy.integrate import solve_ivp
+
+from oracles.flow import flow
 
 
 # Meijaard et al. (2007), table 1.
@@ -156,16 +157,8 @@ def trajectory(parameters, q0, v0, times, torque=lambda t, q, v: 0.0):
         q, v = y[:8], y[8:]
         return np.concatenate([v, accelerations(parameters, q, v, torque(t, q, v))[0]])
 
-    solution = solve_ivp(
-        field,
-        (0.0, times[-1]),
-        np.concatenate([q0, v0]),
-        method="DOP853",
-        t_eval=times,
-        rtol=3e-14,
-        atol=1e-14,
-    )
-    return solution.y[:8].T, solution.y[8:].T
+    y = flow(field, [*q0, *v0], times)
+    return y[:, :8], y[:, 8:]
 
 
 def canonical(parameters):
@@ -219,3 +212,9 @@ def linear_motion(parameters, speed, gains=(0.0, 0.0)):
     damping[1, 0] -= gains[1]
     lower = np.linalg.solve(M, np.hstack([-stiffness, -damping]))
     return np.block([[np.zeros((2, 2)), np.eye(2)], [lower]])
+
+
+def forces(on_wheels):
+    """Those of the forces of the ground that multipliers stand for."""
+    rear, front = on_wheels
+    return np.concatenate([rear[:2], front])

@@ -7,8 +7,8 @@ matrix. The centre moves on z = κ/2 (x² + y² + ε z²), and n is the normal o
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.integrate import solve_ivp
 
+from oracles.flow import flow
 from oracles.rolling_bodies import cross, hat
 
 
@@ -69,14 +69,5 @@ class Bowl:
                 [self.velocity(x, w), self.accelerations(x, w)[1], (hat(w) @ R).ravel()]
             )
 
-        sol = solve_ivp(
-            field,
-            (0.0, times[-1]),
-            np.concatenate([x, w, R.ravel()]),
-            t_eval=times,
-            method="DOP853",
-            rtol=3e-14,
-            atol=1e-14,
-        )
-        assert sol.success
-        return sol.y[:3].T, sol.y[3:6].T, sol.y[6:].T.reshape(-1, 3, 3)
+        y = flow(field, [*x, *w, *R.ravel()], times, start=0.0)
+        return y[:, :3], y[:, 3:6], y[:, 6:].reshape(-1, 3, 3)

@@ -8,7 +8,8 @@ body. No Lagrangian, no multipliers, no derivative by a program.
 import math
 
 import numpy as np
-from scipy.integrate import solve_ivp
+
+from oracles.flow import flow
 
 
 def along(heading):
@@ -133,17 +134,8 @@ class Train:
             change = second[:2] @ along(q[2])
             return np.concatenate([self.velocity(q, speed, rate), [change, second[3]]])
 
-        solution = solve_ivp(
-            field,
-            (0.0, times[-1]),
-            np.concatenate([q0, [speed, steer_rate]]),
-            method="DOP853",
-            t_eval=times,
-            rtol=3e-14,
-            atol=1e-14,
-        )
         q, v, forces = [], [], []
-        for y in solution.y.T:
+        for y in flow(field, [*q0, speed, steer_rate], times):
             q.append(y[:size])
             speed, rate = y[size:]
             v.append(self.velocity(y[:size], speed, rate))
@@ -197,17 +189,8 @@ class Robot:
             changes = self.changes(speed, turn, *torques)
             return np.concatenate([self.velocity(q, speed, turn), changes])
 
-        solution = solve_ivp(
-            field,
-            (0.0, times[-1]),
-            np.concatenate([q0, [speed, turn]]),
-            method="DOP853",
-            t_eval=times,
-            rtol=3e-14,
-            atol=1e-14,
-        )
         q, v, forces = [], [], []
-        for y in solution.y.T:
+        for y in flow(field, [*q0, speed, turn], times):
             speed, turn = y[5:]
             q.append(y[:5])
             v.append(self.velocity(y[:5], speed, turn))

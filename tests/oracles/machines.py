@@ -66,6 +66,15 @@ def runs(system, method, y0, counts, duration, args=None):
     return Runs(tuple(counts), ts, ys, multiplier, violation)
 
 
+def runs_of_both(example, counts, duration):
+    """The runs of an example with two and with three stages."""
+    system, y0 = example.system, example.initial_state()
+    return {
+        stages: runs(system, nhjax.LobattoIIIAB(stages), y0, counts, duration)
+        for stages in (2, 3)
+    }
+
+
 def assert_orders(runs: Runs, order: int, errors_at, floor: float, atol=0.3):
     """Check the slope of each error from each lane to the next.
 
@@ -107,8 +116,9 @@ def _invariants(example, t, q, v) -> Any:
     return jax.vmap(jax.vmap(example.invariants))(t, q, v)
 
 
-def drifts(example, y0, runs: Runs):
+def drifts(example, runs: Runs):
     """The largest change of each invariant along all of each lane, by name."""
+    y0 = example.initial_state()
     values = _invariants(example, *map(_device, (runs.ts, runs.ys.q, runs.ys.v)))
     start = example.invariants(jnp.zeros(()), y0.q, y0.v)
     return {

@@ -1,15 +1,16 @@
 """What tests of machines share: the motion by the library and by other equations."""
 
+from functools import partial
 from typing import NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from scipy.integrate import solve_ivp
 
 import nhjax
-from oracles.orders import runs_of_all_steps, slopes
+from oracles import orders
+from oracles.orders import runs_of_all_steps
 
 
 def assert_motion(found, expected, tolerance=1e-11):
@@ -26,21 +27,6 @@ def saddle(mass, force, jacobian, hidden):
     matrix[:n, :n], matrix[:n, n:], matrix[n:, :n] = mass, -jacobian.T, jacobian
     solution = np.linalg.solve(matrix, np.concatenate([force, hidden]))
     return solution[:n], solution[n:]
-
-
-def flow(velocity_field, y0, times):
-    """The solution of ẏ = f(t, y) at `times`, the first of which is that of `y0`."""
-    solution = solve_ivp(
-        velocity_field,
-        (times[0], times[-1]),
-        np.asarray(y0, float),
-        method="DOP853",
-        t_eval=times,
-        rtol=3e-14,
-        atol=1e-14,
-    )
-    assert solution.success
-    return solution.y.T
 
 
 class Lane(NamedTuple):
@@ -79,11 +65,8 @@ def runs(example, stages, counts, duration, args=None, solver=None):
     return Runs(lanes, violations)
 
 
-def assert_order(order, counts, errors):
-    """Compare the observed order from each N to the next with the expected one."""
-    assert min(errors) > 0
-    observed = slopes(counts, errors)
-    np.testing.assert_allclose(observed, order, rtol=0, atol=0.2, err_msg=f"{errors}")
+# Compare the observed order from each N to the next with the expected one.
+assert_order = partial(orders.assert_order, floor=0.0, tolerance=0.2)
 
 
 @eqx.filter_jit

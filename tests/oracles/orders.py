@@ -1,5 +1,7 @@
 """Errors of runs of N steps over a fixed duration, and their observed orders."""
 
+from typing import NamedTuple
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -69,9 +71,39 @@ def slopes(counts, errors):
     return np.log(errors[:-1] / errors[1:]) / np.log(np.divide(counts[1:], counts[:-1]))
 
 
-def assert_order(order, counts, errors, floor=EXACT_FLOOR):
+def assert_order(order, counts, errors, floor=EXACT_FLOOR, tolerance=SLOPE_TOLERANCE):
     assert min(errors) > floor, f"errors too near those of the reference: {errors}"
     observed = slopes(counts, errors)
     np.testing.assert_allclose(
-        observed, order, rtol=0, atol=SLOPE_TOLERANCE, err_msg=f"errors {errors}"
+        observed, order, rtol=0, atol=tolerance, err_msg=f"errors {errors}"
     )
+
+
+class Ladder(NamedTuple):
+    """The step sizes of runs of N steps each, and the nodes of a reference.
+
+    All lanes take as many steps, of which those up to the `duration` count; the
+    reference is known at multiples of the `finest` step.
+    """
+
+    step_sizes: tuple[float, ...]
+    num_steps: int
+    duration: float
+    finest: float
+
+    def climb(self, system, method, y0, args=None, solver=None):
+        """Times, states and continuous multipliers, with one lane for each size."""
+        solver = solver_for(method.stages) if solver is None else solver
+        dts = jnp.array(self.step_sizes)
+        sol = runs_of_all_steps(system, method, y0, dts, self.num_steps, args, solver)
+        assert np.all(np.asarray(sol.stats["failed_step"]) == -1)
+        return jax.tree.map(np.asarray, (sol.ts, *sol.ys))
+
+    def assert_order(self, order, found, expected, floor=1e-11):
+        """Compare the order at which `found` comes near to what is `expected`."""
+        counts, errors = [], []
+        for lane, h in enumerate(self.step_sizes):
+            count, stride = round(self.duration / h), round(h / self.finest)
+            counts.append(count)
+            errors.append(rms(found[lane, :count] - expected[stride::stride]))
+        assert_order(order, counts, errors, floor=floor)

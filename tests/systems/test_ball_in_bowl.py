@@ -8,10 +8,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-import nhjax
 from nhjax.systems import BallInBowl, TurntableBall
 from oracles.bowl import Bowl, UP
-from oracles.machines import accelerations, assert_orders, drifts, runs, stack
+from oracles.machines import accelerations, assert_orders, drifts, runs_of_both, stack
 from oracles.rolling_bodies import matrix_of
 
 
@@ -58,17 +57,9 @@ def start_of(ball):
     return np.asarray(ball.q0[1]), R @ np.asarray(ball.v0[:3]), R
 
 
-def runs_of_both_methods(ball):
-    y0 = ball.initial_state()
-    return {
-        stages: runs(ball.system, nhjax.LobattoIIIAB(stages), y0, COUNTS, DURATION)
-        for stages in (2, 3)
-    }
-
-
 @pytest.fixture(scope="module")
 def runs_of():
-    return runs_of_both_methods(BALLS["paraboloid"])
+    return runs_of_both(BALLS["paraboloid"], COUNTS, DURATION)
 
 
 def random_balls(ball, number):
@@ -145,7 +136,7 @@ def test_constraints_hold_to_round_off_and_moving_energy_stays(runs_of):
     largest = {2: (1e-2, 3e-3, 6e-4), 3: (2e-6, 1e-7, 6e-9)}
     for stages in (2, 3):
         assert np.max(runs_of[stages].violation) < 1e-13
-        drift = drifts(ball, ball.initial_state(), runs_of[stages])["moving_energy"]
+        drift = drifts(ball, runs_of[stages])["moving_energy"]
         assert np.all(drift < largest[stages]), drift
 
 
@@ -216,7 +207,7 @@ def test_runs_stay_on_the_circle_to_the_order_of_the_method(runs_of):
         path = [0.4 * np.cos(angle), 0.4 * np.sin(angle), np.full_like(t, 0.12)]
         return {"position": y.q[1] - np.stack(path, axis=1)}
 
-    for stages, found in runs_of_both_methods(ball).items():
+    for stages, found in runs_of_both(ball, COUNTS, DURATION).items():
         assert_orders(found, 2 * stages - 2, errors_at, floor=1e-12)
 
 

@@ -6,12 +6,12 @@ import pytest
 
 from nhjax.systems import CarAxis
 from oracles import car_axis
+from oracles.flow import flow
 from oracles.library_motion import library_motion
 from oracles.mechanisms import (
     assert_motion,
     assert_order,
     assert_single_precision,
-    flow,
     runs,
 )
 

@@ -12,7 +12,7 @@ import nhjax
 from nhjax.systems import CarWithTrailers
 from oracles.cars import Train
 from oracles.library_motion import library_motion
-from oracles.orders import assert_order, rms, runs_of_all_steps, solver_for
+from oracles.orders import Ladder
 
 
 def some_car(num_trailers, seed, same_trailers=False):
@@ -101,8 +101,11 @@ def test_a_turning_car_goes_on_turning_on_circles(steer):
 
 # A drive and a torque on a car with two trailers.
 CONTROLS = (1200.0, 15.0)
-NUM_STEPS, STEP_SIZES = {2: 200, 3: 50}, {2: (0.02, 0.01), 3: (0.08, 0.04)}
 DURATION, FINEST = 2.0, 0.01
+LADDERS = {
+    2: Ladder((0.02, 0.01), 200, DURATION, FINEST),
+    3: Ladder((0.08, 0.04), 50, DURATION, FINEST),
+}
 
 
 def driven():
@@ -116,17 +119,8 @@ def runs(stages, free=False):
     car = driven()
     args = tuple(jnp.asarray(0.0 if free else x) for x in CONTROLS)
     y0 = nhjax.initial_state(car.system, car.q0, car.v0, args=args)
-    sol = runs_of_all_steps(
-        car.system,
-        nhjax.LobattoIIIAB(stages),
-        y0,
-        jnp.array(STEP_SIZES[stages]),
-        NUM_STEPS[stages],
-        args,
-        solver_for(stages),
-    )
-    assert np.all(np.asarray(sol.stats["failed_step"]) == -1)
-    return jax.tree.map(np.asarray, (sol.ts, *sol.ys))
+    method = nhjax.LobattoIIIAB(stages)
+    return LADDERS[stages].climb(car.system, method, y0, args)
 
 
 @cache
@@ -142,12 +136,7 @@ def reference():
 def test_the_motion_converges_to_that_of_the_reduced_equations(stages, part):
     _, states, continuous = runs(stages)
     found = (states.q, states.v, continuous)[part]
-    counts, errors = [], []
-    for lane, h in enumerate(STEP_SIZES[stages]):
-        count, stride = round(DURATION / h), round(h / FINEST)
-        counts.append(count)
-        errors.append(rms(found[lane, :count] - reference()[part][stride::stride]))
-    assert_order(2 * stages - 2, counts, errors, floor=1e-11)
+    LADDERS[stages].assert_order(2 * stages - 2, found, reference()[part])
 
 
 def test_the_controls_do_the_work_that_becomes_energy():

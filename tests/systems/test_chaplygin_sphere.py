@@ -5,11 +5,10 @@ from dataclasses import replace
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from scipy.integrate import solve_ivp
 
-import nhjax
 from nhjax.systems import ChaplyginSphere
-from oracles.machines import accelerations, assert_orders, drifts, runs
+from oracles.flow import flow
+from oracles.machines import accelerations, assert_orders, drifts, runs_of_both
 from oracles.rolling_bodies import (
     assert_newton_and_euler,
     errors_of,
@@ -55,12 +54,7 @@ def chaplygin(ball):
 
 @pytest.fixture(scope="module")
 def runs_of():
-    ball = SPHERES["default"]
-    y0 = ball.initial_state()
-    return y0, {
-        stages: runs(ball.system, nhjax.LobattoIIIAB(stages), y0, COUNTS, DURATION)
-        for stages in (2, 3)
-    }
+    return runs_of_both(SPHERES["default"], COUNTS, DURATION)
 
 
 @pytest.mark.parametrize("ball", SPHERES.values(), ids=SPHERES)
@@ -74,7 +68,7 @@ def test_order_is_that_of_the_method(runs_of):
     start = np.asarray(ball.q0[:4]), np.asarray(ball.v0[3:])
     errors_at = errors_of(newton_euler(ball), start, DURATION, COUNTS[-1])
     for stages in (2, 3):
-        assert_orders(runs_of[1][stages], 2 * stages - 2, errors_at, floor=1e-11)
+        assert_orders(runs_of[stages], 2 * stages - 2, errors_at, floor=1e-11)
 
 
 def test_order_is_the_same_against_chaplygins_equations(runs_of):
@@ -85,31 +79,21 @@ def test_order_is_the_same_against_chaplygins_equations(runs_of):
     np.testing.assert_allclose(velocity(np.asarray(K0), up0), v0[3:], rtol=1e-14)
 
     def errors_at(t, y, _):
-        sol = solve_ivp(
-            field,
-            (0.0, t[-1]),
-            np.concatenate([K0, up0]),
-            method="DOP853",
-            t_eval=t,
-            rtol=3e-14,
-            atol=1e-14,
-        )
-        K, up = np.split(sol.y.T, 2, axis=1)
+        K, up = np.split(flow(field, [*K0, *up0], t, start=0.0), 2, axis=1)
         omega = [velocity(*pair) for pair in zip(K, up, strict=True)]
         found = [matrix_of(quaternion)[2] for quaternion in y.q[:, :4]]
         return {"omega": y.v[:, 3:] - np.array(omega), "up": np.array(found) - up}
 
     for stages in (2, 3):
-        assert_orders(runs_of[1][stages], 2 * stages - 2, errors_at, floor=1e-11)
+        assert_orders(runs_of[stages], 2 * stages - 2, errors_at, floor=1e-11)
 
 
 def test_constraints_hold_to_round_off_and_invariants_stay(runs_of):
-    y0, found = runs_of
     # Of 2 to 14 in SI units; the coarsest runs take four times the duration.
     largest = {2: (1e-3, 3e-4, 6e-5), 3: (1e-5, 5e-7, 3e-8)}
     for stages in (2, 3):
-        assert np.max(found[stages].violation) < 1e-13
-        for name, drift in drifts(SPHERES["default"], y0, found[stages]).items():
+        assert np.max(runs_of[stages].violation) < 1e-13
+        for name, drift in drifts(SPHERES["default"], runs_of[stages]).items():
             assert np.all(drift < largest[stages]), (name, drift)
 
 

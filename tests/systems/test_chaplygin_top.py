@@ -4,9 +4,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-import nhjax
 from nhjax.systems import ChaplyginSphere, ChaplyginTop
-from oracles.machines import accelerations, assert_orders, drifts, runs
+from oracles.machines import accelerations, assert_orders, drifts, runs_of_both
 from oracles.rolling_bodies import (
     assert_newton_and_euler,
     cross,
@@ -33,12 +32,7 @@ def newton_euler(top):
 
 @pytest.fixture(scope="module")
 def runs_of():
-    top = TOPS["Routh"]
-    y0 = top.initial_state()
-    return y0, {
-        stages: runs(top.system, nhjax.LobattoIIIAB(stages), y0, COUNTS, DURATION)
-        for stages in (2, 3)
-    }
+    return runs_of_both(TOPS["Routh"], COUNTS, DURATION)
 
 
 @pytest.mark.parametrize("top", TOPS.values(), ids=TOPS)
@@ -52,16 +46,15 @@ def test_order_is_that_of_the_method(runs_of):
     start = np.asarray(top.q0[:4]), np.asarray(top.v0[3:])
     errors_at = errors_of(newton_euler(top), start, DURATION, COUNTS[-1])
     for stages in (2, 3):
-        assert_orders(runs_of[1][stages], 2 * stages - 2, errors_at, floor=1e-11)
+        assert_orders(runs_of[stages], 2 * stages - 2, errors_at, floor=1e-11)
 
 
 def test_constraints_hold_to_round_off_and_energy_stays(runs_of):
-    y0, found = runs_of
     # Of 12 J; the coarsest runs take four times the duration.
     largest = {2: (6e-3, 2e-3, 4e-4), 3: (3e-6, 2e-7, 1e-8)}
     for stages in (2, 3):
-        assert np.max(found[stages].violation) < 1e-13
-        drift = drifts(TOPS["Routh"], y0, found[stages])["energy"]
+        assert np.max(runs_of[stages].violation) < 1e-13
+        drift = drifts(TOPS["Routh"], runs_of[stages])["energy"]
         assert np.all(drift < largest[stages]), drift
 
 
@@ -89,7 +82,7 @@ def test_runs_keep_the_integrals_of_routh_at_least_to_the_order_of_the_method(ru
     for stages in (2, 3):
         errors = []
         for lane in range(len(COUNTS)):
-            _, y, _ = runs_of[1][stages].until_the_duration(lane)
+            _, y, _ = runs_of[stages].until_the_duration(lane)
             end = top.integrals_of_routh(jnp.asarray(y.q[-1]), jnp.asarray(y.v[-1]))
             errors.append(np.abs(np.array(end) - start))
         assert np.min(errors) > 1e-12

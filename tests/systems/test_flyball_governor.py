@@ -6,12 +6,12 @@ import pytest
 import nhjax
 from nhjax.systems import FlyballGovernor
 from oracles import governor
+from oracles.flow import flow
 from oracles.library_motion import library_motion
 from oracles.mechanisms import (
     assert_motion,
     assert_order,
     assert_single_precision,
-    flow,
     invariants,
     runs,
 )

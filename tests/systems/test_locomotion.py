@@ -8,12 +8,12 @@ import pytest
 
 from nhjax.systems import RollerRacer, Snakeboard
 from oracles import locomotion
+from oracles.flow import flow
 from oracles.library_motion import library_motion
 from oracles.mechanisms import (
     assert_motion,
     assert_order,
     assert_single_precision,
-    flow,
     invariants,
     runs,
 )

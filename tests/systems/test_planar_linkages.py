@@ -6,12 +6,12 @@ from scipy.integrate import quad
 
 from nhjax.systems import FourBar, SliderCrank
 from oracles import linkages
+from oracles.flow import flow
 from oracles.library_motion import library_motion
 from oracles.mechanisms import (
     assert_motion,
     assert_order,
     assert_single_precision,
-    flow,
     invariants,
     runs,
 )

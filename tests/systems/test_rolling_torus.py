@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-import nhjax
 from nhjax.systems import RollingTorus
-from oracles.machines import accelerations, assert_orders, drifts, runs, stack
+from oracles.machines import accelerations, assert_orders, drifts, runs_of_both, stack
 from oracles.rolling_bodies import (
     assert_newton_and_euler,
     errors_of,
@@ -52,19 +51,10 @@ def newton_euler(body):
     )
 
 
-def runs_of_both_methods(body):
-    # The numbers of a body are leaves: all bodies run by the same two programs.
-    y0 = body.initial_state()
-    return {
-        stages: runs(body.system, nhjax.LobattoIIIAB(stages), y0, COUNTS, DURATION)
-        for stages in (2, 3)
-    }
-
-
 @pytest.fixture(scope="module")
 def tumbling():
     body = BODIES["torus"].rolling((0.8, 0.6, 0.0, 0.0), (0.2, 0.5, 4.0))
-    return body, runs_of_both_methods(body)
+    return body, runs_of_both(body, COUNTS, DURATION)
 
 
 @over(BODIES)
@@ -147,7 +137,7 @@ def test_steady_motion_solves_the_equations_of_newton_and_euler(body):
 
 @pytest.mark.parametrize("name", ["disc", "torus"])
 def test_runs_stay_on_the_circle_to_the_order_of_the_method(tumbling, name):
-    for stages, found in runs_of_both_methods(STEADY[name]).items():
+    for stages, found in runs_of_both(STEADY[name], COUNTS, DURATION).items():
         errors_at = errors_on_the_circle(STEADY[name])
         assert_orders(found, 2 * stages - 2, errors_at, floor=1e-12)
 
@@ -166,7 +156,7 @@ def test_constraints_hold_to_round_off_and_energy_stays(tumbling):
     largest = {2: (2e-2, 5e-3, 1e-3), 3: (2e-5, 1e-6, 5e-8)}
     for stages in (2, 3):
         assert np.max(found[stages].violation) < 1e-13
-        drift = drifts(body, body.initial_state(), found[stages])["energy"]
+        drift = drifts(body, found[stages])["energy"]
         assert np.all(drift < largest[stages]), drift
 
 

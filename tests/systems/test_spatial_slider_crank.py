@@ -5,12 +5,12 @@ import pytest
 from scipy.integrate import quad
 
 from nhjax.systems import SpatialSliderCrank
+from oracles.flow import flow
 from oracles.library_motion import library_motion
 from oracles.mechanisms import (
     assert_motion,
     assert_order,
     assert_single_precision,
-    flow,
     invariants,
     runs,
 )

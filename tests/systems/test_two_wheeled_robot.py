@@ -11,7 +11,7 @@ import nhjax
 from nhjax.systems import TwoWheeledRobot
 from oracles.cars import Robot
 from oracles.library_motion import library_motion
-from oracles.orders import assert_order, rms, runs_of_all_steps, solver_for
+from oracles.orders import Ladder
 
 
 def some_robot(seed):
@@ -58,8 +58,11 @@ def test_the_default_data_are_those_of_rolling():
 
 
 TORQUES = (2.0, 0.5)
-NUM_STEPS, STEP_SIZES = {2: 200, 3: 50}, {2: (0.02, 0.01), 3: (0.08, 0.04)}
 DURATION, FINEST = 2.0, 0.01
+LADDERS = {
+    2: Ladder((0.02, 0.01), 200, DURATION, FINEST),
+    3: Ladder((0.08, 0.04), 50, DURATION, FINEST),
+}
 
 
 @cache
@@ -68,17 +71,8 @@ def runs(stages, free=False):
     robot = TwoWheeledRobot.rolling(0.8, 1.1, 0.3)
     args = tuple(jnp.asarray(0.0 if free else x) for x in TORQUES)
     y0 = nhjax.initial_state(robot.system, robot.q0, robot.v0, args=args)
-    sol = runs_of_all_steps(
-        robot.system,
-        nhjax.LobattoIIIAB(stages),
-        y0,
-        jnp.array(STEP_SIZES[stages]),
-        NUM_STEPS[stages],
-        args,
-        solver_for(stages),
-    )
-    assert np.all(np.asarray(sol.stats["failed_step"]) == -1)
-    return jax.tree.map(np.asarray, (sol.ts, *sol.ys))
+    method = nhjax.LobattoIIIAB(stages)
+    return LADDERS[stages].climb(robot.system, method, y0, args)
 
 
 @cache
@@ -94,12 +88,7 @@ def reference():
 def test_the_motion_converges_to_that_of_the_reduced_equations(stages, part):
     _, states, continuous = runs(stages)
     found = (states.q, states.v, continuous)[part]
-    counts, errors = [], []
-    for lane, h in enumerate(STEP_SIZES[stages]):
-        count, stride = round(DURATION / h), round(h / FINEST)
-        counts.append(count)
-        errors.append(rms(found[lane, :count] - reference()[part][stride::stride]))
-    assert_order(2 * stages - 2, counts, errors, floor=1e-11)
+    LADDERS[stages].assert_order(2 * stages - 2, found, reference()[part])
 
 
 def test_the_motors_do_the_work_that_becomes_energy():
