@@ -4,12 +4,10 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Complex, Float
 
-from .._compile import as_cpu_kernel, tracked_jit
 from .._custom_types import Args, BoolScalar, FloatScalarLike
 from .._errors import (
     Check,
@@ -17,7 +15,6 @@ from .._errors import (
     IrregularLagrangianError,
     require,
 )
-from .._numerics import jacobian_and_value, max_norm, unit
 from .._system import (
     AbstractMechanicalSystem,
     check_flag,
@@ -26,7 +23,9 @@ from .._system import (
 )
 from ._arguments import checked_time
 from ._permitted import independent_basis, orthonormal_basis
-from ._perturbation import check_independent, Indices, perturbed, rates_of_change
+from ._perturbation import check_independent, Indices
+from ._slopes import size_of, Slopes, slopes_along_symmetry, slopes_along_velocity
+from ._symmetry import Bounded, check_symmetry, checks_of, judged, Symmetry, Verdict
 
 
 class LinearStability(eqx.Module):
@@ -36,7 +35,8 @@ class LinearStability(eqx.Module):
     - `basis`: the perturbation (ξ, w) of the state that belongs to each z, as columns,
         shape (2n, d). The first n rows are the change ξ of the configuration, which
         becomes q + ξ or, on a group, q τ(ξ); the last n rows are the change w of the
-        velocity, or for a Hamiltonian system of the momentum.
+        velocity, or for a Hamiltonian system of the momentum. With a `symmetry` each
+        stands for all that differ from it by a perturbation along its generators.
     """
 
     matrix: Float[Array, "d d"]
@@ -62,19 +62,29 @@ def linear_stability(
     *,
     positions: Sequence[int] | None = None,
     velocities: Sequence[int] | None = None,
+    symmetry: Symmetry | None = None,
     must_be_steady: bool = True,
 ) -> LinearStability:
     """Linearise the constrained equations of motion about a steady motion.
 
-    With x = (q, u) and the equations of motion ẋ = f(x), whose multipliers follow from
-    the hidden constraints, a perturbation that satisfies the constraints to first order
-    is δx = Z z, and ż = A z with A = W Df(x) Z for any W with W Z = 1. On a group
-    perturbations are left-trivialised, ξ̇ = δv - ad_v ξ.
+    A steady motion is the orbit of a one-parameter group of symmetries of the system, a
+    relative equilibrium. With x = (q, u), the equations of motion ẋ = f(x), whose
+    multipliers follow from the hidden constraints, and the vector field X that makes
+    the symmetries, f - X vanishes at the state, and
 
-    The motion is an equilibrium, or it is steady in these coordinates: all velocities
-    are constant, those of the body on a group, or at least the independent ones that
-    are chosen, as for a bicycle that runs in a circle. A body of revolution that rolls
-    on a circle is not steady in this sense, since its axes turn against the motion.
+    ż = A z,    A = W D(f - X) Z,
+
+    in the frame that moves with X. Perturbations δx = Z z satisfy the constraints to
+    first order, and W Z = 1. On a group they are left-trivialised.
+
+    There are two ways to tell X. With `symmetry` it is the combination of the given
+    generators along which the state moves, and perturbations along the generators,
+    which lead to the same motion moved in time or space, are left out: A is that of
+    the reduced system. Without it X has the velocity itself as its constant
+    components; it is a translation of ignorable coordinates, or of the group from the
+    left, and velocities are constant: those of the body on a group, or at least the
+    independent ones that are chosen, as for a bicycle that runs in a circle.
+
     About any other motion A holds for an instant, and its eigenvalues have no meaning
     for stability. `steady_motion` finds steady motions.
 
@@ -91,6 +101,12 @@ def linear_stability(
         constraints are not perturbed: use it for coordinates that the motion does not
         depend on, such as where a wheel is. By default z are coordinates in an
         orthonormal basis of all perturbations that the constraints permit.
+    - `symmetry`: generators of symmetries, as vector fields like those of
+        `momentum_map`: called as `symmetry(q)`, of shape (n,) or (k, n), in the
+        components of the velocity. On a group that of g -> g exp(εξ), a symmetry of the
+        body, is the constant ξ, and that of g -> exp(εξ) g, one of space, is
+        `manifold.Ad(manifold.inverse(q), xi)`. The velocity must be a combination of
+        them, and translations go with rotations that turn them.
     - `must_be_steady`: raise unless the motion is steady. Without it the matrix is that
         of the instant, for instance to linearise along a trajectory.
 
@@ -98,57 +114,88 @@ def linear_stability(
     differentiable with respect to `y` and `args`. The eigenvalues themselves are
     computed by a library that JAX has on a CPU only.
 
-    **Raises:** `TypeError` if `system` is no system or `y` no `State`; `ValueError` if
-    only one of `positions` and `velocities` is given, an index is out of range or
-    occurs twice, their number does not fit, or they do not determine the other
-    velocities, or if the motion is not steady; `DependentConstraintsError` if the
-    constraints are dependent; `IrregularLagrangianError` if the mass matrix or the
-    compatibility matrix is singular; `ShapeError` if `y` is no state of this system.
+    **Raises:** `TypeError` if `system` is no system, `y` no `State` or `symmetry` no
+    function; `ValueError` if only one of `positions` and `velocities` is given, an
+    index is out of range or occurs twice, their number does not fit, or they do not
+    determine the other velocities, if the motion is not steady, or if generators are
+    dependent, not closed, or no symmetries of the equations of motion to first order at
+    `y`; `DependentConstraintsError` if the constraints are dependent;
+    `IrregularLagrangianError` if the mass matrix or the compatibility matrix is
+    singular; `ShapeError` if `y` is no state of this system, or generators no
+    velocities.
 
     !!! example
 
-        >>> import nhjax
+        A pendulum that turns on a cone, where cos θ is 1/4:
+
+        >>> import jax.numpy as jnp, nhjax
         >>> pendulum = nhjax.systems.SphericalPendulum(
-        ...     q0=(0.0, 0.0, -1.0), v0=(0.0, 0.0, 0.0), gravity=4.0)
-        >>> y = pendulum.initial_state()
-        >>> stability = nhjax.linear_stability(pendulum.system, 0.0, y)
-        >>> [round(abs(float(x.imag)), 4) for x in stability.eigenvalues]
-        [2.0, 2.0, 2.0, 2.0]
+        ...     q0=(0.9682458365518543, 0.0, -0.25), v0=(0.0, 1.9364916731037085, 0.0))
+        >>> stability = nhjax.linear_stability(
+        ...     pendulum.system, 0.0, pendulum.initial_state(),
+        ...     symmetry=lambda q: jnp.stack([-q[1], q[0], 0 * q[2]]))
+        >>> [round(float(x), 6) for x in jnp.sort(stability.eigenvalues.imag)]
+        [-2.179449, 0.0, 2.179449]
     """
     args = parameters(args)
     t = checked_time("linear_stability", system, t, y, args)
     independent = check_independent(system, t, y, args, positions, velocities)
     must_be_steady = check_flag("must_be_steady", must_be_steady)
-    slopes = _slopes(system, t, y, args)
+    if symmetry is None:
+        slopes = slopes_along_velocity(system, t, y, args)
+    else:
+        _check_alone(independent, must_be_steady)
+        check_symmetry(symmetry, y)
+        slopes = slopes_along_symmetry(system, t, y, args, symmetry)
     reduced = _reduced(slopes, y, independent)
-    checks = [
-        Check(reduced.has_motion, _singular, (y.q,)),
-        Check(reduced.determined, _not_determined, (independent,)),
-    ]
-    if must_be_steady:
-        drift = reduced.drift, reduced.allowed
-        checks.append(Check(reduced.is_steady, _not_steady, drift))
+    checks = [Check(reduced.has_motion, _singular, (y.q,))]
+    if reduced.verdict is not None:
+        checks += checks_of(reduced.verdict)
+    checks.append(Check(reduced.determined, _not_determined, (independent,)))
+    if must_be_steady and reduced.verdict is None:
+        drift = reduced.drift
+        checks.append(Check(drift.holds, _not_steady, tuple(drift)))
     return require(reduced.found, *checks)
 
 
+def _check_alone(independent: object, must_be_steady: bool) -> None:
+    if independent is not None:
+        raise ValueError(
+            "Give either `symmetry`, which leaves out what its generators move, or "
+            "`positions` and `velocities`, not both."
+        )
+    if not must_be_steady:
+        raise ValueError(
+            "With `symmetry` the motion must be steady: leave `must_be_steady` out."
+        )
+
+
 def _drift(
-    slopes: "_Slopes", y: State, independent: tuple[Indices, Indices] | None
-) -> tuple[Array, Array]:
+    slopes: Slopes, y: State, independent: tuple[Indices, Indices] | None
+) -> Bounded:
     """Find how fast what must be constant changes, and how fast it may.
 
-    The bound is for states that were computed or printed with some digits.
+    That is the velocity of what is perturbed, and where nothing is chosen that of the
+    velocities alone, which must keep this rate too: a pendulum that passes its lowest
+    point does not. The bound is for states that were computed or printed with some
+    digits.
     """
     dim = slopes.on_positions.shape[1]
-    drift = jnp.abs(slopes.drift)
     if independent is None:
         chosen = jnp.arange(dim, 2 * dim)
     else:
         positions, velocities = independent
         chosen = jnp.asarray((*positions, *(dim + i for i in velocities)), int)
-    size = unit(max_norm(*jax.tree.leaves(y.q), y.v, y.p))
-    terms = jnp.sum(jnp.abs(slopes.rates), axis=1) * size
+    rates = jnp.abs(slopes.rates)
+    drift = jnp.stack([slopes.velocity, slopes.rates @ slopes.velocity])
+    terms = jnp.stack(
+        [jnp.sum(rates, axis=1) * size_of(y), rates @ jnp.abs(slopes.velocity)]
+    )
     small = float(jnp.finfo(drift.dtype).eps) ** 0.25
-    return drift[chosen], small * (1 + terms[chosen])
+    allowed = small * (1 + terms)
+    return Bounded(
+        jnp.abs(drift[:, chosen]).reshape(-1), allowed[:, chosen].reshape(-1)
+    )
 
 
 def _singular(q: object) -> IrregularLagrangianError:
@@ -183,68 +230,38 @@ def _not_determined(independent: tuple[Indices, Indices] | None) -> ValueError:
     )
 
 
-class _Slopes(NamedTuple):
-    """The derivatives of the equations with respect to perturbations x = (ξ, w)."""
-
-    rates: Float[Array, "x x"]
-    drift: Float[Array, " x"]  # (v, u̇), of which the steady part must vanish
-    on_velocities: Float[Array, "l x"]
-    on_positions: Float[Array, "k n"]
-
-
-@tracked_jit("system", "args")
-def _slopes(system, t, y, args) -> _Slopes:
-    dim, count = y.p.shape[0], y.multiplier.shape[0]
-
-    def equations(x):
-        q, u = perturbed(system, y, x)
-        return jnp.concatenate(
-            [
-                rates_of_change(system, t, y, args)(x),
-                system.constraint(t, q, u, args),
-                system.position_constraint(t, q, args),
-            ]
-        )
-
-    slopes, value, _ = jacobian_and_value(
-        lambda x: (as_cpu_kernel(equations, x), None), jnp.zeros(2 * dim, y.p.dtype)
-    )
-    drift = jnp.concatenate([y.v, value[dim : 2 * dim]])
-    rates, on_velocities, rest = jnp.split(slopes, [2 * dim, 2 * dim + count])
-    return _Slopes(rates, drift, on_velocities, rest[:, :dim])
-
-
 class _Reduced(NamedTuple):
     """The linear equations, and what tells whether they mean anything."""
 
     found: LinearStability
     has_motion: BoolScalar
     determined: BoolScalar
-    is_steady: BoolScalar
-    drift: Array
-    allowed: Array
+    drift: Bounded
+    verdict: Verdict | None
 
 
 @eqx.filter_jit
 def _reduced(
-    slopes: _Slopes, y: State, independent: tuple[Indices, Indices] | None
+    slopes: Slopes, y: State, independent: tuple[Indices, Indices] | None
 ) -> _Reduced:
     """Restrict the linear equations to the perturbations that are permitted."""
+    orbit = slopes.orbit
     if independent is None:
-        dim = slopes.on_positions.shape[1]
-        rows = jnp.pad(slopes.on_positions, ((0, 0), (0, dim)))
-        found = orthonormal_basis(jnp.concatenate([slopes.on_velocities, rows]))
+        beside = slopes.rates[:0] if orbit is None else orbit.directions
+        permitted = orthonormal_basis(slopes.rows, beside)
     else:
-        found = independent_basis(
+        permitted = independent_basis(
             slopes.on_velocities, slopes.on_positions, *independent
         )
-    matrix = found.left @ slopes.rates @ found.basis
-    drift, allowed = _drift(slopes, y, independent)
+    matrix = permitted.left @ slopes.rates @ permitted.basis
+    verdict, equations = None, slopes.rates
+    if orbit is not None:
+        verdict = judged(orbit, slopes.rows, permitted, size_of(y))
+        equations = orbit.motion_slopes
     return _Reduced(
-        found=LinearStability(matrix, found.basis),
-        has_motion=jnp.all(jnp.isfinite(slopes.rates)),
-        determined=found.determined,
-        is_steady=jnp.all(drift <= allowed),
-        drift=drift,
-        allowed=allowed,
+        found=LinearStability(matrix, permitted.basis),
+        has_motion=jnp.all(jnp.isfinite(equations)),
+        determined=permitted.determined,
+        drift=_drift(slopes, y, independent),
+        verdict=verdict,
     )

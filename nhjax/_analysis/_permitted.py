@@ -21,20 +21,29 @@ class Permitted(NamedTuple):
     determined: BoolScalar
 
 
-def orthonormal_basis(rows: Array) -> Permitted:
-    """Compute an orthonormal basis of the kernel of `rows`.
+def orthonormal_basis(rows: Array, orbit: Array) -> Permitted:
+    """Compute an orthonormal basis of the kernel of `rows`, at right angles to `orbit`.
+
+    What is picked from perturbations does not depend on how far they go along the
+    vectors of `orbit`, which lie in the kernel themselves.
 
     The basis is defined up to a rotation, which no derivative of a singular value
     decomposition settles: the one that is found is held, and its derivative is that by
     which it stays in the kernel.
     """
+    rows = jnp.concatenate([rows, orbit])
     count = rows.shape[0]
     _, _, right = jnp.linalg.svd(jax.lax.stop_gradient(rows), full_matrices=True)
     kernel = right[count:].T
-    normal = jnp.linalg.solve(rows @ rows.T, rows @ kernel)
-    basis = kernel - rows.T @ normal
-    left = jnp.linalg.solve(kernel.T @ basis, kernel.T)
+    basis = kernel - _along(rows, kernel)
+    beside = (kernel - _along(orbit, kernel)).T
+    left = jnp.linalg.solve(beside @ basis, beside)
     return Permitted(basis, left, ~is_deficient(rows))
+
+
+def _along(rows: Array, vectors: Array) -> Array:
+    """Compute the parts of vectors, as columns, in the span of `rows`."""
+    return rows.T @ jnp.linalg.solve(rows @ rows.T, rows @ vectors)
 
 
 def independent_basis(

@@ -5,6 +5,7 @@ import dataclasses
 from typing import Self
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
@@ -82,6 +83,16 @@ class AbstractRollingBody(AbstractConstrainedGroupExample):
     def contact_point(self, q: Pose) -> Vector3:
         """Compute the lowest point of the body, in space."""
         return q[4:] + SO3().Ad(q[:4], self._contact(q))
+
+    def plane_symmetry(self, q: Pose) -> Float[Array, "3 6"]:
+        """Compute the generators of the motions of the plane, as body velocities.
+
+        They are the translations along the axes of x and y, and the turn about that of
+        z, under which the system is symmetric whatever the shape of the body.
+        """
+        motions = jnp.eye(6, dtype=q.dtype)[jnp.array([0, 1, 5])]
+        back = self.manifold.inverse(q)
+        return jax.vmap(lambda xi: self.manifold.Ad(back, xi))(motions)
 
     def contact_momentum(self, q: Pose, v: Twist) -> Vector3:
         """Compute the angular momentum about the point of contact, in body axes."""

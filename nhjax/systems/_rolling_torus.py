@@ -151,6 +151,14 @@ class RollingTorus(AbstractRollingBody):
         across = up.at[2].set(0.0)
         return -self.tube_radius * up - self.radius * across / jnp.sqrt(across @ across)
 
+    def symmetry(self, q: Array) -> Float[Array, "4 6"]:
+        """Compute the generators of all symmetries, as body velocities.
+
+        They are those of the plane, and the turn of the torus about its axle.
+        """
+        spin = jnp.zeros((1, 6), q.dtype).at[0, 5].set(1)
+        return jnp.concatenate([self.plane_symmetry(q), spin])
+
     def invariants(self, t: FloatScalarLike, q: Array, v: Array) -> dict[str, Array]:
         """Compute the conserved quantities: the energy."""
         return {"energy": self.energy(t, q, v)}

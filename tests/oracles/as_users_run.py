@@ -250,6 +250,22 @@ def a_steady_motion_and_its_stability():
 
 
 @feature
+def stability_up_to_a_symmetry():
+    cosine = 0.25
+    radius, speed = (1 - cosine**2) ** 0.5, (1 / cosine - cosine) ** 0.5
+    cone = systems.SphericalPendulum(q0=(0, radius, -cosine), v0=(speed, 0, 0))
+    stability = nhjax.linear_stability(
+        cone.system,
+        0.0,
+        cone.initial_state(),
+        symmetry=lambda q: jnp.stack([-q[1], q[0], 0 * q[2]]),
+    )
+    assert stability.basis.shape == (6, 3)
+    frequency = (1 / cosine + 3 * cosine) ** 0.5
+    close([*jnp.sort(stability.eigenvalues.imag)], [-frequency, 0.0, frequency])
+
+
+@feature
 def single_precision():
     sol = run(y0=PARTICLE.initial_state(jnp.float32))
     assert sol.ys.q.dtype == jnp.float32

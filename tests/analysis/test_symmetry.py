@@ -1,0 +1,285 @@
+"""Stability of motions that are steady up to a symmetry, against closed forms."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.optimize import linear_sum_assignment
+
+import nhjax
+from nhjax.systems import FreeRigidBody, HeavyTop, RollingTorus, SphericalPendulum
+from oracles.group_problems import both_forms
+from oracles.rolling_bodies import matrix_of, RollingBody, torus
+
+
+AXIS = jnp.asarray([0.0, 0.0, 1.0])
+# A disc of no thickness, and a tyre. Both are leaves of one program.
+DISC = RollingTorus(1.3, 0.4, 0.0, 0.05, 0.11)
+TYRE = RollingTorus(1.7, 0.4, 0.06, 0.15, 0.28)
+
+
+def about_vertical(q):
+    """The generator of the rotations of space about the vertical, on SO(3)."""
+    return nhjax.SO3().Ad(nhjax.SO3().inverse(q), AXIS)
+
+
+def on_axis(q):
+    return AXIS
+
+
+def assert_eigenvalues(stability, expected, atol=1e-12):
+    found, expected = np.asarray(stability.eigenvalues), np.asarray(expected)
+    assert found.shape == expected.shape
+    distance = np.abs(found[:, None] - expected)
+    assert np.max(distance[linear_sum_assignment(distance)]) < atol
+
+
+def rolling(body, attitude, omega):
+    body = body.rolling(attitude, omega)
+    return nhjax.linear_stability(
+        body.system, 0.0, body.initial_state(), symmetry=body.symmetry
+    )
+
+
+def numbers(body):
+    names = ["mass", "radius", "diametral_inertia", "axial_inertia", "gravity"]
+    return (float(getattr(body, name)) for name in names)
+
+
+@pytest.mark.parametrize("ratio", [0.9, 1.1])
+def test_critical_speed_of_a_disc_that_rolls_straight(ratio):
+    # λ² (I + m a²) = m g a - J (J + m a²) ω² / I: Neimark and Fufaev.
+    m, a, diametral, axial, g = numbers(DISC)
+    contact = axial + m * a**2
+    omega = ratio * np.sqrt(m * g * a * diametral / (axial * contact))
+    square = m * g * a * (1 - ratio**2) / (diametral + m * a**2)
+    root = np.sqrt(complex(square))
+    half = np.sqrt(0.5)
+    stability = rolling(DISC, (half, half, 0.0, 0.0), (0.0, 0.0, omega))
+    # The two zeros are the speed and the rate of turning of other steady motions.
+    assert_eigenvalues(stability, [root, -root, 0, 0])
+
+
+@pytest.mark.parametrize("ratio", [0.9, 1.1])
+def test_critical_rate_of_a_disc_that_spins_on_the_spot(ratio):
+    # λ² = m g a / (I + m a²) - Ω²
+    m, a, diametral, _, g = numbers(DISC)
+    square = m * g * a / (diametral + m * a**2)
+    root = np.sqrt(complex(square * (1 - ratio**2)))
+    # The axle points anywhere in the plane, and the wheel has turned.
+    attitude = np.array([0.5, 0.5, 0.5, 0.5])
+    up = matrix_of(attitude)[2]
+    stability = rolling(DISC, attitude, ratio * np.sqrt(square) * up)
+    assert_eigenvalues(stability, [root, -root, 0, 0])
+
+
+def rates_in_angles(oracle, state):
+    """The rates of the tilt and of ω along the axes (horizontal, up the disc, axle).
+
+    These axes do not roll with the body, but turn with its plane.
+    """
+    tilt, omega = state[0], state[1:]
+    c, s = np.cos(tilt), np.sin(tilt)
+    attitude = np.array([[1, 0, 0], [0, c, -s], [0, s, c]])
+    _, slope, _ = oracle.accelerations(attitude, omega)
+    # ω = (θ̇, Ω sin θ, Ω cos θ + ψ̇) with the rate ψ̇ of rolling.
+    roll = np.array([0, 0, omega[2] - omega[1] * c / s])
+    return np.append(omega[0], slope + np.cross(roll, omega))
+
+
+@pytest.mark.parametrize("body", [DISC, TYRE], ids=["disc", "tyre"])
+def test_circling_wheels_have_the_eigenvalues_of_newton_and_euler(body):
+    steady = type(body).steady(
+        1.2,
+        2.5,
+        mass=body.mass,
+        radius=body.radius,
+        tube_radius=body.tube_radius,
+        diametral_inertia=body.diametral_inertia,
+        axial_inertia=body.axial_inertia,
+    )
+    oracle = RollingBody(
+        float(body.mass),
+        np.asarray(body.inertia),
+        float(body.gravity),
+        torus(float(body.radius), float(body.tube_radius)),
+    )
+    state, h = np.append(1.2, steady.v0[3:]), 1e-3
+    np.testing.assert_allclose(rates_in_angles(oracle, state), 0, atol=1e-13)
+    columns = []
+    for e in h * np.eye(4):
+        # Differences of the sixth order.
+        at = {k: rates_in_angles(oracle, state + k * e) for k in (-3, -2, -1, 1, 2, 3)}
+        odd = [at[k] - at[-k] for k in (1, 2, 3)]
+        columns.append((45 * odd[0] - 9 * odd[1] + odd[2]) / (60 * h))
+    # The wheel has rolled on, and its circle lies anywhere.
+    turned = nhjax.SO3().compose(steady.q0[:4], jnp.asarray([0.6, 0.0, 0.0, 0.8]))
+    back = matrix_of([0.6, 0.0, 0.0, 0.8]).T
+    moved = steady.rolling(turned, back @ np.asarray(steady.v0[3:]), (0.3, -0.7))
+    stability = nhjax.linear_stability(
+        moved.system, 0.0, moved.initial_state(), symmetry=moved.symmetry
+    )
+    # Double zeros of the differences are a root of their round-off.
+    expected = np.linalg.eigvals(np.stack(columns, axis=1))
+    expected[np.abs(expected) < 1e-4] = 0
+    assert np.sum(expected == 0) == 2
+    assert_eigenvalues(stability, expected, 1e-9)
+
+
+def sleeping(rate, gravity, form="lagrangian"):
+    top = HeavyTop(gravity=gravity)
+    arm = float(top.centre[2])
+    moments = top.moments + top.mass * arm**2 * jnp.asarray([1.0, 1.0, 0.0])
+    weight = top.mass * gravity * arm
+    system = both_forms(
+        lambda t, q: jnp.diag(moments),
+        lambda t, q: weight * top.manifold.Ad(q, AXIS)[2],
+        inverse=lambda M: jnp.diag(1 / jnp.diagonal(M)),
+        manifold=top.manifold,
+    )[form]
+    q, v = jnp.asarray([0.8, 0.0, 0.0, 0.6]), jnp.stack([0 * rate, 0 * rate, rate])
+    y = nhjax.State(q, v, moments * v, jnp.zeros(0))
+    return system, y
+
+
+# J₁ about the pivot, J₃ and m l of this top.
+FIRST, THIRD, ARM = 0.55, 0.4, 0.5
+
+
+@pytest.mark.parametrize("form", ["lagrangian", "hamiltonian"])
+def test_precession_and_nutation_of_a_sleeping_top(form):
+    # J₁ ν² - J₃ ω ν + m g l = 0 in space; it sleeps where (J₃ ω)² > 4 J₁ m g l.
+    for ratio in (0.9, 1.1):
+        rate = ratio * np.sqrt(4 * FIRST * ARM * 9.81) / THIRD
+        system, y = sleeping(jnp.asarray(rate), 9.81, form)
+        found = nhjax.linear_stability(system, 0.0, y, symmetry=on_axis)
+        nu = np.roots([FIRST, -THIRD * rate, ARM * 9.81])
+        expected = 1j * np.array([*nu, *-np.conj(nu), 0])
+        assert_eigenvalues(found, expected)
+        # In the frame of the body it turns backwards: ν - ω, and the same growth.
+        found = nhjax.linear_stability(system, 0.0, y, symmetry=about_vertical)
+        turned = 1j * np.array([*(nu - rate), *-np.conj(nu - rate), 0])
+        assert_eigenvalues(found, turned)
+
+
+def test_derivative_with_respect_to_the_rate_and_gravity():
+    def squares(rate, gravity):
+        system, y = sleeping(rate, gravity)
+        matrix = nhjax.linear_stability(system, 0.0, y, symmetry=on_axis).matrix
+        return jnp.trace(matrix @ matrix)
+
+    rate, gravity = jnp.asarray(30.0), jnp.asarray(9.81)
+    found = jax.value_and_grad(squares, argnums=(0, 1))(rate, gravity)
+    # The sum of the squares of both roots, which occur twice.
+    sums = (THIRD * rate / FIRST) ** 2 - 2 * ARM * gravity / FIRST
+    slopes = 2 * (THIRD / FIRST) ** 2 * rate, -2 * ARM / FIRST
+    for x, y in zip(jax.tree.leaves(found), (sums, *slopes), strict=True):
+        np.testing.assert_allclose(x, -2 * y, rtol=1e-12)
+
+
+def test_left_translations_leave_the_equations_of_euler():
+    def everywhere(q):
+        return jax.vmap(lambda xi: nhjax.SO3().Ad(nhjax.SO3().inverse(q), xi))(
+            jnp.eye(3)
+        )
+
+    i1, i2, i3 = moments = np.array([3.0, 2.0, 1.0])
+    body = FreeRigidBody(moments, v0=(0.0, 1.3, 0.0))
+    y = body.initial_state()
+    stability = nhjax.linear_stability(body.system, 0.0, y, symmetry=everywhere)
+    growth = 1.3 * np.sqrt((i1 - i2) * (i2 - i3) / (i1 * i3))
+    assert_eigenvalues(stability, [growth, -growth, 0])
+
+
+def turn(q):
+    return jnp.stack([-q[1], q[0], 0 * q[2]])
+
+
+@pytest.mark.parametrize("form", ["lagrangian", "hamiltonian"])
+def test_cone_of_a_pendulum_in_space(form):
+    g, angle = 9.81, 0.7
+    rate = np.sqrt(g / np.cos(angle))
+    system = both_forms(
+        lambda t, q: jnp.eye(3, dtype=q.dtype),
+        lambda t, q: g * q[2],
+        holonomic=lambda t, q, args: 0.5 * (q @ q - 1),
+    )[form]
+    q = jnp.asarray([np.sin(angle), 0.0, -np.cos(angle)])
+    v = jnp.asarray([0.0, rate * np.sin(angle), 0.0])
+    y = nhjax.initial_state(system, q, **{"v" if form == "lagrangian" else "p": v})
+    stability = nhjax.linear_stability(system, 0.0, y, symmetry=turn)
+    frequency = rate * np.sqrt(1 + 3 * np.cos(angle) ** 2)
+    assert_eigenvalues(stability, [1j * frequency, -1j * frequency, 0])
+    with pytest.raises(ValueError, match="velocity or chosen position changes"):
+        nhjax.linear_stability(system, 0.0, y)
+
+
+def test_many_and_in_single_precision():
+    @jax.jit
+    @jax.vmap
+    def squares(cosine):
+        sine, zero = jnp.sqrt(1 - cosine**2), 0 * cosine
+        pendulum = SphericalPendulum(
+            gravity=1.0,
+            q0=jnp.stack([sine, zero, -cosine]),
+            v0=jnp.stack([zero, sine / jnp.sqrt(cosine), zero]),
+        )
+        y = pendulum.initial_state(cosine.dtype)
+        found = nhjax.linear_stability(pendulum.system, 0.0, y, symmetry=turn)
+        return jnp.trace(found.matrix @ found.matrix)
+
+    cosines = jnp.asarray([0.3, 0.6], jnp.float32)
+    expected = -2 * (1 / cosines + 3 * cosines)
+    np.testing.assert_allclose(squares(cosines), expected, rtol=1e-4)
+
+
+FREE = nhjax.LagrangianSystem(lambda t, q, v, args: 0.5 * (v @ v))
+PLANE = nhjax.State(
+    jnp.asarray([0.0, 0.5]), jnp.asarray([1.0, 0.0]), jnp.asarray([1.0, 0.0]), AXIS[:0]
+)
+
+
+@pytest.mark.parametrize(
+    ("symmetry", "message"),
+    [
+        (lambda q: jnp.eye(2)[1], "no combination .* moves the state as it moves, 1 "),
+        (lambda q: jnp.stack([jnp.eye(2)[0]] * 2), "are dependent at `y`"),
+        (
+            lambda q: jnp.stack([jnp.eye(2)[0], jnp.stack([-q[1], q[0]])]),
+            "not closed: .* generator 1 moves out of their span, at the rate 1 ",
+        ),
+        (
+            lambda q: jnp.stack([1 + (q[1] - 0.5) * q[0], 0 * q[0]]),
+            "Generator 0 .* no symmetry of the system: .* at the rate 2 ",
+        ),
+        (lambda q: jnp.ones(3), r"must return shape \(2,\) or \(k, 2\), .* \(3,\)"),
+        (lambda q: "x", "got type str"),
+        (jnp.ones(2), "must be a function of q"),
+    ],
+)
+def test_what_is_no_symmetry_is_refused(symmetry, message):
+    with pytest.raises((ValueError, TypeError), match=message):
+        nhjax.linear_stability(FREE, 0.0, PLANE, symmetry=symmetry)
+
+
+def test_a_symmetry_is_refused_whose_axis_is_not_that_of_the_body():
+    # All first derivatives are those of a top with equal moments.
+    top = HeavyTop(moments=(0.3, 0.31, 0.4))
+    y = nhjax.initial_state(top.system, jnp.asarray([1.0, 0, 0, 0]), 4.0 * AXIS)
+    with pytest.raises(ValueError, match=r"Generator 0 .* no symmetry of the sys"):
+        nhjax.linear_stability(top.system, 0.0, y, symmetry=on_axis)
+
+
+def test_a_generator_that_leaves_the_constraints_is_refused():
+    pendulum = SphericalPendulum(q0=(0.0, 0.0, -1.0), v0=(0.0, 0.0, 0.0))
+    y = pendulum.initial_state()
+    with pytest.raises(ValueError, match="off them at the rate 2 "):
+        nhjax.linear_stability(pendulum.system, 0.0, y, symmetry=lambda q: AXIS)
+
+
+@pytest.mark.parametrize(
+    "chosen", [{"positions": (0,), "velocities": (0, 1)}, {"must_be_steady": False}]
+)
+def test_a_symmetry_stands_alone(chosen):
+    with pytest.raises(ValueError, match=r"Give either `symmetry`|With `symmetry`"):
+        nhjax.linear_stability(FREE, 0.0, PLANE, symmetry=turn, **chosen)
