@@ -35,8 +35,9 @@ def member_ir(
     **Returns:**
 
     The text of a module of LLVM with the function
-    `void kernel(ptr operands, ptr results, i64 first, i64 last)`. It computes the
-    members from `first` to `first + width - 1`; those beyond `last` repeat that one.
+    `i1 kernel(ptr operands, ptr results, i64 first, i64 last)`. It computes the members
+    from `first` to `first + width - 1`; those beyond `last` repeat that one. It returns
+    whether that failed, for lack of scratch memory.
 
     **Raises:**
 
@@ -74,14 +75,24 @@ def _module(text: Text, size: int) -> str:
         "ptr %scratch)"
     )
     if size <= _STACK:
-        body = [f"  %scratch = alloca [{size} x i8], align {ALIGNMENT}", f"  {call}"]
+        body = [
+            f"  %scratch = alloca [{size} x i8], align {ALIGNMENT}",
+            f"  {call}",
+            "  ret i1 false",
+        ]
     else:
         body = [
             f"  %piece = call ptr @malloc(i64 {size + ALIGNMENT})",
+            "  %is_lacking = icmp eq ptr %piece, null",
+            "  br i1 %is_lacking, label %lacking, label %run",
+            "lacking:",
+            "  ret i1 true",
+            "run:",
             f"  %up = getelementptr i8, ptr %piece, i64 {ALIGNMENT - 1}",
             f"  %scratch = call ptr @llvm.ptrmask.p0.i64(ptr %up, i64 -{ALIGNMENT})",
             f"  {call}",
             "  call void @free(ptr %piece)",
+            "  ret i1 false",
         ]
         text.declare("malloc", "declare ptr @malloc(i64)")
         text.declare("free", "declare void @free(ptr)")
@@ -90,9 +101,8 @@ def _module(text: Text, size: int) -> str:
         *first,
         *text.lines,
         "}",
-        "define void @kernel(ptr %operands, ptr %results, i64 %first, i64 %last) {",
+        "define i1 @kernel(ptr %operands, ptr %results, i64 %first, i64 %last) {",
         *body,
-        "  ret void",
         "}",
         *text.declared.values(),
         "!0 = !{}",

@@ -5,6 +5,7 @@ from ._ffi_structs import field, size_of
 
 # The names of the messages, as constants of the module.
 NO_MEMORY, MISMATCH = "nhjax.no_memory", "nhjax.mismatch"
+NO_SCRATCH = "nhjax.no_scratch"
 
 
 def _constant_string(name: str, text: str) -> str:
@@ -16,6 +17,7 @@ _CREATE, _DESTROY = "XLA_FFI_Error_Create_Args", "XLA_FFI_Error_Destroy_Args"
 
 ERRORS = f"""
 {_constant_string(NO_MEMORY, "no memory to share a call's blocks")}
+{_constant_string(NO_SCRATCH, "no memory for the arrays that a program works with")}
 {_constant_string(MISMATCH, "unexpected numbers of arrays")}
 
 ; Make an error, for XLA to destroy.

@@ -6,7 +6,7 @@ computes results from operands. How the work is shared among threads is in `_poo
 
 import time
 
-from ._ffi_errors import ERRORS, MISMATCH, NO_MEMORY
+from ._ffi_errors import ERRORS, MISMATCH, NO_MEMORY, NO_SCRATCH
 from ._ffi_structs import (
     EXTENSION_METADATA,
     field,
@@ -50,6 +50,7 @@ def handler_ir(
         pool_ir(width),
         _members(num_results, is_batched),
         _CALL,
+        _OUTCOME,
         _execution(num_operands, num_results, width),
         _ENTRY,
     ]
@@ -57,7 +58,7 @@ def handler_ir(
 
 
 _DECLARATIONS = f"""
-declare void @kernel(ptr, ptr, i64, i64)
+declare i1 @kernel(ptr, ptr, i64, i64)
 declare ptr @malloc(i64)
 declare i32 @clock_gettime(i32, ptr)
 
@@ -182,6 +183,24 @@ end:
 }}
 """
 
+_OUTCOME = f"""
+; Run a job to its end and let go of it; return an error if a block failed.
+define internal ptr @nhjax.outcome(ptr %frame, ptr %job) {{
+  call void @nhjax.call(ptr %frame, ptr %job)
+  %failed_at = {job_field("failed")}
+  %failed = load atomic i64, ptr %failed_at monotonic, align 8
+  call void @nhjax.release(ptr %job)
+  %is_fine = icmp eq i64 %failed, 0
+  br i1 %is_fine, label %fine, label %lacking
+fine:
+  ret ptr null
+lacking:
+  %no_scratch = call ptr @nhjax.error(
+    ptr %frame, ptr @{NO_SCRATCH}, i32 {RESOURCE_EXHAUSTED})
+  ret ptr %no_scratch
+}}
+"""
+
 
 _FRAME = "XLA_FFI_CallFrame"
 _ENTRY = f"""
@@ -257,9 +276,8 @@ run:
   store ptr %operands, ptr %operands_at
   %results_at = {job_field("results")}
   store ptr %results, ptr %results_at
-  call void @nhjax.call(ptr %frame, ptr %job)
-  call void @nhjax.release(ptr %job)
-  br label %done
+  %outcome = call ptr @nhjax.outcome(ptr %frame, ptr %job)
+  ret ptr %outcome
 done:
   ret ptr null
 }}

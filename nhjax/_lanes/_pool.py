@@ -32,8 +32,8 @@ _YIELDS, _SHORTEST_SLEEP, _LONGEST_SLEEP = 100, 50, 10_000
 
 # What the threads that work on a call share: how many blocks have been begun and are
 # done, how many threads hold the job, how many the pool has, how many blocks there are,
-# the last member, and the addresses of the data. The first two change all the time, and
-# have cache lines of their own.
+# the last member, whether a block failed, and the addresses of the data. The first two
+# change all the time, and have cache lines of their own.
 JOB = {
     "begun": "i64",
     "padding_1": "[7 x i64]",
@@ -43,6 +43,7 @@ JOB = {
     "threads": "i64",
     "blocks": "i64",
     "last": "i64",
+    "failed": "i64",
     "operands": "ptr",
     "results": "ptr",
 }
@@ -89,7 +90,14 @@ define internal void @nhjax.run(ptr %job, i64 %block) noinline {{
   %last_at = {job_field("last")}
   %last = load i64, ptr %last_at
   %first = mul i64 %block, {width}
-  call void @kernel(ptr %operands, ptr %results, i64 %first, i64 %last)
+  %has_failed = call i1 @kernel(
+    ptr %operands, ptr %results, i64 %first, i64 %last)
+  br i1 %has_failed, label %failed, label %done
+failed:
+  %failed_at = {job_field("failed")}
+  store atomic i64 1, ptr %failed_at monotonic, align 8
+  br label %done
+done:
   %done_at = {job_field("done")}
   atomicrmw add ptr %done_at, i64 1 release
   ret void

@@ -70,7 +70,7 @@ def registered(
 
     **Arguments:**
 
-    - `kernel_ir`: the text of a module in LLVM IR with `define void @kernel(ptr
+    - `kernel_ir`: the text of a module in LLVM IR with `define i1 @kernel(ptr
         %operands, ptr %results, i64 %first, i64 %last)`, which computes the members
         from `%first` on, `width` of them but none after `%last`. `%operands` and
         `%results` are arrays of the addresses of the data. Other threads may run it at

@@ -206,7 +206,8 @@ def test_cone_of_a_pendulum_in_space(form):
     )[form]
     q = jnp.asarray([np.sin(angle), 0.0, -np.cos(angle)])
     v = jnp.asarray([0.0, rate * np.sin(angle), 0.0])
-    y = nhjax.initial_state(system, q, **{"v" if form == "lagrangian" else "p": v})
+    # The mass is one: momenta are velocities.
+    y = nhjax.initial_state(system, q, *((v,) if form == "lagrangian" else (None, v)))
     stability = nhjax.linear_stability(system, 0.0, y, symmetry=turn)
     frequency = rate * np.sqrt(1 + 3 * np.cos(angle) ** 2)
     assert_eigenvalues(stability, [1j * frequency, -1j * frequency, 0])

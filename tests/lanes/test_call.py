@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jax import lax
 
 from nhjax import _lanes
 from oracles import lane_processes
@@ -52,6 +53,27 @@ def test_subnormal_numbers_are_those_of_xla(triple):
     """XLA flushes them to zero, in the threads of its pool and in the caller's."""
     x = jnp.full(100_000, 5e-324)
     np.testing.assert_array_equal(call(triple, x), jax.jit(lambda x: 3 * x)(x))
+
+
+def test_a_kernel_without_memory_to_work_in_is_an_error_of_jax():
+    def sums(x):
+        # Too many numbers for the stack.
+        places = jnp.zeros(3000)
+        return lax.fori_loop(0, 20, lambda k, y: y.at[100 * k].add(x[k]), places)[:1000]
+
+    x = jnp.arange(20.0 * WIDTH).reshape(WIDTH, 20)
+    text = _lanes.member_ir(jax.make_jaxpr(sums)(x[0]), (True,), WIDTH)
+    declared = "declare ptr @malloc(i64)"
+    assert declared in text
+    name = _lanes.registered(text, 1, 1, WIDTH, True)
+    found = call(name, x, shape=(WIDTH, 1000))
+    np.testing.assert_array_equal(found, jax.vmap(sums)(x))
+    lacking = "define internal ptr @malloc(i64 %size) { ret ptr null }"
+    text = text.replace(declared, lacking)
+    name = _lanes.registered(text, 1, 1, WIDTH, True)
+    message = "RESOURCE_EXHAUSTED: no memory for the arrays that a program works with"
+    with pytest.raises(jax.errors.JaxRuntimeError, match=message):
+        jax.block_until_ready(call(name, x, shape=(WIDTH, 1000)))
 
 
 @pytest.mark.parametrize("members", [1, WIDTH + 1, 1000])

@@ -324,6 +324,27 @@ def test_lack_of_memory_is_an_error():
     assert runtime.messages[error] == (8, "no memory to share a call's blocks")
 
 
+def test_a_block_that_finds_no_memory_is_an_error():
+    # The first block finds some.
+    kernel = """
+define i1 @kernel(ptr %operands, ptr %results, i64 %first, i64 %last) {
+  %is_later = icmp sgt i64 %first, 0
+  ret i1 %is_later
+}
+"""
+    text = _handler.handler_ir(1, 1, WIDTH, True)
+    handler = loaded([kernel, text], _handler.HANDLER)
+    for members, is_lacking in ((WIDTH, False), (3 * WIDTH, True)):
+        runtime = Runtime(threads=2)
+        x = np.ones(members)
+        error = runtime.call(handler, [x], [x])
+        runtime.run_tasks()
+        assert (error is not None) == is_lacking
+        texts = [(8, "no memory for the arrays that a program works with")]
+        assert list(runtime.messages.values()) == texts[: int(is_lacking)]
+    assert WORKERS.value == 0
+
+
 def test_a_program_without_members_runs_once():
     program = Program(is_batched=False)
     runtime = Runtime(threads=4)
@@ -335,6 +356,6 @@ def test_a_program_without_members_runs_once():
 
 
 def test_a_program_without_results_does_nothing():
-    kernel = "define void @kernel(ptr %operands, ptr %results, i64 %first, i64 %last) {"
+    kernel = "define i1 @kernel(ptr %operands, ptr %results, i64 %first, i64 %last) {"
     texts = [f"{kernel} unreachable }}", _handler.handler_ir(1, 0, WIDTH, True)]
     assert Runtime().call(loaded(texts, _handler.HANDLER), [np.ones(3)], []) is None

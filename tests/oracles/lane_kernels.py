@@ -44,7 +44,7 @@ def kernel_ir(body: str, width: int = WIDTH, before: str = "") -> str:
     """Return a kernel that does something for each of `width` members in turn."""
     return f"""
 {before}
-define void @kernel(ptr %operands, ptr %results, i64 %first, i64 %last) {{
+define i1 @kernel(ptr %operands, ptr %results, i64 %first, i64 %last) {{
 entry:
   %x = load ptr, ptr %operands
   %y = load ptr, ptr %results
@@ -59,14 +59,14 @@ next:
   %is_more = icmp slt i64 %lane_next, {width}
   br i1 %is_more, label %next, label %end
 end:
-  ret void
+  ret i1 false
 }}
 """
 
 
 # A product of vectors, as kernels that are made for programs have them.
 VECTORS = """
-define void @kernel(ptr %operands, ptr %results, i64 %first, i64 %last) {
+define i1 @kernel(ptr %operands, ptr %results, i64 %first, i64 %last) {
   %x = load ptr, ptr %operands
   %y = load ptr, ptr %results
   %x_at = getelementptr double, ptr %x, i64 %first
@@ -76,6 +76,6 @@ define void @kernel(ptr %operands, ptr %results, i64 %first, i64 %last) {
   %sum = fadd contract <8 x double> %cube, %square
   %y_at = getelementptr double, ptr %y, i64 %first
   store <8 x double> %sum, ptr %y_at, align 8
-  ret void
+  ret i1 false
 }
 """
