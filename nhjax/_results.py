@@ -16,7 +16,9 @@ class RESULTS(eqx.Enumeration):
         "`max_iterations` of the stage solver: its iteration converges too slowly, or "
         "not at all. Try a smaller `dt`, `stage_solver=nhjax.Newton()`, or more "
         "iterations; where stiff forces magnify round-off, a `tolerance` of the stage "
-        "solver."
+        "solver. None of these helps where constraints become dependent in the course "
+        "of the step, as those of a linkage whose bars come to lie in one line: the "
+        "multipliers and the way on are not determined there."
     )
     singular_stage_matrix = (
         "The mass matrix D2D2L (or D2D2H) or the compatibility matrix C = D2Φ M⁻¹ D2Φᵀ "
@@ -29,7 +31,9 @@ class RESULTS(eqx.Enumeration):
     )
     left_chart = (
         "A step turned so far that it left the chart of the retraction (a rotation "
-        "near π for Cayley, near 2π for Exponential). Take a smaller `dt`."
+        "near π for Cayley, near 2π for Exponential), or its iteration left it: with "
+        "Cayley and two stages, a step of about one radian need have no solution. Take "
+        "a smaller `dt`, `retraction=nhjax.Exponential()`, or more stages."
     )
     inconsistent_start = (
         "The initial state violates the constraints at `t0`, its q is off the group, "

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, DTypeLike, PyTree
 
 from .._custom_types import Args, FloatScalarLike
-from .._errors import is_traced
+from .._errors import is_traced, ShapeError
 from .._initial import initial_state
 from .._manifold import AbstractLieGroup
 from .._system import LagrangianSystem, State
@@ -95,6 +95,28 @@ def require_consistent(name: str, violation: ArrayLike, scale: ArrayLike) -> Non
             f"`{name}` violates the constraint by {largest:.3e}; the exact solution "
             "needs consistent initial data."
         )
+
+
+def given_forces(
+    args: Args, shape: tuple[int, ...], dtype: DTypeLike, what: str
+) -> Array:
+    """Return the forces in `args` as an array; they are zero where it is None.
+
+    Raise a `ShapeError` unless they have the given shape. `what` says what they are.
+    """
+    if args is None:
+        return jnp.zeros(shape, dtype)
+    try:
+        forces = jnp.asarray(args, dtype)
+    except (TypeError, ValueError):
+        # No numbers, or of several shapes.
+        forces = None
+    if forces is None or forces.shape != shape:
+        raise ShapeError(
+            f"`args` must be None or {what}, of shape {shape}, got "
+            f"{eqx.tree_pformat(args)}. For many runs use `jax.vmap` over `args`."
+        )
+    return forces
 
 
 def on_host(tree: PyTree[Array]) -> PyTree[np.ndarray]:

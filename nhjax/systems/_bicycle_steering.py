@@ -4,7 +4,7 @@ import equinox as eqx
 from jaxtyping import Array
 
 from .._custom_types import Args, FloatScalarLike
-from ._base import parameter
+from ._base import given_forces, parameter
 
 
 class SteerTorque(eqx.Module):
@@ -20,11 +20,9 @@ class SteerTorque(eqx.Module):
         1.5
     """
 
-    def __call__(
-        self, t: FloatScalarLike, q: Array, v: Array, args: Args
-    ) -> FloatScalarLike:
+    def __call__(self, t: FloatScalarLike, q: Array, v: Array, args: Args) -> Array:
         """Return the torque, which is `args`, or zero where that is None."""
-        return 0.0 if args is None else args
+        return given_forces(args, (), v.dtype, "a torque on the steer axis")
 
 
 class LeanToSteer(eqx.Module):

@@ -12,6 +12,7 @@ from .._system import LagrangianSystem
 from ._base import (
     AbstractNonholonomicExample,
     coordinates,
+    given_forces,
     parameter,
     require_positive,
     require_possible,
@@ -188,10 +189,9 @@ class CarWithTrailers(AbstractNonholonomicExample):
 
     def force(self, t: FloatScalarLike, q: Array, v: Array, args: Args) -> Array:
         """Compute the generalised force of `args`, the driving force and the torque."""
+        what = "the driving force and the torque on the steering"
+        drive, torque = given_forces(args, (2,), v.dtype, what)
         force = jnp.zeros_like(v)
-        if args is None:
-            return force
-        drive, torque = args
         return force.at[:2].set(drive * direction(q[2])).at[3].set(torque)
 
     def invariants(self, t: FloatScalarLike, q: Array, v: Array) -> dict[str, Array]:

@@ -13,6 +13,7 @@ from .._system import LagrangianSystem
 from ._base import (
     AbstractExample,
     coordinates,
+    given_forces,
     parameter,
     require_positive,
     require_possible,
@@ -163,7 +164,7 @@ class FlyballGovernor(AbstractExample):
 
     def force(self, t: FloatScalarLike, q: Array, v: Array, args: Args) -> Array:
         """Compute the forces of the dampers, and the torque in `args` on the shaft."""
-        torque = jnp.zeros_like(v[0]) if args is None else jnp.asarray(args, v.dtype)
+        torque = given_forces(args, (), v.dtype, "a torque on the shaft")
         driving = jnp.zeros_like(v).at[0].set(torque)
         if self.couplers == "rods":
             return driving

@@ -11,6 +11,7 @@ from jaxtyping import Array, ArrayLike, Float
 from .._custom_types import Args, FloatScalarLike
 from ._base import (
     coordinates,
+    given_forces,
     require_not_negative,
     require_positive,
     require_possible,
@@ -133,7 +134,7 @@ class RollerRacer(AbstractGaitMachine):
 
     def force(self, t: FloatScalarLike, q: Array, v: Array, args: Args) -> Array:
         """Compute the force (0, 0, 0, τ), with the torque in `args`."""
-        torque = jnp.zeros_like(v[0]) if args is None else jnp.asarray(args, v.dtype)
+        torque = given_forces(args, (), v.dtype, "a torque on the pivot")
         return jnp.zeros_like(v).at[3].set(torque)
 
     def invariants(self, t: FloatScalarLike, q: Array, v: Array) -> dict[str, Array]:

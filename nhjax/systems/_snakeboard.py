@@ -11,6 +11,7 @@ from jaxtyping import Array, ArrayLike, Float
 from .._custom_types import Args, FloatScalarLike
 from ._base import (
     coordinates,
+    given_forces,
     parameter,
     require_positive,
     require_possible,
@@ -146,7 +147,7 @@ class Snakeboard(AbstractGaitMachine):
 
     def force(self, t: FloatScalarLike, q: Array, v: Array, args: Args) -> Array:
         """Compute the force (0, 0, 0, τ_ψ, τ_b, τ_f), with the torques in `args`."""
-        torques = jnp.zeros_like(v[3:]) if args is None else jnp.asarray(args, v.dtype)
+        torques = given_forces(args, (3,), v.dtype, "the torques on the joints")
         return jnp.concatenate([jnp.zeros_like(v[:3]), torques])
 
     def invariants(self, t: FloatScalarLike, q: Array, v: Array) -> dict[str, Array]:

@@ -12,6 +12,7 @@ from .._system import LagrangianSystem
 from ._base import (
     AbstractNonholonomicExample,
     coordinates,
+    given_forces,
     parameter,
     require_positive,
     require_shape,
@@ -127,11 +128,9 @@ class TwoWheeledRobot(AbstractNonholonomicExample):
 
     def force(self, t: FloatScalarLike, q: Array, v: Array, args: Args) -> Array:
         """Compute the generalised force of `args`, the torques of the motors."""
-        force = jnp.zeros_like(v)
-        if args is None:
-            return force
-        right, left = args
-        return force.at[3].set(right).at[4].set(left)
+        what = "the torques of the motors on the right and on the left"
+        torques = given_forces(args, (2,), v.dtype, what)
+        return jnp.zeros_like(v).at[3:5].set(torques)
 
     def invariants(self, t: FloatScalarLike, q: Array, v: Array) -> dict[str, Array]:
         """Compute the energy, which is conserved without torques."""

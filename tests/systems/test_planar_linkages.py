@@ -1,9 +1,11 @@
 """Slider-crank and four-bar linkage against their equations in the crank's angle."""
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy.integrate import quad
 
+import nhjax
 from nhjax.systems import FourBar, SliderCrank
 from oracles import linkages
 from oracles.flow import flow
@@ -139,6 +141,23 @@ def test_parallelogram_falls_as_a_pendulum_does():
     assert time == pytest.approx(0.4, abs=1e-9)
     np.testing.assert_allclose(lane.q[:, 1], 0.0, rtol=0, atol=1e-14)
     np.testing.assert_allclose(lane.q[:, 2], lane.q[:, 0], rtol=0, atol=1e-14)
+
+
+def test_a_parallelogram_does_not_pass_the_place_where_it_may_fold():
+    linkage = FourBar.parallelogram()
+    system, start = linkage.system, linkage.initial_state()
+    message = "constraints become dependent in the course of the step"
+    with pytest.raises(nhjax.IntegrationError, match=message):
+        nhjax.integrate(
+            system,
+            nhjax.LobattoIIIAB(3),
+            start,
+            dt=0.01,
+            num_steps=80,
+            stage_solver=nhjax.Newton(),
+        )
+    flat = nhjax.check_system(system, jnp.zeros(3), jnp.zeros(3))
+    assert flat.dependent == ("Γ[0]",)
 
 
 def test_points_are_those_of_the_joints():

@@ -1,0 +1,55 @@
+"""Forces that machines are given as `args`: of the right shape, or refused by name."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import nhjax
+from nhjax.systems import (
+    CarWithTrailers,
+    FlyballGovernor,
+    RollerRacer,
+    Snakeboard,
+    SteerTorque,
+    TwoWheeledRobot,
+    WhippleBicycle,
+)
+
+
+# A machine, what it takes, and the same in another form.
+MACHINES = {
+    "car": (CarWithTrailers(), (2.0, 0.3), jnp.asarray([2.0, 0.3])),
+    "robot": (TwoWheeledRobot(), (0.2, 0.1), np.asarray([0.2, 0.1])),
+    "governor": (FlyballGovernor(), 0.5, jnp.asarray(0.5)),
+    "racer": (RollerRacer(gait=None), 0.5, np.float32(0.5)),
+    "snakeboard": (
+        Snakeboard(gait=None),
+        [0.1, 0.2, 0.3],
+        jnp.asarray([0.1, 0.2, 0.3]),
+    ),
+    "bicycle": (WhippleBicycle(steering=SteerTorque()), 1.5, np.asarray(1.5)),
+}
+
+
+@pytest.mark.parametrize(("example", "forces", "same"), MACHINES.values(), ids=MACHINES)
+def test_forces_are_taken_in_their_shape_alone(example, forces, same):
+    def force(args):
+        return example.force(0.0, example.q0, example.v0, args)
+
+    found = np.asarray(force(forces))
+    assert np.any(found != np.asarray(force(None)))
+    np.testing.assert_array_equal(force(same), found)
+    slope = jax.jacfwd(force)(jnp.asarray(forces))
+    assert np.any(np.asarray(slope) != 0)
+    shape = np.shape(forces)
+    for wrong in (jnp.ones((4, *shape)), jnp.ones(5), {"torque": 1.0}):
+        with pytest.raises(nhjax.ShapeError, match="`args` must be None or") as error:
+            force(wrong)
+        assert f"of shape {shape}" in str(error.value)
+
+
+def test_the_error_comes_before_a_run():
+    robot, _, _ = MACHINES["robot"]
+    with pytest.raises(nhjax.ShapeError, match=r"torques of the motors .* \(2,\), got"):
+        nhjax.initial_state(robot.system, robot.q0, robot.v0, args=jnp.ones((3, 2)))
