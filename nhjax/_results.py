@@ -31,9 +31,11 @@ class RESULTS(eqx.Enumeration):
     )
     left_chart = (
         "A step turned so far that it left the chart of the retraction (a rotation "
-        "near π for Cayley, near 2π for Exponential), or its iteration left it: with "
-        "Cayley and two stages, a step of about one radian need have no solution. Take "
-        "a smaller `dt`, `retraction=nhjax.Exponential()`, or more stages."
+        "near π for Cayley and near 2π for Exponential, from the origin of the chart, "
+        "which lies in the middle of a step or at its start), or its iteration left "
+        "it: with Cayley and two stages, a step of about one radian need have no "
+        "solution. Take a smaller `dt`, `retraction=nhjax.Exponential()`, or more "
+        "stages."
     )
     inconsistent_start = (
         "The initial state violates the constraints at `t0`, its q is off the group, "

@@ -10,7 +10,7 @@ from .._custom_types import Args, FloatScalar, FloatScalarLike
 from .._errors import Check, require
 from .._method import AbstractMethod
 from .._numerics import max_norm, root
-from .._step import chart_at, StepRecord
+from .._step import chart_of_step, StepRecord
 from .._system import AbstractMechanicalSystem, linearise, real_scalar, State
 
 
@@ -31,10 +31,13 @@ def interpolate(
     """
     start, time = record.start, t + theta * h
     weights = method.integrated_basis(theta)
-    chart = chart_at(system.manifold_of(start.q), start.q)
-    xi = h * (weights @ record.velocity)
-    q = chart.manifold.act(start.q, xi)
-    p = chart.to_end(xi, start.p + h * (weights @ record.force))
+    whole = h * (jnp.asarray(method.b, h.dtype) @ record.velocity)
+    manifold = system.manifold_of(start.q)
+    chart = chart_of_step(manifold, method.chart, start.q, whole)
+    y = chart.coordinates(h * (weights @ record.velocity)[None])
+    known = chart.momentum_at_origin(start.p) + h * (weights @ record.force)
+    q = jax.tree.map(lambda leaf: leaf[0], chart.positions(y))
+    p = chart.from_origin(y, known[None])[0]
     u = p
     if system.fibre_coordinate_name == "v":
         u = root(

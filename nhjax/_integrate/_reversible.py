@@ -22,10 +22,10 @@ from ._stepping import Carry, Stepping
 class ReversibleAdjoint(AbstractAdjoint):
     """Keep the end of the run alone and retrace the steps from there: memory O(1).
 
-    On a vector space the method is symmetric, so that a step of -h leads back to where
-    a step of h came from. On a group, and with the consistent closure, it leads back up
-    to a small error only, and the step is inverted by an iteration that starts from the
-    step of -h.
+    A symmetric step of -h leads back to where a step of h came from. With the
+    consistent closure, and on a group with the chart at the start of a step, it leads
+    back up to a small error only, and the step is inverted by an iteration that starts
+    from the step of -h.
 
     The states that are retraced differ by round-off from those of the run. Where the
     motion is attracted to some set, as that of a sleigh is, it is repelled in reversed
@@ -210,7 +210,8 @@ def step_back(
 def _retraces(stepping: Stepping, step_state: StepState) -> bool:
     """Tell whether a step of -h undoes a step of h, up to round-off."""
     system, method = stepping.system, stepping.method
-    if not system.manifold_of(step_state.state.q).is_flat:
+    is_flat = system.manifold_of(step_state.state.q).is_flat
+    if not is_flat and method.chart != "middle":
         return False
     if system.nonholonomic is not None and method.closure == "consistent":
         return False

@@ -94,6 +94,10 @@ class AbstractLieGroup(eqx.Module):
         """Compute g τ(ξ), the element that ξ leads to from g."""
         return self.compose(g, self.retract(xi))
 
+    def act_back(self, g: Element, xi: Vector) -> Element:
+        """Compute g τ(ξ)⁻¹, the element from which ξ leads to g."""
+        return self.compose(g, self.inverse(self.retract(xi)))
+
     def no_compensation(self, q: Element) -> Element:
         """Return the compensation to start `advance` from, which is zero."""
         return jax.tree.map(jnp.zeros_like, q)
@@ -107,6 +111,12 @@ class AbstractLieGroup(eqx.Module):
         up over many steps. A group without such a sum returns it unchanged.
         """
         return self.act(q, xi), compensation
+
+    def advance_across(
+        self, q: Element, xi: Vector, compensation: Element
+    ) -> tuple[Element, Element]:
+        """Compute g τ(-ξ)⁻¹ τ(ξ) as `advance` does: in the chart, from -ξ to ξ."""
+        return self.advance(self.act_back(q, -xi), xi, compensation)
 
     def tangent(self, g: Element, eta: Vector) -> Element:
         """Compute T L_g η, the derivative of ε -> g τ(εη) at ε = 0, shaped like g."""
@@ -140,6 +150,10 @@ class AbstractLieGroup(eqx.Module):
     def dtau_dual(self, xi: Vector, mu: Vector) -> Vector:
         """Compute dτ_ξ^* μ, for which ⟨dτ_ξ^* μ, η⟩ = ⟨μ, dτ_ξ η⟩."""
         return transpose(lambda eta: self.dtau(xi, eta), mu)(mu)
+
+    def right_dtau_dual(self, xi: Vector, mu: Vector) -> Vector:
+        """Compute (Ad_{τ(ξ)} dτ_ξ)^* μ, by the right-trivialised tangent of τ."""
+        return self.dtau_dual(xi, self.to_end(xi, mu))
 
     def dtau_inv_dual(self, xi: Vector, mu: Vector) -> Vector:
         """Compute (dτ_ξ⁻¹)^* μ, the dual of `dtau_inv`."""
@@ -178,6 +192,10 @@ class AbstractLieGroup(eqx.Module):
     def to_start(self, xi: Vector, mu: Vector) -> Vector:
         """Compute Ad_{τ(ξ)⁻¹}^* μ: carry a covector from g τ(ξ) to g."""
         return self.Ad_dual(self.inverse(self.retract(xi)), mu)
+
+    def to_start_change(self, xi: Vector, mu: Vector) -> Vector:
+        """Compute Ad_{τ(ξ)⁻¹}^* μ - μ; subclasses may do so without cancellation."""
+        return self.to_start(xi, mu) - mu
 
     def ad_dual(self, xi: Vector, mu: Vector) -> Vector:
         """Compute ad_ξ^* μ, for which ⟨ad_ξ^* μ, η⟩ = ⟨μ, ad_ξ η⟩."""

@@ -70,6 +70,12 @@ class Euclidean(AbstractLieGroup):
         """Compute the point q + ξ by compensated summation."""
         return two_sum(q, xi + compensation)
 
+    def advance_across(
+        self, q: Point, xi: Vector, compensation: Point
+    ) -> tuple[Point, Point]:
+        """Compute the point q + 2 ξ by compensated summation."""
+        return self.advance(q, 2 * xi, compensation)
+
     def matrix(self, g: Point) -> Float[Array, "n+1 n+1"]:
         """Return the matrix of the translation by g in homogeneous coordinates."""
         return homogeneous(jnp.eye(self.n, dtype=g.dtype), g, 1.0)

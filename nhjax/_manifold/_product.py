@@ -121,10 +121,15 @@ class ProductGroup(AbstractLieGroup):
         self, q: Element, xi: Vector, compensation: Element
     ) -> tuple[Element, Element]:
         """Advance the part of every factor, with its own compensation."""
-        pairs = self._each(
-            lambda group, g, x, c: group.advance(g, x, c), q, xi, compensation
+        return self._pair(lambda group, *of: group.advance(*of), q, xi, compensation)
+
+    def advance_across(
+        self, q: Element, xi: Vector, compensation: Element
+    ) -> tuple[Element, Element]:
+        """Advance the part of every factor from -ξ to ξ in its chart."""
+        return self._pair(
+            lambda group, *of: group.advance_across(*of), q, xi, compensation
         )
-        return tuple(g for g, _ in pairs), tuple(c for _, c in pairs)
 
     def matrix(self, g: Element) -> Float[Array, "k k"]:
         """Return the block-diagonal matrix of the factors' matrices of g."""
@@ -146,23 +151,17 @@ class ProductGroup(AbstractLieGroup):
         """Apply the dτ⁻¹ of every factor, to its parts of the vectors."""
         return self._vector(lambda group, x, y: group.dtau_inv(x, y), xi, eta)
 
-    def ddtau(self, xi: Vector, eta: Vector, delta: Vector) -> Vector:
-        """Apply the ddτ of every factor, to its parts of the vectors."""
-        return self._vector(lambda group, x, y, d: group.ddtau(x, y, d), xi, eta, delta)
-
     def dtau_dual(self, xi: Vector, mu: Vector) -> Vector:
         """Apply the dτ^* of every factor, to its parts of the vectors."""
         return self._vector(lambda group, x, m: group.dtau_dual(x, m), xi, mu)
 
+    def right_dtau_dual(self, xi: Vector, mu: Vector) -> Vector:
+        """Apply the (Ad_{τ(ξ)} dτ_ξ)^* of every factor, to its parts of the vectors."""
+        return self._vector(lambda group, x, m: group.right_dtau_dual(x, m), xi, mu)
+
     def dtau_inv_dual(self, xi: Vector, mu: Vector) -> Vector:
         """Apply the (dτ⁻¹)^* of every factor, to its parts of the vectors."""
         return self._vector(lambda group, x, m: group.dtau_inv_dual(x, m), xi, mu)
-
-    def ddtau_dual(self, xi: Vector, eta: Vector, mu: Vector) -> Vector:
-        """Apply the ddτ^* of every factor, to its parts of the vectors."""
-        return self._vector(
-            lambda group, x, y, m: group.ddtau_dual(x, y, m), xi, eta, mu
-        )
 
     def Ad(self, g: Element, eta: Vector) -> Vector:
         """Apply the Ad_g of every factor, to its part of the vector."""
@@ -184,6 +183,10 @@ class ProductGroup(AbstractLieGroup):
         """Apply the Ad_{τ(ξ)⁻¹}^* of every factor, to its part of the covector."""
         return self._vector(lambda group, x, m: group.to_start(x, m), xi, mu)
 
+    def to_start_change(self, xi: Vector, mu: Vector) -> Vector:
+        """Compute the Ad_{τ(ξ)⁻¹}^* μ - μ of every factor, concatenated."""
+        return self._vector(lambda group, x, m: group.to_start_change(x, m), xi, mu)
+
     def ad(self, xi: Vector, eta: Vector) -> Vector:
         """Apply the ad_ξ of every factor, to its parts of the vectors."""
         return self._vector(lambda group, x, y: group.ad(x, y), xi, eta)
@@ -196,6 +199,10 @@ class ProductGroup(AbstractLieGroup):
         """Call a function with every factor and its parts of elements and vectors."""
         parts = [a if isinstance(a, tuple) else self._split(a) for a in arguments]
         return [function(*part) for part in zip(self.factors, *parts, strict=True)]
+
+    def _pair(self, function, *arguments) -> tuple[Element, Element]:
+        pairs = self._each(function, *arguments)
+        return tuple(g for g, _ in pairs), tuple(c for _, c in pairs)
 
     def _tuple(self, function, *arguments) -> Element:
         return tuple(self._each(function, *arguments))

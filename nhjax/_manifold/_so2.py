@@ -80,6 +80,12 @@ class SO2(AbstractLieGroup):
         """Compute g τ(ω) by compensated summation."""
         return two_sum(q, self.retract(xi) + compensation)
 
+    def advance_across(
+        self, q: Angle, xi: Vector, compensation: Angle
+    ) -> tuple[Angle, Angle]:
+        """Compute g τ(ω)², which is g τ(-ω)⁻¹ τ(ω), by compensated summation."""
+        return two_sum(q, 2 * self.retract(xi) + compensation)
+
     def matrix(self, g: Angle) -> Float[Array, "2 2"]:
         """Return the rotation matrix of the angle."""
         basis = jnp.eye(2, dtype=g.dtype)

@@ -16,6 +16,7 @@ from ._tableau import Tableau
 
 
 CLOSURES = ("propagated", "consistent", "symmetric")
+CHARTS = ("middle", "start")
 
 _STATEMENTS = {
     "H1": "H1 (a_1j = 0, first stage at t_k)",
@@ -39,12 +40,13 @@ class AbstractMethod(eqx.Module):
 
     All data of a method is static: it is hashable, has no array leaves, can be a static
     argument of `jax.jit`, and equals any other method with the same data. Coefficients
-    are computed in 60 digits and rounded once. A subclass defines `stages`, `closure`
-    and `_tableau`, and has no subclasses of its own.
+    are computed in 60 digits and rounded once. A subclass defines `stages`, `closure`,
+    `chart` and `_tableau`, and has no subclasses of its own.
     """
 
     stages: eqx.AbstractVar[int]
     closure: eqx.AbstractVar[str | None]
+    chart: eqx.AbstractVar[str]
 
     @abc.abstractmethod
     def _tableau(self) -> Tableau:
@@ -235,7 +237,21 @@ def check_closure(closure: str) -> str:
 
     A `ValueError` that lists the choices.
     """
-    if closure not in CLOSURES:
-        choices = ", ".join(repr(m) for m in CLOSURES)
-        raise ValueError(f"closure must be one of {choices}, got {closure!r}")
-    return closure
+    return _check_choice("closure", closure, CLOSURES)
+
+
+def check_chart(chart: str) -> str:
+    """Return `chart` if it is one of `CHARTS`.
+
+    **Raises:**
+
+    A `ValueError` that lists the choices.
+    """
+    return _check_choice("chart", chart, CHARTS)
+
+
+def _check_choice(name: str, value: str, choices: tuple[str, ...]) -> str:
+    if value not in choices:
+        listed = ", ".join(map(repr, choices))
+        raise ValueError(f"{name} must be one of {listed}, got {value!r}")
+    return value

@@ -2,7 +2,7 @@
 
 import equinox as eqx
 
-from ._abstract import AbstractMethod, check_closure, check_stages
+from ._abstract import AbstractMethod, check_chart, check_closure, check_stages
 from ._tableau import gauss_tableau, lobatto_tableau, Tableau
 
 
@@ -22,8 +22,9 @@ class LobattoIIIAB(AbstractMethod):
 
     stages: int = eqx.field(static=True)
     closure: str = eqx.field(static=True)
+    chart: str = eqx.field(static=True)
 
-    def __init__(self, stages: int, closure: str = "symmetric"):
+    def __init__(self, stages: int, closure: str = "symmetric", chart: str = "middle"):
         """
         **Arguments:**
 
@@ -35,14 +36,20 @@ class LobattoIIIAB(AbstractMethod):
             multiplier of the state. `"symmetric"` uses the continuous multipliers of
             the states at both ends of the step, with one unknown added that makes the
             step symmetric; a step then depends on nothing but its state.
+        - `chart`: where, on a Lie group, the chart of a step has its origin. With
+            `"middle"` a step leads from -ξ/2 to ξ/2 in its chart, and is symmetric;
+            without constraints it is symplectic. With `"start"`, the choice of the
+            paper, it leads from 0 to ξ, and is not symmetric. On a vector space the two
+            are the same.
 
         **Raises:**
 
         A `TypeError` if `stages` is no integer; a `ValueError` if it is out of range,
-        or if `closure` is not one of the three.
+        or if `closure` or `chart` is not one of the choices.
         """
         self.stages = check_stages(stages, 2, "LobattoIIIAB")
         self.closure = check_closure(closure)
+        self.chart = check_chart(chart)
 
     def _tableau(self) -> Tableau:
         return lobatto_tableau(self.stages)
@@ -63,19 +70,23 @@ class Gauss(AbstractMethod):
     """
 
     stages: int = eqx.field(static=True)
+    chart: str = eqx.field(static=True)
 
-    def __init__(self, stages: int):
+    def __init__(self, stages: int, chart: str = "middle"):
         """
         **Arguments:**
 
         - `stages`: s from 1 to 32, beyond which coefficients take minutes to find
             and nothing is gained in float64.
+        - `chart`: as for `LobattoIIIAB`.
 
         **Raises:**
 
-        A `TypeError` if `stages` is no integer, a `ValueError` if it is out of range.
+        A `TypeError` if `stages` is no integer; a `ValueError` if it is out of range,
+        or if `chart` is not one of the two.
         """
         self.stages = check_stages(stages, 1, "Gauss")
+        self.chart = check_chart(chart)
 
     @property
     def closure(self) -> None:

@@ -4,7 +4,7 @@ import equinox as eqx
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ._abstract import AbstractMethod, check_closure
+from ._abstract import AbstractMethod, check_chart, check_closure
 from ._tableau import Tableau, user_tableau
 
 
@@ -26,21 +26,28 @@ class PartitionedRungeKutta(AbstractMethod):
 
     stages: int = eqx.field(static=True)
     closure: str = eqx.field(static=True)
+    chart: str = eqx.field(static=True)
     _coefficients: tuple[tuple[float, ...], ...] = eqx.field(static=True)
     _weights: tuple[float, ...] = eqx.field(static=True)
 
-    def __init__(self, a: ArrayLike, b: ArrayLike, closure: str = "symmetric"):
+    def __init__(
+        self,
+        a: ArrayLike,
+        b: ArrayLike,
+        closure: str = "symmetric",
+        chart: str = "middle",
+    ):
         """
         **Arguments:**
 
         - `a`: the coefficients a_ij, shape (s, s), not traced.
         - `b`: the weights b_j, shape (s,), none of them zero and of sum 1.
-        - `closure`: as for `LobattoIIIAB`.
+        - `closure`, `chart`: as for `LobattoIIIAB`.
 
         **Raises:**
 
         A `ValueError` if a shape is wrong, an entry is not finite, a weight is zero,
-        the weights do not sum to 1, or `closure` is not one of the three.
+        the weights do not sum to 1, or `closure` or `chart` is not one of the choices.
         """
         a = np.asarray(a, dtype=np.float64)
         b = np.asarray(b, dtype=np.float64)
@@ -62,6 +69,7 @@ class PartitionedRungeKutta(AbstractMethod):
             raise ValueError(f"b must sum to 1, got {float(b.sum())!r}")
         self.stages = b.size
         self.closure = check_closure(closure)
+        self.chart = check_chart(chart)
         self._coefficients = tuple(tuple(row) for row in a.tolist())
         self._weights = tuple(b.tolist())
 

@@ -1,4 +1,4 @@
-"""The chart around the start of a step, on a vector space or on a Lie group."""
+"""The chart in which a step is written: what it must do, and that of a vector space."""
 
 from abc import abstractmethod
 from typing import TypeAlias
@@ -19,70 +19,87 @@ Vectors: TypeAlias = Float[Array, "r n"]
 
 
 class AbstractChart(eqx.Module):
-    """The chart Ξ -> g_k τ(Ξ) of a manifold around g_k, in which a step is written.
+    """The chart y -> g_o τ(y) of a manifold around its origin g_o, for one step.
 
-    Its methods carry velocities and covectors at g_k τ(Ξ) to the chart and back (paper,
-    section 6).
+    Its methods carry velocities and covectors at g_o τ(y) to the chart and back (paper,
+    section 6). Where the origin lies depends on the chart, and on the increment ξ of
+    the step.
     """
 
     manifold: eqx.AbstractVar[AbstractLieGroup]
-    origin: eqx.AbstractVar[PyTree[Array]]
 
     @abstractmethod
-    def body_velocities(self, xi: Vectors, velocity: Vectors) -> Vectors:
-        """Compute the body velocities dτ_Ξ H of the chart velocities H."""
+    def coordinates(self, increment: Vectors) -> Vectors:
+        """Compute the coordinates y of the points that increments Ξ from g_k lead to.
 
-    @abstractmethod
-    def chart_velocities(self, xi: Vectors, body_velocity: Vectors) -> Vectors:
-        """Compute the chart velocities dτ_Ξ⁻¹ η of the body velocities η."""
-
-    @abstractmethod
-    def to_chart(
-        self, xi: Vectors, velocity: Vectors, momentum: Vectors, force: Vectors
-    ) -> tuple[Vectors, Vectors]:
-        """Compute (Π, F), the momenta and forces with respect to the coordinates Ξ.
-
-        They are Π = dτ_Ξ^* μ and F = dτ_Ξ^* w + (ddτ_Ξ)^*(H, Π) for body momenta μ and
-        body forces w. The second term of F is the derivative of ⟨μ, dτ_Ξ H⟩ along Ξ.
+        The increment ξ itself leads to the end of the step.
         """
 
     @abstractmethod
-    def to_start(self, xi: Vectors, covector: Vectors) -> Vectors:
-        """Compute Ad^*_{τ(Ξ)⁻¹} w: carry body covectors from g_k τ(Ξ) to g_k."""
+    def positions(self, y: Vectors) -> PyTree[Array]:
+        """Compute the positions g_o τ(y), one for each row of y."""
 
     @abstractmethod
-    def to_end(self, xi: Vector, covector: Vector) -> Vector:
-        """Compute Ad^*_{τ(Ξ)} μ: carry a body covector from g_k to g_k τ(Ξ)."""
+    def body_velocities(self, y: Vectors, velocity: Vectors) -> Vectors:
+        """Compute the body velocities dτ_y H of the chart velocities H."""
 
     @abstractmethod
-    def carry(
-        self, xi: Vector, momentum: Vector, compensation: Vector
-    ) -> tuple[Vector, Vector]:
-        """Apply Ad^*_{τ(ξ)} to a compensated sum; return a compensated sum.
+    def chart_velocities(self, y: Vectors, body_velocity: Vectors) -> Vectors:
+        """Compute the chart velocities dτ_y⁻¹ η of the body velocities η."""
+
+    @abstractmethod
+    def to_chart(
+        self, y: Vectors, velocity: Vectors, momentum: Vectors, force: Vectors
+    ) -> tuple[Vectors, Vectors]:
+        """Compute (Π, F), the momenta and forces with respect to the coordinates y.
+
+        They are Π = dτ_y^* μ and F = dτ_y^* w + (ddτ_y)^*(H, Π) for body momenta μ and
+        body forces w. The second term of F is the derivative of ⟨μ, dτ_y H⟩ along y.
+        """
+
+    @abstractmethod
+    def to_origin(self, y: Vectors, covector: Vectors) -> Vectors:
+        """Compute Ad^*_{τ(y)⁻¹} w: carry body covectors from g_o τ(y) to g_o."""
+
+    @abstractmethod
+    def from_origin(self, y: Vectors, covector: Vectors) -> Vectors:
+        """Compute Ad^*_{τ(y)} μ: carry body covectors from g_o to g_o τ(y)."""
+
+    @abstractmethod
+    def momentum_at_origin(self, momentum: Vector) -> Vector:
+        """Carry the body momentum μ_k from g_k to g_o."""
+
+    @abstractmethod
+    def base_momentum(
+        self, momentum: Vector, transported: Vector, chart_force: Vector
+    ) -> Vector:
+        """Compute the constant term of the stage momenta Π^i = base + h Σ â_ij F^j.
+
+        **Arguments:**
+
+        - `momentum`: μ_k, carried to the origin.
+        - `transported`: h Σ b_j n^j, the sum of the forces carried to the origin.
+        - `chart_force`: h Σ b_j F^j, that of the forces in the chart.
+        """
+
+    @abstractmethod
+    def advance(
+        self, compensation: PyTree[Array]
+    ) -> tuple[PyTree[Array], PyTree[Array]]:
+        """Compute the end g_{k+1} of the step and the rounding error of the sum.
 
         A compensated sum is a number and the rounding error it has accumulated.
         """
 
     @abstractmethod
-    def base_momentum(
-        self, xi: Vector, momentum: Vector, transported: Vector, chart_force: Vector
-    ) -> Vector:
-        """Compute the constant term of the stage momenta Π^i = base + h Σ â_ij F^j.
-
-        It is dτ_ξ^* μ_{k+1} - h Σ b_j F^j, with
-        μ_{k+1} = Ad^*_{τ(ξ)}(μ_k + h Σ b_j n^j).
-
-        **Arguments:**
-
-        - `xi`: ξ, the increment of the whole step in the chart.
-        - `momentum`: μ_k.
-        - `transported`: h Σ b_j n^j.
-        - `chart_force`: h Σ b_j F^j.
-        """
+    def advance_momentum(
+        self, momentum: Vector, gained: Vector, compensation: Vector
+    ) -> tuple[Vector, Vector]:
+        """Compute μ_{k+1} as a compensated sum, from μ_k and h Σ b_j n^j."""
 
     @abstractmethod
-    def in_domain(self, xi: Vectors) -> BoolScalar:
-        """Tell whether all Ξ^i lie where the retraction τ is invertible."""
+    def in_domain(self, y: Vectors) -> BoolScalar:
+        """Tell whether all y lie where the retraction τ is invertible."""
 
 
 class FlatChart(AbstractChart):
@@ -93,110 +110,61 @@ class FlatChart(AbstractChart):
     """
 
     manifold: AbstractLieGroup
-    origin: PyTree[Array]
+    start: PyTree[Array]
+    increment: Vector
 
-    def body_velocities(self, xi: Vectors, velocity: Vectors) -> Vectors:
+    def coordinates(self, increment: Vectors) -> Vectors:
+        """Return the increments Ξ, since the origin is q_k."""
+        return increment
+
+    def positions(self, y: Vectors) -> PyTree[Array]:
+        """Compute the positions q_k + y."""
+        return jax.vmap(lambda y: self.manifold.act(self.start, y))(y)
+
+    def body_velocities(self, y: Vectors, velocity: Vectors) -> Vectors:
         """Return the chart velocities H, which are the body velocities here."""
         return velocity
 
-    def chart_velocities(self, xi: Vectors, body_velocity: Vectors) -> Vectors:
+    def chart_velocities(self, y: Vectors, body_velocity: Vectors) -> Vectors:
         """Return the body velocities η, which are the chart velocities here."""
         return body_velocity
 
     def to_chart(
-        self, xi: Vectors, velocity: Vectors, momentum: Vectors, force: Vectors
+        self, y: Vectors, velocity: Vectors, momentum: Vectors, force: Vectors
     ) -> tuple[Vectors, Vectors]:
         """Return the momenta μ and the forces w unchanged."""
         return momentum, force
 
-    def to_start(self, xi: Vectors, covector: Vectors) -> Vectors:
+    def to_origin(self, y: Vectors, covector: Vectors) -> Vectors:
         """Return the covectors w unchanged."""
         return covector
 
-    def to_end(self, xi: Vector, covector: Vector) -> Vector:
-        """Return the covector μ unchanged."""
+    def from_origin(self, y: Vectors, covector: Vectors) -> Vectors:
+        """Return the covectors μ unchanged."""
         return covector
 
-    def carry(
-        self, xi: Vector, momentum: Vector, compensation: Vector
-    ) -> tuple[Vector, Vector]:
-        """Return the compensated sum unchanged."""
-        return momentum, compensation
+    def momentum_at_origin(self, momentum: Vector) -> Vector:
+        """Return the momentum unchanged."""
+        return momentum
 
     def base_momentum(
-        self, xi: Vector, momentum: Vector, transported: Vector, chart_force: Vector
+        self, momentum: Vector, transported: Vector, chart_force: Vector
     ) -> Vector:
         """Return μ_k, because the two sums are the same here and cancel."""
         return momentum
 
-    def in_domain(self, xi: Vectors) -> BoolScalar:
+    def advance(
+        self, compensation: PyTree[Array]
+    ) -> tuple[PyTree[Array], PyTree[Array]]:
+        """Compute q_k + ξ by compensated summation."""
+        return self.manifold.advance(self.start, self.increment, compensation)
+
+    def advance_momentum(
+        self, momentum: Vector, gained: Vector, compensation: Vector
+    ) -> tuple[Vector, Vector]:
+        """Compute the sum of μ_k and h Σ b_j n^j by compensated summation."""
+        return two_sum(momentum, gained + compensation)
+
+    def in_domain(self, y: Vectors) -> BoolScalar:
         """Return True, because the chart is the whole space."""
         return jnp.asarray(True)
-
-
-class CurvedChart(AbstractChart):
-    """The chart of a Lie group around g_k that its retraction τ gives."""
-
-    manifold: AbstractLieGroup
-    origin: PyTree[Array]
-
-    def body_velocities(self, xi: Vectors, velocity: Vectors) -> Vectors:
-        """Compute the body velocities dτ_Ξ H of the chart velocities H."""
-        return jax.vmap(self.manifold.dtau)(xi, velocity)
-
-    def chart_velocities(self, xi: Vectors, body_velocity: Vectors) -> Vectors:
-        """Compute the chart velocities dτ_Ξ⁻¹ η of the body velocities η."""
-        return jax.vmap(self.manifold.dtau_inv)(xi, body_velocity)
-
-    def to_chart(
-        self, xi: Vectors, velocity: Vectors, momentum: Vectors, force: Vectors
-    ) -> tuple[Vectors, Vectors]:
-        """Compute (Π, F), the momenta and forces with respect to the coordinates Ξ."""
-
-        def one(xi, velocity, momentum, force):
-            _, pullback = jax.vjp(self.manifold.dtau, xi, velocity)
-            curvature, chart_momentum = pullback(momentum)
-            return chart_momentum, curvature + pullback(force)[1]
-
-        return jax.vmap(one)(xi, velocity, momentum, force)
-
-    def to_start(self, xi: Vectors, covector: Vectors) -> Vectors:
-        """Compute Ad^*_{τ(Ξ)⁻¹} w: carry body covectors from g_k τ(Ξ) to g_k."""
-        return jax.vmap(self.manifold.to_start)(xi, covector)
-
-    def to_end(self, xi: Vector, covector: Vector) -> Vector:
-        """Compute Ad^*_{τ(Ξ)} μ: carry a body covector from g_k to g_k τ(Ξ)."""
-        return self.manifold.to_end(xi, covector)
-
-    def carry(
-        self, xi: Vector, momentum: Vector, compensation: Vector
-    ) -> tuple[Vector, Vector]:
-        """Apply Ad^*_{τ(ξ)} to a compensated sum; return a compensated sum.
-
-        The rounding errors of plain products with Ad^* would add up over the steps, as
-        those of plain sums do.
-        """
-        change = self.manifold.to_end_change(xi, momentum)
-        return two_sum(momentum, change + self.manifold.to_end(xi, compensation))
-
-    def base_momentum(
-        self, xi: Vector, momentum: Vector, transported: Vector, chart_force: Vector
-    ) -> Vector:
-        """Compute dτ_ξ^* μ_{k+1} - h Σ b_j F^j, the constant term of Π^i."""
-        end = self.to_end(xi, momentum + transported)
-        return self.manifold.dtau_dual(xi, end) - chart_force
-
-    def in_domain(self, xi: Vectors) -> BoolScalar:
-        """Tell whether all Ξ^i lie where the retraction τ is invertible."""
-        return jnp.all(jax.vmap(self.manifold.in_chart)(xi))
-
-
-def chart_at(manifold: AbstractLieGroup, origin: PyTree[Array]) -> AbstractChart:
-    """Make the chart of a manifold around one of its elements."""
-    kind = FlatChart if manifold.is_flat else CurvedChart
-    return kind(manifold, origin)
-
-
-def positions(chart: AbstractChart, xi: Vectors) -> PyTree[Array]:
-    """Compute the positions g_k τ(Ξ^i), one for each row of Ξ."""
-    return jax.vmap(lambda xi: chart.manifold.act(chart.origin, xi))(xi)

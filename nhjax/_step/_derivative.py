@@ -151,7 +151,7 @@ def _end(
     system, args, start = arguments.system, arguments.args, arguments.step_state.state
     stages = _stage_system(arguments, method)
     t, u = arguments.t + arguments.h, x.node_fibre_coordinate[-1]
-    q = system.manifold_of(start.q).act(start.q, stages.increment(x))
+    q = stages.end_position(x)
     p = system.momentum(t, q, u, args)
 
     def continuous():

@@ -7,42 +7,36 @@ from jaxtyping import Array, Float, PyTree
 from .._custom_types import BoolScalar
 from .._numerics import small_einsum
 from .._system import motion_residual, whole_force
-from ._chart import positions
 from ._stage_system import StageSystem
 from ._unknowns import StageForces, Stages
 
 
 def stage_velocities(stages: StageSystem, x: Stages) -> Float[Array, "s n"]:
-    """Compute the chart velocities dτ_Ξ⁻¹ D2H(Q^i, P^i) of a Hamiltonian system."""
-    xi = stages.stage_increments(x)
+    """Compute the chart velocities dτ_y⁻¹ D2H(Q^i, P^i) of a Hamiltonian system."""
+    chart, y = stages.chart(x), stages.stage_coordinates(x)
     v = jax.vmap(lambda t, q, u: stages.system.velocity(t, q, u, stages.args))(
-        stages.stage_times, positions(stages.chart, xi), x.momentum
+        stages.stage_times, chart.positions(y), x.momentum
     )
-    return stages.chart.chart_velocities(xi, v)
+    return chart.chart_velocities(y, v)
 
 
 def stage_forces(stages: StageSystem, x: Stages) -> StageForces:
     """Compute the forces n^i, multipliers Λ^i and residuals of the stage momenta."""
     h, a_hat, b = stages.h, stages.coefficients("a_hat"), stages.coefficients("b")
     multiplier = stages.multipliers(x)
-    xi = stages.stage_increments(x)
-    q = positions(stages.chart, xi)
-    u = (
-        x.momentum
-        if stages.hamiltonian
-        else stages.chart.body_velocities(xi, x.velocity)
-    )
+    chart, y = stages.chart(x), stages.stage_coordinates(x)
+    q = chart.positions(y)
+    u = x.momentum if stages.hamiltonian else chart.body_velocities(y, x.velocity)
     force, momentum = jax.vmap(
         lambda t, q, u, lam: (
             whole_force(stages.system, t, q, u, lam, stages.args),
             stages.system.momentum(t, q, u, stages.args),
         )
     )(stages.stage_times, q, u, multiplier)
-    momentum, chart_force = stages.chart.to_chart(xi, x.velocity, momentum, force)
-    transported = stages.chart.to_start(xi, force)
-    base = stages.chart.base_momentum(
-        stages.increment(x),
-        stages.p,
+    momentum, chart_force = chart.to_chart(y, x.velocity, momentum, force)
+    transported = chart.to_origin(y, force)
+    base = chart.base_momentum(
+        chart.momentum_at_origin(stages.p),
         h * small_einsum("s,sn->n", b, transported),
         h * small_einsum("s,sn->n", b, chart_force),
     )
@@ -54,7 +48,7 @@ def stage_forces(stages: StageSystem, x: Stages) -> StageForces:
 
 def node_positions(stages: StageSystem, x: Stages) -> PyTree[Array]:
     """Compute the positions q^i at the nodes, of which the last is q_{k+1}."""
-    return positions(stages.chart, stages.node_increments(x))
+    return stages.chart(x).positions(stages.node_coordinates(x))
 
 
 def node_residual(
@@ -62,16 +56,16 @@ def node_residual(
 ) -> Float[Array, "r n"]:
     """Compute the residuals of the momentum equations at the nodes.
 
-    They are p(q^i, u^i) - Ad^*_{τ(Ξ^i)} (p_k + h Σ a_ij n^j).
+    They are p(q^i, u^i) - Ad^*_{τ(y^i)} (M + h Σ a_ij n^j).
     """
     momentum = jax.vmap(lambda t, q, u: stages.system.momentum(t, q, u, stages.args))(
         stages.node_times, node_positions(stages, x), x.node_fibre_coordinate
     )
-    known = stages.p[None] + stages.h * small_einsum(
+    chart = stages.chart(x)
+    known = chart.momentum_at_origin(stages.p)[None] + stages.h * small_einsum(
         "ij,jn->in", stages.node_weights, force
     )
-    carried = jax.vmap(stages.chart.to_end)(stages.node_increments(x), known)
-    return momentum - carried
+    return momentum - chart.from_origin(stages.node_coordinates(x), known)
 
 
 def node_constraint(stages: StageSystem, x: Stages) -> Float[Array, "r m"]:
@@ -86,7 +80,7 @@ def holonomic_constraint(stages: StageSystem, x: Stages) -> Float[Array, "s k"]:
 
     The division by h makes the values the size of velocities, as the tangency is.
     """
-    nodes = positions(stages.chart, stages.stage_increments(x)[1:])
+    nodes = stages.chart(x).positions(stages.stage_coordinates(x)[1:])
     on_positions = jax.vmap(
         lambda t, q: stages.system.position_constraint(t, q, stages.args)
     )(stages.stage_times[1:], nodes)
@@ -102,7 +96,7 @@ def constraint_jacobian(stages: StageSystem, x: Stages) -> Float[Array, "r l n"]
     times, fibre = stages.stage_times[1:], x.node_fibre_coordinate
     if not stages.num_nonholonomic:
         fibre = jnp.broadcast_to(fibre, (stages.method.stages - 1, fibre.shape[1]))
-    nodes = positions(stages.chart, stages.stage_increments(x)[1:])
+    nodes = stages.chart(x).positions(stages.stage_coordinates(x)[1:])
     return jax.vmap(
         lambda t, q, u: jax.jacrev(stages.system.constraint, argnums=2)(
             t, q, u, stages.args
@@ -120,7 +114,7 @@ def end_residual(
     return motion_residual(
         stages.system,
         stages.t + stages.h,
-        stages.chart.manifold.act(stages.q, stages.increment(x)),
+        stages.end_position(x),
         x.node_fibre_coordinate[-1],
         x.end_acceleration,
         x.end_multiplier,
@@ -130,5 +124,6 @@ def end_residual(
 
 def in_chart(stages: StageSystem, x: Stages) -> BoolScalar:
     """Tell whether stages, nodes and end lie where the chart is invertible."""
-    increments = [stages.stage_increments(x), stages.increment(x)[None]]
-    return stages.chart.in_domain(jnp.concatenate(increments))
+    chart = stages.chart(x)
+    end = chart.coordinates(stages.increment(x)[None])
+    return chart.in_domain(jnp.concatenate([stages.stage_coordinates(x), end]))

@@ -167,7 +167,7 @@ def increment_size(
         change = small_einsum("sl,nl->sn", after - before, reaction)
         changes.append(stages.h * change)
     size = max_norm(*changes)
-    if stages.chart.manifold.is_flat:
+    if stages.manifold.is_flat:
         return size
     return jnp.where(in_chart(stages, x_next), size, jnp.inf)
 

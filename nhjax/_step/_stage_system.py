@@ -7,21 +7,24 @@ import numpy as np
 from jaxtyping import Array, Float, PyTree
 
 from .._custom_types import Args, FloatScalar
+from .._manifold import AbstractLieGroup
 from .._method import AbstractMethod
 from .._numerics import max_norm, small_einsum
 from .._system import AbstractMechanicalSystem, State
-from ._chart import AbstractChart, chart_at
+from ._chart import AbstractChart
+from ._curved_chart import chart_of_step
 from ._unknowns import Stages
 
 
 class StageSystem(eqx.Module):
     """The discrete equations of one step from (q_k, p_k, λ_k).
 
-    These are the paper's four Summaries in the unknowns of `Stages`. With w^i the body
-    force at stage i (reactions included), n^i = Ad^*_{τ(Ξ^i)⁻¹} w^i and F^i the same
-    force in the chart, they read
+    These are the paper's four Summaries in the unknowns of `Stages`, in the chart of
+    the method. With w^i the body force at stage i (reactions included), y^i the
+    coordinates of the stage, n^i = Ad^*_{τ(y^i)⁻¹} w^i, F^i the same force in the chart
+    and M the momentum μ_k carried to its origin, they read
 
-    Π^i = base + h Σ â_ij F^j,    μ^i = Ad^*_{τ(Ξ^i)} (μ_k + h Σ a_ij n^j),
+    Π^i = base + h Σ â_ij F^j,    μ^i = Ad^*_{τ(y^i)} (M + h Σ a_ij n^j),
 
     together with the nonholonomic constraints at the nodes (q^i, μ^i), the holonomic
     ones at the positions Q^i, i >= 2, and their tangency at the end. The constraints at
@@ -90,9 +93,15 @@ class StageSystem(eqx.Module):
         return self.system.fibre_coordinate_name == "p"
 
     @property
-    def chart(self) -> AbstractChart:
-        """Return the chart around q_k, in which the step is written."""
-        return chart_at(self.system.manifold_of(self.q), self.q)
+    def manifold(self) -> AbstractLieGroup:
+        """Return the configuration space."""
+        return self.system.manifold_of(self.q)
+
+    def chart(self, x: Stages) -> AbstractChart:
+        """Make the chart in which the step is written."""
+        return chart_of_step(
+            self.manifold, self.method.chart, self.q, self.increment(x)
+        )
 
     def coefficients(self, name: str) -> Array:
         """Return the array `name` of the method in the working precision."""
@@ -173,13 +182,22 @@ class StageSystem(eqx.Module):
         # all, would bias every step in the same way.
         return self.h * small_einsum("s,sn->n", self.coefficients("b"), x.velocity)
 
-    def stage_increments(self, x: Stages) -> Float[Array, "s n"]:
-        """Compute the increments Ξ^i = h Σ a_ij H^j of the stages."""
-        return self.h * small_einsum("ij,jn->in", self.coefficients("a"), x.velocity)
+    def stage_coordinates(self, x: Stages) -> Float[Array, "s n"]:
+        """Compute the coordinates y^i of the stages, from Ξ^i = h Σ a_ij H^j."""
+        return self._coordinates(x, self.coefficients("a"))
 
-    def node_increments(self, x: Stages) -> Float[Array, "r n"]:
-        """Compute the increments h Σ a_ij H^j of the nodes."""
-        return self.h * small_einsum("ij,jn->in", self.node_weights, x.velocity)
+    def node_coordinates(self, x: Stages) -> Float[Array, "r n"]:
+        """Compute the coordinates of the nodes at which momenta are formed."""
+        return self._coordinates(x, self.node_weights)
+
+    def end_position(self, x: Stages) -> PyTree[Array]:
+        """Compute q_{k+1}."""
+        end, _ = self.chart(x).advance(self.manifold.no_compensation(self.q))
+        return end
+
+    def _coordinates(self, x: Stages, weights: Float[Array, "r s"]) -> Array:
+        increments = self.h * small_einsum("ij,jn->in", weights, x.velocity)
+        return self.chart(x).coordinates(increments)
 
 
 def nudged(stages: StageSystem, nudge: FloatScalar) -> StageSystem:
@@ -189,7 +207,7 @@ def nudged(stages: StageSystem, nudge: FloatScalar) -> StageSystem:
     the round-off of positions, divided by the unit round-off. The coordinates are moved
     by different amounts, so that the moves do not cancel in the difference of two.
     """
-    manifold, n = stages.chart.manifold, stages.p.shape[0]
+    manifold, n = stages.manifold, stages.p.shape[0]
     size = max_norm(*jax.tree.leaves(stages.q))
     if manifold.is_flat:
         size = jnp.abs(stages.q)

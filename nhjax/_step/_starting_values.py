@@ -42,7 +42,7 @@ def _starting_velocities(stages: StageSystem, u, lin: Linearisation, times) -> A
     v = stages.system.velocity(stages.t, stages.q, u, stages.args)
     _, rate = jax.jvp(
         lambda t, xi, u: stages.system.velocity(
-            t, stages.chart.manifold.act(stages.q, xi), u, stages.args
+            t, stages.manifold.act(stages.q, xi), u, stages.args
         ),
         (stages.t, jnp.zeros_like(u), u),
         (jnp.ones_like(stages.t), v, lin.acceleration),

@@ -17,7 +17,6 @@ from .._numerics import (
     relative,
     small_einsum,
     Solved,
-    two_sum,
     zero_unless,
 )
 from .._results import RESULTS
@@ -153,12 +152,12 @@ def step(
     solved = solver.solve(stages, x0, lin, skip)
     x, forces = solved.x, solved.aux.forces
 
-    q, q_compensation = system.manifold_of(state.q).advance(
-        state.q, stages.increment(x), step_state.q_compensation
+    chart = stages.chart(x)
+    q, q_compensation = chart.advance(step_state.q_compensation)
+    gained = h * small_einsum("s,sn->n", stages.coefficients("b"), forces.force)
+    p, p_compensation = chart.advance_momentum(
+        state.p, gained, step_state.p_compensation
     )
-    p_increment = h * small_einsum("s,sn->n", stages.coefficients("b"), forces.force)
-    p, p_compensation = two_sum(state.p, p_increment + step_state.p_compensation)
-    p, p_compensation = stages.chart.carry(stages.increment(x), p, p_compensation)
     u = p if stages.hamiltonian else x.node_fibre_coordinate[-1]
     lin_next = linearise(system, t + h, q, u, args)
     end = end_state(stages, q, u, p, forces.multiplier[-1], lambda: lin_next.multiplier)

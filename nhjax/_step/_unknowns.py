@@ -35,7 +35,7 @@ class Stages(eqx.Module):
 class StageForces(NamedTuple):
     """The forces, multipliers and momenta at the stages i = 1..s, with residuals."""
 
-    force: Float[Array, "s n"]  # n^i, the force W^i carried to the start of the step
+    force: Float[Array, "s n"]  # n^i, the force W^i carried to the origin of the chart
     multiplier: Float[Array, "s l"]  # Λ^i
     residual: Float[Array, "s n"]  # Π^i - base - h Σ â_ij F^j
     momentum: Float[Array, "s n"]  # Π^i, by whose size residuals are judged

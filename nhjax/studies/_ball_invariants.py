@@ -232,7 +232,7 @@ def ball_invariants(
     (_, position), _, _ = ball.exact(final_time)
     runs = []
     for s in stages:
-        method = LobattoIIIAB(s, closure)
+        method = LobattoIIIAB(s, closure, chart="start")  # as in the paper
         runs += _runs(ball, method, dt, num_steps, compared, position, progress)
     return BallInvariants(
         stages=tuple(stages),

@@ -37,4 +37,5 @@ from ._unicycle import (
     Unicycle as Unicycle,
     UnicycleInCoordinates as UnicycleInCoordinates,
 )
+from ._veselova import Veselova as Veselova
 from ._whipple_bicycle import WhippleBicycle as WhippleBicycle

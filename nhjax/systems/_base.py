@@ -34,7 +34,9 @@ def parameter(value: ArrayLike) -> Array:
     return jnp.asarray(value)
 
 
-def coordinates(value: ArrayLike | tuple[float, ...]) -> Array:
+def coordinates(
+    value: ArrayLike | tuple[float, ...] | tuple[tuple[float, ...], ...],
+) -> Array:
     """Convert to a floating array a tuple or an array of coordinates."""
     array = jnp.asarray(value)
     if not jnp.issubdtype(array.dtype, jnp.inexact):

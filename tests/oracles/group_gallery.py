@@ -16,6 +16,7 @@ from nhjax.systems import (
     TurntableBall,
     Unicycle,
     UnicycleInCoordinates,
+    Veselova,
 )
 
 
@@ -81,6 +82,12 @@ UNSOLVED = {
     "heavy top skew on SE(3)": HeavyTop(
         1.3, (0.3, 0.5, 0.6), (0.2, -0.1, 0.4), 2.0, q0=TILTED
     ).on_se3(),
+    "Veselova": Veselova(),
+    "Veselova without weight": Veselova(
+        ((2.0, 0.0, 0.3), (0.0, 1.5, 0.2), (0.3, 0.2, 1.0)),
+        (0.0, 0.0, 0.0),
+        v0=(0.4, -0.9, 0.3),
+    ),
     "double pendulum": DoublePendulum(),
     "double pendulum uneven": DoublePendulum.swinging(
         (1.0, -0.5), (0.3, 0.8), masses=(1.0, 0.4), lengths=(0.8, 1.3), gravity=2.0

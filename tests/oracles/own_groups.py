@@ -34,6 +34,19 @@ class Heisenberg(AbstractLieGroup):
         return g
 
 
+class HeisenbergBySecondKind(Heisenberg):
+    """The same group by coordinates of the second kind, with τ(-ξ) ≠ τ(ξ)⁻¹.
+
+    τ(ξ) = (0, ξ₂, 0)(ξ₁, 0, ξ₃).
+    """
+
+    def retract(self, xi):
+        return xi.at[2].add(-0.5 * xi[0] * xi[1])
+
+    def local(self, g):
+        return g.at[2].add(0.5 * g[0] * g[1])
+
+
 class SL2(AbstractLieGroup):
     """The real 2 x 2 matrices of determinant 1, with Cayley's map."""
 

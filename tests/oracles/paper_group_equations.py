@@ -14,7 +14,8 @@ from typing import Self
 
 import numpy as np
 
-from oracles.group_mechanics import MatrixGroup, Mechanics
+from oracles.charts import CHARTS, dual, rows
+from oracles.group_mechanics import Mechanics
 
 
 @dataclass(frozen=True)
@@ -106,66 +107,10 @@ class Residuals(dict[str, np.ndarray]):
         return np.concatenate([x.ravel() for x in self.values()])
 
 
-def _rows(function, *arguments):
-    """The function at every stage, stacked."""
-    return np.stack([function(*row) for row in zip(*arguments, strict=True)])
-
-
-def _dual(matrices, covectors):
-    """The transposes of the matrices times the covectors, stage by stage."""
-    return np.einsum("...ij,...i->...j", matrices, covectors)
-
-
-class _Geometry:
-    """The maps at Ξ^i = h Σ a_ij H^j, stacked, and at ξ_{k,k+1} = h Σ b_j H^j."""
-
-    def __init__(self, group: MatrixGroup, tableau: Tableau, h, g, H):
-        Xi, xi = h * (tableau.a @ H), h * (tableau.b @ H)
-        self.G = _rows(lambda x: g @ group.tau(x), Xi)
-        self.dtau = _rows(group.dtau, Xi)
-        self.dtau_inv = _rows(group.dtau_inv, Xi)
-        self.dtau_inv_minus = _rows(group.dtau_inv, -Xi)
-        self.ddtau = _rows(group.ddtau, Xi, H)  # ddτ_Ξ(H, ·)
-        self.Ad = _rows(lambda x: group.Ad(group.tau(x)), Xi)
-        self.g_next = g @ group.tau(xi)
-        self.end_dtau_inv = group.dtau_inv(xi)
-        self.end_dtau_inv_minus = group.dtau_inv(-xi)
-        self.end_Ad = group.Ad(group.tau(xi))
-
-
-def _momenta(found, tableau, h, at: _Geometry, mu, N, Pi, mu_next):
-    """The equations for M_k^i and μ_{k+1}; N with the Lagrangian sign. Returns μ^i.
-
-    Both Lie-group summaries: the third, fifth and fourth lines, with the definition of
-    M_k^i in the second half substituted into the third.
-    """
-    a, b = tableau.a, tableau.b
-    ratio = a.T / b[:, None]  # a_ji / b_i
-    curvature = h * np.einsum("ij,j,jn->in", ratio, b, _dual(at.ddtau, Pi))
-    body = _dual(at.dtau_inv_minus, N)
-    start = np.broadcast_to(mu, Pi.shape)
-    found.add(
-        "M^i = (dτ^-1_ξ)*[Π^i + h Σ b_j a_ji / b_i ddτ*_Ξj(H^j, Π^j)]"
-        " = Ad*_τ(ξ)[μ_k + h Σ b_j (dτ^-1_-Ξj - a_ji / b_i dτ^-1_-ξ)* N^j]",
-        Pi @ at.end_dtau_inv,
-        curvature @ at.end_dtau_inv,
-        -start @ at.end_Ad,
-        -np.broadcast_to(h * (b @ body), Pi.shape) @ at.end_Ad,
-        h * (ratio @ (b[:, None] * (N @ at.end_dtau_inv_minus))) @ at.end_Ad,
-    )
-    found.add(
-        "μ_{k+1} = Ad*_τ(ξ)[μ_k + h Σ b_j (dτ^-1_-Ξj)* N^j]",
-        mu_next,
-        -mu @ at.end_Ad,
-        -h * (b @ body) @ at.end_Ad,
-    )
-    return _dual(at.Ad, mu + h * (a @ body))
-
-
 def _constraints(found, mechanics: Mechanics, name, G, velocities, values):
     """φ or ψ at the nodes, relative to |D2φ| |η| and the part that η does not enter."""
-    slopes = _rows(mechanics.d2phi, G, velocities)
-    rest = _rows(mechanics.phi, G, np.zeros_like(velocities))
+    slopes = rows(mechanics.d2phi, G, velocities)
+    rest = rows(mechanics.phi, G, np.zeros_like(velocities))
     speed = np.max(np.abs(velocities))
     size = np.sum(np.abs(slopes), axis=-1) * speed + np.abs(rest)
     found.add(name, values, size=float(np.max(size, initial=0.0)))
@@ -173,65 +118,82 @@ def _constraints(found, mechanics: Mechanics, name, G, velocities, values):
 
 def _holonomic(found, mechanics: Mechanics, G, g_next, mu_next):
     """Φ(G^i) = 0 and the tangency condition at the end."""
-    slopes = np.abs(_rows(mechanics.d_holonomic, G))
+    slopes = np.abs(rows(mechanics.d_holonomic, G))
     reach = np.max(np.sum(slopes, axis=-1), initial=0.0) * np.max(np.abs(G))
-    found.add("Φ(G^i) = 0", _rows(mechanics.holonomic, G), size=float(reach))
-    rows, velocity = mechanics.d_holonomic(g_next), mechanics.d2h(g_next, mu_next)
-    size = np.max(np.abs(rows) @ np.abs(velocity), initial=0.0)
-    found.add("<DΦ, D2h>(g_{k+1}, μ_{k+1}) = 0", rows @ velocity, size=float(size))
+    found.add("Φ(G^i) = 0", rows(mechanics.holonomic, G), size=float(reach))
+    slope, velocity = mechanics.d_holonomic(g_next), mechanics.d2h(g_next, mu_next)
+    size = np.max(np.abs(slope) @ np.abs(velocity), initial=0.0)
+    found.add("<DΦ, D2h>(g_{k+1}, μ_{k+1}) = 0", slope @ velocity, size=float(size))
 
 
 def _lagrangian_force(mechanics: Mechanics, G, eta, stages: Stages):
     """D1ℓ + Λ D2φ + Λ_hol DΦ at the stages, left-trivialised."""
-    reaction = _dual(_rows(mechanics.d2phi, G, eta), stages.Lambda)
-    holonomic = _dual(_rows(mechanics.d_holonomic, G), stages.Lambda_hol)
-    return _rows(mechanics.d1l, G, eta) + reaction + holonomic
+    reaction = dual(rows(mechanics.d2phi, G, eta), stages.Lambda)
+    holonomic = dual(rows(mechanics.d_holonomic, G), stages.Lambda_hol)
+    return rows(mechanics.d1l, G, eta) + reaction + holonomic
 
 
 def _hamiltonian_force(mechanics: Mechanics, G, mu, stages: Stages):
     """D1h - Λ ♭_h(D2ψ) - Λ_hol DΦ at the stages, left-trivialised."""
-    flat = _rows(lambda g, m: mechanics.flat(g, m, mechanics.d2psi(g, m)), G, mu)
-    holonomic = _dual(_rows(mechanics.d_holonomic, G), stages.Lambda_hol)
-    return _rows(mechanics.d1h, G, mu) - _dual(flat, stages.Lambda) - holonomic
+    flat = rows(lambda g, m: mechanics.flat(g, m, mechanics.d2psi(g, m)), G, mu)
+    holonomic = dual(rows(mechanics.d_holonomic, G), stages.Lambda_hol)
+    return rows(mechanics.d1h, G, mu) - dual(flat, stages.Lambda) - holonomic
 
 
-def chart_momenta(mechanics: Mechanics, tableau: Tableau, h, H, mu_hat) -> np.ndarray:
-    """Π^i = (dτ_Ξi)* of the body momenta μ^i of the stages; those of h at (G^i, ·)."""
+def chart_momenta(
+    mechanics: Mechanics, tableau: Tableau, h, H, mu_hat, chart: str
+) -> np.ndarray:
+    """Π^i = (dτ_yi)* of the body momenta μ^i of the stages; those of h at (G^i, ·)."""
     if mechanics.group is None:
         return mu_hat
-    return _dual(_rows(mechanics.group.dtau, h * (tableau.a @ H)), mu_hat)
+    y = CHARTS[chart].coordinates(tableau, h, H)
+    return dual(rows(mechanics.group.dtau, y), mu_hat)
 
 
 def lagrangian_group_residuals(
-    mechanics: Mechanics, tableau: Tableau, h: float, g, mu, stages: LagrangianStages
+    mechanics: Mechanics,
+    tableau: Tableau,
+    h: float,
+    g,
+    mu,
+    stages: LagrangianStages,
+    chart: str,
 ) -> Residuals:
     """Summary "Discrete nonholonomic Lagrangian equations. Lie group".
 
-    With N^i + T^i of the section "Holonomic constraints" in place of N^i, Φ(G^i) = 0
-    and the tangency condition. μ^i = D2ℓ(g_k τ(ξ^i), η^i) is substituted.
+    These are the paper's for the chart at the start. With N^i + T^i of the section
+    "Holonomic constraints" in place of N^i, Φ(G^i) = 0 and the tangency condition.
+    μ^i = D2ℓ(g_k τ(ξ^i), η^i) is substituted.
     """
     assert mechanics.group is not None
-    at, found = _Geometry(mechanics.group, tableau, h, g, stages.H), Residuals()
+    at = CHARTS[chart](mechanics.group, tableau, h, g, stages.H)
+    found = Residuals()
     eta = np.einsum("inm,im->in", at.dtau, stages.H)  # dτ_Ξ H
-    Pi = _dual(at.dtau, _rows(mechanics.d2l, at.G, eta))
-    N = _dual(at.dtau, _lagrangian_force(mechanics, at.G, eta, stages))
+    Pi = dual(at.dtau, rows(mechanics.d2l, at.G, eta))
+    N = dual(at.dtau, _lagrangian_force(mechanics, at.G, eta, stages))
 
-    mu_nodes = _momenta(found, tableau, h, at, mu, N, Pi, stages.mu_next)
+    mu_nodes = at.momenta(found, mu, N, Pi, stages.mu_next)
     found.add(
         "μ^i = D2ℓ(g_k τ(ξ^i), η^i) = Ad*_τ(Ξi)[μ_k + h Σ a_ij (dτ^-1_-Ξj)* N^j]",
-        _rows(mechanics.d2l, at.G, stages.eta_nodes),
+        rows(mechanics.d2l, at.G, stages.eta_nodes),
         -mu_nodes,
     )
-    values = _rows(mechanics.phi, at.G, stages.eta_nodes)
+    values = rows(mechanics.phi, at.G, stages.eta_nodes)
     name = "φ(g_k τ(ξ^i), η^i) = 0"
     _constraints(found, mechanics, name, at.G, stages.eta_nodes, values)
     _holonomic(found, mechanics, at.G, stages.g_next, stages.mu_next)
-    found.add("g_{k+1} = g_k τ(ξ)", stages.g_next, -at.g_next)
+    found.add("g_{k+1} = the end of the chart", stages.g_next, -at.g_next)
     return found
 
 
 def hamiltonian_group_residuals(
-    mechanics: Mechanics, tableau: Tableau, h: float, g, mu, stages: HamiltonianStages
+    mechanics: Mechanics,
+    tableau: Tableau,
+    h: float,
+    g,
+    mu,
+    stages: HamiltonianStages,
+    chart: str,
 ) -> Residuals:
     """Summary "Discrete nonholonomic Hamiltonian equations. Lie group".
 
@@ -239,23 +201,24 @@ def hamiltonian_group_residuals(
     H^i = dτ_Ξ^{-1} D2h. Holonomic constraints as on the Lagrangian side.
     """
     assert mechanics.group is not None
-    at, found = _Geometry(mechanics.group, tableau, h, g, stages.H), Residuals()
-    mu_hat = _dual(at.dtau_inv, stages.Pi)
-    N = _dual(at.dtau, _hamiltonian_force(mechanics, at.G, mu_hat, stages))
+    at = CHARTS[chart](mechanics.group, tableau, h, g, stages.H)
+    found = Residuals()
+    mu_hat = dual(at.dtau_inv, stages.Pi)
+    N = dual(at.dtau, _hamiltonian_force(mechanics, at.G, mu_hat, stages))
 
-    mu_nodes = _momenta(found, tableau, h, at, mu, -N, stages.Pi, stages.mu_next)
-    velocity = _rows(mechanics.d2h, at.G, mu_hat)
+    mu_nodes = at.momenta(found, mu, -N, stages.Pi, stages.mu_next)
+    velocity = rows(mechanics.d2h, at.G, mu_hat)
     found.add(
         "H^i = dτ^-1_Ξi D2h(g_k τ(Ξ^i), (dτ^-1_Ξi)* Π^i)",
         stages.H,
         -np.einsum("inm,im->in", at.dtau_inv, velocity),
     )
-    velocities = _rows(mechanics.d2h, at.G, mu_nodes)
-    values = _rows(mechanics.psi, at.G, mu_nodes)
+    velocities = rows(mechanics.d2h, at.G, mu_nodes)
+    values = rows(mechanics.psi, at.G, mu_nodes)
     name = "ψ(g_k τ(ξ^i), μ^i) = 0"
     _constraints(found, mechanics, name, at.G, velocities, values)
     _holonomic(found, mechanics, at.G, stages.g_next, stages.mu_next)
-    found.add("g_{k+1} = g_k τ(ξ)", stages.g_next, -at.g_next)
+    found.add("g_{k+1} = the end of the chart", stages.g_next, -at.g_next)
     return found
 
 
@@ -280,14 +243,14 @@ def lagrangian_residuals(
     found = Residuals()
     Q = q + h * (tableau.a @ stages.H)
     W = _lagrangian_force(mechanics, Q, stages.H, stages)
-    P = _rows(mechanics.d2l, Q, stages.H)
+    P = rows(mechanics.d2l, Q, stages.H)
     p_nodes = _vector_space(found, mechanics, tableau, h, q, p, P, W, stages)
     found.add(
         "p^i = D2L(q^i, v^i) = p_k + h Σ a_ij W^j",
-        _rows(mechanics.d2l, Q, stages.eta_nodes),
+        rows(mechanics.d2l, Q, stages.eta_nodes),
         -p_nodes,
     )
-    values = _rows(mechanics.phi, Q, stages.eta_nodes)
+    values = rows(mechanics.phi, Q, stages.eta_nodes)
     _constraints(found, mechanics, "Φ(q^i, v^i) = 0", Q, stages.eta_nodes, values)
     _holonomic(found, mechanics, Q, stages.g_next, stages.mu_next)
     return found
@@ -305,10 +268,10 @@ def hamiltonian_residuals(
     Q = q + h * (tableau.a @ stages.H)
     W = -_hamiltonian_force(mechanics, Q, stages.Pi, stages)
     p_nodes = _vector_space(found, mechanics, tableau, h, q, p, stages.Pi, W, stages)
-    velocity = _rows(mechanics.d2h, Q, stages.Pi)
+    velocity = rows(mechanics.d2h, Q, stages.Pi)
     found.add("V^i = D2H(Q^i, P^i)", stages.H, -velocity)
-    velocities = _rows(mechanics.d2h, Q, p_nodes)
-    values = _rows(mechanics.psi, Q, p_nodes)
+    velocities = rows(mechanics.d2h, Q, p_nodes)
+    values = rows(mechanics.psi, Q, p_nodes)
     _constraints(found, mechanics, "Ψ(q^i, p^i) = 0", Q, velocities, values)
     _holonomic(found, mechanics, Q, stages.g_next, stages.mu_next)
     return found

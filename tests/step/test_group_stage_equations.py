@@ -12,6 +12,7 @@ import pytest
 
 import nhjax
 from oracles import paper_group_equations as paper
+from oracles.charts import CHARTS
 from oracles.group_problems import (
     BUILDERS,
     FORMS,
@@ -41,6 +42,7 @@ class Case(NamedTuple):
     stages: int
     closure: str
     solver: str
+    chart: str
 
     @property
     def problem(self):
@@ -55,15 +57,15 @@ class Case(NamedTuple):
 
 def covering_selection():
     """Every problem in both forms, one with either retraction; the rest takes turns."""
-    rest = list(product(CLOSURES, SOLVERS, (2, 3, 4)))
+    rest = list(product(CHARTS, CLOSURES, SOLVERS, (2, 3, 4)))
     for turn, (name, form) in enumerate(product(BUILDERS, FORMS)):
         flat = name in ON_VECTOR_SPACES
         retraction = list(RETRACTIONS)[0 if flat else (turn + turn // 2) % 2]
-        # 7 and 18 are coprime: all combinations occur, and neighbours differ.
-        closure, solver, stages = rest[(7 * turn + 1) % len(rest)]
+        # 7 and 36 are coprime: no combination comes twice, and neighbours differ.
+        chart, closure, solver, stages = rest[(7 * turn + 1) % len(rest)]
         if name in ON_SE3:  # where the dense one takes long to compile
             solver = "simplified"
-        yield Case(name, form, retraction, stages, closure, solver)
+        yield Case(name, form, retraction, stages, closure, solver, chart)
 
 
 CASES = list(covering_selection())
@@ -81,7 +83,7 @@ def steps_of(case):
     """Three steps, the first from a state that is nothing special either."""
     return solved_steps(
         case.problem.forms[case.form],
-        nhjax.LobattoIIIAB(case.stages, case.closure),
+        nhjax.LobattoIIIAB(case.stages, case.closure, case.chart),
         SOLVERS[case.solver],
         case.problem.y0,
         STEP,
@@ -96,16 +98,19 @@ def split(case, multiplier):
 
 
 def at_nodes(case, taken):
-    """(g_k τ(Ξ^i), Ad^*_τ(Ξ^i) (μ_k + h Σ a_ij n^j)) at i = 1..s, on matrices."""
+    """(g_o τ(y^i), Ad^*_τ(y^i) (M + h Σ a_ij n^j)) at i = 1..s, on matrices."""
     group, h, tableau = case.problem.mechanics.group, STEP, case.tableau
-    g = case.problem.element(taken.start.q)
-    momenta = taken.start.p + h * (tableau.a @ taken.force)
-    increments = h * (tableau.a @ taken.stages.velocity)
+    g, velocity = case.problem.element(taken.start.q), taken.stages.velocity
+    gained = h * (tableau.a @ taken.force)
     if group is None:
-        return g + increments, momenta
-    turns = [group.tau(xi) for xi in increments]
-    pairs = zip(turns, momenta, strict=True)
-    return [g @ turn for turn in turns], np.stack([mu @ group.Ad(x) for x, mu in pairs])
+        return g + h * (tableau.a @ velocity), taken.start.p + gained
+    y = CHARTS[case.chart].coordinates(tableau, h, velocity)
+    turns = [group.tau(y) for y in y]
+    # The first node is the start: g_o τ(y^1) = g_k and Ad^*_τ(y^1) M = μ_k.
+    origin = g @ np.linalg.inv(turns[0])
+    M = np.linalg.solve(group.Ad(turns[0]).T, taken.start.p)
+    pairs = zip(turns, M + gained, strict=True)
+    return [origin @ x for x in turns], np.stack([mu @ group.Ad(x) for x, mu in pairs])
 
 
 def node_velocities(case, taken):
@@ -128,7 +133,12 @@ def on_paper(case, taken):
         stages = paper.LagrangianStages(*shared, *end, node_velocities(case, taken))
     else:
         Pi = paper.chart_momenta(
-            case.problem.mechanics, case.tableau, STEP, x.velocity, x.momentum
+            case.problem.mechanics,
+            case.tableau,
+            STEP,
+            x.velocity,
+            x.momentum,
+            case.chart,
         )
         stages = paper.HamiltonianStages(*shared, *end, Pi)
     return element(taken.start.q), taken.start.p, stages
@@ -139,7 +149,10 @@ def residuals(case, g, mu, stages):
     mechanics = case.problem.mechanics
     where = "residuals" if mechanics.group is None else "group_residuals"
     function = getattr(paper, f"{case.form}_{where}")
-    return function(mechanics, case.tableau, STEP, g, mu, stages).relative()
+    given = [mechanics, case.tableau, STEP, g, mu, stages]
+    if mechanics.group is not None:
+        given.append(case.chart)
+    return function(*given).relative()
 
 
 def continuous_multiplier(case, state):
@@ -213,6 +226,7 @@ def test_every_pair_of_choices_is_tested():
         "stages": (2, 3, 4),
         "closure": CLOSURES,
         "solver": SOLVERS,
+        "chart": CHARTS,
     }
     for first, second in combinations(list(choices)[1:], 2):
         cases = WITH_CLOSURE if "closure" in (first, second) else CASES
@@ -254,6 +268,13 @@ def test_the_residuals_tell_the_retractions_apart(case):
     found = residuals(
         case._replace(retraction=other), *on_paper(case, steps_of(case)[-1])
     )
+    assert max(found.values()) > 1e-6
+
+
+@over([case for case in CASES if case.name in ("Suslov", "anisotropic")])
+def test_the_residuals_tell_the_charts_apart(case):
+    [other] = set(CHARTS) - {case.chart}
+    found = residuals(case._replace(chart=other), *on_paper(case, steps_of(case)[-1]))
     assert max(found.values()) > 1e-6
 
 

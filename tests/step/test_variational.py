@@ -25,11 +25,11 @@ from oracles.group_problems import (
 )
 
 
-def momenta_along(start, form, momentum):
+def momenta_along(start, form, momentum, chart="middle"):
     """The momentum map at every tenth of 1000 steps."""
     sol = nhjax.integrate(
         start.forms[form],
-        nhjax.LobattoIIIAB(3),
+        nhjax.LobattoIIIAB(3, chart=chart),
         start.y0,
         dt=STEP,
         num_steps=1000,
@@ -39,8 +39,8 @@ def momenta_along(start, form, momentum):
     return np.asarray(jax.vmap(momentum)(sol.ys.q, sol.ys.p))
 
 
-def assert_conserved(start, form, momentum):
-    values = momenta_along(start, form, momentum)
+def assert_conserved(start, form, momentum, chart="middle"):
+    values = momenta_along(start, form, momentum, chart)
     assert len(values) == 101
     assert np.min(np.max(np.abs(values), axis=0)) > 1e-3
     drift = np.max(np.abs(values - values[0]))
@@ -48,33 +48,35 @@ def assert_conserved(start, form, momentum):
 
 
 both_ways = pytest.mark.parametrize(
-    ("form", "retraction"), [("lagrangian", "cayley"), ("hamiltonian", "exponential")]
+    ("form", "retraction", "chart"),
+    [("lagrangian", "cayley", "middle"), ("hamiltonian", "exponential", "middle")],
 )
 crosswise = pytest.mark.parametrize(
-    ("form", "retraction"), [("lagrangian", "exponential"), ("hamiltonian", "cayley")]
+    ("form", "retraction", "chart"),
+    [("lagrangian", "exponential", "middle"), ("hamiltonian", "cayley", "start")],
 )
 OMEGA = np.array([0.7, -0.4, 1.3])
 
 
 @both_ways
-def test_a_free_rigid_body_keeps_its_spatial_angular_momentum(form, retraction):
+def test_a_free_rigid_body_keeps_its_spatial_angular_momentum(form, retraction, chart):
     group = nhjax.SO3(RETRACTIONS[retraction])
     start = Start(free_forms(group, INERTIA), QUATERNION, OMEGA)
-    assert_conserved(start, form, lambda q, p: group.matrix(q) @ p)
+    assert_conserved(start, form, lambda q, p: group.matrix(q) @ p, chart)
 
 
 @crosswise
-def test_a_heavy_top_keeps_its_vertical_angular_momentum(form, retraction):
+def test_a_heavy_top_keeps_its_vertical_angular_momentum(form, retraction, chart):
     group = nhjax.SO3(RETRACTIONS[retraction])
     forms = free_forms(group, INERTIA, lambda q: 0.5 * group.matrix(q)[2, 2])
     start = Start(forms, QUATERNION, OMEGA)
-    assert_conserved(start, form, lambda q, p: group.matrix(q)[2:] @ p)
+    assert_conserved(start, form, lambda q, p: group.matrix(q)[2:] @ p, chart)
     horizontal = momenta_along(start, form, lambda q, p: group.matrix(q)[:2] @ p)
     assert np.max(np.ptp(horizontal, axis=0)) > 1e-2
 
 
 @both_ways
-def test_a_free_body_in_the_plane_keeps_its_momenta(form, retraction):
+def test_a_free_body_in_the_plane_keeps_its_momenta(form, retraction, chart):
     group = nhjax.SE2(RETRACTIONS[retraction])
     # So slow that the angle θ, and with it R(θ), has enough digits to the end.
     q, v = np.array([0.3, -0.2, 0.4]), np.array([0.05, 0.02, 0.3])
@@ -87,14 +89,14 @@ def test_a_free_body_in_the_plane_keeps_its_momenta(form, retraction):
         return p[2:] + q[0] * y - q[1] * x
 
     start = Start(free_forms(group, INERTIA), q, v)
-    assert_conserved(start, form, momentum)
+    assert_conserved(start, form, momentum, chart)
     # Known to the arm times the round-off of the linear one.
-    about_origin = momenta_along(start, form, angular_momentum)
+    about_origin = momenta_along(start, form, angular_momentum, chart)
     assert np.max(np.abs(about_origin - about_origin[0])) <= 1e-13
 
 
 @crosswise
-def test_a_falling_body_keeps_its_horizontal_momenta(form, retraction):
+def test_a_falling_body_keeps_its_horizontal_momenta(form, retraction, chart):
     group = nhjax.SE3(RETRACTIONS[retraction])
     q = np.append(QUATERNION, [0.1, 0.2, 0.3])
     v = np.append([0.04, -0.03, 0.02], OMEGA)
@@ -103,7 +105,7 @@ def test_a_falling_body_keeps_its_horizontal_momenta(form, retraction):
     def momentum(q, p):
         return group.matrix(q)[:2, :3] @ p[:3]
 
-    assert_conserved(Start(forms, q, v), form, momentum)
+    assert_conserved(Start(forms, q, v), form, momentum, chart)
 
 
 @pytest.mark.parametrize("form", FORMS)
@@ -124,18 +126,24 @@ def test_a_spherical_pendulum_keeps_its_vertical_angular_momentum(form):
 # The variational principle
 
 
-def discrete_action(mechanics, tableau, h, g, g_next, H):
-    """h Σ b_i ℓ(g τ(Ξ^i), dτ_Ξi H^i); H^s follows from g τ(h Σ b_j H^j) = g_next.
+def discrete_action(mechanics, tableau, h, g, g_next, H, chart):
+    """h Σ b_i ℓ(g_o τ(y^i), dτ_yi H^i); H^s follows from the ends of the chart.
 
-    For Cayley's map, and analytic in all arguments.
+    With the origin g_o = g at the start, τ(ξ) leads to g_next; in the middle τ(ξ/2)
+    leads from g to g_o, and again to g_next. For Cayley's map on rotations, and
+    analytic in all arguments.
     """
     a, b, group = tableau.a, tableau.b, mechanics.group
     turn, unit = np.linalg.solve(g, g_next), np.eye(len(g))
-    xi = group.vee(2 * np.linalg.solve(turn + unit, turn - unit))
+    xi, origin, start = group.vee(2 * np.linalg.solve(turn + unit, turn - unit)), g, 0
+    if chart == "middle":
+        # By tan(α/2) = tan α / (1 + 1/cos α) for α a quarter of the angle.
+        half = xi / (1 + np.sqrt(1 + np.sum(xi * xi) / 4))
+        xi, origin, start = 2 * half, g @ group.tau(half), -half
     H = np.concatenate([H, (xi / h - b[:-1] @ H)[None] / b[-1]])
     total = 0.0
-    for weight, velocity, increment in zip(b, H, h * (a @ H), strict=True):
-        here, eta = g @ group.tau(increment), group.dtau(increment) @ velocity
+    for weight, velocity, y in zip(b, H, start + h * (a @ H), strict=True):
+        here, eta = origin @ group.tau(y), group.dtau(y) @ velocity
         kinetic = eta @ mechanics.inertia(here) @ eta / 2
         total = total + h * weight * (kinetic - np.sum(mechanics.C * here))
     return total
@@ -147,12 +155,22 @@ def slopes(function, directions):
 
 
 @pytest.mark.parametrize(
-    ("stages", "form"),
-    [(2, "lagrangian"), (2, "hamiltonian"), (3, "lagrangian"), (4, "hamiltonian")],
+    ("stages", "form", "chart"),
+    [
+        (2, "lagrangian", "middle"),
+        (2, "hamiltonian", "start"),
+        (3, "lagrangian", "start"),
+        (3, "hamiltonian", "middle"),
+        (4, "hamiltonian", "start"),
+        (4, "lagrangian", "middle"),
+    ],
 )
-def test_unconstrained_steps_on_groups_extremise_the_discrete_action(stages, form):
+def test_unconstrained_steps_on_groups_extremise_the_discrete_action(
+    stages, form, chart
+):
     top, tableau = problem("heavy top"), paper.lobatto(stages)
-    method, solver = nhjax.LobattoIIIAB(stages), nhjax.SimplifiedNewton()
+    method = nhjax.LobattoIIIAB(stages, chart=chart)
+    solver = nhjax.SimplifiedNewton()
     assert top.mechanics.group is not None
     basis = top.mechanics.group.basis
     for taken in solved_steps(top.forms[form], method, solver, top.y0, STEP):
@@ -160,7 +178,7 @@ def test_unconstrained_steps_on_groups_extremise_the_discrete_action(stages, for
         H = taken.stages.velocity[:-1]
 
         def action(g=g, g_next=g_next, H=H):
-            return discrete_action(top.mechanics, tableau, STEP, g, g_next, H)
+            return discrete_action(top.mechanics, tableau, STEP, g, g_next, H, chart)
 
         # The oracle itself loses digits in H^s = (ξ / h - ...) / b_s.
         entries = np.eye(H.size).reshape(-1, *H.shape)

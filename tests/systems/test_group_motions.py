@@ -21,6 +21,7 @@ from nhjax.systems import (
     TurntableBall,
     Unicycle,
     UnicycleInCoordinates,
+    Veselova,
 )
 from oracles.group_gallery import (
     assert_close,
@@ -252,6 +253,8 @@ def test_suslov_ends_in_a_steady_rotation():
             lambda: TurntableBall(frame="lab"),  # pyright: ignore[reportArgumentType]
             r"`frame` must be .* got 'lab'",
         ),
+        (lambda: Veselova(inertia=(1.0, 2.0, 3.0)), r"`inertia` must have shape"),
+        (lambda: Veselova(-jnp.eye(3)), r"`inertia` must be symmetric and positive"),
         (lambda: Suslov(moments=(1.0, 0.0, 1.0)), r"`moments` must be positive"),
         (lambda: Suslov(products=(2.0, 0.0)), r"`products` are too large"),
         (lambda: RollingDisc(radius=0.0), r"`radius` must be positive, got 0"),

@@ -19,6 +19,7 @@ from nhjax.systems import (
     Suslov,
     TurntableBall,
     Unicycle,
+    Veselova,
 )
 from oracles.group_gallery import (
     assert_close,
@@ -136,6 +137,7 @@ def test_parameters_are_leaves_of_the_system(example):
         Unicycle,
         TurntableBall,
         Suslov,
+        Veselova,
         RollingDisc,
         FreeRigidBody,
         HeavyTop,

@@ -1,0 +1,173 @@
+"""The two charts of a step on a group: reversal, energy over long runs, and cost.
+
+For each system, retraction and number of stages, and for the chart at the start of a
+step (the paper's) and that in its middle:
+
+- how far 50 steps of h and as many of -h lead away from the start;
+- the largest relative error of the energy over a long run, without the first tenth and
+  within it, which tells a drift from an oscillation;
+- the iterations a step, and the time of a step relative to the chart at the start.
+"""
+
+import argparse
+import time
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import nhjax
+from nhjax import systems
+
+from ._report import markdown_table, number, write
+
+
+STEP, THERE_AND_BACK = 0.1, 50
+CHARTS = ("start", "middle")
+RETRACTIONS = {"cay": nhjax.Cayley(), "exp": nhjax.Exponential()}
+_INERTIA = ((1.0, 0.1, 0.2), (0.1, 1.4, -0.15), (0.2, -0.15, 0.8))
+
+
+def suslov_in_a_potential(retraction):
+    """Suslov's problem with a full matrix of inertia and V = 0.3 R₃₃."""
+    inertia, manifold = jnp.asarray(_INERTIA), nhjax.SO3(retraction)
+
+    def lagrangian(t, q, v, args):
+        return 0.5 * v @ inertia @ v - 0.3 * manifold.matrix(q)[2, 2]
+
+    system = nhjax.LagrangianSystem(
+        lagrangian, nonholonomic=lambda t, q, v, args: v[2], manifold=manifold
+    )
+    q0 = nhjax.SO3(nhjax.Exponential()).retract(jnp.array([0.2, -0.4, 0.5]))
+    return system, nhjax.initial_state(system, q0, jnp.array([0.6, -0.9, 0.0]))
+
+
+def _of_the_gallery(kind):
+    def build(retraction):
+        example = kind(retraction=retraction)
+        return example.system, example.initial_state()
+
+    return build
+
+
+SYSTEMS = {
+    "Suslov in a potential": suslov_in_a_potential,
+    "Suslov": _of_the_gallery(systems.Suslov),
+    "Veselova": _of_the_gallery(systems.Veselova),
+    "heavy top": _of_the_gallery(systems.HeavyTop),
+    "unicycle": _of_the_gallery(systems.Unicycle),
+    "ball": _of_the_gallery(systems.TurntableBall),
+}
+
+
+class Row(NamedTuple):
+    """What was measured for one chart of one system."""
+
+    system: str
+    retraction: str
+    stages: int
+    chart: str
+    there_and_back: float
+    energy_early: float
+    energy: float
+    iterations: float
+    microseconds: float
+
+
+def measure(name, retraction, stages, chart, duration) -> Row:
+    """Run one system with one chart."""
+    system, y0 = SYSTEMS[name](RETRACTIONS[retraction])
+    method = nhjax.LobattoIIIAB(stages, chart=chart)
+    num_steps = round(duration / STEP)
+    every = max(1, num_steps // 2000)
+
+    def energy(t, y, args):
+        return y.p @ y.v - system.lagrangian(t, y.q, y.v, args)
+
+    @jax.jit
+    def run(y0, dt):
+        return nhjax.integrate(
+            system,
+            method,
+            y0,
+            dt=dt,
+            num_steps=num_steps,
+            saveat=nhjax.SaveAt(t0=True, steps=every, fn=energy),
+            throw=False,
+        )
+
+    @jax.jit
+    def short(y0, dt):
+        options = {"num_steps": THERE_AND_BACK, "throw": False}
+        ys = nhjax.integrate(system, method, y0, dt=dt, **options).ys
+        return jax.tree.map(lambda x: x[-1], ys)
+
+    dt = jnp.asarray(STEP)
+    back = short(short(y0, dt), -dt)
+    change = jax.tree.map(lambda x, y: np.max(np.abs(x - y), initial=0.0), back, y0)
+    sol = jax.block_until_ready(run(y0, dt))
+    start = time.process_time()
+    jax.block_until_ready(run(y0, dt))
+    spent = time.process_time() - start
+    values = np.asarray(sol.ys)
+    # The energy of a motion may be near zero: the kinetic energy gives its scale.
+    scale = max(abs(values[0]), float(0.5 * y0.p @ y0.v))
+    errors = np.abs(values - values[0]) / scale
+    return Row(
+        name,
+        retraction,
+        stages,
+        chart,
+        max(jax.tree.leaves((change.q, change.v))),
+        float(np.max(errors[: len(errors) // 10])),
+        float(np.max(errors)),
+        float(sol.stats["num_iterations"]) / num_steps,
+        1e6 * spent / num_steps,
+    )
+
+
+def main() -> None:
+    """Measure all systems, and write the table."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--duration", type=float, default=1e4, help="t of long runs")
+    parser.add_argument("--quick", action="store_true", help="t = 100 and two stages")
+    asked = parser.parse_args()
+    jax.config.update("jax_enable_x64", True)
+    duration = 100.0 if asked.quick else asked.duration
+    rows = [
+        measure(name, retraction, stages, chart, duration)
+        for name in SYSTEMS
+        for retraction in RETRACTIONS
+        for stages in ((2,) if asked.quick else (2, 3, 4))
+        for chart in CHARTS
+    ]
+    header = ["system", "τ", "s", "h, then -h: start", "middle", "energy: start"]
+    header += ["middle", "middle / start", "first tenth: start", "middle"]
+    header += ["iterations: start", "middle", "time: middle / start"]
+    table = []
+    for paper, middle in zip(rows[::2], rows[1::2], strict=True):
+        table.append(
+            [
+                paper.system,
+                paper.retraction,
+                str(paper.stages),
+                number(paper.there_and_back),
+                number(middle.there_and_back),
+                number(paper.energy),
+                number(middle.energy),
+                f"{middle.energy / paper.energy:.2f}",
+                number(paper.energy_early),
+                number(middle.energy_early),
+                f"{paper.iterations:.1f}",
+                f"{middle.iterations:.1f}",
+                f"{middle.microseconds / paper.microseconds:.2f}",
+            ]
+        )
+    title = f"Two charts on a group, h = {STEP}, t = {duration:g}"
+    data = {"rows": [row._asdict() for row in rows]}
+    write("charts", title, markdown_table(header, table), data)
+
+
+if __name__ == "__main__":
+    main()
