@@ -11,6 +11,7 @@ step (the paper's) and that in its middle:
 
 import argparse
 import time
+from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
@@ -19,6 +20,8 @@ import numpy as np
 
 import nhjax
 from nhjax import systems
+from nhjax._manifold import AbstractRetraction
+from nhjax._system import State
 
 from ._report import markdown_table, number, write
 
@@ -29,7 +32,9 @@ RETRACTIONS = {"cay": nhjax.Cayley(), "exp": nhjax.Exponential()}
 _INERTIA = ((1.0, 0.1, 0.2), (0.1, 1.4, -0.15), (0.2, -0.15, 0.8))
 
 
-def suslov_in_a_potential(retraction):
+def suslov_in_a_potential(
+    retraction: AbstractRetraction,
+) -> tuple[nhjax.LagrangianSystem, State]:
     """Suslov's problem with a full matrix of inertia and V = 0.3 R₃₃."""
     inertia, manifold = jnp.asarray(_INERTIA), nhjax.SO3(retraction)
 
@@ -43,8 +48,20 @@ def suslov_in_a_potential(retraction):
     return system, nhjax.initial_state(system, q0, jnp.array([0.6, -0.9, 0.0]))
 
 
-def _of_the_gallery(kind):
-    def build(retraction):
+def _uneven_ball(retraction: AbstractRetraction) -> systems.TurntableBall:
+    """A ball with three moments of inertia on a table at rest, which keeps energy."""
+    return systems.TurntableBall.rolling(
+        (0.5, -0.2),
+        (0.4, 0.3),
+        0.7,
+        moments=(0.3, 0.4, 0.5),
+        rate=0.0,
+        retraction=retraction,
+    )
+
+
+def _of_the_gallery(kind: Callable) -> Callable:
+    def build(retraction: AbstractRetraction):
         example = kind(retraction=retraction)
         return example.system, example.initial_state()
 
@@ -57,7 +74,7 @@ SYSTEMS = {
     "Veselova": _of_the_gallery(systems.Veselova),
     "heavy top": _of_the_gallery(systems.HeavyTop),
     "unicycle": _of_the_gallery(systems.Unicycle),
-    "ball": _of_the_gallery(systems.TurntableBall),
+    "uneven ball": _of_the_gallery(_uneven_ball),
 }
 
 
@@ -75,7 +92,9 @@ class Row(NamedTuple):
     microseconds: float
 
 
-def measure(name, retraction, stages, chart, duration) -> Row:
+def measure(
+    name: str, retraction: str, stages: int, chart: str, duration: float
+) -> Row:
     """Run one system with one chart."""
     system, y0 = SYSTEMS[name](RETRACTIONS[retraction])
     method = nhjax.LobattoIIIAB(stages, chart=chart)
@@ -111,7 +130,7 @@ def measure(name, retraction, stages, chart, duration) -> Row:
     jax.block_until_ready(run(y0, dt))
     spent = time.process_time() - start
     values = np.asarray(sol.ys)
-    # The energy of a motion may be near zero: the kinetic energy gives its scale.
+    # The energy of a motion may be near zero: the kinetic energy gives its scale too.
     scale = max(abs(values[0]), float(0.5 * y0.p @ y0.v))
     errors = np.abs(values - values[0]) / scale
     return Row(

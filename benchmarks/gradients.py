@@ -32,17 +32,29 @@ import nhjax
 from nhjax import systems
 
 from ._report import markdown_table, number, RESULTS, write
+from .charts import suslov_in_a_potential
 
 
 DT, REPEATS, LONG, REPEATS_OF_LONG = 0.1, 7, 10**4, 3
 # So that freed memory goes back at once, and is not taken for what a run needs.
 MALLOC = {"MALLOC_MMAP_THRESHOLD_": "65536", "MALLOC_TRIM_THRESHOLD_": "65536"}
 
+
+def _of_the_gallery(kind: Callable) -> Callable:
+    def build():
+        example = kind()
+        return example.system, example.initial_state()
+
+    return build
+
+
 EXAMPLES = {
-    "chaotic": systems.ChaoticSystem,
-    "sleigh": systems.ChaplyginSleigh,
-    "CVT": systems.ContinuouslyVariableTransmission,
-    "Suslov": systems.Suslov,
+    "chaotic": _of_the_gallery(systems.ChaoticSystem),
+    "sleigh": _of_the_gallery(systems.ChaplyginSleigh),
+    "CVT": _of_the_gallery(systems.ContinuouslyVariableTransmission),
+    "Suslov": _of_the_gallery(systems.Suslov),
+    "Suslov in a potential": lambda: suslov_in_a_potential(nhjax.Cayley()),
+    "heavy top": _of_the_gallery(systems.HeavyTop),
 }
 ADJOINTS = {
     "direct": nhjax.DirectAdjoint(),
@@ -55,8 +67,8 @@ def problem(
     name: str, stages: int, num_steps: int, adjoint: str = "direct"
 ) -> tuple[Callable[..., Array], tuple]:
     """A loss, and the state, step and parameters that it is a function of."""
-    example = EXAMPLES[name]()
-    parameters, fixed = eqx.partition(example.system, eqx.is_inexact_array)
+    system, y0 = EXAMPLES[name]()
+    parameters, fixed = eqx.partition(system, eqx.is_inexact_array)
 
     def loss(y0, dt, parameters):
         sol = nhjax.integrate(
@@ -71,7 +83,7 @@ def problem(
         ends = [sol.ys.v[-1], *(leaf[-1] for leaf in jax.tree.leaves(sol.ys.q))]
         return jnp.sum(jnp.concatenate(ends) ** 2)
 
-    return loss, (example.initial_state(), jnp.asarray(DT), parameters)
+    return loss, (y0, jnp.asarray(DT), parameters)
 
 
 def gradient(loss: Callable[..., Array]) -> Callable:
@@ -198,17 +210,16 @@ def modes(name: str, stages: int, num_steps: int) -> dict[str, float]:
     The derivative is that of (q, v) at the end with respect to v0, and for reverse mode
     that of the loss.
     """
-    example = EXAMPLES[name]()
-    y0 = example.initial_state()
+    system, y0 = EXAMPLES[name]()
 
     def end(v, dt):
         sol = nhjax.integrate(
-            example.system,
+            system,
             nhjax.LobattoIIIAB(stages),
             eqx.tree_at(
                 lambda y: (y.v, y.p),
                 y0,
-                (v, example.system.momentum(0.0, y0.q, v, None)),
+                (v, system.momentum(0.0, y0.q, v, None)),
             ),
             dt=dt,
             num_steps=num_steps,
