@@ -12,7 +12,11 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 # Nearly all the time goes into tracing and compiling programs that run once, hence the
 # compiler's older and quicker code generator, in one piece rather than in 32. The
 # backend reads this when it starts; what the environment says comes last and wins.
-QUICK_FLAGS = "--xla_cpu_parallel_codegen_split_count=1"
+QUICK_FLAGS = (
+    "--xla_cpu_parallel_codegen_split_count=1 "
+    # Passes over loops, which take a quarter of the time.
+    "--xla_disable_hlo_passes=while-loop-invariant-code-motion,simplify-while-loops"
+)
 # From 0.11.1 on there is no older code generator, and a flag that the compiler does not
 # know ends the process without a word.
 if tuple(map(int, importlib.metadata.version("jaxlib").split(".")[:3])) < (0, 11, 1):
@@ -21,6 +25,8 @@ os.environ["XLA_FLAGS"] = f"{QUICK_FLAGS} {os.environ.get('XLA_FLAGS', '')}".str
 
 import jax
 import pytest
+
+from nhjax._lanes import _registration
 
 
 # Python's collector looks for cycles each time that 700 objects have been made, which
@@ -70,6 +76,14 @@ def quick_compilation():
     jax.config.update("jax_disable_most_optimizations", True)
     yield
     jax.config.update("jax_disable_most_optimizations", False)
+
+
+@pytest.fixture(scope="module")
+def optimised_kernels():
+    """Kernels of nhjax as users have them, unlike what XLA compiles around them."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(_registration, "is_quick", lambda: False)
+        yield
 
 
 # Of the 65530 memory maps that Linux gives a process by default.

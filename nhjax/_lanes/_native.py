@@ -39,6 +39,8 @@ _PASSES = 1
 # with it, and a long one 2 percent faster.
 _LONG_TEXT = 1_000_000
 _GENERATION_OF_SHORT, _GENERATION_OF_LONG = 2, 1
+# The level of both for programs that run once: all of the above left out.
+_QUICK = 0
 
 
 @lru_cache(maxsize=1)
@@ -96,7 +98,9 @@ def host_width(dtype: Any) -> int:
     return bits // (8 * np.dtype(dtype).itemsize)
 
 
-def object_code(texts: Sequence[str], exported: str, target: Target) -> bytes:
+def object_code(
+    texts: Sequence[str], exported: str, target: Target, is_quick: bool = False
+) -> bytes:
     """Compile modules, which may refer to each other, to one object file.
 
     **Arguments:**
@@ -104,14 +108,15 @@ def object_code(texts: Sequence[str], exported: str, target: Target) -> bytes:
     - `texts`: the modules, in LLVM IR. They may declare the same functions.
     - `exported`: the one function that is seen from outside.
     - `target`: the machine, which need not be this one.
+    - `is_quick`: whether to compile in a third of the time or less, to slower code.
     """
-    module, machine = _optimised(texts, exported, target)
+    module, machine = _compiled(texts, exported, target, is_quick)
     return machine.emit_object(module)
 
 
 def assembly(texts: Sequence[str], exported: str, target: Target) -> str:
     """Compile modules to the text of an assembler, to be read."""
-    module, machine = _optimised(texts, exported, target)
+    module, machine = _compiled(texts, exported, target, is_quick=False)
     return machine.emit_assembly(module)
 
 
@@ -159,11 +164,14 @@ def _machine(target: Target, level: int) -> Any:
     )
 
 
-def _optimised(texts: Sequence[str], exported: str, target: Target) -> tuple[Any, Any]:
-    """Return the optimised module, and the machine that makes code of it."""
+def _compiled(
+    texts: Sequence[str], exported: str, target: Target, is_quick: bool
+) -> tuple[Any, Any]:
+    """Return the module after all passes, and the machine that makes code of it."""
     llvm = _llvm()
     is_long = sum(map(len, texts)) >= _LONG_TEXT
-    machine = _machine(target, _GENERATION_OF_LONG if is_long else _GENERATION_OF_SHORT)
+    level = _GENERATION_OF_LONG if is_long else _GENERATION_OF_SHORT
+    machine = _machine(target, _QUICK if is_quick else level)
     # In the context that all modules share their types and constants would never be
     # freed.
     context = llvm.create_context()
@@ -182,7 +190,9 @@ def _optimised(texts: Sequence[str], exported: str, target: Target) -> tuple[Any
             # Of a function that nobody else calls no copy stays where it is inlined.
             if function.name != exported:
                 function.linkage = "internal"
-    options = llvm.create_pipeline_tuning_options(speed_level=_PASSES)
+    options = llvm.create_pipeline_tuning_options(
+        speed_level=_QUICK if is_quick else _PASSES
+    )
     # The lanes are vectors already.
     options.loop_vectorization = options.loop_interleaving = False
     options.slp_vectorization = options.loop_unrolling = False

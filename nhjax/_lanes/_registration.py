@@ -1,10 +1,11 @@
 """Names of compiled programs, under which XLA finds their handlers.
 
-A program's name is made of its content, its machine's and the compiler's version: equal
-programs share a name, in all processes. XLA keeps names for as long as the process
-runs, and an executable may call them at any time. For this reason neither code nor name
-is ever given up: each program costs its code, some 20 to 150 KB, and `held` tells how
-much that is in all. What is compiled once per process is not compiled again.
+A program's name is made of its content, its machine's, the compiler's version and how
+it optimises: equal programs share a name, in all processes. XLA keeps names for as long
+as the process runs, and an executable may call them at any time. For this reason
+neither code nor name is ever given up: each program costs its code, some 20 to 150 KB,
+and `held` tells how much that is in all. What is compiled once per process is not
+compiled again.
 
 Executables that JAX keeps on disk call programs by these names too. JAX lowers a
 program before it looks for its executable, and lowering registers the name, so that it
@@ -18,6 +19,7 @@ import os
 import threading
 from typing import NamedTuple
 
+import jax
 import jax.ffi
 
 from ._handler import HANDLER, handler_ir
@@ -85,16 +87,22 @@ def registered(
     A name for `jax.ffi.ffi_call` and `jax.ffi.ffi_lowering`.
     """
     handler = handler_ir(num_operands, num_results, width, is_batched)
-    name = _name(kernel_ir, handler)
+    quick = is_quick()
+    name = _name(kernel_ir, handler, "quick" if quick else "optimised")
     with _lock:
         if name not in _programs:
-            code = object_code([kernel_ir, handler], HANDLER, host())
+            code = object_code([kernel_ir, handler], HANDLER, host(), quick)
             address = ctypes.c_void_p(load(code, name, HANDLER, _IMPORTS))
             jax.ffi.register_ffi_target(
                 name, jax.ffi.pycapsule(address), platform="cpu", api_version=1
             )
             _programs[name] = len(code)
     return name
+
+
+def is_quick() -> bool:
+    """Tell whether JAX is set to optimise little: programs are wanted early then."""
+    return bool(jax.config.read("jax_disable_most_optimizations"))
 
 
 def _name(*texts: str) -> str:

@@ -6,7 +6,9 @@ import numpy as np
 import pytest
 
 import nhjax
+from nhjax import _lanes
 from nhjax._compile import as_cpu_kernel
+from oracles.lane_kernels import kernel_ir, TRIPLE, WIDTH
 
 
 def wanders(g, x, k):
@@ -142,3 +144,22 @@ def test_operations_that_jax_writes_out_when_it_compiles():
         np.testing.assert_allclose(transform(total)(x), slopes, rtol=1e-14)
     jacobian = jax.jit(jax.vmap(jax.vjp(jax.vmap(read), x)[1]))(jnp.eye(3))[0]
     np.testing.assert_allclose(jacobian, jnp.diag(slopes), rtol=1e-14)
+
+
+def test_kernels_are_optimised_little_where_jax_is():
+    # One that nobody else compiles.
+    text = kernel_ir(TRIPLE, before="@of_this_test = global i32 0\n")
+    names, sizes = [], []
+    try:
+        for is_little in (False, True):
+            jax.config.update("jax_disable_most_optimizations", is_little)
+            before = _lanes.held().bytes
+            names.append(_lanes.registered(text, 1, 1, WIDTH, True))
+            sizes.append(_lanes.held().bytes - before)
+    finally:
+        jax.config.update("jax_disable_most_optimizations", True)
+    assert sizes[1] > 1.2 * sizes[0] > 0
+    out = jax.ShapeDtypeStruct(G.shape, G.dtype)
+    for name in names:
+        tripled = jax.jit(lambda x, name=name: jax.ffi.ffi_call(name, out)(x))(G)
+        np.testing.assert_array_equal(tripled, 3 * G)

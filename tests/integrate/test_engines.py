@@ -10,6 +10,8 @@ from benchmarks.engines import difference, gallery, program
 from nhjax import LobattoIIIAB, systems
 
 
+pytestmark = pytest.mark.usefixtures("optimised_kernels")
+
 GALLERY = gallery()
 PARTICLE = systems.NonholonomicParticle()
 # Iterations end in round-off: some steps have one more or one less.

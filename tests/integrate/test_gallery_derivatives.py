@@ -49,6 +49,8 @@ def assert_gradients_of_examples(examples, method, turning):
         return jnp.sum(each), each
 
     dt, along = jnp.asarray(0.05), direction(given)
+    # Of the types of all that is moved, not weaker ones: one program serves them all.
+    given = moved(given, along, 0.0)
     program = jax.jit(jax.value_and_grad(losses, argnums=(0, 1), has_aux=True))
     _, (gradients, in_dt) = program(given, dt)
     # Smaller differences are lost in the rounding errors of propagated multipliers,
