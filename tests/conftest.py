@@ -41,17 +41,19 @@ jax.config.update("jax_numpy_rank_promotion", "raise")
 # A file stays in one process: of two, those that take longest come first, lest one
 # process be left with one of them when all others are done.
 LONGEST = (
+    "integrate/test_engines.py",
+    "test_fitting.py",
     "integrate/test_gallery_derivatives.py",
+    "systems/test_whipple_bicycle.py",
+    "test_as_users_run.py",
+    "integrate/test_geometry.py",
+    "integrate/test_adjoints.py",
+    "integrate/test_group_convergence.py",
+    "step/test_accepted_steps.py",
+    "integrate/test_convergence.py",
     "integrate/test_derivatives.py",
     "integrate/test_num_steps.py",
-    "integrate/test_adjoints.py",
-    "step/test_accepted_steps.py",
-    "integrate/test_group_convergence.py",
-    "integrate/test_convergence.py",
-    "systems/test_group_systems.py",
-    "test_fitting.py",
     "test_notebooks.py",
-    "test_as_users_run.py",
 )
 
 
