@@ -23,7 +23,8 @@ class RESULTS(eqx.Enumeration):
     singular_stage_matrix = (
         "The mass matrix D2D2L (or D2D2H) or the compatibility matrix C = D2Φ M⁻¹ D2Φᵀ "
         "became singular, so that the multiplier is not determined. The system has "
-        "reached the edge of its domain."
+        "reached the edge of its domain, or its constraints are dependent, which "
+        '`constraints="redundant"` of a system permits.'
     )
     nonfinite_state = (
         "The state became infinite or NaN, or was so from the start. Check `y0` and "
@@ -36,6 +37,12 @@ class RESULTS(eqx.Enumeration):
         "it: with Cayley and two stages, a step of about one radian need have no "
         "solution. Take a smaller `dt`, `retraction=nhjax.Exponential()`, or more "
         "stages."
+    )
+    lost_constraints = (
+        "Constraints are violated at the end of a step, though as many hold as were "
+        "independent at its start: the redundant constraints contradict each other, or "
+        "more of them became independent. Leave out those that do not always follow "
+        "from the others."
     )
     inconsistent_start = (
         "The initial state violates the constraints at `t0`, its q is off the group, "

@@ -12,7 +12,15 @@ from .._compile import tracked_jit
 from .._custom_types import Args, FloatScalarLike
 from .._errors import is_traced, require
 from .._initial import checked_inputs
-from .._numerics import conditioning, dependent_rows, inverse, is_deficient, max_norm
+from .._numerics import (
+    conditioning,
+    conditioning_of_range,
+    dependent_rows,
+    inverse,
+    is_deficient,
+    max_norm,
+    rank_of_gram,
+)
 from .._system import AbstractMechanicalSystem, check_functions, finite, parameters
 from ._motion import in_velocities
 
@@ -35,6 +43,8 @@ class SystemReport(eqx.Module):
     - `violations`: the constraint functions by name, "Φ[0]" for nonholonomic ones and
         "Γ[0]", "dΓ[0]/dt" for holonomic ones.
     - `dependent`: the names of constraints that depend on each other, if any do.
+    - `num_redundant`: of a system whose constraints are redundant, how many follow from
+        others. The reactions of those in `dependent` are not unique then.
     - `depends_on_time`: the names of the functions that depend on t.
     - `ignorable`: the indices of coordinates that no function depends on near the given
         state; one that drops out by terms that cancel is not found.
@@ -49,14 +59,19 @@ class SystemReport(eqx.Module):
     compatibility_condition: float
     violations: dict[str, float]
     dependent: tuple[str, ...]
+    num_redundant: int
     depends_on_time: tuple[str, ...]
     ignorable: tuple[int, ...]
     constant: tuple[str, ...]
 
     @property
     def degrees_of_freedom(self) -> int:
-        """Return the dimension n - m - k of the velocities that are permitted."""
-        return self.dimension - self.num_nonholonomic - self.num_holonomic
+        """Return the dimension n - m - k of the velocities that are permitted.
+
+        Constraints that are redundant do not count.
+        """
+        count = self.num_nonholonomic + self.num_holonomic - self.num_redundant
+        return self.dimension - count
 
     def _size(self, name: str) -> float:
         # What is no number is worse than any.
@@ -80,6 +95,9 @@ class SystemReport(eqx.Module):
             "ignorable coordinates": _listed(self.ignorable),
             "constant": _listed(self.constant),
         }
+        if self.num_redundant:
+            rows["redundant constraints"] = self.num_redundant
+            rows["reactions not unique"] = _listed(self.dependent)
         return "\n".join(f"{name:30} {value}" for name, value in rows.items())
 
 
@@ -155,6 +173,7 @@ def check_system(
         dimension=u.size,
         num_nonholonomic=m,
         num_holonomic=k,
+        num_redundant=int(found["redundant"]),
         mass_condition=_condition(found["regularity"]),
         compatibility_condition=_condition(found["compatibility"]),
         violations=dict(zip(rates + letters[m:], map(float, values), strict=True)),
@@ -230,11 +249,16 @@ def _measured(system, t, q, u, args) -> dict[str, Any]:
     rows = jax.jacfwd(system.constraint, argnums=2)(t, q, u, args)
     mass, rows = in_velocities(system, metric(t, jnp.zeros_like(u), u), rows)
     compatibility = rows @ inverse(mass) @ rows.T
+    redundant, condition = jnp.zeros((), int), conditioning
+    if system.constraints == "redundant":
+        redundant = rows.shape[0] - rank_of_gram(compatibility)
+        condition = conditioning_of_range
     return {
         "constraints": system.constraint(t, q, u, args),
         "positions": system.position_constraint(t, q, args),
         "regularity": conditioning(mass),
-        "compatibility": conditioning(compatibility),
+        "compatibility": condition(compatibility),
+        "redundant": redundant,
         "jacobian": rows,
         "deficient": is_deficient(rows),
         "of time": by_time,

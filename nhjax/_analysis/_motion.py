@@ -3,15 +3,18 @@
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from .._compile import tracked_jit
 from .._custom_types import Args, FloatScalarLike
-from .._numerics import inverse
+from .._errors import is_traced
+from .._numerics import inverse, nan_unless
 from .._system import (
     AbstractMechanicalSystem,
+    all_finite,
     linearise,
     parameters,
+    require_independent,
     State,
 )
 from ._arguments import checked_time
@@ -29,6 +32,9 @@ class Motion(eqx.Module):
     - `mass_matrix`: M = ∂p/∂v, shape (n, n).
     - `constraint_jacobian`: B = ∂Φ/∂v, shape (l, n), with the rates of the holonomic
         constraints as its last rows.
+    - `is_unique`: which multipliers the equations determine, shape (l,). Of redundant
+        constraints it is false for all that depend on others, whose reactions are one
+        choice of many: that of the least norm. Their sum `reaction` is unique.
 
     A generalised force has the unit that makes its product with a coordinate a work: N
     for a coordinate in m, N m for an angle. A multiplier is a force in N if its
@@ -41,6 +47,7 @@ class Motion(eqx.Module):
     reaction: Float[Array, " n"]
     mass_matrix: Float[Array, "n n"]
     constraint_jacobian: Float[Array, "l n"]
+    is_unique: Bool[Array, " l"]
 
     @property
     def reaction_of_each(self) -> Float[Array, "l n"]:
@@ -85,8 +92,10 @@ def motion(
     **Returns:** a `Motion`. Its numbers are not finite where the mass matrix or the
     compatibility matrix is singular.
 
-    **Raises:** `TypeError` if `system` is no system or `y` no `State`; `ShapeError` if
-    `y` is no state of this system, or many.
+    **Raises:** `DependentConstraintsError` if constraints are dependent, and the system
+    does not say that they are redundant; under `jit` and `vmap` accelerations and
+    reactions are NaN then. `TypeError` if `system` is no system or `y` no `State`;
+    `ShapeError` if `y` is no state of this system, or many.
 
     !!! example
 
@@ -97,7 +106,10 @@ def motion(
     """
     args = parameters(args)
     t = checked_time("motion", system, t, y, args)
-    return _motion(system, t, y, args)
+    found = _motion(system, t, y, args)
+    if not is_traced(*jax.tree.leaves((found, y))) and not all_finite(found.multiplier):
+        require_independent(system, t, y, args)
+    return found
 
 
 @tracked_jit("system", "args")
@@ -118,13 +130,18 @@ def _motion(system, t, y, args) -> Motion:
     )
     metric = system.metric(t, y.q, u, args)
     mass, jacobian = in_velocities(system, metric, lin.jacobian)
+    rates = acceleration, momentum_rate, lin.multiplier
+    if lin.multiplier.shape[0] > 0:
+        rates = nan_unless(lin.determines_multipliers, rates)
+    acceleration, momentum_rate, multiplier = rates
     return Motion(
         acceleration=acceleration,
         momentum_rate=momentum_rate,
-        multiplier=lin.multiplier,
-        reaction=lin.multiplier @ jacobian,
+        multiplier=multiplier,
+        reaction=multiplier @ jacobian,
         mass_matrix=mass,
         constraint_jacobian=jacobian,
+        is_unique=lin.is_unique,
     )
 
 

@@ -3,7 +3,6 @@
 from typing import NamedTuple
 
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Float, PyTree
 
 from .._custom_types import BoolScalar, FloatScalar
@@ -16,8 +15,14 @@ from .._errors import (
     NewtonError,
     NonFiniteError,
 )
-from .._numerics import dependent_rows, Rank
-from .._system import AbstractMechanicalSystem, all_finite, Linearisation, State
+from .._numerics import Rank
+from .._system import (
+    AbstractMechanicalSystem,
+    all_finite,
+    dependence_error,
+    Linearisation,
+    State,
+)
 
 
 class Found(NamedTuple):
@@ -27,7 +32,8 @@ class Found(NamedTuple):
     - `off_group`: the distance of the given q to the group.
     - `regularity`, `compatibility`: the reciprocal condition numbers of the metric on
         the fibre and of the compatibility matrix.
-    - `ranks`, `deficient`: the derivatives that must have full rank, and which lack it.
+    - `ranks`, `deficient`: the derivatives that must have full rank, and which lack it;
+        those of redundant constraints must not mix their two kinds.
     - `allowed`, `allowed_positions`, `allowed_off_group`: the bounds on violations.
     - `legendre_solved`: whether the Legendre transform could be inverted.
     - `projected`: whether the projection onto the constraints has converged.
@@ -96,6 +102,7 @@ class _Case(NamedTuple):
     project: bool
     words: _Words
     group: str
+    is_redundant: bool
 
     @property
     def where(self) -> str:
@@ -131,7 +138,8 @@ def judged(
     singular = 10 * state.v.shape[0] * jnp.finfo(state.v.dtype).eps
     name, given = ("p", p) if v is None else ("v", v)
     words, group = _WORDS[system.generator], f"{system.manifold_of(q)}"
-    case = (_Case(found, q, name, given, project, words, group),)
+    of_system = words, group, system.constraints == "redundant"
+    case = (_Case(found, q, name, given, project, *of_system),)
     return [
         Check(found.off_group <= found.allowed_off_group, _group_error, case),
         # The negated "<=" lets NaN pass, which ">" would not: a matrix that is not
@@ -223,37 +231,13 @@ def _force_error(case: _Case) -> NonFiniteError:
 
 
 def _dependence_error(case: _Case, rank: Rank) -> DependentConstraintsError:
-    phi, k = case.words.constraint, case.found.positions.shape[0]
-    m = rank.jacobian.shape[0] - k
-    letters = [f"{phi}[{a}]" for a in range(m)] + [f"Γ[{a}]" for a in range(k)]
-    zero = [a for a in range(m + k) if not np.any(rank.jacobian[a])]
-    if zero and zero[0] < m:
-        advice = (
-            f"{letters[zero[0]]} does not depend on velocities there; pass a "
-            "constraint on positions as `holonomic`."
-        )
-    elif zero:
-        advice = (
-            f"{letters[zero[0]]} has no gradient there; a constraint must have one "
-            "where it vanishes."
-        )
-    else:
-        advice = (
-            "Remove redundant constraints, or start from a state at which they are "
-            "independent."
-        )
-    names = " and ".join([f"D2{phi}"] * (m > 0) + ["DΓ"] * (k > 0))
-    have = "have" if m > 0 and k > 0 else "has"
-    which = _enumerated([letters[a] for a in dependent_rows(np.asarray(rank.jacobian))])
-    return DependentConstraintsError(
-        f"The constraints are dependent: {names} {have} not full rank at q = {rank.q}, "
-        f"{case.given_name} = {case.given} (the paper's admissibility condition fails "
-        f"for {which}). {advice}"
+    return dependence_error(
+        rank.jacobian,
+        case.found.positions.shape[0],
+        case.words.constraint,
+        f"q = {rank.q}, {case.given_name} = {case.given}",
+        case.is_redundant,
     )
-
-
-def _enumerated(names: list[str]) -> str:
-    return " and ".join([", ".join(names[:-1])] * bool(names[1:]) + names[-1:])
 
 
 def _listed(

@@ -3,14 +3,16 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, PyTree
 
 from .._compile import tracked_jit
-from .._custom_types import Args, BoolScalar, FloatScalarLike
+from .._custom_types import Args, BoolScalar, FloatScalar, FloatScalarLike
 from .._errors import DTypeError, require, ShapeError
 from .._numerics import (
     conditioning,
     inverse,
     max_norm,
+    mixes_kinds,
     nan_unless,
     Rank,
+    rank_of_gram,
     root,
     those_that_count,
 )
@@ -25,6 +27,7 @@ from .._system import (
     floating,
     HamiltonianSystem,
     LagrangianSystem,
+    Linearisation,
     linearise,
     parameters,
     position_scale,
@@ -82,7 +85,8 @@ def initial_state(
     - `ConstraintViolationError`: a constraint is violated, or `q` is off the group, and
         `project` is false.
     - `IrregularLagrangianError`: D2D2L (or D2D2H) is singular.
-    - `DependentConstraintsError`: D2Φ and DΓ have not full rank (admissibility).
+    - `DependentConstraintsError`: D2Φ and DΓ have not full rank (admissibility), unless
+        the constraints of the system are `"redundant"`.
     - `IncompatibleConstraintsError`: C^{ab} is singular (compatibility).
     - `NewtonError`: no velocity belongs to the momentum (or the reverse), or Newton's
         method found no state on the constraints from the one to be projected.
@@ -149,24 +153,47 @@ def _solve(system, t, q, v, p, args, project: bool) -> Found:
         found_v = found_v if v is None else v
         found_p = found_p if p is None else p
     metric = system.metric(t, q, u, args)
-    ranks = those_that_count([*starts, Rank(lin.jacobian, q, projected)])
+    here = Rank(lin.jacobian, q, projected)
+    ranks = (
+        [here]
+        if system.constraints == "redundant"
+        else those_that_count([*starts, here])
+    )
+    positions = system.position_constraint(t, q, args)
+    m = lin.violation.shape[0] - positions.shape[0]
+    deficient, compatibility = _ranks_judged(system, lin, ranks, m)
     tolerance = jnp.asarray(1e3 * float(jnp.finfo(u.dtype).eps), u.dtype)
     return Found(
         state=State(q, found_v, found_p, lin.multiplier),
         lin=lin,
         generator=getattr(system, system.generator)(t, q, u, args),
-        positions=system.position_constraint(t, q, args),
+        positions=positions,
         off_group=off_group,
         regularity=conditioning(metric),
         ranks=ranks,
-        deficient=[rank.deficient for rank in ranks],
-        compatibility=conditioning(lin.jacobian @ lin.reaction),
+        deficient=deficient,
+        compatibility=compatibility,
         allowed=tolerance * violation_scale(system, lin, t, q, u, args),
         allowed_positions=tolerance * position_scale(system, t, q, args),
         allowed_off_group=tolerance,
         legendre_solved=legendre_solved,
         projected=projected,
     )
+
+
+def _ranks_judged(
+    system: AbstractMechanicalSystem, lin: Linearisation, ranks: list[Rank], m: int
+) -> tuple[list[BoolScalar], FloatScalar]:
+    """Tell which derivatives of constraints are deficient, and how compatible C is.
+
+    Redundant constraints are compatible if C has the rank of their derivatives.
+    """
+    compliance = lin.jacobian @ lin.reaction
+    if system.constraints != "redundant":
+        return [rank.deficient for rank in ranks], conditioning(compliance)
+    rank = rank_of_gram(lin.jacobian @ lin.jacobian.T)
+    full = (rank_of_gram(compliance) == rank).astype(compliance.dtype)
+    return [rank.counts & mixes_kinds(rank.jacobian, m) for rank in ranks], full
 
 
 def _inverse_legendre(

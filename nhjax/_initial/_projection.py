@@ -1,6 +1,7 @@
 """The states on the constraints that are nearest to a given one."""
 
 from collections.abc import Callable
+from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -8,7 +9,14 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from .._custom_types import BoolScalar, FloatScalar
-from .._numerics import inverse, max_norm, root
+from .._numerics import (
+    inverse,
+    least_norm_inverse,
+    least_norm_solve,
+    max_norm,
+    NEARLY_DEPENDENT,
+    root,
+)
 from .._system import position_scale, velocity_scale
 
 
@@ -41,7 +49,9 @@ def project_position(system, t, q, u, args) -> Nearest:
     def sizes(_):
         return max_norm(*jax.tree.leaves(q)), position_scale(system, t, q, args)
 
-    return _nearest(mass, gamma, jnp.zeros_like(u), sizes)
+    return _nearest(
+        mass, gamma, jnp.zeros_like(u), sizes, system.constraints == "redundant"
+    )
 
 
 def project_fibre_coordinate(system, t, q, u, args) -> Nearest:
@@ -56,7 +66,8 @@ def project_fibre_coordinate(system, t, q, u, args) -> Nearest:
     def sizes(jacobian):
         return max_norm(u), velocity_scale(system, jacobian, t, q, u, args)
 
-    return _nearest(system.metric(t, q, u, args), phi, u, sizes)
+    metric = system.metric(t, q, u, args)
+    return _nearest(metric, phi, u, sizes, system.constraints == "redundant")
 
 
 def _nearest(
@@ -64,6 +75,7 @@ def _nearest(
     constraint: Callable[[Float[Array, " n"]], Float[Array, " m"]],
     x: Float[Array, " n"],
     sizes: Callable[[Float[Array, "m n"]], tuple[FloatScalar, Float[Array, " m"]]],
+    is_redundant: bool,
 ) -> Nearest:
     """Find the stationary point y of ½ (y-x)ᵀ K (y-x) on constraint(y) = 0.
 
@@ -74,12 +86,17 @@ def _nearest(
     - `x`: the point from which the search starts.
     - `sizes`: called as `sizes(jacobian)`, the sizes of y and of the terms of the
         constraint, to which their round-off is proportional.
+    - `is_redundant`: whether constraints may follow from each other.
     """
     jacobian = jax.jacrev(constraint)(x)
     size, terms = sizes(jacobian)
     # The round-off of the constraint moves y too. If y is zero, nothing else does.
     reaction = inverse(metric) @ jacobian.T
-    response = reaction @ inverse(jacobian @ reaction)
+    invert, solve = inverse, jnp.linalg.solve
+    if is_redundant:
+        invert = partial(least_norm_inverse, negligible=NEARLY_DEPENDENT**2)
+        solve = least_norm_solve
+    response = reaction @ invert(jacobian @ reaction)
     scale = size + max_norm(jnp.abs(response) @ terms)
 
     def stationarity(z):
@@ -92,5 +109,6 @@ def _nearest(
         (x, jnp.zeros_like(constraint(x))),
         jnp.where(jnp.isfinite(scale), scale, size),
         judged=lambda z: z[0],
+        solve=solve,
     )
     return Nearest(solved.x[0], solved.converged, jacobian)

@@ -2,7 +2,7 @@ from dataclasses import replace
 
 import jax.numpy as jnp
 
-from .._custom_types import Args, FloatScalarLike, IntScalar
+from .._custom_types import Args, FloatScalar, FloatScalarLike, IntScalar
 from .._errors import Check, require
 from .._method import AbstractMethod
 from .._step import (
@@ -20,6 +20,7 @@ from .._system import (
     LagrangianSystem,
     parameters,
     real_scalar,
+    require_independent,
     State,
 )
 from ._adjoint import AbstractAdjoint, DirectAdjoint
@@ -35,7 +36,12 @@ from ._interpolation import (
 from ._progress_meter import AbstractProgressMeter, NoProgressMeter
 from ._run import run
 from ._saveat import SaveAt
-from ._solution import is_unsolved, raise_failures, Solution
+from ._solution import (
+    is_singular_from_the_start,
+    is_unsolved,
+    raise_failures,
+    Solution,
+)
 
 
 def integrate(
@@ -94,9 +100,10 @@ def integrate(
 
     **Raises:** `IntegrationError` as described (under `jit` its message comes in an
     error of JAX, a `JaxRuntimeError` or a `ValueError`), `ShapeError`, `DTypeError`,
-    `NonFiniteError`, `TypeError` and `ValueError` for arguments that cannot be right; a
-    `ValueError` that names the failing hypothesis (H1, H2, H3) if the method cannot
-    integrate constrained systems.
+    `NonFiniteError`, `TypeError` and `ValueError` for arguments that cannot be right;
+    `DependentConstraintsError` with the names of constraints that depend on each other
+    in `y0`; a `ValueError` that names the failing hypothesis (H1, H2, H3) if the method
+    cannot integrate constrained systems.
 
     !!! note
 
@@ -159,10 +166,7 @@ def integrate(
         *countable(num_steps),
         advancing(t0, dt),
     )
-    if y0.multiplier.shape[0] > 0:
-        method.require_constraint_hypotheses()
-    if saveat.dense or saveat.ts is not None:
-        require_collocation(method)
+    _check_method(method, y0, saveat)
     saveat = saveat.within(t0, dt, num_steps)
     # A plain call has no use for a length that is known, but for one that changes.
     if not isinstance(num_steps, int) or (needed_by is None and not is_tracing()):
@@ -178,7 +182,30 @@ def integrate(
     if not is_tracing() and leaves_steps_to_newton(stage_solver) and is_unsolved(sol):
         # Silently: the meter has shown its run already.
         sol = run_with(replace(stage_solver, fallback=True), NoProgressMeter())
-    return raise_failures(sol, dt) if throw else sol
+    if not throw:
+        return sol
+    _require_constraints(sol, system, t0, y0, args)
+    return raise_failures(sol, dt)
+
+
+def _require_constraints(
+    sol: Solution,
+    system: AbstractMechanicalSystem,
+    t0: FloatScalar,
+    y0: State,
+    args: Args,
+) -> None:
+    """Raise for constraints that are dependent, if a plain run failed for them."""
+    if not is_tracing() and is_singular_from_the_start(sol):
+        require_independent(system, t0, y0, args)
+
+
+def _check_method(method: AbstractMethod, y0: State, saveat: SaveAt) -> None:
+    """Raise unless the method can integrate with constraints and save what is asked."""
+    if y0.multiplier.shape[0] > 0:
+        method.require_constraint_hypotheses()
+    if saveat.dense or saveat.ts is not None:
+        require_collocation(method)
 
 
 def _zero_step() -> ValueError:

@@ -26,6 +26,8 @@ class Solution(eqx.Module):
         `num_iterations` (how many iterations the stage solver made in all),
         `num_newton_steps` (how many steps the stage solver's own iteration did not
         solve, so that Newton's method had to),
+        `num_redundant` (how many redundant constraints follow from others at the start;
+        if any do, reactions are not unique),
         `max_residual` (the largest residual of the stage equations, relative to the
         momenta),
         `max_constraint_violation` (the largest |Φ| at the nodes, the initial state
@@ -130,6 +132,12 @@ def is_unsolved(sol: Solution) -> bool:
     return any(bool(sol.result == result) for result in unsolved)
 
 
+def is_singular_from_the_start(sol: Solution) -> bool:
+    """Tell whether the multipliers of a run without a batch were never determined."""
+    singular = bool(sol.result == RESULTS.singular_stage_matrix)
+    return singular and int(sol.stats["failed_step"]) == 0
+
+
 def raise_failures(sol: Solution, dt: FloatScalarLike | None = None) -> Solution:
     """Return `sol`, or raise an `IntegrationError` with lane, step and reason.
 
@@ -194,6 +202,7 @@ def _messages() -> list[str]:
         RESULTS.singular_stage_matrix,
         RESULTS.nonfinite_state,
         RESULTS.left_chart,
+        RESULTS.lost_constraints,
         RESULTS.inconsistent_start,
     ]
     with jax.ensure_compile_time_eval():

@@ -12,12 +12,15 @@ from .._step import StepOutcome
 Statistics: TypeAlias = dict[str, Any]
 
 
-def first_statistics(violation: FloatScalar, is_good: BoolScalar) -> Statistics:
+def first_statistics(
+    violation: FloatScalar, redundant: Int[Array, ""], is_good: BoolScalar
+) -> Statistics:
     """Make the statistics of a run before its first step.
 
     **Arguments:**
 
     - `violation`: the largest constraint violation of the initial state.
+    - `redundant`: how many constraints follow from others at the initial state.
     - `is_good`: whether the run can start; otherwise step 0 counts as failed.
     """
     zero, none = jnp.zeros_like(violation), jnp.zeros((), jnp.int32)
@@ -25,6 +28,7 @@ def first_statistics(violation: FloatScalar, is_good: BoolScalar) -> Statistics:
         "num_steps": none,
         "num_iterations": none,
         "num_newton_steps": none,
+        "num_redundant": redundant,
         "max_residual": zero,
         "max_constraint_violation": violation,
         "max_multiplier_defect": zero,
@@ -61,6 +65,7 @@ def updated_statistics(
         + jnp.where(alive, outcome.num_iterations, 0),
         "num_newton_steps": stats["num_newton_steps"]
         + (good & outcome.newton).astype(jnp.int32),
+        "num_redundant": stats["num_redundant"],
         "max_residual": larger("max_residual", outcome.residual),
         "max_constraint_violation": larger(
             "max_constraint_violation", outcome.constraint_violation

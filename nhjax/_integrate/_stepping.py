@@ -78,9 +78,17 @@ class Stepping(eqx.Module):
             RESULTS.successful,
             RESULTS.inconsistent_start,
         )
+        if y0.multiplier.shape[0] > 1:
+            # That of one constraint is found singular by the first step.
+            result = RESULTS.where(
+                (result == RESULTS.successful) & ~step_state.lin.determines_multipliers,
+                RESULTS.singular_stage_matrix,
+                result,
+            )
         result = RESULTS.where(all_finite(y0), result, RESULTS.nonfinite_state)
         violation = largest_violation(system, t, step_state, args)
-        stats = first_statistics(violation, result == RESULTS.successful)
+        redundant = step_state.lin.num_redundant
+        stats = first_statistics(violation, redundant, result == RESULTS.successful)
         return Carry(step_state, result, stats)
 
     def one_step(

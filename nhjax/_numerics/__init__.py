@@ -25,6 +25,14 @@ from ._iteration import (
     Sizes as Sizes,
     Solved as Solved,
 )
+from ._least_norm import (
+    conditioning_of_range as conditioning_of_range,
+    least_norm_inverse as least_norm_inverse,
+    least_norm_solve as least_norm_solve,
+    mixes_kinds as mixes_kinds,
+    NEARLY_DEPENDENT as NEARLY_DEPENDENT,
+    rank_of_gram as rank_of_gram,
+)
 from ._max_norm import (
     largest_column as largest_column,
     max_norm as max_norm,
@@ -35,6 +43,7 @@ from ._rank import (
     conditioning as conditioning,
     dependent_rows as dependent_rows,
     is_deficient as is_deficient,
+    is_nearly_singular as is_nearly_singular,
     Rank as Rank,
     those_that_count as those_that_count,
 )

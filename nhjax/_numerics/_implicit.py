@@ -119,6 +119,7 @@ def root(
     scale: FloatScalar,
     *,
     judged: Callable[[X], PyTree[Array]] = lambda x: x,
+    solve: Callable[[Array, Array], Array] = jnp.linalg.solve,
     max_iterations: int = 30,
 ) -> Solved[X, None]:
     """Find a root of `residual` near `x0`, to round-off, by Newton's method.
@@ -126,8 +127,8 @@ def root(
     The iteration ends by the size of the `judged` part of its increments. `scale` is
     the size to which the round-off of that part is proportional, which is larger than
     the size of x0 if x is an increment to something larger. Multipliers, which have
-    units of their own and follow from the rest, need not be judged. The derivative of
-    the root is found by a dense solve with the Jacobian there.
+    units of their own and follow from the rest, need not be judged. Increments, and the
+    derivative of the root, are found by `solve(jacobian, b)`, a dense solve by default.
     """
     flat, unravel = ravel_pytree(x0)
     scale = jax.lax.stop_gradient(scale)
@@ -136,7 +137,7 @@ def root(
         return ravel_pytree(residual(unravel(x)))[0]
 
     def sweep(x):
-        dx, _ = dense_increment(lambda z: (flat_residual(z), None), x)
+        dx, _ = dense_increment(lambda z: (flat_residual(z), None), x, solve)
         # The part that is not judged must be finite all the same.
         rest = jnp.where(jnp.all(jnp.isfinite(dx)), 0, jnp.inf).astype(dx.dtype)
         size = rest + max_norm(*jax.tree.leaves(judged(unravel(dx))))
@@ -150,7 +151,7 @@ def root(
         return solved.x, jax.tree.map(lambda z: z.astype(x.dtype), outcome)
 
     def solve_linear(operator, b):
-        return jnp.linalg.solve(jax.jacfwd(operator)(jnp.zeros_like(b)), b)
+        return solve(jax.jacfwd(operator)(jnp.zeros_like(b)), b)
 
     x, (converged, exhausted, num_iterations) = jax.lax.custom_root(
         flat_residual, flat, newton, solve_linear, has_aux=True

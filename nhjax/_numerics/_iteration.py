@@ -185,10 +185,11 @@ def _progress(rules: _Rules, before: _Progress, sizes: Sizes) -> _Progress:
 def dense_increment(
     residual: Callable[[Float[Array, " k"]], tuple[Float[Array, " k"], Aux]],
     x: Float[Array, " k"],
+    solve: Callable[[Array, Array], Array] = jnp.linalg.solve,
 ) -> tuple[Float[Array, " k"], Aux]:
     """Compute the Newton increment -J⁻¹ r at x with the exact J by autodiff."""
     jacobian, r, aux = jacobian_and_value(residual, x)
-    return jnp.linalg.solve(jacobian, -r), aux
+    return solve(jacobian, -r), aux
 
 
 def jacobian_and_value(

@@ -73,6 +73,25 @@ def is_deficient(matrix: Float[Array, "k l"]) -> BoolScalar:
     return conditioning(matrix) <= 10 * matrix.shape[1] * eps
 
 
+def is_nearly_singular(
+    matrix: Float[Array, "l l"], inverse: Float[Array, "l l"]
+) -> BoolScalar:
+    """Tell from what was computed as its inverse if a matrix is singular.
+
+    The product of their largest entries, after rows and columns of the matrix are
+    scaled as those of a Gram matrix, estimates the condition number. It takes no
+    library of linear algebra, and can be a part of any program.
+    """
+    size = matrix.shape[0]
+    if size < 2:
+        return ~jnp.all(jnp.isfinite(inverse))
+    diagonal = jnp.abs(jnp.sum(matrix * jnp.eye(size, dtype=matrix.dtype), axis=1))
+    root = jnp.sqrt(jnp.where(diagonal > 0, diagonal, 1))
+    scales = root[:, None] * root[None, :]
+    number = jnp.max(jnp.abs(matrix / scales)) * jnp.max(jnp.abs(inverse * scales))
+    return ~(10 * size * jnp.finfo(matrix.dtype).eps * number < 1)
+
+
 def dependent_rows(jacobian: np.ndarray) -> list[int]:
     """Find the rows that take part in a vanishing linear combination of rows."""
     rows = np.max(np.abs(jacobian), axis=1, keepdims=True)

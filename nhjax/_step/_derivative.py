@@ -136,6 +136,7 @@ def _stage_system(arguments: StepArguments, method: AbstractMethod) -> StageSyst
         arguments.h,
         arguments.step_state.state,
         arguments.args,
+        arguments.step_state.lin,
     )
 
 
@@ -155,8 +156,9 @@ def _end(
     p = system.momentum(t, q, u, args)
 
     def continuous():
-        # With the symmetric closure this multiplier is one of the unknowns of the step.
-        if stages.symmetric:
+        # With the symmetric closure this multiplier is one of the unknowns of the step,
+        # but of redundant constraints it is not the one of the least norm there.
+        if stages.symmetric and system.constraints != "redundant":
             return x.end_multiplier
         return linearise(system, t, q, u, args).multiplier
 

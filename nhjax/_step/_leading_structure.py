@@ -138,11 +138,20 @@ def leading_structure(
         return LeadingStructure(lin.momentum_inverse, reaction, reaction, nothing, lin)
     jacobian = jnp.concatenate([lin.jacobian[None], constraint_jacobian(stages, x)])
     reaction = jnp.swapaxes(matvec(lin.metric_inverse, jacobian), 1, 2)
-    blocks = small_einsum("ian,jnb->ijab", jacobian[1:], reaction)
+    rows, redundancy = jacobian[1:], stages.redundancy
+    if redundancy is not None:
+        rows = small_einsum("ab,ibn->ian", redundancy.projector, rows)
+    blocks = small_einsum("ian,jnb->ijab", rows, reaction)
+    schur, compliance = _schur(stages, blocks), blocks[-1, -1]
+    if redundancy is not None:
+        compliance = compliance + redundancy.rest
+        schur = schur + redundancy.schur_rest(
+            stages.method.stages, stages.num_nonholonomic
+        )
     end = eqx.tree_at(
         lambda z: (z.jacobian, z.reaction, z.compliance_inverse),
         lin,
-        (jacobian[-1], reaction[-1], inverse(blocks[-1, -1])),
+        (rows[-1], reaction[-1], inverse(compliance)),
     )
     return LeadingStructure(
         momentum_inverse=lin.momentum_inverse,
@@ -150,7 +159,7 @@ def leading_structure(
         velocity_reaction=(
             jnp.swapaxes(jacobian, 1, 2) if stages.hamiltonian else reaction
         ),
-        schur_inverse=inverse(_schur(stages, blocks)),
+        schur_inverse=inverse(schur),
         end=end,
     )
 

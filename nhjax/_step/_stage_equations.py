@@ -70,9 +70,12 @@ def node_residual(
 
 def node_constraint(stages: StageSystem, x: Stages) -> Float[Array, "r m"]:
     """Compute the nonholonomic constraints Φ(q^i, u^i) at the nodes."""
-    return jax.vmap(
+    values = jax.vmap(
         lambda t, q, u: stages.system.kinematic_constraint(t, q, u, stages.args)
     )(stages.node_times, node_positions(stages, x), x.node_fibre_coordinate)
+    if stages.redundancy is None:
+        return values
+    return stages.redundancy.reduced(values, stages.h * x.closure, 0)
 
 
 def holonomic_constraint(stages: StageSystem, x: Stages) -> Float[Array, "s k"]:
@@ -88,7 +91,11 @@ def holonomic_constraint(stages: StageSystem, x: Stages) -> Float[Array, "s k"]:
     tangency = stages.system.tangency(
         stages.t + stages.h, end, x.node_fibre_coordinate[-1], stages.args
     )
-    return jnp.concatenate([on_positions / stages.h, tangency[None]])
+    values = jnp.concatenate([on_positions / stages.h, tangency[None]])
+    if stages.redundancy is None:
+        return values
+    m = stages.num_nonholonomic
+    return stages.redundancy.reduced(values, stages.h * x.holonomic, m)
 
 
 def constraint_jacobian(stages: StageSystem, x: Stages) -> Float[Array, "r l n"]:
@@ -111,7 +118,7 @@ def end_residual(
 
     Their root gives the continuous multiplier λ_c there.
     """
-    return motion_residual(
+    on_momentum, hidden = motion_residual(
         stages.system,
         stages.t + stages.h,
         stages.end_position(x),
@@ -120,6 +127,9 @@ def end_residual(
         x.end_multiplier,
         stages.args,
     )
+    if stages.redundancy is not None:
+        hidden = stages.redundancy.reduced(hidden[None], x.end_multiplier[None], 0)[0]
+    return on_momentum, hidden
 
 
 def in_chart(stages: StageSystem, x: Stages) -> BoolScalar:

@@ -10,9 +10,10 @@ from .._custom_types import Args, FloatScalar
 from .._manifold import AbstractLieGroup
 from .._method import AbstractMethod
 from .._numerics import max_norm, small_einsum
-from .._system import AbstractMechanicalSystem, State
+from .._system import AbstractMechanicalSystem, Linearisation, State
 from ._chart import AbstractChart
 from ._curved_chart import chart_of_step
+from ._redundancy import Redundancy
 from ._unknowns import Stages
 
 
@@ -29,6 +30,7 @@ class StageSystem(eqx.Module):
     together with the nonholonomic constraints at the nodes (q^i, μ^i), the holonomic
     ones at the positions Q^i, i >= 2, and their tangency at the end. The constraints at
     the first node hold by hypothesis H1; the last node is the end of the step by H3.
+    Of redundant constraints as many are kept as are independent; see `Redundancy`.
     The three closures differ in the constant matrices of `method.closure_weights`
     alone.
     """
@@ -41,6 +43,7 @@ class StageSystem(eqx.Module):
     p: Float[Array, " n"]
     multiplier: Float[Array, " l"]
     args: Args
+    redundancy: Redundancy | None = None
 
     @classmethod
     def at(
@@ -51,9 +54,12 @@ class StageSystem(eqx.Module):
         h: FloatScalar,
         y: State,
         args: Args,
+        lin: Linearisation,
     ) -> "StageSystem":
         """Make the equations of a step of size h from the state y at t."""
-        return cls(system, method, t, h, y.q, y.p, y.multiplier, args)
+        given = system, method, t, h, y.q, y.p, y.multiplier, args
+        is_reduced = system.constraints == "redundant" and y.multiplier.shape[0] > 0
+        return cls(*given, Redundancy.at(lin) if is_reduced else None)
 
     @property
     def num_holonomic(self) -> int:

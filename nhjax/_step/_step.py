@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, PyTree
 
-from .._custom_types import Args, BoolScalar, FloatScalar
+from .._custom_types import Args, BoolScalar, FloatScalar, FloatScalarLike
 from .._method import AbstractMethod
 from .._numerics import (
     frozen,
@@ -25,7 +25,9 @@ from .._system import (
     all_finite,
     Linearisation,
     linearise,
+    position_scale,
     State,
+    violation_scale,
 )
 from ._end import end_state
 from ._newton import AbstractStageSolver
@@ -147,7 +149,7 @@ def step(
     Where `skip` is true nothing is solved, and the outcome is to be discarded.
     """
     state, lin = step_state.state, step_state.lin
-    stages = StageSystem.at(system, method, t, h, state, args)
+    stages = StageSystem.at(system, method, t, h, state, args, lin)
     x0 = starting_values(stages, system.fibre_coordinate(state), lin)
     solved = solver.solve(stages, x0, lin, skip)
     x, forces = solved.x, solved.aux.forces
@@ -163,13 +165,18 @@ def step(
     end = end_state(stages, q, u, p, forces.multiplier[-1], lambda: lin_next.multiplier)
     next_state = StepState(end, q_compensation, p_compensation, lin_next)
 
+    result = _result(solved, lin, next_state, in_chart(stages, x))
+    if stages.redundancy is not None:
+        kept = _keeps_constraints(system, t + h, next_state, args, solver.tolerance)
+        lost = (result == RESULTS.successful) & ~kept
+        result = RESULTS.where(lost, RESULTS.lost_constraints, result)
     residual, worst = largest_column(forces.residual, solved.aux.node_residual)
     scale = max_norm(forces.momentum) + max_norm(h * forces.force)
     return StepOutcome(
         step_state=next_state,
         record=StepRecord(state, x.velocity, forces.force, forces.multiplier),
         stages=x,
-        result=_result(solved, lin, next_state, in_chart(stages, x)),
+        result=result,
         num_iterations=solved.num_iterations,
         residual=relative(residual, scale),
         worst_coordinate=worst,
@@ -200,6 +207,25 @@ def _result(
     # because λ_c does not exist there.
     singular = lin.is_singular | (solved.converged & step_state.lin.is_singular)
     return RESULTS.where(singular, RESULTS.singular_stage_matrix, result)
+
+
+def _keeps_constraints(
+    system: AbstractMechanicalSystem,
+    t: FloatScalar,
+    step_state: StepState,
+    args: Args,
+    tolerance: FloatScalarLike,
+) -> BoolScalar:
+    """Tell whether all constraints hold at a state, also those that were left out."""
+    y, lin = step_state.state, step_state.lin
+    small = float(jnp.finfo(y.p.dtype).eps) ** 0.5 + 100 * tolerance
+    u = system.fibre_coordinate(y)
+    scale = violation_scale(system, lin, t, y.q, u, args)
+    positions = system.position_constraint(t, y.q, args)
+    allowed = position_scale(system, t, y.q, args)
+    return jnp.all(jnp.abs(lin.violation) <= small * scale) & jnp.all(
+        jnp.abs(positions) <= small * allowed
+    )
 
 
 def largest_violation(

@@ -17,6 +17,10 @@ from ._checks import (
     require_manifold as require_manifold,
 )
 from ._closure import closure_converted as closure_converted
+from ._dependence import (
+    dependence_error as dependence_error,
+    require_independent as require_independent,
+)
 from ._hamiltonian import HamiltonianSystem as HamiltonianSystem
 from ._lagrangian import LagrangianSystem as LagrangianSystem
 from ._linearisation import (

@@ -15,7 +15,7 @@ from .._custom_types import (
     PositionFunction,
 )
 from .._manifold import AbstractLieGroup, Euclidean
-from ._signatures import check_signature
+from ._signatures import check_choice, check_manifold, check_signature
 from ._state import check_time_and_state, State
 
 
@@ -32,6 +32,7 @@ class AbstractMechanicalSystem(eqx.Module):
     holonomic: eqx.AbstractVar[PositionFunction | None]
     force: eqx.AbstractVar[PhaseFunction | None]
     manifold: eqx.AbstractVar[AbstractLieGroup | None]
+    constraints: eqx.AbstractVar[Literal["independent", "redundant"]]
 
     # The name of the function L or H that generates the motion, and the letter of the
     # fibre coordinate.
@@ -42,11 +43,8 @@ class AbstractMechanicalSystem(eqx.Module):
         for name, arguments in self.signatures().items():
             if getattr(self, name) is not None or name == self.generator:
                 check_signature(self, name, arguments)
-        if not isinstance(self.manifold, AbstractLieGroup | None):
-            raise TypeError(
-                f"{type(self).__name__}: `manifold` must be an nhjax manifold such as "
-                f"nhjax.Euclidean(3), got {self.manifold!r}."
-            )
+        check_choice(self, "constraints", ("independent", "redundant"))
+        check_manifold(self)
 
     @abstractmethod
     def momentum(

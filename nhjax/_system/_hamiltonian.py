@@ -39,6 +39,11 @@ class HamiltonianSystem(AbstractMechanicalSystem):
     - `holonomic`: Γ, called as `holonomic(t, q, args)`, of shape () or (k,).
     - `force`: an external covector F, called as `force(t, q, p, args)`, of shape (n,).
     - `manifold`: the configuration manifold; R^n with the n of the state if left out.
+    - `constraints`: `"independent"`, by which dependent constraints are refused, or
+        `"redundant"`, by which some may follow from others of their kind. Of all
+        multipliers with the same reaction the result is then the one with the least
+        Σ |λ_a B_a|², the sizes of the reactions of single constraints in the metric
+        M⁻¹; it marks reactions as not unique. `docs/systems.md` has the details.
 
     !!! example
 
@@ -55,6 +60,9 @@ class HamiltonianSystem(AbstractMechanicalSystem):
     holonomic: PositionFunction | None = eqx.field(default=None, kw_only=True)
     force: PhaseFunction | None = eqx.field(default=None, kw_only=True)
     manifold: AbstractLieGroup | None = eqx.field(default=None, kw_only=True)
+    constraints: Literal["independent", "redundant"] = eqx.field(
+        default="independent", kw_only=True, static=True
+    )
 
     generator: ClassVar[Literal["lagrangian", "hamiltonian"]] = "hamiltonian"
     fibre_coordinate_name: ClassVar[Literal["v", "p"]] = "p"

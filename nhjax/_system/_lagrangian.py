@@ -48,6 +48,11 @@ class LagrangianSystem(AbstractMechanicalSystem):
     - `force`: an external covector F, called as `force(t, q, v, args)`, of shape (n,);
         on a group in left-trivialised components.
     - `manifold`: the configuration manifold; R^n with the n of the state if left out.
+    - `constraints`: `"independent"`, by which dependent constraints are refused, or
+        `"redundant"`, by which some may follow from others of their kind. Of all
+        multipliers with the same reaction the result is then the one with the least
+        Σ |λ_a B_a|², the sizes of the reactions of single constraints in the metric
+        M⁻¹; it marks reactions as not unique. `docs/systems.md` has the details.
 
     !!! example
 
@@ -62,6 +67,9 @@ class LagrangianSystem(AbstractMechanicalSystem):
     holonomic: PositionFunction | None = eqx.field(default=None, kw_only=True)
     force: PhaseFunction | None = eqx.field(default=None, kw_only=True)
     manifold: AbstractLieGroup | None = eqx.field(default=None, kw_only=True)
+    constraints: Literal["independent", "redundant"] = eqx.field(
+        default="independent", kw_only=True, static=True
+    )
 
     generator: ClassVar[Literal["lagrangian", "hamiltonian"]] = "lagrangian"
     fibre_coordinate_name: ClassVar[Literal["v", "p"]] = "v"

@@ -4,10 +4,18 @@ from typing import Literal
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, PyTree
+from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from .._custom_types import Args, FloatScalar, FloatScalarLike
-from .._numerics import inverse, jacobian, Matrix, matvec, small_einsum
+from .._numerics import (
+    inverse,
+    is_nearly_singular,
+    jacobian,
+    least_norm_inverse,
+    Matrix,
+    matvec,
+    small_einsum,
+)
 from ._abstract import AbstractMechanicalSystem
 from ._state import check_time_and_state, State
 
@@ -33,11 +41,12 @@ class Linearisation(eqx.Module):
     metric_inverse: Matrix  # K⁻¹
     jacobian: Float[Array, "l n"]  # B
     reaction: Float[Array, "n l"]  # N⁻¹ R
-    compliance_inverse: Float[Array, "l l"]  # C⁻¹
+    compliance_inverse: Float[Array, "l l"]  # C⁻¹, or of the least norm
     acceleration: Float[Array, " n"]  # u̇
     multiplier: Float[Array, " l"]
     violation: Float[Array, " l"]
     fibre_coordinate_name: Literal["v", "p"] = eqx.field(static=True)
+    is_redundant: bool = eqx.field(static=True)
 
     @property
     def momentum_inverse(self) -> Matrix:
@@ -56,6 +65,33 @@ class Linearisation(eqx.Module):
             jnp.all(jnp.isfinite(self.metric_inverse))
             & jnp.all(jnp.isfinite(self.compliance_inverse))
         )
+
+    @property
+    def is_unique(self) -> Bool[Array, " l"]:
+        """Tell which multipliers are determined, which redundant ones are not."""
+        count = self.compliance_inverse.shape[0]
+        if not self.is_redundant:
+            return jnp.ones((count,), bool)
+        # C C⁻ projects onto what the derivatives of the constraints can reach.
+        compliance = small_einsum("kn,nl->kl", self.jacobian, self.reaction)
+        kept = small_einsum("kl,lm->km", compliance, self.compliance_inverse)
+        small = float(jnp.finfo(kept.dtype).eps) ** 0.5
+        return jnp.abs(1 - jnp.diagonal(kept)) <= small
+
+    @property
+    def num_redundant(self) -> Int[Array, ""]:
+        """Count the constraints that follow from others, if these are redundant."""
+        if not self.is_redundant:
+            return jnp.zeros((), jnp.int32)
+        compliance = small_einsum("kn,nl->kl", self.jacobian, self.reaction)
+        rank = jnp.sum(compliance * self.compliance_inverse.T)
+        return compliance.shape[0] - jnp.round(rank).astype(jnp.int32)
+
+    @property
+    def determines_multipliers(self) -> Bool[Array, ""]:
+        """Tell whether C can be inverted in the working precision."""
+        compliance = small_einsum("kn,nl->kl", self.jacobian, self.reaction)
+        return ~is_nearly_singular(compliance, self.compliance_inverse)
 
     def solve(
         self, momentum_residual: Float[Array, " n"], hidden_residual: Float[Array, " l"]
@@ -146,15 +182,17 @@ def linearise(
     metric_inverse = inverse(metric)
     reaction = matvec(metric_inverse, slopes).T
     compliance = small_einsum("kn,nl->kl", slopes, reaction)
+    invert = least_norm_inverse if system.constraints == "redundant" else inverse
     lin = Linearisation(
         metric_inverse=metric_inverse,
         jacobian=slopes,
         reaction=reaction,
-        compliance_inverse=inverse(compliance),
+        compliance_inverse=invert(compliance),
         acceleration=zero,
         multiplier=jnp.zeros_like(violation),
         violation=violation,
         fibre_coordinate_name=system.fibre_coordinate_name,
+        is_redundant=system.constraints == "redundant",
     )
     known = system.free_force(t, q, u, args) + _inertial_force(system, q, p, v)
     acceleration, multiplier = lin.solve(known - p_dot, -phi_dot)

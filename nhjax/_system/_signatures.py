@@ -1,9 +1,11 @@
-"""The check that a user's function takes the arguments it will be called with."""
+"""The checks of what a system is made of: its functions' arguments, its options."""
 
 import inspect
 from collections.abc import Callable
 from types import MethodType
 from typing import Any
+
+from .._manifold import AbstractLieGroup
 
 
 def check_signature(owner: Any, name: str, arguments: tuple[str, ...]) -> None:
@@ -19,6 +21,25 @@ def check_signature(owner: Any, name: str, arguments: tuple[str, ...]) -> None:
         raise TypeError(
             f"{kind}: `{name}` must take {expected}, but "
             f"`{_name(function)}{signature}` does not."
+        )
+
+
+def check_choice(owner: Any, name: str, choices: tuple[str, ...]) -> None:
+    """Raise a `ValueError` unless the option `name` of `owner` is one of `choices`."""
+    value = getattr(owner, name)
+    if not isinstance(value, str) or value not in choices:
+        raise ValueError(
+            f"{type(owner).__name__}: `{name}` must be one of "
+            f"{', '.join(map(repr, choices))}, got {value!r}."
+        )
+
+
+def check_manifold(owner: Any) -> None:
+    """Raise a `TypeError` unless the `manifold` of `owner` is one, or None."""
+    if not isinstance(owner.manifold, AbstractLieGroup | None):
+        raise TypeError(
+            f"{type(owner).__name__}: `manifold` must be an nhjax manifold such as "
+            f"nhjax.Euclidean(3), got {owner.manifold!r}."
         )
 
 

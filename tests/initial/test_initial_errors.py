@@ -199,12 +199,12 @@ BY_VALUE = {
         adjusted(rows=jnp.stack([ROWS[0], 2 * ROWS[0]])),
         nhjax.DependentConstraintsError,
         r"D2Φ has not full rank at q = \[1\. 2\. 3\.\].*admissibility.*fails for "
-        r"Φ\[0\] and Φ\[1\]\)\. Remove redundant",
+        r"nonholonomic\[0\] and nonholonomic\[1\]\)\. Remove redundant",
     ),
     "no velocity": (
         adjusted(rows=ROWS.at[1].set(0)),
         nhjax.DependentConstraintsError,
-        r"Φ\[1\] does not depend on velocities there; pass .* as `holonomic`",
+        r"nonholonomic\[1\] does not depend on velocities there; .* as `holonomic`",
     ),
     "incompatible": (
         adjusted(mass=jnp.array([1.0, 1.0, -1.0])),

@@ -72,6 +72,7 @@ def test_stats():
         "num_steps",
         "num_iterations",
         "num_newton_steps",
+        "num_redundant",
         "max_residual",
         "max_constraint_violation",
         "max_multiplier_defect",

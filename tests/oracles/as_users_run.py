@@ -106,6 +106,25 @@ def both_kinds_of_constraints():
 
 
 @feature
+def redundant_constraints():
+    pendulum = systems.SphericalPendulum()
+
+    def twice(t, q, args):
+        return jnp.stack([pendulum.holonomic(t, q, args), q @ q - 1.0])
+
+    system = nhjax.LagrangianSystem(
+        pendulum.lagrangian, holonomic=twice, constraints="redundant"
+    )
+    y0 = nhjax.initial_state(system, pendulum.q0, pendulum.v0)
+    sol = run(pendulum, system=system, y0=y0)
+    assert_exact(pendulum, sol)
+    assert int(sol.stats["num_redundant"]) == 1
+    assert not np.any(nhjax.motion(system, 0.0, y0).is_unique)
+    report = nhjax.check_system(system, pendulum.q0, pendulum.v0)
+    assert report.degrees_of_freedom == 2
+
+
+@feature
 def a_hamiltonian_system():
     pendulum = systems.SphericalPendulum()
     system = nhjax.HamiltonianSystem(

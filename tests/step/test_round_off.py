@@ -171,7 +171,8 @@ def test_a_constraint_without_a_gradient_is_named():
         holonomic=lambda t, q, args: (q @ q - 1.0) ** 2,
     )
     with pytest.raises(
-        nhjax.DependentConstraintsError, match=r"DΓ has not.*Γ\[0\] has no gradient"
+        nhjax.DependentConstraintsError,
+        match=r"DΓ has not.*holonomic\[0\] has no gradient",
     ):
         nhjax.initial_state(system, jnp.array([1.0, 0.0]), jnp.array([0.0, 1.0]))
 

@@ -1,0 +1,93 @@
+"""The error for constraints that depend on each other, with their names."""
+
+import jax
+import numpy as np
+from jaxtyping import Array, Float
+
+from .._custom_types import Args, FloatScalar
+from .._errors import DependentConstraintsError
+from .._numerics import dependent_rows, is_deficient
+from ._abstract import AbstractMechanicalSystem
+from ._state import State
+
+
+def _names(num_nonholonomic: int, num_holonomic: int) -> list[str]:
+    """List the names of all constraints, such as "nonholonomic[0]" or "holonomic[2]".
+
+    The order is that of the rows of the Jacobian ∂Φ/∂u and of the multipliers.
+    """
+    return [f"nonholonomic[{a}]" for a in range(num_nonholonomic)] + [
+        f"holonomic[{a}]" for a in range(num_holonomic)
+    ]
+
+
+def dependence_error(
+    jacobian: Float[Array, "l n"],
+    num_holonomic: int,
+    letter: str,
+    where: str,
+    is_redundant: bool,
+) -> DependentConstraintsError:
+    """Make the error that names the constraints which depend on each other.
+
+    **Arguments:**
+
+    - `jacobian`: the derivatives of all constraints, those of holonomic ones last, or
+        of holonomic constraints alone.
+    - `num_holonomic`: the number k of holonomic constraints.
+    - `letter`: the letter of nonholonomic constraints, Φ or Ψ.
+    - `where`: the state, as text.
+    - `is_redundant`: whether constraints of one kind may depend on each other, so that
+        the error is about something else.
+    """
+    rows, k = np.asarray(jacobian), num_holonomic
+    m = rows.shape[0] - k
+    names = _names(m, k)
+    zero = [a for a in range(m + k) if not np.any(rows[a])]
+    if zero and zero[0] < m:
+        advice = (
+            f"{names[zero[0]]} does not depend on velocities there; pass a "
+            "constraint on positions as `holonomic`."
+        )
+    elif zero:
+        advice = (
+            f"{names[zero[0]]} has no gradient there; a constraint must have one "
+            "where it vanishes."
+        )
+    elif is_redundant:
+        advice = (
+            "Constraints of one kind may be redundant, but a nonholonomic one may not "
+            "follow from holonomic ones: remove it."
+        )
+    else:
+        advice = (
+            "Remove redundant constraints, start from a state at which they are "
+            'independent, or give the system `constraints="redundant"`.'
+        )
+    derivatives = " and ".join([f"D2{letter}"] * (m > 0) + ["DΓ"] * (k > 0))
+    have = "have" if m > 0 and k > 0 else "has"
+    which = _enumerated([names[a] for a in dependent_rows(rows)])
+    return DependentConstraintsError(
+        f"The constraints are dependent: {derivatives} {have} not full rank at {where} "
+        f"(the paper's admissibility condition fails for {which}). {advice}"
+    )
+
+
+def require_independent(
+    system: AbstractMechanicalSystem, t: FloatScalar, y: State, args: Args
+) -> None:
+    """Raise a `DependentConstraintsError` if constraints are dependent at a state."""
+    u = system.fibre_coordinate(y)
+    jacobian = jax.jacrev(system.constraint, argnums=2)(t, y.q, u, args)
+    if jacobian.shape[0] == 0 or not is_deficient(jacobian):
+        return
+    k = system.position_constraint(t, y.q, args).shape[0]
+    letter = "Φ" if system.fibre_coordinate_name == "v" else "Ψ"
+    where = f"q = {y.q}, {system.fibre_coordinate_name} = {u}"
+    raise dependence_error(
+        jacobian, k, letter, where, system.constraints == "redundant"
+    )
+
+
+def _enumerated(names: list[str]) -> str:
+    return " and ".join([", ".join(names[:-1])] * bool(names[1:]) + names[-1:])
