@@ -191,7 +191,8 @@ def run(
         def advance(carry, k):
             step_state, alive = carry
             t = k * h
-            stages = StageSystem.at(system, method, t, h, step_state.state, None)
+            given = step_state.state, None, step_state.lin
+            stages = StageSystem.at(system, method, t, h, *given)
             first, second = (
                 step(system, method, solver, t, h, step_state, None, go_on)
                 for solver in solvers
@@ -227,11 +228,12 @@ def single_steps(
     go_on = jnp.asarray(False)
     solvers = nhjax.SimplifiedNewton(), nhjax.Newton()
 
-    def one(given):
-        y0, h = given
+    def one(start):
+        y0, h = start
         t = jnp.zeros_like(h)
         step_state = first_step_state(system, method, t, y0, None)
-        stages = StageSystem.at(system, method, t, h, step_state.state, None)
+        given = step_state.state, None, step_state.lin
+        stages = StageSystem.at(system, method, t, h, *given)
         first, second = (
             step(system, method, solver, t, h, step_state, None, go_on)
             for solver in solvers

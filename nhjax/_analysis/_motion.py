@@ -129,7 +129,7 @@ def _motion(system, t, y, args) -> Motion:
         (jnp.ones_like(t), velocity, lin.acceleration),
     )
     metric = system.metric(t, y.q, u, args)
-    mass, jacobian = in_velocities(system, metric, lin.jacobian)
+    mass, jacobian = in_velocities(system, metric, lin.dense[0])
     rates = acceleration, momentum_rate, lin.multiplier
     if lin.multiplier.shape[0] > 0:
         rates = nan_unless(lin.determines_multipliers, rates)

@@ -12,8 +12,8 @@ from jaxtyping import PyTree
 # Calls into libraries (products of matrices, factorisations, transforms), sorting,
 # scattering and callbacks are not among them.
 #
-# These operations act element by element, which `_diagonal` relies on: no other may be
-# listed here.
+# These operations act element by element, which `_index_sets` relies on: no other may
+# be listed here.
 ELEMENTWISE = """
     abs acos acosh add add_any and asin asinh atan atan2 atanh
     bitcast_convert_type cbrt ceil clamp convert_element_type cos cosh div eq erf

@@ -153,7 +153,7 @@ def _solve(system, t, q, v, p, args, project: bool) -> Found:
         found_v = found_v if v is None else v
         found_p = found_p if p is None else p
     metric = system.metric(t, q, u, args)
-    here = Rank(lin.jacobian, q, projected)
+    here = Rank(lin.dense[0], q, projected)
     ranks = (
         [here]
         if system.constraints == "redundant"
@@ -188,10 +188,11 @@ def _ranks_judged(
 
     Redundant constraints are compatible if C has the rank of their derivatives.
     """
-    compliance = lin.jacobian @ lin.reaction
+    jacobian, reaction, _ = lin.dense
+    compliance = jacobian @ reaction
     if system.constraints != "redundant":
         return [rank.deficient for rank in ranks], conditioning(compliance)
-    rank = rank_of_gram(lin.jacobian @ lin.jacobian.T)
+    rank = rank_of_gram(jacobian @ jacobian.T)
     full = (rank_of_gram(compliance) == rank).astype(compliance.dtype)
     return [rank.counts & mixes_kinds(rank.jacobian, m) for rank in ranks], full
 

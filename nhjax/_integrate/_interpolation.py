@@ -47,7 +47,7 @@ def interpolate(
     if method.closure == "propagated":
         multiplier = method.basis(theta) @ record.multiplier
     else:
-        multiplier = linearise(system, time, q, u, args).multiplier
+        multiplier = linearise(system, time, q, u, args, may_be_sparse=True).multiplier
     return State(q, v, p, multiplier)
 
 

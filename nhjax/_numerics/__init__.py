@@ -1,7 +1,14 @@
 """The numerical building blocks without mechanics: products, norms, iterations."""
 
+from ._block_tridiagonal import (
+    block_tridiagonal_inverse as block_tridiagonal_inverse,
+    BlockTridiagonalInverse as BlockTridiagonalInverse,
+    couplings as couplings,
+)
 from ._compensated import two_sum as two_sum
 from ._contraction import (
+    absolute as absolute,
+    AbstractLinearMap as AbstractLinearMap,
     inverse as inverse,
     Matrix as Matrix,
     matvec as matvec,
@@ -18,6 +25,7 @@ from ._implicit import (
     solve_contraction as solve_contraction,
     zero_unless as zero_unless,
 )
+from ._index_sets import dependence as dependence
 from ._iteration import (
     iterate as iterate,
     jacobian_and_value as jacobian_and_value,
@@ -46,4 +54,10 @@ from ._rank import (
     is_nearly_singular as is_nearly_singular,
     Rank as Rank,
     those_that_count as those_that_count,
+)
+from ._sparse import (
+    Pattern as Pattern,
+    sparse_jacobian as sparse_jacobian,
+    SparseMatrix as SparseMatrix,
+    WeightedTranspose as WeightedTranspose,
 )

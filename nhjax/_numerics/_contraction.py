@@ -8,10 +8,12 @@ one kernel with the operations around them, and batches of them run one by one.
 import itertools
 import math
 import string
+from abc import abstractmethod
 from collections.abc import Callable
 from functools import reduce
 from typing import Any, TypeAlias
 
+import equinox as eqx
 import jax
 import jax.extend
 import jax.numpy as jnp
@@ -26,6 +28,18 @@ LARGEST = math.isqrt(LARGEST_REDUCTION)
 # Longer sums and larger products are left to a library too: the program that is written
 # out must stay short, and from some 10⁵ terms on the library was faster (measured).
 LONGEST_SUM, LARGEST_PRODUCT = 128, 2**15
+
+
+class AbstractLinearMap(eqx.Module):
+    """A matrix that is not kept as an array of its entries."""
+
+    @abstractmethod
+    def apply(self, x: Float[Array, "..."]) -> Float[Array, "..."]:
+        """Multiply the vectors along the last axis of x by the matrix."""
+
+    @abstractmethod
+    def absolute(self) -> "AbstractLinearMap":
+        """Return the matrix of absolute values, or one that serves to estimate it."""
 
 
 # A square matrix, or its diagonal if it has no other entries.
@@ -60,11 +74,23 @@ def _term(x: Array, index: tuple[int, ...]) -> Array:
     return x[(..., *(k if n > 1 else 0 for k, n in zip(index, lengths, strict=True)))]
 
 
-def matvec(matrix: Matrix, x: Float[Array, "... n"]) -> Float[Array, "... n"]:
+def absolute(matrix: Array | AbstractLinearMap) -> Array | AbstractLinearMap:
+    """Return the matrix of absolute values."""
+    if isinstance(matrix, AbstractLinearMap):
+        return matrix.absolute()
+    return jnp.abs(matrix)
+
+
+def matvec(
+    matrix: Array | AbstractLinearMap, x: Float[Array, "... n"]
+) -> Float[Array, "... k"]:
     """Multiply the vectors along the last axis of x by a matrix.
 
-    The array x has at most four axes.
+    An array of one axis stands for a diagonal matrix. The array x has at most four
+    axes.
     """
+    if isinstance(matrix, AbstractLinearMap):
+        return matrix.apply(x)
     if matrix.ndim == 1:
         return jnp.expand_dims(matrix, range(x.ndim - 1)) * x
     rows = "abc"[: x.ndim - 1]

@@ -160,7 +160,7 @@ def _end(
         # but of redundant constraints it is not the one of the least norm there.
         if stages.symmetric and system.constraints != "redundant":
             return x.end_multiplier
-        return linearise(system, t, q, u, args).multiplier
+        return linearise(system, t, q, u, args, may_be_sparse=True).multiplier
 
     end = end_state(stages, q, u, p, stages.multipliers(x)[-1], continuous)
     forces = stage_forces(stages, x)

@@ -1,10 +1,25 @@
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from .._numerics import inverse, Matrix, matvec, small_einsum
+from .._numerics import (
+    block_tridiagonal_inverse,
+    BlockTridiagonalInverse,
+    couplings,
+    inverse,
+    Matrix,
+    matvec,
+    small_einsum,
+    SparseMatrix,
+    WeightedTranspose,
+)
 from .._system import Linearisation
-from ._stage_equations import constraint_jacobian, stage_velocities
+from ._stage_equations import (
+    constraint_jacobian,
+    sparse_constraint_jacobian,
+    stage_velocities,
+)
 from ._stage_system import StageSystem
 from ._unknowns import Stages
 
@@ -27,9 +42,9 @@ class LeadingStructure(eqx.Module):
     """
 
     momentum_inverse: Matrix
-    reaction: Float[Array, "s n l"]
-    velocity_reaction: Float[Array, "s n l"]
-    schur_inverse: Float[Array, "c c"]
+    reaction: Float[Array, "s n l"] | WeightedTranspose
+    velocity_reaction: Float[Array, "s n l"] | WeightedTranspose
+    schur_inverse: Float[Array, "c c"] | BlockTridiagonalInverse
     end: Linearisation
 
     def correct_stages(
@@ -58,18 +73,16 @@ class LeadingStructure(eqx.Module):
     ) -> Stages:
         """Change the free multipliers so that the linearised constraints hold."""
         residual = jnp.concatenate([kinematic.reshape(-1), holonomic.reshape(-1)])
-        change = -small_einsum("cd,d->c", self.schur_inverse, residual)
+        change = -matvec(self.schur_inverse, residual)
         h_dy = change[: x.closure.size].reshape(x.closure.shape)
         h_dholonomic = change[x.closure.size :].reshape(x.holonomic.shape)
         h_dlambda = stages.free_multipliers(h_dy, h_dholonomic)
         # This is h K⁻¹ Bᵀ δΛ; a division by h is needed for the multipliers alone.
-        push = small_einsum("jnm,jm->jn", self.reaction, h_dlambda)
+        push = _pushed(self.reaction, h_dlambda)
         a_hat, momentum = stages.coefficients("a_hat"), x.momentum
         velocity_push = push
         if stages.hamiltonian:
-            velocity_push = small_einsum(
-                "jnm,jm->jn", self.velocity_reaction, h_dlambda
-            )
+            velocity_push = _pushed(self.velocity_reaction, h_dlambda)
             momentum = momentum + small_einsum("ij,jn->in", a_hat, push)
         return Stages(
             velocity=x.velocity + small_einsum("ij,jn->in", a_hat, velocity_push),
@@ -101,10 +114,11 @@ class LeadingStructure(eqx.Module):
             stages.closure_weights, ("response", "stage_response")
         )
 
-        def pushed(u: Array, reaction: Array) -> Array:
-            reaction = reaction[-1, :, : stages.num_nonholonomic]
-            push = stages.h * small_einsum("nm,m->n", reaction, dlam_closure)
-            return u + jnp.outer(on_stages, push)
+        def pushed(u: Array, reaction: Array | WeightedTranspose) -> Array:
+            last = reaction[-1]
+            if isinstance(last, jax.Array):
+                last = last[:, : stages.num_nonholonomic]
+            return u + jnp.outer(on_stages, stages.h * matvec(last, dlam_closure))
 
         momentum = x.momentum
         if stages.hamiltonian:
@@ -136,7 +150,10 @@ def leading_structure(
         n, nothing = stages.p.shape[0], jnp.zeros((0, 0), stages.p.dtype)
         reaction = jnp.zeros((stages.method.stages, n, 0), stages.p.dtype)
         return LeadingStructure(lin.momentum_inverse, reaction, reaction, nothing, lin)
-    jacobian = jnp.concatenate([lin.jacobian[None], constraint_jacobian(stages, x)])
+    if isinstance(lin.jacobian, SparseMatrix):
+        return _sparse(stages, x, lin, lin.jacobian)
+    at_nodes = constraint_jacobian(stages, x)
+    jacobian = jnp.concatenate([lin.dense[0][None], at_nodes])
     reaction = jnp.swapaxes(matvec(lin.metric_inverse, jacobian), 1, 2)
     rows, redundancy = jacobian[1:], stages.redundancy
     if redundancy is not None:
@@ -160,6 +177,54 @@ def leading_structure(
             jnp.swapaxes(jacobian, 1, 2) if stages.hamiltonian else reaction
         ),
         schur_inverse=inverse(schur),
+        end=end,
+    )
+
+
+def _pushed(
+    reaction: Float[Array, "s n l"] | WeightedTranspose, multiplier: Float[Array, "s l"]
+) -> Float[Array, "s n"]:
+    if isinstance(reaction, WeightedTranspose):
+        return reaction.apply(multiplier)
+    return small_einsum("jnm,jm->jn", reaction, multiplier)
+
+
+def _sparse(
+    stages: StageSystem, x: Stages, lin: Linearisation, start: SparseMatrix
+) -> LeadingStructure:
+    """Do what `leading_structure` does, for constraints that share few coordinates."""
+    pattern = start.pattern
+    nodes = sparse_constraint_jacobian(stages, x, pattern)
+    rows = SparseMatrix(jnp.concatenate([start.values[None], nodes.values]), pattern)
+    products = couplings(rows[1:], rows, lin.metric_inverse)
+    a, a_hat, b = (stages.coefficients(name) for name in ("a", "a_hat", "b"))
+    if stages.num_nonholonomic:
+        weights = a[1:, :, None] * stages.closure_weights("E")[None]
+        schur = small_einsum("ijk,ijcbl->ikcbl", weights, products)
+    else:
+        weights = small_einsum("ik,kj->ij", a[1:], a_hat)
+        on_positions = weights[:, :, None, None, None] * products
+        tangency = b[:, None, None, None] * products[-1]
+        schur = jnp.concatenate([on_positions, tangency[None]])
+    reaction = WeightedTranspose(lin.metric_inverse, rows)
+    end = eqx.tree_at(
+        lambda z: (z.jacobian, z.reaction, z.compliance_inverse),
+        lin,
+        (
+            rows[-1],
+            reaction[-1],
+            block_tridiagonal_inverse(products[-1:, -1:], pattern),
+        ),
+    )
+    velocity_reaction = reaction
+    if stages.hamiltonian:
+        ones = jnp.ones_like(lin.metric_inverse)
+        velocity_reaction = WeightedTranspose(ones, rows)
+    return LeadingStructure(
+        momentum_inverse=lin.momentum_inverse,
+        reaction=reaction,
+        velocity_reaction=velocity_reaction,
+        schur_inverse=block_tridiagonal_inverse(schur, pattern),
         end=end,
     )
 

@@ -31,8 +31,9 @@ class Redundancy(eqx.Module):
     @classmethod
     def at(cls, lin: Linearisation) -> "Redundancy":
         """Make the equations for a step from the state of a linearisation."""
-        compliance = small_einsum("kn,nl->kl", lin.jacobian, lin.reaction)
-        projector = small_einsum("kl,lm->km", compliance, lin.compliance_inverse)
+        jacobian, reaction, inverse = lin.dense
+        compliance = small_einsum("kn,nl->kl", jacobian, reaction)
+        projector = small_einsum("kl,lm->km", compliance, inverse)
         unit = jnp.eye(projector.shape[0], dtype=projector.dtype)
         sizes = jnp.sum(jnp.abs(compliance) * unit, axis=1)
         # A row without derivatives is left out; its multiplier has no unit.

@@ -3,7 +3,7 @@
 import jax.numpy as jnp
 
 from .._custom_types import FloatScalar
-from .._numerics import max_norm, small_einsum
+from .._numerics import absolute, matvec, max_norm
 from .._system import Linearisation, position_scale
 from ._stage_system import StageSystem
 from ._unknowns import Stages
@@ -22,19 +22,14 @@ def fibre_coordinate_scale(
     h = jnp.abs(stages.h)
     rate = max_norm(lin.acceleration)
     if stages.constrained:
-        rate = rate + max_norm(
-            small_einsum("nl,l->n", jnp.abs(lin.reaction), jnp.abs(lin.multiplier))
-        )
+        rate = rate + max_norm(matvec(absolute(lin.reaction), jnp.abs(lin.multiplier)))
     scale = h * rate + max_norm(
         x0.node_fibre_coordinate, x0.momentum if stages.hamiltonian else x0.velocity
     )
     if stages.num_holonomic:
         m = stages.num_nonholonomic
-        sizes = position_scale(stages.system, stages.t, stages.q, stages.args)
-        response = small_einsum(
-            "nl,lk->nk",
-            jnp.abs(lin.reaction),
-            jnp.abs(lin.compliance_inverse[:, m:]),
-        )
-        scale = scale + max_norm(small_einsum("nk,k->n", response, sizes)) / h
+        sizes = position_scale(stages.system, stages.t, stages.q, stages.args, lin)
+        sizes = jnp.concatenate([jnp.zeros((m,), sizes.dtype), sizes]) if m else sizes
+        response = matvec(absolute(lin.compliance_inverse), sizes)
+        scale = scale + max_norm(matvec(absolute(lin.reaction), response)) / h
     return scale

@@ -1,14 +1,20 @@
 """The equations of one step, as functions of the unknowns of the step."""
 
+from collections.abc import Callable
+from typing import TypeVar
+
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PyTree
 
 from .._custom_types import BoolScalar
-from .._numerics import small_einsum
+from .._numerics import Pattern, small_einsum, sparse_jacobian, SparseMatrix
 from .._system import motion_residual, whole_force
 from ._stage_system import StageSystem
 from ._unknowns import StageForces, Stages
+
+
+T = TypeVar("T")
 
 
 def stage_velocities(stages: StageSystem, x: Stages) -> Float[Array, "s n"]:
@@ -100,14 +106,31 @@ def holonomic_constraint(stages: StageSystem, x: Stages) -> Float[Array, "s k"]:
 
 def constraint_jacobian(stages: StageSystem, x: Stages) -> Float[Array, "r l n"]:
     """Compute B = ∂Φ/∂u of all constraints on velocities at the nodes i >= 2."""
+    return _at_nodes(stages, x, jax.jacrev)
+
+
+def sparse_constraint_jacobian(
+    stages: StageSystem, x: Stages, pattern: Pattern
+) -> SparseMatrix:
+    """Compute what `constraint_jacobian` does, for a B whose pattern is known."""
+    return _at_nodes(
+        stages,
+        x,
+        lambda constraint: lambda u: sparse_jacobian(constraint, u, pattern),
+    )
+
+
+def _at_nodes(
+    stages: StageSystem, x: Stages, differentiated: Callable[..., Callable[..., T]]
+) -> T:
     times, fibre = stages.stage_times[1:], x.node_fibre_coordinate
     if not stages.num_nonholonomic:
         fibre = jnp.broadcast_to(fibre, (stages.method.stages - 1, fibre.shape[1]))
     nodes = stages.chart(x).positions(stages.stage_coordinates(x)[1:])
     return jax.vmap(
-        lambda t, q, u: jax.jacrev(stages.system.constraint, argnums=2)(
-            t, q, u, stages.args
-        )
+        lambda t, q, u: differentiated(
+            lambda u: stages.system.constraint(t, q, u, stages.args)
+        )(u)
     )(times, nodes, fibre)
 
 

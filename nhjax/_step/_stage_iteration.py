@@ -1,14 +1,16 @@
 """The residual of all stage equations, and a sweep of simplified Newton over them."""
 
 import dataclasses
+import math
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
 from .._custom_types import BoolScalar, FloatScalar
-from .._numerics import matvec, max_norm, Sizes, small_einsum, unit
+from .._numerics import matvec, max_norm, Sizes, unit
 from .._system import Linearisation
 from ._leading_structure import LeadingStructure
 from ._stage_equations import (
@@ -160,11 +162,11 @@ def increment_size(
         # right.
         before, after = map(stages.multiplier_change, (x, x_next))
         reaction = lin.reaction
-        if reaction.shape[1] == 1:
+        if before.shape[1] == 1 and isinstance(reaction, jax.Array):
             # With one constraint the largest entry of the column decides, and it is the
             # same for all iterates.
             reaction = max_norm(reaction).reshape(1, 1)
-        change = small_einsum("sl,nl->sn", after - before, reaction)
+        change = matvec(reaction, after - before)
         changes.append(stages.h * change)
     size = max_norm(*changes)
     if stages.manifold.is_flat:
@@ -182,7 +184,9 @@ def unknown_units(stages: StageSystem, lin: Linearisation) -> list[FloatScalar]:
     h = jnp.abs(stages.h)
     one = jnp.ones_like(h)
     velocity = 1 / unit(max_norm(lin.metric_inverse)) if stages.hamiltonian else one
-    multiplier = 1 / unit(h * max_norm(lin.reaction))
+    # Of a sparse matrix this is the product of its largest factors.
+    sizes_of_reaction = map(max_norm, jax.tree.leaves(lin.reaction))
+    multiplier = 1 / unit(h * math.prod(sizes_of_reaction))
     sizes = {
         "velocity": velocity,
         "momentum": one,

@@ -100,7 +100,8 @@ def first_step_state(
     With closures that do not carry the multiplier from step to step, the first state
     already has the continuous multiplier λ_c.
     """
-    lin = linearise(system, t, y0.q, system.fibre_coordinate(y0), args)
+    u = system.fibre_coordinate(y0)
+    lin = linearise(system, t, y0.q, u, args, may_be_sparse=True)
     multiplier = _continuous_multiplier(
         (system, t, y0.q, system.fibre_coordinate(y0), args)
     )
@@ -115,7 +116,7 @@ def first_step_state(
 
 @eqx.filter_custom_jvp
 def _continuous_multiplier(arguments: tuple[Any, ...]) -> Float[Array, " l"]:
-    return linearise(*arguments).multiplier
+    return linearise(*arguments, may_be_sparse=True).multiplier
 
 
 @_continuous_multiplier.def_jvp
@@ -127,7 +128,9 @@ def _continuous_multiplier_jvp(primals, tangents):
     ok = jnp.all(jnp.isfinite(multiplier))
     perturbed, fixed = eqx.partition(arguments, has_tangent(rates))
     _, change = jax.jvp(
-        lambda perturbed: linearise(*eqx.combine(perturbed, fixed)).multiplier,
+        lambda perturbed: (
+            linearise(*eqx.combine(perturbed, fixed), may_be_sparse=True).multiplier
+        ),
         (perturbed,),
         (zero_unless(ok, rates),),
     )
@@ -161,7 +164,7 @@ def step(
         state.p, gained, step_state.p_compensation
     )
     u = p if stages.hamiltonian else x.node_fibre_coordinate[-1]
-    lin_next = linearise(system, t + h, q, u, args)
+    lin_next = linearise(system, t + h, q, u, args, may_be_sparse=True)
     end = end_state(stages, q, u, p, forces.multiplier[-1], lambda: lin_next.multiplier)
     next_state = StepState(end, q_compensation, p_compensation, lin_next)
 

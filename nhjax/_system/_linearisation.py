@@ -1,4 +1,5 @@
 from collections.abc import Callable
+from functools import reduce
 from typing import Literal
 
 import equinox as eqx
@@ -8,6 +9,9 @@ from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from .._custom_types import Args, FloatScalar, FloatScalarLike
 from .._numerics import (
+    block_tridiagonal_inverse,
+    BlockTridiagonalInverse,
+    couplings,
     inverse,
     is_nearly_singular,
     jacobian,
@@ -15,9 +19,13 @@ from .._numerics import (
     Matrix,
     matvec,
     small_einsum,
+    sparse_jacobian,
+    SparseMatrix,
+    WeightedTranspose,
 )
 from ._abstract import AbstractMechanicalSystem
 from ._state import check_time_and_state, State
+from ._structure import constraint_pattern, FEWEST_SPARSE
 
 
 class Linearisation(eqx.Module):
@@ -35,13 +43,15 @@ class Linearisation(eqx.Module):
 
     The same matrices are the leading structure of the stage system. Inverses are formed
     once, and later computations multiply with them: the matrices are tiny, and a
-    triangular solve inside an iteration costs far more than a product.
+    triangular solve inside an iteration costs far more than a product. Those of many
+    constraints, each of which shares coordinates with few others, are kept sparse.
     """
 
     metric_inverse: Matrix  # K⁻¹
-    jacobian: Float[Array, "l n"]  # B
-    reaction: Float[Array, "n l"]  # N⁻¹ R
-    compliance_inverse: Float[Array, "l l"]  # C⁻¹, or of the least norm
+    jacobian: Float[Array, "l n"] | SparseMatrix  # B
+    reaction: Float[Array, "n l"] | WeightedTranspose  # N⁻¹ R
+    # C⁻¹, or of the least norm
+    compliance_inverse: Float[Array, "l l"] | BlockTridiagonalInverse
     acceleration: Float[Array, " n"]  # u̇
     multiplier: Float[Array, " l"]
     violation: Float[Array, " l"]
@@ -59,22 +69,28 @@ class Linearisation(eqx.Module):
         return jnp.ones_like(self.acceleration)
 
     @property
+    def dense(self) -> tuple[Array, Array, Array]:
+        """Return B, N⁻¹ R and C⁻¹ as arrays, of a linearisation that is not sparse."""
+        assert not isinstance(self.jacobian, SparseMatrix)
+        assert not isinstance(self.reaction, WeightedTranspose)
+        assert not isinstance(self.compliance_inverse, BlockTridiagonalInverse)
+        return self.jacobian, self.reaction, self.compliance_inverse
+
+    @property
     def is_singular(self) -> Bool[Array, ""]:
         """Tell whether the metric K or the compatibility matrix C is singular."""
-        return ~(
-            jnp.all(jnp.isfinite(self.metric_inverse))
-            & jnp.all(jnp.isfinite(self.compliance_inverse))
-        )
+        inverses = [self.metric_inverse, *jax.tree.leaves(self.compliance_inverse)]
+        return ~reduce(jnp.logical_and, [jnp.all(jnp.isfinite(x)) for x in inverses])
 
     @property
     def is_unique(self) -> Bool[Array, " l"]:
         """Tell which multipliers are determined, which redundant ones are not."""
-        count = self.compliance_inverse.shape[0]
         if not self.is_redundant:
-            return jnp.ones((count,), bool)
+            return jnp.ones(self.violation.shape, bool)
         # C C⁻ projects onto what the derivatives of the constraints can reach.
-        compliance = small_einsum("kn,nl->kl", self.jacobian, self.reaction)
-        kept = small_einsum("kl,lm->km", compliance, self.compliance_inverse)
+        jacobian, reaction, inverse = self.dense
+        compliance = small_einsum("kn,nl->kl", jacobian, reaction)
+        kept = small_einsum("kl,lm->km", compliance, inverse)
         small = float(jnp.finfo(kept.dtype).eps) ** 0.5
         return jnp.abs(1 - jnp.diagonal(kept)) <= small
 
@@ -83,24 +99,33 @@ class Linearisation(eqx.Module):
         """Count the constraints that follow from others, if these are redundant."""
         if not self.is_redundant:
             return jnp.zeros((), jnp.int32)
-        compliance = small_einsum("kn,nl->kl", self.jacobian, self.reaction)
-        rank = jnp.sum(compliance * self.compliance_inverse.T)
+        jacobian, reaction, inverse = self.dense
+        compliance = small_einsum("kn,nl->kl", jacobian, reaction)
+        rank = jnp.sum(compliance * inverse.T)
         return compliance.shape[0] - jnp.round(rank).astype(jnp.int32)
 
     @property
     def determines_multipliers(self) -> Bool[Array, ""]:
         """Tell whether C can be inverted in the working precision."""
-        compliance = small_einsum("kn,nl->kl", self.jacobian, self.reaction)
-        return ~is_nearly_singular(compliance, self.compliance_inverse)
+        if isinstance(self.jacobian, SparseMatrix):
+            assert isinstance(self.compliance_inverse, BlockTridiagonalInverse)
+            squares = SparseMatrix(self.jacobian.values**2, self.jacobian.pattern)
+            sizes = jnp.abs(matvec(squares, self.metric_inverse))
+            eps = float(jnp.finfo(sizes.dtype).eps)
+            number = 1 / (10 * sizes.shape[0] * eps)
+            return ~self.compliance_inverse.exceeds(sizes, number)
+        jacobian, reaction, inverse = self.dense
+        compliance = small_einsum("kn,nl->kl", jacobian, reaction)
+        return ~is_nearly_singular(compliance, inverse)
 
     def solve(
         self, momentum_residual: Float[Array, " n"], hidden_residual: Float[Array, " l"]
     ) -> tuple[Float[Array, " n"], Float[Array, " l"]]:
         """Find (u̇, λ) with N u̇ - R λ and B u̇ equal to the two given residuals."""
         free = matvec(self.momentum_inverse, momentum_residual)
-        hidden = hidden_residual - small_einsum("ln,n->l", self.jacobian, free)
-        multiplier = small_einsum("kl,l->k", self.compliance_inverse, hidden)
-        return free + small_einsum("nl,l->n", self.reaction, multiplier), multiplier
+        hidden = hidden_residual - matvec(self.jacobian, free)
+        multiplier = matvec(self.compliance_inverse, hidden)
+        return free + matvec(self.reaction, multiplier), multiplier
 
 
 def _momentum_and_constraint(
@@ -169,25 +194,42 @@ def linearise(
     q: PyTree[Array],
     u: Float[Array, " n"],
     args: Args,
+    *,
+    may_be_sparse: bool = False,
 ) -> Linearisation:
-    """Linearise the equations of motion at (t, q, u), and solve them for u̇ and λ_c."""
+    """Linearise the equations of motion at (t, q, u), and solve them for u̇ and λ_c.
+
+    With `may_be_sparse` the matrices of many constraints are sparse where that pays.
+    """
     zero, v = jnp.zeros_like(u), system.velocity(t, q, u, args)
     (p, violation), (p_dot, phi_dot) = jax.jvp(
         _momentum_and_constraint(system, q, args),
         (t, zero, u),
         (jnp.ones_like(t), v, zero),
     )
-    slopes = jax.jacrev(system.constraint, argnums=2)(t, q, u, args)
     metric = jacobian(lambda u: system.fibre_derivative(t, q, u, args), u)
     metric_inverse = inverse(metric)
-    reaction = matvec(metric_inverse, slopes).T
-    compliance = small_einsum("kn,nl->kl", slopes, reaction)
-    invert = least_norm_inverse if system.constraints == "redundant" else inverse
+    pattern = None
+    is_large = violation.shape[0] >= FEWEST_SPARSE
+    if may_be_sparse and is_large and metric.ndim == 1:
+        pattern = constraint_pattern(system, t, q, u, args)
+    if pattern is None:
+        slopes = jax.jacrev(system.constraint, argnums=2)(t, q, u, args)
+        reaction = matvec(metric_inverse, slopes).T
+        compliance = small_einsum("kn,nl->kl", slopes, reaction)
+        redundant = system.constraints == "redundant"
+        compliance_inverse = (least_norm_inverse if redundant else inverse)(compliance)
+    else:
+        slopes = sparse_jacobian(lambda u: system.constraint(t, q, u, args), u, pattern)
+        reaction = WeightedTranspose(metric_inverse, slopes)
+        rows = SparseMatrix(slopes.values[None], pattern)
+        products = couplings(rows, rows, metric_inverse)
+        compliance_inverse = block_tridiagonal_inverse(products, pattern)
     lin = Linearisation(
         metric_inverse=metric_inverse,
         jacobian=slopes,
         reaction=reaction,
-        compliance_inverse=invert(compliance),
+        compliance_inverse=compliance_inverse,
         acceleration=zero,
         multiplier=jnp.zeros_like(violation),
         violation=violation,

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, PyTree
 
 from .._custom_types import Args, FloatScalar
-from .._numerics import max_norm, unit
+from .._numerics import max_norm, SparseMatrix, unit
 from ._abstract import AbstractMechanicalSystem
 from ._linearisation import Linearisation
 
@@ -30,7 +30,7 @@ def violation_scale(
 
 def velocity_scale(
     system: AbstractMechanicalSystem,
-    jacobian: Float[Array, "l n"],
+    jacobian: Float[Array, "l n"] | SparseMatrix,
     t: FloatScalar,
     q: PyTree[Array],
     u: Float[Array, " n"],
@@ -38,16 +38,21 @@ def velocity_scale(
 ) -> Float[Array, " l"]:
     """Do what `violation_scale` does, given the Jacobian ∂Φ/∂u alone."""
     affine = _finite_or_zero(system.constraint(t, q, jnp.zeros_like(u), args))
-    slopes = jnp.sum(jnp.abs(jacobian), axis=1)
+    slopes = _row_sums(jacobian)
     return slopes * unit(max_norm(u)) + affine
 
 
 def position_scale(
-    system: AbstractMechanicalSystem, t: FloatScalar, q: PyTree[Array], args: Args
+    system: AbstractMechanicalSystem,
+    t: FloatScalar,
+    q: PyTree[Array],
+    args: Args,
+    lin: Linearisation | None = None,
 ) -> Float[Array, " k"]:
     """Estimate, row by row, how large the terms of Γ are for a q of the given size.
 
     The estimate treats Γ as affine in q. Where q vanishes one unit stands for its size.
+    Where a sparse linearisation at q has the derivatives of Γ already, it serves.
     """
 
     def gamma(q):
@@ -56,12 +61,24 @@ def position_scale(
     constant = _finite_or_zero(gamma(jax.tree.map(jnp.zeros_like, q)))
     if system.holonomic is None:
         return constant
+    size = unit(max_norm(*jax.tree.leaves(q)))
+    if (
+        lin is not None
+        and isinstance(lin.jacobian, SparseMatrix)
+        and lin.fibre_coordinate_name == "v"
+    ):
+        return _row_sums(lin.jacobian) * size + constant
     slopes = jax.tree.map(
         lambda slope: jnp.sum(jnp.abs(slope), axis=tuple(range(1, slope.ndim))),
         jax.jacrev(gamma)(q),
     )
-    size = unit(max_norm(*jax.tree.leaves(q)))
     return sum(jax.tree.leaves(slopes)) * size + constant
+
+
+def _row_sums(matrix: Float[Array, "l n"] | SparseMatrix) -> Float[Array, " l"]:
+    if isinstance(matrix, SparseMatrix):
+        return jnp.sum(jnp.abs(matrix.values), axis=0)
+    return jnp.sum(jnp.abs(matrix), axis=1)
 
 
 def _finite_or_zero(x: Array) -> Array:
