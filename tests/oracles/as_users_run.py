@@ -125,6 +125,15 @@ def redundant_constraints():
 
 
 @feature
+def many_constraints_that_share_few_coordinates():
+    chain = systems.PendulumChain(5)
+    sol = run(chain, num_steps=3)
+    assert float(sol.stats["max_constraint_violation"]) < 1e-13
+    start, y = chain.initial_state(), jax.tree.map(lambda x: x[-1], sol.ys)
+    close(chain.energy(0.3, y.q, y.v), chain.energy(0.0, start.q, start.v), 1e-7)
+
+
+@feature
 def a_hamiltonian_system():
     pendulum = systems.SphericalPendulum()
     system = nhjax.HamiltonianSystem(
@@ -138,6 +147,12 @@ def a_hamiltonian_system():
 def a_group():
     suslov = systems.Suslov()
     assert_exact(suslov, run(suslov), 1e-6)
+
+
+@feature
+def a_group_with_the_chart_of_the_paper():
+    suslov = systems.Suslov()
+    assert_exact(suslov, run(suslov, LobattoIIIAB(4, chart="start")))
 
 
 @feature
