@@ -85,6 +85,7 @@ BESIDE = {
     "disc": [systems.RollingDisc()],
     "ball": [systems.TurntableBall()],
     "Suslov": [systems.Suslov()],
+    "Veselova": [systems.Veselova()],
     "rigid body": [systems.FreeRigidBody()],
     "heavy top": [systems.HeavyTop()],
     "heavy top on SE(3)": [systems.HeavyTopSE3()],
@@ -109,6 +110,7 @@ BESIDE = {
         ("Suslov", 2, "symmetric"),
         ("Suslov", 2, "propagated"),
         ("Suslov", 2, "consistent"),
+        ("Veselova", 2, "symmetric"),
         # Without nonholonomic constraints there is nothing to close.
         ("oscillator and pendulums", 2, "symmetric"),
         ("rigid body", 2, "symmetric"),
