@@ -12,8 +12,8 @@ from nhjax import SaveAt
 from oracles.particle_run import assert_trees_equal, PARTICLE
 
 
-# Two programs agree bit for bit in kernels as users have them; without optimisation the
-# products of one are rounded before they are added, and those of the other are not.
+# Two programs agree bit for bit in kernels as users have them; without optimisation a
+# product that is added to something may be rounded before in one and not in the other.
 pytestmark = pytest.mark.usefixtures("optimised_kernels")
 
 REVERSIBLE = nhjax.ReversibleAdjoint()
