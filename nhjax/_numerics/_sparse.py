@@ -90,13 +90,13 @@ def _raised(x: Array, other: Array) -> Array:
 class SparseMatrix(AbstractLinearMap):
     """A matrix B, or several with the same places, by the entries of each row."""
 
-    values: Float[Array, "*batch w l"]
+    values: Float[Array, "... w l"]
     pattern: Pattern = eqx.field(static=True)
 
     def __getitem__(self, k: int | slice) -> "SparseMatrix":
         return SparseMatrix(self.values[k], self.pattern)
 
-    def apply(self, x: Float[Array, "*batch n"]) -> Float[Array, "*batch l"]:
+    def apply(self, x: Float[Array, "... n"]) -> Float[Array, "... l"]:
         """Compute B x for vectors along the last axis."""
         taken = [static_take(x, columns) for columns in self.pattern.columns]
         rows = [self.values[..., e, :] for e in range(len(taken))]
@@ -105,7 +105,7 @@ class SparseMatrix(AbstractLinearMap):
             [_raised(row, x) * x for row, x in zip(rows, taken, strict=True)],
         )
 
-    def apply_transposed(self, y: Float[Array, "*batch l"]) -> Float[Array, "*batch n"]:
+    def apply_transposed(self, y: Float[Array, "... l"]) -> Float[Array, "... n"]:
         """Compute Bᵀ y for vectors along the last axis."""
         y = y[..., None, :]
         products = _raised(self.values, y) * _raised(y, self.values)
@@ -131,7 +131,7 @@ class WeightedTranspose(AbstractLinearMap):
     def __getitem__(self, k: int | slice) -> "WeightedTranspose":
         return WeightedTranspose(self.weights, self.matrix[k])
 
-    def apply(self, x: Float[Array, "*batch l"]) -> Float[Array, "*batch n"]:
+    def apply(self, x: Float[Array, "... l"]) -> Float[Array, "... n"]:
         """Compute diag(w) Bᵀ x for vectors along the last axis."""
         product = self.matrix.apply_transposed(x)
         return jnp.expand_dims(self.weights, range(product.ndim - 1)) * product
