@@ -38,6 +38,7 @@ from nhjax._step._stage_system import nudged, StageSystem
 from nhjax._step._unknowns import Stages
 from nhjax._system import position_scale, violation_scale
 
+from ._examples import of_the_gallery
 from ._random_systems import random_systems
 from ._report import markdown_table, number, RESULTS, write
 
@@ -51,10 +52,6 @@ NUDGE = 2.0**-26
 
 def gallery() -> dict[str, Callable]:
     """The systems of the gallery, each with a state to start from."""
-
-    def of(example):
-        return lambda: (example().system, example().initial_state())
-
     cvt = systems.ContinuouslyVariableTransmission
     named = {"CVT low": cvt.low, "CVT high": cvt.high}
     others = [
@@ -78,8 +75,8 @@ def gallery() -> dict[str, Callable]:
         systems.VerticalRollingDisc,
     ]
     named |= {example.__name__: example for example in others}
-    made = {name: of(example) for name, example in named.items()}
-    return made | {"Whipple bicycle": of(systems.WhippleBicycle)}
+    made = {name: of_the_gallery(example) for name, example in named.items()}
+    return made | {"Whipple bicycle": of_the_gallery(systems.WhippleBicycle)}
 
 
 class Judged(NamedTuple):

@@ -11,7 +11,6 @@ step (the paper's) and that in its middle:
 
 import argparse
 import time
-from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
@@ -21,31 +20,14 @@ import numpy as np
 import nhjax
 from nhjax import systems
 from nhjax._manifold import AbstractRetraction
-from nhjax._system import State
 
+from ._examples import of_the_gallery, suslov_in_a_potential
 from ._report import markdown_table, number, write
 
 
 STEP, THERE_AND_BACK = 0.1, 50
 CHARTS = ("start", "middle")
 RETRACTIONS = {"cay": nhjax.Cayley(), "exp": nhjax.Exponential()}
-_INERTIA = ((1.0, 0.1, 0.2), (0.1, 1.4, -0.15), (0.2, -0.15, 0.8))
-
-
-def suslov_in_a_potential(
-    retraction: AbstractRetraction,
-) -> tuple[nhjax.LagrangianSystem, State]:
-    """Suslov's problem with a full matrix of inertia and V = 0.3 R₃₃."""
-    inertia, manifold = jnp.asarray(_INERTIA), nhjax.SO3(retraction)
-
-    def lagrangian(t, q, v, args):
-        return 0.5 * v @ inertia @ v - 0.3 * manifold.matrix(q)[2, 2]
-
-    system = nhjax.LagrangianSystem(
-        lagrangian, nonholonomic=lambda t, q, v, args: v[2], manifold=manifold
-    )
-    q0 = nhjax.SO3(nhjax.Exponential()).retract(jnp.array([0.2, -0.4, 0.5]))
-    return system, nhjax.initial_state(system, q0, jnp.array([0.6, -0.9, 0.0]))
 
 
 def _uneven_ball(retraction: AbstractRetraction) -> systems.TurntableBall:
@@ -60,21 +42,13 @@ def _uneven_ball(retraction: AbstractRetraction) -> systems.TurntableBall:
     )
 
 
-def _of_the_gallery(kind: Callable) -> Callable:
-    def build(retraction: AbstractRetraction):
-        example = kind(retraction=retraction)
-        return example.system, example.initial_state()
-
-    return build
-
-
 SYSTEMS = {
     "Suslov in a potential": suslov_in_a_potential,
-    "Suslov": _of_the_gallery(systems.Suslov),
-    "Veselova": _of_the_gallery(systems.Veselova),
-    "heavy top": _of_the_gallery(systems.HeavyTop),
-    "unicycle": _of_the_gallery(systems.Unicycle),
-    "uneven ball": _of_the_gallery(_uneven_ball),
+    "Suslov": of_the_gallery(systems.Suslov),
+    "Veselova": of_the_gallery(systems.Veselova),
+    "heavy top": of_the_gallery(systems.HeavyTop),
+    "unicycle": of_the_gallery(systems.Unicycle),
+    "uneven ball": of_the_gallery(_uneven_ball),
 }
 
 
@@ -96,7 +70,7 @@ def measure(
     name: str, retraction: str, stages: int, chart: str, duration: float
 ) -> Row:
     """Run one system with one chart."""
-    system, y0 = SYSTEMS[name](RETRACTIONS[retraction])
+    system, y0 = SYSTEMS[name](retraction=RETRACTIONS[retraction])
     method = nhjax.LobattoIIIAB(stages, chart=chart)
     num_steps = round(duration / STEP)
     every = max(1, num_steps // 2000)

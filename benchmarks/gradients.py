@@ -31,8 +31,8 @@ from matplotlib.figure import Figure
 import nhjax
 from nhjax import systems
 
+from ._examples import of_the_gallery, suslov_in_a_potential
 from ._report import markdown_table, number, RESULTS, write
-from .charts import suslov_in_a_potential
 
 
 DT, REPEATS, LONG, REPEATS_OF_LONG = 0.1, 7, 10**4, 3
@@ -40,21 +40,13 @@ DT, REPEATS, LONG, REPEATS_OF_LONG = 0.1, 7, 10**4, 3
 MALLOC = {"MALLOC_MMAP_THRESHOLD_": "65536", "MALLOC_TRIM_THRESHOLD_": "65536"}
 
 
-def _of_the_gallery(kind: Callable) -> Callable:
-    def build():
-        example = kind()
-        return example.system, example.initial_state()
-
-    return build
-
-
 EXAMPLES = {
-    "chaotic": _of_the_gallery(systems.ChaoticSystem),
-    "sleigh": _of_the_gallery(systems.ChaplyginSleigh),
-    "CVT": _of_the_gallery(systems.ContinuouslyVariableTransmission),
-    "Suslov": _of_the_gallery(systems.Suslov),
-    "Suslov in a potential": lambda: suslov_in_a_potential(nhjax.Cayley()),
-    "heavy top": _of_the_gallery(systems.HeavyTop),
+    "chaotic": of_the_gallery(systems.ChaoticSystem),
+    "sleigh": of_the_gallery(systems.ChaplyginSleigh),
+    "CVT": of_the_gallery(systems.ContinuouslyVariableTransmission),
+    "Suslov": of_the_gallery(systems.Suslov),
+    "Suslov in a potential": suslov_in_a_potential,
+    "heavy top": of_the_gallery(systems.HeavyTop),
 }
 ADJOINTS = {
     "direct": nhjax.DirectAdjoint(),

@@ -75,6 +75,13 @@ def is_traced(*arrays: object) -> bool:
     return any(isinstance(x, Tracer) for x in arrays)
 
 
+def check_choice(name: str, value: Any, choices: tuple[str, ...]) -> None:
+    """Raise a `ValueError` unless `value`, called `name`, is one of `choices`."""
+    if not isinstance(value, str) or value not in choices:
+        listed = ", ".join(map(repr, choices))
+        raise ValueError(f"{name} must be one of {listed}, got {value!r}")
+
+
 class Check(NamedTuple):
     """A condition, and the exception that says what is wrong where it fails.
 

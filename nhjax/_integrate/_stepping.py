@@ -25,9 +25,8 @@ from .._step import (
 from .._system import (
     AbstractMechanicalSystem,
     all_finite,
-    position_scale,
+    keeps_constraints,
     State,
-    violation_scale,
 )
 from ._statistics import first_statistics, Statistics, updated_statistics
 
@@ -145,12 +144,8 @@ def _is_consistent(
     derivative = system.fibre_derivative(t, y.q, u, args)
     given = y.p if system.fibre_coordinate_name == "v" else y.v
     size = max_norm(derivative) + max_norm(given)
-    scale = violation_scale(system, lin, t, y.q, u, args)
-    positions = system.position_constraint(t, y.q, args)
-    allowed = position_scale(system, t, y.q, args)
     return (
-        jnp.all(jnp.abs(lin.violation) <= small * scale)
-        & jnp.all(jnp.abs(positions) <= small * allowed)
+        keeps_constraints(system, lin, t, y, args, small)
         & (system.manifold_of(y.q).distance_to_group(y.q) <= small)
         & (max_norm(derivative - given) <= small * size)
     )

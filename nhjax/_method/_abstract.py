@@ -9,6 +9,7 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
+from .._errors import check_choice
 from . import _basis, _conditions
 from ._closure import ClosureWeights, make_closure_weights
 from ._conditions import Hypotheses, SimplifyingAssumptions
@@ -237,7 +238,8 @@ def check_closure(closure: str) -> str:
 
     A `ValueError` that lists the choices.
     """
-    return _check_choice("closure", closure, CLOSURES)
+    check_choice("closure", closure, CLOSURES)
+    return closure
 
 
 def check_chart(chart: str) -> str:
@@ -247,11 +249,5 @@ def check_chart(chart: str) -> str:
 
     A `ValueError` that lists the choices.
     """
-    return _check_choice("chart", chart, CHARTS)
-
-
-def _check_choice(name: str, value: str, choices: tuple[str, ...]) -> str:
-    if value not in choices:
-        listed = ", ".join(map(repr, choices))
-        raise ValueError(f"{name} must be one of {listed}, got {value!r}")
-    return value
+    check_choice("chart", chart, CHARTS)
+    return chart

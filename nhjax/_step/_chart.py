@@ -35,9 +35,15 @@ class AbstractChart(eqx.Module):
         The increment ξ itself leads to the end of the step.
         """
 
+    @property
     @abstractmethod
+    def origin(self) -> PyTree[Array]:
+        """Compute g_o, the origin of the chart."""
+
     def positions(self, y: Vectors) -> PyTree[Array]:
         """Compute the positions g_o τ(y), one for each row of y."""
+        origin = self.origin
+        return jax.vmap(lambda y: self.manifold.act(origin, y))(y)
 
     @abstractmethod
     def body_velocities(self, y: Vectors, velocity: Vectors) -> Vectors:
@@ -113,13 +119,14 @@ class FlatChart(AbstractChart):
     start: PyTree[Array]
     increment: Vector
 
+    @property
+    def origin(self) -> PyTree[Array]:
+        """Return q_k."""
+        return self.start
+
     def coordinates(self, increment: Vectors) -> Vectors:
         """Return the increments Ξ, since the origin is q_k."""
         return increment
-
-    def positions(self, y: Vectors) -> PyTree[Array]:
-        """Compute the positions q_k + y."""
-        return jax.vmap(lambda y: self.manifold.act(self.start, y))(y)
 
     def body_velocities(self, y: Vectors, velocity: Vectors) -> Vectors:
         """Return the chart velocities H, which are the body velocities here."""

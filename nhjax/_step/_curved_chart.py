@@ -1,7 +1,5 @@
 """The charts of a Lie group in which a step can be written, by its retraction."""
 
-from abc import abstractmethod
-
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, PyTree
@@ -14,16 +12,6 @@ from ._chart import AbstractChart, FlatChart, Vector, Vectors
 
 class AbstractCurvedChart(AbstractChart):
     """A chart y -> g_o τ(y) of a Lie group by its retraction τ, wherever g_o lies."""
-
-    @property
-    @abstractmethod
-    def origin(self) -> PyTree[Array]:
-        """Compute g_o, the origin of the chart."""
-
-    def positions(self, y: Vectors) -> PyTree[Array]:
-        """Compute the positions g_o τ(y), one for each row of y."""
-        origin = self.origin
-        return jax.vmap(lambda y: self.manifold.act(origin, y))(y)
 
     def body_velocities(self, y: Vectors, velocity: Vectors) -> Vectors:
         """Compute the body velocities dτ_y H of the chart velocities H."""

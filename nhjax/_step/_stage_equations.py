@@ -5,7 +5,7 @@ from typing import TypeVar
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, PyTree
+from jaxtyping import Array, Float
 
 from .._custom_types import BoolScalar
 from .._numerics import Pattern, small_einsum, sparse_jacobian, SparseMatrix
@@ -19,7 +19,7 @@ T = TypeVar("T")
 
 def stage_velocities(stages: StageSystem, x: Stages) -> Float[Array, "s n"]:
     """Compute the chart velocities dτ_y⁻¹ D2H(Q^i, P^i) of a Hamiltonian system."""
-    chart, y = stages.chart(x), stages.stage_coordinates(x)
+    chart, y = stages.in_stages(x)
     v = jax.vmap(lambda t, q, u: stages.system.velocity(t, q, u, stages.args))(
         stages.stage_times, chart.positions(y), x.momentum
     )
@@ -30,7 +30,7 @@ def stage_forces(stages: StageSystem, x: Stages) -> StageForces:
     """Compute the forces n^i, multipliers Λ^i and residuals of the stage momenta."""
     h, a_hat, b = stages.h, stages.coefficients("a_hat"), stages.coefficients("b")
     multiplier = stages.multipliers(x)
-    chart, y = stages.chart(x), stages.stage_coordinates(x)
+    chart, y = stages.in_stages(x)
     q = chart.positions(y)
     u = x.momentum if stages.hamiltonian else chart.body_velocities(y, x.velocity)
     force, momentum = jax.vmap(
@@ -52,11 +52,6 @@ def stage_forces(stages: StageSystem, x: Stages) -> StageForces:
     return StageForces(transported, multiplier, residual, momentum)
 
 
-def node_positions(stages: StageSystem, x: Stages) -> PyTree[Array]:
-    """Compute the positions q^i at the nodes, of which the last is q_{k+1}."""
-    return stages.chart(x).positions(stages.node_coordinates(x))
-
-
 def node_residual(
     stages: StageSystem, x: Stages, force: Float[Array, "s n"]
 ) -> Float[Array, "r n"]:
@@ -64,21 +59,22 @@ def node_residual(
 
     They are p(q^i, u^i) - Ad^*_{τ(y^i)} (M + h Σ a_ij n^j).
     """
+    chart, y = stages.in_nodes(x)
     momentum = jax.vmap(lambda t, q, u: stages.system.momentum(t, q, u, stages.args))(
-        stages.node_times, node_positions(stages, x), x.node_fibre_coordinate
+        stages.node_times, chart.positions(y), x.node_fibre_coordinate
     )
-    chart = stages.chart(x)
     known = chart.momentum_at_origin(stages.p)[None] + stages.h * small_einsum(
         "ij,jn->in", stages.node_weights, force
     )
-    return momentum - chart.from_origin(stages.node_coordinates(x), known)
+    return momentum - chart.from_origin(y, known)
 
 
 def node_constraint(stages: StageSystem, x: Stages) -> Float[Array, "r m"]:
     """Compute the nonholonomic constraints Φ(q^i, u^i) at the nodes."""
+    chart, y = stages.in_nodes(x)
     values = jax.vmap(
         lambda t, q, u: stages.system.kinematic_constraint(t, q, u, stages.args)
-    )(stages.node_times, node_positions(stages, x), x.node_fibre_coordinate)
+    )(stages.node_times, chart.positions(y), x.node_fibre_coordinate)
     if stages.redundancy is None:
         return values
     return stages.redundancy.reduced(values, stages.h * x.closure, 0)
@@ -89,7 +85,8 @@ def holonomic_constraint(stages: StageSystem, x: Stages) -> Float[Array, "s k"]:
 
     The division by h makes the values the size of velocities, as the tangency is.
     """
-    nodes = stages.chart(x).positions(stages.stage_coordinates(x)[1:])
+    chart, y = stages.in_stages(x)
+    nodes = chart.positions(y[1:])
     on_positions = jax.vmap(
         lambda t, q: stages.system.position_constraint(t, q, stages.args)
     )(stages.stage_times[1:], nodes)
@@ -126,7 +123,8 @@ def _at_nodes(
     times, fibre = stages.stage_times[1:], x.node_fibre_coordinate
     if not stages.num_nonholonomic:
         fibre = jnp.broadcast_to(fibre, (stages.method.stages - 1, fibre.shape[1]))
-    nodes = stages.chart(x).positions(stages.stage_coordinates(x)[1:])
+    chart, y = stages.in_stages(x)
+    nodes = chart.positions(y[1:])
     return jax.vmap(
         lambda t, q, u: differentiated(
             lambda u: stages.system.constraint(t, q, u, stages.args)
@@ -157,6 +155,6 @@ def end_residual(
 
 def in_chart(stages: StageSystem, x: Stages) -> BoolScalar:
     """Tell whether stages, nodes and end lie where the chart is invertible."""
-    chart = stages.chart(x)
+    chart, y = stages.in_stages(x)
     end = chart.coordinates(stages.increment(x)[None])
-    return chart.in_domain(jnp.concatenate([stages.stage_coordinates(x), end]))
+    return chart.in_domain(jnp.concatenate([y, end]))

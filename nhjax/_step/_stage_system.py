@@ -188,22 +188,25 @@ class StageSystem(eqx.Module):
         # all, would bias every step in the same way.
         return self.h * small_einsum("s,sn->n", self.coefficients("b"), x.velocity)
 
-    def stage_coordinates(self, x: Stages) -> Float[Array, "s n"]:
-        """Compute the coordinates y^i of the stages, from Ξ^i = h Σ a_ij H^j."""
-        return self._coordinates(x, self.coefficients("a"))
+    def in_stages(self, x: Stages) -> tuple[AbstractChart, Float[Array, "s n"]]:
+        """Make the chart and the coordinates y^i of the stages, from h Σ a_ij H^j."""
+        return self._in_chart(x, self.coefficients("a"))
 
-    def node_coordinates(self, x: Stages) -> Float[Array, "r n"]:
-        """Compute the coordinates of the nodes at which momenta are formed."""
-        return self._coordinates(x, self.node_weights)
+    def in_nodes(self, x: Stages) -> tuple[AbstractChart, Float[Array, "r n"]]:
+        """Make the chart and the coordinates of the nodes with momenta of their own."""
+        return self._in_chart(x, self.node_weights)
 
     def end_position(self, x: Stages) -> PyTree[Array]:
         """Compute q_{k+1}."""
         end, _ = self.chart(x).advance(self.manifold.no_compensation(self.q))
         return end
 
-    def _coordinates(self, x: Stages, weights: Float[Array, "r s"]) -> Array:
+    def _in_chart(
+        self, x: Stages, weights: Float[Array, "r s"]
+    ) -> tuple[AbstractChart, Array]:
+        chart = self.chart(x)
         increments = self.h * small_einsum("ij,jn->in", weights, x.velocity)
-        return self.chart(x).coordinates(increments)
+        return chart, chart.coordinates(increments)
 
 
 def nudged(stages: StageSystem, nudge: FloatScalar) -> StageSystem:

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, PyTree
 
-from .._custom_types import Args, BoolScalar, FloatScalar, FloatScalarLike
+from .._custom_types import Args, BoolScalar, FloatScalar
 from .._method import AbstractMethod
 from .._numerics import (
     frozen,
@@ -23,11 +23,10 @@ from .._results import RESULTS
 from .._system import (
     AbstractMechanicalSystem,
     all_finite,
+    keeps_constraints,
     Linearisation,
     linearise,
-    position_scale,
     State,
-    violation_scale,
 )
 from ._end import end_state
 from ._newton import AbstractStageSolver
@@ -170,7 +169,8 @@ def step(
 
     result = _result(solved, lin, next_state, in_chart(stages, x))
     if stages.redundancy is not None:
-        kept = _keeps_constraints(system, t + h, next_state, args, solver.tolerance)
+        small = float(jnp.finfo(p.dtype).eps) ** 0.5 + 100 * solver.tolerance
+        kept = keeps_constraints(system, lin_next, t + h, end, args, small)
         lost = (result == RESULTS.successful) & ~kept
         result = RESULTS.where(lost, RESULTS.lost_constraints, result)
     residual, worst = largest_column(forces.residual, solved.aux.node_residual)
@@ -210,25 +210,6 @@ def _result(
     # because λ_c does not exist there.
     singular = lin.is_singular | (solved.converged & step_state.lin.is_singular)
     return RESULTS.where(singular, RESULTS.singular_stage_matrix, result)
-
-
-def _keeps_constraints(
-    system: AbstractMechanicalSystem,
-    t: FloatScalar,
-    step_state: StepState,
-    args: Args,
-    tolerance: FloatScalarLike,
-) -> BoolScalar:
-    """Tell whether all constraints hold at a state, also those that were left out."""
-    y, lin = step_state.state, step_state.lin
-    small = float(jnp.finfo(y.p.dtype).eps) ** 0.5 + 100 * tolerance
-    u = system.fibre_coordinate(y)
-    scale = violation_scale(system, lin, t, y.q, u, args)
-    positions = system.position_constraint(t, y.q, args)
-    allowed = position_scale(system, t, y.q, args)
-    return jnp.all(jnp.abs(lin.violation) <= small * scale) & jnp.all(
-        jnp.abs(positions) <= small * allowed
-    )
 
 
 def largest_violation(

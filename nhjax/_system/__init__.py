@@ -31,6 +31,7 @@ from ._linearisation import (
     whole_force as whole_force,
 )
 from ._scales import (
+    keeps_constraints as keeps_constraints,
     position_scale as position_scale,
     velocity_scale as velocity_scale,
     violation_scale as violation_scale,

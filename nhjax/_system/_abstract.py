@@ -15,7 +15,7 @@ from .._custom_types import (
     PositionFunction,
 )
 from .._manifold import AbstractLieGroup, Euclidean
-from ._signatures import check_choice, check_manifold, check_signature
+from ._signatures import check_constraints, check_manifold, check_signature
 from ._state import check_time_and_state, State
 
 
@@ -43,7 +43,7 @@ class AbstractMechanicalSystem(eqx.Module):
         for name, arguments in self.signatures().items():
             if getattr(self, name) is not None or name == self.generator:
                 check_signature(self, name, arguments)
-        check_choice(self, "constraints", ("independent", "redundant"))
+        check_constraints(self)
         check_manifold(self)
 
     @abstractmethod

@@ -4,10 +4,11 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PyTree
 
-from .._custom_types import Args, FloatScalar
+from .._custom_types import Args, BoolScalar, FloatScalar, FloatScalarLike
 from .._numerics import max_norm, SparseMatrix, unit
 from ._abstract import AbstractMechanicalSystem
 from ._linearisation import Linearisation
+from ._state import State
 
 
 def violation_scale(
@@ -73,6 +74,24 @@ def position_scale(
         jax.jacrev(gamma)(q),
     )
     return sum(jax.tree.leaves(slopes)) * size + constant
+
+
+def keeps_constraints(
+    system: AbstractMechanicalSystem,
+    lin: Linearisation,
+    t: FloatScalar,
+    y: State,
+    args: Args,
+    small: FloatScalarLike,
+) -> BoolScalar:
+    """Tell whether all constraints hold at y, up to `small` times their terms."""
+    u = system.fibre_coordinate(y)
+    scale = violation_scale(system, lin, t, y.q, u, args)
+    positions = system.position_constraint(t, y.q, args)
+    allowed = position_scale(system, t, y.q, args)
+    return jnp.all(jnp.abs(lin.violation) <= small * scale) & jnp.all(
+        jnp.abs(positions) <= small * allowed
+    )
 
 
 def _row_sums(matrix: Float[Array, "l n"] | SparseMatrix) -> Float[Array, " l"]:

@@ -5,6 +5,7 @@ from collections.abc import Callable
 from types import MethodType
 from typing import Any
 
+from .._errors import check_choice
 from .._manifold import AbstractLieGroup
 
 
@@ -24,14 +25,10 @@ def check_signature(owner: Any, name: str, arguments: tuple[str, ...]) -> None:
         )
 
 
-def check_choice(owner: Any, name: str, choices: tuple[str, ...]) -> None:
-    """Raise a `ValueError` unless the option `name` of `owner` is one of `choices`."""
-    value = getattr(owner, name)
-    if not isinstance(value, str) or value not in choices:
-        raise ValueError(
-            f"{type(owner).__name__}: `{name}` must be one of "
-            f"{', '.join(map(repr, choices))}, got {value!r}."
-        )
+def check_constraints(owner: Any) -> None:
+    """Raise a `ValueError` unless the option `constraints` of `owner` is known."""
+    name = f"{type(owner).__name__}: `constraints`"
+    check_choice(name, owner.constraints, ("independent", "redundant"))
 
 
 def check_manifold(owner: Any) -> None:
