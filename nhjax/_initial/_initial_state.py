@@ -2,11 +2,12 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PyTree
 
-from .._compile import tracked_jit
+from .._compile import as_cpu_kernel, tracked_jit
 from .._custom_types import Args, BoolScalar, FloatScalar, FloatScalarLike
 from .._errors import DTypeError, require, ShapeError
 from .._numerics import (
     conditioning,
+    frozen,
     inverse,
     max_norm,
     mixes_kinds,
@@ -125,7 +126,7 @@ def _solve(system, t, q, v, p, args, project: bool) -> Found:
     given = p if v is None else v
     is_fibre = (v is None) == (system.fibre_coordinate_name == "p")
     legendre_solved = projected = jnp.asarray(True)
-    off_group = manifold.distance_to_group(q)
+    off_group = manifold.distance_to_group(frozen(q))
     starts = []
     if project:
         normal = manifold.normalise(q)
@@ -145,14 +146,14 @@ def _solve(system, t, q, v, p, args, project: bool) -> Found:
         nearest = project_fibre_coordinate(system, t, q, u, args)
         starts.append(Rank(nearest.jacobian, q, projected & ~nearest.found))
         u, projected = nearest.x, projected & nearest.found
-    lin = linearise(system, t, q, u, args)
-    found_v = system.velocity(t, q, u, args)
-    found_p = system.momentum(t, q, u, args)
+    lin, found_v, found_p = as_cpu_kernel(_motion, system, t, q, u, args)
     if not project:
         # The velocity or momentum that was given is kept to the last bit.
         found_v = found_v if v is None else v
         found_p = found_p if p is None else p
-    metric = system.metric(t, q, u, args)
+    state = State(q, found_v, found_p, lin.multiplier)
+    # The numbers by which the state is judged lead to no derivative.
+    system, args, t, q, u, lin, starts = frozen((system, args, t, q, u, lin, starts))
     here = Rank(lin.dense[0], q, projected)
     ranks = (
         [here]
@@ -164,12 +165,12 @@ def _solve(system, t, q, v, p, args, project: bool) -> Found:
     deficient, compatibility = _ranks_judged(system, lin, ranks, m)
     tolerance = jnp.asarray(1e3 * float(jnp.finfo(u.dtype).eps), u.dtype)
     return Found(
-        state=State(q, found_v, found_p, lin.multiplier),
+        state=state,
         lin=lin,
         generator=getattr(system, system.generator)(t, q, u, args),
         positions=positions,
         off_group=off_group,
-        regularity=conditioning(metric),
+        regularity=conditioning(system.metric(t, q, u, args)),
         ranks=ranks,
         deficient=deficient,
         compatibility=compatibility,
@@ -179,6 +180,19 @@ def _solve(system, t, q, v, p, args, project: bool) -> Found:
         legendre_solved=legendre_solved,
         projected=projected,
     )
+
+
+def _motion(
+    system: AbstractMechanicalSystem,
+    t: FloatScalar,
+    q: PyTree[Array],
+    u: Float[Array, " n"],
+    args: Args,
+) -> tuple[Linearisation, Float[Array, " n"], Float[Array, " n"]]:
+    """Compute the linearised equations of motion, the velocity and the momentum."""
+    lin = linearise(system, t, q, u, args)
+    v = system.velocity(t, q, u, args)
+    return lin, v, system.momentum(t, q, u, args)
 
 
 def _ranks_judged(
