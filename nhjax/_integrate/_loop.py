@@ -5,6 +5,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Int
 
+from .._numerics import moving_with
 from ._checks import known
 from ._progress_meter import AbstractProgressMeter
 from ._saving import Rows, Saving
@@ -52,6 +53,12 @@ class Loop(eqx.Module):
 
         return jax.eval_shape(rows)
 
+    def moving(self, carry: Carry) -> Carry:
+        """Return the same carry, its state differentiated wherever the run is."""
+        state = moving_with(carry.step_state.state, self.stepping)
+        return eqx.tree_at(lambda x: x.step_state.state, carry, state)
+
     def empty_rows(self, carry: Carry) -> Rows:
         """Make buffers of zeros for all rows that the run saves."""
-        return self.saving.empty(self.row_shapes(carry))
+        rows = self.saving.empty(self.row_shapes(carry))
+        return moving_with(rows, (self.stepping, carry))

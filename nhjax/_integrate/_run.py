@@ -58,7 +58,7 @@ def run(
 
     def all_steps(loop: Loop, y0: State):
         start = loop.stepping.start(y0)
-        return start.step_state.state, *adjoint.run(loop, start)
+        return start.step_state.state, *adjoint.run(loop, loop.moving(start))
 
     loop = Loop(stepping, saving, meter)
     start, carry, rows = as_cpu_kernel(all_steps, loop, y0)

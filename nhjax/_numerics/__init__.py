@@ -19,6 +19,7 @@ from ._implicit import (
     ClosureConverted as ClosureConverted,
     frozen as frozen,
     has_tangent as has_tangent,
+    moving_with as moving_with,
     nan_gradient_unless as nan_gradient_unless,
     nan_unless as nan_unless,
     root as root,

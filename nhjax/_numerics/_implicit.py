@@ -206,6 +206,43 @@ def _identity_jvp(primals, tangents):
     return _identity(*primals), dx
 
 
+def moving_with(tree: X, parameters: PyTree[Any]) -> X:
+    """Return the same values, which are differentiated wherever a parameter is.
+
+    JAX traces the body of a loop once more if a part of the carry that had no
+    derivative at the start has one after a round. What starts a loop is given a
+    derivative of zeros by this function, so that one trace is enough.
+    """
+    parameters = jax.tree.leaves(eqx.filter(parameters, eqx.is_inexact_array))
+    moving, fixed = eqx.partition(tree, eqx.is_inexact_array)
+    leaves, structure = jax.tree.flatten(moving)
+    if not leaves or not parameters:
+        return tree
+    return eqx.combine(
+        jax.tree.unflatten(structure, _moving(leaves, parameters)), fixed
+    )
+
+
+@eqx.filter_custom_jvp
+def _moving(leaves: list[Array], parameters: list[Array]) -> list[Array]:
+    del parameters
+    return leaves
+
+
+@_moving.def_jvp
+def _moving_jvp(primals, tangents):
+    (leaves, _), (rates, others) = primals, tangents
+    given = jax.tree.leaves((rates, others))
+    if not given:
+        return leaves, rates
+    # A sum of no terms: JAX takes what depends on no tangent for no derivative at all.
+    nothing = jnp.sum(jnp.ravel(given[0])[:0])
+    return leaves, [
+        jnp.zeros_like(x) + nothing.astype(x.dtype) if rate is None else rate
+        for x, rate in zip(leaves, rates, strict=True)
+    ]
+
+
 class ClosureConverted(eqx.Module):
     """A function with the arrays that it closes over, which are among its leaves.
 
