@@ -238,9 +238,9 @@ def gradients_of_an_ensemble_in_its_projected_starts():
         sol = run(sleigh, TWO, y0=y0, saveat=SaveAt(steps=True))
         return jnp.sum(sol.ys.q)
 
+    one = jax.jit(jax.grad(loss))(sleigh.q0)
     for engine in ("kernels", "lanes"):
         os.environ["NHJAX_ENGINE"] = engine
-        one = jax.jit(jax.grad(loss))(sleigh.q0)
         many = jax.jit(jax.vmap(jax.grad(loss)))(jnp.stack([sleigh.q0] * 40))
         close(many, jnp.broadcast_to(one, many.shape))
         jax.clear_caches()
