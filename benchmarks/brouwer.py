@@ -9,6 +9,8 @@ import argparse
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.flatten_util import ravel_pytree
+from jaxtyping import Array, PyTree
 
 import nhjax
 from nhjax import systems
@@ -18,18 +20,42 @@ from nhjax.systems._base import AbstractExample
 from ._report import markdown_table, number, write
 
 
+Problem = tuple[nhjax.LagrangianSystem, PyTree[Array], Array]
+
+
+def in_coordinates(example: AbstractExample) -> Problem:
+    """Return the system of an example with its initial position and velocity."""
+    return example.system, example.q0, example.v0
+
+
+def with_a_heading_on_a_circle(disc: systems.VerticalRollingDisc) -> Problem:
+    """Return the disc on R^3 x SO(2): with the exponential map its steps are the same.
+
+    Whoever models it on R^4 does not say that one of the coordinates is an angle.
+    """
+    system = nhjax.LagrangianSystem(
+        lambda t, q, v, args: disc.lagrangian(t, jnp.concatenate(q), v, args),
+        nonholonomic=lambda t, q, v, args: disc.constraint(
+            t, jnp.concatenate(q), v, args
+        ),
+        manifold=nhjax.ProductGroup(nhjax.Euclidean(3), nhjax.SO2(nhjax.Exponential())),
+    )
+    return system, (disc.q0[:3], disc.q0[3:]), disc.v0
+
+
 def energy_rms(
-    example: AbstractExample,
+    problem: Problem,
     method: AbstractMethod,
     dt: float,
     counts: list[int],
     members: int,
 ) -> np.ndarray:
     """Root mean square over the ensemble of (E_k - E_0)/E_0 after each of `counts`."""
-    system = example.system
-    noise = np.random.default_rng(0).uniform(-0.1, 0.1, (2, members, len(example.q0)))
-    q0 = example.q0 + jnp.asarray(noise[0])
-    v0 = example.v0 * (1 + jnp.asarray(noise[1]))
+    system, q0, v0 = problem
+    flat, unravel = ravel_pytree(q0)
+    noise = np.random.default_rng(0).uniform(-0.1, 0.1, (2, members, len(flat)))
+    q0 = jax.vmap(unravel)(flat + jnp.asarray(noise[0]))
+    v0 = v0 * (1 + jnp.asarray(noise[1]))
     stride = counts[0]
 
     @jax.jit
@@ -62,18 +88,25 @@ def main() -> None:
     jax.config.update("jax_enable_x64", True)
     counts = [64 * 2**k for k in range(options.doublings)]
     lobatto = nhjax.LobattoIIIAB
+    oscillator = in_coordinates(systems.HarmonicOscillator())
+    particle = in_coordinates(systems.NonholonomicParticle())
+    disc = systems.VerticalRollingDisc()
+    on_circle = with_a_heading_on_a_circle(disc)
     cases = [
-        ("harmonic oscillator", systems.HarmonicOscillator(), lobatto(6), 0.1),
-        ("harmonic oscillator", systems.HarmonicOscillator(), nhjax.Gauss(5), 0.1),
-        ("particle", systems.NonholonomicParticle(), lobatto(6), 0.1),
-        ("particle", systems.NonholonomicParticle(), lobatto(6, "propagated"), 0.1),
-        ("rolling disc", systems.VerticalRollingDisc(), lobatto(5), 0.1),
+        ("harmonic oscillator", oscillator, lobatto(6), 0.1),
+        ("harmonic oscillator", oscillator, nhjax.Gauss(5), 0.1),
+        ("particle", particle, lobatto(6), 0.1),
+        ("particle", particle, lobatto(6, "propagated"), 0.1),
+        ("rolling disc on R^4", in_coordinates(disc), lobatto(5), 0.1),
+        ("rolling disc, heading on SO(2)", on_circle, lobatto(5), 0.1),
+        ("unicycle on SE(2)", in_coordinates(systems.Unicycle()), lobatto(6), 0.1),
     ]
     rows, data = [], []
-    for name, example, method, dt in cases:
-        rms = energy_rms(example, method, dt, counts, options.members)
+    for name, problem, method, dt in cases:
+        rms = energy_rms(problem, method, dt, counts, options.members)
         slope = float(np.polyfit(np.log(counts[2:]), np.log(rms[2:]), 1)[0])
-        label = f"{type(method).__name__}({method.stages}), {method.closure}"
+        label = f"{type(method).__name__}({method.stages})"
+        label += f", {method.closure}" if method.closure else ""
         rows.append([name, label, f"{slope:.2f}"])
         rows[-1] += [number(x) for x in rms[[0, len(rms) // 2, -1]]]
         data.append(

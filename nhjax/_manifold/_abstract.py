@@ -102,6 +102,15 @@ class AbstractLieGroup(eqx.Module):
         """Return the compensation to start `advance` from, which is zero."""
         return jax.tree.map(jnp.zeros_like, q)
 
+    def wrapped(self, q: Element, compensation: Element) -> Element:
+        """Return g as functions on the group are given it by a step.
+
+        An angle that has grown over many turns is replaced by the one of the first turn
+        that means the same, which holds more of its digits; to these the compensation
+        adds what `advance` could not.
+        """
+        return q
+
     def advance(
         self, q: Element, xi: Vector, compensation: Element
     ) -> tuple[Element, Element]:

@@ -1,5 +1,6 @@
 from collections.abc import Callable
 from functools import reduce
+from itertools import accumulate
 from typing import Any
 
 import equinox as eqx
@@ -79,9 +80,8 @@ class ProductGroup(AbstractLieGroup):
 
     def in_chart(self, xi: Vector) -> BoolScalar:
         """Tell whether the vector of every factor lies in that factor's chart."""
-        return reduce(
-            jnp.logical_and, self._each(lambda group, x: group.in_chart(x), xi)
-        )
+        inside = self._each(lambda group, x: group.in_chart(x), xi)
+        return reduce(jnp.logical_and, inside)
 
     def distance_to_group(self, q: Element) -> FloatScalar:
         """Compute the largest distance of a part of `q` to its factor."""
@@ -116,6 +116,10 @@ class ProductGroup(AbstractLieGroup):
     def no_compensation(self, q: Element) -> Element:
         """Return the tuple of the compensations to start `advance` from."""
         return self._tuple(lambda group, g: group.no_compensation(g), q)
+
+    def wrapped(self, q: Element, compensation: Element) -> Element:
+        """Wrap the part of every factor."""
+        return self._tuple(lambda group, *of: group.wrapped(*of), q, compensation)
 
     def advance(
         self, q: Element, xi: Vector, compensation: Element
@@ -210,9 +214,6 @@ class ProductGroup(AbstractLieGroup):
     def _vector(self, function, *arguments) -> Vector:
         return jnp.concatenate(self._each(function, *arguments))
 
-    def _split(self, vector):
-        parts, start = [], 0
-        for group in self.factors:
-            parts.append(vector[start : start + group.dim])
-            start += group.dim
-        return parts
+    def _split(self, vector: Vector) -> list[Vector]:
+        ends = accumulate(group.dim for group in self.factors)
+        return [vector[k - f.dim : k] for k, f in zip(ends, self.factors, strict=True)]

@@ -6,7 +6,7 @@ from .._numerics import two_sum
 from ._abstract import check_shape
 from ._homogeneous import homogeneous
 from ._motions import AbstractMotionGroup
-from ._plane import rotate, turn
+from ._plane import rotate, turn, wrapped_angle
 from ._retraction import AbstractRetraction, Cayley, check_retraction
 from ._so2 import SO2
 
@@ -19,7 +19,8 @@ class SE2(AbstractMotionGroup):
     """The group SE(2) of rigid motions of the plane, with elements (x, y, θ).
 
     The body velocity is (v1, v2, ω), with d(x, y)/dt = R(θ) (v1, v2) and dθ/dt = ω. The
-    angle is never wrapped to one turn, as on `SO2`.
+    angle is never wrapped to one turn, and the functions of a system must have the
+    period 2π in it, as on `SO2`.
 
     **Arguments:**
 
@@ -79,9 +80,14 @@ class SE2(AbstractMotionGroup):
         v = alpha * g[:2] - 0.5 * omega * turn(g[:2])
         return jnp.concatenate([v, rate])
 
+    def wrapped(self, q: Pose, compensation: Pose) -> Pose:
+        """Return the pose with the angle of the first turn, between -π and π."""
+        return jnp.concatenate([q[:2], wrapped_angle(q[2:], compensation[2:])])
+
     def advance(self, q: Pose, xi: Vector, compensation: Pose) -> tuple[Pose, Pose]:
         """Compute g τ(ξ) by compensated summation."""
-        return two_sum(q, self.tangent(q, self.retract(xi)) + compensation)
+        direction = self.wrapped(q, compensation)
+        return two_sum(q, self.tangent(direction, self.retract(xi)) + compensation)
 
     def matrix(self, g: Pose) -> Float[Array, "3 3"]:
         """Return the matrix of the motion in homogeneous coordinates."""

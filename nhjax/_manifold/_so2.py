@@ -4,7 +4,7 @@ from jaxtyping import Array, DTypeLike, Float
 from .._custom_types import BoolScalar
 from .._numerics import two_sum
 from ._abstract import AbstractLieGroup, check_shape
-from ._plane import turn
+from ._plane import turn, wrapped_angle
 from ._retraction import AbstractRetraction, Cayley, check_retraction, Exponential
 
 
@@ -16,9 +16,12 @@ class SO2(AbstractLieGroup):
     """The group SO(2) of rotations of the plane, with an angle θ for an element.
 
     The velocity is ω = dθ/dt. The angle is never wrapped to one turn, so that it counts
-    the turns: it is an array of shape (1,), as an element of `Euclidean(1)` is. With
-    `Exponential()` the two groups are the same; with `Cayley()` the retraction turns by
-    2 arctan(ω/2).
+    the turns: it is an array of shape (1,), as an element of `Euclidean(1)` is. Inside
+    of a step the functions of the system are given the angle of the first turn, whose
+    sine and cosine lose no digits after many turns: they must have the period 2π.
+
+    With `Exponential()` the group is else the same as `Euclidean(1)`; with `Cayley()`
+    the retraction turns by 2 arctan(ω/2).
 
     **Arguments:**
 
@@ -75,6 +78,10 @@ class SO2(AbstractLieGroup):
     def local(self, g: Angle) -> Vector:
         """Compute the ω for which τ(ω) has the angle θ."""
         return self.retraction.rate(g)
+
+    def wrapped(self, q: Angle, compensation: Angle) -> Angle:
+        """Return the angle of the first turn, between -π and π."""
+        return wrapped_angle(q, compensation)
 
     def advance(self, q: Angle, xi: Vector, compensation: Angle) -> tuple[Angle, Angle]:
         """Compute g τ(ω) by compensated summation."""

@@ -90,11 +90,12 @@ class AbstractChart(eqx.Module):
 
     @abstractmethod
     def advance(
-        self, compensation: PyTree[Array]
+        self, start: PyTree[Array], compensation: PyTree[Array]
     ) -> tuple[PyTree[Array], PyTree[Array]]:
         """Compute the end g_{k+1} of the step and the rounding error of the sum.
 
-        A compensated sum is a number and the rounding error it has accumulated.
+        A compensated sum is a number and the rounding error it has accumulated. The
+        `start` is g_k as it was before it was wrapped; see `AbstractLieGroup.wrapped`.
         """
 
     @abstractmethod
@@ -161,10 +162,10 @@ class FlatChart(AbstractChart):
         return momentum
 
     def advance(
-        self, compensation: PyTree[Array]
+        self, start: PyTree[Array], compensation: PyTree[Array]
     ) -> tuple[PyTree[Array], PyTree[Array]]:
         """Compute q_k + ξ by compensated summation."""
-        return self.manifold.advance(self.start, self.increment, compensation)
+        return self.manifold.advance(start, self.increment, compensation)
 
     def advance_momentum(
         self, momentum: Vector, gained: Vector, compensation: Vector

@@ -88,10 +88,10 @@ class StartChart(AbstractCurvedChart):
         return self.manifold.right_dtau_dual(self.increment, known) - chart_force
 
     def advance(
-        self, compensation: PyTree[Array]
+        self, start: PyTree[Array], compensation: PyTree[Array]
     ) -> tuple[PyTree[Array], PyTree[Array]]:
         """Compute g_k τ(ξ) by compensated summation."""
-        return self.manifold.advance(self.start, self.increment, compensation)
+        return self.manifold.advance(start, self.increment, compensation)
 
     def advance_momentum(
         self, momentum: Vector, gained: Vector, compensation: Vector
@@ -142,10 +142,10 @@ class MiddleChart(AbstractCurvedChart):
         return 0.5 * (start + end - chart_force)
 
     def advance(
-        self, compensation: PyTree[Array]
+        self, start: PyTree[Array], compensation: PyTree[Array]
     ) -> tuple[PyTree[Array], PyTree[Array]]:
         """Compute g_k τ(-ξ/2)⁻¹ τ(ξ/2) by compensated summation."""
-        return self.manifold.advance_across(self.start, self._half, compensation)
+        return self.manifold.advance_across(start, self._half, compensation)
 
     def advance_momentum(
         self, momentum: Vector, gained: Vector, compensation: Vector

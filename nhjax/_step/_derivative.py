@@ -134,7 +134,7 @@ def _stage_system(arguments: StepArguments, method: AbstractMethod) -> StageSyst
         method,
         arguments.t,
         arguments.h,
-        arguments.step_state.state,
+        arguments.step_state.wrapped(arguments.system),
         arguments.args,
         arguments.step_state.lin,
     )

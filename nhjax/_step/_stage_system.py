@@ -198,7 +198,7 @@ class StageSystem(eqx.Module):
 
     def end_position(self, x: Stages) -> PyTree[Array]:
         """Compute q_{k+1}."""
-        end, _ = self.chart(x).advance(self.manifold.no_compensation(self.q))
+        end, _ = self.chart(x).advance(self.q, self.manifold.no_compensation(self.q))
         return end
 
     def _in_chart(

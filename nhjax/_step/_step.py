@@ -1,5 +1,6 @@
 """One step of a method, and the data that is carried from step to step."""
 
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -49,6 +50,11 @@ class StepState(eqx.Module):
     q_compensation: PyTree[Array]
     p_compensation: Float[Array, " n"]
     lin: Linearisation
+
+    def wrapped(self, system: AbstractMechanicalSystem) -> State:
+        """Return the state with the angles of the first turn, with all their digits."""
+        q, manifold = self.state.q, system.manifold_of(self.state.q)
+        return replace(self.state, q=manifold.wrapped(q, self.q_compensation))
 
     def differentiated_in_state(self) -> "StepState":
         """Return the same data, differentiable with respect to the state alone.
@@ -151,21 +157,24 @@ def step(
     Where `skip` is true nothing is solved, and the outcome is to be discarded.
     """
     state, lin = step_state.state, step_state.lin
-    stages = StageSystem.at(system, method, t, h, state, args, lin)
+    start = step_state.wrapped(system)
+    stages = StageSystem.at(system, method, t, h, start, args, lin)
     x0 = starting_values(stages, system.fibre_coordinate(state), lin)
     solved = solver.solve(stages, x0, lin, skip)
     x, forces = solved.x, solved.aux.forces
 
     chart = stages.chart(x)
-    q, q_compensation = chart.advance(step_state.q_compensation)
+    q, q_compensation = chart.advance(state.q, step_state.q_compensation)
+    at_end = chart.manifold.wrapped(q, q_compensation)
     gained = h * small_einsum("s,sn->n", stages.coefficients("b"), forces.force)
     p, p_compensation = chart.advance_momentum(
         state.p, gained, step_state.p_compensation
     )
     u = p if stages.hamiltonian else x.node_fibre_coordinate[-1]
-    lin_next = linearise(system, t + h, q, u, args, may_be_sparse=True)
-    end = end_state(stages, q, u, p, forces.multiplier[-1], lambda: lin_next.multiplier)
-    next_state = StepState(end, q_compensation, p_compensation, lin_next)
+    lin_next = linearise(system, t + h, at_end, u, args, may_be_sparse=True)
+    last = forces.multiplier[-1]
+    end = end_state(stages, at_end, u, p, last, lambda: lin_next.multiplier)
+    next_state = StepState(replace(end, q=q), q_compensation, p_compensation, lin_next)
 
     result = _result(solved, lin, next_state, in_chart(stages, x))
     if stages.redundancy is not None:
@@ -184,7 +193,7 @@ def step(
         residual=relative(residual, scale),
         worst_coordinate=worst,
         constraint_violation=largest_violation(system, t + h, next_state, args),
-        multiplier_defect=max_norm(forces.multiplier[-1] - lin_next.multiplier),
+        multiplier_defect=max_norm(last - lin_next.multiplier),
         newton=solved.aux.newton,
     )
 
@@ -216,5 +225,5 @@ def largest_violation(
     system: AbstractMechanicalSystem, t: FloatScalar, step_state: StepState, args: Args
 ) -> FloatScalar:
     """Compute the largest violation of any constraint at a state."""
-    on_positions = system.position_constraint(t, step_state.state.q, args)
+    on_positions = system.position_constraint(t, step_state.wrapped(system).q, args)
     return max_norm(step_state.lin.violation, on_positions)

@@ -217,6 +217,32 @@ def test_advance_is_the_action():
         assert jax.tree.structure(compensation) == jax.tree.structure(q)
 
 
+@pytest.mark.parametrize(
+    ("dtype", "most_turns"), [(jnp.float64, 2**24), (jnp.float32, 2**12)]
+)
+def test_an_angle_of_many_turns_is_wrapped_without_loss(dtype, most_turns):
+    turns = np.random.default_rng(0).uniform(-most_turns, most_turns, 200)
+    angles = jnp.asarray(2 * np.pi * turns, dtype)[:, None]
+    compensations = jnp.asarray(np.linspace(-1e-9, 1e-9, 200), dtype)[:, None]
+    found = np.asarray(jax.vmap(SO2().wrapped)(angles, compensations))[:, 0]
+    with mp.workdps(50):
+        sums = [
+            mp.mpf(float(x)) + mp.mpf(float(c))
+            for x, c in zip(angles[:, 0], compensations[:, 0], strict=True)
+        ]
+        expected = np.array(
+            [float(x - 2 * mp.pi * mp.nint(x / 2 / mp.pi)) for x in sums]
+        )
+    difference = np.mod(found - expected + np.pi, 2 * np.pi) - np.pi
+    eps = float(jnp.finfo(dtype).eps)
+    assert np.max(np.abs(difference)) < 2 * np.pi * eps
+    assert np.max(np.abs(found)) < np.pi * (1 + 4 * eps)
+    poses = jax.vmap(SE2().wrapped)(
+        *(jnp.pad(x, ((0, 0), (2, 0))) for x in (angles, compensations))
+    )
+    np.testing.assert_array_equal(np.asarray(poses)[:, 2], found)
+
+
 # Form
 
 
