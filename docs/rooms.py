@@ -31,6 +31,7 @@ FLOORS = (
     ("_analysis",),
     ("_step",),
     ("_integrate",),
+    ("_files",),
     ("systems", "diagnostics", "plot", "studies", "__main__"),
 )
 ROOMS = tuple(room for floor in FLOORS for room in floor)
@@ -234,6 +235,7 @@ _COLUMNS = {
     "_analysis": 0.2,
     "_step": 2.4,
     "_integrate": 3.0,
+    "_files": 4.1,
     "systems": 0.0,
     "diagnostics": 1.8,
     "plot": 2.5,

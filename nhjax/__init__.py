@@ -22,10 +22,12 @@ from ._errors import (
     NonFiniteError as NonFiniteError,
     ShapeError as ShapeError,
 )
+from ._files import load as load, save as save
 from ._initial import initial_state as initial_state
 from ._integrate import (
     AbstractAdjoint as AbstractAdjoint,
     AbstractProgressMeter as AbstractProgressMeter,
+    Checkpoint as Checkpoint,
     DenseInterpolation as DenseInterpolation,
     DirectAdjoint as DirectAdjoint,
     integrate as integrate,

@@ -1,6 +1,9 @@
 """The ways in which a run can end, with messages that say what to do about each."""
 
+import functools
+
 import equinox as eqx
+import jax
 
 
 class RESULTS(eqx.Enumeration):
@@ -49,3 +52,30 @@ class RESULTS(eqx.Enumeration):
         "or its v and p do not belong together. Make `y0` with `nhjax.initial_state`, "
         "for the system, args and time of the integration."
     )
+
+
+@functools.cache
+def result_codes() -> dict[str, int]:
+    """Map the names of all `RESULTS` to the integers that stand for them in arrays."""
+    names = (
+        "successful",
+        "nonlinear_divergence",
+        "nonlinear_max_iterations",
+        "singular_stage_matrix",
+        "nonfinite_state",
+        "left_chart",
+        "lost_constraints",
+        "inconsistent_start",
+    )
+    # The items are arrays of JAX, while their codes are needed as Python's integers.
+    with jax.ensure_compile_time_eval():
+        return {name: int(getattr(RESULTS, name)._value) for name in names}
+
+
+@functools.cache
+def messages() -> list[str]:
+    """List the messages of `RESULTS` in the order of their codes."""
+    codes = result_codes()
+    with jax.ensure_compile_time_eval():
+        ordered = sorted(codes, key=lambda name: codes[name])
+        return [RESULTS[getattr(RESULTS, name)] for name in ordered]

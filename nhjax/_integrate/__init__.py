@@ -5,6 +5,7 @@ from ._adjoint import (
     DirectAdjoint as DirectAdjoint,
     RecursiveCheckpointAdjoint as RecursiveCheckpointAdjoint,
 )
+from ._checkpoint import Checkpoint as Checkpoint
 from ._integrate import integrate as integrate
 from ._interpolation import DenseInterpolation as DenseInterpolation
 from ._progress_meter import (

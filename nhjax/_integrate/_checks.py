@@ -16,7 +16,7 @@ from .._errors import Check, is_traced, ShapeError
 
 
 # Steps are counted in int32.
-_MOST_STEPS = 2**31 - 1
+MOST_STEPS = 2**31 - 1
 
 
 def check_num_steps(num_steps: Any, needed_by: str | None) -> int | IntScalar:
@@ -63,7 +63,7 @@ def _traced_count(num_steps: Array | np.ndarray, needed_by: str | None) -> IntSc
 
 
 def _require_count(num_steps: int) -> None:
-    if not 1 <= num_steps <= _MOST_STEPS:
+    if not 1 <= num_steps <= MOST_STEPS:
         raise _count_error(num_steps)
 
 
@@ -85,8 +85,8 @@ def countable(num_steps: int | IntScalar) -> list[Check]:
     if isinstance(num_steps, int) or not is_traced(num_steps):
         return []
     ok = num_steps >= 1
-    if jnp.iinfo(num_steps.dtype).max > _MOST_STEPS:
-        ok = ok & (num_steps <= _MOST_STEPS)
+    if jnp.iinfo(num_steps.dtype).max > MOST_STEPS:
+        ok = ok & (num_steps <= MOST_STEPS)
     return [Check(ok, _count_error, (num_steps,))]
 
 

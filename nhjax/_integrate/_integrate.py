@@ -13,7 +13,6 @@ from .._step import (
 from .._system import (
     AbstractMechanicalSystem,
     check_flag,
-    check_state,
     check_type,
     finite,
     HamiltonianSystem,
@@ -24,6 +23,7 @@ from .._system import (
     State,
 )
 from ._adjoint import AbstractAdjoint, DirectAdjoint
+from ._checkpoint import check_start, Checkpoint, countable_from, time_of
 from ._checks import (
     advancing,
     check_num_steps,
@@ -47,11 +47,11 @@ from ._solution import (
 def integrate(
     system: AbstractMechanicalSystem,
     method: AbstractMethod,
-    y0: State,
+    y0: State | Checkpoint,
     *,
     dt: FloatScalarLike,
     num_steps: int | IntScalar,
-    t0: FloatScalarLike = 0.0,
+    t0: FloatScalarLike | None = None,
     args: Args = None,
     saveat: SaveAt = SaveAt(t1=True),
     stage_solver: AbstractStageSolver = SimplifiedNewton(),
@@ -76,10 +76,11 @@ def integrate(
     - `method`: such as `nhjax.LobattoIIIAB(stages=3)`; `Gauss` only without
         constraints.
     - `y0`: a consistent state, from `nhjax.initial_state` or an earlier `Solution`. Its
-        multiplier matters to the propagated closure alone.
+        multiplier matters to the propagated closure alone. Or the `Checkpoint` of an
+        earlier run, to go on bit for bit as if that run had been longer.
     - `dt`: the step size, a scalar, in units of time; negative to go back.
     - `num_steps`: how many steps, an int >= 1; see below for arrays.
-    - `t0`: the time of `y0`.
+    - `t0`: the time of `y0`, 0 by default; a checkpoint has its own.
     - `args`: passed on to the functions of the system. Arrays and floats in it are
         traced, so that other values recompile nothing; anything else is static.
 
@@ -143,7 +144,7 @@ def integrate(
     """
     check_type("system", system, (LagrangianSystem, HamiltonianSystem))
     check_type("method", method, AbstractMethod, "Such as nhjax.LobattoIIIAB(3).")
-    check_type("y0", y0, State, "Make one with nhjax.initial_state.")
+    check_type("y0", y0, (State, Checkpoint), "Make one with nhjax.initial_state.")
     check_type("saveat", saveat, SaveAt, "Such as nhjax.SaveAt(t0=True, steps=True).")
     check_type(
         "stage_solver", stage_solver, AbstractStageSolver, "Such as nhjax.Newton()."
@@ -154,19 +155,9 @@ def integrate(
     needed_by = _what_needs_the_length(saveat, progress_meter)
     num_steps = check_num_steps(num_steps, needed_by)
     args = parameters(args)
-    check_state(system, y0, args)
-    dtype = y0.p.dtype
-    dt, t0 = real_scalar("dt", dt, dtype), real_scalar("t0", t0, dtype)
-    # All on dt, which is always used: jit drops a check of what is not.
-    dt = require(
-        dt,
-        finite("dt", dt),
-        finite("t0", t0),
-        Check(dt != 0, _zero_step),
-        *countable(num_steps),
-        advancing(t0, dt),
-    )
-    _check_method(method, y0, saveat)
+    state = check_start(system, y0, args)
+    t0, dt = _checked_times(y0, state, t0, dt, num_steps)
+    _check_method(method, state, saveat)
     saveat = saveat.within(t0, dt, num_steps)
     # A plain call has no use for a length that is known, but for one that changes.
     if not isinstance(num_steps, int) or (needed_by is None and not is_tracing()):
@@ -184,7 +175,7 @@ def integrate(
         sol = run_with(replace(stage_solver, fallback=True), NoProgressMeter())
     if not throw:
         return sol
-    _require_constraints(sol, system, t0, y0, args)
+    _require_constraints(sol, system, t0, state, args)
     return raise_failures(sol, dt)
 
 
@@ -198,6 +189,29 @@ def _require_constraints(
     """Raise for constraints that are dependent, if a plain run failed for them."""
     if not is_tracing() and is_singular_from_the_start(sol):
         require_independent(system, t0, y0, args)
+
+
+def _checked_times(
+    y0: State | Checkpoint,
+    state: State,
+    t0: FloatScalarLike | None,
+    dt: FloatScalarLike,
+    num_steps: int | IntScalar,
+) -> tuple[FloatScalar, FloatScalar]:
+    """Return the time of `y0` and the step size as arrays, if steps can be counted."""
+    dt = real_scalar("dt", dt, state.p.dtype)
+    t0 = real_scalar("t0", time_of(y0, t0), state.p.dtype)
+    # All on dt, which is always used: jit drops a check of what is not.
+    dt = require(
+        dt,
+        finite("dt", dt),
+        finite("t0", t0),
+        Check(dt != 0, _zero_step),
+        *countable(num_steps),
+        *countable_from(y0, num_steps),
+        advancing(t0, dt),
+    )
+    return t0, dt
 
 
 def _check_method(method: AbstractMethod, y0: State, saveat: SaveAt) -> None:

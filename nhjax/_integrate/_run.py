@@ -2,6 +2,7 @@
 
 from functools import partial
 
+import equinox as eqx
 import jax
 from jaxtyping import Array, Int, PyTree
 
@@ -13,14 +14,15 @@ from .._results import RESULTS
 from .._step import AbstractStageSolver, StepRecord
 from .._system import AbstractMechanicalSystem, closure_converted, State
 from ._adjoint import AbstractAdjoint
+from ._checkpoint import Checkpoint, start_of
 from ._checks import check_saved, known
 from ._interpolation import DenseInterpolation, interpolate, step_index
 from ._loop import Loop
 from ._progress_meter import AbstractProgressMeter
 from ._saveat import SaveAt, stack_saved
-from ._saving import record_places, Saving
+from ._saving import record_places, Rows, Saving
 from ._solution import Solution
-from ._stepping import Stepping
+from ._stepping import as_checkpoint, Carry, Stepping
 
 
 @tracked_jit("system", "args", "saveat")
@@ -29,7 +31,7 @@ def run(
     method: AbstractMethod,
     stage_solver: AbstractStageSolver,
     adjoint: AbstractAdjoint,
-    y0: State,
+    y0: State | Checkpoint,
     t0: FloatScalar,
     dt: FloatScalar,
     num_steps: int | IntScalar,
@@ -38,17 +40,18 @@ def run(
     meter: AbstractProgressMeter,
 ) -> Solution:
     """Integrate with arguments that have been checked, and return the solution."""
-    check_saved(saveat.fn, t0, y0, args)
+    state, origin = start_of(y0, t0, dt)
+    check_saved(saveat.fn, t0, state, args)
     # Arrays that the user's functions close over become leaves, for derivatives.
-    system = closure_converted(system, t0, y0, args)
-    stepping = Stepping(system, method, stage_solver, t0, dt, args, Programs())
+    system = closure_converted(system, t0, state, args)
+    stepping = Stepping(system, method, stage_solver, origin, dt, args, Programs())
     ts, sampled = saveat.ts, None
     if ts is not None:
         length = known(num_steps)
         sampled = jax.vmap(lambda t: step_index(t, t0, dt, length))(ts)
     places = record_places(saveat.dense, sampled, num_steps)
     saving = Saving(
-        fn=ClosureConverted(saveat.fn, t0, y0, args),
+        fn=ClosureConverted(saveat.fn, t0, state, args),
         num_steps=num_steps,
         stride=saveat.steps,
         num_saved=known(num_steps) // saveat.steps if saveat.steps else 0,
@@ -56,12 +59,8 @@ def run(
         record_slots=places.slots,
     )
 
-    def all_steps(loop: Loop, y0: State):
-        start = loop.stepping.start(y0)
-        return start.step_state.state, *adjoint.run(loop, loop.moving(start))
-
     loop = Loop(stepping, saving, meter)
-    start, carry, rows = as_cpu_kernel(all_steps, loop, y0)
+    start, carry, rows = _all_steps(adjoint, loop, y0, saveat.checkpoint)
     found, given = (carry.step_state.state, rows), (system, y0, t0, dt, args)
     successful = carry.result == RESULTS.successful
     end, rows = nan_gradient_unless(successful, found, given)
@@ -83,7 +82,31 @@ def run(
         interpolation = DenseInterpolation(
             system, method, known(num_steps), t0, dt, records, args
         )
-    return Solution(t0, t1, times, ys, carry.stats, carry.result, interpolation)
+    checkpoint = as_checkpoint(stepping, carry, end) if saveat.checkpoint else None
+    how = carry.stats, carry.result, interpolation, checkpoint
+    return Solution(t0, t1, times, ys, *how)
+
+
+def _all_steps(
+    adjoint: AbstractAdjoint, loop: Loop, y0: State | Checkpoint, checkpoint: bool
+) -> tuple[State, Carry, Rows]:
+    """Take all steps; return the first state, what is carried at the end, and rows."""
+
+    def start(loop: Loop, y0: State | Checkpoint):
+        return loop.stepping.start(y0)
+
+    def steps(loop: Loop, first: Carry):
+        return first.step_state.state, *adjoint.run(loop, loop.moving(first))
+
+    if not checkpoint and isinstance(y0, State):
+        return as_cpu_kernel(lambda loop, y0: steps(loop, start(loop, y0)), loop, y0)
+    # What a compiler knows of the start of a loop, such as zeros in the matrices there,
+    # changes how it rounds in the loop. Here it knows nothing, so that a run which goes
+    # on from another takes its steps by the same instructions.
+    first = as_cpu_kernel(start, loop, y0)
+    given, rest = eqx.partition((loop, first), eqx.is_array)
+    loop, first = eqx.combine(jax.lax.optimization_barrier(given), rest)
+    return as_cpu_kernel(steps, loop, first)
 
 
 def _one(saved: PyTree[Array]) -> PyTree[Array]:

@@ -36,6 +36,8 @@ class SaveAt(eqx.Module):
         `t1=True` the final state is saved too, but not twice.
     - `dense`: save the collocation polynomials for `Solution.evaluate`.
     - `fn`: save `fn(t, y, args)` instead of y.
+    - `checkpoint`: save as `Solution.checkpoint` what a later run needs to go on bit
+        for bit; see `nhjax.Checkpoint`.
 
     The output has exactly as many entries as are saved. Saving every k-th step
     (`steps=k`) and saving at given times (`ts`) need no buffer of the length of the
@@ -64,6 +66,7 @@ class SaveAt(eqx.Module):
     steps: int = eqx.field(static=True, default=0)
     dense: bool = eqx.field(static=True, default=False)
     fn: Callable[[Any, Any, Any], PyTree[Array]] = save_state
+    checkpoint: bool = eqx.field(static=True, default=False)
 
     def __init__(
         self,
@@ -74,8 +77,10 @@ class SaveAt(eqx.Module):
         steps: bool | int = False,
         dense: bool = False,
         fn: Callable[[Any, Any, Any], PyTree[Array]] = save_state,
+        checkpoint: bool = False,
     ):
-        for name, flag in (("t0", t0), ("t1", t1), ("dense", dense)):
+        flags = {"t0": t0, "t1": t1, "dense": dense, "checkpoint": checkpoint}
+        for name, flag in flags.items():
             if not isinstance(flag, bool):
                 raise ValueError(
                     f"SaveAt: `{name}` must be True or False, got {flag!r}; times "
@@ -85,10 +90,10 @@ class SaveAt(eqx.Module):
             raise ValueError(
                 f"SaveAt: `steps` must be a bool or an int >= 1, got {steps!r}."
             )
-        if not (t0 or t1 or dense or steps or ts is not None):
+        if not (t0 or t1 or dense or steps or checkpoint or ts is not None):
             raise ValueError(
                 "SaveAt: nothing is saved. Ask for some of `t0`, `t1`, `ts`, `steps`, "
-                "`dense`."
+                "`dense`, `checkpoint`."
             )
         if ts is not None and steps:
             raise ValueError(
@@ -100,6 +105,7 @@ class SaveAt(eqx.Module):
                 f"SaveAt: `fn` must be a function (t, y, args), got {fn!r}."
             )
         self.t0, self.t1, self.dense, self.fn = t0, t1, dense, fn
+        self.checkpoint = checkpoint
         self.steps = int(steps)
         self.ts = None if ts is None else _times(ts)
 
@@ -107,7 +113,7 @@ class SaveAt(eqx.Module):
         self, t0: FloatScalar, dt: FloatScalar, num_steps: int | IntScalar
     ) -> "SaveAt":
         """Check the options against a run; return them with `ts` in the run's dtype."""
-        if self.num_saved(num_steps) == 0 and not self.dense:
+        if self.num_saved(num_steps) == 0 and not (self.dense or self.checkpoint):
             raise ValueError(
                 f"SaveAt: `steps={self.steps}` saves nothing in a run of {num_steps} "
                 "steps. Add `t1=True`."

@@ -1,14 +1,12 @@
-import functools
 from typing import Any, NamedTuple
 
 import equinox as eqx
-import jax
 import numpy as np
 from jaxtyping import Array, Float, PyTree
 
 from .._custom_types import FloatScalarLike
 from .._errors import IntegrationError, is_traced, lane_name, raise_where
-from .._results import RESULTS
+from .._results import messages, RESULTS
 from .._system import State
 from ._interpolation import DenseInterpolation
 
@@ -18,7 +16,7 @@ class Solution(eqx.Module):
 
     - `t0`, `t1`: the first and the last time of the run.
     - `ts`: the times at which output was saved, of shape (k,); None if only dense
-        output was.
+        output or a checkpoint was.
     - `ys`: the saved states, a `State` with a leading axis of length k, or what
         `SaveAt(fn=...)` returned, stacked along such an axis; None where `ts` is.
     - `stats`: a dictionary of numbers about the run:
@@ -41,6 +39,8 @@ class Solution(eqx.Module):
     - `result`: a member of `nhjax.RESULTS`, which says how the run ended.
     - `interpolation`: the collocation polynomials, with `SaveAt(dense=True)`; None
         without.
+    - `checkpoint`: what a later run needs to go on bit for bit, with
+        `SaveAt(checkpoint=True)`; None without.
 
     Under `vmap` every array has the batch as its leading axis; a member of the batch is
     called a lane.
@@ -54,6 +54,8 @@ class Solution(eqx.Module):
     stats: dict[str, Any]
     result: RESULTS
     interpolation: DenseInterpolation | None
+    # A `Checkpoint`, or None.
+    checkpoint: Any = None
 
     def evaluate(self, t: FloatScalarLike) -> State:
         """Compute the state at any time of the run, by the collocation polynomials.
@@ -144,7 +146,7 @@ def raise_failures(sol: Solution, dt: FloatScalarLike | None = None) -> Solution
     With the size `dt` of the steps, the message says which to try.
     """
     outcome = _outcome(sol)
-    bad = outcome.codes != _messages().index("")
+    bad = outcome.codes != messages().index("")
     if is_traced(*outcome, dt):
         return raise_where(sol, bad, _failure, (outcome, dt))
     if np.any(bad):
@@ -163,9 +165,9 @@ def _failures(
     outcome: _Outcome,
 ) -> list[tuple[int | tuple[int, ...] | None, int, str]]:
     codes, steps, coordinates = map(np.asarray, outcome)
-    messages, failures = _messages(), []
+    texts, failures = messages(), []
     for index in np.ndindex(codes.shape):
-        message, coordinate = messages[int(codes[index])], int(coordinates[index])
+        message, coordinate = texts[int(codes[index])], int(coordinates[index])
         # Other failures are not those of single equations.
         if "stage equations" in message and coordinate >= 0:
             message += (
@@ -189,21 +191,3 @@ def _failure_message(
         f"Integration failed in {where}step {k}{others}: {reason} "
         "With `throw=False` the part before the failure is returned."
     )
-
-
-@functools.cache
-def _messages() -> list[str]:
-    """List the messages of `RESULTS` in the order of their integer codes."""
-    # The items are arrays of JAX, while their codes are needed as Python's integers.
-    items = [
-        RESULTS.successful,
-        RESULTS.nonlinear_divergence,
-        RESULTS.nonlinear_max_iterations,
-        RESULTS.singular_stage_matrix,
-        RESULTS.nonfinite_state,
-        RESULTS.left_chart,
-        RESULTS.lost_constraints,
-        RESULTS.inconsistent_start,
-    ]
-    with jax.ensure_compile_time_eval():
-        return [RESULTS[item] for item in sorted(items, key=lambda x: int(x._value))]

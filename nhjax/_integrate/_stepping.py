@@ -28,6 +28,7 @@ from .._system import (
     keeps_constraints,
     State,
 )
+from ._checkpoint import Checkpoint, Origin, resumed
 from ._statistics import first_statistics, Statistics, updated_statistics
 
 
@@ -53,25 +54,33 @@ class Stepping(eqx.Module):
     """The system, method and options of a run, with functions that take its steps.
 
     `programs` keeps the program of a step, which is the same for each way in which the
-    run is differentiated.
+    run is differentiated. The first step is number `origin.first_step` of those counted
+    from `origin.t0`.
     """
 
     system: AbstractMechanicalSystem
     method: AbstractMethod = eqx.field(static=True)
     stage_solver: AbstractStageSolver
-    t0: FloatScalar
+    origin: Origin
     dt: FloatScalar
     args: Args
     programs: Programs
 
     def time(self, k: Int[Array, ""] | int) -> FloatScalar:
         """Compute the time t_k as a product, since a running sum of dt would drift."""
-        return self.t0 + jnp.asarray(k, self.dt.dtype) * self.dt
+        t0, first_step, shift = self.origin
+        number = (first_step + k).astype(self.dt.dtype)
+        return t0 + number * self.dt + shift
 
-    def start(self, y0: State) -> Carry:
+    def start(self, y0: State | Checkpoint) -> Carry:
         """Make the carry of the time loop before the first step."""
-        system, t, args = self.system, self.t0, self.args
+        system, t, args = self.system, self.time(0), self.args
+        checkpoint = y0 if isinstance(y0, Checkpoint) else None
+        if isinstance(y0, Checkpoint):
+            y0 = y0.state
         step_state = first_step_state(system, self.method, t, y0, args)
+        if checkpoint is not None:
+            step_state = resumed(checkpoint, step_state)
         result = RESULTS.where(
             _is_consistent(system, t, step_state, args),
             RESULTS.successful,
@@ -126,6 +135,23 @@ class Stepping(eqx.Module):
         stats = updated_statistics(carry.stats, outcome, alive, good, k)
         carry = Carry(step_state, result, jax.lax.stop_gradient(stats))
         return carry, Taken(outcome.record, good)
+
+
+def as_checkpoint(stepping: Stepping, carry: Carry, end: State) -> Checkpoint:
+    """Make the checkpoint of what is carried after the last step, with the state `end`.
+
+    That is the last state with the derivatives that it is to have.
+    """
+    origin, last = stepping.origin, carry.step_state
+    return Checkpoint(
+        end,
+        last.q_compensation,
+        last.p_compensation,
+        tuple(jax.tree.leaves(last.lin)),
+        origin.t0 + origin.shift,
+        stepping.dt,
+        origin.first_step + carry.stats["num_steps"],
+    )
 
 
 def _is_consistent(

@@ -1,6 +1,7 @@
 """Every feature in brief, as a program of its own: each prints its name if it holds."""
 
 import os
+import tempfile
 from collections.abc import Callable
 from typing import Any
 
@@ -199,6 +200,18 @@ def saved_functions():
     energies = run(saveat=saveat).ys
     assert energies.shape == (6,)
     close(energies, jnp.full(6, energies[0]), 1e-5)
+
+
+@feature
+def a_run_that_is_resumed_from_a_file():
+    saveat = SaveAt(t1=True, checkpoint=True)
+    with tempfile.TemporaryDirectory() as folder:
+        half = run(num_steps=4, saveat=saveat)
+        nhjax.save(f"{folder}/half.npz", half.checkpoint)
+        resumed = nhjax.load(f"{folder}/half.npz")
+    rest = run(y0=resumed, num_steps=STEPS - 4, saveat=saveat)
+    close(rest.ys, run(saveat=saveat).ys, 0.0)
+    assert_exact(PARTICLE, rest)
 
 
 @feature

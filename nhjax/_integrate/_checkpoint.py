@@ -1,0 +1,199 @@
+"""What a run needs to go on from where another one ended, to the last bit."""
+
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int, PyTree
+
+from .._custom_types import Args, BoolScalar, FloatScalar, FloatScalarLike
+from .._errors import Check, is_traced, ShapeError
+from .._numerics import max_norm
+from .._step import StepState
+from .._system import (
+    AbstractMechanicalSystem,
+    check_state,
+    Linearisation,
+    State,
+)
+from ._checks import MOST_STEPS
+
+
+class Checkpoint(eqx.Module):
+    """All that a run carries from step to step, to go on from bit for bit.
+
+    A `State` alone is not enough for that: q and p are sums with compensation, whose
+    rounding errors are carried along; the times t_k = t0 + k dt are products, of which
+    another origin would give others; and the iteration on a step starts from what the
+    step before has linearised. Ask for one by `SaveAt(checkpoint=True)`, give it to
+    `integrate` in place of a state, and write it to a file by `nhjax.save`.
+
+    - `state`: the last state of the run; of one that failed the last good one.
+    - `q_compensation`, `p_compensation`: the rounding errors of the sums q and p.
+    - `linearisation`: the arrays of the linearised equations of motion at the state.
+    - `t0`: the time from which steps are counted, that of the first run.
+    - `dt`: the size of the steps.
+    - `num_steps`: how many steps have been taken since `t0`.
+
+    Under `vmap` every array has the batch as its leading axis. Derivatives pass through
+    `state`, `t0` and `dt`.
+
+    The same bits follow from the same instructions. A run in one piece is repeated by
+    runs in parts if all of them save checkpoints (but the last need not) and otherwise
+    the same things, with the same releases on the same machine; without that it is
+    repeated up to round-off. Samples by `SaveAt(ts=...)` and dense output count times
+    from the start of their own run.
+
+    !!! example
+
+        >>> import nhjax
+        >>> disc, method = nhjax.systems.VerticalRollingDisc(), nhjax.LobattoIIIAB(3)
+        >>> half = nhjax.integrate(disc.system, method, disc.initial_state(), dt=0.1,
+        ...     num_steps=50, saveat=nhjax.SaveAt(checkpoint=True))
+        >>> sol = nhjax.integrate(disc.system, method, half.checkpoint, dt=0.1,
+        ...     num_steps=50)
+        >>> whole = nhjax.integrate(disc.system, method, disc.initial_state(), dt=0.1,
+        ...     num_steps=100, saveat=nhjax.SaveAt(t1=True, checkpoint=True))
+        >>> bool((sol.ys.q == whole.ys.q).all())
+        True
+    """
+
+    state: State
+    q_compensation: PyTree[Array]
+    p_compensation: Float[Array, "*b n"]
+    linearisation: tuple[Array, ...]
+    t0: Float[Array, "*b"]
+    dt: Float[Array, "*b"]
+    num_steps: Int[Array, "*b"]
+
+    @property
+    def t(self) -> Float[Array, "*b"]:
+        """Return the time of the state, t0 + num_steps dt."""
+        return self.t0 + self.num_steps.astype(self.dt.dtype) * self.dt
+
+
+class Origin(NamedTuple):
+    """What the times t_k = t0 + (first_step + k) dt + shift of a run start from.
+
+    The shift is zero, unless steps have another size than those before a checkpoint.
+    """
+
+    t0: FloatScalar
+    first_step: Int[Array, ""]
+    shift: FloatScalar
+
+
+def start_of(
+    y0: State | Checkpoint, t0: FloatScalar, dt: FloatScalar
+) -> tuple[State, Origin]:
+    """Return the state of `y0`, and what the times of a run start from.
+
+    `t0` is the time of the state.
+    """
+    if isinstance(y0, State):
+        return y0, Origin(t0, jnp.zeros((), jnp.int32), jnp.zeros_like(dt))
+    shift = y0.num_steps.astype(dt.dtype) * (y0.dt - dt)
+    return y0.state, Origin(y0.t0, y0.num_steps, shift)
+
+
+def time_of(y0: State | Checkpoint, t0: FloatScalarLike | None) -> FloatScalarLike:
+    """Return the time of `y0`, where `t0` is the argument of the user."""
+    if isinstance(y0, State):
+        return 0.0 if t0 is None else t0
+    if t0 is not None:
+        raise ValueError(
+            "`t0` is given together with a checkpoint, which has its own time: leave "
+            "`t0` out, or go on from `y0.state` at another time."
+        )
+    return y0.t
+
+
+def check_start(
+    system: AbstractMechanicalSystem, y0: State | Checkpoint, args: Args
+) -> State:
+    """Return the state of `y0`, a state of this system or a checkpoint of a run of it.
+
+    Raise if it belongs to another system.
+    """
+    if isinstance(y0, State):
+        check_state(system, y0, args)
+        return y0
+    y = y0.state
+    check_state(system, y, args, "y0.state")
+    scalar = jax.ShapeDtypeStruct((), y.p.dtype)
+    expected = {
+        "q_compensation": system.manifold_of(y.q).no_compensation(y.q),
+        "p_compensation": y.p,
+        "t0": scalar,
+        "dt": scalar,
+        "num_steps": jax.ShapeDtypeStruct((), jnp.int32),
+    }
+    for name, like in expected.items():
+        _check_arrays(name, getattr(y0, name), like)
+    return y
+
+
+def _check_arrays(name: str, got: PyTree[Array], like: PyTree[Any]) -> None:
+    def kinds(tree):
+        return [(x.shape, str(x.dtype)) for x in jax.tree.leaves(tree)]
+
+    if kinds(got) != kinds(like):
+        raise ShapeError(
+            f"`y0.{name}` has arrays of (shape, dtype) {kinds(got)}, but "
+            f"{kinds(like)} is needed: the checkpoint belongs to another system, or "
+            "was changed. For many runs use `jax.vmap` over the checkpoint."
+        )
+
+
+def countable_from(y0: State | Checkpoint, num_steps: int | Array) -> list[Check]:
+    """Make the check that steps can be counted from the origin to the end of a run."""
+    if isinstance(y0, State):
+        return []
+    numbers = y0.num_steps, num_steps
+    numpy: Any = jnp if is_traced(*numbers) else np
+    first, number = (numpy.asarray(x, numpy.int32) for x in numbers)
+    ok = (first >= 0) & (first <= MOST_STEPS - number)
+    return [Check(ok, _too_many, (first, number))]
+
+
+def _too_many(first: np.ndarray, number: np.ndarray) -> ValueError:
+    return ValueError(
+        f"`y0.num_steps` = {first} and `num_steps` = {number} are more than 2^31 - 1 "
+        "steps together. Go on from `y0.state` at `t0=y0.t` instead."
+    )
+
+
+def resumed(y0: Checkpoint, fresh: StepState) -> StepState:
+    """Make the data that the first step of a resumed run starts from.
+
+    `fresh` are those that a run from the state alone would start from. Its
+    linearisation replaces that of the checkpoint where their matrices differ by more
+    than round-off: the run goes on with another system, or with other args.
+    """
+    new, structure = jax.tree.flatten(fresh.lin)
+    _check_arrays("linearisation", y0.linearisation, new)
+    old = jax.tree.unflatten(structure, y0.linearisation)
+    same = _agree(old, fresh.lin)
+    lin = jax.tree.map(lambda x, y: jnp.where(same, x, y), old, fresh.lin)
+    lin = jax.lax.stop_gradient(lin)
+    return StepState(y0.state, y0.q_compensation, y0.p_compensation, lin)
+
+
+def _agree(old: Linearisation, new: Linearisation) -> BoolScalar:
+    """Tell whether the matrices of two linearisations differ by round-off at most."""
+    pairs = [
+        pair
+        for name in ("metric_inverse", "jacobian", "reaction", "compliance_inverse")
+        for pair in zip(
+            jax.tree.leaves(getattr(old, name)),
+            jax.tree.leaves(getattr(new, name)),
+            strict=True,
+        )
+    ]
+    # An inverse is known to fewer digits the worse its condition. Within this bound the
+    # Jacobian serves as well as a fresh one.
+    small = float(jnp.finfo(pairs[0][0].dtype).eps) ** 0.25
+    close = [max_norm(x - y) <= small * (max_norm(x) + max_norm(y)) for x, y in pairs]
+    return jnp.all(jnp.stack(close))

@@ -1,0 +1,179 @@
+"""Files of states, solutions and checkpoints: what is read is what was written."""
+
+import dataclasses
+import json
+import subprocess
+import sys
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import nhjax
+from nhjax import LobattoIIIAB, SaveAt, systems
+
+
+BALL = systems.TurntableBall()
+
+
+@pytest.fixture(scope="module")
+def sol():
+    """A run on a product of groups, whose q is a tuple."""
+    saveat = SaveAt(steps=True, checkpoint=True, dense=True)
+    options = {"dt": 0.05, "num_steps": 4, "saveat": saveat}
+    run = nhjax.integrate(BALL.system, LobattoIIIAB(2), BALL.initial_state(), **options)
+    return run
+
+
+@pytest.fixture(scope="module")
+def saved(sol):
+    return dataclasses.replace(sol, interpolation=None)
+
+
+def assert_same(got, expected):
+    assert jax.tree.structure(got) == jax.tree.structure(expected)
+    pairs = zip(jax.tree.leaves(got), jax.tree.leaves(expected), strict=True)
+    for x, y in pairs:
+        assert np.asarray(x).dtype == np.asarray(y).dtype
+        assert np.asarray(x).tobytes() == np.asarray(y).tobytes()
+
+
+def test_a_tree_is_read_as_it_was_written(saved, tmp_path):
+    tree = {
+        "run": saved,
+        "start": (saved.checkpoint.state, [1, 2.5, True, None, "ω", float("-inf")]),
+        "numbers": {3: jnp.asarray([np.nan, -0.0, 1e-310])},
+        "small": jnp.float32(0.1),
+    }
+    nhjax.save(tmp_path / "all", tree)
+    got = nhjax.load(tmp_path / "all")
+    assert_same(got, tree)
+    assert got["start"][1] == tree["start"][1]
+    assert got["run"].result == nhjax.RESULTS.successful
+    # Nothing else is left in the folder.
+    assert [path.name for path in tmp_path.iterdir()] == ["all"]
+
+
+def test_numpy_reads_the_arrays_under_their_names(saved, tmp_path):
+    nhjax.save(tmp_path / "run.npz", saved)
+    with np.load(tmp_path / "run.npz", allow_pickle=False) as file:
+        np.testing.assert_array_equal(file["ys.q[1]"], saved.ys.q[1])
+        header = json.loads(file["nhjax"].tobytes())
+    assert header["format"] == 1
+    assert header["tree"]["kind"] == "Solution"
+
+
+def test_results_of_a_batch_go_by_their_names(saved, tmp_path):
+    path = tmp_path / "run.npz"
+    failed = nhjax.RESULTS.nonfinite_state
+    batch = jax.tree.map(lambda *x: jnp.stack(x), saved.result, failed)
+    nhjax.save(path, batch)
+    entries = dict(np.load(path))
+    header = json.loads(entries["nhjax"].tobytes())
+    # As if another release had counted them differently.
+    names = header["tree"]["names"]
+    order = sorted(names, reverse=True)
+    codes = {code: name for name, code in names.items()}
+    header["tree"]["names"] = {name: order.index(name) for name in order}
+    key = header["tree"]["codes"]["name"]
+    entries[key] = np.array([order.index(codes[int(c)]) for c in entries[key]])
+    _write(path, header, entries)
+    assert [bool(x) for x in nhjax.load(path) == batch] == [True, True]
+
+
+def _write(path, header, entries):
+    text = np.frombuffer(json.dumps(header).encode(), np.uint8)
+    np.savez(path, **(entries | {"nhjax": text}))
+
+
+def test_single_precision_reads_no_float64(saved, tmp_path):
+    nhjax.save(tmp_path / "run.npz", saved.checkpoint)
+    program = f"import nhjax; nhjax.load({str(tmp_path / 'run.npz')!r})"
+    done = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, check=False
+    )
+    assert "`state.q[0]` has dtype float64 in the file, but JAX" in done.stderr
+    assert "jax_enable_x64" in done.stderr
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda file: file.write_bytes(b"nothing"), "is no file of `nhjax.save`"),
+        (lambda file: np.savez(file, q=np.ones(2)), "it has no entry 'nhjax'"),
+        (
+            lambda file: file.write_bytes(file.read_bytes()[:-100]),
+            "is no file of `nhjax.save`, or is damaged",
+        ),
+        (lambda file: _changed(file, format=2), "in format 2, .* formats up to 1"),
+        (
+            lambda file: _changed(file, tree={"kind": "Robot", "parts": {}}),
+            "names the kind 'Robot'",
+        ),
+        (
+            lambda file: _changed(file, tree={"kind": "State", "parts": {"w": _ONE}}),
+            "State has the parts w",
+        ),
+    ],
+)
+def test_what_is_no_file_of_ours_is_refused(change, message, saved, tmp_path):
+    path = tmp_path / "run.npz"
+    nhjax.save(path, saved.checkpoint.state)
+    change(path)
+    with pytest.raises(ValueError, match=message):
+        nhjax.load(path)
+
+
+_ONE = {"kind": "value", "value": 1}
+
+
+def _changed(path, **parts):
+    entries = dict(np.load(path))
+    header = json.loads(entries["nhjax"].tobytes()) | parts
+    _write(path, header, entries)
+
+
+def test_a_flipped_bit_is_found(saved, tmp_path):
+    path = tmp_path / "run.npz"
+    nhjax.save(path, saved.checkpoint.state)
+    data, q = bytearray(path.read_bytes()), np.asarray(saved.checkpoint.state.p)
+    data[bytes(data).index(q.tobytes())] ^= 1
+    path.write_bytes(data)
+    with pytest.raises(ValueError, match="damaged"):
+        nhjax.load(path)
+
+
+def test_what_cannot_be_saved_is_named(sol, tmp_path):
+    path = tmp_path / "run.npz"
+    wrong = {
+        "`interpolation` is the dense output of a run": sol,
+        r"(?s)`\['system'\]` is .* of type LagrangianSystem": {"system": BALL.system},
+        r"`\[0\]` is a key of random numbers": (jax.random.key(0),),
+        "has the key 1.5 of type float": {1.5: 1},
+        "has dtype bfloat16": jnp.ones(2, jnp.bfloat16),
+    }
+    for message, tree in wrong.items():
+        with pytest.raises(TypeError, match=message):
+            nhjax.save(path, tree)
+    with pytest.raises(TypeError, match="has no value yet"):
+        jax.jit(lambda x: nhjax.save(path, x))(jnp.ones(2))
+    assert not path.exists()
+    with pytest.raises(FileNotFoundError, match="no folder"):
+        nhjax.save(tmp_path / "nowhere" / "run.npz", 1)
+    with pytest.raises(FileNotFoundError, match="no file"):
+        nhjax.load(path)
+
+
+def test_a_save_that_fails_leaves_the_old_file_whole(tmp_path, monkeypatch):
+    path = tmp_path / "run.npz"
+    nhjax.save(path, 1)
+
+    def broken(*args, **kwargs):
+        raise OSError("the disc is full")
+
+    monkeypatch.setattr(np, "savez", broken)
+    with pytest.raises(OSError, match="full"):
+        nhjax.save(path, 2)
+    assert nhjax.load(path) == 1
+    assert [found.name for found in tmp_path.iterdir()] == ["run.npz"]
