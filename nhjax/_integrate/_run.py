@@ -83,7 +83,7 @@ def run(
             system, method, known(num_steps), t0, dt, records, args
         )
     checkpoint = as_checkpoint(stepping, carry, end) if saveat.checkpoint else None
-    how = carry.stats, carry.result, interpolation, checkpoint
+    how = carry.stats, carry.result, interpolation, checkpoint, system.coordinates
     return Solution(t0, t1, times, ys, *how)
 
 

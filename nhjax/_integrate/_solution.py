@@ -1,3 +1,4 @@
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -8,6 +9,7 @@ from .._custom_types import FloatScalarLike
 from .._errors import IntegrationError, is_traced, lane_name, raise_where
 from .._results import messages, RESULTS
 from .._system import State
+from ._dataset import to_dataset
 from ._interpolation import DenseInterpolation
 
 
@@ -41,6 +43,7 @@ class Solution(eqx.Module):
         without.
     - `checkpoint`: what a later run needs to go on bit for bit, with
         `SaveAt(checkpoint=True)`; None without.
+    - `coordinates`: the names of the coordinates, if the system has them.
 
     Under `vmap` every array has the batch as its leading axis; a member of the batch is
     called a lane.
@@ -56,6 +59,7 @@ class Solution(eqx.Module):
     interpolation: DenseInterpolation | None
     # A `Checkpoint`, or None.
     checkpoint: Any = None
+    coordinates: tuple[str, ...] | None = eqx.field(default=None, static=True)
 
     def evaluate(self, t: FloatScalarLike) -> State:
         """Compute the state at any time of the run, by the collocation polynomials.
@@ -94,6 +98,50 @@ class Solution(eqx.Module):
                 "`integrate` to be able to evaluate the solution between steps."
             )
         return self.interpolation.evaluate(t)
+
+    def to_xarray(
+        self,
+        *,
+        coordinates: Sequence[str] | None = None,
+        units: Mapping[str, str] | None = None,
+    ) -> Any:
+        """Make an `xarray.Dataset` of what was saved, with named axes.
+
+        Its variables are `q`, `v`, `p` and `multiplier`, with the dimensions `time`,
+        `coordinate` and `constraint`; on a group whose elements have more numbers than
+        it has dimensions `q_0` takes the place of the second, and on a product of
+        groups `q0`, `q1`, ... are the parts. What `SaveAt(fn=...)` returned is named by
+        the paths in its tree, and `value` if it is one array. Beside them are the
+        `stats` as `stats_num_steps` and so on, and `result`, the name of a member of
+        `nhjax.RESULTS`. For a batch `trajectory` comes first (of a batch of batches
+        `trajectory_0`, `trajectory_1`); if its members have different times, `time` has
+        no labels, and the times are in `t`.
+
+        **Arguments:**
+
+        - `coordinates`: the names of the n coordinates; those of the system by default.
+        - `units`: units by the name of a variable, of `time`, or of a coordinate. The
+            former go to the attribute `units`, the latter along the coordinates as
+            `unit`.
+
+        **Returns:** an `xarray.Dataset`.
+
+        **Raises:** `ImportError` without xarray (`pip install "nhjax[xarray]"`);
+        `RuntimeError` under `jit` and `vmap`; `ValueError` if nothing was saved, or for
+        names that do not fit.
+
+        !!! example
+
+            >>> import nhjax
+            >>> disc = nhjax.systems.VerticalRollingDisc()
+            >>> sol = nhjax.integrate(disc.system, nhjax.LobattoIIIAB(3),
+            ...     disc.initial_state(), dt=0.5, num_steps=4,
+            ...     saveat=nhjax.SaveAt(steps=True))
+            >>> data = sol.to_xarray(coordinates=("x", "y", "θ", "φ"))
+            >>> data.q.sel(coordinate="x", time=1.5).shape
+            ()
+        """
+        return to_dataset(self, coordinates, units or {})
 
     def failures(self) -> list[tuple[int | tuple[int, ...] | None, int, str]]:
         """List the runs that failed, each as (lane, step, reason).

@@ -15,7 +15,12 @@ from .._custom_types import (
     PositionFunction,
 )
 from .._manifold import AbstractLieGroup, Euclidean
-from ._signatures import check_constraints, check_manifold, check_signature
+from ._signatures import (
+    check_constraints,
+    check_coordinates,
+    check_manifold,
+    check_signature,
+)
 from ._state import check_time_and_state, State
 
 
@@ -33,6 +38,7 @@ class AbstractMechanicalSystem(eqx.Module):
     force: eqx.AbstractVar[PhaseFunction | None]
     manifold: eqx.AbstractVar[AbstractLieGroup | None]
     constraints: eqx.AbstractVar[Literal["independent", "redundant"]]
+    coordinates: eqx.AbstractVar[tuple[str, ...] | None]
 
     # The name of the function L or H that generates the motion, and the letter of the
     # fibre coordinate.
@@ -45,6 +51,7 @@ class AbstractMechanicalSystem(eqx.Module):
                 check_signature(self, name, arguments)
         check_constraints(self)
         check_manifold(self)
+        check_coordinates(self)
 
     @abstractmethod
     def momentum(

@@ -111,6 +111,11 @@ def check_state(
                 f"`{called}.{name}` has shape {shape}, but `{called}.q` needs "
                 f"({manifold.dim},). Use `initial_state`."
             )
+    if system.coordinates is not None and len(system.coordinates) != manifold.dim:
+        raise ShapeError(
+            f"The system has {len(system.coordinates)} names of coordinates, "
+            f"{system.coordinates}, but `{called}.q` needs {manifold.dim}."
+        )
     t = jnp.zeros((), y.v.dtype)
     u = system.fibre_coordinate(y)
     expected = eqx.filter_eval_shape(system.constraint, t, y.q, u, args).shape

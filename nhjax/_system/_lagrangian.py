@@ -53,6 +53,8 @@ class LagrangianSystem(AbstractMechanicalSystem):
         multipliers with the same reaction the result is then the one with the least
         Σ |λ_a B_a|², the sizes of the reactions of single constraints in the metric
         M⁻¹; it marks reactions as not unique. `docs/systems.md` has the details.
+    - `coordinates`: a tuple of the names of the n coordinates, for
+        `Solution.to_xarray`; None by default.
 
     !!! example
 
@@ -69,6 +71,9 @@ class LagrangianSystem(AbstractMechanicalSystem):
     manifold: AbstractLieGroup | None = eqx.field(default=None, kw_only=True)
     constraints: Literal["independent", "redundant"] = eqx.field(
         default="independent", kw_only=True, static=True
+    )
+    coordinates: tuple[str, ...] | None = eqx.field(
+        default=None, kw_only=True, static=True
     )
 
     generator: ClassVar[Literal["lagrangian", "hamiltonian"]] = "lagrangian"

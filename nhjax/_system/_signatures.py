@@ -40,6 +40,22 @@ def check_manifold(owner: Any) -> None:
         )
 
 
+def check_coordinates(owner: Any) -> None:
+    """Raise unless the names of the coordinates of `owner` are names, or None."""
+    names = owner.coordinates
+    if names is None:
+        return
+    if not isinstance(names, tuple) or not all(isinstance(x, str) for x in names):
+        raise TypeError(
+            f"{type(owner).__name__}: `coordinates` must be a tuple of names, got "
+            f"{names!r}."
+        )
+    if len(set(names)) != len(names):
+        raise ValueError(
+            f"{type(owner).__name__}: `coordinates` has a name twice: {names}."
+        )
+
+
 def _signature(function: Callable[..., Any]) -> inspect.Signature | None:
     """Find the signature by which a function is called, or None if it is not known.
 

@@ -215,6 +215,12 @@ def a_run_that_is_resumed_from_a_file():
 
 
 @feature
+def labelled_data():
+    data = run(saveat=SaveAt(steps=True)).to_xarray(coordinates=("x", "y", "z"))
+    assert data.q.sel(coordinate="z", time=DT * STEPS).shape == ()
+
+
+@feature
 def batches():
     dts = jnp.array([0.1, 0.05, -0.1])
     batch = jax.jit(jax.vmap(lambda dt: run(dt=dt).ys))(dts)

@@ -1,0 +1,142 @@
+"""A solution as a labelled data set of xarray."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import jax
+import numpy as np
+
+from .._errors import is_traced
+from .._results import result_codes
+from .._system import State
+
+
+def to_dataset(
+    sol: Any, coordinates: Sequence[str] | None, units: Mapping[str, str]
+) -> Any:
+    """Make the data set; the method `Solution.to_xarray` says what is in it."""
+    xarray = _xarray()
+    if is_traced(*jax.tree.leaves(sol)):
+        raise RuntimeError(
+            "Solution.to_xarray() needs a computed solution, outside jit and vmap."
+        )
+    if sol.ts is None:
+        raise ValueError(
+            "Nothing was saved that has times: ask for some with `nhjax.SaveAt`, such "
+            "as `steps=True`."
+        )
+    batch = _batch_dims(np.ndim(sol.t1))
+    variables = _saved(sol.ys, (*batch, "time"))
+    for name, x in sol.stats.items():
+        variables[f"stats_{name}"] = (batch, np.asarray(x))
+    variables["result"] = (batch, _result_names(sol.result))
+    labels = _time(np.asarray(sol.ts), batch)
+    names = _coordinate_names(sol, coordinates, variables)
+    if names is not None:
+        labels["coordinate"] = ("coordinate", list(names))
+        here = [units.get(name, "") for name in names]
+        if any(here):
+            labels["unit"] = ("coordinate", here)
+    made = xarray.Dataset(variables, labels)
+    for name, unit in units.items():
+        if name in made.variables:
+            made[name].attrs["units"] = unit
+        elif names is None or name not in names:
+            known = [*made.variables, *(names or ())]
+            raise ValueError(
+                f"`units` has the name {name!r}, but the names here are: "
+                f"{', '.join(map(str, known))}."
+            )
+    return made
+
+
+def _xarray() -> Any:
+    try:
+        import xarray
+    except ImportError as error:
+        raise ImportError(
+            "Solution.to_xarray() needs xarray, an optional dependency: "
+            '`pip install "nhjax[xarray]"`.'
+        ) from error
+    return xarray
+
+
+def _batch_dims(number: int) -> tuple[str, ...]:
+    if number <= 1:
+        return ("trajectory",) * number
+    return tuple(f"trajectory_{i}" for i in range(number))
+
+
+def _time(ts: np.ndarray, batch: tuple[str, ...]) -> dict[str, Any]:
+    """Label times by their values, if all trajectories have the same."""
+    flat = ts.reshape(-1, ts.shape[-1])
+    if flat.shape[0] and np.all(flat == flat[:1]):
+        return {"time": ("time", flat[0])}
+    return {"t": ((*batch, "time"), ts)}
+
+
+def _result_names(result: Any) -> np.ndarray:
+    names = {code: name for name, code in result_codes().items()}
+    codes = np.asarray(result._value)
+    return np.array([names[int(code)] for code in codes.flat]).reshape(codes.shape)
+
+
+def _saved(ys: Any, dims: tuple[str, ...]) -> dict[str, Any]:
+    """Name the arrays of what was saved, and their axes after those of `dims`."""
+    if not isinstance(ys, State):
+        return _named(ys, dims, "value", None)
+    of = ys.v.shape[-1:]
+    made = _named(ys.q, dims, "q", of)
+    for name, x in (("v", ys.v), ("p", ys.p)):
+        made |= _named(x, dims, name, of)
+    return made | {"multiplier": ((*dims, "constraint"), np.asarray(ys.multiplier))}
+
+
+def _named(
+    tree: Any, dims: tuple[str, ...], root: str, coordinates: tuple[int, ...] | None
+) -> dict[str, Any]:
+    """Name the leaves of a tree by their paths, q0 and q1 for the parts of a tuple q.
+
+    The axis of an array that has as many components as there are `coordinates` is
+    called so.
+    """
+    made = {}
+    for path, leaf in jax.tree_util.tree_leaves_with_path(tree):
+        parts = [_part(key) for key in path]
+        name = "_".join(parts)
+        if coordinates is not None or not path:
+            name = root + name
+        elif parts[0].isdigit():
+            name = f"{root}{name}"
+        x = np.asarray(leaf)
+        shape = x.shape[len(dims) :]
+        inner = tuple(f"{name}_{i}" for i in range(len(shape)))
+        if shape == coordinates and not path:
+            inner = ("coordinate",)
+        made[name] = ((*dims, *inner), x)
+    return made
+
+
+def _part(key: Any) -> str:
+    """Write one step of a path into a tree: a key, a name or an index."""
+    for attribute in ("key", "name", "idx"):
+        if hasattr(key, attribute):
+            return str(getattr(key, attribute))
+    return str(key)
+
+
+def _coordinate_names(
+    sol: Any, given: Sequence[str] | None, variables: dict[str, Any]
+) -> tuple[str, ...] | None:
+    names = sol.coordinates if given is None else tuple(given)
+    sizes = [
+        x.shape[-1] for dims, x in variables.values() if dims[-1:] == ("coordinate",)
+    ]
+    if names is None or not sizes:
+        return None
+    if len(names) != sizes[0] or len(set(names)) != len(names):
+        raise ValueError(
+            f"`coordinates` has the names {names}, but {sizes[0]} different ones are "
+            "needed."
+        )
+    return names
