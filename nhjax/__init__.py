@@ -56,6 +56,7 @@ from ._method import (
     LobattoIIIAB as LobattoIIIAB,
     PartitionedRungeKutta as PartitionedRungeKutta,
 )
+from ._models import from_sympy as from_sympy, SymPyModel as SymPyModel
 from ._results import RESULTS as RESULTS
 from ._step import (
     AbstractStageSolver as AbstractStageSolver,

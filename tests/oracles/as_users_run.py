@@ -12,6 +12,8 @@ jax.config.update("jax_enable_x64", True)
 
 import jax.numpy as jnp  # noqa: E402
 import numpy as np  # noqa: E402
+import sympy  # noqa: E402
+from sympy.physics.mechanics import dynamicsymbols  # noqa: E402
 
 import nhjax  # noqa: E402
 from nhjax import LobattoIIIAB, SaveAt, systems  # noqa: E402
@@ -218,6 +220,21 @@ def a_run_that_is_resumed_from_a_file():
 def labelled_data():
     data = run(saveat=SaveAt(steps=True)).to_xarray(coordinates=("x", "y", "z"))
     assert data.q.sel(coordinate="z", time=DT * STEPS).shape == ()
+
+
+@feature
+def a_model_from_sympy():
+    x, y, _ = coordinates = dynamicsymbols("x y z")
+    speeds = [q.diff() for q in coordinates]
+    k = sympy.Symbol("k")
+    model = nhjax.from_sympy(
+        sum(u**2 for u in speeds) / 2 - k * (x**2 + y**2) / 2,
+        coordinates,
+        nonholonomic=speeds[2] - y * speeds[0],
+        parameters={k: 1.0},
+    )
+    y0 = model.initial_state(PARTICLE.q0, PARTICLE.v0)
+    assert_exact(PARTICLE, run(system=model.system, y0=y0, args=model.args))
 
 
 @feature

@@ -1,0 +1,122 @@
+"""What the first call of a model from SymPy costs, beside the same one written by hand.
+
+Time of the processor to trace, lower and compile a run with three stages and its
+gradient: of a particle with three coordinates, and of the bicycle of SymPy's tests with
+eight, each with its constraints. The hand-written ones are those of the gallery. Both
+are compiled in turn, and of each the least of several times counts.
+
+    python -m benchmarks.sympy_models
+"""
+
+import argparse
+import time
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+import nhjax
+from nhjax import systems
+
+from . import _sympy_models as sympy_models
+from ._report import markdown_table, write
+from .compile_time import compiled, program
+
+
+BOUND = 1.5
+SPEED = 5.0
+
+
+class Pair(NamedTuple):
+    """The same model by hand and from SymPy: systems with their starts."""
+
+    name: str
+    size: int
+    by_hand: tuple[Any, nhjax.State]
+    imported: tuple[Any, nhjax.State]
+    import_seconds: float
+
+
+def particles() -> Pair:
+    """The particle of the gallery."""
+    before = time.process_time()
+    model = sympy_models.particle()
+    importing = time.process_time() - before
+    example = systems.NonholonomicParticle()
+    by_hand = example.system, example.initial_state()
+    start = model.initial_state(example.q0, example.v0)
+    return Pair("particle", 3, by_hand, (_fixed(model), start), importing)
+
+
+def bicycles() -> Pair:
+    """The bicycle of Meijaard et al., upright."""
+    before = time.process_time()
+    model = sympy_models.bicycle()
+    importing = time.process_time() - before
+    riding = systems.WhippleBicycle.running(speed=SPEED)
+    by_hand = riding.system, riding.initial_state()
+    rolling = {"x": SPEED, "q3": SPEED / 0.3, "q6": SPEED / 0.35}
+    start = model.initial_state({}, rolling)
+    return Pair("bicycle", 8, by_hand, (_fixed(model), start), importing)
+
+
+def _fixed(model: nhjax.SymPyModel) -> nhjax.LagrangianSystem:
+    """The system of a model with its parameters, which `args` would be."""
+    system, args = model.system, model.args
+    force, holonomic, nonholonomic = system.force, system.holonomic, system.nonholonomic
+    assert force is None
+    assert nonholonomic is not None
+    return nhjax.LagrangianSystem(
+        lambda t, q, v, _: system.lagrangian(t, q, v, args),
+        nonholonomic=lambda t, q, v, _: nonholonomic(t, q, v, args),
+        holonomic=None if holonomic is None else lambda t, q, _: holonomic(t, q, args),
+    )
+
+
+def seconds(system: Any, y0: nhjax.State, kind: str) -> float:
+    """The seconds of the processor of a first call."""
+    _, parts = compiled(program(system, 3, kind), y0, jnp.asarray(0.05))
+    return sum(parts)
+
+
+def anew(system: Any, y0: nhjax.State, kind: str) -> float:
+    """The seconds of a first call that finds nothing compiled."""
+    jax.clear_caches()
+    return seconds(system, y0, kind)
+
+
+def main() -> None:
+    """Print and save the table."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--repeats", type=int, default=3)
+    parser.add_argument("--kinds", nargs="+", default=["run", "gradient"])
+    options = parser.parse_args()
+    jax.config.update("jax_enable_x64", True)
+    jax.jit(jnp.sin).lower(0.1).compile()
+    rows, data = [], []
+    for name, size, by_hand, imported, importing in (particles(), bicycles()):
+        for kind in options.kinds:
+            times = [
+                [anew(*model, kind) for model in (by_hand, imported)]
+                for _ in range(options.repeats)
+            ]
+            least = [min(column) for column in zip(*times, strict=True)]
+            ratio = least[1] / least[0]
+            row = [name, str(size), kind, *(f"{x:.2f}" for x in (*least, ratio))]
+            print(*row, sep="\t", flush=True)
+            rows.append([*row, f"{importing:.2f}"])
+            data.append(
+                {"model": name, "kind": kind, "seconds": times, "import": importing}
+            )
+    header = ["model", "n", "program", "by hand", "from SymPy", "ratio", "import"]
+    text = (
+        "Seconds of the processor, the least of each. The ratio is to be at most "
+        f"{BOUND}. The last column is what `from_sympy` itself takes, with the "
+        "derivation in SymPy.\n\n"
+    )
+    text += markdown_table(header, rows)
+    write("sympy_models", "First calls of models from SymPy", text, {"rows": data})
+
+
+if __name__ == "__main__":
+    main()

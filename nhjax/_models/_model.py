@@ -1,0 +1,118 @@
+"""The outcome of an import from SymPy: a system, its parameters and its names."""
+
+import math
+import numbers
+from collections.abc import Mapping
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from .._custom_types import Args, FloatScalarLike
+from .._errors import is_traced, ShapeError
+from .._initial import initial_state
+from .._system import LagrangianSystem, State
+
+
+class SymPyModel(eqx.Module):
+    """A model that `from_sympy` has imported.
+
+    - `system`: the system, whose `args` are a dictionary of the parameters by name.
+    - `args`: the values that were given for parameters.
+    - `coordinates`: the names of the coordinates, in the order of q.
+    - `parameters`: the names of all parameters.
+    """
+
+    system: LagrangianSystem
+    args: dict[str, Array]
+    coordinates: tuple[str, ...] = eqx.field(static=True)
+    parameters: tuple[str, ...] = eqx.field(static=True)
+
+    def initial_state(
+        self,
+        q: Mapping[Any, FloatScalarLike] | Float[Array, " n"],
+        v: Mapping[Any, FloatScalarLike] | Float[Array, " n"],
+        *,
+        t: FloatScalarLike = 0.0,
+        args: Args = None,
+        project: bool = False,
+    ) -> State:
+        """Make a consistent state, as `nhjax.initial_state` does.
+
+        **Arguments:**
+
+        - `q`, `v`: coordinates and velocities, as arrays, or as dictionaries by the
+            names of coordinates, or by the coordinates of SymPy themselves; those that
+            are left out are zero.
+        - `t`: the time.
+        - `args`: the parameters, those of the model by default.
+        - `project`: move the state to the constraints.
+
+        **Returns:** a `State`.
+
+        **Raises:** as `nhjax.initial_state`; `ValueError` for unknown names.
+        """
+        q, v = self._array("q", q), self._array("v", v)
+        args = self.args if args is None else args
+        return initial_state(self.system, q, v, t=t, args=args, project=project)
+
+    def _array(self, name: str, given: Any) -> Array:
+        if not isinstance(given, Mapping):
+            return given
+        values = {_name(key): value for key, value in given.items()}
+        unknown = [key for key in values if key not in self.coordinates]
+        if unknown:
+            raise ValueError(
+                f"`{name}` has {', '.join(unknown)}, but the coordinates are "
+                f"{', '.join(self.coordinates)}."
+            )
+        found = [values.get(key, 0.0) for key in self.coordinates]
+        return jnp.stack([jnp.asarray(x, jnp.result_type(float)) for x in found])
+
+
+def _name(key: Any) -> str:
+    """Return the name of a symbol, of a coordinate q(t), or of a name itself."""
+    if isinstance(key, str):
+        return key
+    return str(getattr(key, "func", key)) if getattr(key, "args", ()) else str(key)
+
+
+def parameter_defaults(
+    parameters: Mapping[Any, Any], known: tuple[str, ...]
+) -> dict[str, Array]:
+    """Return the values of parameters by name, as arrays that suit any precision."""
+    values = {}
+    for key, value in parameters.items():
+        name = _name(key)
+        if name not in known:
+            raise ValueError(
+                f"from_sympy: `parameters` has {name}, but the symbols of the model "
+                f"are {', '.join(known) or 'none'}."
+            )
+        if name in values:
+            raise ValueError(f"from_sympy: `parameters` has {name} twice.")
+        if not eqx.is_array_like(value):
+            # Such as a number of SymPy.
+            value = _number(name, value)
+        value = float(value) if isinstance(value, numbers.Real) else value
+        values[name] = jnp.asarray(value)
+        if values[name].shape != ():
+            raise ShapeError(
+                f"from_sympy: `parameters[{name!r}]` has shape {values[name].shape}, "
+                "but a parameter is a scalar; for several values use `jax.vmap` over "
+                "`args`."
+            )
+        if not is_traced(value) and not math.isfinite(np.asarray(value)):
+            raise ValueError(f"from_sympy: `parameters[{name!r}]` is {value}.")
+    return values
+
+
+def _number(name: str, value: Any) -> float:
+    try:
+        return float(value)
+    except (TypeError, ValueError):
+        raise TypeError(
+            f"from_sympy: `parameters[{name!r}]` must be a real number, got {value!r}."
+        ) from None

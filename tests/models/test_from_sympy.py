@@ -1,0 +1,312 @@
+"""Models written in SymPy: equations of motion, parameters, and what is refused."""
+
+import builtins
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import sympy
+from sympy import cos, sin
+from sympy.physics import mechanics
+from sympy.physics.mechanics import dynamicsymbols
+
+import nhjax
+from benchmarks import _sympy_models as sympy_models
+from nhjax import from_sympy, LobattoIIIAB, systems
+
+
+T = sympy.Symbol("t")
+X, Y, A = dynamicsymbols("x y a")
+DX, DY, DA = (q.diff() for q in (X, Y, A))
+M, K = sympy.symbols("m k")
+FREE = M * (DX**2 + DY**2) / 2
+
+
+def numbers(expression, model, y, acceleration):
+    """An expression of SymPy at a state, with an acceleration."""
+    symbols: list[Any] = [dynamicsymbols(name) for name in model.coordinates]
+    values = {}
+    for order, given in ((2, acceleration), (1, y.v), (0, y.q)):
+        values |= {
+            q.diff(T, order) if order else q: float(x)
+            for q, x in zip(symbols, given, strict=True)
+        }
+    values |= {sympy.Symbol(name): float(x) for name, x in model.args.items()}
+    # Derivatives first: the coordinates are parts of them.
+    for part in (2, 1, 0):
+        some = {
+            key: value
+            for key, value in values.items()
+            if getattr(key, "derivative_count", 0) == part
+        }
+        expression = expression.subs(some)
+    return np.array(expression.subs(T, 0.7).evalf(), float).reshape(-1)
+
+
+def test_a_lagranges_method_has_the_motion_of_its_own_equations():
+    """With both kinds of constraints, loads, an explicit time and a factor 1/2."""
+    z: Any = dynamicsymbols("z")
+    frame, point = mechanics.ReferenceFrame("N"), mechanics.Point("P")
+    velocity = DX * frame.x + DY * frame.y + z.diff() * frame.z
+    point.set_vel(frame, velocity)
+    lagrangian = M * velocity.dot(velocity) / 2 - K * X**2 * cos(T) - Y * z / 3
+    method = mechanics.LagrangesMethod(
+        lagrangian,
+        [X, Y, z],
+        forcelist=[(point, -K * (1 + Y**2) * velocity)],
+        frame=frame,
+        hol_coneqs=[X**2 + Y**2 - 1 - sin(T) / 5],
+        nonhol_coneqs=[z.diff() - Y * DX - T],
+    )
+    model = from_sympy(method, parameters={"m": 1.7, K: 0.4})
+    y = model.initial_state(
+        jnp.array([0.8, 0.6, 0.1]), jnp.array([0.1, 0.2, 0.3]), t=0.7, project=True
+    )
+    found = nhjax.motion(model.system, 0.7, y, model.args)
+    equations: Any = method.form_lagranges_equations()
+    names: Any = method.lam_vec
+    # There the holonomic ones come first, and multipliers have the other sign.
+    signed = [-found.multiplier[1], -found.multiplier[0]]
+    multipliers = dict(zip(names, map(float, signed), strict=True))
+    residual = numbers(equations.subs(multipliers), model, y, found.acceleration)
+    np.testing.assert_allclose(residual, 0, atol=1e-12)
+    slopes = numbers(method.coneqs.diff(T), model, y, found.acceleration)
+    np.testing.assert_allclose(slopes, 0, atol=1e-12)
+    values = numbers(method.coneqs, model, y, found.acceleration)
+    np.testing.assert_allclose(values, 0, atol=1e-13)
+
+
+def skate(**options):
+    """A skate for Kane's method: speeds forward, sideways and of its turn."""
+    forward, aside, turn = dynamicsymbols("u1 u2 u3")
+    frame = mechanics.ReferenceFrame("N")
+    body = frame.orientnew("B", "Axis", [A, frame.z])
+    origin, centre = mechanics.Point("O"), mechanics.Point("C")
+    origin.set_vel(frame, 0)
+    centre.set_pos(origin, X * frame.x + Y * frame.y)
+    body.set_ang_vel(frame, turn * frame.z)
+    velocity = forward * body.x + aside * body.y
+    ahead = centre.locatenew("G", body.x / 5)
+    centre.set_vel(frame, velocity)
+    ahead.v2pt_theory(centre, frame, body)
+    moments = mechanics.inertia(body, 0, 0, K), ahead
+    rigid = mechanics.RigidBody("skate", ahead, body, M, moments)
+    rates = [
+        forward - DX * cos(A) - DY * sin(A),
+        aside + DX * sin(A) - DY * cos(A),
+        turn - DA,
+    ]
+    method = mechanics.KanesMethod(
+        frame,
+        q_ind=[X, Y, A],
+        u_ind=[forward, turn],
+        u_dependent=[aside],
+        kd_eqs=rates,
+        velocity_constraints=[aside],
+        bodies=[rigid],
+        forcelist=[(centre, 3 * frame.x), (body, -turn * frame.z)],
+        **options,
+    )
+    return method, (forward, turn, aside)
+
+
+def test_a_kanes_method_has_the_motion_of_its_own_equations():
+    method, speeds = skate()
+    model = from_sympy(method, parameters={M: 1.3, K: 0.2})
+    y = model.initial_state(
+        {A: 0.3}, {"a": 1.5, X: 2 * np.cos(0.3), Y: 2 * np.sin(0.3)}
+    )
+    found = nhjax.motion(model.system, 0.0, y, model.args)
+    method.kanes_equations()
+    values = {A: 0.3, speeds[0]: 2.0, speeds[1]: 1.5, speeds[2]: 0.0, M: 1.3, K: 0.2}
+    rates = method.mass_matrix.subs(values).LUsolve(method.forcing.subs(values))
+    forward, turn, aside = np.array(rates, float).reshape(-1)
+    assert abs(aside) < 1e-15
+    expected = [
+        forward * np.cos(0.3) - 2 * 1.5 * np.sin(0.3),
+        forward * np.sin(0.3) + 2 * 1.5 * np.cos(0.3),
+        turn,
+    ]
+    np.testing.assert_allclose(found.acceleration, expected, rtol=1e-12)
+
+
+@pytest.fixture(scope="module")
+def particle():
+    return sympy_models.particle()
+
+
+def test_an_imported_particle_moves_as_that_of_the_gallery(particle):
+    example = systems.NonholonomicParticle()
+    options = {"dt": 0.1, "num_steps": 20}
+    ours = nhjax.integrate(
+        particle.system,
+        LobattoIIIAB(3),
+        particle.initial_state(example.q0, example.v0),
+        args=particle.args,
+        **options,
+    )
+    y0 = example.initial_state()
+    theirs = nhjax.integrate(example.system, LobattoIIIAB(3), y0, **options)
+    for got, expected in zip(
+        jax.tree.leaves(ours.ys), jax.tree.leaves(theirs.ys), strict=True
+    ):
+        np.testing.assert_allclose(got, expected, rtol=0, atol=1e-13)
+    assert ours.coordinates == ("x", "y", "z")
+
+
+def test_gradients_reach_the_parameters(particle):
+    y0 = particle.initial_state({"x": 1.0, "y": 0.5}, {"y": 1.0})
+
+    def end(k):
+        sol = nhjax.integrate(
+            particle.system, LobattoIIIAB(2), y0, dt=0.1, num_steps=3, args={"k": k}
+        )
+        return jnp.sum(sol.ys.q)
+
+    slope = jax.jit(jax.value_and_grad(end))
+    difference = (slope(1.0 + 1e-6)[0] - slope(1.0 - 1e-6)[0]) / 2e-6
+    np.testing.assert_allclose(slope(1.0)[1], difference, rtol=1e-8)
+
+
+def test_a_model_serves_both_precisions(particle):
+    q, v = jnp.ones(3, jnp.float32), jnp.zeros(3, jnp.float32)
+    y = particle.initial_state(q, v)
+    assert y.p.dtype == jnp.float32
+    assert nhjax.motion(particle.system, 0.0, y, particle.args).multiplier.shape == (1,)
+
+
+def test_values_at_run_time_are_refused_by_name(particle):
+    for args, message in (
+        (None, "with the parameters of the model, k, such as `args=model.args`"),
+        ({}, "`args` lacks k of the parameters"),
+        ({"k": 1.0, "g": 2.0}, "`args` has g, which is none of the parameters"),
+        ({"k": jnp.ones(2)}, r"`args\['k'\]` has shape \(2,\)"),
+    ):
+        with pytest.raises((ValueError, TypeError), match=message):
+            nhjax.initial_state(particle.system, jnp.ones(3), jnp.zeros(3), args=args)
+    with pytest.raises(ValueError, match="`q` has w, but the coordinates are x, y, z"):
+        particle.initial_state({"w": 1.0}, {})
+
+
+def test_forces_may_be_given_in_three_forms():
+    frame, point = mechanics.ReferenceFrame("N"), mechanics.Point("P")
+    point.set_vel(frame, DX * frame.x + DY * frame.y)
+    forms = (
+        ([-K * DX, 0], None),
+        ({X: -K * DX}, None),
+        ([(point, -K * DX * frame.x)], frame),
+    )
+    for forces, inertial in forms:
+        model = from_sympy(
+            FREE, [X, Y], forces=forces, frame=inertial, parameters={M: 2, K: 0.5}
+        )
+        y = model.initial_state({}, {X: 3.0})
+        found = nhjax.motion(model.system, 0.0, y, model.args).acceleration
+        np.testing.assert_allclose(found, [-0.75, 0.0], rtol=1e-15)
+
+
+def test_an_equation_and_a_derivative_of_a_product_are_read():
+    model = from_sympy(
+        FREE, [X, Y], nonholonomic=sympy.Eq((X * Y).diff(T, evaluate=False), 0)
+    )
+    zero = jnp.zeros(())
+    value = model.system.constraint(
+        zero, jnp.array([2.0, 3.0]), jnp.array([5.0, 7.0]), {"m": 1.0}
+    )
+    np.testing.assert_allclose(value, [29.0])
+
+
+OTHER = sympy.Function("f")
+WRONG = {
+    "`lagrangian` contains f\\(t\\), which is not among the coordinates": (
+        {"lagrangian": FREE + OTHER(T)}
+    ),
+    "contains Derivative\\(x\\(t\\), \\(t, 2\\)\\); .* not on accelerations": (
+        {"lagrangian": FREE + X.diff(T, 2)}
+    ),
+    "contains Derivative\\(a\\(t\\), t\\), the derivative of what is no coordinate": (
+        {"lagrangian": FREE + DA**2}
+    ),
+    "contains Integral\\(.*\\) \\(Integral\\), which SymPy's printer": (
+        {"lagrangian": FREE + sympy.Integral(sin(K**2 * Y), (K, 0, 1))}
+    ),
+    "contains besselj\\(1, x\\(t\\)\\) \\(besselj\\), which SymPy's printer": (
+        {"lagrangian": FREE + sympy.besselj(1, X)}
+    ),
+    "`lagrangian` contains the imaginary unit": {"lagrangian": FREE + sympy.I * X},
+    "the coordinate x is given twice": {"coordinates": [X, X]},
+    "the coordinate k is no function of time": {"coordinates": [X, K]},
+    "`coordinates` is empty": {"coordinates": []},
+    "`holonomic\\[1\\]`, k - 1, contains no coordinate": {"holonomic": [X, K - 1]},
+    "contains velocities: give it as `nonholonomic`": {"holonomic": DX},
+    "contains no velocity: give it as `holonomic`": {"nonholonomic": X},
+    "`forces` has 1 entries, but there are 2 coordinates": {"forces": [X]},
+    "`forces` has a\\(t\\), not among the coordinates": {"forces": {A: X}},
+    "`parameters` has q, but the symbols of the model are m": {"parameters": {"q": 1}},
+    "`parameters` has m twice": {"parameters": {"m": 1, M: 2}},
+    "`parameters\\['m'\\]` has shape \\(2,\\)": {"parameters": {"m": np.ones(2)}},
+    "`parameters\\['m'\\]` must be a real number": {"parameters": {"m": K}},
+    "`parameters\\['m'\\]` is nan": {"parameters": {"m": float("nan")}},
+    "two symbols of the name m": (
+        {"lagrangian": FREE + sympy.Symbol("m", positive=True) * X}
+    ),
+    "must be of scalar expressions of SymPy, got 'x' of type str": {"lagrangian": "x"},
+    "`potential` belongs to a KanesMethod": {"potential": X},
+    "need `frame`, the inertial ReferenceFrame": (
+        {"forces": [(mechanics.Point("P"), mechanics.ReferenceFrame("N").x)]}
+    ),
+}
+
+
+@pytest.mark.parametrize("message", WRONG)
+def test_what_cannot_be_imported_is_named(message):
+    given = {"lagrangian": FREE, "coordinates": [X, Y]} | WRONG[message]
+    with pytest.raises((ValueError, TypeError), match=message):
+        from_sympy(**given)
+
+
+def test_a_method_with_more_is_refused():
+    with pytest.raises(ValueError, match="`coordinates` is given together with a Kan"):
+        from_sympy(skate()[0], [X])
+
+
+def rolling_for_kane(speeds):
+    """A wheel on a line whose point of contact has the velocity zero."""
+    frame = mechanics.ReferenceFrame("N")
+    wheel = frame.orientnew("B", "Axis", [A, frame.y])
+    wheel.set_ang_vel(frame, speeds[0] * frame.y)
+    contact = mechanics.Point("contact")
+    contact.set_vel(frame, 0)
+    centre = contact.locatenew("centre", frame.z)
+    centre.v2pt_theory(contact, frame, wheel)
+    moments = mechanics.inertia(wheel, 0, K, 0), centre
+    return mechanics.KanesMethod(
+        frame,
+        q_ind=[A],
+        u_ind=speeds,
+        kd_eqs=[DA - speeds[0]],
+        bodies=[mechanics.RigidBody("wheel", centre, wheel, M, moments)],
+    )
+
+
+def test_energies_that_roll_already_are_refused():
+    u, w = dynamicsymbols("u w")
+    with pytest.raises(ValueError, match="centre relative to contact is not the rate"):
+        from_sympy(rolling_for_kane([u]))
+    with pytest.raises(ValueError, match=r"2 speeds \(u\(t\), w\(t\)\) for 1 coord"):
+        from_sympy(rolling_for_kane([u, w]))
+
+
+def test_without_sympy_the_extra_is_named(monkeypatch):
+    imported = builtins.__import__
+
+    def without(name, *args, **kwargs):
+        if name.startswith("sympy"):
+            raise ImportError(name)
+        return imported(name, *args, **kwargs)
+
+    monkeypatch.setattr(builtins, "__import__", without)
+    with pytest.raises(ImportError, match=r'pip install "nhjax\[sympy\]"'):
+        from_sympy(FREE, [X, Y])

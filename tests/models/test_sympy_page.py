@@ -1,0 +1,30 @@
+"""The page about SymPy keeps its word: its code runs as printed."""
+
+from pathlib import Path
+
+import numpy as np
+
+from oracles.pages import blocks
+
+
+PAGE = Path(__file__).parents[2] / "docs" / "sympy.md"
+
+
+def test_the_code_of_the_page_runs():
+    namespace = {}
+    for block in blocks(PAGE.read_text(encoding="utf-8")):
+        exec(compile(block, PAGE.name, "exec"), namespace)
+    sol, model = namespace["sol"], namespace["model"]
+    assert sol.coordinates == ("x", "y", "θ")
+    assert float(sol.stats["max_constraint_violation"]) < 1e-13
+    # Friction at the centre of mass takes energy.
+    energies = [
+        model.system.energy(0.0, y, model.args)
+        for y in (namespace["y0"], sol.ys.__class__(*(_last(sol.ys))))
+    ]
+    assert 0 < energies[1] < energies[0]
+    assert np.isfinite(energies[0])
+
+
+def _last(ys):
+    return [x[-1] for x in (ys.q, ys.v, ys.p, ys.multiplier)]
