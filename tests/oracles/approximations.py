@@ -7,24 +7,28 @@ is. `python tests/oracles/approximations.py` prints the module with the coeffici
 """
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import mpmath
 from mpmath import mp, mpf
 
 
+# Numbers of mpmath, whose class is an attribute of a context before mpmath 1.4.
+Real = Any
+
+
 class Approximation(NamedTuple):
     """A tail as a function of the polynomial's argument, its share, and where."""
 
-    tail: Callable[[mpf], mpf]
-    share: Callable[[mpf], mpf]
+    tail: Callable[[Real], Real]
+    share: Callable[[Real], Real]
     lower: float
     upper: float
     degree: int
     comment: str
 
 
-def _log_ratio(z: mpf) -> mpf:
+def _log_ratio(z: Real) -> Real:
     """Return artanh(s) / s for s = sqrt(z)."""
     s = mpmath.sqrt(z)
     return mpmath.atanh(s) / s
@@ -100,7 +104,7 @@ APPROXIMATIONS = {
 }  # fmt: skip
 
 
-def _erfc_argument(u: mpf) -> mpf:
+def _erfc_argument(u: Real) -> Real:
     return mpf(1 / (u + mpf(ERFC_CENTRE)) - 2)
 
 

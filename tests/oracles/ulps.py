@@ -6,6 +6,7 @@ function over that many arguments, and where it is.
 
 import sys
 from collections.abc import Callable
+from typing import Any
 
 import mpmath
 import numpy as np
@@ -15,11 +16,15 @@ from nhjax._lanes import library, SUPPORTED, symbol
 from oracles.native_lanes import Native
 
 
+# Numbers of mpmath, whose class is an attribute of a context before mpmath 1.4.
+Real = Any
+
+
 BINARY = ("atan2", "pow", "rem")
 # Digits for which all that cancels in the formulas below does not matter.
 BITS = 300
 
-_REFERENCES: dict[str, Callable[..., mpf]] = {
+_REFERENCES: dict[str, Callable[..., Real]] = {
     "cbrt": lambda x: mpmath.sign(x) * mpmath.cbrt(abs(x)),
     "exp2": lambda x: mpf(2) ** x,
     "logistic": lambda x: 1 / (1 + mpmath.exp(-x)),
@@ -28,14 +33,14 @@ _REFERENCES: dict[str, Callable[..., mpf]] = {
 }
 
 
-def reference(op: str, *arguments: float) -> mpf:
+def reference(op: str, *arguments: float) -> Real:
     """Return what a function is, to many digits."""
     function = _REFERENCES.get(op) or getattr(mpmath, op)
     # Products of powers of 2 may be of any size in mpmath.
     return function(*map(mpf, arguments))
 
 
-def error(got: float, exact: mpf, dtype: type) -> float:
+def error(got: float, exact: Real, dtype: type) -> float:
     """Return the error of a result in units of the last place of the exact one."""
     limits = np.finfo(dtype)
     largest, digits = mpf(float(limits.max)), limits.nmant
@@ -149,13 +154,13 @@ def arguments(op: str, seed: int, count: int, dtype: type) -> list[np.ndarray]:
         return [rng.permutation(_of_one(op, rng, count, dtype))]
 
 
-def exact_values(op: str, given: list[np.ndarray]) -> list[mpf]:
+def exact_values(op: str, given: list[np.ndarray]) -> list[Real]:
     """Return the values of a function to many digits."""
     with mp.workprec(2400 if op == "rem" else BITS):
         return [reference(op, *map(float, x)) for x in zip(*given, strict=True)]
 
 
-def errors(got: np.ndarray, exact: list[mpf]) -> np.ndarray:
+def errors(got: np.ndarray, exact: list[Real]) -> np.ndarray:
     """Return the errors of results in units of the last place."""
     dtype = got.dtype.type
     with mp.workprec(BITS):
