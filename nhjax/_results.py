@@ -52,6 +52,13 @@ class RESULTS(eqx.Enumeration):
         "or its v and p do not belong together. Make `y0` with `nhjax.initial_state`, "
         "for the system, args and time of the integration."
     )
+    not_conserved = (
+        "The system does not conserve what `invariants` asks for: its rate of change "
+        "along the motion is not zero at the start, or at a state near it. Reactions "
+        "of affine, rheonomic and other constraints that are not homogeneous in the "
+        "velocities do work, as forces do; what such a system conserves, if anything, "
+        "such as a moving energy, can be given as a function."
+    )
 
 
 @functools.cache
@@ -66,6 +73,7 @@ def result_codes() -> dict[str, int]:
         "left_chart",
         "lost_constraints",
         "inconsistent_start",
+        "not_conserved",
     )
     # The items are arrays of JAX, while their codes are needed as Python's integers.
     with jax.ensure_compile_time_eval():

@@ -1,8 +1,15 @@
 from dataclasses import replace
+from typing import Literal
 
 import jax.numpy as jnp
 
-from .._custom_types import Args, FloatScalar, FloatScalarLike, IntScalar
+from .._custom_types import (
+    Args,
+    FloatScalar,
+    FloatScalarLike,
+    IntScalar,
+    PhaseFunction,
+)
 from .._errors import Check, require
 from .._method import AbstractMethod
 from .._step import (
@@ -58,6 +65,7 @@ def integrate(
     adjoint: AbstractAdjoint = DirectAdjoint(),
     throw: bool = True,
     progress_meter: AbstractProgressMeter = NoProgressMeter(),
+    invariants: Literal["energy"] | PhaseFunction | None = None,
 ) -> Solution:
     """Integrate a mechanical system over `num_steps` steps of size `dt`.
 
@@ -96,6 +104,10 @@ def integrate(
         are NaN (zero where nothing depends on it). Other members of a batch are not
         touched.
     - `progress_meter`: such as `nhjax.TqdmProgressMeter()`.
+    - `invariants`: what the steps keep at its value in `y0` to round-off: `"energy"`,
+        or a function of (t, q, v, args), or of (t, q, p, args) of a Hamiltonian system,
+        of shape () or (k,), that the system conserves. `docs/invariants.md` says how,
+        what it costs and what it does at rest.
 
     **Returns:** a `Solution`.
 
@@ -166,7 +178,7 @@ def integrate(
     def run_with(
         stage_solver: AbstractStageSolver, meter: AbstractProgressMeter
     ) -> Solution:
-        given = (adjoint, y0, t0, dt, num_steps, args, saveat, meter)
+        given = (adjoint, y0, t0, dt, num_steps, args, saveat, meter, invariants)
         return run(system, method, stage_solver, *given)
 
     sol = run_with(stage_solver, progress_meter)

@@ -1,6 +1,8 @@
 """The compiled program of a run: its loop, what is saved of it, and the solution."""
 
+from collections.abc import Callable
 from functools import partial
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -16,6 +18,7 @@ from .._system import AbstractMechanicalSystem, closure_converted, State
 from ._adjoint import AbstractAdjoint
 from ._checkpoint import Checkpoint, start_of
 from ._checks import check_saved, known
+from ._conservation import kept_invariants
 from ._interpolation import DenseInterpolation, interpolate, step_index
 from ._loop import Loop
 from ._progress_meter import AbstractProgressMeter
@@ -25,7 +28,7 @@ from ._solution import Solution
 from ._stepping import as_checkpoint, Carry, Stepping
 
 
-@tracked_jit("system", "args", "saveat")
+@tracked_jit("system", "args", "saveat", "invariants")
 def run(
     system: AbstractMechanicalSystem,
     method: AbstractMethod,
@@ -38,13 +41,16 @@ def run(
     args: Args,
     saveat: SaveAt,
     meter: AbstractProgressMeter,
+    invariants: str | Callable[..., Any] | None,
 ) -> Solution:
     """Integrate with arguments that have been checked, and return the solution."""
     state, origin = start_of(y0, t0, dt)
     check_saved(saveat.fn, t0, state, args)
     # Arrays that the user's functions close over become leaves, for derivatives.
     system = closure_converted(system, t0, state, args)
-    stepping = Stepping(system, method, stage_solver, origin, dt, args, Programs())
+    kept = kept_invariants(invariants, system, t0, state, args)
+    given = system, method, stage_solver, origin, dt, args, kept, Programs()
+    stepping = Stepping(*given)
     ts, sampled = saveat.ts, None
     if ts is not None:
         length = known(num_steps)
@@ -62,8 +68,7 @@ def run(
     loop = Loop(stepping, saving, meter)
     start, carry, rows = _all_steps(adjoint, loop, y0, saveat.checkpoint)
     found, given = (carry.step_state.state, rows), (system, y0, t0, dt, args)
-    successful = carry.result == RESULTS.successful
-    end, rows = nan_gradient_unless(successful, found, given)
+    end, rows = nan_gradient_unless(carry.result == RESULTS.successful, found, given)
     t1 = stepping.time(num_steps)
 
     first = [_one(saving.saved(t0, start, args))] if saveat.t0 else []
@@ -72,8 +77,7 @@ def run(
         row = places.slots[sampled]
         records = jax.tree.map(lambda x: x[row], rows.record)
         on_the_way = [jax.vmap(partial(_sample, loop))(ts, sampled, records)]
-    ends = saveat.saves_end(num_steps)
-    last = [_one(saving.saved(t1, end, args))] if ends else []
+    last = [_one(saving.saved(t1, end, args))] if saveat.saves_end(num_steps) else []
     pieces = first + on_the_way + last
     times, ys = stack_saved(pieces) if pieces else (None, None)
     interpolation = None

@@ -34,6 +34,8 @@ class Solution(eqx.Module):
         included),
         `max_multiplier_defect` (the largest |Λ^s - λ_c|, the distance of the last stage
         multiplier of a step from the continuous multiplier),
+        `max_invariant_error` (with `invariants` alone: the largest |I - I_0| of a
+        function that is kept, relative to the size of its terms),
         `failed_step` (the index of the step that failed, -1 if none did), and
         `worst_coordinate` (the index of the coordinate whose momentum equations had
         the largest residual in the step that failed, or one that is not a number; -1

@@ -59,7 +59,12 @@ def updated_statistics(
         return jnp.where(good, jnp.maximum(stats[name], value), stats[name])
 
     failed = alive & ~good
-    return {
+    kept = {}
+    if outcome.invariant_error is not None:
+        kept["max_invariant_error"] = larger(
+            "max_invariant_error", outcome.invariant_error
+        )
+    return kept | {
         "num_steps": stats["num_steps"] + good.astype(jnp.int32),
         "num_iterations": stats["num_iterations"]
         + jnp.where(alive, outcome.num_iterations, 0),

@@ -1,8 +1,10 @@
 """The function `nhjax.step`, for users who write their own time loop."""
 
+from typing import Literal
+
 import jax
 
-from .._custom_types import Args, FloatScalarLike
+from .._custom_types import Args, FloatScalarLike, PhaseFunction
 from .._method import AbstractMethod
 from .._numerics import nan_unless
 from .._results import RESULTS
@@ -21,6 +23,7 @@ def step(
     *,
     stage_solver: AbstractStageSolver = SimplifiedNewton(),
     throw: bool = True,
+    invariants: Literal["energy"] | PhaseFunction | None = None,
 ) -> State:
     """Take one step of size `dt`, from the state `y` at `t` to the state at `t + dt`.
 
@@ -43,6 +46,7 @@ def step(
     - `stage_solver`: `nhjax.SimplifiedNewton()` by default, or `nhjax.Newton()`.
     - `throw`: raise if the step cannot be solved. Otherwise all numbers of the state
         that is returned are NaN.
+    - `invariants`: what the step keeps at its value in `y`, as for `nhjax.integrate`.
 
     **Returns:** the `State` at `t + dt`.
 
@@ -67,6 +71,7 @@ def step(
         args=args,
         stage_solver=stage_solver,
         throw=throw,
+        invariants=invariants,
     )
     end = jax.tree.map(lambda x: x[0], sol.ys)
     if throw:

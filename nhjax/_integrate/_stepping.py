@@ -15,6 +15,7 @@ from .._results import RESULTS
 from .._step import (
     AbstractStageSolver,
     first_step_state,
+    Invariants,
     largest_violation,
     primitive_step,
     StepArguments,
@@ -29,6 +30,7 @@ from .._system import (
     State,
 )
 from ._checkpoint import Checkpoint, Origin, resumed
+from ._conservation import conserves
 from ._statistics import first_statistics, Statistics, updated_statistics
 
 
@@ -64,6 +66,7 @@ class Stepping(eqx.Module):
     origin: Origin
     dt: FloatScalar
     args: Args
+    invariants: Invariants | None
     programs: Programs
 
     def time(self, k: Int[Array, ""] | int) -> FloatScalar:
@@ -93,10 +96,19 @@ class Stepping(eqx.Module):
                 RESULTS.singular_stage_matrix,
                 result,
             )
+        if self.invariants is not None:
+            given = self.invariants, t, self.dt, y0, args
+            result = RESULTS.where(
+                (result == RESULTS.successful) & ~conserves(system, *given),
+                RESULTS.not_conserved,
+                result,
+            )
         result = RESULTS.where(all_finite(y0), result, RESULTS.nonfinite_state)
         violation = largest_violation(system, t, step_state, args)
         redundant = step_state.lin.num_redundant
         stats = first_statistics(violation, redundant, result == RESULTS.successful)
+        if self.invariants is not None:
+            stats["max_invariant_error"] = jnp.zeros_like(violation)
         return Carry(step_state, result, stats)
 
     def one_step(
@@ -104,7 +116,7 @@ class Stepping(eqx.Module):
     ) -> StepOutcome:
         """Take one step of size h from t; h may be negative, to go back."""
         start = step_state.differentiated_in_state()
-        arguments = StepArguments(self.system, t, h, start, self.args)
+        arguments = StepArguments(self.system, t, h, start, self.args, self.invariants)
         given = arguments, self.method, self.stage_solver, skip, self.programs
         return primitive_step(*given)
 

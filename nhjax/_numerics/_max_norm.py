@@ -50,11 +50,13 @@ def largest_column(*arrays: Float[Array, "_ n"]) -> tuple[FloatScalar, Int[Array
     return value, column
 
 
-def unit(scale: FloatScalarLike) -> FloatScalar:
+def unit(scale: FloatScalarLike | Float[Array, "*k"]) -> Float[Array, "*k"]:
     """Return the unit in which sizes are measured: the scale, or one if it is zero."""
     return jnp.where(scale > 0, scale, 1)
 
 
-def relative(size: FloatScalar, scale: FloatScalarLike) -> FloatScalar:
+def relative(
+    size: Float[Array, "*k"], scale: FloatScalarLike | Float[Array, "*k"]
+) -> Float[Array, "*k"]:
     """Divide a size by the scale that it is measured in, or by one if that is zero."""
     return size / unit(scale)

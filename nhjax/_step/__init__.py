@@ -6,6 +6,10 @@ from ._derivative import (
     primitive_step as primitive_step,
     StepArguments as StepArguments,
 )
+from ._invariants import (
+    invariant_values as invariant_values,
+    Invariants as Invariants,
+)
 from ._newton import (
     AbstractStageSolver as AbstractStageSolver,
     leaves_steps_to_newton as leaves_steps_to_newton,

@@ -17,13 +17,14 @@ from .._numerics import (
 )
 from .._results import RESULTS
 from .._system import AbstractMechanicalSystem, linearise, State
-from ._end import end_state
+from ._end import end_state, step_record
+from ._invariants import Invariants
 from ._newton import AbstractStageSolver
 from ._record import StepRecord
 from ._stage_equations import stage_forces
 from ._stage_iteration import unknown_units
 from ._stage_system import StageSystem
-from ._step import step, StepOutcome, StepState
+from ._step import equations_of_step, step, StepOutcome, StepState
 from ._unknowns import Stages
 
 
@@ -31,6 +32,7 @@ class StepArguments(eqx.Module):
     """The arguments of a step with respect to which it can be differentiated.
 
     Of `step_state` this is the state alone; see `StepState.differentiated_in_state`.
+    Without `invariants` the step keeps none.
     """
 
     system: AbstractMechanicalSystem
@@ -38,6 +40,7 @@ class StepArguments(eqx.Module):
     h: FloatScalar
     step_state: StepState
     args: Args
+    invariants: Invariants | None
 
 
 @eqx.filter_custom_jvp
@@ -61,9 +64,8 @@ def differentiable_step(
     """
     del programs
     system, t, h = arguments.system, arguments.t, arguments.h
-    return step(
-        system, method, solver, t, h, arguments.step_state, arguments.args, skip
-    )
+    given = arguments.step_state, arguments.args, skip, arguments.invariants
+    return step(system, method, solver, t, h, *given)
 
 
 @differentiable_step.def_jvp
@@ -129,14 +131,14 @@ def primitive_step(
 
 
 def _stage_system(arguments: StepArguments, method: AbstractMethod) -> StageSystem:
-    return StageSystem.at(
+    return equations_of_step(
         arguments.system,
         method,
         arguments.t,
         arguments.h,
-        arguments.step_state.wrapped(arguments.system),
+        arguments.step_state,
         arguments.args,
-        arguments.step_state.lin,
+        arguments.invariants,
     )
 
 
@@ -164,5 +166,4 @@ def _end(
 
     end = end_state(stages, q, u, p, stages.multipliers(x)[-1], continuous)
     forces = stage_forces(stages, x)
-    record = StepRecord(start, x.velocity, forces.force, forces.multiplier)
-    return end, record
+    return end, step_record(stages, start, x, forces)

@@ -1,4 +1,4 @@
-"""The state at the end of a step, made from its stages."""
+"""The state at the end of a step and its record, made from its stages."""
 
 from collections.abc import Callable
 
@@ -6,7 +6,10 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, PyTree
 
 from .._system import State
+from ._record import StepRecord
+from ._stage_equations import end_impulse, start_impulse
 from ._stage_system import StageSystem
+from ._unknowns import StageForces, Stages
 
 
 def end_state(
@@ -37,3 +40,21 @@ def end_state(
     if stages.num_holonomic:
         multiplier = jnp.concatenate([multiplier, continuous()[m:]])
     return State(q, v, p, multiplier)
+
+
+def step_record(
+    stages: StageSystem, start: State, x: Stages, forces: StageForces
+) -> StepRecord:
+    """Make the record of a step.
+
+    Impulses are recorded as a constant force over the step, so that the polynomials of
+    dense output lead from the momentum at its start to that at its end.
+    """
+    force = forces.force
+    if stages.kept is not None:
+        chart = stages.chart(x)
+        y = chart.coordinates(stages.increment(x)[None])
+        impulse = chart.momentum_at_origin(start_impulse(stages, x))
+        impulse = impulse + chart.to_origin(y, end_impulse(stages, x)[None])[0]
+        force = force + (impulse / stages.h)[None]
+    return StepRecord(start, x.velocity, force, forces.multiplier)

@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -15,8 +17,10 @@ from .._numerics import (
     WeightedTranspose,
 )
 from .._system import Linearisation
+from ._invariants import ImpulseWeights
 from ._stage_equations import (
     constraint_jacobian,
+    impulse_weights,
     sparse_constraint_jacobian,
     stage_velocities,
 )
@@ -46,6 +50,7 @@ class LeadingStructure(eqx.Module):
     velocity_reaction: Float[Array, "s n l"] | WeightedTranspose
     schur_inverse: Float[Array, "c c"] | BlockTridiagonalInverse
     end: Linearisation
+    impulses: ImpulseWeights | None = None
 
     def correct_stages(
         self, stages: StageSystem, x: Stages, residual: Float[Array, "s n"]
@@ -93,6 +98,7 @@ class LeadingStructure(eqx.Module):
             holonomic=x.holonomic + h_dholonomic / stages.h,
             end_acceleration=x.end_acceleration,
             end_multiplier=x.end_multiplier,
+            impulse=x.impulse,
         )
 
     def correct_end(
@@ -141,11 +147,46 @@ class LeadingStructure(eqx.Module):
             ),
         )
 
+    def correct_impulses(
+        self, stages: StageSystem, x: Stages, error: Float[Array, " k"]
+    ) -> Stages:
+        """Change ε so that the linearised equations of the invariants hold.
+
+        The stages and nodes change with it, for the reason that the end does with λ_c.
+        """
+        weights = self.impulses
+        assert weights is not None
+        change = weights.change(x.impulse, error)
+        start, velocity, end = (
+            small_einsum("k,kn->n", change, direction)
+            for direction in (weights.start, weights.velocity, weights.end)
+        )
+        momentum = x.momentum
+        if stages.hamiltonian:
+            momentum = momentum + start[None]
+        fibre = x.node_fibre_coordinate + start[None]
+        return replace(
+            x,
+            velocity=x.velocity + velocity[None],
+            momentum=momentum,
+            node_fibre_coordinate=jnp.concatenate([fibre[:-1], fibre[-1:] + end[None]]),
+            impulse=x.impulse + change,
+        )
+
 
 def leading_structure(
     stages: StageSystem, x: Stages, lin: Linearisation
 ) -> LeadingStructure:
     """Factorise the leading structure, with N and K at the start and B_i at x."""
+    structure = _without_impulses(stages, x, lin)
+    if stages.kept is None:
+        return structure
+    return replace(structure, impulses=impulse_weights(stages, x))
+
+
+def _without_impulses(
+    stages: StageSystem, x: Stages, lin: Linearisation
+) -> LeadingStructure:
     if not stages.constrained:
         n, nothing = stages.p.shape[0], jnp.zeros((0, 0), stages.p.dtype)
         reaction = jnp.zeros((stages.method.stages, n, 0), stages.p.dtype)

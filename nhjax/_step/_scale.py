@@ -5,6 +5,7 @@ import jax.numpy as jnp
 from .._custom_types import FloatScalar
 from .._numerics import absolute, matvec, max_norm
 from .._system import Linearisation, position_scale
+from ._stage_equations import impulse_weights
 from ._stage_system import StageSystem
 from ._unknowns import Stages
 
@@ -17,7 +18,8 @@ def fibre_coordinate_scale(
     The estimate adds to the size of the coordinates themselves, at the starting values
     x0, the size of the terms that cancel in them: the forces and reactions over the
     step, and the effect on velocities of the round-off of holonomic constraints, which
-    are divided by h. For a system at rest these terms are all there is.
+    are divided by h. For a system at rest these terms are all there is. With invariants
+    the round-off of these is added, as far as impulses have it.
     """
     h = jnp.abs(stages.h)
     rate = max_norm(lin.acceleration)
@@ -32,4 +34,6 @@ def fibre_coordinate_scale(
         sizes = jnp.concatenate([jnp.zeros((m,), sizes.dtype), sizes]) if m else sizes
         response = matvec(absolute(lin.compliance_inverse), sizes)
         scale = scale + max_norm(matvec(absolute(lin.reaction), response)) / h
+    if stages.kept is not None:
+        scale = scale + impulse_weights(stages, x0).noise
     return scale

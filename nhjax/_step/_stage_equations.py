@@ -1,7 +1,7 @@
 """The equations of one step, as functions of the unknowns of the step."""
 
 from collections.abc import Callable
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -10,6 +10,7 @@ from jaxtyping import Array, Float
 from .._custom_types import BoolScalar
 from .._numerics import Pattern, small_einsum, sparse_jacobian, SparseMatrix
 from .._system import motion_residual, whole_force
+from ._invariants import ImpulseWeights, moving_part
 from ._stage_system import StageSystem
 from ._unknowns import StageForces, Stages
 
@@ -42,7 +43,7 @@ def stage_forces(stages: StageSystem, x: Stages) -> StageForces:
     momentum, chart_force = chart.to_chart(y, x.velocity, momentum, force)
     transported = chart.to_origin(y, force)
     base = chart.base_momentum(
-        chart.momentum_at_origin(stages.p),
+        chart.momentum_at_origin(_start_momentum(stages, x)),
         h * small_einsum("s,sn->n", b, transported),
         h * small_einsum("s,sn->n", b, chart_force),
     )
@@ -57,16 +58,20 @@ def node_residual(
 ) -> Float[Array, "r n"]:
     """Compute the residuals of the momentum equations at the nodes.
 
-    They are p(q^i, u^i) - Ad^*_{τ(y^i)} (M + h Σ a_ij n^j).
+    They are p(q^i, u^i) - Ad^*_{τ(y^i)} (M + h Σ a_ij n^j), at the end of the step less
+    the impulse there.
     """
     chart, y = stages.in_nodes(x)
     momentum = jax.vmap(lambda t, q, u: stages.system.momentum(t, q, u, stages.args))(
         stages.node_times, chart.positions(y), x.node_fibre_coordinate
     )
-    known = chart.momentum_at_origin(stages.p)[None] + stages.h * small_einsum(
-        "ij,jn->in", stages.node_weights, force
-    )
-    return momentum - chart.from_origin(y, known)
+    start = chart.momentum_at_origin(_start_momentum(stages, x))
+    gained = stages.h * small_einsum("ij,jn->in", stages.node_weights, force)
+    residual = momentum - chart.from_origin(y, start[None] + gained)
+    if stages.kept is None:
+        return residual
+    last = residual[-1:] - end_impulse(stages, x)[None]
+    return jnp.concatenate([residual[:-1], last])
 
 
 def node_constraint(stages: StageSystem, x: Stages) -> Float[Array, "r m"]:
@@ -151,6 +156,55 @@ def end_residual(
     if stages.redundancy is not None:
         hidden = stages.redundancy.reduced(hidden[None], x.end_multiplier[None], 0)[0]
     return on_momentum, hidden
+
+
+def start_impulse(stages: StageSystem, x: Stages) -> Float[Array, " n"]:
+    """Compute the impulse ε ω_k at the start of a step that keeps invariants."""
+    assert stages.kept is not None
+    return small_einsum("k,kn->n", x.impulse, stages.kept.covectors)
+
+
+def _start_momentum(stages: StageSystem, x: Stages) -> Float[Array, " n"]:
+    """Compute the momentum after the impulse at the start of the step."""
+    return stages.p if stages.kept is None else stages.p + start_impulse(stages, x)
+
+
+def end_impulse(stages: StageSystem, x: Stages) -> Float[Array, " n"]:
+    """Compute the impulse ε ω_{k+1} at the end of the step."""
+    _, covectors = end_slopes(stages, x)
+    return small_einsum("k,kn->n", x.impulse, covectors)
+
+
+def end_slopes(
+    stages: StageSystem, x: Stages
+) -> tuple[Float[Array, "k n"], Float[Array, "k n"]]:
+    """Compute ∂I/∂u and ω = ∂I/∂v of the invariants at the end of a step."""
+    assert stages.kept is not None
+    return stages.kept.invariants.slopes(*_end_point(stages, x))
+
+
+def invariant_errors(stages: StageSystem, x: Stages) -> Float[Array, " k"]:
+    """Compute the errors of the invariants at the end of a step."""
+    assert stages.kept is not None
+    return stages.kept.invariants.error(*_end_point(stages, x))
+
+
+def impulse_weights(stages: StageSystem, x: Stages) -> ImpulseWeights:
+    """Weigh the equations for the impulses of a step, near the given stages."""
+    assert stages.kept is not None
+    slopes, covectors = end_slopes(stages, x)
+    moving = moving_part(slopes, x.node_fibre_coordinate[-1])
+    given = slopes, covectors, moving, stages.hamiltonian
+    return ImpulseWeights.at(stages.kept, *given)
+
+
+def _end_point(stages: StageSystem, x: Stages) -> tuple[Any, ...]:
+    """Return what functions of the system are given at the end of the step."""
+    assert stages.kept is not None
+    end = stages.chart(x).advance(*stages.kept.position)
+    q = stages.manifold.wrapped(*end)
+    u = x.node_fibre_coordinate[-1]
+    return stages.system, stages.t + stages.h, q, u, stages.args
 
 
 def in_chart(stages: StageSystem, x: Stages) -> BoolScalar:

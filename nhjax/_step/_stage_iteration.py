@@ -10,13 +10,15 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
 from .._custom_types import BoolScalar, FloatScalar
-from .._numerics import matvec, max_norm, Sizes, unit
+from .._numerics import frozen, matvec, max_norm, Sizes, unit
 from .._system import Linearisation
 from ._leading_structure import LeadingStructure
 from ._stage_equations import (
     end_residual,
     holonomic_constraint,
+    impulse_weights,
     in_chart,
+    invariant_errors,
     node_constraint,
     node_residual,
     stage_forces,
@@ -47,6 +49,11 @@ def corrected(
     x_next = structure.correct_stages(stages, x, forces.residual)
     r_nodes = node_residual(stages, x_next, forces.force)
     x_next = structure.correct_nodes(x_next, r_nodes)
+    if stages.kept is not None:
+        # Before the constraints, so that these see what impulses change: where a system
+        # is nearly at rest, the work of reactions on that is not small beside it.
+        error = invariant_errors(stages, x_next)
+        x_next = structure.correct_impulses(stages, x_next, error)
     if stages.constrained:
         x_next = _constrain(stages, structure, x_next)
     return x_next, Evaluation(forces, r_nodes, jnp.asarray(False))
@@ -116,6 +123,10 @@ def stage_residual(
     parts += _constraints(stages, x)
     if stages.symmetric:
         parts += end_residual(stages, x)
+    if stages.kept is not None:
+        # The same equation as that of simplified Newton.
+        weights = frozen(impulse_weights(stages, x))
+        parts.append(-weights.change(x.impulse, invariant_errors(stages, x)))
     return (
         ravel_pytree(parts)[0],
         Evaluation(forces, r_nodes, jnp.asarray(False)),
@@ -196,4 +207,8 @@ def unknown_units(stages: StageSystem, lin: Linearisation) -> list[FloatScalar]:
         "end_acceleration": 1 / unit(h),
         "end_multiplier": multiplier,
     }
-    return [sizes[field.name] for field in dataclasses.fields(Stages)]
+    if stages.kept is not None:
+        largest = max_norm(matvec(lin.momentum_inverse, stages.kept.covectors))
+        sizes["impulse"] = 1 / unit(largest)
+    names = [field.name for field in dataclasses.fields(Stages)]
+    return [sizes[name] for name in names if name in sizes]

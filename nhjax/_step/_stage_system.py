@@ -13,6 +13,7 @@ from .._numerics import max_norm, small_einsum
 from .._system import AbstractMechanicalSystem, Linearisation, State
 from ._chart import AbstractChart
 from ._curved_chart import chart_of_step
+from ._invariants import StartImpulses
 from ._redundancy import Redundancy
 from ._unknowns import Stages
 
@@ -32,7 +33,8 @@ class StageSystem(eqx.Module):
     the first node hold by hypothesis H1; the last node is the end of the step by H3.
     Of redundant constraints as many are kept as are independent; see `Redundancy`.
     The three closures differ in the constant matrices of `method.closure_weights`
-    alone.
+    alone. To keep invariants, momenta receive impulses at both ends of the step; see
+    `ImpulseWeights`.
     """
 
     system: AbstractMechanicalSystem
@@ -44,6 +46,7 @@ class StageSystem(eqx.Module):
     multiplier: Float[Array, " l"]
     args: Args
     redundancy: Redundancy | None = None
+    kept: StartImpulses | None = None
 
     @classmethod
     def at(
@@ -55,11 +58,12 @@ class StageSystem(eqx.Module):
         y: State,
         args: Args,
         lin: Linearisation,
+        kept: StartImpulses | None = None,
     ) -> "StageSystem":
         """Make the equations of a step of size h from the state y at t."""
         given = system, method, t, h, y.q, y.p, y.multiplier, args
         is_reduced = system.constraints == "redundant" and y.multiplier.shape[0] > 0
-        return cls(*given, Redundancy.at(lin) if is_reduced else None)
+        return cls(*given, Redundancy.at(lin) if is_reduced else None, kept)
 
     @property
     def num_holonomic(self) -> int:

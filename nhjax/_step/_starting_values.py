@@ -24,7 +24,7 @@ def starting_values(stages: StageSystem, u: Array, lin: Linearisation) -> Stages
     free = (jnp.arange(s - 1) >= int(stages.symmetric)).astype(u.dtype)
     nothing = jnp.zeros((0,), u.dtype)
     fibre = u[None] + jnp.outer(stage_times, push)
-    velocity, momentum = fibre, jnp.zeros((s, 0), u.dtype)
+    velocity, momentum, kept = fibre, jnp.zeros((s, 0), u.dtype), stages.kept
     if stages.hamiltonian:
         velocity, momentum = _starting_velocities(stages, u, lin, stage_times), fibre
     return Stages(
@@ -35,6 +35,7 @@ def starting_values(stages: StageSystem, u: Array, lin: Linearisation) -> Stages
         holonomic=jnp.outer(jnp.ones((s,), u.dtype), lin.multiplier[m:]),
         end_acceleration=lin.acceleration if stages.symmetric else nothing,
         end_multiplier=lin.multiplier if stages.symmetric else nothing,
+        impulse=None if kept is None else jnp.zeros_like(kept.sizes),
     )
 
 

@@ -18,6 +18,7 @@ from .._numerics import (
     relative,
     small_einsum,
     Solved,
+    two_sum,
     zero_unless,
 )
 from .._results import RESULTS
@@ -29,10 +30,11 @@ from .._system import (
     linearise,
     State,
 )
-from ._end import end_state
+from ._end import end_state, step_record
+from ._invariants import Invariants, StartImpulses
 from ._newton import AbstractStageSolver
 from ._record import StepRecord
-from ._stage_equations import in_chart
+from ._stage_equations import end_impulse, in_chart, start_impulse
 from ._stage_iteration import Evaluation
 from ._stage_system import StageSystem
 from ._starting_values import starting_values
@@ -79,6 +81,8 @@ class StepOutcome(NamedTuple):
     - `constraint_violation`: the largest violation of a constraint at the end.
     - `multiplier_defect`: the distance |Λ^s - λ_c| at the end.
     - `newton`: whether Newton's method took over from simplified Newton.
+    - `invariant_error`: the largest error of an invariant at the end, relative to the
+        size of its terms; None if the run keeps none.
     """
 
     step_state: StepState
@@ -91,6 +95,7 @@ class StepOutcome(NamedTuple):
     constraint_violation: FloatScalar
     multiplier_defect: FloatScalar
     newton: BoolScalar
+    invariant_error: FloatScalar | None
 
 
 def first_step_state(
@@ -142,6 +147,23 @@ def _continuous_multiplier_jvp(primals, tangents):
     return multiplier, zero_unless(ok, change)
 
 
+def equations_of_step(
+    system: AbstractMechanicalSystem,
+    method: AbstractMethod,
+    t: FloatScalar,
+    h: FloatScalar,
+    step_state: StepState,
+    args: Args,
+    invariants: Invariants | None,
+) -> StageSystem:
+    """Make the equations of a step, with those of the invariants that it keeps."""
+    y, lin, kept = step_state.wrapped(system), step_state.lin, None
+    if invariants is not None:
+        position = step_state.state.q, step_state.q_compensation
+        kept = StartImpulses.at(invariants, system, t, y, position, args, lin)
+    return StageSystem.at(system, method, t, h, y, args, lin, kept)
+
+
 def step(
     system: AbstractMechanicalSystem,
     method: AbstractMethod,
@@ -151,14 +173,14 @@ def step(
     step_state: StepState,
     args: Args,
     skip: BoolScalar,
+    invariants: Invariants | None = None,
 ) -> StepOutcome:
     """Take one step of size h, from (q_k, p_k, λ_k) to (q_{k+1}, p_{k+1}, λ_{k+1}).
 
     Where `skip` is true nothing is solved, and the outcome is to be discarded.
     """
     state, lin = step_state.state, step_state.lin
-    start = step_state.wrapped(system)
-    stages = StageSystem.at(system, method, t, h, start, args, lin)
+    stages = equations_of_step(system, method, t, h, step_state, args, invariants)
     x0 = starting_values(stages, system.fibre_coordinate(state), lin)
     solved = solver.solve(stages, x0, lin, skip)
     x, forces = solved.x, solved.aux.forces
@@ -167,9 +189,12 @@ def step(
     q, q_compensation = chart.advance(state.q, step_state.q_compensation)
     at_end = chart.manifold.wrapped(q, q_compensation)
     gained = h * small_einsum("s,sn->n", stages.coefficients("b"), forces.force)
-    p, p_compensation = chart.advance_momentum(
-        state.p, gained, step_state.p_compensation
-    )
+    p, p_compensation = state.p, step_state.p_compensation
+    if invariants is not None:
+        p_compensation = p_compensation + start_impulse(stages, x)
+    p, p_compensation = chart.advance_momentum(p, gained, p_compensation)
+    if invariants is not None:
+        p, p_compensation = two_sum(p, p_compensation + end_impulse(stages, x))
     u = p if stages.hamiltonian else x.node_fibre_coordinate[-1]
     lin_next = linearise(system, t + h, at_end, u, args, may_be_sparse=True)
     last = forces.multiplier[-1]
@@ -186,7 +211,7 @@ def step(
     scale = max_norm(forces.momentum) + max_norm(h * forces.force)
     return StepOutcome(
         step_state=next_state,
-        record=StepRecord(state, x.velocity, forces.force, forces.multiplier),
+        record=step_record(stages, state, x, forces),
         stages=x,
         result=result,
         num_iterations=solved.num_iterations,
@@ -195,7 +220,19 @@ def step(
         constraint_violation=largest_violation(system, t + h, next_state, args),
         multiplier_defect=max_norm(last - lin_next.multiplier),
         newton=solved.aux.newton,
+        invariant_error=_invariant_error(stages, at_end, u),
     )
+
+
+def _invariant_error(
+    stages: StageSystem, q: PyTree[Array], u: Float[Array, " n"]
+) -> FloatScalar | None:
+    """Measure the errors of invariants at the end by the sizes of their terms."""
+    if stages.kept is None:
+        return None
+    invariants, t = stages.kept.invariants, stages.t + stages.h
+    error = invariants.error(stages.system, t, q, u, stages.args)
+    return max_norm(relative(error, stages.kept.sizes))
 
 
 def _result(

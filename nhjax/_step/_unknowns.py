@@ -3,7 +3,7 @@
 from typing import NamedTuple
 
 import equinox as eqx
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, PyTree
 
 
 class Stages(eqx.Module):
@@ -21,6 +21,8 @@ class Stages(eqx.Module):
     - `holonomic`: the holonomic multipliers Λ^1..Λ^s.
     - `end_acceleration`, `end_multiplier`: u̇ and λ_c at the end of the step, unknowns
         of the symmetric closure alone.
+    - `impulse`: ε, the impulses at the ends of the step along ∂I/∂v of the invariants
+        I that the run keeps; None if it keeps none.
     """
 
     velocity: Float[Array, "s n"]
@@ -30,6 +32,8 @@ class Stages(eqx.Module):
     holonomic: Float[Array, "s k"]
     end_acceleration: Float[Array, " a"]
     end_multiplier: Float[Array, " e"]
+    # None, the empty tree, if no invariants are kept.
+    impulse: PyTree[Float[Array, " i"]] = None
 
 
 class StageForces(NamedTuple):

@@ -185,6 +185,33 @@ def time_force_and_args():
 
 
 @feature
+def energy_that_is_kept():
+    for example in (PARTICLE, systems.Suslov()):
+        start = example.initial_state()
+        sol = run(example, TWO, y0=start, num_steps=50, invariants="energy")
+        expected = example.energy(0.0, start.q, start.v)
+        y = jax.tree.map(lambda x: x[-1], sol.ys)
+        close(example.energy(5.0, y.q, y.v), expected, 1e-14)
+        assert float(sol.stats["max_invariant_error"]) < 1e-14
+
+
+@feature
+def two_functions_that_are_kept_and_their_gradient():
+    cvt = systems.ContinuouslyVariableTransmission.low()
+
+    def energies(t, q, v, args):
+        return jnp.stack([cvt.driver_energy(q, v), cvt.passenger_energy(q, v)])
+
+    def loss(dt):
+        sol = run(cvt, TWO, dt=dt, invariants=energies)
+        y = jax.tree.map(lambda x: x[-1], sol.ys)
+        return jnp.sum(jnp.sin(y.q)) + energies(1.0, y.q, y.v, None) @ jnp.ones(2)
+
+    gradient = jax.jit(jax.grad(loss))(DT)
+    close(gradient, (loss(DT + 1e-5) - loss(DT - 1e-5)) / 2e-5, 1e-7)
+
+
+@feature
 def dense_output_and_samples():
     ts = jnp.array([0.05, 0.33, 1.0])
     dense = jax.vmap(run(saveat=SaveAt(dense=True)).evaluate)(ts)

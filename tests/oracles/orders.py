@@ -21,7 +21,9 @@ def solver_for(stages):
 
 
 @eqx.filter_jit
-def runs_of_all_steps(system, method, y0, dts, num_steps, args, solver):
+def runs_of_all_steps(
+    system, method, y0, dts, num_steps, args, solver, invariants=None
+):
     """One lane for each dt, with the continuous multiplier beside the state."""
 
     def with_multiplier(t, y, args):
@@ -36,6 +38,7 @@ def runs_of_all_steps(system, method, y0, dts, num_steps, args, solver):
             num_steps=num_steps,
             args=args,
             stage_solver=solver,
+            invariants=invariants,
             throw=False,  # Runs of few steps go on beyond the duration.
             saveat=nhjax.SaveAt(steps=True, fn=with_multiplier),
         )
@@ -43,12 +46,15 @@ def runs_of_all_steps(system, method, y0, dts, num_steps, args, solver):
     return jax.vmap(run)(dts)
 
 
-def trajectories(system, method, y0, counts, args=None, stage_solver=None):
+def trajectories(
+    system, method, y0, counts, args=None, stage_solver=None, invariants=None
+):
     """Nodes of runs of N = counts[lane] steps over the duration, as one program."""
     dts = DURATION / jnp.asarray(counts, float)
     if stage_solver is None:
         stage_solver = solver_for(method.stages)
-    sol = runs_of_all_steps(system, method, y0, dts, max(counts), args, stage_solver)
+    options = args, stage_solver, invariants
+    sol = runs_of_all_steps(system, method, y0, dts, max(counts), *options)
     # Each index into an array of JAX would be a program of its own.
     ts, ys, failed = jax.tree.map(
         np.asarray, (sol.ts, sol.ys, sol.stats["failed_step"])

@@ -1,0 +1,163 @@
+"""The invariants that a run is to keep, and whether its system conserves them."""
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, PyTree
+
+from .._custom_types import Args, BoolScalar, FloatScalar
+from .._errors import DTypeError, ShapeError
+from .._numerics import ClosureConverted, dependence, matvec, max_norm
+from .._step import invariant_values, Invariants
+from .._system import AbstractMechanicalSystem, linearise, State
+
+
+# Rates of change are looked at in the initial state and in this many around it.
+_SAMPLES, _SPREAD = 3, 0.3
+# By Newton's method these are moved onto constraints that are nonlinear in velocities.
+_ITERATIONS = 5
+# Rates that within a step amount to this many units of round-off tell nothing.
+_UNITS = 1e3
+
+
+def kept_invariants(
+    invariants: str | Callable[..., Any] | None,
+    system: AbstractMechanicalSystem,
+    t: FloatScalar,
+    y: State,
+    args: Args,
+) -> Invariants | None:
+    """Make what a run keeps, at its values in the initial state y.
+
+    Raise a `TypeError` for what is neither None, "energy" nor a function, and a
+    `ValueError` that says why a system does not conserve its energy, where that can be
+    seen from its functions alone.
+    """
+    if invariants is None:
+        return None
+    u, function = system.fibre_coordinate(y), None
+    if callable(invariants):
+        _check_function(invariants, system, t, y, args)
+        function = ClosureConverted(invariants, t, y.q, u, args)
+    elif isinstance(invariants, str) and invariants == "energy":
+        _require_conserved_energy(system, t, y.q, u, args)
+    else:
+        raise TypeError(
+            '`invariants` must be None, "energy" or a function of (t, q, v, args) (of '
+            f"a Hamiltonian system of (t, q, p, args)), got {invariants!r} of type "
+            f"{type(invariants).__name__}."
+        )
+    value = invariant_values(function, system, t, y.q, u, args)
+    return Invariants(function, value)
+
+
+def _check_function(
+    function: Callable[..., Any],
+    system: AbstractMechanicalSystem,
+    t: FloatScalar,
+    y: State,
+    args: Args,
+) -> None:
+    u = system.fibre_coordinate(y)
+    out = eqx.filter_eval_shape(function, t, y.q, u, args)
+    shape, most = getattr(out, "shape", None), u.shape[0]
+    if system.constraints == "independent":
+        most -= y.multiplier.shape[0]
+    if shape is None or len(shape) > 1 or not 1 <= math.prod(shape) <= most:
+        got = f"{out!r}" if shape is None else f"shape {shape}"
+        raise ShapeError(
+            "`invariants` must return an array of shape () or (k,) with 1 <= k <= "
+            f"{most}, the number of degrees of freedom, got {got}."
+        )
+    if out.dtype != u.dtype:
+        raise DTypeError(
+            f"`invariants` returns dtype {out.dtype}, but the state has {u.dtype}."
+        )
+
+
+def _require_conserved_energy(
+    system: AbstractMechanicalSystem,
+    t: FloatScalar,
+    q: PyTree[Array],
+    u: Array,
+    args: Args,
+) -> None:
+    reason = None
+    if system.force is not None:
+        reason = "has a `force`, which may do work"
+    for name in (system.generator, "holonomic"):
+        function, given = system.functions(t, q, u, args).get(name, (None, ()))
+        if function is not None and _depends_on_time(function, *given):
+            reason = f"has a `{name}` that depends on time"
+    if reason is not None:
+        raise ValueError(
+            f'`invariants="energy"`: the system {reason}, so that its energy is not '
+            "conserved. If it conserves something else, give that as a function."
+        )
+
+
+def _depends_on_time(function: Callable[..., Any], t: FloatScalar, *rest: Any) -> bool:
+    """Tell whether the program of a function contains its first argument."""
+    time = jnp.reshape(t, (1,))
+    found = dependence(lambda t: jnp.atleast_1d(function(t[0], *rest)), time)
+    return bool(np.any(found))
+
+
+def conserves(
+    system: AbstractMechanicalSystem,
+    invariants: Invariants,
+    t: FloatScalar,
+    h: FloatScalar,
+    y: State,
+    args: Args,
+) -> BoolScalar:
+    """Tell whether invariants have no rate of change, at a state and near it.
+
+    States near it are moved onto the constraints on velocities. Those that still
+    violate them are not judged, nor those at which the equations of motion have no
+    solution. Where there are holonomic constraints only the velocity is varied.
+    """
+    u0, manifold = system.fibre_coordinate(y), system.manifold_of(y.q)
+    numbers = np.random.default_rng(0).standard_normal((2, _SAMPLES, u0.shape[0]))
+    moves = np.concatenate([np.zeros_like(numbers[:, :1]), _SPREAD * numbers], axis=1)
+    xi, w = jnp.asarray(moves, u0.dtype)
+    steps = jnp.arange(_SAMPLES + 1, dtype=u0.dtype)
+    if system.holonomic is not None:
+        xi, steps = jnp.zeros_like(xi), jnp.zeros_like(steps)
+    eps = float(jnp.finfo(u0.dtype).eps)
+    small = eps**0.5
+
+    def is_constant(t, xi, w):
+        q = manifold.act(y.q, xi)
+
+        def nearer(_, u):
+            lin = linearise(system, t, q, u, args)
+            excess = matvec(lin.compliance_inverse, lin.violation)
+            return u - matvec(lin.reaction, excess)
+
+        u = jax.lax.fori_loop(0, _ITERATIONS, nearer, u0 + w * (1 + jnp.abs(u0)))
+        lin = linearise(system, t, q, u, args)
+        v = system.velocity(t, q, u, args)
+        by_time, by_position, by_fibre = jax.jacrev(
+            lambda t, xi, u: invariants.error(system, t, manifold.act(q, xi), u, args),
+            argnums=(0, 1, 2),
+        )(t, jnp.zeros_like(v), u)
+        terms = jnp.concatenate(
+            [
+                by_time[:, None],
+                by_position * v[None],
+                by_fibre * lin.acceleration[None],
+            ],
+            axis=1,
+        )
+        sizes = invariants.sizes(system, t, q, u, args, by_fibre)
+        noise = small * jnp.sum(jnp.abs(terms), axis=1) + _UNITS * eps * sizes / abs(h)
+        is_off = max_norm(lin.violation) > small * (1 + max_norm(u))
+        return is_off | ~jnp.any(jnp.abs(jnp.sum(terms, axis=1)) > noise)
+
+    return jnp.all(jax.vmap(is_constant)(t + h * steps, xi, w))

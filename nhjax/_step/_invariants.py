@@ -1,0 +1,220 @@
+"""Functions that a run keeps at their values, and the impulses that keep them."""
+
+from collections.abc import Callable
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, PyTree
+
+from .._custom_types import Args, FloatScalar
+from .._numerics import (
+    inverse,
+    Matrix,
+    matvec,
+    max_norm,
+    small_einsum,
+    unit,
+)
+from .._system import AbstractMechanicalSystem, Linearisation, State
+
+
+# Impulses change the part of an invariant that belongs to the motion by no more than
+# this: where hardly any is left, no impulse might make up for the error.
+_LARGEST_PART = 0.1
+
+
+class Invariants(eqx.Module):
+    """Functions I(t, q, u) of the fibre coordinate u, and the values they are kept at.
+
+    - `function`: called as `function(t, q, u, args)`, of shape (k,); None stands for
+        the energy of the system.
+    - `value`: the k values.
+    """
+
+    function: Callable[..., Array] | None
+    value: Float[Array, " k"]
+
+    def error(
+        self,
+        system: AbstractMechanicalSystem,
+        t: FloatScalar,
+        q: PyTree[Array],
+        u: Float[Array, " n"],
+        args: Args,
+    ) -> Float[Array, " k"]:
+        """Compute by how much the functions differ from their values."""
+        return invariant_values(self.function, system, t, q, u, args) - self.value
+
+    def slopes(
+        self,
+        system: AbstractMechanicalSystem,
+        t: FloatScalar,
+        q: PyTree[Array],
+        u: Float[Array, " n"],
+        args: Args,
+    ) -> tuple[Float[Array, "k n"], Float[Array, "k n"]]:
+        """Compute ∂I/∂u, and the covectors ω = ∂I/∂v of the impulses of a step."""
+        slopes = jax.jacrev(
+            lambda u: invariant_values(self.function, system, t, q, u, args)
+        )(u)
+        if system.fibre_coordinate_name == "v":
+            return slopes, slopes
+        return slopes, jax.vmap(lambda x: system.flat(t, q, u, x, args))(slopes)
+
+    def sizes(
+        self,
+        system: AbstractMechanicalSystem,
+        t: FloatScalar,
+        q: PyTree[Array],
+        u: Float[Array, " n"],
+        args: Args,
+        slopes: Float[Array, "k n"],
+    ) -> Float[Array, " k"]:
+        """Estimate the sizes of the terms of I, to which its round-off is proportional.
+
+        That of positions counts: those of a wheel that rolls on and on grow for ever.
+        """
+        found = jnp.abs(self.value) + moving_part(slopes, u)
+        by_position = jax.jacrev(
+            lambda q: invariant_values(self.function, system, t, q, u, args)
+        )(q)
+        for slope, x in zip(*map(jax.tree.leaves, (by_position, q)), strict=True):
+            found = found + jnp.sum(
+                jnp.abs(slope * x[None]), axis=tuple(range(1, slope.ndim))
+            )
+        return found
+
+
+def invariant_values(
+    function: Callable[..., Array] | None,
+    system: AbstractMechanicalSystem,
+    t: FloatScalar,
+    q: PyTree[Array],
+    u: Float[Array, " n"],
+    args: Args,
+) -> Float[Array, " k"]:
+    """Evaluate the functions of `Invariants`, in shape (k,)."""
+    if function is not None:
+        return jnp.atleast_1d(function(t, q, u, args))
+    # The energy reads the fibre coordinate alone, whichever of the two it is.
+    nothing = jnp.zeros((0,), u.dtype)
+    return system.energy(t, State(q, u, u, nothing), args)[None]
+
+
+class StartImpulses(eqx.Module):
+    """The invariants of a step, with what is known of them at its start.
+
+    - `slopes`, `covectors`: ∂I/∂u and ω = ∂I/∂v there.
+    - `momentum_inverse`: N⁻¹, which turns momenta into fibre coordinates.
+    - `moving`: Σ |u ∂I/∂u| there, of the energy twice the kinetic one as a rule.
+    - `sizes`: the sizes of the terms of the invariants, whose round-off is theirs.
+    - `position`: q_k before it was wrapped and the rounding error that it has
+        accumulated, so that the invariants are kept at the position to which the step
+        will round its end.
+    """
+
+    invariants: Invariants
+    slopes: Float[Array, "k n"]
+    covectors: Float[Array, "k n"]
+    momentum_inverse: Matrix
+    moving: Float[Array, " k"]
+    sizes: Float[Array, " k"]
+    position: tuple[PyTree[Array], PyTree[Array]]
+
+    @classmethod
+    def at(
+        cls,
+        invariants: Invariants,
+        system: AbstractMechanicalSystem,
+        t: FloatScalar,
+        y: State,
+        position: tuple[PyTree[Array], PyTree[Array]],
+        args: Args,
+        lin: Linearisation,
+    ) -> "StartImpulses":
+        """Make them at the state y, of which `lin` is the linearisation."""
+        u = system.fibre_coordinate(y)
+        slopes, covectors = invariants.slopes(system, t, y.q, u, args)
+        given = slopes, covectors, lin.momentum_inverse, moving_part(slopes, u)
+        sizes = invariants.sizes(system, t, y.q, u, args, slopes)
+        return cls(invariants, *given, sizes, position)
+
+
+def moving_part(slopes: Float[Array, "k n"], u: Float[Array, " n"]) -> Array:
+    """Measure the part of invariants that belongs to the motion, Σ |u ∂I/∂u|."""
+    return jnp.sum(jnp.abs(slopes * u[None]), axis=1)
+
+
+class ImpulseWeights(eqx.Module):
+    """The linearised equations for the impulses ε of a step, near its solution.
+
+    To leading order a change of ε changes the invariants at the end by G δε with
+    G = Σ ∂I/∂u N⁻¹ ωᵀ, the sum being over both ends: what an impulse at the start adds
+    to an invariant is still there at the end. Row by row the equation r = 0 for the
+    errors r of the invariants is blended with ε = 0,
+
+    a r / g + (1 - a) ε = 0,    g = G_ii,    a = g² / (g² + ϵ S²),
+
+    with ϵ the unit round-off and S the size of the terms of I. Where g is not small, a
+    is 1 up to round-off; at rest g vanishes, so that no impulse could keep I.
+
+    - `errors`: a / g, by which errors are multiplied.
+    - `rest`: 1 - a.
+    - `inverse`: the inverse of the derivative of the equations by ε.
+    - `limits`: the largest |ε|.
+    - `start`, `end`: N⁻¹ ω at both ends, by which u changes with ε.
+    - `velocity`: M⁻¹ ω at the start, by which velocities do.
+    - `noise`: the round-off of u for that of the invariants.
+    """
+
+    errors: Float[Array, " k"]
+    rest: Float[Array, " k"]
+    inverse: Float[Array, "k k"]
+    limits: Float[Array, " k"]
+    start: Float[Array, "k n"]
+    end: Float[Array, "k n"]
+    velocity: Float[Array, "k n"]
+    noise: FloatScalar
+
+    @classmethod
+    def at(
+        cls,
+        given: StartImpulses,
+        slopes: Float[Array, "k n"],
+        covectors: Float[Array, "k n"],
+        moving: Float[Array, " k"],
+        hamiltonian: bool,
+    ) -> "ImpulseWeights":
+        """Make the weights from what is given at the start and known at the end."""
+        start, end = (
+            matvec(given.momentum_inverse, x) for x in (given.covectors, covectors)
+        )
+        gram = small_einsum("kn,ln->kl", given.slopes, start)
+        gram = gram + small_einsum("kn,ln->kl", slopes, end)
+        eps = float(jnp.finfo(gram.dtype).eps)
+        one = jnp.eye(gram.shape[0], dtype=gram.dtype)
+        g = jnp.sum(gram * one, axis=1)
+        denominator = unit(g**2 + eps * given.sizes**2)
+        errors, a = g / denominator, g**2 / denominator
+        matrix = errors[:, None] * gram + (1 - a)[:, None] * one
+        pushes = jnp.abs(jnp.concatenate([start, end], axis=1))
+        return cls(
+            errors=errors,
+            rest=1 - a,
+            # Functions of which some follow from others have a singular matrix.
+            inverse=inverse(matrix + eps**0.5 * one),
+            limits=_LARGEST_PART * (given.moving + moving) / unit(g),
+            start=start,
+            end=end,
+            velocity=given.slopes if hamiltonian else start,
+            noise=max_norm(given.sizes * errors * jnp.max(pushes, axis=1)),
+        )
+
+    def change(
+        self, impulse: Float[Array, " k"], error: Float[Array, " k"]
+    ) -> Float[Array, " k"]:
+        """Compute the change of ε that makes the linearised equations hold."""
+        residual = self.errors * error + self.rest * impulse
+        wanted = impulse - matvec(self.inverse, residual)
+        return jnp.clip(wanted, -self.limits, self.limits) - impulse
