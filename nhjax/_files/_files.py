@@ -1,7 +1,7 @@
 import importlib.metadata
 import os
-import tempfile
-import zipfile
+import shutil
+import uuid
 from pathlib import Path
 from typing import Any
 
@@ -37,7 +37,7 @@ def save(path: str | os.PathLike[str], tree: Any) -> None:
 
     **Raises:** `TypeError` with the place of what cannot be saved, such as the dense
     output of a run, which holds functions; `FileNotFoundError` if the folder does not
-    exist.
+    exist, `IsADirectoryError` if `path` is one itself.
 
     !!! example
 
@@ -51,7 +51,12 @@ def save(path: str | os.PathLike[str], tree: Any) -> None:
         >>> int(nhjax.load(path).num_steps)
         50
     """
-    path = Path(path)
+    # A link stays one, to the new file.
+    path = Path(path).resolve()
+    if path.is_dir():
+        raise IsADirectoryError(
+            f"{str(path)!r} is a folder: give the name of a file in it."
+        )
     if not path.parent.is_dir():
         raise FileNotFoundError(
             f"There is no folder {str(path.parent)!r} to save {path.name!r} in: make "
@@ -63,16 +68,19 @@ def save(path: str | os.PathLike[str], tree: Any) -> None:
         "nhjax": _version(),
         "tree": described(tree, arrays),
     }
-    handle, unfinished = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
+    unfinished = path.with_name(f".{uuid.uuid4().hex}")
     try:
-        with os.fdopen(handle, "wb") as file:
+        # Not by `tempfile`, whose files only their owner may read.
+        with open(unfinished, "xb") as file:
             entries: dict[str, Any] = {_HEADER: as_text(header), **arrays}
             np.savez(file, **entries)
             file.flush()
             os.fsync(file.fileno())
+        if path.exists():
+            shutil.copymode(path, unfinished)
         os.replace(unfinished, path)
     except BaseException:
-        os.unlink(unfinished)
+        unfinished.unlink(missing_ok=True)
         raise
 
 
@@ -100,11 +108,14 @@ def load(path: str | os.PathLike[str]) -> Any:
         'disc'
     """
     path = Path(path)
-    if not path.exists():
+    if not path.is_file():
         raise FileNotFoundError(f"There is no file {str(path)!r}.")
     try:
         header, arrays = _read(path)
-    except (zipfile.BadZipFile, ValueError, KeyError, EOFError, OSError) as error:
+    except (PermissionError, MemoryError):
+        raise
+    # Whatever else goes wrong, in unpacking or in what was unpacked.
+    except Exception as error:
         raise ValueError(
             f"{str(path)!r} is no file of `nhjax.save`, or is damaged: {error}"
         ) from error
@@ -136,10 +147,12 @@ def _version() -> str:
 def _read(path: Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     """Read all entries; those of a damaged file fail by their check sums."""
     # What NumPy opens itself stays open if it is damaged.
-    with open(path, "rb") as opened, np.load(opened, allow_pickle=False) as file:
+    with open(path, "rb") as opened:
+        file = np.load(opened, allow_pickle=False)
         if not isinstance(file, np.lib.npyio.NpzFile):
             raise ValueError("it is no .npz")
-        if _HEADER not in file:
-            raise ValueError(f"it has no entry {_HEADER!r}")
-        arrays = {name: file[name] for name in file.files}
+        with file:
+            if _HEADER not in file:
+                raise ValueError(f"it has no entry {_HEADER!r}")
+            arrays = {name: file[name] for name in file.files}
     return from_text(arrays.pop(_HEADER)), arrays

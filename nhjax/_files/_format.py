@@ -167,4 +167,10 @@ def as_text(header: dict[str, Any]) -> np.ndarray:
 
 def from_text(array: np.ndarray) -> dict[str, Any]:
     """Read a header again."""
-    return json.loads(array.tobytes().decode("utf-8"))
+    header = json.loads(array.tobytes().decode("utf-8"))
+    kinds = {"format": int, "nhjax": str, "tree": dict}
+    if not isinstance(header, dict) or any(
+        not isinstance(header.get(name), kind) for name, kind in kinds.items()
+    ):
+        raise ValueError(f"its header lacks {', '.join(kinds)}")
+    return header

@@ -16,6 +16,10 @@ def to_dataset(
 ) -> Any:
     """Make the data set; the method `Solution.to_xarray` says what is in it."""
     xarray = _xarray()
+    if not isinstance(units, Mapping):
+        raise TypeError(
+            f"`units` must be a dictionary of units by name, got {units!r}."
+        )
     if is_traced(*jax.tree.leaves(sol)):
         raise RuntimeError(
             "Solution.to_xarray() needs a computed solution, outside jit and vmap."
@@ -27,10 +31,16 @@ def to_dataset(
         )
     batch = _batch_dims(np.ndim(sol.t1))
     variables = _saved(sol.ys, (*batch, "time"))
-    for name, x in sol.stats.items():
-        variables[f"stats_{name}"] = (batch, np.asarray(x))
-    variables["result"] = (batch, _result_names(sol.result))
+    outcome = {f"stats_{name}": (batch, np.asarray(x)) for name, x in sol.stats.items()}
+    outcome["result"] = (batch, _result_names(sol.result))
     labels = _time(np.asarray(sol.ts), batch)
+    for name in variables:
+        if name in {*outcome, *labels, *batch, "time", "coordinate"}:
+            raise ValueError(
+                f"What `SaveAt(fn=...)` returned has the name {name!r}, which "
+                "something else in the data set has already: take another one."
+            )
+    variables |= outcome
     names = _coordinate_names(sol, coordinates, variables)
     if names is not None:
         labels["coordinate"] = ("coordinate", list(names))
@@ -108,6 +118,11 @@ def _named(
             name = root + name
         elif parts[0].isdigit():
             name = f"{root}{name}"
+        if name in made:
+            raise ValueError(
+                f"Two parts of what `SaveAt(fn=...)` returned have the name {name!r} "
+                "in the data set, the keys on their paths joined by _: rename one."
+            )
         x = np.asarray(leaf)
         shape = x.shape[len(dims) :]
         inner = tuple(f"{name}_{i}" for i in range(len(shape)))
@@ -128,6 +143,8 @@ def _part(key: Any) -> str:
 def _coordinate_names(
     sol: Any, given: Sequence[str] | None, variables: dict[str, Any]
 ) -> tuple[str, ...] | None:
+    if isinstance(given, str):
+        raise TypeError(f"`coordinates` must be a tuple of names, got {given!r}.")
     names = sol.coordinates if given is None else tuple(given)
     sizes = [
         x.shape[-1] for dims, x in variables.values() if dims[-1:] == ("coordinate",)

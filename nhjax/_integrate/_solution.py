@@ -143,7 +143,7 @@ class Solution(eqx.Module):
             >>> data.q.sel(coordinate="x", time=1.5).shape
             ()
         """
-        return to_dataset(self, coordinates, units or {})
+        return to_dataset(self, coordinates, {} if units is None else units)
 
     def failures(self) -> list[tuple[int | tuple[int, ...] | None, int, str]]:
         """List the runs that failed, each as (lane, step, reason).

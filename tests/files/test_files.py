@@ -106,6 +106,8 @@ def test_single_precision_reads_no_float64(saved, tmp_path):
             lambda file: file.write_bytes(file.read_bytes()[:-100]),
             "is no file of `nhjax.save`, or is damaged",
         ),
+        (lambda file: _changed(file, format="new"), "its header lacks format"),
+        (lambda file: _as_array(file), "it is no .npz"),
         (lambda file: _changed(file, format=2), "in format 2, .* formats up to 1"),
         (
             lambda file: _changed(file, tree={"kind": "Robot", "parts": {}}),
@@ -126,6 +128,11 @@ def test_what_is_no_file_of_ours_is_refused(change, message, saved, tmp_path):
 
 
 _ONE = {"kind": "value", "value": 1}
+
+
+def _as_array(path):
+    with open(path, "wb") as file:
+        np.save(file, np.ones(2))
 
 
 def _changed(path, **parts):
@@ -163,6 +170,21 @@ def test_what_cannot_be_saved_is_named(sol, tmp_path):
         nhjax.save(tmp_path / "nowhere" / "run.npz", 1)
     with pytest.raises(FileNotFoundError, match="no file"):
         nhjax.load(path)
+
+
+def test_a_file_has_the_rights_of_others_and_a_link_stays(tmp_path):
+    path, link = tmp_path / "run.npz", tmp_path / "link"
+    (tmp_path / "plain").touch()
+    nhjax.save(path, 1)
+    assert path.stat().st_mode == (tmp_path / "plain").stat().st_mode
+    path.chmod(0o640)
+    link.symlink_to(path)
+    nhjax.save(link, 2)
+    assert link.is_symlink()
+    assert nhjax.load(path) == 2
+    assert path.stat().st_mode & 0o777 == 0o640
+    with pytest.raises(IsADirectoryError, match="give the name of a file"):
+        nhjax.save(tmp_path, 1)
 
 
 def test_a_save_that_fails_leaves_the_old_file_whole(tmp_path, monkeypatch):

@@ -93,6 +93,19 @@ def test_saved_functions_are_named_by_their_paths():
     assert one.to_xarray().value.dims == ("time", "value_0")
 
 
+@pytest.mark.parametrize(
+    ("fn", "message"),
+    [
+        (lambda t, y, args: {"result": t}, "has the name 'result', which something"),
+        (lambda t, y, args: {"time": t}, "has the name 'time', which something"),
+        (lambda t, y, args: {"a_b": t, "a": {"b": t}}, "have the name 'a_b'"),
+    ],
+)
+def test_names_of_functions_replace_nothing(fn, message):
+    with pytest.raises(ValueError, match=message):
+        run(falling(), saveat=SaveAt(steps=2, fn=fn)).to_xarray()
+
+
 def test_what_has_no_labels_is_refused(sol, monkeypatch):
     with pytest.raises(ValueError, match="Nothing was saved that has times"):
         dataclasses.replace(sol, ts=None, ys=None).to_xarray()
@@ -100,6 +113,10 @@ def test_what_has_no_labels_is_refused(sol, monkeypatch):
         sol.to_xarray(coordinates=("x",))
     with pytest.raises(ValueError, match=r"has the name 'z', but .* x, y"):
         sol.to_xarray(units={"z": "m"})
+    with pytest.raises(TypeError, match="`units` must be a dictionary"):
+        sol.to_xarray(units=["m"])
+    with pytest.raises(TypeError, match="must be a tuple of names, got 'xy'"):
+        sol.to_xarray(coordinates="xy")
     with pytest.raises(RuntimeError, match="outside jit and vmap"):
         jax.jit(lambda sol: sol.to_xarray().q.values)(sol)
     imported = builtins.__import__
