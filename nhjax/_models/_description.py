@@ -2,7 +2,7 @@
 
 import contextlib
 import reprlib
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Set
 from typing import Any, NamedTuple
 
 from ._library import mechanics, sympy
@@ -28,6 +28,10 @@ def expressions(name: str, given: Any) -> list[Any]:
     library = sympy()
     if isinstance(given, library.MatrixBase):
         given = list(given)
+    if isinstance(given, Set | library.Set):
+        raise TypeError(
+            f"from_sympy: `{name}` is a set, which has no order: give a list."
+        )
     several = isinstance(given, Iterable) and not isinstance(given, str | Mapping)
     return [expression(name, x) for x in (given if several else [given])]
 
@@ -42,7 +46,8 @@ def expression(name: str, x: Any) -> Any:
         x = library.sympify(x, strict=True)
     if isinstance(x, library.Equality):
         x = x.lhs - x.rhs
-    if not isinstance(x, library.Expr):
+    matrix = library.MatrixBase | library.MatrixExpr
+    if not isinstance(x, library.Expr) or isinstance(x, matrix):
         raise TypeError(
             f"from_sympy: `{name}` must be of scalar expressions of SymPy, got "
             f"{reprlib.repr(x)} of type {type(x).__name__}."
@@ -65,7 +70,8 @@ def check_coordinates(coordinates: Any) -> list[Any]:
     for q in found:
         if not isinstance(q, library.core.function.AppliedUndef) or q.args != (t,):
             raise TypeError(
-                f"from_sympy: the coordinate {q} is no function of time; make it by "
+                f"from_sympy: the coordinate {q} is no function of time, of the symbol "
+                "`dynamicsymbols._t`; make it by "
                 "`sympy.physics.mechanics.dynamicsymbols`."
             )
     names = [str(q.func) for q in found]

@@ -56,7 +56,8 @@ def from_sympy(
         one must be in `args` at run time.
     - `frame`: the inertial frame of forces at points.
     - `potential`: the potential energy of a `KanesMethod`; by default the sum of those
-        of its bodies.
+        of its bodies. It must be given if these have one and there are loads beside
+        it; 0 if the loads contain its forces.
 
     **Returns:** a `SymPyModel`, with `.system`, `.args` for `integrate(..., args=)` and
     the names of the coordinates, which `Solution.to_xarray` shows.
@@ -94,15 +95,16 @@ def from_sympy(
             model = of_lagranges_method(lagrangian)
     else:
         _refuse_potential(potential)
+        energy = expression("lagrangian", lagrangian)
         chosen = check_coordinates(coordinates)
         model = Description(
-            expression("lagrangian", lagrangian),
+            energy,
             chosen,
             expressions("nonholonomic", nonholonomic),
             expressions("holonomic", holonomic),
             generalised_forces(forces, chosen, frame),
         )
-    return _model(model, parameters or {})
+    return _model(model, {} if parameters is None else parameters)
 
 
 def _refuse_more(method: Any, *given: Any) -> None:
@@ -133,12 +135,15 @@ def _model(model: Description, parameters: Mapping[Any, Any]) -> SymPyModel:
     symbols = place_symbols(model.coordinates, [x for g in groups.values() for x in g])
     _check_constraints(model, symbols)
 
+    names = tuple(str(q.func) for q in model.coordinates)
+
     def of_phase(name: str) -> Any:
         if not groups[name]:
             return None
         is_scalar = name == "lagrangian"
         return _of_phase(
-            printed(name, groups[name], symbols, of_rates=True, is_scalar=is_scalar)
+            printed(name, groups[name], symbols, of_rates=True, is_scalar=is_scalar),
+            names,
         )
 
     holonomic = None
@@ -146,8 +151,7 @@ def _model(model: Description, parameters: Mapping[Any, Any]) -> SymPyModel:
         function = printed(
             "holonomic", model.holonomic, symbols, of_rates=False, is_scalar=False
         )
-        holonomic = _of_position(function)
-    names = tuple(str(q.func) for q in model.coordinates)
+        holonomic = _of_position(function, names)
     system = LagrangianSystem(
         of_phase("lagrangian"),
         nonholonomic=of_phase("nonholonomic"),
@@ -159,16 +163,16 @@ def _model(model: Description, parameters: Mapping[Any, Any]) -> SymPyModel:
     return SymPyModel(system, parameter_defaults(parameters, known), names, known)
 
 
-def _of_phase(function: Printed) -> Callable[..., Array]:
+def _of_phase(function: Printed, names: tuple[str, ...]) -> Callable[..., Array]:
     def of_phase(t, q, v, args):
-        return function(t, (*parts(q), *parts(v)), args)
+        return function(t, (*parts("q", q, names), *parts("v", v, names)), args)
 
     return of_phase
 
 
-def _of_position(function: Printed) -> Callable[..., Array]:
+def _of_position(function: Printed, names: tuple[str, ...]) -> Callable[..., Array]:
     def of_position(t, q, args):
-        return function(t, parts(q), args)
+        return function(t, parts("q", q, names), args)
 
     return of_position
 

@@ -1,6 +1,9 @@
 """Models for Kane's method: their energies, with speeds u written in terms of q'."""
 
+import zlib
 from typing import Any
+
+import numpy as np
 
 from ._description import check_coordinates, Description, expression, of_loads, rates
 from ._library import mechanics, sympy
@@ -28,16 +31,23 @@ def of_kanes_method(method: Any, potential: Any) -> Description:
     for body in bodies:
         _check_velocity(body, frame, solved)
     kinetic = mechanics().kinetic_energy(frame, *bodies)
+    loads = list(method.loads or [])
     if potential is None:
         potential = mechanics().potential_energy(*bodies)
+        if loads and potential != 0:
+            raise ValueError(
+                f"from_sympy: the bodies of the KanesMethod have the potential energy "
+                f"{potential}, and there are loads. Kane's method leaves potential "
+                "energies out: give `potential=0` if the loads contain its forces, "
+                "and otherwise the energy itself as `potential`."
+            )
     lagrangian = (kinetic - expression("potential", potential)).subs(solved)
-    conditions = method._k_nh * sympy().Matrix(speeds) + method._f_nh
-    loads = list(method.loads or [])
+    holonomic = list(method._f_h)
     return Description(
         lagrangian,
         coordinates,
-        [x.subs(solved) for x in conditions] if method._k_nh else [],
-        list(method._f_h),
+        _nonholonomic(method, coordinates, speeds, solved, holonomic),
+        holonomic,
         _forces(loads, coordinates, speeds, solved, frame) if loads else [],
     )
 
@@ -58,6 +68,40 @@ def _speeds_of_rates(
             f"speeds {_listed(speeds)} from the rates of the coordinates."
         )
     return dict(zip(speeds, matrix.LUsolve(-(of_rates + rest)), strict=True))
+
+
+def _nonholonomic(
+    method: Any,
+    coordinates: list[Any],
+    speeds: list[Any],
+    solved: dict[Any, Any],
+    holonomic: list[Any],
+) -> list[Any]:
+    """Return the velocity constraints that are no rates of holonomic ones.
+
+    Kane's method needs the rates of its configuration constraints among its velocity
+    constraints. They are linear in the speeds.
+    """
+    if not method._f_nh:
+        return []
+    given = method._k_nh * sympy().Matrix(speeds) + method._f_nh
+    velocity = [x.subs(solved) for x in given]
+    if not holonomic:
+        return velocity
+    t = mechanics().dynamicsymbols._t
+
+    def row(x: Any) -> list[Any]:
+        slopes = [x.diff(rate) for rate in rates(coordinates)]
+        rest = x.subs(dict.fromkeys(rates(coordinates), 0))
+        return [_at_a_point(part) for part in (*slopes, rest)]
+
+    known = np.array([row(x.diff(t)) for x in holonomic])
+    rank = np.linalg.matrix_rank(known)
+
+    def is_new(x: Any) -> bool:
+        return bool(np.linalg.matrix_rank(np.vstack([known, row(x)])) > rank)
+
+    return [x for x in velocity if is_new(x)]
 
 
 def _forces(
@@ -103,17 +147,30 @@ def _check_velocity(body: Any, frame: Any, solved: dict[Any, Any]) -> None:
 
 def _vanishes(expression: Any) -> bool:
     """Tell whether an expression is zero, at some point that is nothing special."""
+    return abs(_at_a_point(expression)) < 1e-9
+
+
+def _at_a_point(expression: Any) -> complex:
+    """Evaluate an expression where its variables have values that are nothing special.
+
+    The value of a variable depends on its name alone, so that several expressions are
+    evaluated at the same point.
+    """
     library = sympy()
-    functions = expression.atoms(library.core.function.AppliedUndef)
     # Derivatives first: the functions are parts of them.
-    for kind in (expression.atoms(library.Derivative), functions):
-        found = sorted(kind, key=str)
-        values = [library.Rational(3 + i, 7 + 2 * i) for i in range(len(found))]
-        expression = expression.xreplace(dict(zip(found, values, strict=True)))
-    free = sorted(expression.free_symbols, key=str)
-    values = [library.Rational(5 + i, 4 + 3 * i) for i in range(len(free))]
-    value = expression.xreplace(dict(zip(free, values, strict=True)))
-    return abs(complex(value.evalf())) < 1e-9
+    for kind in (
+        library.Derivative,
+        library.core.function.AppliedUndef,
+        library.Symbol,
+    ):
+        values = {x: _value_of(str(x)) for x in expression.atoms(kind)}
+        expression = expression.xreplace(values)
+    return complex(expression.evalf())
+
+
+def _value_of(name: str) -> Any:
+    """Return a number between 1/2 and 3/2 that belongs to a name."""
+    return sympy().Rational(zlib.crc32(name.encode()) % 9973 + 4987, 9973)
 
 
 def _connected(point: Any) -> list[Any]:

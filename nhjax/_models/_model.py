@@ -14,6 +14,7 @@ from .._custom_types import Args, FloatScalarLike
 from .._errors import is_traced, ShapeError
 from .._initial import initial_state
 from .._system import LagrangianSystem, State
+from ._printed import parameter_values
 
 
 class SymPyModel(eqx.Module):
@@ -52,16 +53,19 @@ class SymPyModel(eqx.Module):
 
         **Returns:** a `State`.
 
-        **Raises:** as `nhjax.initial_state`; `ValueError` for unknown names.
+        **Raises:** as `nhjax.initial_state`; `ValueError` for unknown names and those
+        given twice; `TypeError` for parameters that are no real numbers.
         """
         q, v = self._array("q", q), self._array("v", v)
         args = self.args if args is None else args
+        # Before JAX sorts the keys, which it cannot if they are symbols.
+        parameter_values(self.parameters, args)
         return initial_state(self.system, q, v, t=t, args=args, project=project)
 
     def _array(self, name: str, given: Any) -> Array:
         if not isinstance(given, Mapping):
             return given
-        values = {_name(key): value for key, value in given.items()}
+        values = _by_name(f"`{name}`", given)
         unknown = [key for key in values if key not in self.coordinates]
         if unknown:
             raise ValueError(
@@ -69,31 +73,44 @@ class SymPyModel(eqx.Module):
                 f"{', '.join(self.coordinates)}."
             )
         found = [values.get(key, 0.0) for key in self.coordinates]
-        return jnp.stack([jnp.asarray(x, jnp.result_type(float)) for x in found])
+        made = [jnp.asarray(x, jnp.result_type(float)) for x in found]
+        for key, x in zip(self.coordinates, made, strict=True):
+            if x.shape != ():
+                raise ShapeError(
+                    f"`{name}[{key!r}]` has shape {x.shape}, but a coordinate is a "
+                    "scalar; for several states use `jax.vmap`."
+                )
+        return jnp.stack(made)
 
 
-def _name(key: Any) -> str:
-    """Return the name of a symbol, of a coordinate q(t), or of a name itself."""
-    if isinstance(key, str):
-        return key
-    return str(getattr(key, "func", key)) if getattr(key, "args", ()) else str(key)
+def _by_name(where: str, given: Mapping[Any, Any]) -> dict[str, Any]:
+    """Key a dictionary by names, where symbols and coordinates q(t) were keys."""
+    values = {}
+    for key, value in given.items():
+        name = key if isinstance(key, str) else str(getattr(key, "name", key))
+        if name in values:
+            raise ValueError(f"{where} has {name} twice.")
+        values[name] = value
+    return values
 
 
 def parameter_defaults(
     parameters: Mapping[Any, Any], known: tuple[str, ...]
 ) -> dict[str, Array]:
     """Return the values of parameters by name, as arrays that suit any precision."""
+    if not isinstance(parameters, Mapping):
+        raise TypeError(
+            "from_sympy: `parameters` must be a dictionary of values by symbol or "
+            f"name, got {parameters!r}."
+        )
     values = {}
-    for key, value in parameters.items():
-        name = _name(key)
+    for name, value in _by_name("from_sympy: `parameters`", parameters).items():
         if name not in known:
             raise ValueError(
                 f"from_sympy: `parameters` has {name}, but the symbols of the model "
                 f"are {', '.join(known) or 'none'}."
             )
-        if name in values:
-            raise ValueError(f"from_sympy: `parameters` has {name} twice.")
-        if not eqx.is_array_like(value):
+        if not eqx.is_array_like(value) or jnp.iscomplexobj(value):
             # Such as a number of SymPy.
             value = _number(name, value)
         value = float(value) if isinstance(value, numbers.Real) else value
@@ -111,6 +128,8 @@ def parameter_defaults(
 
 def _number(name: str, value: Any) -> float:
     try:
+        if isinstance(value, str):
+            raise TypeError
         return float(value)
     except (TypeError, ValueError):
         raise TypeError(

@@ -1,15 +1,17 @@
 """Expressions of SymPy as functions of JAX, by SymPy's own printer."""
 
+import reprlib
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
 from .._custom_types import Args
 from .._errors import ShapeError
-from ._library import mechanics, sympy
+from ._library import mechanics, printer, sympy
 
 
 class Symbols(NamedTuple):
@@ -43,7 +45,7 @@ def place_symbols(coordinates: list[Any], all_expressions: list[Any]) -> Symbols
     parameters = sorted(free, key=lambda symbol: symbol.name)
     names = [symbol.name for symbol in parameters]
     for name in names:
-        if names.count(name) > 1:
+        if [*names, t.name].count(name) > 1:
             raise ValueError(
                 f"from_sympy: there are two symbols of the name {name}, with different "
                 "assumptions: use one of them."
@@ -70,15 +72,15 @@ def with_symbols(name: str, given: Any, symbols: Symbols) -> Any:
             f"from_sympy: `{name}` contains {derivative}, the derivative of what is no "
             "coordinate."
         )
-    given = given.xreplace(symbols.of)
-    left = sorted(given.atoms(library.core.function.AppliedUndef), key=str)
+    functions = given.atoms(library.core.function.AppliedUndef)
+    left = sorted(functions - set(symbols.of), key=str)
     if left:
         raise ValueError(
             f"from_sympy: `{name}` contains {left[0]}, which is not among the "
             "coordinates. Make it a coordinate, a parameter (a Symbol), or an explicit "
             "function of time."
         )
-    return given
+    return given.xreplace(symbols.of)
 
 
 class Printed(NamedTuple):
@@ -101,8 +103,16 @@ def printed(
 ) -> Printed:
     """Print expressions as one function, with what they share computed once."""
     given = [with_symbols(name, x, symbols) for x in given]
-    if any(x.has(sympy().I) for x in given):
-        raise ValueError(f"from_sympy: `{name}` contains the imaginary unit.")
+    library = sympy()
+    for number, words in (
+        (library.I, "the imaginary unit"),
+        (library.nan, "nan, which is no number"),
+        (library.oo, "infinity"),
+        (-library.oo, "infinity"),
+        (library.zoo, "infinity"),
+    ):
+        if any(x.has(number) for x in given):
+            raise ValueError(f"from_sympy: `{name}` contains {words}.")
     compute = _computed(given, symbols, of_rates)
     if compute is None:
         raise ValueError(
@@ -126,7 +136,9 @@ def _computed(
     scalar = jax.ShapeDtypeStruct((), jnp.result_type(float))
     # Whatever goes wrong, in printing or in what was printed, the model is to blame.
     try:
-        compute = sympy().lambdify(inputs, given, modules="jax", cse=True)
+        compute = sympy().lambdify(
+            inputs, given, modules="jax", printer=printer(), cse=True
+        )
         shapes = jax.eval_shape(
             lambda *x: [jnp.asarray(value) for value in compute(*x)],
             *[scalar] * len(inputs),
@@ -150,11 +162,14 @@ def parameter_values(names: tuple[str, ...], args: Args) -> list[Any]:
     """Take the values of the parameters from `args`, in the order of their names."""
     if args is None and not names:
         return []
-    if not isinstance(args, dict):
+    if not isinstance(args, dict) or not all(isinstance(name, str) for name in args):
+        got = type(args).__name__
+        if args is None or isinstance(args, dict):
+            got = reprlib.repr(args)
         raise TypeError(
-            "`args` must be a dictionary with the parameters of the model, "
-            f"{', '.join(names)}, such as `args=model.args`; got "
-            f"{'None' if args is None else type(args).__name__}."
+            "`args` must be a dictionary with the parameters of the model by name, "
+            f"as strings, {', '.join(names)}, such as `args=model.args`; got "
+            f"{got}."
         )
     missing = [name for name in names if name not in args]
     unknown = [str(name) for name in args if name not in names]
@@ -168,6 +183,8 @@ def parameter_values(names: tuple[str, ...], args: Args) -> list[Any]:
     values = []
     for name in names:
         value = float(args[name]) if isinstance(args[name], int) else args[name]
+        if not eqx.is_array_like(value) or jnp.iscomplexobj(value):
+            raise TypeError(f"`args[{name!r}]` must be a real number, got {value!r}.")
         if jnp.shape(value) != ():
             raise ShapeError(
                 f"`args[{name!r}]` has shape {jnp.shape(value)}, but a parameter is a "
@@ -177,6 +194,11 @@ def parameter_values(names: tuple[str, ...], args: Args) -> list[Any]:
     return values
 
 
-def parts(x: Any) -> tuple[Array, ...]:
-    """Take a vector apart."""
-    return tuple(jax.lax.index_in_dim(x, i, keepdims=False) for i in range(x.shape[0]))
+def parts(name: str, x: Any, names: tuple[str, ...]) -> tuple[Array, ...]:
+    """Take a vector apart that has one component for each of the coordinates."""
+    if jnp.shape(x) != (len(names),):
+        raise ShapeError(
+            f"`{name}` has shape {jnp.shape(x)}, but the model has the coordinates "
+            f"{', '.join(names)}: shape ({len(names)},) is needed."
+        )
+    return tuple(jax.lax.index_in_dim(x, i, keepdims=False) for i in range(len(names)))

@@ -132,6 +132,64 @@ def test_a_kanes_method_has_the_motion_of_its_own_equations():
     np.testing.assert_allclose(found.acceleration, expected, rtol=1e-12)
 
 
+def slider(loads=(), energy=0, pushed=False):
+    """One or two bodies on a line for Kane's method, joined if there are two."""
+    u, w = dynamicsymbols("u w")
+    frame = mechanics.ReferenceFrame("N")
+    bodies = []
+    for name, speed in (("P", u), ("Q", w))[: 2 if pushed else 1]:
+        point = mechanics.Point(name)
+        point.set_vel(frame, speed * frame.x)
+        bodies.append(mechanics.Particle(name, point, M))
+    bodies[0].potential_energy = energy
+    joined: dict[str, Any] = {
+        "q_dependent": [Y],
+        "u_dependent": [w],
+        "configuration_constraints": [X - Y],
+        "velocity_constraints": [u - w],
+    }
+    rates = [DX - u, DY - w] if pushed else [DX - u]
+    forces = [(bodies[0].point, x * frame.x) for x in loads]
+    return mechanics.KanesMethod(
+        frame,
+        [X],
+        [u],
+        rates,
+        bodies=bodies,
+        forcelist=forces,
+        **(joined if pushed else {}),
+    )
+
+
+@pytest.mark.parametrize(("pushed", "expected"), [(False, [-1.5]), (True, [-0.75] * 2)])
+def test_a_kanes_method_may_have_holonomic_constraints_or_none(pushed, expected):
+    model = from_sympy(slider([-K * X], pushed=pushed), parameters={M: 2.0, K: 3.0})
+    assert (model.system.nonholonomic, model.system.holonomic is None) == (
+        None,
+        not pushed,
+    )
+    y = model.initial_state(dict.fromkeys(model.coordinates, 1.0), {})
+    found = nhjax.motion(model.system, 0.0, y, model.args).acceleration
+    np.testing.assert_allclose(found, expected, rtol=1e-14)
+
+
+def test_a_potential_energy_beside_loads_is_not_counted_twice():
+    method = slider([-K * X], energy=K * X**2 / 2)
+    with pytest.raises(ValueError, match=r"and there are loads.* give `potential=0`"):
+        from_sympy(method)
+    model = from_sympy(method, potential=0, parameters={M: 2.0, K: 3.0})
+    y = model.initial_state({X: 1.0}, {})
+    found = nhjax.motion(model.system, 0.0, y, model.args).acceleration
+    np.testing.assert_allclose(found, [-1.5], rtol=1e-14)
+
+
+def test_numbers_keep_all_their_digits():
+    for number in (np.pi, 5.972e24, 10**25):
+        system = from_sympy(sympy.sympify(number) * X + DX**2, [X]).system
+        one, zero = jnp.ones(1), jnp.zeros(1)
+        assert float(system.lagrangian(jnp.zeros(()), one, zero, None)) == float(number)
+
+
 @pytest.fixture(scope="module")
 def particle():
     return sympy_models.particle()
@@ -179,15 +237,23 @@ def test_a_model_serves_both_precisions(particle):
 
 def test_values_at_run_time_are_refused_by_name(particle):
     for args, message in (
-        (None, "with the parameters of the model, k, such as `args=model.args`"),
+        (None, "with the parameters of the model by name, as strings, k, such as"),
         ({}, "`args` lacks k of the parameters"),
         ({"k": 1.0, "g": 2.0}, "`args` has g, which is none of the parameters"),
+        ({"k": "1"}, r"`args\['k'\]` must be a real number, got '1'"),
+        ({sympy.Symbol("k"): 1.0}, "by name, as strings, k"),
         ({"k": jnp.ones(2)}, r"`args\['k'\]` has shape \(2,\)"),
     ):
         with pytest.raises((ValueError, TypeError), match=message):
             nhjax.initial_state(particle.system, jnp.ones(3), jnp.zeros(3), args=args)
     with pytest.raises(ValueError, match="`q` has w, but the coordinates are x, y, z"):
         particle.initial_state({"w": 1.0}, {})
+    with pytest.raises(ValueError, match="`q` has x twice"):
+        particle.initial_state({"x": 1.0, X: 2.0}, {})
+    with pytest.raises(nhjax.ShapeError, match=r"`q` has shape \(2,\), .* x, y, z"):
+        nhjax.initial_state(
+            particle.system, jnp.ones(2), jnp.zeros(2), args=particle.args
+        )
 
 
 def test_forces_may_be_given_in_three_forms():
@@ -235,6 +301,16 @@ WRONG = {
     "contains besselj\\(1, x\\(t\\)\\) \\(besselj\\), which SymPy's printer": (
         {"lagrangian": FREE + sympy.besselj(1, X)}
     ),
+    "`lagrangian` contains f\\(x\\(t\\)\\), which": {"lagrangian": FREE + OTHER(X)},
+    "`lagrangian` contains infinity": {"lagrangian": FREE + sympy.oo * X},
+    "(?s)got Matrix.* of type": {"lagrangian": sympy.Matrix([FREE, FREE])},
+    "`coordinates` is a set, which has no order": {"coordinates": {X, Y}},
+    "two symbols of the name t": (
+        {"lagrangian": FREE + X * sympy.Symbol("t", real=True)}
+    ),
+    "`parameters` must be a dictionary": {"parameters": [("m", 1.0)]},
+    "`parameters\\['m'\\]` must be a real number, got 1j": {"parameters": {M: 1j}},
+    "`parameters` has m \\+ 1, but": {"parameters": {M + 1: 1.0}},
     "`lagrangian` contains the imaginary unit": {"lagrangian": FREE + sympy.I * X},
     "the coordinate x is given twice": {"coordinates": [X, X]},
     "the coordinate k is no function of time": {"coordinates": [X, K]},
