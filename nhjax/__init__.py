@@ -30,6 +30,8 @@ from ._integrate import (
     Checkpoint as Checkpoint,
     DenseInterpolation as DenseInterpolation,
     DirectAdjoint as DirectAdjoint,
+    Event as Event,
+    EventLog as EventLog,
     integrate as integrate,
     NoProgressMeter as NoProgressMeter,
     RecursiveCheckpointAdjoint as RecursiveCheckpointAdjoint,

@@ -6,6 +6,9 @@ import equinox as eqx
 import jax
 
 
+EVENT_OCCURRED = "An event ended the run, as was asked for; this is no failure."
+
+
 class RESULTS(eqx.Enumeration):
     """The ways in which a run can end; `RESULTS[sol.result]` is the message."""
 
@@ -59,6 +62,23 @@ class RESULTS(eqx.Enumeration):
         "velocities do work, as forces do; what such a system conserves, if anything, "
         "such as a moving energy, can be given as a function."
     )
+    event_occurred = EVENT_OCCURRED
+    nonfinite_event = (
+        "The condition of an event became infinite or NaN where the state is finite. "
+        "Check its `cond_fn` along the trajectory."
+    )
+    inconsistent_reset = (
+        "The state that the `reset` of an event returned is not finite, violates the "
+        "constraints, its q is off the group, or its v and p do not belong together. "
+        "Return a pair (q, v), for a Hamiltonian system (q, p), whose velocity "
+        "satisfies the constraints."
+    )
+    too_many_events = (
+        "There were more events than the `max_events` of the `nhjax.Event`s make room "
+        "for. Give them a larger `max_events`, unless the events accumulate at one "
+        "time, as the bounces of a ball that comes to rest do: then end the run, or "
+        "let the reset keep the motion away from the next event."
+    )
 
 
 @functools.cache
@@ -74,6 +94,10 @@ def result_codes() -> dict[str, int]:
         "lost_constraints",
         "inconsistent_start",
         "not_conserved",
+        "event_occurred",
+        "nonfinite_event",
+        "inconsistent_reset",
+        "too_many_events",
     )
     # The items are arrays of JAX, while their codes are needed as Python's integers.
     with jax.ensure_compile_time_eval():

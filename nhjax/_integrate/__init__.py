@@ -6,8 +6,10 @@ from ._adjoint import (
     RecursiveCheckpointAdjoint as RecursiveCheckpointAdjoint,
 )
 from ._checkpoint import Checkpoint as Checkpoint
+from ._event import Event as Event
 from ._integrate import integrate as integrate
 from ._interpolation import DenseInterpolation as DenseInterpolation
+from ._log import EventLog as EventLog
 from ._progress_meter import (
     AbstractProgressMeter as AbstractProgressMeter,
     NoProgressMeter as NoProgressMeter,

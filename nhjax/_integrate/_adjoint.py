@@ -71,7 +71,7 @@ class DirectAdjoint(AbstractAdjoint):
     def run(self, loop: Loop, carry: Carry) -> _Run:
         """Run all steps of the loop from `carry`; return its end and all saved rows."""
         state = (carry, loop.empty_rows(carry))
-        end = count(loop.num_steps)
+        end = count(loop.num_iterations)
         return jax.lax.fori_loop(
             np.int32(0), end, lambda k, state: _advance(loop, state, k), state
         )
@@ -126,12 +126,12 @@ class RecursiveCheckpointAdjoint(AbstractAdjoint):
 
     def run(self, loop: Loop, carry: Carry) -> _Run:
         """Run all steps of the loop from `carry`; return its end and all saved rows."""
-        if not isinstance(loop.num_steps, int):
+        if not isinstance(loop.num_iterations, int):
             # Blocks serve reverse mode alone, which needs a known number of steps.
             return DirectAdjoint().run(loop, carry)
-        lengths = self._block_lengths(loop.num_steps)
+        lengths = self._block_lengths(loop.num_iterations)
         advance: _Advance = partial(_advance, loop)
-        if math.prod(lengths) > loop.num_steps:
+        if math.prod(lengths) > loop.num_iterations:
             advance = _idle_after_the_end(loop)
         for level, length in enumerate(reversed(lengths)):
             stride = math.prod(lengths[len(lengths) - level :])
@@ -179,11 +179,9 @@ def _idle_after_the_end(loop: Loop) -> _Advance:
         # The buffers are written outside of the branches of `jax.lax.cond`, which would
         # copy them.
         carry, buffers = state
-        nothing = jax.tree.map(
-            lambda x: jnp.zeros(x.shape, x.dtype), loop.row_shapes(carry)
-        )
+        nothing = loop.no_rows(carry)
         carry, rows = jax.lax.cond(
-            k < loop.num_steps,
+            k < loop.num_iterations,
             lambda carry: loop.step(carry, k),
             lambda carry: (carry, nothing),
             carry,

@@ -1,3 +1,4 @@
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Literal
 
@@ -37,6 +38,7 @@ from ._checks import (
     countable,
     is_tracing,
 )
+from ._event import as_events, Event
 from ._interpolation import (
     require_collocation,
 )
@@ -66,6 +68,7 @@ def integrate(
     throw: bool = True,
     progress_meter: AbstractProgressMeter = NoProgressMeter(),
     invariants: Literal["energy"] | PhaseFunction | None = None,
+    event: Event | Sequence[Event] | None = None,
 ) -> Solution:
     """Integrate a mechanical system over `num_steps` steps of size `dt`.
 
@@ -108,6 +111,8 @@ def integrate(
         or a function of (t, q, v, args), or of (t, q, p, args) of a Hamiltonian system,
         of shape () or (k,), that the system conserves. `docs/invariants.md` says how,
         what it costs and what it does at rest.
+    - `event`: an `nhjax.Event`, or a sequence of them, of which the first in time wins:
+        zeros of functions of the state, where the run ends or the state is reset.
 
     **Returns:** a `Solution`.
 
@@ -158,9 +163,8 @@ def integrate(
     check_type("method", method, AbstractMethod, "Such as nhjax.LobattoIIIAB(3).")
     check_type("y0", y0, (State, Checkpoint), "Make one with nhjax.initial_state.")
     check_type("saveat", saveat, SaveAt, "Such as nhjax.SaveAt(t0=True, steps=True).")
-    check_type(
-        "stage_solver", stage_solver, AbstractStageSolver, "Such as nhjax.Newton()."
-    )
+    newton = "Such as nhjax.Newton()."
+    check_type("stage_solver", stage_solver, AbstractStageSolver, newton)
     check_type("adjoint", adjoint, AbstractAdjoint, "Such as nhjax.DirectAdjoint().")
     check_type("progress_meter", progress_meter, AbstractProgressMeter)
     throw = check_flag("throw", throw)
@@ -169,6 +173,7 @@ def integrate(
     args = parameters(args)
     state = check_start(system, y0, args)
     t0, dt = _checked_times(y0, state, t0, dt, num_steps)
+    events = _checked_events(event, saveat, invariants)
     _check_method(method, state, saveat)
     saveat = saveat.within(t0, dt, num_steps)
     # A plain call has no use for a length that is known, but for one that changes.
@@ -178,8 +183,8 @@ def integrate(
     def run_with(
         stage_solver: AbstractStageSolver, meter: AbstractProgressMeter
     ) -> Solution:
-        given = (adjoint, y0, t0, dt, num_steps, args, saveat, meter, invariants)
-        return run(system, method, stage_solver, *given)
+        given = (adjoint, y0, t0, dt, num_steps, args, saveat, meter)
+        return run(system, method, stage_solver, *given, invariants, events)
 
     sol = run_with(stage_solver, progress_meter)
     if not is_tracing() and leaves_steps_to_newton(stage_solver) and is_unsolved(sol):
@@ -232,6 +237,33 @@ def _check_method(method: AbstractMethod, y0: State, saveat: SaveAt) -> None:
         method.require_constraint_hypotheses()
     if saveat.dense or saveat.ts is not None:
         require_collocation(method)
+
+
+def _checked_events(
+    event: Event | Sequence[Event] | None, saveat: SaveAt, invariants: object
+) -> tuple[Event, ...] | None:
+    """Return the events of a run, or raise if something asked for goes without them."""
+    events = as_events(event)
+    if events is not None and saveat.checkpoint:
+        raise ValueError(
+            "SaveAt: `checkpoint=True` is not available together with `event`, since "
+            "the run may end between two nodes. Go on from its last state with the "
+            "`t0` that is `sol.t1`."
+        )
+    if events is not None and invariants is not None:
+        raise ValueError(
+            "`invariants` are not available together with `event`, since a reset "
+            "changes them. Leave out one of the two."
+        )
+    if events is not None and (saveat.dense or saveat.ts is not None):
+        option = "dense=True" if saveat.dense else "ts=..."
+        raise ValueError(
+            f"SaveAt: `{option}` is not available together with `event`, since a step "
+            "that is cut has two polynomials. Save at `steps`; `Solution.events` has "
+            "the times and states of the events, and runs from one to the next have "
+            "dense output."
+        )
+    return events
 
 
 def _zero_step() -> ValueError:

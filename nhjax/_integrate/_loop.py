@@ -6,7 +6,13 @@ import jax.numpy as jnp
 from jaxtyping import Array, Int
 
 from .._numerics import moving_with
-from ._checks import known
+from .._results import RESULTS
+from .._system import State
+from ._checkpoint import Checkpoint
+from ._checks import known as known_length
+from ._event_stepping import EventStepping
+from ._log import LogEntry, no_entry
+from ._progress import Known, progress_of
 from ._progress_meter import AbstractProgressMeter
 from ._saving import Rows, Saving
 from ._stepping import Carry, Stepping, Taken
@@ -22,18 +28,71 @@ class Loop(eqx.Module):
     stepping: Stepping
     saving: Saving
     meter: AbstractProgressMeter
+    events: EventStepping | None = None
 
     @property
     def num_steps(self) -> int | Int[Array, ""]:
         """Return the number of steps of the run."""
         return self.saving.num_steps
 
-    def step(self, carry: Carry, k: Int[Array, ""]) -> tuple[Carry, Rows]:
-        """Take step k; return the carry after it and the rows that it saves."""
+    @property
+    def num_iterations(self) -> int | Int[Array, ""]:
+        """Return the number of iterations of the loop: its steps, unless it has events.
+
+        With events an iteration takes a part of a step where there is an event in it.
+        """
+        return self.num_steps if self.events is None else self.events.num_iterations
+
+    def start(self, y0: State | Checkpoint) -> Carry:
+        """Make the carry before the first step."""
+        return (self.stepping if self.events is None else self.events).start(y0)
+
+    def step(
+        self, carry: Carry, k: Int[Array, ""], known: Known | None = None
+    ) -> tuple[Carry, Rows]:
+        """Take step k; return the carry after it and the rows that it saves.
+
+        With events k counts iterations, and `known` is what a step back knows of it.
+        """
+        if self.events is not None:
+            return self._go_on(self.events, carry, k, known)
         carry, taken = self.stepping.advance(carry, k)
         if not self.meter.silent:
-            self.meter.report(k, known(self.num_steps))
+            self.meter.report(k, known_length(self.num_steps))
         return carry, self._rows(carry, taken, k)
+
+    def _go_on(
+        self,
+        events: EventStepping,
+        carry: Carry,
+        iteration: Int[Array, ""],
+        known: Known | None,
+    ) -> tuple[Carry, Rows]:
+        """Go on to the next node or event."""
+        carry, taken, entry, row = events.advance(carry, iteration, known)
+        if not self.meter.silent:
+            jax.lax.cond(
+                row < self.num_steps,
+                lambda: self.meter.report(row, known_length(self.num_steps)),
+                lambda: None,
+            )
+        return carry, self._event_rows(events, carry, taken, entry, row)
+
+    def _event_rows(
+        self,
+        events: EventStepping,
+        carry: Carry,
+        taken: Taken,
+        entry: LogEntry,
+        row: Int[Array, ""],
+    ) -> Rows:
+        t = self.stepping.time(row + 1)
+        ended = carry.result == RESULTS.event_occurred
+        t = jnp.where(ended, events.time(progress_of(carry)), t)
+        y, args = carry.step_state.state, self.stepping.args
+        rows = self.saving.rows(t, y, args, taken, row)
+        log = None if events.consequences.ends_only else entry
+        return rows._replace(log=log, row=row)
 
     def _rows(self, carry: Carry, taken: Taken, k: Int[Array, ""]) -> Rows:
         t, args = self.stepping.time(k + 1), self.stepping.args
@@ -49,7 +108,11 @@ class Loop(eqx.Module):
 
         def rows() -> Rows:
             # No step is taken for this, since a step is dear to trace.
-            return self._rows(carry, self.stepping.nothing_taken(carry), k)
+            taken = self.stepping.nothing_taken(carry)
+            if self.events is None:
+                return self._rows(carry, taken, k)
+            entry = no_entry(self.stepping.time(0), carry.step_state.state)
+            return self._event_rows(self.events, carry, taken, entry, k)
 
         return jax.eval_shape(rows)
 
@@ -57,6 +120,19 @@ class Loop(eqx.Module):
         """Return the same carry, its state differentiated wherever the run is."""
         state = moving_with(carry.step_state.state, self.stepping)
         return eqx.tree_at(lambda x: x.step_state.state, carry, state)
+
+    def no_rows(self, carry: Carry) -> Rows:
+        """Make rows of zeros, which `write` puts nowhere after the end of the run."""
+        rows = jax.tree.map(
+            lambda x: jnp.zeros(x.shape, x.dtype), self.row_shapes(carry)
+        )
+        if self.events is None:
+            return rows
+        rows = rows._replace(row=jnp.full_like(rows.row, self.num_steps))
+        if rows.log is None:
+            return rows
+        nowhere = jnp.full_like(rows.log.slot, self.events.consequences.max_events)
+        return eqx.tree_at(lambda rows: rows.log.slot, rows, nowhere)
 
     def empty_rows(self, carry: Carry) -> Rows:
         """Make buffers of zeros for all rows that the run saves."""

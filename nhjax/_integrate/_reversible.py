@@ -5,18 +5,17 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Int, PyTree
+from jaxtyping import Array, PyTree
 
 from .._custom_types import BoolScalar
-from .._numerics import iterate, max_norm, relative, Sizes
-from .._results import RESULTS
-from .._step import StepState
+from .._numerics import max_norm, relative
 from .._system import AbstractMechanicalSystem, State
 from ._adjoint import AbstractAdjoint, count, DirectAdjoint
 from ._loop import Loop
 from ._progress_meter import NoProgressMeter
 from ._saving import Rows
-from ._stepping import Carry, Stepping
+from ._stepping import Carry
+from ._way_back import way_back
 
 
 class ReversibleAdjoint(AbstractAdjoint):
@@ -61,56 +60,59 @@ def _run_fwd(perturbed, arguments):
     del perturbed
     # A call of `_run` would refuse forward mode over this reverse mode.
     carry, rows = DirectAdjoint().run(*arguments)
-    # The backward pass needs the shapes of the buffers alone, so these are not kept.
+    # The backward pass needs the shapes of the buffers alone, so these are not kept,
+    # but for the log of events.
     shapes = jax.eval_shape(lambda: rows)
-    return (carry, rows), (carry, shapes)
+    return (carry, rows), (carry, shapes, rows.log)
 
 
 @_run.def_bwd
 def _run_bwd(residuals, cotangents, perturbed, arguments):
     del perturbed
-    (end, shapes), (loop, start) = residuals, arguments
+    (end, shapes, log), (loop, start) = residuals, arguments
     meter = eqx.filter(loop.meter, eqx.is_inexact_array)
     loop = replace(loop, meter=NoProgressMeter())  # the forward pass has shown all
-    cotangent, row_cotangents = cotangents
-    cotangent = _filled(cotangent.step_state.state, end.step_state.state)
+    of_end, row_cotangents = cotangents
+    way = way_back(loop, start, end, log)
+    cotangent = _filled(way.moving(of_end), way.moving(end))
     row_cotangents = _filled(row_cotangents, shapes)
     parameters, fixed = eqx.partition(loop, eqx.is_inexact_array)
     nothing = jax.tree.map(jnp.zeros_like, parameters)
 
     def retrace(state, k):
-        step_state, cotangent, total = state
-        step_state = step_back(loop.stepping, step_state, k)
+        place, step_state, cotangent, total = state
+        place, step_state = way.back(place, step_state, k)
 
-        def forward(parameters, y):
-            node_at_y = eqx.tree_at(lambda step_state: step_state.state, step_state, y)
-            carry = start._replace(step_state=node_at_y)
-            carry, rows = eqx.combine(parameters, fixed).step(carry, k)
-            return carry.step_state.state, eqx.filter(rows, eqx.is_inexact_array)
+        def forward(parameters, moving):
+            loop = eqx.combine(parameters, fixed)
+            carry, rows = way.again(loop, place, step_state, moving, k)
+            return way.moving(carry), eqx.filter(rows, eqx.is_inexact_array)
 
-        _, pullback = jax.vjp(forward, parameters, step_state.state)
-        row = eqx.filter(loop.saving.read(row_cotangents, k), eqx.is_inexact_array)
+        moving = way.starts_moving(place, step_state)
+        _, pullback = jax.vjp(forward, parameters, moving)
+        row = eqx.filter(way.rows(row_cotangents, place, k), eqx.is_inexact_array)
         change, cotangent = pullback((cotangent, row))
-        return step_state, cotangent, jax.tree.map(jnp.add, total, change)
+        return place, step_state, cotangent, jax.tree.map(jnp.add, total, change)
 
     last, state = (
-        count(loop.num_steps) - np.int32(1),
-        (end.step_state, cotangent, nothing),
+        count(loop.num_iterations) - np.int32(1),
+        (way.place_at_end, end.step_state, cotangent, nothing),
     )
-    first, cotangents, total = jax.lax.fori_loop(
+    _, first, cotangents, total = jax.lax.fori_loop(
         np.int32(0),
-        count(loop.num_steps),
+        count(loop.num_iterations),
         lambda i, state: retrace(state, last - i),
         state,
     )
-    total, cotangent = _if_retraced(
-        end.result == RESULTS.successful,
+    total, cotangents = _if_retraced(
+        way.went_well,
         loop.stepping.system,
         first.state,
         start.step_state.state,
         (cotangent, row_cotangents),
         (total, cotangents),
     )
+    cotangent = cotangents if loop.events is None else cotangents[0]
     of_start = jax.tree.map(lambda _: None, eqx.filter(start, eqx.is_inexact_array))
     of_start = eqx.tree_at(
         lambda carry: carry.step_state.state,
@@ -163,56 +165,3 @@ def _filled(cotangents: PyTree[Any], like: PyTree[Any]) -> PyTree[Any]:
         return jnp.zeros(x.shape, x.dtype) if is_number else None
 
     return jax.tree.map(fill, cotangents, like, is_leaf=lambda leaf: leaf is None)
-
-
-def step_back(
-    stepping: Stepping, step_state: StepState, k: Int[Array, ""]
-) -> StepState:
-    """Compute the state that step k started from, given the one that it led to."""
-    go_on = jnp.asarray(False)
-
-    def back_from(step_state: StepState) -> StepState:
-        t, h = stepping.time(k + 1), -stepping.dt
-        return stepping.one_step(step_state, t, h, go_on).step_state
-
-    if _retraces(stepping, step_state):
-        return back_from(step_state)
-
-    # Let y be the end of a step back from z. Each sweep moves z by the difference
-    # between `step_state` and the end of the step forward from y. The two steps undo
-    # each other up to a small error, so that this iteration contracts far faster than
-    # one that moves y would.
-    target = step_state.state
-    manifold = stepping.system.manifold_of(target.q)
-    propagated = stepping.method.closure == "propagated"
-
-    def sweep(z: State):
-        y = back_from(eqx.tree_at(lambda x: x.state, step_state, z))
-        t, h = stepping.time(k), stepping.dt
-        reached = stepping.one_step(y, t, h, go_on).step_state.state
-        to_reached = manifold.inverse(reached.q)
-        xi = manifold.local(manifold.compose(to_reached, target.q))
-        misses = [xi, target.p - reached.p]
-        multiplier = z.multiplier
-        if propagated:
-            miss = target.multiplier - reached.multiplier
-            misses.append(stepping.dt * miss)
-            multiplier = multiplier + miss
-        size = max_norm(*misses)
-        z = State(manifold.act(z.q, xi), z.v, z.p + misses[1], multiplier)
-        return z, Sizes(size), y
-
-    scale = 1 + max_norm(target.p)
-    limit = stepping.stage_solver.max_iterations
-    return iterate(sweep, target, scale, max_iterations=limit).aux
-
-
-def _retraces(stepping: Stepping, step_state: StepState) -> bool:
-    """Tell whether a step of -h undoes a step of h, up to round-off."""
-    system, method = stepping.system, stepping.method
-    is_flat = system.manifold_of(step_state.state.q).is_flat
-    if not is_flat and method.chart != "middle":
-        return False
-    if system.nonholonomic is not None and method.closure == "consistent":
-        return False
-    return method.is_symmetric

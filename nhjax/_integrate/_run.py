@@ -6,6 +6,7 @@ from typing import Any
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 from jaxtyping import Array, Int, PyTree
 
 from .._compile import as_cpu_kernel, Programs, tracked_jit
@@ -19,16 +20,20 @@ from ._adjoint import AbstractAdjoint
 from ._checkpoint import Checkpoint, start_of
 from ._checks import check_saved, known
 from ._conservation import kept_invariants
+from ._event import Event
+from ._event_stepping import EventStepping
 from ._interpolation import DenseInterpolation, interpolate, step_index
+from ._log import EventLog, log_at_end, reported
 from ._loop import Loop
+from ._progress import progress_of
 from ._progress_meter import AbstractProgressMeter
 from ._saveat import SaveAt, stack_saved
-from ._saving import record_places, Rows, Saving
+from ._saving import record_places, RecordPlaces, Rows, Saving
 from ._solution import Solution
 from ._stepping import as_checkpoint, Carry, Stepping
 
 
-@tracked_jit("system", "args", "saveat", "invariants")
+@tracked_jit("system", "args", "saveat", "invariants", "events")
 def run(
     system: AbstractMechanicalSystem,
     method: AbstractMethod,
@@ -42,6 +47,7 @@ def run(
     saveat: SaveAt,
     meter: AbstractProgressMeter,
     invariants: str | Callable[..., Any] | None,
+    events: tuple[Event, ...] | None,
 ) -> Solution:
     """Integrate with arguments that have been checked, and return the solution."""
     state, origin = start_of(y0, t0, dt)
@@ -56,21 +62,20 @@ def run(
         length = known(num_steps)
         sampled = jax.vmap(lambda t: step_index(t, t0, dt, length))(ts)
     places = record_places(saveat.dense, sampled, num_steps)
-    saving = Saving(
-        fn=ClosureConverted(saveat.fn, t0, state, args),
-        num_steps=num_steps,
-        stride=saveat.steps,
-        num_saved=known(num_steps) // saveat.steps if saveat.steps else 0,
-        num_records=places.number,
-        record_slots=places.slots,
-    )
-
-    loop = Loop(stepping, saving, meter)
+    event_stepping = EventStepping.of(events, stepping, state, num_steps)
+    fn = ClosureConverted(saveat.fn, t0, state, args)
+    saving = _saving(saveat, fn, num_steps, places, event_stepping)
+    loop = Loop(stepping, saving, meter, event_stepping)
     start, carry, rows = _all_steps(adjoint, loop, y0, saveat.checkpoint)
     found, given = (carry.step_state.state, rows), (system, y0, t0, dt, args)
-    end, rows = nan_gradient_unless(carry.result == RESULTS.successful, found, given)
-    t1 = stepping.time(num_steps)
-
+    log = None
+    if event_stepping is None:
+        successful = carry.result == RESULTS.successful
+        end, rows = nan_gradient_unless(successful, found, given)
+        t1 = stepping.time(num_steps)
+    else:
+        given = *given, events
+        end, rows, t1, log = _end_with_events(event_stepping, carry, found, given)
     first = [_one(saving.saved(t0, start, args))] if saveat.t0 else []
     on_the_way = [jax.tree.map(lambda x: x[:-1], rows.saved)] if saveat.steps else []
     if ts is not None and sampled is not None and places.slots is not None:
@@ -83,12 +88,11 @@ def run(
     interpolation = None
     if saveat.dense:
         records = jax.tree.map(lambda x: x[:-1], rows.record)
-        interpolation = DenseInterpolation(
-            system, method, known(num_steps), t0, dt, records, args
-        )
+        given = system, method, known(num_steps), t0, dt, records, args
+        interpolation = DenseInterpolation(*given)
     checkpoint = as_checkpoint(stepping, carry, end) if saveat.checkpoint else None
     how = carry.stats, carry.result, interpolation, checkpoint, system.coordinates
-    return Solution(t0, t1, times, ys, *how)
+    return Solution(t0, t1, times, ys, *how, events=log)
 
 
 def _all_steps(
@@ -97,7 +101,7 @@ def _all_steps(
     """Take all steps; return the first state, what is carried at the end, and rows."""
 
     def start(loop: Loop, y0: State | Checkpoint):
-        return loop.stepping.start(y0)
+        return loop.start(y0)
 
     def steps(loop: Loop, first: Carry):
         return first.step_state.state, *adjoint.run(loop, loop.moving(first))
@@ -111,6 +115,43 @@ def _all_steps(
     given, rest = eqx.partition((loop, first), eqx.is_array)
     loop, first = eqx.combine(jax.lax.optimization_barrier(given), rest)
     return as_cpu_kernel(steps, loop, first)
+
+
+def _saving(
+    saveat: SaveAt,
+    fn: ClosureConverted,
+    num_steps: int | IntScalar,
+    places: RecordPlaces,
+    events: EventStepping | None,
+) -> Saving:
+    """Make the choice of what the steps of a run save."""
+    return Saving(
+        fn=fn,
+        num_steps=num_steps,
+        stride=saveat.steps,
+        num_saved=known(num_steps) // saveat.steps if saveat.steps else 0,
+        num_records=places.number,
+        record_slots=places.slots,
+        num_events=0 if events is None else events.num_kept,
+    )
+
+
+def _end_with_events(
+    events: EventStepping, carry: Carry, found: tuple[State, Rows], given: Any
+) -> tuple[State, Rows, FloatScalar, EventLog]:
+    """Find the state and the time at the end of a run with events, and their log.
+
+    Derivatives with respect to what is `given` are NaN if the run failed.
+    """
+    progress, ended = progress_of(carry), carry.result == RESULTS.event_occurred
+    last = events.stepping.time(events.num_steps)
+    t1 = jnp.where(ended, events.time(progress), last)
+    went_well = ended | (carry.result == RESULTS.successful)
+    end, rows, t1 = nan_gradient_unless(went_well, (*found, t1), given)
+    log = rows.log
+    if log is None:
+        log = log_at_end(progress, t1, end)
+    return end, rows, t1, reported(log, progress.num)
 
 
 def _one(saved: PyTree[Array]) -> PyTree[Array]:

@@ -12,6 +12,7 @@ from .._custom_types import Args, FloatScalar
 from .._step import StepRecord
 from .._system import State
 from ._checks import known
+from ._log import LogEntry
 from ._stepping import Taken
 
 
@@ -20,10 +21,15 @@ class Rows(NamedTuple):
 
     - `saved`: the time and the value of `SaveAt(fn=...)`; None if steps save none.
     - `record`: the record of the step for interpolation; None if none is kept.
+    - `log`: the entry of an event for the log; None in a run that keeps none.
+    - `row`: in a run with events the index of the step whose rows these are, which may
+        be none; None in other runs, and in buffers.
     """
 
     saved: PyTree[Array] | None
     record: StepRecord | None
+    log: LogEntry | None = None
+    row: Int[Array, ""] | None = None
 
 
 class RecordPlaces(NamedTuple):
@@ -68,6 +74,7 @@ class Saving(eqx.Module):
     num_saved: int = eqx.field(static=True)
     num_records: int = eqx.field(static=True)
     record_slots: Int[Array, " nodes"] | None
+    num_events: int = eqx.field(static=True, default=0)
 
     def saved(self, t: FloatScalar, y: State, args: Args) -> PyTree[Array]:
         """Compute the entry that is saved of a state: its time, and `fn` at it."""
@@ -126,7 +133,9 @@ class Saving(eqx.Module):
             )
 
         return Rows(
-            buffers(self.num_saved, row.saved), buffers(self.num_records, row.record)
+            buffers(self.num_saved, row.saved),
+            buffers(self.num_records, row.record),
+            buffers(self.num_events, row.log),
         )
 
     def write(self, buffers: Rows, rows: Rows, k: Int[Array, ""]) -> Rows:
@@ -139,23 +148,36 @@ class Saving(eqx.Module):
                 row,
             )
 
-        saved, records = buffers
+        saved, records, log, _ = buffers
+        if rows.row is not None:
+            # Steps that are cut have iterations of their own, but no more rows.
+            k = rows.row
+        if rows.log is not None:
+            log = put(log, rows.log, rows.log.slot)
         if self.stride:
             saved = put(saved, rows.saved, self._slot(k))
         if self.record_slots is not None:
             slot = self.record_slots[jnp.minimum(k, self.num_steps)]
             records = put(records, rows.record, slot)
-        return Rows(saved, records)
+        return Rows(saved, records, log)
 
-    def read(self, buffers: Rows, k: Int[Array, ""]) -> Rows:
-        """Read the rows of step k from the buffers, from where `write` puts them."""
+    def read(
+        self, buffers: Rows, k: Int[Array, ""], event: Int[Array, ""] | None = None
+    ) -> Rows:
+        """Read the rows of step k from the buffers, from where `write` puts them.
+
+        In a run with events k is the row that an iteration fills, and `event` the place
+        of the event in the log.
+        """
 
         def get(buffer, slot):
             return jax.tree.map(lambda x: x[slot], buffer)
 
-        saved, records = buffers
+        saved, records, log, _ = buffers
+        if log is not None:
+            log = get(log, event)
         if self.stride:
             saved = get(saved, self._slot(k))
         if self.record_slots is not None:
             records = get(records, self.record_slots[k])
-        return Rows(saved, records)
+        return Rows(saved, records, log)

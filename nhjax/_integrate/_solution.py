@@ -7,7 +7,7 @@ from jaxtyping import Array, Float, PyTree
 
 from .._custom_types import FloatScalarLike
 from .._errors import IntegrationError, is_traced, lane_name, raise_where
-from .._results import messages, RESULTS
+from .._results import EVENT_OCCURRED, messages, RESULTS
 from .._system import State
 from ._dataset import to_dataset
 from ._interpolation import DenseInterpolation
@@ -46,6 +46,10 @@ class Solution(eqx.Module):
     - `checkpoint`: what a later run needs to go on bit for bit, with
         `SaveAt(checkpoint=True)`; None without.
     - `coordinates`: the names of the coordinates, if the system has them.
+    - `events`: the events of a run that was given an `event`, an `nhjax.EventLog`; None
+        without. Then `stats` has `num_events`, too, and `num_steps` is the number of
+        nodes that were reached. After an event that ends the run all entries of `ts`
+        and `ys` are those of the event, and so is `t1`.
 
     Under `vmap` every array has the batch as its leading axis; a member of the batch is
     called a lane.
@@ -62,6 +66,8 @@ class Solution(eqx.Module):
     # A `Checkpoint`, or None.
     checkpoint: Any = None
     coordinates: tuple[str, ...] | None = eqx.field(default=None, static=True)
+    # An EventLog, or None, the empty tree, if the run was given no event.
+    events: Any = None
 
     def evaluate(self, t: FloatScalarLike) -> State:
         """Compute the state at any time of the run, by the collocation polynomials.
@@ -197,6 +203,8 @@ def raise_failures(sol: Solution, dt: FloatScalarLike | None = None) -> Solution
     """
     outcome = _outcome(sol)
     bad = outcome.codes != messages().index("")
+    if sol.events is not None:
+        bad = bad & (outcome.codes != messages().index(EVENT_OCCURRED))
     if is_traced(*outcome, dt):
         return raise_where(sol, bad, _failure, (outcome, dt))
     if np.any(bad):
@@ -224,7 +232,7 @@ def _failures(
                 " The largest residual, or one that is not a number, was that of "
                 f"coordinate {coordinate}."
             )
-        if message:
+        if message not in ("", EVENT_OCCURRED):
             failures.append((lane_name(index), int(steps[index]), message))
     return failures
 

@@ -1,6 +1,6 @@
 """The steps of a run: what is carried from one to the next, and how each is taken."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -37,12 +37,14 @@ from ._statistics import first_statistics, Statistics, updated_statistics
 class Carry(NamedTuple):
     """The data that the time loop carries from one step to the next.
 
-    Derivatives pass through `step_state` alone.
+    Derivatives pass through `step_state` alone, and in a run with events through the
+    time in `progress`, which other runs do not have.
     """
 
     step_state: StepState
     result: RESULTS
     stats: Statistics
+    progress: Any = None
 
 
 class Taken(NamedTuple):
@@ -85,7 +87,7 @@ class Stepping(eqx.Module):
         if checkpoint is not None:
             step_state = resumed(checkpoint, step_state)
         result = RESULTS.where(
-            _is_consistent(system, t, step_state, args),
+            is_consistent(system, t, step_state, args),
             RESULTS.successful,
             RESULTS.inconsistent_start,
         )
@@ -166,7 +168,7 @@ def as_checkpoint(stepping: Stepping, carry: Carry, end: State) -> Checkpoint:
     )
 
 
-def _is_consistent(
+def is_consistent(
     system: AbstractMechanicalSystem, t: FloatScalar, start: StepState, args: Args
 ) -> BoolScalar:
     """Tell whether the initial state is consistent, up to small errors.

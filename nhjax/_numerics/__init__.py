@@ -20,7 +20,6 @@ from ._implicit import (
     frozen as frozen,
     has_tangent as has_tangent,
     moving_with as moving_with,
-    nan_gradient_unless as nan_gradient_unless,
     nan_unless as nan_unless,
     root as root,
     solve_contraction as solve_contraction,
@@ -47,6 +46,10 @@ from ._max_norm import (
     max_norm as max_norm,
     relative as relative,
     unit as unit,
+)
+from ._no_gradient import (
+    nan_gradient_unless as nan_gradient_unless,
+    nan_tangent_unless as nan_tangent_unless,
 )
 from ._rank import (
     conditioning as conditioning,

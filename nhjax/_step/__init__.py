@@ -3,8 +3,10 @@
 from .._numerics import Solved as Solved
 from ._curved_chart import chart_of_step as chart_of_step
 from ._derivative import (
+    change_of_step as change_of_step,
     primitive_step as primitive_step,
     StepArguments as StepArguments,
+    tangent_of_outcome as tangent_of_outcome,
 )
 from ._invariants import (
     invariant_values as invariant_values,

@@ -1,6 +1,7 @@
 """A step with its derivative, by the implicit function theorem at the solved stages."""
 
-from functools import partial
+from collections.abc import Callable
+from typing import TypeAlias
 
 import equinox as eqx
 import jax
@@ -75,13 +76,33 @@ def _differentiable_step_jvp(primals, tangents):
     outcome = primitive_step(*primals)
     x, ok = outcome.stages, ~skip & (outcome.result == RESULTS.successful)
     perturbed, fixed = eqx.partition(arguments, has_tangent(tangents[0]))
+    change = change_of_step(arguments, method, solver, ok, x, fixed)
+    # By the checkpoint nothing but states and stages is kept for a reverse pass.
+    change = jax.checkpoint(change, prevent_cse=False)
+    return outcome, tangent_of_outcome(outcome, change(perturbed, x, tangents[0]))
 
+
+Changes: TypeAlias = tuple[Stages, State, StepRecord]
+
+
+def change_of_step(
+    arguments: StepArguments,
+    method: AbstractMethod,
+    solver: AbstractStageSolver,
+    ok: BoolScalar,
+    x: Stages,
+    fixed: StepArguments,
+) -> Callable[[StepArguments, Stages, StepArguments], Changes]:
+    """Make the function (perturbed, x, rates) of the changes of a solved step.
+
+    It computes how the stages x, the state at the end and the record of the step
+    change if the `perturbed` part of its arguments changes at `rates`; the other part
+    is `fixed`. The changes are zero unless the step is `ok`.
+    """
     stages = _stage_system(arguments, method)
     given = frozen((stages, arguments.step_state.lin, x))
     frozen_newton_map = solver.frozen_newton_map(*given)
 
-    # By the checkpoint nothing but states and stages is kept for a reverse pass.
-    @partial(jax.checkpoint, prevent_cse=False)
     def change(perturbed, x, rates):
         rates = zero_unless(ok, rates)
 
@@ -106,11 +127,16 @@ def _differentiable_step_jvp(primals, tangents):
         _, dend = jax.jvp(end, (perturbed, x), (rates, zero_unless(ok, dx)))
         return zero_unless(ok, (dx, *dend))
 
+    return change
+
+
+def tangent_of_outcome(outcome: StepOutcome, changes: Changes) -> StepOutcome:
+    """Make the tangent of an outcome from the changes of its stages and its end."""
     none = jax.tree.map(lambda _: None, outcome)
-    return outcome, eqx.tree_at(
+    return eqx.tree_at(
         lambda outcome: (outcome.stages, outcome.step_state.state, outcome.record),
         none,
-        change(perturbed, x, tangents[0]),
+        changes,
         is_leaf=lambda leaf: leaf is None,
     )
 

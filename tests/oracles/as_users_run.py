@@ -265,6 +265,28 @@ def a_model_from_sympy():
 
 
 @feature
+def events_that_reset_and_end():
+    """A ball falls from 1/2 in unit time and rises with half of its speed."""
+    ball = nhjax.LagrangianSystem(lambda t, q, v, args: 0.5 * v @ v - args * q[0])
+    bounce = nhjax.Event(
+        lambda t, y, args: y.q[0],
+        direction=False,
+        reset=lambda t, y, args: (y.q, -0.5 * y.v),
+    )
+    end = nhjax.Event(lambda t, y, args: t - 1.25)
+
+    def found(gravity):
+        y0 = nhjax.initial_state(ball, jnp.array([0.5]), jnp.zeros(1), args=gravity)
+        options = {"args": gravity, "event": [bounce, end], "dt": 0.3, "num_steps": 9}
+        sol = nhjax.integrate(ball, TWO, y0, **options)
+        return sol.events.ts[0], sol.t1, sol.events.num
+
+    close(found(1.0), (1.0, 1.25, 2))
+    rates = jax.vmap(jax.grad(lambda gravity: found(gravity)[0]))(jnp.array([1.0, 4.0]))
+    close(rates, jnp.array([-0.5, -0.0625]))
+
+
+@feature
 def batches():
     dts = jnp.array([0.1, 0.05, -0.1])
     batch = jax.jit(jax.vmap(lambda dt: run(dt=dt).ys))(dts)

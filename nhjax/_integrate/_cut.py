@@ -1,0 +1,265 @@
+"""A step of a run with events, whole or cut at the first event, with its derivative."""
+
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from .._compile import as_cpu_kernel, Programs
+from .._custom_types import BoolScalar, FloatScalar
+from .._method import AbstractMethod
+from .._numerics import has_tangent, nan_tangent_unless, zero_unless
+from .._results import RESULTS
+from .._step import (
+    AbstractStageSolver,
+    change_of_step,
+    primitive_step,
+    StepArguments,
+    StepOutcome,
+    tangent_of_outcome,
+)
+from .._system import State
+from ._bracket import Bracket
+from ._conditions import Conditions, Sides, with_continuous_multiplier
+
+
+class Cut(NamedTuple):
+    """A step to a node or to an event.
+
+    - `outcome`: the outcome of the step.
+    - `h`: its size.
+    - `fired`: the index of the event that it ends at, -1 if it is the whole step.
+    - `values`: the conditions at its end.
+    - `crossed`: those that have crossed zero in it.
+    """
+
+    outcome: StepOutcome
+    h: FloatScalar
+    fired: Int[Array, ""]
+    values: Float[Array, " e"]
+    crossed: Bool[Array, " e"]
+
+
+class CutOptions(eqx.Module):
+    """How a step is taken: by which method and solver, and whether it is to be cut.
+
+    - `skip`: whether nothing is to be done, and the result to be discarded.
+    - `sides`: the sides of zero of the conditions at the start of the step.
+    - `is_cut`: whether there is an event in the step, where it is to be cut.
+    - `far`: the conditions at the end of the whole step, if so.
+    - `known`: the event at which the step of the given size is known to end, -1 if at
+        none; None if it is to be found.
+    """
+
+    method: AbstractMethod = eqx.field(static=True)
+    solver: AbstractStageSolver
+    skip: BoolScalar
+    sides: Sides
+    is_cut: BoolScalar
+    far: Float[Array, " e"]
+    known: Int[Array, ""] | None
+
+    def signed(self, values: Float[Array, " e"], h: FloatScalar) -> Float[Array, " e"]:
+        """Divide the conditions that start from zero by the size of the step.
+
+        Their other zeros are left.
+        """
+        return jnp.where(self.sides.at_zero, values / jnp.abs(h), values)
+
+
+@eqx.filter_custom_jvp
+def differentiable_cut_step(
+    arguments: StepArguments,
+    conditions: Conditions,
+    options: CutOptions,
+    programs: Programs,
+) -> Cut:
+    """Take a step of size h, or of the size θ h at whose end the first event is.
+
+    The size θ h of a step that is cut is a root of g(t + θ h, y(θ h)), where g is the
+    condition of the event and y the end of the step, so that
+
+    d(θ h) = - (∂g/∂h)⁻¹ dg,
+
+    with dg at fixed size. A size that does not change g has no derivative: it is NaN.
+    """
+    h, none = arguments.h, -jnp.ones((), jnp.int32)
+    found = _Found(h, none, RESULTS.successful)
+    if options.known is not None:
+        found = found._replace(fired=options.known)
+    else:
+        found = jax.lax.cond(
+            options.is_cut,
+            lambda: _first(arguments, conditions, options, programs),
+            lambda: found,
+        )
+    cut = _trial(arguments, conditions, options, programs, found.h)
+    result = RESULTS.where(
+        found.result == RESULTS.successful, cut.outcome.result, found.result
+    )
+    return cut._replace(outcome=cut.outcome._replace(result=result), fired=found.fired)
+
+
+class _Found(NamedTuple):
+    """The size of a step that is cut, and its event; or why it was not found."""
+
+    h: FloatScalar
+    fired: Int[Array, ""]
+    result: RESULTS
+
+
+def _first(
+    arguments: StepArguments,
+    conditions: Conditions,
+    options: CutOptions,
+    programs: Programs,
+) -> _Found:
+    """Find the first event in a step, by steps of different sizes from its start."""
+    h, sign = arguments.h, options.sides.sign
+    far = options.signed(options.far, h)
+    one = jnp.ones((), h.dtype)
+    whole = Bracket.open_from(options.sides.value)
+    whole = whole.with_point(one, far, conditions.crossed(sign, far))
+
+    def narrower(search: tuple[Bracket, FloatScalar, RESULTS]):
+        bracket, _, _ = search
+        theta = bracket.next_place()
+        cut = _trial(arguments, conditions, options, programs, theta * h)
+        values = options.signed(cut.values, cut.h)
+        return bracket.with_point(theta, values, cut.crossed), theta, cut.outcome.result
+
+    bracket, last, result = jax.lax.while_loop(
+        lambda search: (search[2] == RESULTS.successful) & ~search[0].found,
+        narrower,
+        (whole, one, RESULTS.successful),
+    )
+    theta = jnp.where(result == RESULTS.successful, bracket.upper, last)
+    return _Found(theta * h, jnp.argmax(bracket.crossed).astype(jnp.int32), result)
+
+
+def _trial(
+    arguments: StepArguments,
+    conditions: Conditions,
+    options: CutOptions,
+    programs: Programs,
+    h: FloatScalar,
+) -> Cut:
+    """Take a step of any size, and compute the conditions at its end."""
+    at, method = eqx.tree_at(lambda x: x.h, arguments, h), options.method
+    outcome = primitive_step(at, method, options.solver, options.skip, programs)
+    values = _values(at, conditions, method, outcome.step_state.state)
+    solved = outcome.result == RESULTS.successful
+    unknown = solved & ~jnp.all(jnp.isfinite(values))
+    result = RESULTS.where(unknown, RESULTS.nonfinite_event, outcome.result)
+    crossed = conditions.crossed(options.sides.sign, options.signed(values, h))
+    none = -jnp.ones((), jnp.int32)
+    return Cut(outcome._replace(result=result), h, none, values, crossed)
+
+
+def _values(
+    arguments: StepArguments, conditions: Conditions, method: AbstractMethod, y: State
+) -> Float[Array, " e"]:
+    """Compute all conditions at the end y of a step."""
+    system, args, t = arguments.system, arguments.args, arguments.t + arguments.h
+    y = with_continuous_multiplier(system, method, t, y, args)
+    return conditions(t, y, args)
+
+
+@differentiable_cut_step.def_jvp
+def _differentiable_cut_step_jvp(primals, tangents):
+    arguments, conditions, options, _ = primals
+    of_arguments, of_conditions = tangents[:2]
+    cut = primitive_cut_step(*primals)
+    is_cut = cut.fired >= 0
+    # The size of a step that is cut is found, not given.
+    arguments = eqx.tree_at(lambda x: x.h, arguments, cut.h)
+    rate = of_arguments.h
+    rate = jnp.zeros_like(cut.h) if rate is None else jnp.where(is_cut, 0, rate)
+    of_arguments = eqx.tree_at(
+        lambda x: x.h, of_arguments, rate, is_leaf=lambda leaf: leaf is None
+    )
+    given, fixed = eqx.partition(arguments, has_tangent(of_arguments))
+    functions, others = eqx.partition(conditions, has_tangent(of_conditions))
+    changes = _changes(arguments, others, options, cut, fixed)
+    rates = of_arguments, of_conditions
+    # By the checkpoint nothing but states and stages is kept for a reverse pass.
+    change, dh = jax.checkpoint(changes, prevent_cse=False)(
+        given, functions, cut.outcome.stages, cut.outcome.step_state.state, rates
+    )
+    none = jax.tree.map(lambda _: None, cut)
+    tangent = tangent_of_outcome(cut.outcome, change)
+    return cut, none._replace(outcome=tangent, h=dh)
+
+
+def _changes(
+    arguments: StepArguments,
+    others: Conditions,
+    options: CutOptions,
+    cut: Cut,
+    fixed: StepArguments,
+):
+    """Make the function of the changes of a step and of its size.
+
+    `others` and `fixed` are the parts of the conditions and of the arguments that do
+    not change.
+    """
+    ok = ~options.skip & (cut.outcome.result == RESULTS.successful)
+    is_cut = ok & (cut.fired >= 0)
+    is_size = eqx.tree_at(lambda x: x.h, jax.tree.map(lambda _: False, arguments), True)
+    size, rest = eqx.partition(arguments, is_size)
+    unit = eqx.tree_at(lambda x: x.h, size, jnp.ones_like(cut.h))
+    step = arguments, options.method, options.solver
+    change_with = change_of_step(*step, ok, cut.outcome.stages, fixed)
+    change_with_size = change_of_step(*step, is_cut, cut.outcome.stages, rest)
+
+    def condition(given, fixed, functions, y):
+        at, all_of_them = eqx.combine(given, fixed), eqx.combine(functions, others)
+        return _values(at, all_of_them, options.method, y)[cut.fired]
+
+    def changes(given, functions, x, y, rates):
+        change = change_with(given, x, rates[0])
+        by_size = jax.lax.cond(
+            is_cut,
+            lambda: change_with_size(size, x, unit),
+            lambda: jax.tree.map(jnp.zeros_like, change),
+        )
+        _, slope = jax.jvp(
+            lambda size, y: condition(size, rest, functions, y),
+            (size, y),
+            (unit, by_size[1]),
+        )
+        # Where nothing is cut a condition need not have a derivative.
+        _, gained = jax.jvp(
+            lambda given, functions, y: condition(given, fixed, functions, y),
+            (given, functions, y),
+            zero_unless(is_cut, (*rates, change[1])),
+        )
+        resolved = ~is_cut | (jnp.abs(slope * cut.h) > _flat(options.sides, cut))
+        dh = -zero_unless(is_cut, gained) / jnp.where(is_cut & resolved, slope, 1)
+        moved: Any = sum(jnp.sum(x) for x in jax.tree.leaves(rates))
+        dh = nan_tangent_unless(resolved, jnp.where(resolved, dh, moved))
+        total = jax.tree.map(lambda a, b: a + dh * b, change, by_size)
+        return total, rates[0].h + dh
+
+    return changes
+
+
+def _flat(sides: Sides, cut: Cut) -> FloatScalar:
+    """Compute the change over a step below which a condition counts as constant."""
+    start = jnp.where(sides.at_zero, sides.value * cut.h, sides.value)[cut.fired]
+    small = float(jnp.finfo(start.dtype).eps) ** 0.5
+    return jax.lax.stop_gradient(small * jnp.abs(start))
+
+
+def primitive_cut_step(
+    arguments: StepArguments,
+    conditions: Conditions,
+    options: CutOptions,
+    programs: Programs,
+) -> Cut:
+    """Take a step by `differentiable_cut_step`, in a program that is traced once."""
+    # The reason is that of `primitive_step`.
+    given = arguments, conditions, options, programs
+    return as_cpu_kernel(differentiable_cut_step, *given, programs=programs)

@@ -1,0 +1,276 @@
+"""The steps of a run with events: each iteration ends at a node or at an event."""
+
+from dataclasses import replace
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Int, PyTree
+
+from .._custom_types import BoolScalar, FloatScalar, IntScalar
+from .._results import RESULTS
+from .._step import StepArguments, StepState
+from .._system import State
+from ._checkpoint import Checkpoint
+from ._conditions import (
+    Conditions,
+    conditions_of,
+    sides_at,
+)
+from ._consequences import Consequences, consequences_of
+from ._cut import Cut, CutOptions, primitive_cut_step
+from ._event import Event
+from ._log import LogEntry
+from ._progress import Known, Progress, progress_of
+from ._statistics import updated_statistics
+from ._stepping import Carry, Stepping, Taken
+
+
+class _Tried(NamedTuple):
+    """An iteration of the time loop, before what follows from its event.
+
+    - `alive`: whether the run had not ended before.
+    - `steps`: whether it took a step from the time `t`, and did not meet an event at
+        once; `cut` is that step.
+    - `is_next`: whether the step is discarded, since there is an event in it at which
+        the next iteration is to end.
+    - `stepped`: whether the step, of the given `size`, is kept. It led to the state
+        that is `reached`.
+    - `which`: the index of the event at its end, -1 if it ended at a node.
+    - `meets`, `fires`: whether there is an event, and whether there is room for it.
+    """
+
+    alive: BoolScalar
+    steps: BoolScalar
+    t: FloatScalar
+    cut: Cut
+    is_next: BoolScalar
+    stepped: BoolScalar
+    which: Int[Array, ""]
+    meets: BoolScalar
+    fires: BoolScalar
+    size: FloatScalar
+    reached: StepState
+
+    @property
+    def at_node(self) -> BoolScalar:
+        """Tell whether the step led to the next node."""
+        return self.stepped & ~self.meets
+
+
+class EventStepping(eqx.Module):
+    """The events of a run, with functions that step from one to the next or to a node.
+
+    An iteration of the time loop takes the rest of a step. If there is an event in it,
+    the next iteration takes the same step again, as far as the event. So there may be
+    two iterations more for each event, and one if it ends the run.
+    """
+
+    stepping: Stepping
+    conditions: Conditions
+    consequences: Consequences
+    num_steps: int | IntScalar
+
+    @classmethod
+    def of(
+        cls,
+        events: tuple[Event, ...] | None,
+        stepping: Stepping,
+        y: State,
+        num_steps: int | IntScalar,
+    ) -> "EventStepping | None":
+        """Make them from the events that a user gave, if any; raise if one is wrong."""
+        if events is None:
+            return None
+        given = stepping.time(0), y, stepping.args
+        return cls(
+            stepping=stepping,
+            conditions=conditions_of(events, *given),
+            consequences=consequences_of(events, stepping.system, *given),
+            num_steps=num_steps,
+        )
+
+    @property
+    def num_kept(self) -> int:
+        """Return the number of events that are kept in a log on the way."""
+        return 0 if self.consequences.ends_only else self.consequences.max_events
+
+    @property
+    def num_iterations(self) -> int | IntScalar:
+        """Return the number of iterations within which the run surely ends."""
+        consequences = self.consequences
+        goes_on = not all(consequences.terminates)
+        extra = 2 * consequences.max_events if goes_on else 0
+        return self.num_steps + extra + 1
+
+    def time(self, progress: Progress) -> FloatScalar:
+        """Compute the time that a run has come to."""
+        return self.stepping.time(progress.node) + progress.offset
+
+    def start(self, y0: State | Checkpoint) -> Carry:
+        """Make the carry of the time loop before the first step."""
+        carry = self.stepping.start(y0)
+        t = self.stepping.time(0)
+        sides, known = sides_at(self.conditions, self.stepping, t, carry.step_state)
+        unknown = (carry.result == RESULTS.successful) & ~known
+        result = RESULTS.where(unknown, RESULTS.nonfinite_event, carry.result)
+        zero = jnp.zeros((), jnp.int32)
+        failed = jnp.where(unknown, zero, carry.stats["failed_step"])
+        stats = carry.stats | {"failed_step": failed, "num_events": zero}
+        progress = Progress(
+            node=zero,
+            offset=jnp.zeros_like(t),
+            row=zero,
+            active=zero,
+            num=zero,
+            last=-jnp.ones_like(zero),
+            is_cut=jnp.zeros((), bool),
+            far=sides.value,
+            sides=sides,
+            pending=jnp.zeros(sides.sign.shape, bool),
+        )
+        return Carry(carry.step_state, result, stats, progress)
+
+    def advance(
+        self, carry: Carry, iteration: Int[Array, ""], known: Known | None = None
+    ) -> tuple[Carry, Taken, LogEntry, Int[Array, ""]]:
+        """Go on to the next node or event; a run that has ended stays where it is.
+
+        Also return what was taken, the entry of the event for the log, and the index of
+        the output row that is filled, which is `num_steps` if none is. With `known` the
+        event is not looked for.
+        """
+        before, it = progress_of(carry), self._tried(carry, known)
+        met = self.consequences.met(
+            self.conditions,
+            self.stepping,
+            it.fires,
+            it.which,
+            it.t + it.size,
+            it.reached,
+            before,
+        )
+        result = RESULTS.where(it.steps, it.cut.outcome.result, carry.result)
+        result = RESULTS.where(it.meets, RESULTS.too_many_events, result)
+        result = RESULTS.where(it.fires, met.result, result)
+        ends = it.alive & (result != RESULTS.successful)
+        after = _progress(self.stepping.dt, before, it, ends)
+        has_ended = carry.result != RESULTS.successful
+        fills = (after.node > before.node) | ends | has_ended
+        sides = before.sides.moved(it.at_node, it.cut.values)
+        after = replace(
+            after,
+            row=jnp.minimum(before.row + fills.astype(jnp.int32), self.num_steps),
+            sides=jax.lax.stop_gradient(_where(it.fires, met.sides, sides)),
+            pending=jnp.where(it.fires, met.pending, before.pending),
+        )
+        entry = LogEntry(
+            t=it.t + it.size,
+            which=it.which,
+            before=it.reached.state,
+            after=met.step_state.state,
+            iteration=iteration.astype(jnp.int32),
+            node=before.node,
+            offset=before.offset,
+            size=it.size,
+            node_after=after.node,
+            offset_after=after.offset,
+            slot=jnp.where(it.fires, before.num, self.consequences.max_events),
+        )
+        stats = updated_statistics(
+            carry.stats, it.cut.outcome, it.steps, it.stepped, before.node
+        )
+        failed = ends & (result != RESULTS.event_occurred)
+        stats["failed_step"] = jnp.where(failed, before.node, stats["failed_step"])
+        stats |= {"num_steps": after.node, "num_events": after.num}
+        stats = jax.lax.stop_gradient(stats)
+        taken = Taken(it.cut.outcome.record, it.stepped)
+        row = jnp.where(fills, before.row, self.num_steps)
+        return Carry(met.step_state, result, stats, after), taken, entry, row
+
+    def _tried(self, carry: Carry, known: Known | None) -> _Tried:
+        """Take the rest of a step, or as far as the event that is known to be in it."""
+        before = progress_of(carry)
+        alive = (carry.result == RESULTS.successful) & (before.node < self.num_steps)
+        at_once = jnp.any(before.pending)
+        steps = alive & ~at_once
+        t, h = self.time(before), self.stepping.dt - before.offset
+        if known is not None:
+            h = jnp.where(known.which >= 0, known.size, h)
+        cut = _cut(self.stepping, self.conditions, carry, t, h, ~steps, known)
+        solved = steps & (cut.outcome.result == RESULTS.successful)
+        is_next = solved & (cut.fired < 0) & jnp.any(cut.crossed)
+        if known is not None:
+            is_next = jnp.zeros_like(is_next)
+        stepped = solved & ~is_next
+        first_pending = jnp.argmax(before.pending).astype(jnp.int32)
+        which = jnp.where(at_once, first_pending, cut.fired)
+        meets = (stepped | (alive & at_once)) & (which >= 0)
+        reached = _where(stepped, cut.outcome.step_state, carry.step_state)
+        return _Tried(
+            alive=alive,
+            steps=steps,
+            t=t,
+            cut=cut,
+            is_next=is_next,
+            stepped=stepped,
+            which=which,
+            meets=meets,
+            fires=meets & (before.num < self.consequences.max_events),
+            size=jnp.where(stepped, cut.h, 0),
+            reached=reached.differentiated_in_state(),
+        )
+
+
+def _progress(
+    dt: FloatScalar, before: Progress, it: _Tried, ends: BoolScalar
+) -> Progress:
+    """Find the place after an iteration, but for the sides of the conditions."""
+    here = before.offset + it.size
+    # What is left of a step by round-off is left out.
+    small = 4 * float(jnp.finfo(dt.dtype).eps)
+    at_end = it.fires & ~ends & (jnp.abs(dt - here) <= small * jnp.abs(dt))
+    offset = jnp.where(it.fires, here, before.offset)
+    offset = jnp.where(at_end, here - dt, jnp.where(it.at_node, 0, offset))
+    return replace(
+        before,
+        node=before.node + (it.at_node | at_end).astype(jnp.int32),
+        offset=offset,
+        active=before.active + it.alive.astype(jnp.int32),
+        num=before.num + it.fires.astype(jnp.int32),
+        last=jnp.where(it.fires, it.which, before.last),
+        is_cut=it.is_next,
+        far=jax.lax.stop_gradient(it.cut.values),
+    )
+
+
+def _cut(
+    stepping: Stepping,
+    conditions: Conditions,
+    carry: Carry,
+    t: FloatScalar,
+    h: FloatScalar,
+    skip: BoolScalar,
+    known: Known | None,
+) -> Cut:
+    """Take the rest of a step as far as the first event in it."""
+    start = carry.step_state.differentiated_in_state()
+    args, kept = stepping.args, stepping.invariants
+    arguments = StepArguments(stepping.system, t, h, start, args, kept)
+    progress = progress_of(carry)
+    options = CutOptions(
+        method=stepping.method,
+        solver=stepping.stage_solver,
+        skip=skip,
+        sides=progress.sides,
+        is_cut=progress.is_cut & ~skip,
+        far=progress.far,
+        known=None if known is None else known.which,
+    )
+    programs = stepping.programs
+    return primitive_cut_step(arguments, conditions, options, programs)
+
+
+def _where(which: BoolScalar, x: PyTree[Array], y: PyTree[Array]) -> Any:
+    return jax.tree.map(lambda a, b: jnp.where(which, a, b), x, y)
