@@ -214,6 +214,6 @@ class ProductGroup(AbstractLieGroup):
     def _vector(self, function, *arguments) -> Vector:
         return jnp.concatenate(self._each(function, *arguments))
 
-    def _split(self, vector: Vector) -> list[Vector]:
+    def _split(self, vector: Vector) -> list[Array]:
         ends = accumulate(group.dim for group in self.factors)
         return [vector[k - f.dim : k] for k, f in zip(ends, self.factors, strict=True)]

@@ -109,7 +109,8 @@ def test_a_batch_in_step_has_lengths_of_its_own(monkeypatch):
 @pytest.mark.parametrize("engine", ["lanes", "kernels"])
 def test_a_run_whose_length_is_traced_is_compiled_as_a_whole(monkeypatch, engine):
     monkeypatch.setenv("NHJAX_ENGINE", engine)
-    (use,) = nhjax.engines(lambda n: run(n, throw=False).ys.q, 3)
+    y0 = PARTICLE.initial_state()
+    (use,) = nhjax.engines(lambda n: run(n, y0, throw=False).ys.q, 3)
     assert use.engine == engine
 
 
