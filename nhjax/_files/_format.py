@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Array, PyTree
 
 from .._errors import DTypeError, is_traced
-from .._integrate import Checkpoint, DenseInterpolation, Solution
+from .._integrate import Checkpoint, DenseInterpolation, EventLog, Solution
 from .._results import result_codes, RESULTS
 from .._system import State
 
@@ -21,7 +21,7 @@ from .._system import State
 # The classes that a file may name; by their fields, so that a later release can add to
 # them what has a default.
 _CLASSES: dict[str, type] = {
-    kind.__name__: kind for kind in (State, Solution, Checkpoint)
+    kind.__name__: kind for kind in (State, Solution, Checkpoint, EventLog)
 }
 _ADVICE = (
     "A file holds states, solutions, checkpoints, and tuples, lists and dictionaries "

@@ -33,9 +33,12 @@ def to_dataset(
     variables = _saved(sol.ys, (*batch, "time"))
     outcome = {f"stats_{name}": (batch, np.asarray(x)) for name, x in sol.stats.items()}
     outcome["result"] = (batch, _result_names(sol.result))
+    if sol.events is not None:
+        for name, x in (("event_t", sol.events.ts), ("event_which", sol.events.which)):
+            outcome[name] = ((*batch, "event"), np.asarray(x))
     labels = _time(np.asarray(sol.ts), batch)
     for name in variables:
-        if name in {*outcome, *labels, *batch, "time", "coordinate"}:
+        if name in {*outcome, *labels, *batch, "time", "coordinate", "event"}:
             raise ValueError(
                 f"What `SaveAt(fn=...)` returned has the name {name!r}, which "
                 "something else in the data set has already: take another one."
@@ -44,9 +47,7 @@ def to_dataset(
     names = _coordinate_names(sol, coordinates, variables)
     if names is not None:
         labels["coordinate"] = ("coordinate", list(names))
-        here = [units.get(name, "") for name in names]
-        if any(here):
-            labels["unit"] = ("coordinate", here)
+        labels |= _units_of(names, units)
     made = xarray.Dataset(variables, labels)
     for name, unit in units.items():
         if name in made.variables:
@@ -57,6 +58,20 @@ def to_dataset(
                 f"`units` has the name {name!r}, but the names here are: "
                 f"{', '.join(map(str, known))}."
             )
+    return made
+
+
+def _units_of(names: Sequence[str], units: Mapping[str, str]) -> dict[str, Any]:
+    """Label coordinates by their units, and by those of their velocities.
+
+    The units of momenta are left out: they do not follow from those of coordinates.
+    """
+    of_q, of_t = [units.get(name, "") for name in names], units.get("time", "")
+    made = {"coordinate_unit": ("coordinate", of_q)} if any(of_q) else {}
+    if made and of_t:
+        of_t = f"({of_t})" if set(of_t) & set(" */·") else of_t
+        of_v = [f"{unit}/{of_t}" if unit else "" for unit in of_q]
+        made["velocity_unit"] = ("coordinate", of_v)
     return made
 
 

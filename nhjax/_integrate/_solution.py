@@ -121,7 +121,8 @@ class Solution(eqx.Module):
         groups `q0`, `q1`, ... are the parts. What `SaveAt(fn=...)` returned is named by
         the paths in its tree, and `value` if it is one array. Beside them are the
         `stats` as `stats_num_steps` and so on, and `result`, the name of a member of
-        `nhjax.RESULTS`. For a batch `trajectory` comes first (of a batch of batches
+        `nhjax.RESULTS`; of a run with events `event_t` and `event_which` too, along
+        `event`. For a batch `trajectory` comes first (of a batch of batches
         `trajectory_0`, `trajectory_1`); if its members have different times, `time` has
         no labels, and the times are in `t`.
 
@@ -130,7 +131,8 @@ class Solution(eqx.Module):
         - `coordinates`: the names of the n coordinates; those of the system by default.
         - `units`: units by the name of a variable, of `time`, or of a coordinate. The
             former go to the attribute `units`, the latter along the coordinates as
-            `unit`.
+            `coordinate_unit`, and divided by that of `time` as `velocity_unit`. A
+            momentum has no unit that follows from these.
 
         **Returns:** an `xarray.Dataset`.
 

@@ -86,13 +86,7 @@ def generalised_forces(forces: Any, coordinates: list[Any], frame: Any) -> list[
     if forces is None:
         return []
     if isinstance(forces, Mapping):
-        unknown = [str(q) for q in forces if q not in coordinates]
-        if unknown:
-            raise ValueError(
-                f"from_sympy: `forces` has {', '.join(unknown)}, not among the "
-                f"coordinates {', '.join(map(str, coordinates))}."
-            )
-        return [expression("forces", forces.get(q, 0)) for q in coordinates]
+        return _by_coordinate(forces, coordinates)
     pairs = list(forces) if isinstance(forces, Iterable) else [forces]
     if pairs and all(_is_load(pair) for pair in pairs):
         return of_loads(pairs, rates(coordinates), frame)
@@ -104,6 +98,23 @@ def generalised_forces(forces: Any, coordinates: list[Any], frame: Any) -> list[
             "coordinates, or pairs of a point and a force, or a frame and a torque."
         )
     return found
+
+
+def _by_coordinate(forces: Mapping[Any, Any], coordinates: list[Any]) -> list[Any]:
+    """Put the forces of a dictionary, by coordinates or their names, in their order."""
+    of_name = {str(q.func): q for q in coordinates}
+    of_coordinate: dict[Any, Any] = {}
+    for key, force in forces.items():
+        q = of_name.get(key) if isinstance(key, str) else key
+        if q not in coordinates:
+            raise ValueError(
+                f"from_sympy: `forces` has {key}, not among the coordinates "
+                f"{', '.join(map(str, coordinates))}."
+            )
+        if q in of_coordinate:
+            raise ValueError(f"from_sympy: `forces` has {q} twice, once by its name.")
+        of_coordinate[q] = force
+    return [expression("forces", of_coordinate.get(q, 0)) for q in coordinates]
 
 
 def _is_load(pair: Any) -> bool:

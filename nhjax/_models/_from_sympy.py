@@ -49,9 +49,9 @@ def from_sympy(
     - `nonholonomic`: expressions, or equations, in q, q' and t that are zero: linear in
         q' or not.
     - `holonomic`: expressions, or equations, in q and t that are zero.
-    - `forces`: generalised forces, a list with one for each coordinate or a dictionary;
-        or a list of pairs of a point and a force, or a frame and a torque, as
-        `LagrangesMethod` takes it, with `frame`.
+    - `forces`: generalised forces, a list with one for each coordinate, or a dictionary
+        by coordinates or their names; or a list of pairs of a point and a force, or a
+        frame and a torque, as `LagrangesMethod` takes it, with `frame`.
     - `parameters`: values of the symbols that remain, by symbol or name; those without
         one must be in `args` at run time.
     - `frame`: the inertial frame of forces at points.

@@ -43,9 +43,18 @@ def test_names_of_the_system_label_its_coordinates(sol, name):
     assert data[name].dims == ("time", "coordinate")
     assert data.multiplier.dims == ("time", "constraint")
     assert data.time.attrs["units"] == "s"
-    assert data.unit.sel(coordinate="x") == "m"
+    assert data.coordinate_unit.sel(coordinate="x") == "m"
+    assert data.velocity_unit.sel(coordinate="x") == "m/s"
+    assert data.velocity_unit.sel(coordinate="y") == ""
     assert str(data.result.values) == "successful"
     assert int(data.stats_num_steps) == 4
+
+
+def test_a_velocity_has_a_unit_if_time_and_coordinate_have_one(sol):
+    assert "velocity_unit" not in sol.to_xarray(units={"x": "m"}).coords
+    data = sol.to_xarray(units={"time": "10 s", "x": "rad", "y": "m"})
+    assert data.velocity_unit.values.tolist() == ["rad/(10 s)", "m/(10 s)"]
+    assert sol.to_xarray(units={"p": "N s"}).p.attrs == {"units": "N s"}
 
 
 def test_a_batch_has_its_trajectories_first():

@@ -256,12 +256,13 @@ def test_values_at_run_time_are_refused_by_name(particle):
         )
 
 
-def test_forces_may_be_given_in_three_forms():
+def test_forces_may_be_given_in_four_forms():
     frame, point = mechanics.ReferenceFrame("N"), mechanics.Point("P")
     point.set_vel(frame, DX * frame.x + DY * frame.y)
     forms = (
         ([-K * DX, 0], None),
         ({X: -K * DX}, None),
+        ({"x": -K * DX}, None),
         ([(point, -K * DX * frame.x)], frame),
     )
     for forces, inertial in forms:
@@ -320,6 +321,8 @@ WRONG = {
     "contains no velocity: give it as `holonomic`": {"nonholonomic": X},
     "`forces` has 1 entries, but there are 2 coordinates": {"forces": [X]},
     "`forces` has a\\(t\\), not among the coordinates": {"forces": {A: X}},
+    "`forces` has z, not among the coordinates": {"forces": {"z": X}},
+    "`forces` has x\\(t\\) twice": {"forces": {X: 1, "x": 2}},
     "`parameters` has q, but the symbols of the model are m": {"parameters": {"q": 1}},
     "`parameters` has m twice": {"parameters": {"m": 1, M: 2}},
     "`parameters\\['m'\\]` has shape \\(2,\\)": {"parameters": {"m": np.ones(2)}},
