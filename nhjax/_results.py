@@ -75,9 +75,10 @@ class RESULTS(eqx.Enumeration):
     )
     too_many_events = (
         "There were more events than the `max_events` of the `nhjax.Event`s make room "
-        "for. Give them a larger `max_events`, unless the events accumulate at one "
-        "time, as the bounces of a ball that comes to rest do: then end the run, or "
-        "let the reset keep the motion away from the next event."
+        "for, or one followed itself within round-off. Give them a larger "
+        "`max_events`, unless the events accumulate at one time, as the bounces of a "
+        "ball that comes to rest do: then end the run, or let the reset keep the "
+        "motion away from the next event."
     )
 
 

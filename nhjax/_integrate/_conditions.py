@@ -112,14 +112,23 @@ class Sides(eqx.Module):
             at_zero=self.at_zero & ~at_node,
         )
 
+    def scale(self, h: FloatScalar) -> Float[Array, " e"]:
+        """Compute the size of each condition in a step of size h from here."""
+        value = jnp.where(self.at_zero, self.value * h, self.value)
+        return jax.lax.stop_gradient(jnp.abs(value))
+
 
 def sides_at(
-    conditions: Conditions, stepping: Stepping, t: FloatScalar, step_state: StepState
+    conditions: Conditions,
+    stepping: Stepping,
+    t: FloatScalar,
+    step_state: StepState,
+    round_off: Float[Array, " e"] | float = 0.0,
 ) -> tuple[Sides, BoolScalar]:
     """Find the sides of all conditions at a state, and whether all are finite.
 
     A condition that the motion would bring to zero, or has left zero, within a small
-    part of a step counts as zero.
+    part of a step counts as zero; so does one that is not larger than its `round_off`.
     """
     step_state = jax.lax.stop_gradient(step_state)
     system, dt, args = stepping.system, stepping.dt, stepping.args
@@ -138,7 +147,9 @@ def sides_at(
     y = with_continuous_multiplier(system, stepping.method, t, y, args)
     values = conditions(t, y, args)
     small = float(jnp.finfo(values.dtype).eps) ** 0.5
-    at_zero = jnp.abs(values) <= small * jnp.abs(rate * dt)
+    # A rate that is infinite, as that of a root, makes nothing zero that is not.
+    near = jnp.isfinite(rate) & (jnp.abs(values) <= small * jnp.abs(rate * dt))
+    at_zero = near | ((jnp.abs(values) <= round_off) & ~jnp.isnan(rate))
     value = jnp.where(at_zero, rate * jnp.sign(dt), values)
     sides = Sides(jnp.sign(value), value, at_zero)
     return jax.lax.stop_gradient((sides, jnp.all(jnp.isfinite(values))))

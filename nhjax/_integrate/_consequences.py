@@ -55,9 +55,13 @@ class Consequences(eqx.Module):
         which: Int[Array, ""],
         t: FloatScalar,
         step_state: StepState,
+        value: FloatScalar,
         before: Progress,
     ) -> Met:
-        """Find what follows from an event; nothing follows unless it `fires`."""
+        """Find what follows from an event; nothing follows unless it `fires`.
+
+        Its condition has this `value`, zero up to round-off.
+        """
         ends = jnp.asarray(self.terminates)[which]
         result = RESULTS.where(ends, RESULTS.event_occurred, RESULTS.successful)
         nothing = Met(step_state, before.sides, before.pending, result)
@@ -67,9 +71,10 @@ class Consequences(eqx.Module):
         def met() -> Met:
             resets = [partial(_reset, stepping, x, t, step_state) for x in self.resets]
             after, consistent = jax.lax.switch(which, resets)
-            sides, known = sides_at(conditions, stepping, t, after)
-            turned = conditions.crossed(before.sides.sign, sides.sign)
             others = jnp.arange(len(self.resets), dtype=jnp.int32) != which
+            round_off = jnp.where(others, 0, jnp.abs(value))
+            sides, known = sides_at(conditions, stepping, t, after, round_off)
+            turned = conditions.crossed(before.sides.sign, sides.sign)
             pending = (before.pending | (turned & (sides.sign != 0))) & others
             found = RESULTS.where(known, result, RESULTS.nonfinite_event)
             found = RESULTS.where(consistent, found, RESULTS.inconsistent_reset)

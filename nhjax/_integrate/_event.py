@@ -36,8 +36,9 @@ class Event(eqx.Module):
     - `terminate`: end the run at the event, after its reset; by default True without a
         `reset`, and False with one. With False and no `reset` zeros are found and
         reported alone.
-    - `max_events`: how many events a run has room for, an int >= 1; one more ends the
-        run with `RESULTS.too_many_events`. With `terminate` it is 1.
+    - `max_events`: how many events a run has room for, an int >= 1; of several events
+        the sum counts. One more ends the run with `RESULTS.too_many_events`. With
+        `terminate` it is 1.
 
     **Raises:** `TypeError` or `ValueError` for arguments of a wrong type or value.
 

@@ -6,18 +6,14 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Int, PyTree
+from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from .._custom_types import BoolScalar, FloatScalar, IntScalar
 from .._results import RESULTS
 from .._step import StepArguments, StepState
 from .._system import State
 from ._checkpoint import Checkpoint
-from ._conditions import (
-    Conditions,
-    conditions_of,
-    sides_at,
-)
+from ._conditions import Conditions, conditions_of, sides_at
 from ._consequences import Consequences, consequences_of
 from ._cut import Cut, CutOptions, primitive_cut_step
 from ._event import Event
@@ -38,6 +34,7 @@ class _Tried(NamedTuple):
     - `stepped`: whether the step, of the given `size`, is kept. It led to the state
         that is `reached`.
     - `which`: the index of the event at its end, -1 if it ended at a node.
+    - `far`: the conditions at the end of the whole step, if it is cut.
     - `meets`, `fires`: whether there is an event, and whether there is room for it.
     """
 
@@ -48,6 +45,7 @@ class _Tried(NamedTuple):
     is_next: BoolScalar
     stepped: BoolScalar
     which: Int[Array, ""]
+    far: Float[Array, " e"]
     meets: BoolScalar
     fires: BoolScalar
     size: FloatScalar
@@ -57,6 +55,14 @@ class _Tried(NamedTuple):
     def at_node(self) -> BoolScalar:
         """Tell whether the step led to the next node."""
         return self.stepped & ~self.meets
+
+    @property
+    def value(self) -> FloatScalar:
+        """Return the value of the condition at the event, if it is round-off."""
+        value, far = self.cut.values[self.which], self.far[self.which]
+        small = float(jnp.finfo(value.dtype).eps) ** 0.5
+        is_small = self.stepped & (jnp.abs(value) <= small * jnp.abs(far))
+        return jnp.where(is_small, value, 0)
 
 
 class EventStepping(eqx.Module):
@@ -142,20 +148,13 @@ class EventStepping(eqx.Module):
         event is not looked for.
         """
         before, it = progress_of(carry), self._tried(carry, known)
-        met = self.consequences.met(
-            self.conditions,
-            self.stepping,
-            it.fires,
-            it.which,
-            it.t + it.size,
-            it.reached,
-            before,
-        )
+        place = it.fires, it.which, it.t + it.size, it.reached, it.value, before
+        met = self.consequences.met(self.conditions, self.stepping, *place)
         result = RESULTS.where(it.steps, it.cut.outcome.result, carry.result)
         result = RESULTS.where(it.meets, RESULTS.too_many_events, result)
         result = RESULTS.where(it.fires, met.result, result)
         ends = it.alive & (result != RESULTS.successful)
-        after = _progress(self.stepping.dt, before, it, ends)
+        after = _progress(self.stepping.dt, before, it, met.pending, ends)
         has_ended = carry.result != RESULTS.successful
         fills = (after.node > before.node) | ends | has_ended
         sides = before.sides.moved(it.at_node, it.cut.values)
@@ -174,6 +173,7 @@ class EventStepping(eqx.Module):
             node=before.node,
             offset=before.offset,
             size=it.size,
+            scale=before.sides.scale(it.size)[it.which],
             node_after=after.node,
             offset_after=after.offset,
             slot=jnp.where(it.fires, before.num, self.consequences.max_events),
@@ -181,6 +181,9 @@ class EventStepping(eqx.Module):
         stats = updated_statistics(
             carry.stats, it.cut.outcome, it.steps, it.stepped, before.node
         )
+        for name in ("failed_step", "worst_coordinate"):
+            # A step that is discarded has not failed.
+            stats[name] = jnp.where(ends, stats[name], carry.stats[name])
         failed = ends & (result != RESULTS.event_occurred)
         stats["failed_step"] = jnp.where(failed, before.node, stats["failed_step"])
         stats |= {"num_steps": after.node, "num_events": after.num}
@@ -208,6 +211,11 @@ class EventStepping(eqx.Module):
         which = jnp.where(at_once, first_pending, cut.fired)
         meets = (stepped | (alive & at_once)) & (which >= 0)
         reached = _where(stepped, cut.outcome.step_state, carry.step_state)
+        size = jnp.where(stepped, cut.h, 0)
+        # Events that follow themselves like this would do so for ever.
+        at_last = (before.num > 0) & before.sides.at_zero[which]
+        small = 16 * float(jnp.finfo(t.dtype).eps) * jnp.abs(self.stepping.dt)
+        again = stepped & at_last & (jnp.abs(size) <= small)
         return _Tried(
             alive=alive,
             steps=steps,
@@ -216,21 +224,30 @@ class EventStepping(eqx.Module):
             is_next=is_next,
             stepped=stepped,
             which=which,
+            far=before.far,
             meets=meets,
-            fires=meets & (before.num < self.consequences.max_events),
-            size=jnp.where(stepped, cut.h, 0),
+            fires=meets & ~again & (before.num < self.consequences.max_events),
+            size=size,
             reached=reached.differentiated_in_state(),
         )
 
 
 def _progress(
-    dt: FloatScalar, before: Progress, it: _Tried, ends: BoolScalar
+    dt: FloatScalar,
+    before: Progress,
+    it: _Tried,
+    pending: Bool[Array, " e"],
+    ends: BoolScalar,
 ) -> Progress:
-    """Find the place after an iteration, but for the sides of the conditions."""
+    """Find the place after an iteration, but for the sides of the conditions.
+
+    The events that are `pending` come before the node at the same time.
+    """
     here = before.offset + it.size
     # What is left of a step by round-off is left out.
     small = 4 * float(jnp.finfo(dt.dtype).eps)
     at_end = it.fires & ~ends & (jnp.abs(dt - here) <= small * jnp.abs(dt))
+    at_end = at_end & ~jnp.any(pending)
     offset = jnp.where(it.fires, here, before.offset)
     offset = jnp.where(at_end, here - dt, jnp.where(it.at_node, 0, offset))
     return replace(

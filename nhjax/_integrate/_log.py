@@ -39,6 +39,7 @@ class LogEntry(eqx.Module):
     - `node`, `offset`: the iteration started this long after node t_k, k = `node`.
     - `size`: the size of the step that ended at the event; 0 if there was none, since
         a reset before had carried the condition across zero.
+    - `scale`: the size of the condition in that step, by `Sides.scale`.
     - `node_after`, `offset_after`: where the next iteration starts.
     - `slot`: the place of the entry in the log, behind its end if there is no event.
     """
@@ -51,6 +52,7 @@ class LogEntry(eqx.Module):
     node: Int[Array, "*e"]
     offset: Float[Array, "*e"]
     size: Float[Array, "*e"]
+    scale: Float[Array, "*e"]
     node_after: Int[Array, "*e"]
     offset_after: Float[Array, "*e"]
     slot: Int[Array, "*e"]
@@ -89,6 +91,7 @@ def log_at_end(progress: Progress, t: FloatScalar, y: State) -> LogEntry:
         node=node,
         offset=jnp.zeros_like(offset),
         size=offset,
+        scale=progress.sides.scale(offset)[progress.last],
         node_after=node,
         offset_after=offset,
         slot=jnp.zeros_like(node),
@@ -100,4 +103,4 @@ def log_at_end(progress: Progress, t: FloatScalar, y: State) -> LogEntry:
 def no_entry(t: FloatScalar, y: State) -> LogEntry:
     """Make an entry of the shapes that all entries of a run have."""
     zero = jnp.zeros((), jnp.int32)
-    return LogEntry(t, zero, y, y, zero, zero, t, t, zero, t, zero)
+    return LogEntry(t, zero, y, y, zero, zero, t, t, t, zero, t, zero)

@@ -3,6 +3,7 @@
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Int
 
 from .._numerics import moving_with
@@ -71,11 +72,11 @@ class Loop(eqx.Module):
         """Go on to the next node or event."""
         carry, taken, entry, row = events.advance(carry, iteration, known)
         if not self.meter.silent:
-            jax.lax.cond(
-                row < self.num_steps,
-                lambda: self.meter.report(row, known_length(self.num_steps)),
-                lambda: None,
-            )
+            # So many steps are surely done, in all members of a batch: with numbers of
+            # their own each member would report, and in all iterations.
+            length = known_length(self.num_steps)
+            k = iteration + np.int32(length - known_length(self.num_iterations))
+            jax.lax.cond(k >= 0, lambda: self.meter.report(k, length), lambda: None)
         return carry, self._event_rows(events, carry, taken, entry, row)
 
     def _event_rows(

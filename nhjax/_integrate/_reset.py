@@ -4,15 +4,12 @@ import reprlib
 from collections.abc import Callable
 from typing import Any
 
+import equinox as eqx
+import jax
+
 from .._custom_types import Args, FloatScalar
-from .._errors import ShapeError
-from .._system import (
-    AbstractMechanicalSystem,
-    check_state,
-    configuration,
-    floating,
-    State,
-)
+from .._errors import DTypeError, ShapeError
+from .._system import AbstractMechanicalSystem, configuration, floating, State
 
 
 def completed(
@@ -29,17 +26,40 @@ def completed(
     out = reset(t, y, args)
     if isinstance(out, tuple | list) and len(out) == 2:
         q, u = configuration(out[0]), floating(name, out[1])
-        if u.shape != y.p.shape:
-            raise ShapeError(
-                f"{called} returned a `{name}` of shape {u.shape}, but a state has "
-                f"shape {y.p.shape}."
-            )
+        _check_part(called, "q", q, y.q)
+        _check_part(called, name, u, y.p)
         v, p = system.velocity(t, q, u, args), system.momentum(t, q, u, args)
-        out = State(q, v, p, y.multiplier)
+        return State(q, v, p, y.multiplier)
     if not isinstance(out, State):
         raise TypeError(
             f"{called} must return a pair (q, {name}) or an nhjax.State, got "
             f"{reprlib.repr(out)} of type {type(out).__name__}."
         )
-    check_state(system, out, args, called=f"reset of event {i}")
+    for part in ("q", "v", "p", "multiplier"):
+        _check_part(called, part, getattr(out, part), getattr(y, part))
     return out
+
+
+def _check_part(called: str, name: str, got: Any, like: Any) -> None:
+    """Raise unless a part of what a reset returned has the arrays of a state's."""
+
+    def tree(x: Any) -> Any:
+        return jax.tree.structure(x)
+
+    if tree(got) != tree(like) or not all(map(eqx.is_array, jax.tree.leaves(got))):
+        raise TypeError(
+            f"{called} returned the `{name}` {reprlib.repr(got)} of type "
+            f"{type(got).__name__}, but it must be as in the state that it is given: "
+            f"{reprlib.repr(like)}."
+        )
+    for x, y in zip(jax.tree.leaves(got), jax.tree.leaves(like), strict=True):
+        if x.shape != y.shape:
+            raise ShapeError(
+                f"{called} returned a `{name}` with an array of shape {x.shape}, but "
+                f"the state that it is given has shape {y.shape} there."
+            )
+        if x.dtype != y.dtype:
+            raise DTypeError(
+                f"{called} returned a `{name}` of dtype {x.dtype}, but the state that "
+                f"it is given has {y.dtype}: constants of another precision inside it?"
+            )

@@ -12,6 +12,7 @@ from .._custom_types import BoolScalar, FloatScalar
 from .._results import RESULTS
 from .._step import first_step_state, StepState
 from .._system import State
+from ._conditions import Sides
 from ._log import log_at_end, LogEntry
 from ._loop import Loop
 from ._progress import Known, Progress, progress_of
@@ -125,6 +126,7 @@ class EventPlace(eqx.Module):
     - `node`, `offset`, `num`: as in `Progress`.
     - `row`: how many rows of output were filled before.
     - `known`: what the iteration ended at, and its size.
+    - `scale`: the size of the condition of that event in the step.
     - `active`: whether the iteration took a step, or met an event without one.
     - `was_cut`: whether the iteration before found out that this one is to be cut, and
         did nothing else.
@@ -135,6 +137,7 @@ class EventPlace(eqx.Module):
     num: Int[Array, ""]
     row: Int[Array, ""]
     known: Known
+    scale: FloatScalar
     active: Bool[Array, ""]
     was_cut: Bool[Array, ""]
 
@@ -153,7 +156,16 @@ class WayBackOverEvents(AbstractWayBack):
         end = progress_of(self.end)
         none = Known(-jnp.ones_like(end.node), jnp.zeros_like(end.offset))
         never = jnp.zeros((), bool)
-        return EventPlace(end.node, end.offset, end.num, end.row, none, never, never)
+        return EventPlace(
+            node=end.node,
+            offset=end.offset,
+            num=end.num,
+            row=end.row,
+            known=none,
+            scale=jnp.zeros_like(end.offset),
+            active=never,
+            was_cut=never,
+        )
 
     @property
     def went_well(self) -> BoolScalar:
@@ -205,6 +217,7 @@ class WayBackOverEvents(AbstractWayBack):
             num=place.num - at_event.astype(jnp.int32),
             row=jnp.where(active, node, filled),
             known=Known(jnp.where(at_event, entry.which, -1), size),
+            scale=entry.scale,
             active=active,
             was_cut=at_event & (size != 0),
         )
@@ -229,6 +242,7 @@ class WayBackOverEvents(AbstractWayBack):
         which = place.known.which
         numbers = jnp.arange(start.pending.shape[0], dtype=jnp.int32)
         is_one = numbers == which
+        scales = jnp.broadcast_to(place.scale, start.far.shape)
         progress = Progress(
             node=place.node,
             offset=offset,
@@ -238,7 +252,7 @@ class WayBackOverEvents(AbstractWayBack):
             last=start.last,
             is_cut=start.is_cut,
             far=start.far,
-            sides=start.sides,
+            sides=Sides(start.sides.sign, scales, jnp.zeros(scales.shape, bool)),
             pending=is_one & (place.known.size == 0),
         )
         at_state = eqx.tree_at(lambda step_state: step_state.state, step_state, state)

@@ -55,6 +55,26 @@ def test_gradients_are_those_of_differences(on_group):
         np.testing.assert_allclose(dot(gradient, along), expected, rtol=1e-7)
 
 
+def test_members_on_a_group_have_rates_of_their_own():
+    """In forward mode, by blocks, of the same start with two restitutions."""
+    along = direction(GIVEN)
+
+    def value(given):
+        return times_places_and_rows(given, True, CHECKPOINTS)[0]
+
+    def rate(given):
+        return jax.jvp(value, (given,), (along,))
+
+    members = [GIVEN, GIVEN | {"restitution": jnp.asarray(0.6)}]
+    batch = jax.tree.map(lambda *x: jnp.stack(x), *members)
+    values, rates = jax.jit(jax.vmap(rate))(batch)
+    run = jax.jit(value)
+    for given, got, found in zip(members, values, rates, strict=True):
+        np.testing.assert_allclose(got, run(given), rtol=1e-13)
+        expected = central_difference(lambda e, y=given: run(moved(y, along, e)), 1e-4)
+        np.testing.assert_allclose(found, expected, rtol=1e-7)
+
+
 def test_second_derivatives_are_those_of_closed_forms():
     """Of a ball that falls from the height 1/2 at the time g^(-1/2), and rises half.
 
@@ -103,6 +123,25 @@ def test_second_derivatives_are_those_of_closed_forms():
     np.testing.assert_allclose(first, jax.jacfwd(expected)(x), rtol=0, atol=1e-13)
     for one in second:
         np.testing.assert_allclose(one, jax.hessian(expected)(x), rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("adjoint", [DIRECT, REVERSIBLE])
+def test_an_event_next_to_a_node_has_its_derivative(adjoint):
+    """That of the time x/v at which a free motion comes to x, just after a node."""
+    free, place = nhjax.LagrangianSystem(lambda t, q, v, args: 0.5 * v @ v), 0.5 + 1e-12
+
+    def time(v):
+        return nhjax.integrate(
+            free,
+            LobattoIIIAB(2),
+            nhjax.initial_state(free, jnp.zeros(1), v[None]),
+            dt=0.25,
+            num_steps=4,
+            event=Event(lambda t, y, args: y.q[0] - place),
+            adjoint=adjoint,
+        ).t1
+
+    np.testing.assert_allclose(jax.grad(time)(jnp.ones(())), -place, rtol=1e-12)
 
 
 def test_a_place_where_a_multiplier_vanishes_has_the_exact_gradient():

@@ -1,5 +1,7 @@
 """Which zeros are events, which comes first, and what is told where something fails."""
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -114,6 +116,9 @@ def test_bounces_follow_each_other_within_a_step_or_not(dt):
     times, _ = reported(sol)
     np.testing.assert_allclose(times, np.arange(1, 10, 2), rtol=1e-14)
     np.testing.assert_allclose(sol.events.after.v[:5], 1.0, rtol=1e-13)
+    # Steps that were tried and taken anew have not failed.
+    assert int(sol.stats["failed_step"]) == -1
+    assert int(sol.stats["worst_coordinate"]) == -1
 
 
 def test_an_event_at_a_node_is_met_once():
@@ -137,6 +142,28 @@ def test_two_events_at_one_time_are_both_met():
     np.testing.assert_allclose(sol.ys.q[0], -0.7, rtol=1e-14)
 
 
+def test_two_events_at_the_last_node_are_both_met():
+    """The row of the node has the state after both."""
+
+    def wall(i):
+        def reset(t, y, args):
+            return y.q, y.v.at[i].multiply(-1.0)
+
+        return Event(lambda t, y, args: y.q[i], direction=True, reset=reset)
+
+    y0 = nhjax.initial_state(FREE, jnp.array([-0.5, -0.5]), jnp.ones(2))
+    saveat = SaveAt(steps=True)
+    sol = run([wall(0), wall(1)], dt=0.25, num_steps=2, y0=y0, saveat=saveat)
+    assert reported(sol)[1] == [0, 1]
+    np.testing.assert_array_equal(sol.ys.v, [[1.0, 1.0], [-1.0, -1.0]])
+
+
+def test_an_infinite_rate_makes_nothing_zero_that_is_not():
+    """That of the square root of time at its start."""
+    sol = run(Event(lambda t, y, args: 0.5 - jnp.sqrt(t)))
+    np.testing.assert_allclose(sol.t1, 0.25, rtol=1e-15)
+
+
 def test_time_runs_backwards_to_events_too():
     sol = run(at(-0.4, direction=False), dt=-0.25)
     np.testing.assert_allclose(sol.t1, -0.4, rtol=1e-15)
@@ -152,6 +179,23 @@ def test_events_that_accumulate_end_in_a_failure_that_says_so():
     assert step == 9
     assert "max_events" in reason
     assert "accumulate" in reason
+
+
+@pytest.mark.parametrize("floor", [0.0, 1 / 3])
+def test_a_ball_never_falls_through_a_floor_by_round_off(floor):
+    """Its bounces accumulate, and its speed is below the round-off of places."""
+    event = Event(
+        lambda t, y, args: y.q[0] - args,
+        direction=False,
+        reset=lambda t, y, args: (y.q, -0.05 * y.v),
+        max_events=100,
+    )
+    y0 = nhjax.initial_state(BALL, jnp.array([0.5 + floor]), jnp.zeros(1))
+    options = {"dt": 0.3, "num_steps": 12, "system": BALL, "throw": False}
+    sol = run(event, y0=y0, args=floor, **options)
+    assert sol.result == RESULTS.too_many_events
+    assert int(sol.events.num) < 20
+    np.testing.assert_allclose(sol.ys.q[0], floor, rtol=1e-15, atol=1e-30)
 
 
 def test_a_condition_that_is_not_a_number_is_told():
@@ -190,14 +234,23 @@ def test_a_reset_that_breaks_a_constraint_is_told():
     assert end(jnp.array([1.0, 0.0, 0.0, 0.0])) == RESULTS.inconsistent_reset
 
 
+_NUMBER: Any = 0.0
 WRONG = {
     "shape (1,)": Event(lambda t, y, args: y.q),
     "dtype bool": Event(lambda t, y, args: y.q[0] > 0),
     "dtype int32": Event(lambda t, y, args: jnp.ones((), jnp.int32)),
     "got None": Event(lambda t, y, args: None),
     "a pair (q, v)": at(0.5, reset=lambda t, y, args: y.q),
-    "`v` of shape ()": at(0.5, reset=lambda t, y, args: (y.q, y.v[0])),
-    "has shape (1, 1)": at(0.5, reset=lambda t, y, args: (y.q[None], y.v)),
+    "`v` with an array of shape ()": at(0.5, reset=lambda t, y, args: (y.q, y.v[0])),
+    "`q` with an array of shape (1, 1)": at(
+        0.5, reset=lambda t, y, args: (y.q[None], y.v)
+    ),
+    "`v` of dtype float32": at(
+        0.5, reset=lambda t, y, args: (y.q, y.v.astype(jnp.float32))
+    ),
+    "returned the `p` 0.0 of type float": at(
+        0.5, reset=lambda t, y, args: nhjax.State(y.q, y.v, _NUMBER, y.multiplier)
+    ),
 }
 
 
