@@ -7,20 +7,12 @@ import pytest
 from jax.flatten_util import ravel_pytree
 
 import nhjax
+from benchmarks.brouwer import with_a_heading_on_a_circle
 from nhjax import systems
 
 
 def disc_with_a_heading_on_a_circle():
-    """The vertical disc with x, y and the roll angle in R^3, its heading on SO(2)."""
-    disc = systems.VerticalRollingDisc()
-    system = nhjax.LagrangianSystem(
-        lambda t, q, v, args: disc.lagrangian(t, jnp.concatenate(q), v, args),
-        nonholonomic=lambda t, q, v, args: disc.constraint(
-            t, jnp.concatenate(q), v, args
-        ),
-        manifold=nhjax.ProductGroup(nhjax.Euclidean(3), nhjax.SO2(nhjax.Exponential())),
-    )
-    return system, (disc.q0[:3], disc.q0[3:]), disc.v0
+    return with_a_heading_on_a_circle(systems.VerticalRollingDisc())
 
 
 def unicycle():
