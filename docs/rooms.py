@@ -33,6 +33,7 @@ FLOORS = (
     ("_step",),
     ("_integrate",),
     ("_files",),
+    ("_ensemble",),
     ("systems", "diagnostics", "plot", "studies", "__main__"),
 )
 ROOMS = tuple(room for floor in FLOORS for room in floor)
@@ -238,6 +239,7 @@ _COLUMNS = {
     "_step": 2.4,
     "_integrate": 3.0,
     "_files": 4.1,
+    "_ensemble": 3.5,
     "systems": 0.0,
     "diagnostics": 1.8,
     "plot": 2.5,

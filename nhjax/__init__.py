@@ -11,6 +11,17 @@ from ._analysis import (
     SystemReport as SystemReport,
 )
 from ._compile import engines as engines, EngineUse as EngineUse
+from ._ensemble import (
+    AbstractReduction as AbstractReduction,
+    ensemble as ensemble,
+    EnsembleOutcome as EnsembleOutcome,
+    Histogram as Histogram,
+    HistogramCounts as HistogramCounts,
+    Maximum as Maximum,
+    Mean as Mean,
+    Minimum as Minimum,
+    Variance as Variance,
+)
 from ._errors import (
     ConstraintViolationError as ConstraintViolationError,
     DependentConstraintsError as DependentConstraintsError,

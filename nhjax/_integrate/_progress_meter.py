@@ -23,6 +23,10 @@ class AbstractProgressMeter(eqx.Module):
         done = total at the end.
         """
 
+    def close(self) -> None:
+        """Put away what is open, such as the bar of a run that was interrupted."""
+        return
+
     @property
     def silent(self) -> bool:
         """Tell whether the meter shows nothing, so that the loop need not call it."""
@@ -89,6 +93,7 @@ class TqdmProgressMeter(AbstractProgressMeter):
     **Arguments:**
 
     - `description`: the text before the bar.
+    - `unit`: what is counted, in the singular: `"member"` for `nhjax.ensemble`.
 
     !!! example
 
@@ -100,24 +105,37 @@ class TqdmProgressMeter(AbstractProgressMeter):
     """
 
     description: str = eqx.field(static=True, default="")
+    unit: str = eqx.field(static=True, default="step")
     _open: "_Open" = eqx.field(static=True, init=False, repr=False)
 
-    def __init__(self, description: str = ""):
+    def __init__(self, description: str = "", unit: str = "step"):
         self.description = description
+        self.unit = unit
         self._open = _Open()
 
     def update(self, done: int, total: int) -> None:
         """Move the bar to `done` steps, and close it at the end of the run."""
         bar = self._open.bars.get(total)
         if bar is None:
+            # What was done before the bar opened does not count for its speed.
             bar = self._open.bars[total] = tqdm.tqdm(
-                total=total, desc=self.description, unit="step", file=sys.stderr
+                total=total,
+                initial=done,
+                desc=self.description,
+                unit=self.unit,
+                file=sys.stderr,
             )
         bar.n = max(bar.n, done)
         bar.refresh()
         if done == total:
             bar.close()
             del self._open.bars[total]
+
+    def close(self) -> None:
+        """Leave open bars as they stand."""
+        for bar in self._open.bars.values():
+            bar.close()
+        self._open.bars.clear()
 
 
 class _Open:

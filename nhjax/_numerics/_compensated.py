@@ -2,8 +2,8 @@ from jaxtyping import Array, Float
 
 
 def two_sum(
-    a: Float[Array, " n"], b: Float[Array, " n"]
-) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
+    a: Float[Array, "*n"], b: Float[Array, "*n"]
+) -> tuple[Float[Array, "*n"], Float[Array, "*n"]]:
     """Compute the rounded sum a + b and its exact rounding error (Knuth's TwoSum).
 
     Adding the error to the next increment makes the sum of many small increments

@@ -294,6 +294,25 @@ def batches():
 
 
 @feature
+def an_ensemble_in_chunks_with_statistics():
+    def member(dt):
+        return run(method=TWO, dt=dt, throw=False)
+
+    dts = np.array([0.1, 0.05, 300.0, 0.02, 0.08])
+    reduce = {"mean": nhjax.Mean(), "variance": nhjax.Variance()}
+    reduce |= {"least": nhjax.Minimum(), "most": nhjax.Maximum()}
+    reduce["counts"] = nhjax.Histogram([-10, 0, 10], of=lambda sol: sol.ys.q)
+    outcome = nhjax.ensemble(member, dts, reduce=reduce, chunk_size=2)
+    assert outcome.failed.tolist() == [2]
+    q = nhjax.ensemble(member, dts, chunk_size=2).values.ys.q[[0, 1, 3, 4]]
+    got = outcome.statistics
+    close(got["mean"].ys.q, q.mean(axis=0))
+    close(got["variance"].ys.q, q.var(axis=0, ddof=1))
+    close((got["least"].ys.q, got["most"].ys.q), (q.min(axis=0), q.max(axis=0)))
+    close(got["counts"].counts[..., 1], np.sum(q >= 0, axis=0))
+
+
+@feature
 def gradients_and_forward_mode():
     loss = of_dt(nhjax.DirectAdjoint())
     gradient = jax.jit(jax.grad(loss))(DT)

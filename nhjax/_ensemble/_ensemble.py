@@ -1,0 +1,176 @@
+import sys
+import time
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import jax
+import numpy as np
+from jaxtyping import PyTree
+
+from .._integrate import AbstractProgressMeter, NoProgressMeter, TqdmProgressMeter
+from ._failed import failed_rows
+from ._members import Members
+from ._outcome import EnsembleOutcome
+from ._program import Layout, value_structure
+from ._sinks import AbstractSink, check_reductions, Collected, Reduced, Work
+
+
+# Chunks of this many members for each device keep all lanes busy, if their results are
+# not larger than so many bytes.
+_MEMBERS, _BYTES = 1024, 2**26
+# The shortest time between two updates of a progress meter.
+_SECONDS = 0.1
+
+
+def ensemble(
+    run: Callable[[Any], PyTree[Any]],
+    members: Any,
+    *,
+    num_members: int | None = None,
+    reduce: Any = None,
+    chunk_size: int | None = None,
+    devices: Sequence[Any] | None = None,
+    fixed_order: bool = False,
+    progress_meter: AbstractProgressMeter | None = None,
+) -> EnsembleOutcome:
+    """Run a function for every member of an ensemble, chunk after chunk.
+
+    It computes `jax.vmap(run)(members)` for more members than fit into one array. One
+    program is compiled for all chunks, with the members of a chunk spread over all
+    devices; the last chunk is filled up with members that do not count.
+
+    Where `run` returns an `nhjax.Solution` or `nhjax.RESULTS`, alone or as a part of a
+    tree, members whose runs failed are listed in the outcome and left out of
+    statistics. For that `nhjax.integrate` must be called with `throw=False`; otherwise
+    the first failure ends the whole ensemble.
+
+    **Arguments:**
+
+    - `run`: a function of one member that returns a tree of arrays.
+    - `members`: a tree of arrays with the members as leading axis, or a function that
+        JAX can trace from the index of a member to the member, which takes no memory.
+    - `num_members`: how many members there are, if `members` is a function.
+    - `reduce`: an `nhjax.Mean`, `nhjax.Variance`, `nhjax.Minimum`, `nhjax.Maximum`,
+        `nhjax.Histogram`, an `nhjax.AbstractReduction` of one's own, or a tree of them
+        such as a dictionary. Then values are not kept, and memory does not grow with
+        the number of members.
+    - `chunk_size`: how many members run at a time, rounded up to a multiple of the
+        number of devices; by default 1024 for each device, or fewer if they return
+        much.
+    - `devices`: those of JAX to run on, `jax.local_devices()` by default.
+    - `fixed_order`: collect statistics in an order that does not depend on the number
+        of devices, so that they are the same to the last bit if the members are. Each
+        device then looks at all members of a chunk.
+    - `progress_meter`: told of members that are done; by default a bar on the standard
+        error stream if that is a terminal.
+
+    **Returns:** an `nhjax.EnsembleOutcome` with `values` or `statistics`.
+
+    **Raises:** `nhjax.ShapeError` for arrays that differ in their leading axis;
+    `TypeError` if `run` returns anything but arrays; `ValueError` for numbers that make
+    no sense; `nhjax.IntegrationError` if all members failed and there is something to
+    reduce.
+
+    !!! example
+
+        >>> import jax.numpy as jnp, nhjax
+        >>> outcome = nhjax.ensemble(lambda x: x**2, jnp.arange(5.0), chunk_size=2)
+        >>> outcome.values.tolist()
+        [0.0, 1.0, 4.0, 9.0, 16.0]
+    """
+    if not callable(run):
+        raise TypeError(f"`run` must be a function of one member, got {run!r}.")
+    if reduce is not None:
+        check_reductions(reduce)
+    if progress_meter is None:
+        bar = TqdmProgressMeter(unit="member")
+        progress_meter = bar if sys.stderr.isatty() else NoProgressMeter()
+    elif not isinstance(progress_meter, AbstractProgressMeter):
+        raise TypeError(
+            "`progress_meter` must be a progress meter such as "
+            f"`nhjax.TqdmProgressMeter()`, got {progress_meter!r}."
+        )
+    layout = Layout(_devices(devices), bool(fixed_order))
+    source = Members(members, num_members)
+    structure = value_structure(run, source.make, source.inputs(0, 1))
+    size = _chunk_size(chunk_size, source.count, structure, len(layout.devices))
+    work = Work(run, source, size, layout, structure)
+    sink = Collected(work) if reduce is None else Reduced(work, reduce)
+    try:
+        _run_chunks(work, sink, progress_meter)
+        return sink.outcome()
+    finally:
+        sink.close()
+
+
+def _run_chunks(
+    work: Work, sink: AbstractSink, progress_meter: AbstractProgressMeter
+) -> None:
+    todo, total = list(sink.todo()), work.members.count
+    done = total - sum(map(work.filled, todo))
+    shown = time.monotonic()
+    if not todo:
+        return
+    if done:
+        progress_meter.update(done, total)
+
+    def finish(chunk, result):
+        nonlocal done, shown
+        codes, steps = np.asarray(result.codes), np.asarray(result.steps)
+        count = work.filled(chunk)
+        failed = failed_rows(work.start(chunk), codes[:count], steps[:count])
+        sink.take(chunk, result.content, failed)
+        done += count
+        if done == total or time.monotonic() - shown > _SECONDS:
+            shown = time.monotonic()
+            progress_meter.update(done, total)
+
+    running = None
+    try:
+        for chunk in todo:
+            # The next chunk runs while the one before it is put away.
+            following = chunk, sink.start(chunk)
+            if running is not None:
+                finish(*running)
+            running = following
+        if running is not None:
+            finish(*running)
+    except jax.errors.JaxRuntimeError as error:
+        if "throw=False" in str(error):
+            error.add_note(
+                "In `nhjax.ensemble` a run with `throw=False` that returns its "
+                "solution fails alone: it is listed, and the others go on."
+            )
+        raise
+    finally:
+        progress_meter.close()
+
+
+def _devices(devices: Sequence[Any] | None) -> tuple[Any, ...]:
+    if devices is None:
+        return tuple(jax.local_devices())
+    chosen = tuple(devices)
+    if not chosen or len(set(chosen)) < len(chosen):
+        raise ValueError(f"`devices` must be different devices, got {chosen}.")
+    known = jax.local_devices()
+    for device in chosen:
+        if device not in known and device not in jax.local_devices(
+            backend=getattr(device, "platform", None)
+        ):
+            raise ValueError(
+                f"`devices` has {device!r}, which is no device of this process."
+            )
+    return chosen
+
+
+def _chunk_size(size: int | None, count: int, structure: Any, num_devices: int) -> int:
+    if size is None:
+        leaves = jax.tree.leaves(structure)
+        each = sum(x.size * np.dtype(x.dtype).itemsize for x in leaves)
+        size = num_devices * max(1, min(_MEMBERS, _BYTES // max(1, each)))
+    elif isinstance(size, bool) or not isinstance(size, int | np.integer):
+        raise TypeError(f"`chunk_size` must be an int, got {size!r}.")
+    elif size < 1:
+        raise ValueError(f"`chunk_size` must be at least 1, got {size}.")
+    size = min(int(size), count)
+    return -(-size // num_devices) * num_devices

@@ -1,0 +1,142 @@
+"""The program that runs a chunk of members, compiled once for all chunks."""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Int, PyTree
+
+from .._compile import tracked_jit
+from ._reduction import AbstractReduction
+from ._verdict import is_good, verdict, without_results
+
+
+AXIS = "members"
+
+
+class Layout(NamedTuple):
+    """On which devices chunks run, and whether statistics depend on how many."""
+
+    devices: tuple[Any, ...]
+    is_fixed: bool
+
+
+class Chunk(NamedTuple):
+    """What came of a chunk: codes of `RESULTS`, steps of failures, and values."""
+
+    codes: Int[Array, " c"]
+    steps: Int[Array, " c"]
+    content: PyTree[Array]
+
+
+def is_reduction(x: Any) -> bool:
+    """Tell whether `x` is a reduction, which is itself a tree."""
+    return isinstance(x, AbstractReduction)
+
+
+def each_reduction(function: Callable[..., Any], reductions: Any, *trees: Any) -> Any:
+    """Call a function with every reduction of a tree, and the parts beside it."""
+    return jax.tree.map(function, reductions, *trees, is_leaf=is_reduction)
+
+
+def _members_of(run: Any, make: Any, inputs: Any, layout: Layout) -> Any:
+    def member(one):
+        value = run(make(one))
+        return value, *verdict(value)
+
+    every = jax.vmap(member)
+    if len(layout.devices) > 1:
+        # Members have nothing to do with each other; JAX's check of what varies
+        # between devices does not know the operations of an ensemble.
+        every = _on_each(layout, every, jax.P(AXIS), jax.P(AXIS))
+    return every(inputs)
+
+
+def _on_each(layout: Layout, function: Any, inside: Any, outside: Any) -> Any:
+    mesh = jax.sharding.Mesh(np.array(layout.devices), (AXIS,))
+    return jax.shard_map(
+        function, mesh=mesh, in_specs=inside, out_specs=outside, check_vma=False
+    )
+
+
+@tracked_jit("run", "make")
+def values_of_chunk(run: Any, make: Any, inputs: Any, layout: Layout) -> Chunk:
+    """Run the members of a chunk."""
+    value, codes, steps = _members_of(run, make, inputs, layout)
+    return Chunk(codes, steps, value)
+
+
+@tracked_jit("run", "make", "reductions")
+def reduced_chunk(
+    run: Any,
+    make: Any,
+    reductions: Any,
+    state: Any,
+    inputs: Any,
+    is_there: Bool[Array, " c"],
+    layout: Layout,
+) -> Chunk:
+    """Run the members of a chunk, and add them to the states of reductions."""
+    value, codes, steps = _members_of(run, make, inputs, layout)
+    values = without_results(value)
+    counts = is_there & is_good(codes)
+    structure = jax.tree.map(
+        lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), values
+    )
+
+    def of_all(values, counts):
+        return each_reduction(
+            lambda each: each.update(each.init(structure), values, counts), reductions
+        )
+
+    if len(layout.devices) == 1:
+        parts = [of_all(values, counts)]
+    elif layout.is_fixed:
+        # Every device has all members, so that the order is that of one device.
+        everywhere = _on_each(layout, of_all, jax.P(), jax.P())
+        parts = [everywhere(values, counts)]
+    else:
+
+        def of_some(values, counts):
+            return jax.tree.map(lambda x: x[None], of_all(values, counts))
+
+        stacked = _on_each(layout, of_some, jax.P(AXIS), jax.P(AXIS))(values, counts)
+        parts = [
+            jax.tree.map(lambda x, i=i: x[i], stacked)
+            for i in range(len(layout.devices))
+        ]
+    for part in parts:
+        state = each_reduction(_merged, reductions, state, part)
+    return Chunk(codes, steps, state)
+
+
+def _merged(each: AbstractReduction, one: Any, other: Any) -> Any:
+    return each.merge(one, other)
+
+
+def value_structure(run: Any, make: Any, inputs: Any) -> Any:
+    """Find what `run` returns for one member: shapes and dtypes.
+
+    **Raises:** `TypeError` if there is anything but arrays of numbers.
+    """
+    one = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), inputs)
+    structure = eqx.filter_eval_shape(lambda one: run(make(one)), one)
+    leaves = jax.tree_util.tree_leaves_with_path(structure)
+    if not leaves:
+        raise TypeError(f"`run` must return arrays for each member, got {structure!r}.")
+    for path, leaf in leaves:
+        name = f"`run(member){jax.tree_util.keystr(path)}`"
+        if not isinstance(leaf, jax.ShapeDtypeStruct):
+            raise TypeError(
+                f"{name} is {leaf!r}, but `run` must return arrays, in tuples, "
+                "dictionaries and other trees, for each member."
+            )
+        if jnp.issubdtype(leaf.dtype, jax.dtypes.extended):
+            raise TypeError(
+                f"{name} has dtype {leaf.dtype}: of a random key return "
+                "`jax.random.key_data`."
+            )
+    return structure

@@ -1,0 +1,199 @@
+"""Ensembles in chunks: the same as `vmap`, with failures noted and errors by name."""
+
+import io
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import nhjax
+
+
+SYSTEM = nhjax.systems.NonholonomicParticle()
+METHOD = nhjax.LobattoIIIAB(2)
+BAD = (3, 8)
+
+
+def start(x):
+    """A short run; where x is not a number it fails."""
+    y0 = SYSTEM.initial_state()
+    y0 = nhjax.State(y0.q.at[0].set(x), y0.v, y0.p, y0.multiplier)
+    saveat = nhjax.SaveAt(steps=True, fn=SYSTEM.system.energy)
+    options = {"dt": 0.1, "num_steps": 4, "saveat": saveat, "throw": False}
+    return nhjax.integrate(SYSTEM.system, METHOD, y0, **options)
+
+
+def starts(count=10):
+    x = np.linspace(0.5, 1.5, count)
+    x[list(BAD)] = np.nan
+    return x
+
+
+@pytest.fixture(scope="module")
+def outcome():
+    return nhjax.ensemble(start, starts(), chunk_size=4)
+
+
+def test_values_are_those_of_vmap(outcome):
+    expected = jax.jit(jax.vmap(start))(starts())
+    assert isinstance(outcome.values, nhjax.Solution)
+    assert jax.tree.structure(outcome.values) == jax.tree.structure(expected)
+
+    # XLA rounds a little differently in vectors of other lengths.
+    def close(x, y):
+        np.testing.assert_allclose(x, y, rtol=1e-14, atol=1e-14)
+
+    jax.tree.map(close, outcome.values, expected)
+
+
+def test_failures_are_listed_and_others_go_on(outcome):
+    assert outcome.failed.tolist() == list(BAD)
+    assert outcome.failed_step.tolist() == [0, 0]
+    whole = [(index, step, reason) for index, step, reason in outcome.values.failures()]
+    assert outcome.failures() == whole
+    assert outcome.num_members == 10
+
+
+def test_members_that_failed_are_left_out_of_statistics_and_rerun_alone(outcome):
+    got = nhjax.ensemble(start, starts(), chunk_size=4, reduce=nhjax.Mean())
+    assert got.failures() == outcome.failures()
+    good = np.delete(outcome.values.ys, BAD, axis=0)
+    np.testing.assert_allclose(got.statistics.ys, good.mean(axis=0), rtol=1e-15)
+    assert got.statistics.result is None
+    again = nhjax.ensemble(start, np.ones(10)[got.failed], chunk_size=4)
+    assert again.failures() == []
+
+
+def test_a_bare_result_is_looked_at():
+    def bare(x):
+        good, bad = nhjax.RESULTS.successful, nhjax.RESULTS.nonfinite_state
+        return x, nhjax.RESULTS.where(x < 2.0, good, bad)
+
+    got = nhjax.ensemble(bare, jnp.arange(4.0), reduce=nhjax.Maximum())
+    assert got.failed.tolist() == [2, 3]
+    assert got.failed_step.tolist() == [-1, -1]
+    assert float(got.statistics[0]) == 1.0
+
+
+def test_if_all_fail_the_first_reason_is_told():
+    with pytest.raises(nhjax.IntegrationError, match=r"All 2 members .* step 0: The"):
+        nhjax.ensemble(start, starts()[list(BAD)], reduce=nhjax.Mean(), chunk_size=4)
+
+
+def test_one_program_for_all_chunks():
+    traced = []
+
+    def count(x):
+        traced.append(None)
+        return 2 * x
+
+    nhjax.ensemble(count, lambda i: i, num_members=10, chunk_size=4)
+    # Once for the shapes of what it returns, and once for the program.
+    assert len(traced) == 2
+
+
+def test_trees_random_keys_and_functions_as_members():
+    keys = jax.random.split(jax.random.key(1), 5)
+
+    def draw(member):
+        return jax.random.normal(member["key"]) + member["shift"].astype(float)
+
+    member = {"key": keys, "shift": np.arange(5)}
+    got = nhjax.ensemble(draw, member, chunk_size=2).values
+    np.testing.assert_array_equal(got, jax.vmap(draw)(member))
+    by_index = nhjax.ensemble(
+        draw, lambda i: {"key": keys[i], "shift": i}, num_members=5, chunk_size=3
+    )
+    np.testing.assert_array_equal(by_index.values, got)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "error", "message"),
+    [
+        ({"members": (np.ones(3), np.ones(4))}, nhjax.ShapeError, r"\[0\]` has 3"),
+        ({"members": 1.0}, nhjax.ShapeError, "is a single number"),
+        ({"members": np.ones((0, 2))}, nhjax.ShapeError, "no members"),
+        ({"members": {}}, nhjax.ShapeError, "no members"),
+        ({"members": ["x"]}, TypeError, r"`members\[0\]` is 'x'"),
+        ({"members": np.ones(3), "num_members": 4}, ValueError, "have 3 rows"),
+        ({"members": lambda i: i}, ValueError, "`num_members` is needed"),
+        ({"members": lambda i: i, "num_members": 0}, ValueError, "at least 1, got 0"),
+        ({"members": lambda i: i, "num_members": 2.0}, TypeError, "an int, got 2.0"),
+        ({"chunk_size": 0}, ValueError, "`chunk_size` must be at least 1, got 0"),
+        ({"chunk_size": 1.5}, TypeError, "`chunk_size` must be an int"),
+        ({"run": 3}, TypeError, "`run` must be a function"),
+        ({"run": lambda x: "text"}, TypeError, r"`run\(member\)` is 'text'"),
+        ({"run": lambda x: None}, TypeError, "must return arrays"),
+        ({"run": lambda x: jax.random.key(0)}, TypeError, "key_data"),
+        ({"reduce": "mean"}, TypeError, "`reduce` holds 'mean'"),
+        ({"reduce": {}}, TypeError, "holds no reduction"),
+        ({"devices": []}, ValueError, "`devices` must be different devices"),
+        ({"progress_meter": "bar"}, TypeError, "must be a progress meter"),
+    ],
+)
+def test_wrong_arguments_are_refused_by_name(arguments, error, message):
+    whole = {"run": lambda x: x, "members": np.ones(3)} | arguments
+    with pytest.raises(error, match=message):
+        nhjax.ensemble(whole.pop("run"), whole.pop("members"), **whole)
+
+
+def test_it_is_no_part_of_a_program():
+    with pytest.raises(RuntimeError, match="outside of jit"):
+        jax.jit(lambda x: nhjax.ensemble(lambda y: y, x).values)(jnp.ones(3))
+
+
+def test_a_bar_counts_members_and_is_silent_unless_on_a_terminal(monkeypatch):
+    shown = io.StringIO()
+    monkeypatch.setattr(sys, "stderr", shown)
+    nhjax.ensemble(lambda x: x, np.ones(5))
+    assert shown.getvalue() == ""
+    meter = nhjax.TqdmProgressMeter("sweep", unit="member")
+    nhjax.ensemble(lambda x: x, np.ones(5), chunk_size=2, progress_meter=meter)
+    assert "sweep: 100%" in shown.getvalue()
+    assert "5/5" in shown.getvalue()
+    assert "member" in shown.getvalue()
+
+
+SEVERAL = """
+import jax
+jax.config.update("jax_enable_x64", True)
+import numpy as np, nhjax
+from ensemble.test_ensemble import start, starts
+assert len(jax.devices()) == 3
+whole, one = nhjax.ensemble(start, starts()), jax.devices()[:1]
+alone = nhjax.ensemble(start, starts(), devices=one)
+close = lambda x, y: np.testing.assert_allclose(x, y, rtol=1e-14, atol=1e-14)
+jax.tree.map(close, whole.values, alone.values)
+assert whole.failures() == alone.failures() != []
+reduce = {"variance": nhjax.Variance(), "mean": nhjax.Mean()}
+options = {"reduce": reduce, "chunk_size": 60}
+x = np.random.default_rng(0).standard_normal(200)
+square = lambda x: x * x
+fixed = nhjax.ensemble(square, x, fixed_order=True, **options)
+alone = nhjax.ensemble(square, x, devices=one, **options)
+jax.tree.map(np.testing.assert_array_equal, fixed.statistics, alone.statistics)
+free = nhjax.ensemble(square, x, **options).statistics
+jax.tree.map(close, free, alone.statistics)
+print("the same")
+"""
+
+
+def test_members_and_statistics_on_several_devices_are_those_of_one():
+    flags = f"{os.environ['XLA_FLAGS']} --xla_force_host_platform_device_count=3"
+    root = Path(__file__).parents[2]
+    places = os.pathsep.join([str(root), str(root / "tests")])
+    done = subprocess.run(
+        [sys.executable, "-c", SEVERAL],
+        env=os.environ
+        | {"XLA_FLAGS": flags, "PYTHONPATH": places}
+        | {"JAX_DISABLE_MOST_OPTIMIZATIONS": "1"},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.stdout == "the same\n", done.stderr
