@@ -1,6 +1,7 @@
+import os
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import jax
@@ -13,6 +14,7 @@ from ._members import Members
 from ._outcome import EnsembleOutcome
 from ._program import Layout, value_structure
 from ._sinks import AbstractSink, check_reductions, Collected, Reduced, Work
+from ._store import Stored
 
 
 # Chunks of this many members for each device keep all lanes busy, if their results are
@@ -27,11 +29,14 @@ def ensemble(
     members: Any,
     *,
     num_members: int | None = None,
+    out: str | os.PathLike[str] | None = None,
     reduce: Any = None,
     chunk_size: int | None = None,
     devices: Sequence[Any] | None = None,
     fixed_order: bool = False,
     progress_meter: AbstractProgressMeter | None = None,
+    resume: bool = True,
+    units: Mapping[str, str] | None = None,
 ) -> EnsembleOutcome:
     """Run a function for every member of an ensemble, chunk after chunk.
 
@@ -50,6 +55,9 @@ def ensemble(
     - `members`: a tree of arrays with the members as leading axis, or a function that
         JAX can trace from the index of a member to the member, which takes no memory.
     - `num_members`: how many members there are, if `members` is a function.
+    - `out`: a folder for a store of Zarr that the values are written to, chunk after
+        chunk, and `xarray.open_zarr` opens. The same call goes on with a store that an
+        interrupted one has left. `docs/ensembles.md` says more.
     - `reduce`: an `nhjax.Mean`, `nhjax.Variance`, `nhjax.Minimum`, `nhjax.Maximum`,
         `nhjax.Histogram`, an `nhjax.AbstractReduction` of one's own, or a tree of them
         such as a dictionary. Then values are not kept, and memory does not grow with
@@ -63,13 +71,18 @@ def ensemble(
         device then looks at all members of a chunk.
     - `progress_meter`: told of members that are done; by default a bar on the standard
         error stream if that is a terminal.
+    - `resume`: whether to go on with a store that exists, rather than to refuse it.
+    - `units`: units of arrays in the store, by their names there.
 
-    **Returns:** an `nhjax.EnsembleOutcome` with `values` or `statistics`.
+    **Returns:** an `nhjax.EnsembleOutcome` with `values` or `statistics`; neither with
+    `out`.
 
     **Raises:** `nhjax.ShapeError` for arrays that differ in their leading axis;
     `TypeError` if `run` returns anything but arrays; `ValueError` for numbers that make
-    no sense; `nhjax.IntegrationError` if all members failed and there is something to
-    reduce.
+    no sense, and for a store that is damaged or that of other arguments; `OSError` if
+    the store cannot be written; `ImportError` with `out` and without zarr
+    (`pip install "nhjax[ensemble]"`); `nhjax.IntegrationError` if all members failed
+    and there is something to reduce.
 
     !!! example
 
@@ -95,12 +108,33 @@ def ensemble(
     structure = value_structure(run, source.make, source.inputs(0, 1))
     size = _chunk_size(chunk_size, source.count, structure, len(layout.devices))
     work = Work(run, source, size, layout, structure)
-    sink = Collected(work) if reduce is None else Reduced(work, reduce)
+    sink = _sink(work, reduce, out, units, resume)
     try:
         _run_chunks(work, sink, progress_meter)
         return sink.outcome()
     finally:
         sink.close()
+
+
+def _sink(
+    work: Work,
+    reductions: Any,
+    out: str | os.PathLike[str] | None,
+    units: Mapping[str, str] | None,
+    resume: bool,
+) -> AbstractSink:
+    if out is None and units is not None:
+        raise ValueError("`units` are those of a store: give its folder as `out`.")
+    if reductions is None:
+        if out is None:
+            return Collected(work)
+        return Stored(work, out, {} if units is None else units, resume)
+    if out is not None:
+        raise ValueError(
+            "Give either `reduce` or `out`: what is reduced is not kept, and "
+            "statistics of a store can be had from `xarray.open_zarr`."
+        )
+    return Reduced(work, reductions)
 
 
 def _run_chunks(

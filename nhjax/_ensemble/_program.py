@@ -55,8 +55,19 @@ def _members_of(run: Any, make: Any, inputs: Any, layout: Layout) -> Any:
     return every(inputs)
 
 
+def spread(layout: Layout, axes: Any) -> jax.sharding.Sharding:
+    """Make the sharding of arrays along the given axes of the devices."""
+    if len(layout.devices) == 1:
+        return jax.sharding.SingleDeviceSharding(layout.devices[0])
+    return jax.sharding.NamedSharding(_mesh(layout), axes)
+
+
+def _mesh(layout: Layout) -> jax.sharding.Mesh:
+    return jax.sharding.Mesh(np.array(layout.devices), (AXIS,))
+
+
 def _on_each(layout: Layout, function: Any, inside: Any, outside: Any) -> Any:
-    mesh = jax.sharding.Mesh(np.array(layout.devices), (AXIS,))
+    mesh = _mesh(layout)
     return jax.shard_map(
         function, mesh=mesh, in_specs=inside, out_specs=outside, check_vma=False
     )

@@ -12,11 +12,13 @@ from ._failed import Failed
 from ._members import Members
 from ._outcome import EnsembleOutcome
 from ._program import (
+    AXIS,
     Chunk,
     each_reduction,
     is_reduction,
     Layout,
     reduced_chunk,
+    spread,
     values_of_chunk,
 )
 from ._verdict import without_results
@@ -54,9 +56,7 @@ class Work:
 
 def on_devices(inputs: Any, layout: Layout) -> Any:
     """Put the rows of inputs on devices, some on each."""
-    mesh = jax.sharding.Mesh(np.array(layout.devices), ("members",))
-    spread = jax.sharding.NamedSharding(mesh, jax.P("members"))
-    return jax.device_put(inputs, spread)
+    return jax.device_put(inputs, spread(layout, jax.P(AXIS)))
 
 
 class AbstractSink(abc.ABC):
@@ -120,14 +120,9 @@ class Reduced(AbstractSink):
     def __init__(self, work: Work, reductions: Any):
         self.work, self.reductions, self.failed = work, reductions, Failed()
         structure = without_results(work.structure)
-        # Compiled: what a program returns has the same layout as what it is given.
-        self.state = jax.jit(
-            lambda: each_reduction(lambda each: each.init(structure), reductions)
-        )()
-        if len(work.layout.devices) > 1:
-            mesh = jax.sharding.Mesh(np.array(work.layout.devices), ("members",))
-            everywhere = jax.sharding.NamedSharding(mesh, jax.P())
-            self.state = jax.device_put(self.state, everywhere)
+        state = each_reduction(lambda each: each.init(structure), reductions)
+        # Where programs leave it: elsewhere it would be another program for JAX.
+        self.state = jax.device_put(state, spread(work.layout, jax.P()))
 
     def todo(self) -> Iterable[int]:
         """Return all chunks."""

@@ -55,6 +55,15 @@ def verdict(value: Any) -> tuple[Int[Array, ""], Int[Array, ""]]:
     return flat[0][first], flat[1][first]
 
 
+def codes_of_results(value: Any) -> Any:
+    """Replace `RESULTS` by their codes, but not those of a solution itself."""
+    if isinstance(value, Solution):
+        return value
+    return jax.tree.map(
+        lambda x: x._value if is_result(x) else x, value, is_leaf=is_result
+    )
+
+
 def without_results(value: Any) -> Any:
     """Leave out the `RESULTS`, of which there are no statistics."""
     return jax.tree.map(lambda x: None if is_result(x) else x, value, is_leaf=is_result)

@@ -65,7 +65,7 @@ def save(path: str | os.PathLike[str], tree: Any) -> None:
     arrays: dict[str, np.ndarray] = {}
     header = {
         "format": VERSION,
-        "nhjax": _version(),
+        "nhjax": installed_version(),
         "tree": described(tree, arrays),
     }
     unfinished = path.with_name(f".{uuid.uuid4().hex}")
@@ -136,7 +136,8 @@ def load(path: str | os.PathLike[str]) -> Any:
         ) from error
 
 
-def _version() -> str:
+def installed_version() -> str:
+    """Return the release of nhjax; `"unknown"` for sources that are not installed."""
     try:
         return importlib.metadata.version("nhjax")
     except importlib.metadata.PackageNotFoundError:

@@ -6,6 +6,7 @@ from ._adjoint import (
     RecursiveCheckpointAdjoint as RecursiveCheckpointAdjoint,
 )
 from ._checkpoint import Checkpoint as Checkpoint
+from ._dataset import named_arrays as named_arrays
 from ._event import Event as Event
 from ._integrate import integrate as integrate
 from ._interpolation import DenseInterpolation as DenseInterpolation

@@ -34,7 +34,7 @@ def to_dataset(
     outcome = {f"stats_{name}": (batch, np.asarray(x)) for name, x in sol.stats.items()}
     outcome["result"] = (batch, _result_names(sol.result))
     if sol.events is not None:
-        for name, x in (("event_t", sol.events.ts), ("event_which", sol.events.which)):
+        for name, x in _events(sol):
             outcome[name] = ((*batch, "event"), np.asarray(x))
     labels = _time(np.asarray(sol.ts), batch)
     for name in variables:
@@ -73,6 +73,42 @@ def _units_of(names: Sequence[str], units: Mapping[str, str]) -> dict[str, Any]:
         of_v = [f"{unit}/{of_t}" if unit else "" for unit in of_q]
         made["velocity_unit"] = ("coordinate", of_v)
     return made
+
+
+def _events(sol: Any) -> tuple[tuple[str, Any], ...]:
+    return ("event_t", sol.events.ts), ("event_which", sol.events.which)
+
+
+def named_arrays(value: Any, batch: tuple[str, ...]) -> dict[str, Any]:
+    """Name the arrays of what a function of a run returns, and their axes.
+
+    Those of a solution have the names that `Solution.to_xarray` gives them, with the
+    times in `t` and the codes of its result in `result`; those of another tree are
+    named by the paths in it.
+
+    **Returns:** by name pairs of the dimensions, those of `batch` first, and the array.
+    """
+    # A solution, which this module cannot import.
+    if not hasattr(value, "stats"):
+        return _named(value, batch, "value", None)
+    made = {} if value.ts is None else _saved(value.ys, (*batch, "time"))
+    others = {"result": (batch, np.asarray(value.result._value))}
+    for name, x in value.stats.items():
+        others[f"stats_{name}"] = (batch, np.asarray(x))
+    if value.ts is not None:
+        others["t"] = ((*batch, "time"), np.asarray(value.ts))
+    if value.events is not None:
+        for name, x in _events(value):
+            others[name] = ((*batch, "event"), np.asarray(x))
+    parts = _named(value.checkpoint, batch, "", None)
+    others |= {f"checkpoint_{name}": x for name, x in parts.items()}
+    for name in made:
+        if name in others:
+            raise ValueError(
+                f"What `SaveAt(fn=...)` returned has the name {name!r}, which "
+                "something else in the data set has already: take another one."
+            )
+    return made | others
 
 
 def _xarray() -> Any:

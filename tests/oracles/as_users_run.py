@@ -13,6 +13,7 @@ jax.config.update("jax_enable_x64", True)
 import jax.numpy as jnp  # noqa: E402
 import numpy as np  # noqa: E402
 import sympy  # noqa: E402
+import xarray  # noqa: E402
 from sympy.physics.mechanics import dynamicsymbols  # noqa: E402
 
 import nhjax  # noqa: E402
@@ -310,6 +311,21 @@ def an_ensemble_in_chunks_with_statistics():
     close(got["variance"].ys.q, q.var(axis=0, ddof=1))
     close((got["least"].ys.q, got["most"].ys.q), (q.min(axis=0), q.max(axis=0)))
     close(got["counts"].counts[..., 1], np.sum(q >= 0, axis=0))
+
+
+@feature
+def an_ensemble_that_is_stored_and_goes_on():
+    def member(dt):
+        return run(method=TWO, dt=dt, throw=False)
+
+    dts = np.linspace(0.05, 0.1, 5)
+    with tempfile.TemporaryDirectory() as folder:
+        path = os.path.join(folder, "sweep.zarr")
+        nhjax.ensemble(member, dts, out=path, chunk_size=2)
+        os.remove(os.path.join(path, "q", "c", "1", "0", "0"))
+        assert nhjax.ensemble(member, dts, out=path, chunk_size=2).failures() == []
+        with xarray.open_zarr(path) as data:
+            close(data.q.values, nhjax.ensemble(member, dts).values.ys.q)
 
 
 @feature

@@ -1,0 +1,98 @@
+"""What a store was made of, and what has changed since."""
+
+import hashlib
+import re
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from .._files import installed_version
+from ._sinks import Work
+
+
+FORMAT = 1
+# What does not decide the bits of what is done already.
+_VERSIONS = ("nhjax", "jax")
+
+
+def manifest(work: Work, variables: dict[str, Any]) -> dict[str, Any]:
+    """Describe the parameters of a run, in terms of JSON."""
+    return {
+        "format": FORMAT,
+        "nhjax": installed_version(),
+        "jax": jax.__version__,
+        "num_members": work.members.count,
+        "chunk_size": work.size,
+        "members": work.members.digest(),
+        "variables": {
+            name: [list(dims[1:]), list(x.shape[1:]), x.dtype.name]
+            for name, (dims, x) in variables.items()
+        },
+    }
+
+
+def program(work: Work) -> str:
+    """Write the program of one member, with digests of the arrays that it holds.
+
+    Addresses of functions, which differ from process to process, are left out.
+    """
+    one = jax.tree.map(lambda x: x[0], work.members.inputs(0, 1))
+    closed = jax.make_jaxpr(lambda one: work.run(work.members.make(one)))(one)
+    lines = re.sub(r"0x[0-9a-f]+", "0x", str(closed)).splitlines()
+    lines += [f"array {x}" for x in _constants(closed)]
+    return "\n".join(line.rstrip() for line in lines) + "\n"
+
+
+def _constants(closed: Any) -> list[str]:
+    found = [
+        f"{np.shape(x)} {hashlib.sha256(np.asarray(x).tobytes()).hexdigest()}"
+        for x in closed.consts
+        if not jnp.issubdtype(x.dtype, jax.dtypes.extended)
+    ]
+    for equation in closed.jaxpr.eqns:
+        leaves = jax.tree.leaves(
+            list(equation.params.values()), is_leaf=lambda x: hasattr(x, "consts")
+        )
+        for part in leaves:
+            if hasattr(part, "consts") and hasattr(part, "jaxpr"):
+                found += _constants(part)
+    return found
+
+
+def differences(old: dict[str, Any], new: dict[str, Any], is_done: bool) -> list[str]:
+    """Say in what two manifests differ, but for versions if the run is done."""
+    words = {
+        "members": "the arrays of `members`, or whether they are a function",
+        "variables": "the names, shapes or dtypes of what `run` returns",
+    }
+    found = []
+    for name in new:
+        if old.get(name) == new[name] or (is_done and name in _VERSIONS):
+            continue
+        if name in words:
+            found.append(words[name])
+        else:
+            found.append(f"`{name}`, {old.get(name)} before and {new[name]} now")
+    return found
+
+
+def program_difference(old: str, new: str) -> list[str]:
+    """Say where two programs differ first."""
+    if old == new:
+        return []
+    before, now = old.splitlines(), new.splitlines()
+    at = next(
+        (i for i, (a, b) in enumerate(zip(before, now, strict=False)) if a != b),
+        min(len(before), len(now)),
+    )
+    one, other = [_line(lines, at) for lines in (before, now)]
+    return [
+        "what `run` computes, or the numbers in it; first where its program was "
+        f"{one!r} and is {other!r}"
+    ]
+
+
+def _line(lines: list[str], at: int) -> str:
+    return " ".join(lines[at].split())[:100] if at < len(lines) else "at its end"

@@ -1,0 +1,203 @@
+"""Stores of the values of ensembles, which can be resumed."""
+
+import hashlib
+import json
+import os
+import shutil
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from . import _durable as durable
+from ._failed import Failed
+from ._journal import Journal
+from ._manifest import differences, manifest, program, program_difference
+from ._outcome import EnsembleOutcome
+from ._program import Chunk
+from ._sinks import AbstractSink, Work
+from ._variables import attributes_of, BATCH, common_times, rows_of, variables_of
+from ._zarr import Files
+
+
+_MANIFEST = "manifest/zarr.json"
+_PROGRAM = "manifest/program.txt"
+_JOURNAL = "manifest/chunks.jsonl"
+
+
+class Stored(AbstractSink):
+    """The values of members in a store of Zarr, with a journal of finished chunks.
+
+    A chunk counts as done once its files are on the disk and so is its line of the
+    journal: its number, its failures, and a checksum of each file.
+    """
+
+    def __init__(
+        self,
+        work: Work,
+        path: str | os.PathLike[str],
+        units: Mapping[str, str],
+        resume: bool,
+    ):
+        self.work, self.given, self.path = work, path, Path(path).resolve()
+        self.variables = variables_of(work)
+        self.attributes = attributes_of(work.structure, self.variables, units)
+        self.files = Files()
+        self.manifest = manifest(work, self.variables)
+        self.program = program(work)
+        self._open(self.variables)
+        self.journal = Journal(self.path / _JOURNAL)
+        try:
+            if self.path.is_dir() and any(self.path.iterdir()):
+                self._resume(resume)
+            else:
+                self._create()
+                self.journal.open()
+        except OSError as error:
+            self.close()
+            raise durable.told(
+                error, f"The store {str(self.path)!r} cannot be used"
+            ) from error
+        except BaseException:
+            self.close()
+            raise
+
+    def _open(self, variables: dict[str, Any]) -> None:
+        count = self.work.members.count
+        arrays = {
+            name: (
+                dims,
+                (count if dims[0] in BATCH else len(x), *x.shape[1:]),
+                x.dtype,
+            )
+            for name, (dims, x) in variables.items()
+        }
+        self.files.open(arrays, self.work.size, self.attributes, self.manifest)
+
+    def _create(self) -> None:
+        if self.path.exists() and not self.path.is_dir():
+            raise FileExistsError(
+                f"{str(self.path)!r} is a file: `out` names a folder."
+            )
+        unfinished = self.path.with_name(f".{self.path.name}.unfinished")
+        shutil.rmtree(unfinished, ignore_errors=True)
+        content = self.files.metadata()
+        content |= {_PROGRAM: self.program.encode(), _JOURNAL: b""}
+        for name, data in content.items():
+            durable.write(unfinished / name, data)
+        # At once there, as a whole.
+        os.replace(unfinished, self.path)
+        durable.settle(self.path.parent)
+
+    def _resume(self, resume: bool) -> None:
+        where = f"The store {str(self.path)!r}"
+        if not resume:
+            raise FileExistsError(
+                f"{where} exists: go on with it by `resume=True`, or name another one."
+            )
+        for name in (_MANIFEST, _PROGRAM, _JOURNAL):
+            if not (self.path / name).is_file():
+                raise ValueError(
+                    f"{where} has no {name!r}: it was not made by `nhjax.ensemble`, or "
+                    "is damaged. Name another folder, or put the file back."
+                )
+        self.journal.open()
+        try:
+            old = json.loads((self.path / _MANIFEST).read_text())["attributes"]
+        except (ValueError, KeyError) as error:
+            raise ValueError(
+                f"{where} has a damaged {_MANIFEST!r}: {error}."
+            ) from error
+        is_done = len(self.journal.lines) == self.work.chunks
+        found = differences(old, self.manifest, is_done)
+        before = (self.path / _PROGRAM).read_text()
+        if not found:
+            found = program_difference(before, self.program)
+        if found:
+            raise ValueError(
+                f"{where} is that of another run. What differs: {'; '.join(found)}. "
+                "Call with the same arguments, or name another folder."
+            )
+        self._check_files()
+
+    def _check_files(self) -> None:
+        for chunk in sorted(self.journal.lines):
+            for name, digest in self.journal.lines[chunk]["files"].items():
+                file = self.path / name
+                if not file.is_file():
+                    del self.journal.lines[chunk]
+                    break
+                if hashlib.sha256(file.read_bytes()).hexdigest() != digest:
+                    first = self.work.start(chunk)
+                    raise ValueError(
+                        f"The file {str(file)!r} is not what was written: its checksum "
+                        "differs. Delete it and call again: members "
+                        f"{first} to {first + self.work.filled(chunk) - 1} are then "
+                        "run again."
+                    )
+
+    def todo(self) -> Iterable[int]:
+        """Return the chunks without a line in the journal."""
+        return [k for k in range(self.work.chunks) if k not in self.journal.lines]
+
+    def start(self, chunk: int) -> Chunk:
+        """Set a chunk running."""
+        return self.work.values(chunk)
+
+    def take(self, chunk: int, content: Any, failed: list[list[int]]) -> None:
+        """Write the files of a chunk, and then its line of the journal."""
+        first, count = self.work.start(chunk), self.work.filled(chunk)
+        rows = rows_of(content, count)
+        line: dict[str, Any] = {"chunk": chunk, "failed": failed, "files": {}}
+        line["times"] = common_times(rows)
+        try:
+            for name, (_, x) in rows.items():
+                for file, data in self.files.chunk(name, first, x).items():
+                    durable.write(self.path / file, data)
+                    line["files"][file] = hashlib.sha256(data).hexdigest()
+            self.journal.append(line)
+        except OSError as error:
+            what = (
+                f"Members {first} to {first + count - 1} could not be written to "
+                f"{str(self.path)!r}; those of finished chunks are kept, and the same "
+                "call goes on once this is mended"
+            )
+            raise durable.told(error, what) from error
+
+    def outcome(self) -> EnsembleOutcome:
+        """List the failures, and label times if all members have the same."""
+        if "t" in self.variables and not (self.path / "time").is_dir():
+            times = {line["times"] for line in self.journal.lines.values()}
+            if len(times) == 1 and None not in times:
+                self._label_times()
+        failed = Failed()
+        for line in self.journal.lines.values():
+            failed.add(line["failed"])
+        return failed.outcome(self.work.members.count, path=self.given)
+
+    def _label_times(self) -> None:
+        import zarr
+
+        array: Any = zarr.open_array(str(self.path / "t"), mode="r")
+        times = np.asarray(array[0])
+        self.files = Files()
+        self._open(self.variables | {"time": (("time",), times)})
+        try:
+            # The folder stands for all of it, and so comes last.
+            for name, data in self.files.chunk("time", 0, times).items():
+                durable.write(self.path / ".time.unfinished" / name, data)
+            metadata = self.files.metadata()
+            own = metadata.pop("time/zarr.json")
+            durable.write(self.path / ".time.unfinished/time/zarr.json", own)
+            durable.write(self.path / "zarr.json", metadata["zarr.json"])
+            os.replace(self.path / ".time.unfinished/time", self.path / "time")
+            (self.path / ".time.unfinished").rmdir()
+            durable.settle(self.path)
+        except OSError as error:
+            what = f"The times could not be written to {str(self.path)!r}"
+            raise durable.told(error, what) from error
+
+    def close(self) -> None:
+        """Let others write to the store."""
+        self.journal.close()

@@ -1,0 +1,328 @@
+"""Stores of ensembles: opened by xarray, resumed bit for bit, faults told."""
+
+import errno
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import xarray
+
+import nhjax
+from nhjax._ensemble import _durable
+from oracles.ensembles import BAD, start, starts
+
+
+COUNT, CHUNK = 50, 4
+
+
+def run(x):
+    """Something quick, with an axis of its own."""
+    return {"powers": x ** jnp.arange(3.0), "is_large": x > 1.0}
+
+
+def call(out, function=run, count=COUNT, **options):
+    members = np.linspace(0.5, 1.5, count)
+    chosen: dict[str, Any] = {"chunk_size": CHUNK} | options
+    return nhjax.ensemble(function, members, out=out, **chosen)
+
+
+def power(table):
+    """A run with an array that is not written in its program."""
+    return lambda x: x**table
+
+
+def content(folder: Path) -> dict[str, bytes]:
+    """All files of a store, by name."""
+    return {
+        str(path.relative_to(folder)): path.read_bytes()
+        for path in sorted(folder.rglob("*"))
+        if path.is_file()
+    }
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory):
+    """The files of a run that nothing has disturbed."""
+    folder = tmp_path_factory.mktemp("whole") / "store"
+    call(folder)
+    return content(folder)
+
+
+@pytest.fixture
+def store(tmp_path, whole):
+    """A finished store, to be damaged."""
+    for name, data in whole.items():
+        path = tmp_path / "store" / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_bytes(data)
+    return tmp_path / "store"
+
+
+def test_xarray_opens_the_store_of_solutions(tmp_path):
+    options = {"out": tmp_path / "s", "units": {"time": "s", "value": "J"}}
+    outcome = nhjax.ensemble(start, starts(), chunk_size=4, **options)
+    expected = nhjax.ensemble(start, starts(), chunk_size=4)
+    assert outcome.values is None
+    assert outcome.path == tmp_path / "s"
+    assert outcome.failures() == expected.failures()
+    with xarray.open_zarr(tmp_path / "s") as data:
+        assert dict(data.sizes) == {"trajectory": 10, "time": 4}
+        assert data.value.dims == ("trajectory", "time")
+        assert (data.value.units, data.time.units) == ("J", "s")
+        np.testing.assert_array_equal(data.time, expected.values.ts[0])
+        np.testing.assert_array_equal(data.value, expected.values.ys)
+        meanings = data.result.flag_meanings.split()
+        assert [meanings[i] for i in data.result.values[list(BAD)]] == [
+            "nonfinite_state"
+        ] * 2
+        steps = expected.values.stats["num_steps"]
+        np.testing.assert_array_equal(data.stats_num_steps, steps)
+
+
+def test_xarray_opens_the_store_of_a_tree(store):
+    with xarray.open_zarr(store) as data:
+        x = np.linspace(0.5, 1.5, COUNT)
+        np.testing.assert_allclose(data.powers, np.stack([x**0, x, x**2], axis=1))
+        assert data.powers.dims == ("trajectory", "powers_0")
+        assert data.is_large.dtype == bool
+
+
+class Killed(BaseException):
+    """What stands for the end of the process."""
+
+
+def test_wherever_it_is_interrupted_the_same_call_goes_on(tmp_path, whole, monkeypatch):
+    """Each run ends at another operation on files, short of the last bytes."""
+    fsync, replace, folder = os.fsync, os.replace, tmp_path / "store"
+    left, ran = [0], []
+
+    def counted(function):
+        def operation(first, *rest):
+            left[0] -= 1
+            if left[0] == 0:
+                if function is fsync:
+                    os.ftruncate(first, max(0, os.fstat(first).st_size - 3))
+                raise Killed
+            return function(first, *rest)
+
+        return operation
+
+    # Folders cannot be cut in half.
+    monkeypatch.setattr(_durable, "settle", lambda folder: None)
+    monkeypatch.setattr(_durable.os, "fsync", counted(fsync))
+    monkeypatch.setattr(_durable.os, "replace", counted(replace))
+    for operations in (1, 2, 7, 13, 14, 1, 2, 3, 4, 5, 6, 7, 9, 10, 11):
+        left[0] = operations
+        with pytest.raises(Killed):
+            call(folder)
+        ran.append(content(folder) if folder.exists() else {})
+    left[0] = -1
+    call(folder)
+    assert content(folder) == whole
+    assert "manifest/chunks.jsonl" not in ran[0]
+    # No chunk is run twice that was done.
+    journals = [x.get("manifest/chunks.jsonl", b"").count(b"\n") for x in ran]
+    assert journals == sorted(journals)
+    assert 0 < journals[-1] < 13
+
+
+SCRIPT = """
+import jax
+jax.config.update("jax_enable_x64", True)
+import sys
+from ensemble import test_store
+test_store.call(sys.argv[1], count=800)
+"""
+
+
+def test_a_run_that_is_killed_goes_on_to_the_same_bytes(tmp_path):
+    root = Path(__file__).parents[2]
+    places = os.pathsep.join([str(root), str(root / "tests")])
+    command = [sys.executable, "-c", SCRIPT, str(tmp_path / "killed")]
+    journal = tmp_path / "killed" / "manifest" / "chunks.jsonl"
+    process = subprocess.Popen(command, env=os.environ | {"PYTHONPATH": places})
+    while process.poll() is None:
+        if journal.exists() and journal.read_bytes().count(b"\n") > 20:
+            process.send_signal(signal.SIGKILL)
+            break
+        time.sleep(0.001)
+    assert process.wait() == -signal.SIGKILL
+    done = journal.read_bytes().count(b"\n")
+    assert 20 < done < 200
+    call(tmp_path / "killed", count=800)
+    call(tmp_path / "whole", count=800)
+    assert content(tmp_path / "killed") == content(tmp_path / "whole")
+
+
+def test_a_finished_store_runs_nothing(store, whole, capsys):
+    call(store, progress_meter=nhjax.TextProgressMeter())
+    assert capsys.readouterr().out == ""
+    assert content(store) == whole
+    with pytest.raises(FileExistsError, match="`resume=True`"):
+        call(store, resume=False)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"chunk_size": 5}, "`chunk_size`, 4 before and 5 now"),
+        ({"count": 51}, "`num_members`, 50 before and 51 now"),
+        ({"function": lambda x: {"x": x}}, "the names, shapes or dtypes of what"),
+        (
+            {
+                "function": lambda x: {
+                    "powers": x ** jnp.arange(3.0) + 0.25,
+                    "is_large": x > 1.0,
+                }
+            },
+            r"computes, or the numbers in it.*add.*0\.25",
+        ),
+    ],
+)
+def test_other_parameters_are_refused_by_what_differs(options, message, store, whole):
+    with pytest.raises(ValueError, match=f"another run. What differs: .*{message}"):
+        call(store, **options)
+    assert content(store) == whole
+
+
+def test_other_members_and_other_arrays_of_run_are_refused(store):
+    with pytest.raises(ValueError, match="the arrays of `members`"):
+        nhjax.ensemble(run, np.ones(COUNT), out=store, chunk_size=CHUNK)
+    own = store.with_name("own")
+    call(own, power(jnp.arange(3.0)))
+    with pytest.raises(ValueError, match="what `run` computes"):
+        call(own, power(jnp.array([0.0, 1.0, 2.5])))
+
+
+def test_a_damaged_chunk_is_named_and_run_again_once_deleted(store, whole):
+    path = store / "powers" / "c" / "3" / "0"
+    path.write_bytes(path.read_bytes()[:-1] + b"x")
+    with pytest.raises(ValueError, match=r"powers/c/3/0.*members 12 to 15"):
+        call(store)
+    path.unlink()
+    call(store)
+    names = set(whole) - {"manifest/chunks.jsonl"}
+    assert {name: x for name, x in content(store).items() if name in names} == {
+        name: whole[name] for name in names
+    }
+    call(store)
+
+
+@pytest.mark.parametrize("name", ["zarr.json", "program.txt", "chunks.jsonl"])
+def test_a_missing_manifest_is_told(name, store):
+    (store / "manifest" / name).unlink()
+    with pytest.raises(ValueError, match=f"has no 'manifest/{name}'"):
+        call(store)
+
+
+def test_a_damaged_manifest_is_told(store):
+    (store / "manifest" / "zarr.json").write_text("{")
+    with pytest.raises(ValueError, match=r"a damaged 'manifest/zarr\.json'"):
+        call(store)
+
+
+def test_a_damaged_journal_is_told(store):
+    journal = store / "manifest" / "chunks.jsonl"
+    lines = journal.read_text().splitlines()
+    journal.write_text("\n".join([lines[0][:-5], *lines[1:], ""]))
+    with pytest.raises(ValueError, match="Line 1 of"):
+        call(store)
+
+
+def test_a_full_disk_is_told_and_what_is_done_is_kept(tmp_path, whole, monkeypatch):
+    left = [30]
+
+    def fsync(file):
+        left[0] -= 1
+        if left[0] < 0:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    with monkeypatch.context() as patch:
+        patch.setattr(_durable.os, "fsync", fsync)
+        with pytest.raises(OSError, match="No space left") as told:
+            call(tmp_path / "store")
+    assert told.value.errno == errno.ENOSPC
+    assert "could not be written to" in str(told.value)
+    call(tmp_path / "store")
+    assert content(tmp_path / "store") == whole
+
+
+def test_folders_that_cannot_be_used_are_told(tmp_path, monkeypatch):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(FileExistsError, match="is a file: `out` names a folder"):
+        call(tmp_path / "file")
+    with pytest.raises(NotADirectoryError, match="cannot be used"):
+        call(tmp_path / "file" / "store")
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "thesis.tex").write_text("")
+    with pytest.raises(ValueError, match=r"was not made by `nhjax\.ensemble`"):
+        call(tmp_path / "mine")
+
+    def refused(*args):
+        raise PermissionError(errno.EACCES, os.strerror(errno.EACCES), "store")
+
+    monkeypatch.setattr(_durable, "write", refused)
+    with pytest.raises(PermissionError, match="Permission denied"):
+        call(tmp_path / "store")
+
+
+def test_two_runs_do_not_write_to_one_store(store):
+    fcntl = pytest.importorskip("fcntl")
+    with open(store / "manifest" / "chunks.jsonl") as journal:
+        fcntl.flock(journal, fcntl.LOCK_EX)
+        with pytest.raises(RuntimeError, match="written by another process"):
+            call(store)
+
+
+def test_ctrl_c_leaves_a_store_that_goes_on(tmp_path, whole):
+    class Interrupting(nhjax.AbstractProgressMeter):
+        def update(self, done, total):
+            raise KeyboardInterrupt
+
+    folder = tmp_path / "store"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(nhjax._ensemble._ensemble, "_SECONDS", 0.0)
+        with pytest.raises(KeyboardInterrupt):
+            call(folder, progress_meter=Interrupting())
+    line = json.loads((folder / "manifest" / "chunks.jsonl").read_text())
+    assert line["chunk"] == 0
+    call(folder)
+    assert content(folder) == whole
+
+
+def test_without_zarr_the_extra_is_named(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "zarr", None)
+    with pytest.raises(ImportError, match=r'pip install "nhjax\[ensemble\]"'):
+        call(tmp_path / "store")
+
+
+@pytest.mark.parametrize(
+    ("options", "error", "message"),
+    [
+        ({"reduce": nhjax.Mean()}, ValueError, "either `reduce` or `out`"),
+        ({"units": {"mass": "kg"}}, ValueError, "`units` has the name 'mass'"),
+        ({"function": lambda x: {"time": x}}, ValueError, "an array called 'time'"),
+        (
+            {"function": lambda x: x.astype(jnp.bfloat16)},
+            TypeError,
+            "dtype bfloat16, which Zarr",
+        ),
+    ],
+)
+def test_what_a_store_does_not_hold_is_refused(options, error, message, tmp_path):
+    with pytest.raises(error, match=message):
+        call(tmp_path / "store", **options)
+    assert not (tmp_path / "store").exists()
+
+
+def test_units_without_a_store_are_refused():
+    with pytest.raises(ValueError, match="give its folder as `out`"):
+        call(None, units={"time": "s"})
