@@ -161,8 +161,8 @@ class Reduced(AbstractSink):
         if len(bare.failed) == count:
             index, step, reason = bare.failures()[0]
             raise IntegrationError(
-                f"All {count} members failed, so that there are no statistics. "
-                f"Member {index} failed in step {step}: {reason}"
+                f"Integration failed in all {count} members, so that there are no "
+                f"statistics; in member {index} in step {step}: {reason}"
             )
         statistics = each_reduction(
             lambda each, state: each.finish(state), self.reductions, self.state

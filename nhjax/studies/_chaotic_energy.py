@@ -4,13 +4,9 @@ import dataclasses
 from collections.abc import Sequence
 from typing import Any, ClassVar, TYPE_CHECKING
 
-import jax
 import numpy as np
 
-from .._initial import initial_state
-from .._integrate import integrate, raise_failures, SaveAt
 from .._method import LobattoIIIAB
-from .._system import State
 from ..systems import ChaoticSystem
 from ._arguments import (
     ArgumentError,
@@ -22,8 +18,8 @@ from ._arguments import (
     whole_steps,
 )
 from ._chaotic_figure import chaotic_figure
-from ._result import AbstractStudyResult, Timing
-from ._run import compile_and_run, meter
+from ._chaotic_run import Case, chaotic_run, ChaoticRun, WINDOW
+from ._result import AbstractStudyResult
 from ._table import format_slope, format_table, slopes
 
 
@@ -31,37 +27,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
-# Means are taken over this long a stretch to either side of a time: μ(E, k) of one
-# step fluctuates with the fast motion of the system.
-WINDOW = 5.0
 TIMES = (10.0, 50.0, 100.0, 200.0)
-
-
-@dataclasses.dataclass(frozen=True)
-class ChaoticRun:
-    """The ensemble with one method and one step size.
-
-    - `energies`: shape (members, saved times).
-    """
-
-    stages: int
-    dt: float
-    times: np.ndarray
-    energies: np.ndarray
-    mean_iterations: float
-    max_constraint_violation: float
-    timing: Timing
-
-    def mean_squared_error(self) -> np.ndarray:
-        """Compute the mean squared energy error μ(E, k) at the saved times."""
-        return np.mean((self.energies - self.energies[:, :1]) ** 2, axis=0)
-
-    def window_means(self, times: Sequence[float]) -> np.ndarray:
-        """Average μ(E, k) over a window around each of `times`."""
-        mu = self.mean_squared_error()
-        return np.array(
-            [np.mean(mu[np.abs(self.times - t) <= WINDOW + 1e-9]) for t in times]
-        )
 
 
 @dataclasses.dataclass(frozen=True)
@@ -88,7 +54,7 @@ class ChaoticEnergy(AbstractStudyResult):
 
         The first row is NaN: there is no larger step to compare with.
         """
-        means = np.stack([run.window_means(self.times) for run in self.of_stages(s)])
+        means = np.stack([run.windows for run in self.of_stages(s)])
         return slopes(self.dt, means)
 
     def parameters(self) -> dict[str, Any]:
@@ -121,11 +87,12 @@ class ChaoticEnergy(AbstractStudyResult):
         entries = []
         for s in self.stages:
             for run, slope in zip(self.of_stages(s), self.slopes(s), strict=True):
-                means = run.window_means(self.times)
+                means = run.windows
                 entry = {
                     "stages": s,
                     "dt": run.dt,
                     "mu": means,
+                    "mu_error": run.windows_error,
                     "mu_over_h^{4(s-1)}": means / run.dt ** (4 * (s - 1)),
                     "slopes": slope,
                     "expected_slope": 4 * (s - 1),
@@ -147,24 +114,27 @@ class ChaoticEnergy(AbstractStudyResult):
         for run in self.runs:
             key = f"s{run.stages}_h{run.dt:.6g}"
             data[f"{key}_times"] = run.times
-            data[f"{key}_mu"] = run.mean_squared_error()
-            data[f"{key}_energies"] = run.energies
+            data[f"{key}_mu"] = run.mu
+            data[f"{key}_mu_error"] = run.mu_error
         return data
 
     def table(self) -> str:
         """Write a table of μ/h^{4(s-1)} and the slopes of μ at the times."""
         header = ["s", "h", "4(s-1)"]
-        header += [f"μ/h^4(s-1) t={t:g}" for t in self.times]
+        header += [f"μ/h^4(s-1) t={t:g} ± error" for t in self.times]
         header += [f"slope t={t:g}" for t in self.times]
         header += ["compile s", "run s"]
         rows = []
         for s in self.stages:
             for run, slope in zip(self.of_stages(s), self.slopes(s), strict=True):
                 power = 4 * (s - 1)
-                scaled = run.window_means(self.times) / run.dt**power
+                scaled = run.windows / run.dt**power
+                errors = run.windows_error / run.dt**power
+                pairs = zip(scaled, errors, strict=True)
+                values = [f"{x:.3g} ± {y:.1g}" for x, y in pairs]
                 rows.append(
                     [str(s), f"{run.dt:.6g}", str(power)]
-                    + [f"{x:.3g}" for x in scaled]
+                    + values
                     + [format_slope(x) for x in slope]
                     + [f"{run.timing.compile_seconds:.2f}"]
                     + [f"{run.timing.run_seconds:.2f}"]
@@ -174,8 +144,7 @@ class ChaoticEnergy(AbstractStudyResult):
     def figures(self) -> "dict[str, Figure]":
         """Draw μ against time in both normalisations, ours and the paper's."""
         curves = [
-            (run.stages, run.dt, run.times, run.mean_squared_error())
-            for run in self.runs
+            (run.stages, run.dt, run.times, run.mu, run.mu_error) for run in self.runs
         ]
         title = f"J = {self.members}, {self.closure} closure"
         return {self.name: chaotic_figure(curves, title)}
@@ -197,7 +166,8 @@ def chaotic_energy(
     The paper's third experiment, J + 1 motions of a system with 7 degrees of freedom on
     one energy surface. μ(E, k), the mean of (E_jk - E_0)² over the ensemble at step k,
     is found to go as h^{4(s-1)}. Every motion is chaotic: only such statistics can be
-    compared.
+    compared. Members run in chunks and statistics are collected on the way, so that
+    memory does not grow with J; μ has an error bar, its standard error.
 
     **Arguments:**
 
@@ -236,13 +206,13 @@ def chaotic_energy(
             raise ArgumentError(
                 name, f"must leave samples in a window of ±{WINDOW:g}, got {value:g}"
             )
-    chaotic = ChaoticSystem()
-    q0, v0 = chaotic.ensemble(members)
-    y0 = jax.vmap(lambda q, v: initial_state(chaotic.system, q, v))(q0, v0)
     runs = [
-        _run(chaotic, y0, LobattoIIIAB(s, closure), h, n, save_every, progress)
-        for s in stages
-        for h, n in num_steps.items()
+        chaotic_run(case, members, times, progress)
+        for case in (
+            Case(LobattoIIIAB(s, closure), h, n, save_every)
+            for s in stages
+            for h, n in num_steps.items()
+        )
     ]
     return ChaoticEnergy(
         stages=tuple(stages),
@@ -253,42 +223,4 @@ def chaotic_energy(
         times=tuple(times),
         save_every=save_every,
         runs=runs,
-    )
-
-
-def _run(
-    chaotic: ChaoticSystem,
-    y0: State,
-    method: LobattoIIIAB,
-    h: float,
-    num_steps: int,
-    save_every: int,
-    progress: bool,
-) -> ChaoticRun:
-    system = chaotic.system
-    save_every = min(save_every, num_steps)
-
-    def run(y0):
-        return integrate(
-            system,
-            method,
-            y0,
-            dt=h,
-            num_steps=num_steps,
-            saveat=SaveAt(t0=True, steps=save_every, fn=system.energy),
-            throw=False,
-            progress_meter=meter(progress, f"s = {method.stages}, h = {h:.4g}"),
-        )
-
-    sol, timing = compile_and_run(jax.vmap(run), y0)
-    raise_failures(sol)
-    ts, ys, stats = jax.tree.map(np.asarray, (sol.ts, sol.ys, sol.stats))
-    return ChaoticRun(
-        stages=method.stages,
-        dt=h,
-        times=ts[0],
-        energies=ys,
-        mean_iterations=float(np.mean(stats["num_iterations"])) / num_steps,
-        max_constraint_violation=float(np.max(stats["max_constraint_violation"])),
-        timing=timing,
     )

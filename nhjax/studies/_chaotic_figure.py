@@ -13,13 +13,13 @@ if TYPE_CHECKING:
 # The powers of h that the paper's figure divides μ by.
 PAPER_POWERS = {2: 4, 3: 10}
 
-Curve = tuple[int, float, np.ndarray, np.ndarray]
+Curve = tuple[int, float, np.ndarray, np.ndarray, np.ndarray]
 
 
 def chaotic_figure(curves: list[Curve], title: str) -> "Figure":
     """Draw μ against time, a column for each s: ours above, the paper's below.
 
-    `curves` holds (s, h, times, μ).
+    `curves` holds (s, h, times, μ, standard error of μ), the latter for bands.
     """
     from matplotlib.figure import Figure
 
@@ -49,12 +49,15 @@ def chaotic_figure(curves: list[Curve], title: str) -> "Figure":
 def _panel(ax: "Axes", curves: list[Curve], power: int) -> None:
     # The first steps come from zero: they would squeeze the rest.
     levels = []
-    for i, (_, h, times, mu) in enumerate(curves):
-        scaled = mu / h**power
+    for i, (_, h, times, mu, error) in enumerate(curves):
+        scaled, spread = mu / h**power, _smoothed(error) / h**power
         levels += [np.min(scaled[len(scaled) // 10 :]), np.max(scaled[1:])]
         ax.plot(times, scaled, linewidth=0.4, alpha=0.35, color=f"C{i}")
-        ax.plot(
-            times, _smoothed(scaled), color=f"C{i}", linewidth=1.5, label=f"$h$ = {h:g}"
+        mean = _smoothed(scaled)
+        ax.plot(times, mean, color=f"C{i}", linewidth=1.5, label=f"$h$ = {h:g}")
+        # Errors of one time and the next are not independent: they do not average out.
+        ax.fill_between(
+            times, mean - spread, mean + spread, color=f"C{i}", alpha=0.2, linewidth=0
         )
     ax.set_yscale("log")
     ax.set_ylim(min(levels) / 1.5, max(levels) * 1.5)

@@ -21,6 +21,8 @@ def compile_and_run(function: Callable[..., Any], *args: Any) -> tuple[Any, Timi
     return value, Timing(compiled - start, time.perf_counter() - compiled)
 
 
-def meter(progress: bool, description: str) -> AbstractProgressMeter:
+def meter(
+    progress: bool, description: str, unit: str = "step"
+) -> AbstractProgressMeter:
     """Make a progress meter: a bar on the standard error stream, or none."""
-    return TqdmProgressMeter(description) if progress else NoProgressMeter()
+    return TqdmProgressMeter(description, unit) if progress else NoProgressMeter()

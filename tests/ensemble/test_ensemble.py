@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 import nhjax
+from benchmarks import ensembles
 from oracles.ensembles import BAD, start, starts
 
 
@@ -62,7 +63,7 @@ def test_a_bare_result_is_looked_at():
 
 
 def test_if_all_fail_the_first_reason_is_told():
-    with pytest.raises(nhjax.IntegrationError, match=r"All 2 members .* step 0: The"):
+    with pytest.raises(nhjax.IntegrationError, match=r"all 2 members, .* step 0: The"):
         nhjax.ensemble(start, starts()[list(BAD)], reduce=nhjax.Mean(), chunk_size=4)
 
 
@@ -178,3 +179,11 @@ def test_members_and_statistics_on_several_devices_are_those_of_one():
         check=False,
     )
     assert done.stdout == "the same\n", done.stderr
+
+
+def test_the_benchmark_in_a_small_form():
+    row = ensembles.measure(members=2500, num_steps=2, rounds=1)
+    assert row["failed"] == 0
+    # The energy of all members.
+    np.testing.assert_allclose(row["mean"], 3.06, atol=1e-3)
+    assert "2500 | 2" in ensembles.table([row])

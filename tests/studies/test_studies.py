@@ -4,12 +4,15 @@ import json
 import math
 from pathlib import Path
 
+import jax
 import numpy as np
 import pytest
 
+import nhjax
 from nhjax import studies
 from nhjax.__main__ import main
-from nhjax.systems import NonholonomicParticle
+from nhjax.studies import _chaotic_run
+from nhjax.systems import ChaoticSystem, NonholonomicParticle
 
 
 PNG = b"\x89PNG\r\n\x1a\n"
@@ -173,7 +176,7 @@ def test_an_output_directory_that_cannot_be_made(tmp_path, capsys):
 def test_an_unsolvable_step_is_reported(tmp_path, capsys):
     command = "run chaotic-energy --stages 4 --dt 4 --final-time 40 --members 1"
     assert main([*command.split(), "--out", str(tmp_path)]) == 1
-    assert "Integration failed in lane" in capsys.readouterr().err
+    assert "Integration failed in all 2 members" in capsys.readouterr().err
 
 
 def test_errors_in_python_name_the_parameter():
@@ -265,13 +268,44 @@ def test_ball_invariants_record_and_figures(ball):
 def test_chaotic_energy_shapes_and_slopes(chaotic):
     assert chaotic.times == (4.0,)
     data = chaotic.arrays()
-    assert data["s2_h0.2_energies"].shape == (4, 11)
+    assert data["s2_h0.2_mu_error"].shape == (11,)
     assert data["s3_h0.1_mu"].shape == (21,)
-    np.testing.assert_allclose(data["s2_h0.1_energies"][:, 0], 3.06, atol=1e-14)
     slopes = [float(chaotic.slopes(s)[1, 0]) for s in (2, 3)]
     np.testing.assert_allclose(slopes, [4, 8], atol=0.3)
     for run in chaotic.runs:
         assert run.max_constraint_violation < 1e-13
+
+
+def test_chaotic_energy_in_chunks_is_that_of_all_energies_at_once(monkeypatch):
+    monkeypatch.setattr(_chaotic_run, "CHUNK", 3)
+    options = {"stages": (2,), "dt": (0.2,), "final_time": 4.0, "times": (2.0, 4.0)}
+    (run,) = studies.chaotic_energy(members=7, **options).runs
+    chaotic = ChaoticSystem()
+    q0, v0 = chaotic.ensemble(7)
+
+    def energies(q, v):
+        sol = nhjax.integrate(
+            chaotic.system,
+            nhjax.LobattoIIIAB(2, "propagated"),
+            nhjax.initial_state(chaotic.system, q, v),
+            dt=0.2,
+            num_steps=20,
+            saveat=nhjax.SaveAt(t0=True, steps=True, fn=chaotic.system.energy),
+        )
+        return sol.ts, sol.ys
+
+    times, found = jax.jit(jax.vmap(energies))(q0, v0)
+    squares = np.asarray((found - found[:, :1]) ** 2)
+    np.testing.assert_allclose(run.times, times[0], rtol=1e-15)
+    # The errors are themselves differences of energies.
+    np.testing.assert_allclose(run.mu, squares.mean(axis=0), rtol=1e-8, atol=1e-17)
+    error = squares.std(axis=0, ddof=1) / np.sqrt(8)
+    np.testing.assert_allclose(run.mu_error, error, rtol=1e-8, atol=1e-17)
+    # Both windows hold all times.
+    windows = squares.mean(axis=1)
+    np.testing.assert_allclose(run.windows, [windows.mean()] * 2, rtol=1e-8)
+    error = windows.std(ddof=1) / np.sqrt(8)
+    np.testing.assert_allclose(run.windows_error, [error] * 2, rtol=1e-8)
 
 
 def test_chaotic_energy_draws_both_normalisations(chaotic):
