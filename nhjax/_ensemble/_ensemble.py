@@ -10,6 +10,7 @@ from jaxtyping import PyTree
 
 from .._integrate import AbstractProgressMeter, NoProgressMeter, TqdmProgressMeter
 from ._failed import failed_rows
+from ._kept import Kept
 from ._members import Members
 from ._outcome import EnsembleOutcome
 from ._program import Layout, value_structure
@@ -57,7 +58,8 @@ def ensemble(
     - `num_members`: how many members there are, if `members` is a function.
     - `out`: a folder for a store of Zarr that the values are written to, chunk after
         chunk, and `xarray.open_zarr` opens. The same call goes on with a store that an
-        interrupted one has left. `docs/ensembles.md` says more.
+        interrupted one has left. With `reduce` the states of the reductions are kept
+        there instead. `docs/ensembles.md` says more.
     - `reduce`: an `nhjax.Mean`, `nhjax.Variance`, `nhjax.Minimum`, `nhjax.Maximum`,
         `nhjax.Histogram`, an `nhjax.AbstractReduction` of one's own, or a tree of them
         such as a dictionary. Then values are not kept, and memory does not grow with
@@ -74,8 +76,8 @@ def ensemble(
     - `resume`: whether to go on with a store that exists, rather than to refuse it.
     - `units`: units of arrays in the store, by their names there.
 
-    **Returns:** an `nhjax.EnsembleOutcome` with `values` or `statistics`; neither with
-    `out`.
+    **Returns:** an `nhjax.EnsembleOutcome` with `values` or `statistics`, or with
+    neither if values were written to `out`.
 
     **Raises:** `nhjax.ShapeError` for arrays that differ in their leading axis;
     `TypeError` if `run` returns anything but arrays; `ValueError` for numbers that make
@@ -129,12 +131,11 @@ def _sink(
         if out is None:
             return Collected(work)
         return Stored(work, out, {} if units is None else units, resume)
-    if out is not None:
-        raise ValueError(
-            "Give either `reduce` or `out`: what is reduced is not kept, and "
-            "statistics of a store can be had from `xarray.open_zarr`."
-        )
-    return Reduced(work, reductions)
+    if units is not None:
+        raise ValueError("`units` are those of values, which `reduce` does not keep.")
+    if out is None:
+        return Reduced(work, reductions)
+    return Kept(work, reductions, out, resume)
 
 
 def _run_chunks(

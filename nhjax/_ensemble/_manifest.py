@@ -9,7 +9,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from .._files import installed_version
+from ._program import each_reduction
 from ._sinks import Work
+from ._verdict import without_results
 
 
 FORMAT = 1
@@ -19,13 +21,7 @@ _VERSIONS = ("nhjax", "jax")
 
 def manifest(work: Work, variables: dict[str, Any]) -> dict[str, Any]:
     """Describe the parameters of a run, in terms of JSON."""
-    return {
-        "format": FORMAT,
-        "nhjax": installed_version(),
-        "jax": jax.__version__,
-        "num_members": work.members.count,
-        "chunk_size": work.size,
-        "members": work.members.digest(),
+    return _common(work) | {
         "variables": {
             name: [list(dims[1:]), list(x.shape[1:]), x.dtype.name]
             for name, (dims, x) in variables.items()
@@ -33,15 +29,46 @@ def manifest(work: Work, variables: dict[str, Any]) -> dict[str, Any]:
     }
 
 
-def program(work: Work) -> str:
+def statistics_manifest(work: Work, reductions: str) -> dict[str, Any]:
+    """Describe the parameters of a run that is reduced."""
+    return _common(work) | {"reduce": reductions}
+
+
+def _common(work: Work) -> dict[str, Any]:
+    return {
+        "format": FORMAT,
+        "nhjax": installed_version(),
+        "jax": jax.__version__,
+        "num_members": work.members.count,
+        "chunk_size": work.size,
+        "members": work.members.digest(),
+    }
+
+
+def program(work: Work, reductions: Any = ()) -> str:
     """Write the program of one member, with digests of the arrays that it holds.
 
-    Addresses of functions, which differ from process to process, are left out.
+    After it comes that of the reductions. Addresses of functions, which differ from
+    process to process, are left out.
     """
+
+    def run(one):
+        return work.run(work.members.make(one))
+
+    def reduce(value):
+        value = without_results(value)
+        chunk = jax.tree.map(lambda x: x[None], value)
+        counts = jnp.ones(1, bool)
+        return each_reduction(
+            lambda each: each.update(each.init(value), chunk, counts), reductions
+        )
+
     one = jax.tree.map(lambda x: x[0], work.members.inputs(0, 1))
-    closed = jax.make_jaxpr(lambda one: work.run(work.members.make(one)))(one)
-    lines = re.sub(r"0x[0-9a-f]+", "0x", str(closed)).splitlines()
-    lines += [f"array {x}" for x in _constants(closed)]
+    parts = [jax.make_jaxpr(run)(one), jax.make_jaxpr(reduce)(work.structure)]
+    lines = []
+    for closed in parts:
+        lines += re.sub(r"0x[0-9a-f]+", "0x", str(closed)).splitlines()
+        lines += [f"array {x}" for x in _constants(closed)]
     return "\n".join(line.rstrip() for line in lines) + "\n"
 
 

@@ -1,5 +1,6 @@
 """Stores of Zarr, as the files that they are made of."""
 
+import json
 import warnings
 from typing import Any
 
@@ -62,9 +63,14 @@ class Files:
             self._zarr.consolidate_metadata(self._store)
 
     def metadata(self) -> dict[str, bytes]:
-        """Return the files that describe the store, by name."""
+        """Return the files that describe the store, by name.
+
+        Zarr lists arrays in the order in which it comes across them, which may be any.
+        """
         return {
-            name: x.to_bytes()
+            name: json.dumps(
+                json.loads(x.to_bytes()), sort_keys=True, indent=1
+            ).encode()
             for name, x in self._content.items()
             if name.endswith("zarr.json")
         }

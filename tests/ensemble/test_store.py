@@ -10,6 +10,7 @@ import time
 from pathlib import Path
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -307,7 +308,7 @@ def test_without_zarr_the_extra_is_named(tmp_path, monkeypatch):
 @pytest.mark.parametrize(
     ("options", "error", "message"),
     [
-        ({"reduce": nhjax.Mean()}, ValueError, "either `reduce` or `out`"),
+        ({"reduce": nhjax.Mean(), "units": {}}, ValueError, "`units` are those of"),
         ({"units": {"mass": "kg"}}, ValueError, "`units` has the name 'mass'"),
         ({"function": lambda x: {"time": x}}, ValueError, "an array called 'time'"),
         (
@@ -326,3 +327,47 @@ def test_what_a_store_does_not_hold_is_refused(options, error, message, tmp_path
 def test_units_without_a_store_are_refused():
     with pytest.raises(ValueError, match="give its folder as `out`"):
         call(None, units={"time": "s"})
+
+
+def test_statistics_go_on_where_they_were_interrupted(tmp_path, monkeypatch):
+    reduce = {"mean": nhjax.Mean(), "variance": nhjax.Variance()}
+    options: dict[str, Any] = {"members": starts(), "chunk_size": 2, "reduce": reduce}
+    whole = nhjax.ensemble(start, **options)
+    replace, folder, left = os.replace, tmp_path / "s", [0]
+
+    def interrupted(*args):
+        left[0] -= 1
+        if left[0] == 0:
+            raise Killed
+        replace(*args)
+
+    monkeypatch.setattr(os, "replace", interrupted)
+    # Before the program, the manifest and the states are there; then between chunks.
+    for operations in (1, 2, 3, 2, 2):
+        left[0] = operations
+        with pytest.raises(Killed):
+            nhjax.ensemble(start, out=folder, **options)
+    # The rest is run, and then nothing is.
+    for _ in range(2):
+        again = nhjax.ensemble(start, out=folder, **options)
+        assert again.failures() == whole.failures() != []
+        assert content_of(again.statistics) == content_of(whole.statistics)
+    for name, value, message in (
+        ("reduce", nhjax.Minimum(), "`reduce`, .*Mean.* before and .*Minimum"),
+        ("reduce", reduce | {"mean": nhjax.Mean(of=lambda sol: sol.ts)}, "`reduce`, "),
+        ("chunk_size", 4, "`chunk_size`, 2 before and 4 now"),
+    ):
+        other: dict[str, Any] = options | {name: value}
+        with pytest.raises(ValueError, match=message):
+            nhjax.ensemble(start, **other, out=folder)
+    (folder / "state.npz").write_bytes(b"PK")
+    with pytest.raises(ValueError, match="is damaged"):
+        nhjax.ensemble(start, out=folder, **options)
+    (folder / "manifest.json").unlink()
+    with pytest.raises(ValueError, match=r"has no 'manifest\.json'"):
+        nhjax.ensemble(start, out=folder, **options)
+
+
+def content_of(tree):
+    """The bytes of the arrays of a tree."""
+    return [np.asarray(x).tobytes() for x in jax.tree.leaves(tree)]
