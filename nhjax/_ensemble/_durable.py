@@ -1,6 +1,8 @@
 """Files that are whole or not there, whatever interrupts their writing."""
 
 import os
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 
@@ -39,9 +41,14 @@ def settle(folder: Path) -> None:
         os.close(opened)
 
 
-def told(error: OSError, what: str) -> OSError:
-    """Make an error of the system that says what could not be done."""
-    reason = error.strerror or str(error)
-    if error.errno is None:
-        return type(error)(f"{what}: {reason}")
-    return OSError(error.errno, f"{what}: {reason}", error.filename)
+@contextmanager
+def telling(what: str) -> Iterator[None]:
+    """Say with errors of the system what could not be done."""
+    try:
+        yield
+    except OSError as error:
+        reason = error.strerror or str(error)
+        if error.errno is None:
+            raise type(error)(f"{what}: {reason}") from error
+        text = f"{what}: {reason}"
+        raise OSError(error.errno, text, error.filename) from error

@@ -2,6 +2,7 @@
 
 import hashlib
 import re
+from pathlib import Path
 from typing import Any
 
 import jax
@@ -29,9 +30,13 @@ def manifest(work: Work, variables: dict[str, Any]) -> dict[str, Any]:
     }
 
 
-def statistics_manifest(work: Work, reductions: str) -> dict[str, Any]:
+def statistics_manifest(work: Work, reductions: Any) -> dict[str, Any]:
     """Describe the parameters of a run that is reduced."""
-    return _common(work) | {"reduce": reductions}
+    return _common(work) | {"reduce": _without_addresses(repr(reductions))}
+
+
+def _without_addresses(text: str) -> str:
+    return re.sub(r"0x[0-9a-f]+", "0x", text)
 
 
 def _common(work: Work) -> dict[str, Any]:
@@ -67,7 +72,7 @@ def program(work: Work, reductions: Any = ()) -> str:
     parts = [jax.make_jaxpr(run)(one), jax.make_jaxpr(reduce)(work.structure)]
     lines = []
     for closed in parts:
-        lines += re.sub(r"0x[0-9a-f]+", "0x", str(closed)).splitlines()
+        lines += _without_addresses(str(closed)).splitlines()
         lines += [f"array {x}" for x in _constants(closed)]
     return "\n".join(line.rstrip() for line in lines) + "\n"
 
@@ -88,7 +93,42 @@ def _constants(closed: Any) -> list[str]:
     return found
 
 
-def differences(old: dict[str, Any], new: dict[str, Any], is_done: bool) -> list[str]:
+def check_resumable(
+    where: str, folder: Path, names: tuple[str, ...], maker: str, resume: bool
+) -> None:
+    """Raise unless a folder may be gone on with, and has the files of these names.
+
+    `where` says which folder it is, and `maker` which call makes folders of its kind.
+    """
+    if not resume:
+        raise FileExistsError(
+            f"{where} exists: go on with it by `resume=True`, or name another one."
+        )
+    for name in names:
+        if not (folder / name).is_file():
+            raise ValueError(
+                f"{where} has no {name!r}: it was not made by `{maker}`, or is "
+                "damaged. Name another folder, or put the file back."
+            )
+
+
+def check_same_run(
+    where: str,
+    old: dict[str, Any],
+    new: dict[str, Any],
+    programs: tuple[str, str],
+    is_done: bool,
+) -> None:
+    """Raise if two manifests or two `programs`, the old one first, differ."""
+    found = _differences(old, new, is_done) or _program_difference(*programs)
+    if found:
+        raise ValueError(
+            f"{where} is that of another run. What differs: {'; '.join(found)}. "
+            "Call with the same arguments, or name another folder."
+        )
+
+
+def _differences(old: dict[str, Any], new: dict[str, Any], is_done: bool) -> list[str]:
     """Say in what two manifests differ, but for versions if the run is done."""
     words = {
         "members": "the arrays of `members`, or whether they are a function",
@@ -105,7 +145,7 @@ def differences(old: dict[str, Any], new: dict[str, Any], is_done: bool) -> list
     return found
 
 
-def program_difference(old: str, new: str) -> list[str]:
+def _program_difference(old: str, new: str) -> list[str]:
     """Say where two programs differ first."""
     if old == new:
         return []

@@ -13,7 +13,7 @@ import numpy as np
 from . import _durable as durable
 from ._failed import Failed
 from ._journal import Journal
-from ._manifest import differences, manifest, program, program_difference
+from ._manifest import check_resumable, check_same_run, manifest, program
 from ._outcome import EnsembleOutcome
 from ._program import Chunk
 from ._sinks import AbstractSink, Work
@@ -49,16 +49,12 @@ class Stored(AbstractSink):
         self._open(self.variables)
         self.journal = Journal(self.path / _JOURNAL)
         try:
-            if self.path.is_dir() and any(self.path.iterdir()):
-                self._resume(resume)
-            else:
-                self._create()
-                self.journal.open()
-        except OSError as error:
-            self.close()
-            raise durable.told(
-                error, f"The store {str(self.path)!r} cannot be used"
-            ) from error
+            with durable.telling(f"The store {str(self.path)!r} cannot be used"):
+                if self.path.is_dir() and any(self.path.iterdir()):
+                    self._resume(resume)
+                else:
+                    self._create()
+                    self.journal.open()
         except BaseException:
             self.close()
             raise
@@ -92,16 +88,8 @@ class Stored(AbstractSink):
 
     def _resume(self, resume: bool) -> None:
         where = f"The store {str(self.path)!r}"
-        if not resume:
-            raise FileExistsError(
-                f"{where} exists: go on with it by `resume=True`, or name another one."
-            )
-        for name in (_MANIFEST, _PROGRAM, _JOURNAL):
-            if not (self.path / name).is_file():
-                raise ValueError(
-                    f"{where} has no {name!r}: it was not made by `nhjax.ensemble`, or "
-                    "is damaged. Name another folder, or put the file back."
-                )
+        names = _MANIFEST, _PROGRAM, _JOURNAL
+        check_resumable(where, self.path, names, "nhjax.ensemble", resume)
         self.journal.open()
         try:
             old = json.loads((self.path / _MANIFEST).read_text())["attributes"]
@@ -110,15 +98,8 @@ class Stored(AbstractSink):
                 f"{where} has a damaged {_MANIFEST!r}: {error}."
             ) from error
         is_done = len(self.journal.lines) == self.work.chunks
-        found = differences(old, self.manifest, is_done)
-        before = (self.path / _PROGRAM).read_text()
-        if not found:
-            found = program_difference(before, self.program)
-        if found:
-            raise ValueError(
-                f"{where} is that of another run. What differs: {'; '.join(found)}. "
-                "Call with the same arguments, or name another folder."
-            )
+        programs = (self.path / _PROGRAM).read_text(), self.program
+        check_same_run(where, old, self.manifest, programs, is_done)
         self._check_files()
 
     def _check_files(self) -> None:
@@ -151,19 +132,17 @@ class Stored(AbstractSink):
         rows = rows_of(content, count)
         line: dict[str, Any] = {"chunk": chunk, "failed": failed, "files": {}}
         line["times"] = common_times(rows)
-        try:
+        what = (
+            f"Members {first} to {first + count - 1} could not be written to "
+            f"{str(self.path)!r}; those of finished chunks are kept, and the same "
+            "call goes on once this is mended"
+        )
+        with durable.telling(what):
             for name, (_, x) in rows.items():
                 for file, data in self.files.chunk(name, first, x).items():
                     durable.write(self.path / file, data)
                     line["files"][file] = hashlib.sha256(data).hexdigest()
             self.journal.append(line)
-        except OSError as error:
-            what = (
-                f"Members {first} to {first + count - 1} could not be written to "
-                f"{str(self.path)!r}; those of finished chunks are kept, and the same "
-                "call goes on once this is mended"
-            )
-            raise durable.told(error, what) from error
 
     def outcome(self) -> EnsembleOutcome:
         """List the failures, and label times if all members have the same."""
@@ -183,7 +162,8 @@ class Stored(AbstractSink):
         times = np.asarray(array[0])
         self.files = Files()
         self._open(self.variables | {"time": (("time",), times)})
-        try:
+        what = f"The times could not be written to {str(self.path)!r}"
+        with durable.telling(what):
             # The folder stands for all of it, and so comes last.
             for name, data in self.files.chunk("time", 0, times).items():
                 durable.write(self.path / ".time.unfinished" / name, data)
@@ -194,9 +174,6 @@ class Stored(AbstractSink):
             os.replace(self.path / ".time.unfinished/time", self.path / "time")
             (self.path / ".time.unfinished").rmdir()
             durable.settle(self.path)
-        except OSError as error:
-            what = f"The times could not be written to {str(self.path)!r}"
-            raise durable.told(error, what) from error
 
     def close(self) -> None:
         """Let others write to the store."""

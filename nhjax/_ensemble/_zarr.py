@@ -29,7 +29,7 @@ class Files:
         self._content: dict[str, Any] = {}
         self._store = zarr.storage.MemoryStore(self._content)
         self._arrays: dict[str, Any] = {}
-        self._zarr, self._group = zarr, None
+        self._zarr = zarr
 
     def open(
         self,
