@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Int, PyTree
 
+from .._numerics import tree_where
 from ._pairs import Pair, pair, plus, value as rounded
 from ._reduction import (
     AbstractReduction,
@@ -160,7 +161,7 @@ class Variance(AbstractReduction):
             share = other.number.astype(dtype) / jnp.maximum(count, 1).astype(dtype)
             moved = plus(a, pair(_difference(a, b) * share))
             # The mean of the only members there are, to its last bit.
-            return jax.tree.map(lambda x, y: jnp.where(one.number == 0, x, y), b, moved)
+            return tree_where(one.number == 0, b, moved)
 
         def squares(a: Pair, b: Pair, x: Pair, y: Pair) -> Pair:
             dtype, δ = a.high.dtype, _difference(x, y)

@@ -16,6 +16,7 @@ from .._numerics import (
     rank_of_gram,
     root,
     those_that_count,
+    tree_where,
 )
 from .._system import (
     AbstractMechanicalSystem,
@@ -131,7 +132,7 @@ def _solve(system, t, q, v, p, args, project: bool) -> Found:
     if project:
         normal = manifold.normalise(q)
         possible = all_finite(normal)
-        q = jax.tree.map(lambda x, y: jnp.where(possible, x, y), normal, q)
+        q = tree_where(possible, normal, q)
         off_group = jnp.where(possible, 0, off_group)
         if system.holonomic is not None:
             guess = given if is_fibre else jnp.zeros_like(given)

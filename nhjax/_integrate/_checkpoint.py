@@ -10,7 +10,7 @@ from jaxtyping import Array, Float, Int, PyTree
 
 from .._custom_types import Args, BoolScalar, FloatScalar, FloatScalarLike
 from .._errors import Check, is_traced, ShapeError
-from .._numerics import max_norm
+from .._numerics import max_norm, tree_where
 from .._step import StepState
 from .._system import (
     AbstractMechanicalSystem,
@@ -176,8 +176,7 @@ def resumed(y0: Checkpoint, fresh: StepState) -> StepState:
     _check_arrays("linearisation", y0.linearisation, new)
     old = jax.tree.unflatten(structure, y0.linearisation)
     same = _agree(old, fresh.lin)
-    lin = jax.tree.map(lambda x, y: jnp.where(same, x, y), old, fresh.lin)
-    lin = jax.lax.stop_gradient(lin)
+    lin = jax.lax.stop_gradient(tree_where(same, old, fresh.lin))
     return StepState(y0.state, y0.q_compensation, y0.p_compensation, lin)
 
 

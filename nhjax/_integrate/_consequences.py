@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int
 
 from .._custom_types import Args, BoolScalar, FloatScalar
-from .._numerics import ClosureConverted
+from .._numerics import ClosureConverted, tree_where
 from .._results import RESULTS
 from .._step import first_step_state, StepState
 from .._system import AbstractMechanicalSystem, all_finite, State
@@ -78,9 +78,7 @@ class Consequences(eqx.Module):
             pending = (before.pending | (turned & (sides.sign != 0))) & others
             found = RESULTS.where(known, result, RESULTS.nonfinite_event)
             found = RESULTS.where(consistent, found, RESULTS.inconsistent_reset)
-            after = jax.tree.map(
-                lambda new, old: jnp.where(consistent, new, old), after, step_state
-            )
+            after = tree_where(consistent, after, step_state)
             return Met(after.differentiated_in_state(), sides, pending, found)
 
         return jax.lax.cond(fires, met, lambda: nothing)

@@ -1,14 +1,15 @@
 """The steps of a run with events: each iteration ends at a node or at an event."""
 
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int, PyTree
+from jaxtyping import Array, Bool, Float, Int
 
 from .._custom_types import BoolScalar, FloatScalar, IntScalar
+from .._numerics import tree_where
 from .._results import RESULTS
 from .._step import StepArguments, StepState
 from .._system import State
@@ -161,7 +162,7 @@ class EventStepping(eqx.Module):
         after = replace(
             after,
             row=jnp.minimum(before.row + fills.astype(jnp.int32), self.num_steps),
-            sides=jax.lax.stop_gradient(_where(it.fires, met.sides, sides)),
+            sides=jax.lax.stop_gradient(tree_where(it.fires, met.sides, sides)),
             pending=jnp.where(it.fires, met.pending, before.pending),
         )
         entry = LogEntry(
@@ -210,7 +211,7 @@ class EventStepping(eqx.Module):
         first_pending = jnp.argmax(before.pending).astype(jnp.int32)
         which = jnp.where(at_once, first_pending, cut.fired)
         meets = (stepped | (alive & at_once)) & (which >= 0)
-        reached = _where(stepped, cut.outcome.step_state, carry.step_state)
+        reached = tree_where(stepped, cut.outcome.step_state, carry.step_state)
         size = jnp.where(stepped, cut.h, 0)
         # Events that follow themselves like this would do so for ever.
         at_last = (before.num > 0) & before.sides.at_zero[which]
@@ -287,7 +288,3 @@ def _cut(
     )
     programs = stepping.programs
     return primitive_cut_step(arguments, conditions, options, programs)
-
-
-def _where(which: BoolScalar, x: PyTree[Array], y: PyTree[Array]) -> Any:
-    return jax.tree.map(lambda a, b: jnp.where(which, a, b), x, y)

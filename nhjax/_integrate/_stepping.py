@@ -10,7 +10,7 @@ from jaxtyping import Array, Int
 from .._compile import Programs
 from .._custom_types import Args, BoolScalar, FloatScalar
 from .._method import AbstractMethod
-from .._numerics import max_norm
+from .._numerics import max_norm, tree_where
 from .._results import RESULTS
 from .._step import (
     AbstractStageSolver,
@@ -137,11 +137,7 @@ class Stepping(eqx.Module):
         alive = carry.result == RESULTS.successful
         outcome = self.one_step(carry.step_state, self.time(k), self.dt, ~alive)
         good = alive & (outcome.result == RESULTS.successful)
-        step_state = jax.tree.map(
-            lambda new, old: jnp.where(good, new, old),
-            outcome.step_state,
-            carry.step_state,
-        )
+        step_state = tree_where(good, outcome.step_state, carry.step_state)
         # A loop is differentiated again and again until it is known which parts of its
         # carry have derivatives: here it is known from the first time on.
         step_state = step_state.differentiated_in_state()

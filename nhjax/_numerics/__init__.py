@@ -23,6 +23,7 @@ from ._implicit import (
     nan_unless as nan_unless,
     root as root,
     solve_contraction as solve_contraction,
+    tree_where as tree_where,
     zero_unless as zero_unless,
 )
 from ._index_sets import dependence as dependence

@@ -234,6 +234,11 @@ def has_tangent(tangents: PyTree[Any]) -> PyTree[bool]:
     )
 
 
+def tree_where(ok: BoolScalar, tree: X, other: X) -> X:
+    """Take the numbers of a tree where `ok` is true, those of another elsewhere."""
+    return jax.tree.map(lambda x, y: jnp.where(ok, x, y), tree, other)
+
+
 def zero_unless(ok: BoolScalar, tree: X) -> X:
     """Replace the numbers of a tree by zeros where `ok` is false; `None` stays."""
     return jax.tree.map(lambda x: jnp.where(ok, x, jnp.zeros_like(x)), tree)
