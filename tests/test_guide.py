@@ -1,0 +1,47 @@
+"""The pages without a test of their own run as printed, and assert what they say."""
+
+from pathlib import Path
+
+import matplotlib
+import pytest
+
+from oracles.pages import blocks
+
+
+DOCS = Path(__file__).parents[1] / "docs"
+
+
+@pytest.fixture(autouse=True)
+def _closed_figures():
+    from matplotlib import pyplot as plt
+
+    matplotlib.use("Agg")
+    yield
+    plt.close("all")
+
+
+PAGES = (
+    *("index", "start", "constraints", "lie_groups", "theory", "gallery"),
+    *("systems", "derivatives", "engines", "performance"),
+)
+# Its one block compiles the bicycle for eight seconds; what it calls is tested with
+# smaller systems in tests/analysis.
+TOO_LONG = ("machines",)
+
+
+@pytest.mark.parametrize("name", PAGES)
+def test_blocks_run_as_printed(name, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    namespace = {}
+    for block in blocks((DOCS / f"{name}.md").read_text(encoding="utf-8")):
+        exec(compile(block, f"{name}.md", "exec"), namespace)
+
+
+def test_every_page_with_code_is_run_by_a_test():
+    tests = "".join(
+        path.read_text(encoding="utf-8") for path in Path(__file__).parent.rglob("*.py")
+    )
+    for path in DOCS.glob("*.md"):
+        if blocks(path.read_text(encoding="utf-8")):
+            known = (*PAGES, *TOO_LONG)
+            assert path.stem in known or f'"{path.name}"' in tests, path.name

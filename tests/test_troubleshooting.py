@@ -1,0 +1,65 @@
+"""The page of messages: those that it quotes exist, and no way to fail is missing."""
+
+import ast
+import inspect
+import re
+from pathlib import Path
+
+import pytest
+
+import nhjax
+from nhjax._results import result_codes
+from oracles.pages import blocks
+
+
+ROOT = Path(__file__).parents[1]
+PAGE = (ROOT / "docs" / "troubleshooting.md").read_text(encoding="utf-8")
+
+
+def _section(title):
+    return PAGE.split(f"\n## {title}\n")[1].split("\n## ")[0]
+
+
+def _quoted():
+    """The parts of the messages in the tables of messages, without what varies."""
+    for table in PAGE.split("\n\n"):
+        if table.startswith("| message |"):
+            for row in table.splitlines()[2:]:
+                for quote in re.findall(r"`([^`]+)`", row.split(" | ")[0]):
+                    yield from (part for part in quote.split("…") if len(part) > 2)
+
+
+def _written():
+    """The strings in the package, in which messages stand between values."""
+    return "\n".join(
+        node.value
+        for path in sorted((ROOT / "nhjax").rglob("*.py"))
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
+        if isinstance(node, ast.Constant) and isinstance(node.value, str)
+    )
+
+
+@pytest.mark.parametrize("name", sorted(result_codes()))
+def test_every_way_in_which_a_run_can_end_is_explained(name):
+    assert f"| `{name}` |" in _section("A run that ended early")
+
+
+def test_every_exception_is_there():
+    for name, value in vars(nhjax).items():
+        if inspect.isclass(value) and issubclass(value, Exception):
+            assert f"`{name}`" in PAGE, name
+
+
+def test_quoted_messages_are_those_of_the_package():
+    known = _written() + " ".join(vars(nhjax))
+    parts = list(_quoted())
+    assert len(parts) > 50
+    assert [part for part in parts if part not in known and part != "TypeError"] == []
+
+
+def test_the_code_runs():
+    namespace = {}
+    for block in blocks(PAGE):
+        exec(compile(block, "troubleshooting.md", "exec"), namespace)
+    (failure,) = namespace["sol"].failures()
+    assert failure[0] == 1
