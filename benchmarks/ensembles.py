@@ -8,7 +8,10 @@ its own for each number of members, and grows with the compiler's before it runs
 
 With `--kills K` a run of 200 chunks that streams to disk is killed (kill -9) K times at
 random moments, and gone on with; its bytes are compared with those of a run that
-nothing has disturbed.
+nothing has disturbed. With `--processes P` the same is done with two processes of JAX,
+and P times the compiled ensemble is run by one process and then by two, with a core
+each. Beside the time of the wall is that of the processor, the most of both processes,
+which tells what else ran.
 
     python -m benchmarks.ensembles --members 10000 100000 1000000 --num-steps 1000
 """
@@ -16,9 +19,11 @@ nothing has disturbed.
 import argparse
 import hashlib
 import json
+import os
 import random
 import resource
 import signal
+import socket
 import subprocess
 import sys
 import tempfile
@@ -120,32 +125,100 @@ def digest(folder: Path) -> str:
     return made.hexdigest()
 
 
-def kills(number: int, seed: int = 0) -> dict[str, Any]:
+def start(count: int, *arguments: str, first_core: int = 0) -> list[subprocess.Popen]:
+    """Start this program as a number of processes that know of one another.
+
+    Where there are several, or they are timed, each has one core and one thread.
+    """
+    with socket.socket() as found:
+        found.bind(("localhost", 0))
+        port = found.getsockname()[1]
+    cores = sorted(os.sched_getaffinity(0))
+    started = []
+    for index in range(count):
+        core = str(cores[(first_core + index) % len(cores)])
+        parts = [str(index), str(count), str(port), core]
+        command = [sys.executable, "-m", "benchmarks.ensembles", *arguments]
+        started.append(
+            subprocess.Popen(
+                [*command, "--process", *parts],
+                env=os.environ | {"NPROC": "1"},
+                stdout=subprocess.PIPE,
+                stderr=subprocess.DEVNULL,
+                text=True,
+            )
+        )
+    return started
+
+
+def join(index: int, count: int, port: int, core: int) -> None:
+    """Be one of the processes, on one core."""
+    os.sched_setaffinity(0, {core})
+    if count > 1:
+        jax.distributed.initialize(f"localhost:{port}", count, index)
+
+
+def ended(processes: list[subprocess.Popen]) -> list[str]:
+    """Wait for processes, and return what they have printed."""
+    found = [process.communicate()[0] for process in processes]
+    if any(process.returncode for process in processes):
+        raise RuntimeError("A process has failed.")
+    return found
+
+
+def timed(members: int) -> list[float]:
+    """Times of the wall and of the processor, of a program that is compiled."""
+    run, member = problem(1000)
+    found = []
+    for _ in range(2):
+        start = time.perf_counter(), time.process_time()
+        nhjax.ensemble(
+            run, member, num_members=members, chunk_size=BATCH, reduce=REDUCTIONS
+        )
+        found = [time.perf_counter() - start[0], time.process_time() - start[1]]
+    return found
+
+
+def speedup(rounds: int, members: int = 40_000) -> dict[str, Any]:
+    """Wall times of one and of two processes, in turn."""
+    found: dict[str, list[list[float]]] = {"one": [], "two": []}
+    for i in range(rounds):
+        for name, count in (("one", 1), ("two", 2)):
+            texts = ended(start(count, "--timed", str(members), first_core=i))
+            times = [json.loads(text.splitlines()[-1]) for text in texts]
+            found[name].append([max(x) for x in zip(*times, strict=True)])
+    return found | {"members": members}
+
+
+def kills(number: int, count: int = 1, seed: int = 0) -> dict[str, Any]:
     """Kill a run at random moments between its first chunk and its last."""
     moments, reached = random.Random(seed), []
-    command = [sys.executable, "-m", "benchmarks.ensembles", "--stream"]
     with tempfile.TemporaryDirectory() as scratch:
         whole, killed = Path(scratch, "whole"), Path(scratch, "killed")
-        subprocess.run([*command, str(whole)], check=True)
-        journal = killed / "manifest" / "chunks.jsonl"
+        ended(start(1, "--stream", str(whole)))
 
         def done():
-            return journal.read_bytes().count(b"\n") if journal.exists() else 0
+            parts = (killed / "manifest").glob("chunks*.jsonl")
+            return sum(part.read_bytes().count(b"\n") for part in parts)
 
         for _ in range(number):
-            process = subprocess.Popen([*command, str(killed)])
+            processes = start(count, "--stream", str(killed))
             before = done()
             # On the way to the end, so that there is something left for all others.
             goal = before + moments.uniform(0, 2 * (CHUNKS - before) / (number + 1))
-            while process.poll() is None and done() < goal:
+            while processes[0].poll() is None and done() < goal:
                 time.sleep(0.0005)
-            time.sleep(moments.uniform(0, 0.02))
-            process.send_signal(signal.SIGKILL)
-            process.wait()
+            # In any order, with some time between them.
+            for process in moments.sample(processes, count):
+                time.sleep(moments.uniform(0, 0.02))
+                process.send_signal(signal.SIGKILL)
+            for process in processes:
+                process.communicate()
             reached.append(done())
-        subprocess.run([*command, str(killed)], check=True)
+        ended(start(count, "--stream", str(killed)))
         return {
             "kills": number,
+            "processes": count,
             "chunks_done": reached,
             "is_same": digest(whole) == digest(killed),
         }
@@ -171,18 +244,51 @@ def table(rows: list[dict[str, Any]]) -> str:
     return markdown_table(header, lines)
 
 
+def told(found: dict[str, Any]) -> str:
+    """What came of runs that were killed."""
+    same = "the same" if found["is_same"] else "OTHER"
+    who = "One process" if found["processes"] == 1 else "Two processes"
+    return (
+        f"\n\n{who} killed {found['kills']} times, with "
+        f"{', '.join(map(str, found['chunks_done']))} of {CHUNKS} chunks done: "
+        f"{same} bytes as undisturbed."
+    )
+
+
+def compared(found: dict[str, Any]) -> str:
+    """The wall times of one process and of two."""
+    lines = [
+        [f"{x:.2f}" for x in (*one, *two, two[0] / one[0], two[1] / one[1])]
+        for one, two in zip(found["one"], found["two"], strict=True)
+    ]
+    header = ["one: wall [s]", "processor [s]", "two: wall [s]", "processor [s]"]
+    return (
+        f"\n\n{found['members']} members of 1000 steps by one process and by two, "
+        "with a core and a thread each, in turn:\n\n"
+        + markdown_table([*header, "ratio of walls", "of processors"], lines)
+    )
+
+
 def main() -> None:
     """Print and save the table."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--members", type=int, nargs="+", default=[10_000, 30_000])
     parser.add_argument("--num-steps", type=int, default=100)
     parser.add_argument("--kills", type=int, default=0)
+    parser.add_argument("--processes", type=int, default=0, metavar="P")
     parser.add_argument("--stream", help="only write such a store")
+    parser.add_argument("--timed", type=int, help="only time so many members")
     parser.add_argument("--one", type=int, help="only measure so many members")
+    parser.add_argument("--process", type=int, nargs=4, help="be one of several")
     options = parser.parse_args()
     jax.config.update("jax_enable_x64", True)
+    if options.process is not None:
+        join(*options.process)
     if options.stream is not None:
         stream(options.stream)
+        return
+    if options.timed is not None:
+        print(json.dumps(timed(options.timed)))
         return
     if options.one is not None:
         print(json.dumps(measure(options.one, options.num_steps)))
@@ -197,13 +303,13 @@ def main() -> None:
     text = "Time of a member and step, and peak memory.\n\n" + table(rows)
     data: dict[str, Any] = {"rows": rows}
     if options.kills:
-        data["killed"] = found = kills(options.kills)
-        same = "the same" if found["is_same"] else "OTHER"
-        text += (
-            f"\n\nKilled {found['kills']} times, with "
-            f"{', '.join(map(str, found['chunks_done']))} of {CHUNKS} chunks done: "
-            f"{same} bytes as undisturbed."
-        )
+        data["killed"] = [kills(options.kills)]
+        if options.processes:
+            data["killed"].append(kills(options.kills, count=2))
+        text += "".join(map(told, data["killed"]))
+    if options.processes:
+        data["processes"] = speedup(options.processes)
+        text += compared(data["processes"])
     write("ensembles", "Ensembles in chunks", text, data)
 
 

@@ -13,13 +13,24 @@ def write(path: Path, content: bytes) -> None:
     has left is written over by the next one.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
-    unfinished = path.with_name(f".{path.name}.unfinished")
-    with open(unfinished, "wb") as file:
+    with open(_unfinished(path), "wb") as file:
         file.write(content)
         file.flush()
         os.fsync(file.fileno())
-    os.replace(unfinished, path)
+    os.replace(_unfinished(path), path)
     settle(path.parent)
+
+
+def ensure(path: Path, content: bytes) -> None:
+    """Write a file unless it has this content, and let nothing unfinished be left."""
+    if path.read_bytes() == content:
+        _unfinished(path).unlink(missing_ok=True)
+    else:
+        write(path, content)
+
+
+def _unfinished(path: Path) -> Path:
+    return path.with_name(f".{path.name}.unfinished")
 
 
 def append(path: Path, line: bytes) -> None:

@@ -9,12 +9,15 @@ import numpy as np
 from jaxtyping import PyTree
 
 from .._integrate import AbstractProgressMeter, NoProgressMeter, TqdmProgressMeter
+from ._collected import Collected
 from ._failed import failed_rows
 from ._kept import Kept
 from ._members import Members
 from ._outcome import EnsembleOutcome
+from ._processes import Pace, Processes
 from ._program import Layout, value_structure
-from ._sinks import AbstractSink, check_reductions, Collected, Reduced, Work
+from ._reduced import check_reductions, Reduced
+from ._sinks import AbstractSink, Work
 from ._store import Stored
 
 
@@ -50,6 +53,9 @@ def ensemble(
     statistics. For that `nhjax.integrate` must be called with `throw=False`; otherwise
     the first failure ends the whole ensemble.
 
+    After `jax.distributed.initialize` all processes make the same call: each runs its
+    share of the chunks on its own devices, and every one returns the whole outcome.
+
     **Arguments:**
 
     - `run`: a function of one member that returns a tree of arrays.
@@ -69,8 +75,9 @@ def ensemble(
         much.
     - `devices`: those of JAX to run on, `jax.local_devices()` by default.
     - `fixed_order`: collect statistics in an order that does not depend on the number
-        of devices, so that they are the same to the last bit if the members are. Each
-        device then looks at all members of a chunk.
+        of devices and processes, so that they are the same to the last bit if the
+        members are. Each device then looks at all members of a chunk, and processes
+        meet after each.
     - `progress_meter`: told of members that are done; by default a bar on the standard
         error stream if that is a terminal.
     - `resume`: whether to go on with a store that exists, rather than to refuse it.
@@ -81,8 +88,10 @@ def ensemble(
 
     **Raises:** `nhjax.ShapeError` for arrays that differ in their leading axis;
     `TypeError` if `run` returns anything but arrays; `ValueError` for numbers that make
-    no sense, and for a store that is damaged or that of other arguments; `OSError` if
-    the store cannot be written; `ImportError` with `out` and without zarr
+    no sense, for a store that is damaged or that of other arguments, and for processes
+    that call with different ones; `RuntimeError` for a store that another run is
+    writing, and if another process has failed or is gone; `OSError` if the store cannot
+    be written; `ImportError` with `out` and without zarr
     (`pip install "nhjax[ensemble]"`); `nhjax.IntegrationError` if all members failed
     and there is something to reduce.
 
@@ -93,60 +102,83 @@ def ensemble(
         >>> outcome.values.tolist()
         [0.0, 1.0, 4.0, 9.0, 16.0]
     """
-    if not callable(run):
-        raise TypeError(f"`run` must be a function of one member, got {run!r}.")
-    if reduce is not None:
-        check_reductions(reduce)
-    if progress_meter is None:
-        bar = TqdmProgressMeter(unit="member")
-        progress_meter = bar if sys.stderr.isatty() else NoProgressMeter()
-    elif not isinstance(progress_meter, AbstractProgressMeter):
+    processes = Processes()
+    with processes.together():
+        if not callable(run):
+            raise TypeError(f"`run` must be a function of one member, got {run!r}.")
+        if reduce is not None:
+            check_reductions(reduce)
+        progress_meter = _meter(progress_meter, processes)
+        chosen = _devices(devices)
+        layout = Layout(chosen, bool(fixed_order) and len(chosen) > 1)
+        source = Members(members, num_members)
+        structure = value_structure(run, source.make, source.inputs(0, 1))
+        size = _chunk_size(chunk_size, source.count, structure, len(layout.devices))
+        work = Work(run, source, size, layout, structure, processes)
+        if reduce is None:
+            sink = _for_values(work, out, units, resume)
+        else:
+            sink = _for_statistics(work, reduce, out, units, resume, bool(fixed_order))
+        try:
+            _run_chunks(work, sink, progress_meter)
+            outcome = sink.outcome()
+        finally:
+            sink.close()
+    return outcome
+
+
+def _meter(given: Any, processes: Processes) -> AbstractProgressMeter:
+    if given is None:
+        is_shown = processes.index == 0 and sys.stderr.isatty()
+        return TqdmProgressMeter(unit="member") if is_shown else NoProgressMeter()
+    if not isinstance(given, AbstractProgressMeter):
         raise TypeError(
             "`progress_meter` must be a progress meter such as "
-            f"`nhjax.TqdmProgressMeter()`, got {progress_meter!r}."
+            f"`nhjax.TqdmProgressMeter()`, got {given!r}."
         )
-    layout = Layout(_devices(devices), bool(fixed_order))
-    source = Members(members, num_members)
-    structure = value_structure(run, source.make, source.inputs(0, 1))
-    size = _chunk_size(chunk_size, source.count, structure, len(layout.devices))
-    work = Work(run, source, size, layout, structure)
-    sink = _sink(work, reduce, out, units, resume)
-    try:
-        _run_chunks(work, sink, progress_meter)
-        return sink.outcome()
-    finally:
-        sink.close()
+    return given
 
 
-def _sink(
+def _for_values(
+    work: Work,
+    out: str | os.PathLike[str] | None,
+    units: Mapping[str, str] | None,
+    resume: bool,
+) -> AbstractSink:
+    if out is not None:
+        return Stored(work, out, {} if units is None else units, resume)
+    if units is not None:
+        raise ValueError("`units` are those of a store: give its folder as `out`.")
+    return Collected(work)
+
+
+def _for_statistics(
     work: Work,
     reductions: Any,
     out: str | os.PathLike[str] | None,
     units: Mapping[str, str] | None,
     resume: bool,
+    fixed_order: bool,
 ) -> AbstractSink:
-    if out is None and units is not None:
-        raise ValueError("`units` are those of a store: give its folder as `out`.")
-    if reductions is None:
-        if out is None:
-            return Collected(work)
-        return Stored(work, out, {} if units is None else units, resume)
     if units is not None:
         raise ValueError("`units` are those of values, which `reduce` does not keep.")
-    if out is None:
-        return Reduced(work, reductions)
-    return Kept(work, reductions, out, resume)
+    if out is not None:
+        return Kept(work, reductions, out, resume)
+    sink = Reduced(work, reductions, in_rounds=fixed_order)
+    sink.agree()
+    return sink
 
 
 def _run_chunks(
     work: Work, sink: AbstractSink, progress_meter: AbstractProgressMeter
 ) -> None:
     todo, total = list(sink.todo()), work.members.count
+    if work.processes.count > 1:
+        total = sum(map(work.filled, todo))
     done = total - sum(map(work.filled, todo))
     shown = time.monotonic()
-    if not todo:
-        return
-    if done:
+    pace = Pace(work.processes, len(todo), is_needed=not sink.in_rounds)
+    if todo and done:
         progress_meter.update(done, total)
 
     def finish(chunk, result):
@@ -159,6 +191,7 @@ def _run_chunks(
         if done == total or time.monotonic() - shown > _SECONDS:
             shown = time.monotonic()
             progress_meter.update(done, total)
+        pace.chunk_done()
 
     running = None
     try:
@@ -170,6 +203,7 @@ def _run_chunks(
             running = following
         if running is not None:
             finish(*running)
+        pace.finish()
     except jax.errors.JaxRuntimeError as error:
         if "throw=False" in str(error):
             error.add_note(

@@ -1,5 +1,6 @@
+from abc import abstractmethod
 from collections.abc import Callable
-from typing import Any
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax
@@ -10,7 +11,60 @@ from jaxtyping import Array, Bool, PyTree
 from ._reduction import AbstractReduction, selected_of_each, selected_structure
 
 
-class Minimum(AbstractReduction):
+class _AbstractExtreme(AbstractReduction):
+    """The best of the numbers of members; any is at least as good as `worst`."""
+
+    worst: eqx.AbstractClassVar[float]
+    of: Callable[[Any], Any] | None = eqx.field(static=True, default=None)
+
+    @abstractmethod
+    def best(self, rows: Array) -> Array:
+        """Choose the best along the leading axis."""
+
+    def init(self, value: PyTree[jax.ShapeDtypeStruct]) -> PyTree[Array]:
+        """Make the worst numbers there are."""
+        return jax.tree.map(
+            lambda x: jnp.full(x.shape, self._limit(x.dtype), x.dtype),
+            selected_structure(self.of, value),
+        )
+
+    def update(
+        self, state: PyTree[Array], values: PyTree[Array], counts: Bool[Array, " c"]
+    ) -> PyTree[Array]:
+        """Compare with the members of a chunk."""
+
+        def leaf(x):
+            marks = counts.reshape(-1, *[1] * (x.ndim - 1))
+            worst = jnp.asarray(self._limit(x.dtype), x.dtype)
+            return self.best(jnp.where(marks, x, worst))
+
+        found = jax.tree.map(leaf, selected_of_each(self.of, values))
+        return self.merge(state, found)
+
+    def merge(self, one: PyTree[Array], other: PyTree[Array]) -> PyTree[Array]:
+        """Choose the better of two."""
+        return jax.tree.map(lambda x, y: self.best(jnp.stack([x, y])), one, other)
+
+    def finish(self, state: PyTree[Array]) -> PyTree[Array]:
+        """Return the best."""
+        return state
+
+    def _limit(self, dtype: Any) -> Any:
+        if jnp.issubdtype(dtype, jnp.floating):
+            return self.worst
+        is_large = self.worst > 0
+        if jnp.issubdtype(dtype, jnp.bool_):
+            return is_large
+        if not jnp.issubdtype(dtype, jnp.integer):
+            raise TypeError(
+                f"There is no order of numbers of dtype {dtype}: let `of` take real "
+                "ones."
+            )
+        limits = jnp.iinfo(dtype)
+        return limits.max if is_large else limits.min
+
+
+class Minimum(_AbstractExtreme):
     """The least value over the members of an ensemble, of every number `run` returns.
 
     NaN of a member that has not failed is handed on.
@@ -28,29 +82,14 @@ class Minimum(AbstractReduction):
         True
     """
 
-    of: Callable[[Any], Any] | None = eqx.field(static=True, default=None)
+    worst: ClassVar[float] = np.inf
 
-    def init(self, value: PyTree[jax.ShapeDtypeStruct]) -> PyTree[Array]:
-        """Make the largest numbers there are."""
-        return _full(selected_structure(self.of, value), largest=True)
-
-    def update(
-        self, state: PyTree[Array], values: PyTree[Array], counts: Bool[Array, " c"]
-    ) -> PyTree[Array]:
-        """Compare with the members of a chunk."""
-        values = _counted(selected_of_each(self.of, values), counts, largest=True)
-        return self.merge(state, jax.tree.map(lambda x: jnp.min(x, axis=0), values))
-
-    def merge(self, one: PyTree[Array], other: PyTree[Array]) -> PyTree[Array]:
-        """Take the lesser."""
-        return jax.tree.map(jnp.minimum, one, other)
-
-    def finish(self, state: PyTree[Array]) -> PyTree[Array]:
-        """Return the least values."""
-        return state
+    def best(self, rows: Array) -> Array:
+        """Choose the least."""
+        return jnp.min(rows, axis=0)
 
 
-class Maximum(AbstractReduction):
+class Maximum(_AbstractExtreme):
     """The largest value over the members of an ensemble, of every number of a value.
 
     NaN of a member that has not failed is handed on.
@@ -68,50 +107,8 @@ class Maximum(AbstractReduction):
         1.0
     """
 
-    of: Callable[[Any], Any] | None = eqx.field(static=True, default=None)
+    worst: ClassVar[float] = -np.inf
 
-    def init(self, value: PyTree[jax.ShapeDtypeStruct]) -> PyTree[Array]:
-        """Make the least numbers there are."""
-        return _full(selected_structure(self.of, value), largest=False)
-
-    def update(
-        self, state: PyTree[Array], values: PyTree[Array], counts: Bool[Array, " c"]
-    ) -> PyTree[Array]:
-        """Compare with the members of a chunk."""
-        values = _counted(selected_of_each(self.of, values), counts, largest=False)
-        return self.merge(state, jax.tree.map(lambda x: jnp.max(x, axis=0), values))
-
-    def merge(self, one: PyTree[Array], other: PyTree[Array]) -> PyTree[Array]:
-        """Take the larger."""
-        return jax.tree.map(jnp.maximum, one, other)
-
-    def finish(self, state: PyTree[Array]) -> PyTree[Array]:
-        """Return the largest values."""
-        return state
-
-
-def _limit(dtype: Any, largest: bool) -> Any:
-    if jnp.issubdtype(dtype, jnp.floating):
-        return np.inf if largest else -np.inf
-    if jnp.issubdtype(dtype, jnp.bool_):
-        return largest
-    if not jnp.issubdtype(dtype, jnp.integer):
-        raise TypeError(
-            f"There is no order of numbers of dtype {dtype}: let `of` take real ones."
-        )
-    limits = jnp.iinfo(dtype)
-    return limits.max if largest else limits.min
-
-
-def _full(value: Any, *, largest: bool) -> Any:
-    return jax.tree.map(
-        lambda x: jnp.full(x.shape, _limit(x.dtype, largest), x.dtype), value
-    )
-
-
-def _counted(values: Any, counts: Bool[Array, " c"], *, largest: bool) -> Any:
-    def leaf(x):
-        marks = counts.reshape(-1, *[1] * (x.ndim - 1))
-        return jnp.where(marks, x, jnp.asarray(_limit(x.dtype, largest), x.dtype))
-
-    return jax.tree.map(leaf, values)
+    def best(self, rows: Array) -> Array:
+        """Choose the largest."""
+        return jnp.max(rows, axis=0)

@@ -21,6 +21,14 @@ class Failed:
         """Append rows."""
         self.rows += rows
 
+    def to_bytes(self) -> bytes:
+        """Write the rows as integers of 64 bits."""
+        return np.array(self.rows, np.int64).tobytes()
+
+    def add_bytes(self, data: bytes) -> None:
+        """Append rows that were written so."""
+        self.rows += np.frombuffer(data, np.int64).reshape(-1, 3).tolist()
+
     def outcome(self, count: int, **parts: Any) -> EnsembleOutcome:
         """Make the outcome of an ensemble, without what is not given."""
         table = np.array(sorted(self.rows), np.int64).reshape(-1, 3)

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from .._files import installed_version
+from ._processes import Processes
 from ._program import each_reduction
 from ._sinks import Work
 from ._verdict import without_results
@@ -32,10 +33,11 @@ def manifest(work: Work, variables: dict[str, Any]) -> dict[str, Any]:
 
 def statistics_manifest(work: Work, reductions: Any) -> dict[str, Any]:
     """Describe the parameters of a run that is reduced."""
-    return _common(work) | {"reduce": _without_addresses(repr(reductions))}
+    return _common(work) | {"reduce": without_addresses(repr(reductions))}
 
 
-def _without_addresses(text: str) -> str:
+def without_addresses(text: str) -> str:
+    """Leave out of a text where functions lie in memory."""
     return re.sub(r"0x[0-9a-f]+", "0x", text)
 
 
@@ -48,6 +50,12 @@ def _common(work: Work) -> dict[str, Any]:
         "chunk_size": work.size,
         "members": work.members.digest(),
     }
+
+
+def call_of(work: Work, **others: Any) -> dict[str, Any]:
+    """Describe what processes must have in common that run an ensemble together."""
+    leaves = jax.tree.leaves(work.structure)
+    return _common(work) | {"values": [f"{x.dtype}{x.shape}" for x in leaves]} | others
 
 
 def program(work: Work, reductions: Any = ()) -> str:
@@ -72,7 +80,7 @@ def program(work: Work, reductions: Any = ()) -> str:
     parts = [jax.make_jaxpr(run)(one), jax.make_jaxpr(reduce)(work.structure)]
     lines = []
     for closed in parts:
-        lines += _without_addresses(str(closed)).splitlines()
+        lines += without_addresses(str(closed)).splitlines()
         lines += [f"array {x}" for x in _constants(closed)]
     return "\n".join(line.rstrip() for line in lines) + "\n"
 
@@ -110,6 +118,21 @@ def check_resumable(
                 f"{where} has no {name!r}: it was not made by `{maker}`, or is "
                 "damaged. Name another folder, or put the file back."
             )
+
+
+def digest(text: str) -> str:
+    """Compute a checksum of a text."""
+    return hashlib.sha256(text.encode()).hexdigest()
+
+
+def check_shared(lock: Path, token: str, processes: Processes) -> None:
+    """Raise unless a file of a store has the text that process 0 has written to it."""
+    if not lock.is_file() or lock.read_text() != token:
+        raise ValueError(
+            f"Process {processes.index} does not see the store that process 0 has "
+            f"made in {str(lock.parents[1])!r}: `out` must be a folder that all "
+            "processes share."
+        )
 
 
 def check_same_run(

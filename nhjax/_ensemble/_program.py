@@ -85,12 +85,11 @@ def reduced_chunk(
     run: Any,
     make: Any,
     reductions: Any,
-    state: Any,
     inputs: Any,
     is_there: Bool[Array, " c"],
     layout: Layout,
 ) -> Chunk:
-    """Run the members of a chunk, and add them to the states of reductions."""
+    """Run the members of a chunk, and make of them the states of reductions."""
     value, codes, steps = _members_of(run, make, inputs, layout)
     values = without_results(value)
     counts = is_there & is_good(codes)
@@ -104,24 +103,32 @@ def reduced_chunk(
         )
 
     if len(layout.devices) == 1:
-        parts = [of_all(values, counts)]
-    elif layout.is_fixed:
+        return Chunk(codes, steps, of_all(values, counts))
+    if layout.is_fixed:
         # Every device has all members, so that the order is that of one device.
         everywhere = _on_each(layout, of_all, jax.P(), jax.P())
-        parts = [everywhere(values, counts)]
-    else:
+        return Chunk(codes, steps, everywhere(values, counts))
 
-        def of_some(values, counts):
-            return jax.tree.map(lambda x: x[None], of_all(values, counts))
+    def of_some(values, counts):
+        return jax.tree.map(lambda x: x[None], of_all(values, counts))
 
-        stacked = _on_each(layout, of_some, jax.P(AXIS), jax.P(AXIS))(values, counts)
-        parts = [
-            jax.tree.map(lambda x, i=i: x[i], stacked)
-            for i in range(len(layout.devices))
-        ]
-    for part in parts:
-        state = each_reduction(_merged, reductions, state, part)
+    stacked = _on_each(layout, of_some, jax.P(AXIS), jax.P(AXIS))(values, counts)
+    state, *others = [
+        jax.tree.map(lambda x, i=i: x[i], stacked) for i in range(len(layout.devices))
+    ]
+    for other in others:
+        state = each_reduction(_merged, reductions, state, other)
     return Chunk(codes, steps, state)
+
+
+@tracked_jit("reductions")
+def merged_states(reductions: Any, one: Any, other: Any) -> Any:
+    """Merge the states of reductions of two sets of members.
+
+    It is a program of its own, so that it rounds in the same way wherever the states
+    come from.
+    """
+    return each_reduction(_merged, reductions, one, other)
 
 
 def _merged(each: AbstractReduction, one: Any, other: Any) -> Any:

@@ -3,7 +3,6 @@
 import hashlib
 import json
 import os
-import shutil
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
@@ -12,8 +11,17 @@ import numpy as np
 
 from . import _durable as durable
 from ._failed import Failed
-from ._journal import Journal
-from ._manifest import check_resumable, check_same_run, manifest, program
+from ._journal import Journal, Line, NAME as JOURNAL
+from ._lock import Lock
+from ._manifest import (
+    call_of,
+    check_resumable,
+    check_same_run,
+    check_shared,
+    digest,
+    manifest,
+    program,
+)
 from ._outcome import EnsembleOutcome
 from ._program import Chunk
 from ._sinks import AbstractSink, Work
@@ -23,14 +31,16 @@ from ._zarr import Files
 
 _MANIFEST = "manifest/zarr.json"
 _PROGRAM = "manifest/program.txt"
-_JOURNAL = "manifest/chunks.jsonl"
+_JOURNAL = f"manifest/{JOURNAL}"
+_LOCK = "manifest/lock"
 
 
 class Stored(AbstractSink):
     """The values of members in a store of Zarr, with a journal of finished chunks.
 
     A chunk counts as done once its files are on the disk and so is its line of the
-    journal: its number, its failures, and a checksum of each file.
+    journal: its number, its failures, and a checksum of each file. Process 0 makes the
+    store and its journal, and all write their own chunks.
     """
 
     def __init__(
@@ -41,20 +51,20 @@ class Stored(AbstractSink):
         resume: bool,
     ):
         self.work, self.given, self.path = work, path, Path(path).resolve()
+        self.where = f"The store {str(self.path)!r}"
         self.variables = variables_of(work)
         self.attributes = attributes_of(work.structure, self.variables, units)
-        self.files = Files()
+        self.files, self.lock = Files(), Lock()
         self.manifest = manifest(work, self.variables)
         self.program = program(work)
+        call = call_of(work, run=digest(self.program), units=dict(units))
+        work.processes.agree(call)
         self._open(self.variables)
-        self.journal = Journal(self.path / _JOURNAL)
+        self.journal = Journal(self.path / "manifest", work.processes.index)
         try:
-            with durable.telling(f"The store {str(self.path)!r} cannot be used"):
-                if self.path.is_dir() and any(self.path.iterdir()):
-                    self._resume(resume)
-                else:
-                    self._create()
-                    self.journal.open()
+            with durable.telling(f"{self.where} cannot be used"):
+                self.lines = self._begin(resume)
+                self._check_files()
         except BaseException:
             self.close()
             raise
@@ -71,13 +81,37 @@ class Stored(AbstractSink):
         }
         self.files.open(arrays, self.work.size, self.attributes, self.manifest)
 
+    def _begin(self, resume: bool) -> dict[int, Line]:
+        """Make or open the store, and return the lines of its journal."""
+        processes, lines, token = self.work.processes, {}, b""
+        if processes.index == 0:
+            if self.path.is_dir() and any(self.path.iterdir()):
+                lines = self._resume(resume)
+            else:
+                self._create()
+            token = os.urandom(16).hex().encode() if processes.count > 1 else b""
+            self.lock.write(token)
+        told = json.loads(
+            processes.of_first(json.dumps([token.decode(), [*lines.values()]]).encode())
+        )
+        if processes.index > 0:
+            check_shared(self.path / _LOCK, told[0], processes)
+            self.journal.open_part()
+        # From here on all parts are locked.
+        processes.exchange()
+        return {line["chunk"]: line for line in told[1]}
+
     def _create(self) -> None:
         if self.path.exists() and not self.path.is_dir():
             raise FileExistsError(
                 f"{str(self.path)!r} is a file: `out` names a folder."
             )
         unfinished = self.path.with_name(f".{self.path.name}.unfinished")
-        shutil.rmtree(unfinished, ignore_errors=True)
+        (unfinished / _LOCK).parent.mkdir(parents=True, exist_ok=True)
+        self.lock.take(unfinished / _LOCK, self.where)
+        kept = unfinished / _LOCK
+        for left in sorted({*unfinished.rglob("*")} - {kept, kept.parent})[::-1]:
+            left.rmdir() if left.is_dir() else left.unlink()
         content = self.files.metadata()
         content |= {_PROGRAM: self.program.encode(), _JOURNAL: b""}
         for name, data in content.items():
@@ -86,30 +120,32 @@ class Stored(AbstractSink):
         os.replace(unfinished, self.path)
         durable.settle(self.path.parent)
 
-    def _resume(self, resume: bool) -> None:
-        where = f"The store {str(self.path)!r}"
+    def _resume(self, resume: bool) -> dict[int, Line]:
         names = _MANIFEST, _PROGRAM, _JOURNAL
-        check_resumable(where, self.path, names, "nhjax.ensemble", resume)
-        self.journal.open()
+        check_resumable(self.where, self.path, names, "nhjax.ensemble", resume)
+        self.lock.take(self.path / _LOCK, self.where)
+        lines = self.journal.collect()
         try:
             old = json.loads((self.path / _MANIFEST).read_text())["attributes"]
         except (ValueError, KeyError) as error:
             raise ValueError(
-                f"{where} has a damaged {_MANIFEST!r}: {error}."
+                f"{self.where} has a damaged {_MANIFEST!r}: {error}."
             ) from error
-        is_done = len(self.journal.lines) == self.work.chunks
+        is_done = len(lines) == self.work.chunks
         programs = (self.path / _PROGRAM).read_text(), self.program
-        check_same_run(where, old, self.manifest, programs, is_done)
-        self._check_files()
+        check_same_run(self.where, old, self.manifest, programs, is_done)
+        return lines
 
     def _check_files(self) -> None:
-        for chunk in sorted(self.journal.lines):
-            for name, digest in self.journal.lines[chunk]["files"].items():
+        """Compare checksums, each process those of some chunks."""
+        processes, missing = self.work.processes, []
+        for chunk in sorted(self.lines)[processes.index :: processes.count]:
+            for name, expected in self.lines[chunk]["files"].items():
                 file = self.path / name
                 if not file.is_file():
-                    del self.journal.lines[chunk]
+                    missing.append(chunk)
                     break
-                if hashlib.sha256(file.read_bytes()).hexdigest() != digest:
+                if hashlib.sha256(file.read_bytes()).hexdigest() != expected:
                     first = self.work.start(chunk)
                     raise ValueError(
                         f"The file {str(file)!r} is not what was written: its checksum "
@@ -117,10 +153,15 @@ class Stored(AbstractSink):
                         f"{first} to {first + self.work.filled(chunk) - 1} are then "
                         "run again."
                     )
+        for found in processes.exchange(json.dumps(missing).encode()):
+            for chunk in json.loads(found):
+                del self.lines[chunk]
 
     def todo(self) -> Iterable[int]:
-        """Return the chunks without a line in the journal."""
-        return [k for k in range(self.work.chunks) if k not in self.journal.lines]
+        """Return this process' share of the chunks without a line in the journal."""
+        processes = self.work.processes
+        left = [k for k in range(self.work.chunks) if k not in self.lines]
+        return left[processes.index :: processes.count]
 
     def start(self, chunk: int) -> Chunk:
         """Set a chunk running."""
@@ -145,13 +186,22 @@ class Stored(AbstractSink):
             self.journal.append(line)
 
     def outcome(self) -> EnsembleOutcome:
-        """List the failures, and label times if all members have the same."""
-        if "t" in self.variables and not (self.path / "time").is_dir():
-            times = {line["times"] for line in self.journal.lines.values()}
-            if len(times) == 1 and None not in times:
-                self._label_times()
+        """Close the journal, and label times if all members have the same."""
+        processes = self.work.processes
+        self.journal.close()
+        new = json.dumps([*self.journal.lines.values()]).encode()
+        for lines in map(json.loads, processes.exchange(new)):
+            self.lines |= {line["chunk"]: line for line in lines}
+        if processes.index == 0:
+            with durable.telling(f"{self.where} could not be finished"):
+                if "t" in self.variables and not (self.path / "time").is_dir():
+                    times = {line["times"] for line in self.lines.values()}
+                    if len(times) == 1 and None not in times:
+                        self._label_times()
+                self.journal.finish(self.lines)
+                self.lock.write(b"")
         failed = Failed()
-        for line in self.journal.lines.values():
+        for line in self.lines.values():
             failed.add(line["failed"])
         return failed.outcome(self.work.members.count, path=self.given)
 
@@ -162,19 +212,18 @@ class Stored(AbstractSink):
         times = np.asarray(array[0])
         self.files = Files()
         self._open(self.variables | {"time": (("time",), times)})
-        what = f"The times could not be written to {str(self.path)!r}"
-        with durable.telling(what):
-            # The folder stands for all of it, and so comes last.
-            for name, data in self.files.chunk("time", 0, times).items():
-                durable.write(self.path / ".time.unfinished" / name, data)
-            metadata = self.files.metadata()
-            own = metadata.pop("time/zarr.json")
-            durable.write(self.path / ".time.unfinished/time/zarr.json", own)
-            durable.write(self.path / "zarr.json", metadata["zarr.json"])
-            os.replace(self.path / ".time.unfinished/time", self.path / "time")
-            (self.path / ".time.unfinished").rmdir()
-            durable.settle(self.path)
+        # The folder stands for all of it, and so comes last.
+        for name, data in self.files.chunk("time", 0, times).items():
+            durable.write(self.path / ".time.unfinished" / name, data)
+        metadata = self.files.metadata()
+        own = metadata.pop("time/zarr.json")
+        durable.write(self.path / ".time.unfinished/time/zarr.json", own)
+        durable.write(self.path / "zarr.json", metadata["zarr.json"])
+        os.replace(self.path / ".time.unfinished/time", self.path / "time")
+        (self.path / ".time.unfinished").rmdir()
+        durable.settle(self.path)
 
     def close(self) -> None:
         """Let others write to the store."""
         self.journal.close()
+        self.lock.release()

@@ -1,0 +1,150 @@
+"""What two processes of JAX do together, and one of them alone.
+
+What processes say of it goes to standard output.
+"""
+
+import errno
+import os
+import sys
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import nhjax
+
+
+CHUNKS, CHUNK = 200, 4
+
+
+class Digits(nhjax.AbstractReduction):
+    """Members as the digits of a number, for which their order counts."""
+
+    def init(self, value):
+        """No digits, and the weight of one more."""
+        return jnp.zeros((), int), jnp.ones((), int)
+
+    def update(self, state, values, counts):
+        """Append those of a chunk."""
+
+        def add(state, x):
+            digit, counts = x
+            added = self.merge(state, (digit, jnp.array(10)))
+            return jax.tree.map(
+                lambda a, b: jnp.where(counts, a, b), added, state
+            ), None
+
+        return jax.lax.scan(add, state, (values.astype(int), counts))[0]
+
+    def merge(self, one, other):
+        """Append digits."""
+        return one[0] * other[1] + other[0], one[1] * other[1]
+
+    def finish(self, state):
+        """Return the number."""
+        return int(state[0])
+
+
+REDUCTIONS = {"mean": nhjax.Mean(), "variance": nhjax.Variance()}
+
+
+def judged(x):
+    """Something quick that fails for a number that is none."""
+    good, bad = nhjax.RESULTS.successful, nhjax.RESULTS.nonfinite_state
+    return jnp.exp(x * jnp.arange(3.0)), nhjax.RESULTS.where(jnp.isnan(x), bad, good)
+
+
+MEMBERS = np.linspace(0.5, 1.5, 9)
+MEMBERS[[3, 8]] = np.nan
+
+
+def statistics(folder: Path | None = None, **options: Any) -> nhjax.EnsembleOutcome:
+    """Statistics of runs of which some fail, in five chunks."""
+    return nhjax.ensemble(
+        judged, MEMBERS, chunk_size=2, reduce=REDUCTIONS, out=folder, **options
+    )
+
+
+def digits(**options: Any) -> int:
+    """The number 1234567."""
+    return nhjax.ensemble(
+        lambda i: i + 1,
+        lambda i: i,
+        num_members=7,
+        chunk_size=2,
+        reduce=Digits(),
+        **options,
+    ).statistics
+
+
+def power(x):
+    """Something quick, with an axis of its own."""
+    return {"powers": x ** jnp.arange(3.0), "is_large": x > 1.0}
+
+
+def stored(folder: Path, **options: Any) -> nhjax.EnsembleOutcome:
+    """Many chunks to disk."""
+    members = np.linspace(0.5, 1.5, CHUNKS * CHUNK - 1)
+    chosen: dict[str, Any] = {"chunk_size": CHUNK, "out": folder} | options
+    return nhjax.ensemble(power, members, **chosen)
+
+
+def bits(tree: Any) -> str:
+    """The bytes of the arrays of a tree."""
+    return "".join(np.asarray(x).tobytes().hex() for x in jax.tree.leaves(tree))
+
+
+def summary(folder: Path) -> dict[str, Any]:
+    """What must be the same in both processes, and in one that is alone."""
+    kept = statistics(folder / "kept")
+    assert kept.failures() == statistics().failures()
+    return {
+        "failures": kept.failures(),
+        "fixed": bits(statistics(fixed_order=True).statistics),
+        "kept": bits(kept.statistics),
+        "again": bits(statistics(folder / "kept").statistics),
+        "digits": digits(),
+        "rounds": digits(fixed_order=True),
+        "values": bits(nhjax.ensemble(judged, MEMBERS, chunk_size=2).values),
+    }
+
+
+def together(index: int, folder: Path) -> None:
+    """Statistics, and then a store in whose midst the process may be killed."""
+    print(repr(summary(folder)))
+    print([np.asarray(x).tolist() for x in jax.tree.leaves(statistics().statistics)])
+    sys.stdout.flush()
+    try:
+        stored(folder / "killed")
+    except RuntimeError as error:
+        print(str(error).splitlines()[0], flush=True)
+        # Without JAX's wait for the process that is gone.
+        os._exit(3)
+
+
+def again(index: int, folder: Path) -> None:
+    """Calls that are not alike, an error of one process, and the rest of stores."""
+
+    def refused(*args, **options):
+        try:
+            stored(*args, **options)
+        except (ValueError, RuntimeError, OSError) as error:
+            print(type(error).__name__, error)
+
+    refused(folder / "new", chunk_size=4 + index)
+    refused(folder / f"new-{index}")
+    meter = Failing() if index == 1 else nhjax.NoProgressMeter()
+    refused(folder / "bad", progress_meter=meter)
+    for name in ("bad", "killed"):
+        stored(folder / name)
+    print(bits(statistics(folder / "begun").statistics))
+
+
+class Failing(nhjax.AbstractProgressMeter):
+    """Ends a run as a full disk does."""
+
+    def update(self, done: int, total: int) -> None:
+        """Raise."""
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
