@@ -7,7 +7,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from .._integrate import named_arrays, Solution
+from .._integrate import named_arrays, Solution, units_of_coordinates
 from .._results import result_codes
 from ._sinks import Work
 from ._verdict import codes_of_results
@@ -45,21 +45,33 @@ def variables_of(work: Work) -> dict[str, Any]:
 def attributes_of(
     structure: Any, variables: dict[str, Any], units: Mapping[str, str]
 ) -> dict[str, dict[str, Any]]:
+    """Say what the arrays are: their units, and what is known of a solution.
+
+    Names of coordinates and their units are attributes, since Zarr has no arrays of
+    strings that all releases read.
+    """
     made: dict[str, dict[str, Any]] = {name: {} for name in (*variables, "time")}
+    names = structure.coordinates if isinstance(structure, Solution) else None
+    along = [name for name, (dims, _) in variables.items() if "coordinate" in dims]
+    coordinates = names if names is not None and along else ()
     for name, unit in units.items():
-        if name not in made:
+        if name in made:
+            made[name]["units"] = unit
+        elif name not in coordinates:
             raise ValueError(
                 f"`units` has the name {name!r}, but the names here are: "
-                f"{', '.join(made)}."
+                f"{', '.join([*made, *coordinates])}."
             )
-        made[name]["units"] = unit
     if isinstance(structure, Solution):
         codes = result_codes()
         made["result"]["flag_values"] = list(codes.values())
         made["result"]["flag_meanings"] = " ".join(codes)
-        for name, (dims, _) in variables.items():
-            if "coordinate" in dims and structure.coordinates is not None:
-                made[name]["coordinate_names"] = list(structure.coordinates)
+    for name in along if coordinates else ():
+        made[name]["coordinate_names"] = list(coordinates)
+    labels = units_of_coordinates(coordinates, units)
+    for name, label in (("q", "coordinate_unit"), ("v", "velocity_unit")):
+        if name in along and label in labels:
+            made[name]["coordinate_units"] = labels[label][1]
     return made
 
 

@@ -6,7 +6,10 @@ from ._adjoint import (
     RecursiveCheckpointAdjoint as RecursiveCheckpointAdjoint,
 )
 from ._checkpoint import Checkpoint as Checkpoint
-from ._dataset import named_arrays as named_arrays
+from ._dataset import (
+    named_arrays as named_arrays,
+    units_of_coordinates as units_of_coordinates,
+)
 from ._event import Event as Event
 from ._integrate import integrate as integrate
 from ._interpolation import DenseInterpolation as DenseInterpolation

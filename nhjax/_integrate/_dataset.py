@@ -47,7 +47,7 @@ def to_dataset(
     names = _coordinate_names(sol, coordinates, variables)
     if names is not None:
         labels["coordinate"] = ("coordinate", list(names))
-        labels |= _units_of(names, units)
+        labels |= units_of_coordinates(names, units)
     made = xarray.Dataset(variables, labels)
     for name, unit in units.items():
         if name in made.variables:
@@ -61,10 +61,14 @@ def to_dataset(
     return made
 
 
-def _units_of(names: Sequence[str], units: Mapping[str, str]) -> dict[str, Any]:
+def units_of_coordinates(
+    names: Sequence[str], units: Mapping[str, str]
+) -> dict[str, Any]:
     """Label coordinates by their units, and by those of their velocities.
 
     The units of momenta are left out: they do not follow from those of coordinates.
+
+    **Returns:** by name pairs of the dimension and the units along it.
     """
     of_q, of_t = [units.get(name, "") for name in names], units.get("time", "")
     made = {"coordinate_unit": ("coordinate", of_q)} if any(of_q) else {}

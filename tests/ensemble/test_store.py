@@ -88,6 +88,29 @@ def test_xarray_opens_the_store_of_solutions(tmp_path):
         np.testing.assert_array_equal(data.stats_num_steps, steps)
 
 
+def test_units_by_coordinate_are_those_of_solutions(tmp_path):
+    system = nhjax.LagrangianSystem(
+        lambda t, q, v, args: 0.5 * v @ v - q[1], coordinates=("x", "angle")
+    )
+    y0 = nhjax.initial_state(system, jnp.zeros(2), jnp.ones(2))
+    options: dict[str, Any] = {"dt": 0.1, "saveat": nhjax.SaveAt(steps=True)}
+    sol = nhjax.integrate(system, nhjax.LobattoIIIAB(2), y0, num_steps=1, **options)
+    units = {"time": "s", "x": "m", "p": "N s"}
+    nhjax.ensemble(
+        lambda x: jax.tree.map(lambda leaf: leaf + x.astype(leaf.dtype), sol),
+        np.zeros(3),
+        out=tmp_path / "s",
+        units=units,
+    )
+    single = sol.to_xarray(units=units)
+    with xarray.open_zarr(tmp_path / "s") as data:
+        assert data.q.coordinate_names == ["x", "angle"]
+        assert data.q.coordinate_units == single.coordinate_unit.values.tolist()
+        assert data.v.coordinate_units == single.velocity_unit.values.tolist()
+        assert "coordinate_units" not in data.p.attrs
+        assert data.p.units == single.p.units == "N s"
+
+
 def test_xarray_opens_the_store_of_a_tree(store):
     with xarray.open_zarr(store) as data:
         x = np.linspace(0.5, 1.5, COUNT)
