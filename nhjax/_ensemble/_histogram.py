@@ -101,9 +101,9 @@ class Histogram(AbstractReduction):
             return HistogramCounts(
                 self.edges,
                 counts=np.moveaxis(above[:-1] - above[1:], 0, -1),
-                below=known - above[0],
-                above=above[-1],
-                nan=there - known,
+                below=np.asarray(known - above[0]),
+                above=np.asarray(above[-1]),
+                nan=np.asarray(there - known),
             )
 
         return jax.tree.map(lambda x: leaf(np.asarray(x)), state)

@@ -69,11 +69,11 @@ def program(work: Work, reductions: Any = ()) -> str:
         return work.run(work.members.make(one))
 
     def reduce(value):
-        value = without_results(value)
+        value, counts = without_results(value), jnp.ones(1, bool)
         chunk = jax.tree.map(lambda x: x[None], value)
-        counts = jnp.ones(1, bool)
+        structure = without_results(work.structure)
         return each_reduction(
-            lambda each: each.update(each.init(value), chunk, counts), reductions
+            lambda each: each.update(each.init(structure), chunk, counts), reductions
         )
 
     one = jax.tree.map(lambda x: x[0], work.members.inputs(0, 1))

@@ -305,6 +305,11 @@ def an_ensemble_in_chunks_with_statistics():
     reduce["counts"] = nhjax.Histogram([-10, 0, 10], of=lambda sol: sol.ys.q)
     outcome = nhjax.ensemble(member, dts, reduce=reduce, chunk_size=2)
     assert outcome.failed.tolist() == [2]
+    with tempfile.TemporaryDirectory() as folder:
+        options = {"reduce": reduce, "chunk_size": 2, "out": folder}
+        for _ in range(2):
+            kept = nhjax.ensemble(member, dts, **options)
+            close(kept.statistics, outcome.statistics, atol=0)
     q = nhjax.ensemble(member, dts, chunk_size=2).values.ys.q[[0, 1, 3, 4]]
     got = outcome.statistics
     close(got["mean"].ys.q, q.mean(axis=0))
