@@ -14,7 +14,7 @@ import jax
 from . import __version__
 from ._errors import IntegrationError
 from ._method import CLOSURES
-from .studies import ArgumentError, STUDIES, write
+from .studies import ArgumentError, plan, QUICK, shown, STUDIES, write
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -36,6 +36,7 @@ def _run(
     out: Path | None,
     json_output: bool,
     progress: bool | None,
+    quick: bool,
     length_in_steps: int | None = None,
     **options: Any,
 ) -> int:
@@ -44,6 +45,8 @@ def _run(
     out = Path("nhjax-results") / study if out is None else out
     if progress is None:
         progress = sys.stderr.isatty()
+    if quick:
+        options = {**QUICK[study], **options}
     try:
         if length_in_steps is not None:
             if length_in_steps < 1:
@@ -54,6 +57,8 @@ def _run(
             options["final_time"] = length_in_steps * max(dt)
         # Before hours of computing, not after them.
         out.mkdir(parents=True, exist_ok=True)
+        if not json_output:
+            print(plan(study, function, options), end="\n\n", flush=True)
         result = function(progress=progress, **options)
     except ArgumentError as error:
         name = error.argument.replace("_", "-")
@@ -69,7 +74,7 @@ def _run(
     if json_output:
         print(json.dumps(record, indent=2))
     else:
-        print(result.table())
+        print(f"{result.table()}\n\nVerdict: {result.verdict()}.")
         files = record["files"]
         for path in (*files["figures"], files["data"], files["record"]):
             print(f"wrote {path}")
@@ -105,9 +110,9 @@ def _add_options(parser: argparse.ArgumentParser, function: Callable) -> None:
         if name == "progress":
             continue
         default = parameter.default
-        shown = "" if default is None else f" (default: {_shown(default)})"
+        told = "" if default is None else f" (default: {shown(default)})"
         keywords = dict(_OPTIONS[name])
-        keywords["help"] += shown
+        keywords["help"] += told
         group = length if length and name == "final_time" else parser
         # The defaults stay where they are: in the study.
         group.add_argument(
@@ -133,6 +138,11 @@ def _add_options(parser: argparse.ArgumentParser, function: Callable) -> None:
         action="store_true",
         dest="json_output",
         help="print the record of the run, as JSON, instead of a table",
+    )
+    parser.add_argument(
+        "--quick",
+        action="store_true",
+        help="a small form of the study; options that are given count",
     )
     parser.add_argument(
         "--progress",
@@ -202,12 +212,6 @@ _OPTIONS: dict[str, dict[str, Any]] = {
 
 def _headline(function: Callable) -> str:
     return (inspect.getdoc(function) or "").partition("\n")[0]
-
-
-def _shown(default: Any) -> str:
-    if isinstance(default, tuple):
-        return " ".join(map(_shown, default))
-    return f"{default:.6g}" if isinstance(default, float) else str(default)
 
 
 if __name__ == "__main__":

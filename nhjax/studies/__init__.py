@@ -13,11 +13,14 @@ from ._chaotic_energy import (
     ChaoticEnergy as ChaoticEnergy,
 )
 from ._cvt_energy import cvt_energy as cvt_energy, CVTEnergy as CVTEnergy
+from ._envelope import envelope as envelope
 from ._particle_order import (
     particle_order as particle_order,
     ParticleOrder as ParticleOrder,
 )
+from ._plan import plan as plan, QUICK as QUICK, shown as shown
 from ._result import AbstractStudyResult as AbstractStudyResult, write as write
+from ._style import colour_blind_safe as colour_blind_safe
 from ._unicycle_order import (
     unicycle_order as unicycle_order,
     UnicycleOrder as UnicycleOrder,

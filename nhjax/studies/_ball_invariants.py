@@ -19,7 +19,8 @@ from ._arguments import (
     check_step_sizes,
     whole_steps,
 )
-from ._ball_run import BallRun
+from ._ball_run import ball_verdict, BallRun, ENERGY_FLOOR
+from ._envelope import draw_envelope
 from ._result import AbstractStudyResult, initial_data, system_parameters
 from ._retractions import RETRACTIONS
 from ._run import compile_and_run, meter
@@ -37,8 +38,7 @@ LINEAR_INTEGRALS = {
     "rω_η-Ωy/(1+a)": r"$r\omega_\eta - \Omega y/(1 + a)$",
 }
 MOVING_ENERGY = "moving energy"
-# Where the moving energy and the position are round-off.
-ENERGY_FLOOR = 4e-15
+# Where the position is round-off.
 POSITION_FLOOR = 1e-13
 
 
@@ -142,6 +142,10 @@ class BallInvariants(AbstractStudyResult):
         note = "E_m: the moving energy; the largest errors in the first and last fifth."
         return f"{format_table(header, rows)}\n\n{note}"
 
+    def verdict(self) -> str:
+        """Say how well the linear integrals and the moving energy are kept."""
+        return ball_verdict(self.runs)
+
     def figures(self) -> "dict[str, Figure]":
         """For each s the errors of the four integrals against time, as in the paper."""
         return {f"{self.name}-s{s}": self._figure(s) for s in self.stages}
@@ -160,14 +164,11 @@ class BallInvariants(AbstractStudyResult):
             # The moving energy falls steeply with h.
             logarithmic = label == MOVING_ENERGY
             # The largest step first, so that it does not cover the others.
-            for run in self.of_stages(s):
+            for k, run in enumerate(self.of_stages(s)):
                 error = run.deviations()[:, i]
-                ax.plot(
-                    run.times,
-                    np.abs(error) if logarithmic else error,
-                    linewidth=0.6,
-                    label=f"$h$ = {run.dt:g}",
-                )
+                error = np.abs(error) if logarithmic else error
+                style = {"color": f"C{k}", "label": f"$h$ = {run.dt:g}"}
+                draw_envelope(ax, run.times, error, **style)
             if logarithmic:
                 ax.set_yscale("log")
                 ax.set_ylim(bottom=1e-16)

@@ -8,6 +8,10 @@ from ._result import Timing
 from ._table import largest_by_fifths
 
 
+# Where the moving energy is round-off.
+ENERGY_FLOOR = 4e-15
+
+
 @dataclasses.dataclass(frozen=True)
 class BallRun:
     """One run, at every step.
@@ -41,3 +45,12 @@ class BallRun:
     def energy_by_fifths(self) -> list[float]:
         """Return the moving energy's largest deviation in each fifth of the run."""
         return largest_by_fifths(self.deviations()[1:, 3])
+
+
+def ball_verdict(runs: list[BallRun]) -> str:
+    """Say in a line how well the linear integrals and the moving energy are kept."""
+    linear = max(float(np.max(run.largest_linear_errors())) for run in runs)
+    fifths = [run.energy_by_fifths() for run in runs]
+    growth = max(max(x) / max(x[0], ENERGY_FLOOR) for x in fifths)
+    energy = f"grows {growth:.1f}-fold" if growth > 1.2 else "does not drift"
+    return f"the linear integrals are kept to {linear:.0e}; the moving energy {energy}"

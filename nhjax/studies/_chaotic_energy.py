@@ -141,6 +141,17 @@ class ChaoticEnergy(AbstractStudyResult):
                 )
         return format_table(header, rows)
 
+    def verdict(self) -> str:
+        """Say with which power of h the mean squared error goes."""
+        powers = {s: self.slopes(s)[-1] for s in self.stages}
+        if not all(np.all(np.isfinite(x)) for x in powers.values()):
+            return "no power of h can be seen: it takes two step sizes"
+        found = ", ".join(
+            f"h^{np.mean(x):.1f} for s = {s} (4(s - 1) = {4 * (s - 1)})"
+            for s, x in powers.items()
+        )
+        return f"μ goes as {found}, averaged over the times"
+
     def figures(self) -> "dict[str, Figure]":
         """Draw μ against time in both normalisations, ours and the paper's."""
         curves = [

@@ -20,9 +20,11 @@ from ._arguments import (
     check_stages,
     check_step_sizes,
 )
-from ._result import AbstractStudyResult, Timing
+from ._cvt_run import cvt_verdict, CVTRun, ENERGIES
+from ._envelope import draw_envelope
+from ._result import AbstractStudyResult
 from ._run import compile_and_run, meter
-from ._table import format_table, largest_by_fifths
+from ._table import format_table
 
 
 if TYPE_CHECKING:
@@ -33,44 +35,6 @@ REGIMES = {
     "low": ContinuouslyVariableTransmission.low,
     "high": ContinuouslyVariableTransmission.high,
 }
-ENERGIES = ("total", "driver", "passenger")
-
-
-@dataclasses.dataclass(frozen=True)
-class CVTRun:
-    """The energies of one run, at every step.
-
-    - `energies`: shape (k + 1, 3): total, driver and passenger.
-    - `timing`: of the program that runs all regimes with this s and h side by side.
-    """
-
-    regime: str
-    stages: int
-    dt: float
-    times: np.ndarray
-    energies: np.ndarray
-    max_multiplier_defect: float
-    timing: Timing
-
-    @property
-    def key(self) -> str:
-        """Return the name of the run for files and arrays."""
-        return f"{self.regime}_s{self.stages}_h{self.dt:.6g}"
-
-    def deviations(self) -> np.ndarray:
-        """Return the energies less their initial values."""
-        return self.energies - self.energies[0]
-
-    def by_fifths(self) -> list[float]:
-        """Return max |E - E0| of the total energy over each fifth of the run."""
-        return largest_by_fifths(self.deviations()[1:, 0])
-
-    def ranges(self) -> dict[str, tuple[float, float]]:
-        """Return the least and the greatest deviation of each energy."""
-        low, high = self.deviations().min(axis=0), self.deviations().max(axis=0)
-        return {
-            name: (float(low[i]), float(high[i])) for i, name in enumerate(ENERGIES)
-        }
 
 
 @dataclasses.dataclass(frozen=True)
@@ -151,6 +115,10 @@ class CVTEnergy(AbstractStudyResult):
             )
         return format_table(header, rows)
 
+    def verdict(self) -> str:
+        """Say which runs keep their energy bounded."""
+        return cvt_verdict(self.runs)
+
     def figures(self) -> "dict[str, Figure]":
         """Draw short and long term for each regime and step size, as in the paper."""
         cases = dict.fromkeys((run.regime, run.dt) for run in self.runs)
@@ -166,16 +134,12 @@ class CVTEnergy(AbstractStudyResult):
         axes = figure.subplots(3, 2, sharex="col", sharey="row")
         runs = [run for run in self.runs if (run.regime, run.dt) == (regime, h)]
         # The least accurate first, so that it does not cover the others.
-        for run in sorted(runs, key=lambda run: run.stages):
+        for i, run in enumerate(sorted(runs, key=lambda run: run.stages)):
+            style = {"color": f"C{i}", "label": f"s = {run.stages}"}
             short = run.times <= self.short_time
             for row, deviation in zip(axes, run.deviations().T, strict=True):
                 for ax, part in zip(row, (short, slice(None)), strict=True):
-                    ax.plot(
-                        run.times[part],
-                        deviation[part],
-                        linewidth=0.6,
-                        label=f"s = {run.stages}",
-                    )
+                    draw_envelope(ax, run.times[part], deviation[part], **style)
         for row, name in zip(axes, ENERGIES, strict=True):
             row[0].set_ylabel(f"{name} energy, $E - E_0$")
         for ax, title in zip(axes[0], ("short term", "long term"), strict=True):

@@ -19,7 +19,7 @@ from .._system import continuous_multiplier, LagrangianSystem, State
 from ._arguments import check_positive, check_stages, check_step_sizes, whole_steps
 from ._result import AbstractStudyResult, initial_data, system_parameters, Timing
 from ._run import compile_and_run
-from ._table import format_slope, format_table, slopes, SYMBOLS
+from ._table import format_slope, format_table, order_verdict, slopes, SYMBOLS
 
 
 if TYPE_CHECKING:
@@ -144,6 +144,11 @@ class AbstractOrderStudy(AbstractStudyResult):
         ]
         summary = format_table(["s", *symbols], orders)
         return f"{format_table(header, rows)}\n\nobserved (expected) orders\n{summary}"
+
+    def verdict(self) -> str:
+        """Say whether the orders are those of the theory."""
+        expected = np.array([self._expected(s) for s in self.stages])
+        return order_verdict(self.quantities, self.orders(), expected)
 
     def figures(self) -> "dict[str, Figure]":
         """Draw the errors against the step size, like the paper's order plots."""

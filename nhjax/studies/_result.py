@@ -15,6 +15,8 @@ import equinox as eqx
 import jax
 import numpy as np
 
+from ._style import colour_blind_safe
+
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -50,6 +52,10 @@ class AbstractStudyResult(abc.ABC):
         """Write the results in short as a table of text."""
 
     @abc.abstractmethod
+    def verdict(self) -> str:
+        """Say in one line what came out."""
+
+    @abc.abstractmethod
     def figures(self) -> "dict[str, Figure]":
         """Draw the figures; return them by file name, without suffix."""
 
@@ -69,10 +75,11 @@ def write(result: AbstractStudyResult, directory: str | Path) -> dict[str, Any]:
     data = directory / f"{result.name}.npz"
     np.savez_compressed(data, **result.arrays())  # pyright: ignore[reportArgumentType]
     pictures = []
-    for name, figure in result.figures().items():
-        picture = directory / f"{name}.png"
-        figure.savefig(picture, dpi=150)
-        pictures.append(str(picture))
+    with colour_blind_safe():
+        for name, figure in result.figures().items():
+            picture = directory / f"{name}.png"
+            figure.savefig(picture, dpi=150)
+            pictures.append(str(picture))
     path = directory / f"{result.name}.json"
     record = {
         "study": result.name,

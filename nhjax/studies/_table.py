@@ -53,3 +53,17 @@ def slopes(
         )
         order[1:][~(above[1:] & above[:-1])] = np.nan
     return order
+
+
+def order_verdict(
+    quantities: Sequence[str], orders: np.ndarray, expected: np.ndarray
+) -> str:
+    """Say in a line whether orders, of shape (stages, quantities), are as expected."""
+    off = np.abs(orders - expected)
+    if not np.any(np.isfinite(off)):
+        return "no order can be seen: it takes two step sizes above round-off"
+    worst = np.nanmax(off)
+    # The largest steps of many stages are not small enough for a whole digit.
+    theirs = "are those of the theory" if worst <= 0.5 else "are not all of the theory"
+    names = ", ".join(SYMBOLS[name][0] for name in quantities)
+    return f"the orders of {names} {theirs}; they differ by {worst:.2f} at most"

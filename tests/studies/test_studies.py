@@ -1,7 +1,9 @@
 """The studies with tiny arguments, from Python and from the command line."""
 
+import functools
 import json
 import math
+import re
 from pathlib import Path
 
 import jax
@@ -93,7 +95,12 @@ def test_run_prints_a_table(tmp_path, capsys):
     assert main(["run", "cvt-energy", *arguments.split(), "--out", str(out)]) == 0
     shown = capsys.readouterr()
     assert shown.err == ""
-    header, ruler, row, *files = shown.out.splitlines()
+    headline, options, seconds, _, header, ruler, row, *rest = shown.out.splitlines()
+    assert headline.startswith("Compute the energies of the CVT")
+    assert "stages 3, dt 0.1, final_time 2, closure symmetric" in options
+    assert seconds == "About 10 seconds on two cores."
+    _, verdict, *files = rest
+    assert verdict.startswith("Verdict: the energy error ")
     assert "range of ΔE_d" in header
     assert set(ruler) == {"-", " "}
     assert row.split()[:3] == ["high", "3", "0.1"]
@@ -105,6 +112,34 @@ def test_run_prints_a_table(tmp_path, capsys):
     assert parameters["closure"] == "symmetric"
     assert parameters["final_time"] == 2.0
     assert parameters["short_time"] == 1.0
+
+
+@pytest.mark.parametrize("study", studies.STUDIES)
+def test_quick_is_smaller_and_gives_way_to_options(
+    study, monkeypatch, tmp_path, capsys
+):
+    asked = []
+
+    @functools.wraps(studies.STUDIES[study])
+    def recorded(**options):
+        asked.append(options)
+        raise studies.ArgumentError("dt", "is only recorded")
+
+    monkeypatch.setattr("nhjax.__main__.STUDIES", {study: recorded})
+    command = ["run", study, "--out", str(tmp_path), "--quick"]
+    for more in ([], ["--closure", "symmetric", "--stages", "5"]):
+        with pytest.raises(SystemExit):
+            main([*command, *more])
+    smaller = studies.QUICK[study]
+    assert asked[0] == {"progress": False, **smaller}
+    assert asked[1] == asked[0] | {"closure": "symmetric", "stages": [5]}
+
+    def seconds(options):
+        told = studies.plan(study, studies.STUDIES[study], options)
+        return int(re.findall(r"About (\d+) seconds", told)[0])
+
+    assert seconds(smaller) < seconds({}) < 90
+    capsys.readouterr()
 
 
 @pytest.mark.parametrize(
@@ -191,6 +226,7 @@ def test_particle_order_finds_the_orders(particle):
         particle.orders(), [[4, 4, 2, 4], [6, 6, 4, 6]], atol=0.15
     )
     assert np.all(np.isnan(particle.slopes()[:, 0]))
+    assert "q, p, λ, λ_c are those of the theory" in particle.verdict()
     assert (
         particle.table().splitlines()[-1].split()
         == (
@@ -213,6 +249,7 @@ def test_particle_order_leaves_round_off_out():
         timings=[],
     )
     assert np.all(np.isnan(result.orders()))
+    assert result.verdict().startswith("no order can be seen")
     assert "-" in result.table().splitlines()[-1]
 
 
@@ -239,6 +276,7 @@ def test_ball_invariants_are_kept(ball):
         np.testing.assert_array_less(run.largest_linear_errors(), 3e-15)
         assert run.max_constraint_violation < 1e-14
         assert len(run.energy_by_fifths()) == 5
+    assert re.search(r"kept to \de-1[56]; the moving energy", ball.verdict())
 
 
 def test_ball_invariants_finds_the_orders(ball):
@@ -272,6 +310,7 @@ def test_chaotic_energy_shapes_and_slopes(chaotic):
     assert data["s3_h0.1_mu"].shape == (21,)
     slopes = [float(chaotic.slopes(s)[1, 0]) for s in (2, 3)]
     np.testing.assert_allclose(slopes, [4, 8], atol=0.3)
+    assert re.search(r"h\^[34]\.\d for s = 2 \(4\(s - 1\) = 4\)", chaotic.verdict())
     for run in chaotic.runs:
         assert run.max_constraint_violation < 1e-13
 
@@ -324,6 +363,7 @@ def test_cvt_energy_of_a_short_run():
         low.energies[:, 0], low.energies[:, 1] + low.energies[:, 2], atol=1e-14
     )
     assert len(low.by_fifths()) == 5
+    assert "the energy error grows after the first fifth in: low" in result.verdict()
     least, greatest = high.ranges()["driver"]
     assert least == pytest.approx(-5.3e-3, rel=0.02)
     assert greatest == pytest.approx(1.26e-2, rel=0.02)
@@ -334,3 +374,15 @@ def test_number_of_steps_follows_from_the_nearest_whole_one():
         regimes=("low",), dt=(math.pi / 10,), final_time=4.0, short_time=1.0
     )
     assert len(result.runs[0].times) == 1 + round(40 / math.pi)
+
+
+def test_an_envelope_holds_every_value_and_no_more():
+    times = np.linspace(0.0, 1.0, 1003)
+    values = np.sin(300.0 * times)
+    values[500] = np.nan
+    middles, low, high = studies.envelope(times, values, 10)
+    bins = np.array_split(values, 10)
+    assert np.all(np.diff(middles) > 0)
+    np.testing.assert_allclose(low, [np.nanmin(x) for x in bins], atol=0.2)
+    assert (low.min(), high.max()) == (np.nanmin(values), np.nanmax(values))
+    assert np.all(low <= high)
