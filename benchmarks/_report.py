@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import jax
+import numpy as np
 
 import nhjax
 
@@ -28,7 +29,9 @@ def number(x: float) -> str:
 
 
 def _finite(x: Any) -> Any:
-    """`x` with what JSON does not know, infinities and NaN, as None."""
+    """`x` as JSON knows it: arrays as lists, infinities and NaN as None."""
+    if isinstance(x, np.ndarray | np.generic | jax.Array):
+        x = x.tolist()
     if isinstance(x, dict):
         return {key: _finite(value) for key, value in x.items()}
     if isinstance(x, list | tuple):

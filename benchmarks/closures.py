@@ -66,15 +66,15 @@ def measure(case: Case, stages: int, closure: str, length: float) -> Measured:
     """All figures of one system, number of stages and closure."""
     method = nhjax.LobattoIIIAB(stages, closure)
     system, y0 = case.example.system, case.example.initial_state()
-    order, end_error = _order(case, system, method, y0)
+    order, end_error = observed_order(case, system, method, y0)
     defect = _symmetry_defect(system, method, y0, case.dt)
-    first, last, lam, steps = _long_run(
+    first, last, lam, steps = long_run(
         system, method, y0, case.dt, length * case.long_time
     )
     return Measured(order, end_error, defect, first, last, lam, steps)
 
 
-def _order(case, system, method, y0) -> tuple[float, float]:
+def observed_order(case, system, method, y0) -> tuple[float, float]:
     t = case.order_time
     try:
         q, v, *_ = case.example.exact(t)  # pyright: ignore[reportAttributeAccessIssue]
@@ -120,7 +120,7 @@ def _symmetry_defect(system, method, y0, dt) -> float:
     return float(max(jnp.max(jnp.abs(back.q - y0.q)), jnp.max(jnp.abs(back.p - y0.p))))
 
 
-def _long_run(system, method, y0, dt, time) -> tuple[float, float, float, int]:
+def long_run(system, method, y0, dt, time) -> tuple[float, float, float, int]:
     sol = nhjax.integrate(
         system,
         method,

@@ -1,0 +1,133 @@
+"""Where the print is wrong: the equations as printed, tried."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+import nhjax
+from nhjax import systems
+
+from .. import _baselines
+from ._claim import (
+    Claim,
+    command,
+    DEPENDS,
+    Found,
+    orders_text,
+    PRINT,
+    slope,
+    stages_text,
+)
+
+
+PART = "errata"
+
+
+def body_step(stages: int, form: str):
+    """Make a step of the free rigid body by the Hamiltonian equations on a group.
+
+    With N = 0 they are μ_{k+1} = Ad*_{τ(ξ)} μ_k and, for every stage,
+
+        (dτ_ξ)* μ_{k+1} = Π^i + h Σ_j (b_j a_ji / b_i) (ddτ)*(H^j, Π^j),
+        H^i = dτ⁻¹ D₂h((dτ⁻¹)* Π^i),  with dτ and ddτ at Ξ^i.
+
+    `form` is "right", or one of two slips: "dual", where H^i = (dτ)* D₂h as in the
+    paper's summary, and "base", (ddτ)*(Ξ^j, ·) as in the remark that follows the
+    theorem.
+    """
+    method = nhjax.LobattoIIIAB(stages)
+    a, b = jnp.asarray(method.a, float), jnp.asarray(method.b, float)
+    weights = b[None, :] * a.T / b[:, None]
+    group = nhjax.SO3(nhjax.Cayley())
+    over = jax.vmap
+
+    def step(inertia: Array, mu: Array, h: Array) -> Array:
+        def residual(x):
+            H, Pi = x[:stages], x[stages:]
+            Xi, xi = h * (a @ H), h * (b @ H)
+            end = group.Ad_dual(group.retract(xi), mu)
+            body = over(group.dtau_inv_dual)(Xi, Pi)
+            back = group.dtau_dual if form == "dual" else group.dtau_inv
+            velocities = over(back)(Xi, body / inertia)
+            turning = over(group.ddtau_dual)(Xi, Xi if form == "base" else H, Pi)
+            momenta = group.dtau_dual(xi, end) - h * (weights @ turning)
+            return x - jnp.concatenate([velocities, momenta]), end
+
+        start = jnp.concatenate(
+            [jnp.tile(mu / inertia, (stages, 1)), jnp.tile(mu, (stages, 1))]
+        )
+        return _baselines.solved(residual, start)
+
+    return step
+
+
+def found(quick: bool) -> Found:
+    """Try what is printed."""
+    del quick
+    body = systems.FreeRigidBody()
+    inertia = jnp.asarray(body.moments, float)
+    mu0 = inertia * body.v0
+    exact = np.asarray(inertia) * body.exact(2.0)[1]
+    stages, counts = (2, 3), (40, 80)
+    orders: dict[str, list[float]] = {}
+    for form in ("right", "dual", "base"):
+        orders[form] = []
+        for s in stages:
+            step = body_step(s, form)
+
+            @jax.jit
+            def end(h, step=step):
+                def following(mu, _):
+                    mu = step(inertia, mu, h)
+                    return mu, mu
+
+                return jax.lax.scan(following, mu0, length=counts[-1])[1]
+
+            errors = [
+                float(np.max(np.abs(np.asarray(end(2.0 / n))[n - 1] - exact)))
+                for n in counts
+            ]
+            orders[form].append(slope([1 / n for n in counts], errors))
+    stability = {s: stability_at_infinity(s) for s in range(2, 7)}
+    right = orders_text(orders["right"])
+    claims = []
+    for form, printed, instead in (
+        ("dual", "H = (dτ)* D₂h (summary, Hamiltonian on groups)", "H = dτ⁻¹ D₂h"),
+        ("base", "(ddτ)*(Ξ, ·) (remark after the theorem on groups)", "(ddτ)*(H, ·)"),
+    ):
+        falls = orders[form][-1] < 2 * stages[-1] - 2.5
+        claims.append(
+            Claim(
+                printed,
+                f"order on the free rigid body, cay, {stages_text(stages)}: "
+                f"{orders_text(orders[form])}"
+                f"; with {instead}: {right}",
+                command(PART),
+                PRINT if falls else DEPENDS,
+                "(dτ)* maps covectors, D₂h is a vector: η = dτ H = D₂h gives H"
+                if form == "dual"
+                else "the derivative of dτ_Ξ H by Ξ, as the theorem itself has it",
+            )
+        )
+    signs = all(abs(x - (-1) ** (s - 1)) < 1e-6 for s, x in stability.items())
+    claims.append(
+        Claim(
+            "“q >= 1 if R_A(∞)” (5, global convergence)",
+            "R_A(∞): " + ", ".join(f"{x:+.3f} (s = {s})" for s, x in stability.items()),
+            command(PART),
+            PRINT if signs else DEPENDS,
+            "“= 1” is missing: this is the case of odd s, where λ loses an order",
+        )
+    )
+    return Found(claims, {"errata": {"orders": orders, "stability": stability}})
+
+
+def stability_at_infinity(stages: int) -> float:
+    """Compute R_A(z) = 1 + z b·(1 - z A)⁻¹ 1 for a large z."""
+    method = nhjax.LobattoIIIAB(stages)
+    z = 1e9
+    ones = np.ones(stages)
+    inner = np.linalg.solve(np.eye(stages) - z * np.asarray(method.a), ones)
+    # b is the last row of A, so that this is the last stage: no cancellation.
+    return float(inner[-1])

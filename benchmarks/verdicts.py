@@ -1,0 +1,94 @@
+"""The claims of the paper's sections 5 and 7, each measured, with a verdict.
+
+Writes the table to `benchmarks/results/verdicts.md` and `.json`, and into the page
+`docs/experiments.md`, whose figures go to `docs/experiments/`. With `--quick`
+everything runs in a small form, which shows that it runs but decides nothing, and with
+`--only` some parts alone; then nothing is written. It takes about seven minutes of one
+core.
+"""
+
+import argparse
+import dataclasses
+import time
+from pathlib import Path
+from typing import Any
+
+import jax
+import matplotlib
+
+from nhjax.studies import colour_blind_safe
+
+from ._report import markdown_table, write
+from ._verdicts import _ball, _chaotic, _errata, _orders, _ours, _transmission
+from ._verdicts._claim import Claim, Found
+
+
+PARTS = {x.PART: x for x in (_orders, _transmission, _chaotic, _ball, _ours, _errata)}
+DOCS = Path(__file__).parents[1] / "docs"
+PAGE, PICTURES = DOCS / "experiments.md", DOCS / "experiments"
+HEADER = ["claim (section)", "measured", "command", "verdict"]
+
+
+def measure(
+    parts: list[str], quick: bool
+) -> tuple[dict[str, list[Claim]], dict[str, Any], dict[str, Any]]:
+    """Run some parts; return their claims by part, their data and their figures."""
+    claims, data, figures = {}, {}, {}
+    for part in parts:
+        start = time.process_time()
+        with colour_blind_safe():
+            found: Found = PARTS[part].found(quick)
+        claims[part] = found.claims
+        data |= found.data
+        figures |= found.figures
+        data[f"{part}_cpu_seconds"] = time.process_time() - start
+        # Compiled programs hold memory maps, of which a process has only so many.
+        jax.clear_caches()
+    return claims, data, figures
+
+
+def table(claims: list[Claim]) -> str:
+    """Write the table."""
+    return markdown_table(HEADER, [claim.row() for claim in claims])
+
+
+def filled(page: str, claims: dict[str, list[Claim]]) -> str:
+    """Put the tables into the places of a page that wait for them."""
+    for part, lines in claims.items():
+        start, end = f"<!-- verdicts: {part} -->\n", "<!-- end -->"
+        before, _, rest = page.partition(start)
+        _, _, after = rest.partition(end)
+        page = f"{before}{start}\n{table(lines)}\n\n{end}{after}"
+    return page
+
+
+def main() -> None:
+    """Print and save the table."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--quick", action="store_true", help="short runs; no files")
+    parser.add_argument(
+        "--only", nargs="+", choices=PARTS, help="these parts; no files"
+    )
+    asked = parser.parse_args()
+    jax.config.update("jax_enable_x64", True)
+    matplotlib.use("Agg")
+    parts = asked.only or list(PARTS)
+    claims, data, figures = measure(parts, asked.quick)
+    text = table([claim for lines in claims.values() for claim in lines])
+    if asked.quick or asked.only:
+        print(text)
+        return
+    data["claims"] = {
+        part: [dataclasses.asdict(claim) for claim in lines]
+        for part, lines in claims.items()
+    }
+    write("verdicts", "The claims of the paper, measured", text, data)
+    PICTURES.mkdir(exist_ok=True)
+    with colour_blind_safe():
+        for name, figure in figures.items():
+            figure.savefig(PICTURES / f"{name}.png", dpi=75)
+    PAGE.write_text(filled(PAGE.read_text(encoding="utf-8"), claims), encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,87 @@
+"""The methods that ours are compared with, and the arithmetic of the verdicts."""
+
+import json
+import re
+
+import jax
+import numpy as np
+import pytest
+
+from benchmarks import _baselines as baselines
+from benchmarks._report import RESULTS
+from benchmarks._verdicts._claim import Claim
+from benchmarks._verdicts._errata import stability_at_infinity
+from benchmarks._verdicts._growth import Curve, growth, in_stretches
+from benchmarks._verdicts._orders import BASELINE_ORDERS, baseline_orders
+from benchmarks._verdicts._ours import distances
+from benchmarks.verdicts import DOCS, filled, PAGE, table
+from nhjax import systems
+
+
+def test_methods_of_others_have_their_orders():
+    orders = baseline_orders(counts=(24, 48), time=2.0)
+    assert list(orders) == list(BASELINE_ORDERS)
+    np.testing.assert_allclose(
+        list(orders.values()), list(BASELINE_ORDERS.values()), atol=0.1
+    )
+
+
+def test_leapfrog_satisfies_the_discrete_lagrange_dalembert_equations():
+    cvt = systems.ContinuouslyVariableTransmission.high()
+    y0, h = cvt.initial_state(), 0.1
+    nat = baselines.natural(cvt.system)
+    step = baselines.discrete_lagrange_dalembert(nat)
+    q, _ = jax.jit(lambda: baselines.run(step, y0.q, y0.v, h, 3))()
+
+    def action(left, right):
+        v = (right - left) / h
+        ends = [cvt.lagrangian(0.0, x, v, None) for x in (left, right)]
+        return 0.5 * h * (ends[0] + ends[1])
+
+    force = jax.grad(action, 1)(q[0], q[1]) + jax.grad(action, 0)(q[1], q[2])
+    b = nat.direction(q[1])
+    left_over = force - b * (b @ force) / (b @ b)
+    np.testing.assert_allclose(left_over, 0.0, atol=1e-14)
+    for left, right in ((q[0], q[1]), (q[1], q[2])):
+        assert abs(nat.direction(0.5 * (left + right)) @ (right - left)) < 1e-14
+
+
+def test_methods_that_coincide_do():
+    apart = distances(systems.NonholonomicParticle(), num_steps=20)
+    assert apart["DLA, SPARK 2"] < 1e-13
+    assert apart["leapfrog, Lobatto-2"] < 1e-13
+    assert apart["SPARK 2, Lobatto-2"] > 1e-4
+
+
+@pytest.mark.parametrize("alpha", [1.0, 2.0])
+def test_growth_finds_the_power_of_time(alpha):
+    times = np.arange(5.0, 1e4, 5.0)
+    mu = 1e-5 + 1e-3 * (times / 1e4) ** alpha
+    found = growth(in_stretches(times, mu, 0.1 * mu, 1e4))
+    assert found.alpha == pytest.approx(alpha, abs=0.05)
+    assert found.alpha_error < 0.3
+    assert growth(Curve(times, 0 * times + 1.0, times)).alpha == 0.0
+
+
+def test_stability_at_infinity_alternates():
+    found = [stability_at_infinity(s) for s in (2, 3, 4, 5)]
+    np.testing.assert_allclose(found, [-1, 1, -1, 1], atol=1e-7)
+
+
+def test_bars_do_not_end_cells():
+    line = table([Claim("|E|", "1", "x", "confirmed", "y")]).splitlines()[-1]
+    assert line == "| \\|E\\| | 1 | `x` | **confirmed**: y |"
+
+
+def test_the_page_has_the_tables_of_the_result_and_its_figures():
+    record = json.loads((RESULTS / "verdicts.json").read_text(encoding="utf-8"))
+    claims = {
+        part: [Claim(**claim) for claim in lines]
+        for part, lines in record["claims"].items()
+    }
+    page = PAGE.read_text(encoding="utf-8")
+    assert page == filled(page, claims), "run `python -m benchmarks.verdicts`"
+    for target in re.findall(r"\]\(([^)#:]+)\)", page):
+        found = DOCS / target
+        assert found.is_file()
+        assert found.suffix != ".png" or found.stat().st_size < 150_000
