@@ -21,7 +21,7 @@ from oracles.random_programs import programs
 from oracles.random_steps import evaluate, numbers
 
 
-EXAMPLES = int(os.environ.get("NHJAX_FUZZ", "200"))
+EXAMPLES = int(os.environ.get("NHJAX_FUZZ", "100"))
 MEMBERS = 6
 
 
