@@ -13,9 +13,10 @@ from typing import Any, NamedTuple
 
 import jax
 import numpy as np
-from matplotlib.animation import FuncAnimation, PillowWriter
+from matplotlib.animation import PillowWriter
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from PIL import Image, ImageSequence
 
 import nhjax
 from nhjax import systems
@@ -24,6 +25,7 @@ from nhjax.systems import Rattleback, RollingTorus, WhippleBicycle
 
 DOCS = Path(__file__).parent
 TIMES_SHOWN = 7
+FRAME_RATE = 16
 
 
 class Machine(NamedTuple):
@@ -31,6 +33,9 @@ class Machine(NamedTuple):
 
     - `rods`: the names of points that are connected, one after the other.
     - `traced`: the names of points whose paths are drawn.
+    - `wheels`: the names of a hub, of a point of the rim, and of another point of the
+        wheel's plane, of each wheel that an animation shows.
+    - `follow`: the name of a point that an animation moves along with.
     """
 
     example: Any
@@ -38,6 +43,8 @@ class Machine(NamedTuple):
     num_steps: int
     rods: tuple[str, ...]
     traced: tuple[str, ...]
+    wheels: tuple[tuple[str, str, str], ...] = ()
+    follow: str | None = None
 
     @property
     def name(self) -> str:
@@ -54,6 +61,11 @@ def machines() -> tuple[Machine, ...]:
             200,
             ("rear_contact", "rear_hub", "rear_frame", "head", "front_hub"),
             ("rear_contact", "front_contact"),
+            (
+                ("rear_hub", "rear_contact", "rear_frame"),
+                ("front_hub", "front_contact", "head"),
+            ),
+            "rear_hub",
         ),
         Machine(
             systems.CarWithTrailers(num_trailers=2),
@@ -194,25 +206,48 @@ def axes_for(
     return ax
 
 
-def animate(machine: Machine, path: Path, frames: int = 100) -> None:
-    """Write an animation of a machine."""
+def circle(points: dict[str, np.ndarray], wheel: tuple[str, str, str]) -> np.ndarray:
+    """The rim of a wheel along the run, of shape (times, corners, 3)."""
+    hub, rim, other = (points[name] for name in wheel)
+    spoke, inwards = rim - hub, other - hub
+    radius = np.linalg.norm(spoke, axis=1, keepdims=True)
+    along = np.sum(spoke * inwards, axis=1, keepdims=True) / radius**2
+    across = inwards - along * spoke
+    across *= radius / np.linalg.norm(across, axis=1, keepdims=True)
+    angle = np.linspace(0, 2 * np.pi, 41)[:, None]
+    return (
+        hub[:, None] + np.cos(angle) * spoke[:, None] + np.sin(angle) * across[:, None]
+    )
+
+
+def animate(machine: Machine, path: Path, seconds: float = 3.0) -> None:
+    """Write an animation of a machine that takes some seconds."""
     points = run(machine)
+    ts = np.linspace(0, machine.duration, machine.num_steps + 1)
+    rims = {" ".join(wheel): circle(points, wheel) for wheel in machine.wheels}
+    spatial = points[machine.rods[0]].shape[1] == 3
     figure = Figure(figsize=(4, 4), layout="constrained")
-    ax = axes_for(figure, (1, 1, 1), points)
-    for name in machine.traced:
-        ax.plot(*points[name].T, linewidth=0.6, color="tab:blue")
-    lines = ax.plot(*np.array([points[name][0] for name in machine.rods]).T, "ko-")
-    shown = np.linspace(0, machine.num_steps, frames).astype(int)
-
-    def show(frame):
-        rods = np.array([points[name][shown[frame]] for name in machine.rods]).T
-        lines[0].set_data(*rods[:2])
-        if len(rods) == 3:
-            lines[0].set_3d_properties(rods[2])  # pyright: ignore
-        return lines
-
-    animation = FuncAnimation(figure, show, frames=frames)
-    animation.save(path, writer=PillowWriter(fps=25), dpi=80)
+    ax = figure.add_subplot(projection="3d" if spatial else None)
+    ax.tick_params(labelsize=6)
+    animation = nhjax.plot.animate(
+        ts,
+        points | rims,
+        [machine.rods],
+        traced=machine.traced,
+        follow=machine.follow,
+        speed=machine.duration / seconds,
+        frame_rate=FRAME_RATE,
+        ax=ax,
+    )
+    animation.save(path, writer=PillowWriter(fps=FRAME_RATE), dpi=80)
+    # A few colours halve the file.
+    with Image.open(path) as pictures:
+        first, *others = [
+            picture.convert("RGB").quantize(8, dither=Image.Dither.NONE)
+            for picture in ImageSequence.Iterator(pictures)
+        ]
+    duration = 1000 // FRAME_RATE
+    first.save(path, save_all=True, append_images=others, duration=duration, loop=0)
 
 
 def main() -> None:

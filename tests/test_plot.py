@@ -9,6 +9,7 @@ import matplotlib
 import numpy as np
 import pytest
 from matplotlib.figure import Figure
+from PIL import Image, ImageSequence
 
 import nhjax
 from nhjax import plot
@@ -134,3 +135,83 @@ def test_errors(sol):
 def test_importing_the_library_does_not_import_matplotlib():
     code = "import sys, nhjax, nhjax.plot; sys.exit('matplotlib' in sys.modules)"
     subprocess.run([sys.executable, "-c", code], check=True)
+
+
+TIMES = np.array([0.0, 0.1, 0.5, 2.0])
+SLIDER = {
+    "hub": np.stack([TIMES, 0 * TIMES], axis=1),
+    "end": np.stack([TIMES, 1 + TIMES], axis=1),
+}
+
+
+def in_space(points):
+    return {
+        name: np.concatenate([x, np.ones((*x.shape[:-1], 1))], axis=-1)
+        for name, x in points.items()
+    }
+
+
+@pytest.mark.parametrize("spatial", [False, True])
+def test_an_animation_keeps_the_pace_of_the_motion(tmp_path, spatial):
+    wheel = np.array([[-1.0, 0.0], [0.0, 1.0], [1.0, 0.0]])
+    points = SLIDER | {"wheel": SLIDER["hub"][:, None] + wheel}
+    points = in_space(points) if spatial else points
+    animation = plot.animate(
+        TIMES, points, [("hub", "end")], traced=["end"], speed=0.5, frame_rate=5
+    )
+    animation.save(tmp_path / "motion.gif", dpi=20)
+    with Image.open(tmp_path / "motion.gif") as picture:
+        # Two seconds at half the speed, with the first and the last moment.
+        assert picture.info["duration"] == 200
+        assert len(list(ImageSequence.Iterator(picture))) == 21
+    (ax,) = animation._fig.axes  # pyright: ignore[reportAttributeAccessIssue]
+    body, rod, path = (
+        np.stack(line.get_data_3d() if spatial else line.get_data(), axis=1)
+        for line in ax.lines
+    )
+    np.testing.assert_allclose(body, points["wheel"][-1])
+    np.testing.assert_allclose(rod, [points["hub"][-1], points["end"][-1]])
+    # Straight between the times that were saved.
+    assert path.shape == (21, 3 if spatial else 2)
+    np.testing.assert_allclose(path[:, 0], np.linspace(0, 2, 21), atol=1e-15)
+    np.testing.assert_allclose(path[:, 1], np.linspace(1, 3, 21), atol=1e-15)
+    low, high = ax.get_xlim()
+    assert low <= -1
+    assert high >= 3
+
+
+def test_an_animation_backwards_in_time_moves_along_with_a_point(tmp_path):
+    points = {name: x[::-1] for name, x in SLIDER.items()}
+    ax = Figure().subplots()
+    animation = plot.animate(
+        TIMES[::-1], points, [("hub", "end")], follow="hub", frame_rate=2, ax=ax
+    )
+    animation.save(tmp_path / "motion.gif", dpi=20)
+    x, y = map(np.asarray, ax.lines[0].get_data())
+    np.testing.assert_allclose((x, y), [[0, 0], [0, 1]])
+    # The end is up to three away, and the hub stays in the middle.
+    np.testing.assert_allclose(ax.get_xlim(), (-3.15, 3.15))
+    np.testing.assert_allclose(ax.get_ylim(), (-3.15, 3.15))
+
+
+@pytest.mark.parametrize(
+    ("changes", "error", "message"),
+    [
+        ({"ts": np.zeros((2, 4))}, ValueError, r"`ts` .* got shape \(2, 4\)"),
+        ({"ts": [0, 2, 1, 3]}, ValueError, "`ts` must increase"),
+        ({"ts": "now"}, TypeError, "`ts` must be an array of real numbers"),
+        ({"points": {}}, TypeError, "`points` must be positions by name, .* got dict"),
+        ({"points": {"a": np.ones((3, 2))}}, ValueError, r"shape \(4, 2\), .*\(3, 2\)"),
+        ({"points": {"a": np.ones((4, 5))}}, ValueError, r"got shapes .*\(4, 5\)"),
+        ({"points": {"hub": SLIDER["hub"] * np.nan}}, ValueError, r"`points\['hub'\]`"),
+        ({"rods": [("hub", "head")]}, ValueError, "`rods` .* hub, end, got 'head'"),
+        ({"rods": ["hub"]}, ValueError, "`rods` .* hub, end, got 'h'"),
+        ({"traced": ["head"]}, ValueError, "`traced` must name points"),
+        ({"follow": "head"}, ValueError, "`follow` must name points"),
+        ({"speed": 0.0}, ValueError, "`speed` and `frame_rate` must be positive"),
+        ({"frame_rate": -1}, ValueError, "`speed` and `frame_rate` must be positive"),
+    ],
+)
+def test_what_cannot_be_animated_is_refused(changes, error, message):
+    with pytest.raises(error, match=message):
+        plot.animate(**({"ts": TIMES, "points": SLIDER} | changes))

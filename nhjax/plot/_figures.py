@@ -1,11 +1,5 @@
-"""Figures of trajectories and of convergence, drawn with matplotlib.
+"""Figures of trajectories, of errors against time, and of convergence."""
 
-Every function draws into the axes `ax` if they are given, and into the axes of a new
-figure otherwise. It returns the axes, and never shows or saves anything. Matplotlib is
-imported by the first call that needs it.
-"""
-
-import reprlib
 from collections.abc import Sequence
 from typing import Any, TYPE_CHECKING
 
@@ -13,16 +7,17 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
-from ._custom_types import Args
-from ._integrate import Solution
-from ._system import AbstractMechanicalSystem
-from .diagnostics import (
+from .._custom_types import Args
+from .._integrate import Solution
+from .._system import AbstractMechanicalSystem
+from ..diagnostics import (
     check_system,
     energy_error,
     map_over_axes,
     numbers,
     saved_states,
 )
+from ._axes import new_axes
 
 
 if TYPE_CHECKING:
@@ -80,7 +75,7 @@ def trajectory(
         )
     names = _names(names, [f"$q_{i % n + 1}$" for i in coordinates])
     spatial = len(coordinates) == 3
-    ax = _axes(ax, projection="3d" if spatial else None)
+    ax = new_axes(ax, projection="3d" if spatial else None)
     for path in q.reshape(-1, *q.shape[-2:])[..., list(coordinates)]:
         ax.plot(*path.T, **style)
     for letter, name in zip("xyz", names, strict=False):
@@ -216,7 +211,7 @@ def convergence(
     if not np.any(shown):
         raise ValueError(f"`errors` must hold a positive number, got {errors}.")
     h, e = h[shown], e[shown]
-    ax = _axes(ax)
+    ax = new_axes(ax)
     (line,) = ax.plot(h, e, **{"marker": "o", "markersize": 4, **style})
     if order is not None and not isinstance(order, int | float | np.number):
         raise TypeError(f"`order` must be a number or None, got {order!r}.")
@@ -232,25 +227,8 @@ def convergence(
     return ax
 
 
-def _axes(ax: "Axes | None", projection: str | None = None) -> "Axes":
-    if ax is not None:
-        if not hasattr(ax, "plot"):
-            raise TypeError(
-                "`ax` must be axes of matplotlib, such as those of "
-                f"`matplotlib.pyplot.subplots()`, got {reprlib.repr(ax)} of type "
-                f"{type(ax).__name__}."
-            )
-        return ax
-    # The import is here alone, because drawing into given axes must not choose a
-    # backend of matplotlib.
-    from matplotlib import pyplot as plt
-
-    keywords = {} if projection is None else {"projection": projection}
-    return plt.figure(layout="constrained").add_subplot(**keywords)
-
-
 def _against_time(ts: Any, values: Any, ax: "Axes | None", style: Any) -> "Axes":
-    ax = _axes(ax)
+    ax = new_axes(ax)
     times, values = np.asarray(ts), np.asarray(values)
     # A batch becomes columns, so that each member is a line.
     ax.plot(_columns(times), _columns(values), **style)

@@ -1,0 +1,203 @@
+"""Animations of machines by the points and outlines of their parts."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any, TYPE_CHECKING
+
+import numpy as np
+from jaxtyping import Float
+
+from ..diagnostics import numbers
+from ._axes import new_axes
+
+
+if TYPE_CHECKING:
+    from matplotlib.animation import FuncAnimation
+    from matplotlib.axes import Axes
+
+
+def animate(
+    ts: Float[np.ndarray, " times"],
+    points: Mapping[str, Float[np.ndarray, "times ..."]],
+    rods: Sequence[Sequence[str]] = (),
+    *,
+    traced: Sequence[str] = (),
+    follow: str | None = None,
+    speed: float = 1.0,
+    frame_rate: float = 25.0,
+    ax: "Axes | None" = None,
+) -> "FuncAnimation":
+    """Animate a machine, in the plane or in space, at the pace of its motion.
+
+    Between the saved times points move on straight lines, so that frames come at a
+    steady rate whatever the steps were. Matplotlib's own writers make the file:
+    `animation.save("motion.gif")`, or `"motion.mp4"` where there is FFmpeg.
+
+    **Arguments:**
+
+    - `ts`: the saved times of one trajectory.
+    - `points`: the saved positions by name: points of shape (times, 2) or (times, 3),
+        outlines of bodies of shape (times, corners, 2) or (times, corners, 3). The
+        machines of `nhjax.systems` have a method `points`, which
+        `SaveAt(fn=lambda t, y, args: machine.points(t, y.q))` saves.
+    - `rods`: chains of names of points that are connected by lines.
+    - `traced`: the names of points whose paths so far are drawn.
+    - `follow`: the name of a point that the picture moves along with.
+    - `speed`: the seconds of the motion that one second of the animation shows.
+    - `frame_rate`: the frames of a second.
+    - `ax`: the axes to draw into; for points in space, with a 3d projection.
+
+    **Returns:** an animation of matplotlib. Keep it in a variable until it is saved or
+    shown: it stops where nothing refers to it.
+
+    **Raises:** `ValueError` if shapes do not fit together, a name is not one of
+    `points`, positions are not finite, `ts` does not go one way, or `speed` or
+    `frame_rate` is not positive.
+
+    !!! example
+
+        >>> import nhjax
+        >>> robot = nhjax.systems.TwoWheeledRobot()
+        >>> sol = nhjax.integrate(robot.system, nhjax.LobattoIIIAB(2),
+        ...     robot.initial_state(), dt=0.05, num_steps=20, saveat=nhjax.SaveAt(
+        ...     t0=True, steps=True, fn=lambda t, y, args: robot.points(t, y.q)))
+        >>> rods = [("left_wheel", "centre", "right_wheel")]
+        >>> animation = nhjax.plot.animate(
+        ...     sol.ts, sol.ys, rods, traced=["centre"], frame_rate=5)
+        >>> page = animation.to_jshtml()
+    """
+    times = _times(ts)
+    moving = _positions(points, times.size)
+    for chain in rods:
+        for name in chain:
+            _check_point("rods", name, moving)
+    for name in traced:
+        _check_point("traced", name, moving)
+    if follow is not None:
+        _check_point("follow", follow, moving)
+    if not (speed > 0 and frame_rate > 0):
+        raise ValueError(
+            "`speed` and `frame_rate` must be positive, got "
+            f"{speed!r} and {frame_rate!r}."
+        )
+
+    from matplotlib.animation import FuncAnimation
+
+    shown = _frame_times(times, speed / frame_rate)
+    frames = {name: _at(shown, times, x) for name, x in moving.items()}
+    spatial = next(iter(frames.values())).shape[-1] == 3
+    ax = new_axes(ax, projection="3d" if spatial else None)
+    centres, reach = _window(frames, follow)
+    bodies = [name for name, x in frames.items() if x.ndim == 3]
+    lines: list[Any] = [
+        *(ax.plot(*_nothing(spatial), color="0.25", linewidth=1.5)[0] for _ in bodies),
+        *(ax.plot(*_nothing(spatial), "o-", color="0.1", ms=3)[0] for _ in rods),
+        *(ax.plot(*_nothing(spatial), color="tab:blue", lw=1)[0] for _ in traced),
+    ]
+
+    def show(frame: int) -> list[Any]:
+        drawn = [frames[name][frame] for name in bodies]
+        drawn += [np.array([frames[name][frame] for name in chain]) for chain in rods]
+        drawn += [frames[name][: frame + 1] for name in traced]
+        for line, path in zip(lines, drawn, strict=True):
+            line.set_data(*path.T[:2])
+            if spatial:
+                line.set_3d_properties(path.T[2])
+        _look_at(ax, centres[frame], reach)
+        return lines
+
+    if spatial:
+        ax.set_box_aspect((1, 1, 1))  # pyright: ignore[reportArgumentType]
+    else:
+        ax.set_aspect("equal", adjustable="box")
+    show(0)
+    figure: Any = ax.figure
+    interval = 1000 / frame_rate
+    return FuncAnimation(figure, show, frames=len(shown), interval=interval)
+
+
+def _times(ts: Any) -> np.ndarray:
+    times = numbers("ts", ts)
+    if times.ndim != 1 or times.size < 2:
+        raise ValueError(
+            "`ts` must hold two or more times of one trajectory, got shape "
+            f"{times.shape}. Of a batch, animate one member."
+        )
+    if not (np.all(np.diff(times) > 0) or np.all(np.diff(times) < 0)):
+        raise ValueError("`ts` must increase from each time to the next, or decrease.")
+    return times
+
+
+def _positions(points: Any, count: int) -> dict[str, np.ndarray]:
+    if not isinstance(points, Mapping) or not points:
+        raise TypeError(
+            "`points` must be positions by name, such as those that the method "
+            f"`points` of a machine computes, got {type(points).__name__}."
+        )
+    moving = {name: np.asarray(x, float) for name, x in points.items()}
+    dimensions = {x.shape[-1] if x.ndim else 0 for x in moving.values()}
+    if dimensions not in ({2}, {3}) or not all(
+        x.ndim in (2, 3) and len(x) == count for x in moving.values()
+    ):
+        raise ValueError(
+            f"`points` must be arrays of shape ({count}, 2), ({count}, corners, 2), or "
+            "with 3 in place of 2, all of the plane or all of space, got shapes "
+            f"{ {name: x.shape for name, x in moving.items()} }."
+        )
+    for name, x in moving.items():
+        if not np.all(np.isfinite(x)):
+            raise ValueError(
+                f"`points[{name!r}]` holds numbers that are not finite. Where a run "
+                "has failed, animate the part before."
+            )
+    return moving
+
+
+def _check_point(argument: str, name: Any, moving: dict[str, np.ndarray]) -> None:
+    names = [name for name, x in moving.items() if x.ndim == 2]
+    if name not in names:
+        raise ValueError(
+            f"`{argument}` must name points, of which there are {', '.join(names)}, "
+            f"got {name!r}."
+        )
+
+
+def _frame_times(times: np.ndarray, spacing: float) -> np.ndarray:
+    """Times as far apart as frames are, from the first saved one on."""
+    duration = abs(times[-1] - times[0])
+    # What is shown last is at most half a frame from the last saved time.
+    shown = spacing * np.arange(round(duration / spacing) + 1)
+    return times[0] + np.sign(times[-1] - times[0]) * np.minimum(shown, duration)
+
+
+def _at(shown: np.ndarray, times: np.ndarray, positions: np.ndarray) -> np.ndarray:
+    # NumPy interpolates where abscissas increase.
+    forwards = 1 if times[-1] > times[0] else -1
+    columns = positions.reshape(len(times), -1).T
+    values = [np.interp(forwards * shown, forwards * times, x) for x in columns]
+    return np.stack(values, axis=1).reshape(len(shown), *positions.shape[1:])
+
+
+def _window(
+    frames: dict[str, np.ndarray], follow: str | None
+) -> tuple[np.ndarray, float]:
+    """The middle of the picture in each frame, and half its size."""
+    everything = np.concatenate(
+        [x.reshape(len(x), -1, x.shape[-1]) for x in frames.values()], axis=1
+    )
+    if follow is None:
+        low, high = (f(everything, axis=(0, 1)) for f in (np.min, np.max))
+        centres = np.broadcast_to((low + high) / 2, (len(everything), low.size))
+    else:
+        centres = frames[follow]
+    reach = np.max(np.abs(everything - centres[:, None]))
+    # A machine that is a single point at rest has no size.
+    return centres, 1.05 * float(reach) or 1.0
+
+
+def _look_at(ax: "Axes", centre: np.ndarray, reach: float) -> None:
+    for axis, middle in zip("xyz", centre, strict=False):
+        getattr(ax, f"set_{axis}lim")(middle - reach, middle + reach)
+
+
+def _nothing(spatial: bool) -> list[list[float]]:
+    return [[]] * (3 if spatial else 2)
