@@ -139,9 +139,9 @@ GROUPS = (
     ),
     Group(
         "Plots",
-        "Figures of matplotlib. Every function draws into `ax`, or into a new figure, "
-        "and returns the axes.",
-        ("trajectory", "energy", "multiplier", "constraint", "convergence"),
+        "Figures and animations of matplotlib. Every function draws into `ax`, or into a new "
+        "figure, and returns the axes or the animation.",
+        ("trajectory", "animate", "energy", "multiplier", "constraint", "convergence"),
         "nhjax.plot",
     ),
     Group(
