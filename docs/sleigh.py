@@ -1,4 +1,4 @@
-"""Draws the picture of README: `python docs/sleigh.py` writes docs/sleigh.png."""
+"""Draws a picture of the first page: `python docs/sleigh.py` writes docs/sleigh.png."""
 
 from pathlib import Path
 

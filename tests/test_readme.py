@@ -31,6 +31,7 @@ def test_python_blocks_run_as_printed(tmp_path, monkeypatch):
     assert namespace["sol"].ys.q.shape == (1001, 3)
     assert namespace["sol"].stats["max_constraint_violation"] < 1e-13
     assert namespace["energies"].shape == (100,)
+    assert namespace["slope"] > 0
     assert (tmp_path / "energy.png").stat().st_size > 0
 
 

@@ -139,8 +139,8 @@ GROUPS = (
     ),
     Group(
         "Plots",
-        "Figures and animations of matplotlib. Every function draws into `ax`, or into a new "
-        "figure, and returns the axes or the animation.",
+        "Figures and animations of matplotlib. Every function draws into `ax`, or into "
+        "a new figure, and returns the axes or the animation.",
         ("trajectory", "animate", "energy", "multiplier", "constraint", "convergence"),
         "nhjax.plot",
     ),
