@@ -1,23 +1,17 @@
 """The page about writing one's own parts: its blocks run as printed, and are right."""
 
 import re
-from pathlib import Path
 from typing import Any
 
 import pytest
 
 import nhjax
-from oracles.pages import blocks
-
-
-PAGE = Path(__file__).parents[1] / "docs" / "extending.md"
+from oracles.pages import blocks, page
 
 
 def _sections():
     """The blocks of each section, after those that all of them begin with."""
-    opening, *sections = re.split(
-        r"^## (.+)$", PAGE.read_text(encoding="utf-8"), flags=re.MULTILINE
-    )
+    opening, *sections = re.split(r"^## (.+)$", page("extending"), flags=re.MULTILINE)
     titles, texts = sections[::2], sections[1::2]
     return blocks(opening), dict(zip(titles, map(blocks, texts), strict=True))
 
@@ -28,7 +22,7 @@ OPENING, SECTIONS = _sections()
 def _run(title):
     namespace: dict[str, Any] = {"__name__": f"extending.{title}"}
     for block in (*OPENING, *SECTIONS[title]):
-        exec(compile(block, f"{PAGE.name}: {title}", "exec"), namespace)
+        exec(compile(block, f"extending.md: {title}", "exec"), namespace)
     return namespace
 
 

@@ -5,10 +5,7 @@ from pathlib import Path
 import matplotlib
 import pytest
 
-from oracles.pages import blocks
-
-
-DOCS = Path(__file__).parents[1] / "docs"
+from oracles.pages import blocks, DOCS, page, run_page
 
 
 @pytest.fixture(autouse=True)
@@ -22,7 +19,7 @@ def _closed_figures():
 
 PAGES = (
     *("index", "start", "constraints", "lie_groups", "theory", "gallery"),
-    *("systems", "derivatives", "engines", "performance"),
+    *("systems", "events", "derivatives", "engines", "performance"),
 )
 # Its one block compiles the bicycle for eight seconds; what it calls is tested with
 # smaller systems in tests/analysis.
@@ -32,16 +29,13 @@ TOO_LONG = ("machines",)
 @pytest.mark.parametrize("name", PAGES)
 def test_blocks_run_as_printed(name, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    namespace = {}
-    for block in blocks((DOCS / f"{name}.md").read_text(encoding="utf-8")):
-        exec(compile(block, f"{name}.md", "exec"), namespace)
+    run_page(name)
 
 
 def test_every_page_with_code_is_run_by_a_test():
     tests = "".join(
         path.read_text(encoding="utf-8") for path in Path(__file__).parent.rglob("*.py")
     )
-    for path in DOCS.glob("*.md"):
-        if blocks(path.read_text(encoding="utf-8")):
-            known = (*PAGES, *TOO_LONG)
-            assert path.stem in known or f'"{path.name}"' in tests, path.name
+    for name in (path.stem for path in DOCS.glob("*.md")):
+        if blocks(page(name)) and name not in (*PAGES, *TOO_LONG):
+            assert f'page("{name}")' in tests, name

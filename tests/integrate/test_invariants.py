@@ -1,7 +1,6 @@
 """Runs that keep the energy, or functions that a user gives."""
 
 from functools import cache
-from pathlib import Path
 from typing import Any
 
 import jax
@@ -17,7 +16,7 @@ from nhjax import LobattoIIIAB, SaveAt, systems
 from oracles import paper_equations as paper, paper_mechanics as mechanics
 from oracles.helpers import central_difference, scalar
 from oracles.orders import assert_order, rms, SCIPY_FLOOR, trajectories
-from oracles.pages import blocks
+from oracles.pages import run_page
 
 
 CHAOTIC, CVT = systems.ChaoticSystem(), systems.ContinuouslyVariableTransmission.low()
@@ -446,9 +445,5 @@ def test_next_to_a_saddle_the_error_stays_below_the_root_of_round_off():
 
 
 def test_the_page_runs_as_printed():
-    page = Path(__file__).parents[2] / "docs" / "invariants.md"
-    namespace: dict[str, Any] = {}
-    for block in blocks(page.read_text(encoding="utf-8")):
-        exec(compile(block, page.name, "exec"), namespace)
-    found = namespace["sol"].ys
+    found = run_page("invariants")["sol"].ys
     np.testing.assert_allclose(found, found[0], rtol=0, atol=1e-15)

@@ -1,19 +1,12 @@
 """The page about SymPy keeps its word: its code runs as printed."""
 
-from pathlib import Path
-
 import numpy as np
 
-from oracles.pages import blocks
-
-
-PAGE = Path(__file__).parents[2] / "docs" / "sympy.md"
+from oracles.pages import run_page
 
 
 def test_the_code_of_the_page_runs():
-    namespace = {}
-    for block in blocks(PAGE.read_text(encoding="utf-8")):
-        exec(compile(block, PAGE.name, "exec"), namespace)
+    namespace = run_page("sympy")
     sol, model = namespace["sol"], namespace["model"]
     assert sol.coordinates == ("x", "y", "θ")
     assert float(sol.stats["max_constraint_violation"]) < 1e-13
