@@ -9,11 +9,11 @@ import pytest
 
 import nhjax
 from nhjax._results import result_codes
-from oracles.pages import blocks
+from oracles.pages import page, run_page
 
 
 ROOT = Path(__file__).parents[1]
-PAGE = (ROOT / "docs" / "troubleshooting.md").read_text(encoding="utf-8")
+PAGE = page("troubleshooting")
 
 
 def _section(title):
@@ -58,8 +58,5 @@ def test_quoted_messages_are_those_of_the_package():
 
 
 def test_the_code_runs():
-    namespace = {}
-    for block in blocks(PAGE):
-        exec(compile(block, "troubleshooting.md", "exec"), namespace)
-    (failure,) = namespace["sol"].failures()
+    (failure,) = run_page("troubleshooting")["sol"].failures()
     assert failure[0] == 1
