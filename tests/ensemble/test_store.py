@@ -29,6 +29,15 @@ def run(x):
     return {"powers": x ** jnp.arange(3.0), "is_large": x > 1.0}
 
 
+def failing(x):
+    """Something quick that fails for some members."""
+    codes = nhjax.RESULTS.nonfinite_state, nhjax.RESULTS.successful
+    return {
+        "powers": x ** jnp.arange(3.0),
+        "result": nhjax.RESULTS.where(x > 1, *codes),
+    }
+
+
 def call(out, function=run, count=COUNT, **options):
     members = np.linspace(0.5, 1.5, count)
     chosen: dict[str, Any] = {"chunk_size": CHUNK} | options
@@ -354,8 +363,9 @@ def test_units_without_a_store_are_refused():
 
 def test_statistics_go_on_where_they_were_interrupted(tmp_path, monkeypatch):
     reduce = {"mean": nhjax.Mean(), "variance": nhjax.Variance()}
-    options: dict[str, Any] = {"members": starts(), "chunk_size": 2, "reduce": reduce}
-    whole = nhjax.ensemble(start, **options)
+    members = np.linspace(0.5, 1.5, 10)
+    options: dict[str, Any] = {"members": members, "chunk_size": 2, "reduce": reduce}
+    whole = nhjax.ensemble(failing, **options)
     replace, folder, left = os.replace, tmp_path / "s", [0]
 
     def interrupted(*args):
@@ -369,31 +379,35 @@ def test_statistics_go_on_where_they_were_interrupted(tmp_path, monkeypatch):
     for operations in (1, 2, 3, 2, 2):
         left[0] = operations
         with pytest.raises(Killed):
-            nhjax.ensemble(start, out=folder, **options)
+            nhjax.ensemble(failing, out=folder, **options)
     # The rest is run, and then nothing is.
     for _ in range(2):
-        again = nhjax.ensemble(start, out=folder, **options)
+        again = nhjax.ensemble(failing, out=folder, **options)
         assert again.failures() == whole.failures() != []
         assert content_of(again.statistics) == content_of(whole.statistics)
     for name, value, message in (
         ("reduce", nhjax.Minimum(), "`reduce`, .*Mean.* before and .*Minimum"),
-        ("reduce", reduce | {"mean": nhjax.Mean(of=lambda sol: sol.ts)}, "`reduce`, "),
+        (
+            "reduce",
+            reduce | {"mean": nhjax.Mean(of=lambda it: it["powers"])},
+            "`reduce`, ",
+        ),
         ("chunk_size", 4, "`chunk_size`, 2 before and 4 now"),
     ):
         other: dict[str, Any] = options | {name: value}
         with pytest.raises(ValueError, match=message):
-            nhjax.ensemble(start, **other, out=folder)
+            nhjax.ensemble(failing, **other, out=folder)
     fcntl = pytest.importorskip("fcntl")
     with open(folder / "lock") as locked:
         fcntl.flock(locked, fcntl.LOCK_EX)
         with pytest.raises(RuntimeError, match="written by another process"):
-            nhjax.ensemble(start, out=folder, **options)
+            nhjax.ensemble(failing, out=folder, **options)
     (folder / "state.npz").write_bytes(b"PK")
     with pytest.raises(ValueError, match="is damaged"):
-        nhjax.ensemble(start, out=folder, **options)
+        nhjax.ensemble(failing, out=folder, **options)
     (folder / "manifest.json").unlink()
     with pytest.raises(ValueError, match=r"has no 'manifest\.json'"):
-        nhjax.ensemble(start, out=folder, **options)
+        nhjax.ensemble(failing, out=folder, **options)
 
 
 def content_of(tree):
