@@ -8,13 +8,13 @@ import jax
 import numpy as np
 
 from ._failed import Failed
-from ._manifest import call_of
+from ._manifest import call_of, program, values_manifest
 from ._outcome import EnsembleOutcome
 from ._program import Chunk
 from ._sinks import AbstractSink, Work
 
 
-# Processes send each other so many bytes at a time.
+# So many bytes come from all processes at a time.
 _BLOCK = 2**24
 
 
@@ -24,7 +24,7 @@ class Collected(AbstractSink):
     def __init__(self, work: Work):
         self.work, self.failed = work, Failed()
         if work.processes.count > 1:
-            work.processes.agree(call_of(work))
+            work.processes.agree(call_of(values_manifest(work), program(work)))
         count = work.members.count
         self.whole = jax.tree.map(
             lambda x: np.empty((count, *x.shape), x.dtype), work.structure
@@ -65,10 +65,10 @@ class Collected(AbstractSink):
             min(work.share(i).stop * work.size, work.members.count) * width
             for i in range(-1, processes.count)
         ]
-        longest = max(np.diff(ends))
-        for moved in range(0, longest, _BLOCK):
+        longest, block = max(np.diff(ends)), -(-_BLOCK // processes.count)
+        for moved in range(0, longest, block):
             places = [
-                slice(start + moved, min(start + moved + _BLOCK, stop))
+                slice(start + moved, min(start + moved + block, stop))
                 for start, stop in itertools.pairwise(ends)
             ]
             own = content[places[processes.index]].tobytes()

@@ -15,7 +15,6 @@ from ._manifest import (
     call_of,
     check_resumable,
     check_same_run,
-    digest,
     program,
     statistics_manifest,
 )
@@ -44,9 +43,7 @@ class Kept(Reduced):
         self.lock = Lock()
         self.manifest = statistics_manifest(work, reductions)
         self.program = program(work, reductions)
-        work.processes.agree(
-            call_of(work, run=digest(self.program), reduce=self.manifest["reduce"])
-        )
+        work.processes.agree(call_of(self.manifest, self.program, out=True))
         content = b""
         try:
             if work.processes.index == 0:
@@ -59,8 +56,9 @@ class Kept(Reduced):
             self.close()
             raise
         self.first = int(np.frombuffer(content, np.int64, 1)[0])
-        state, self.failed = self._unpacked(content[8:])
-        self.state = self._placed(state)
+        if self.first:
+            state, self.failed = self._unpacked(content[8:])
+            self.state = self._placed(state)
 
     def _begin(self, resume: bool) -> None:
         """Make or open the folder, and read the state in it."""

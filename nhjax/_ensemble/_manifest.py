@@ -52,10 +52,22 @@ def _common(work: Work) -> dict[str, Any]:
     }
 
 
-def call_of(work: Work, **others: Any) -> dict[str, Any]:
-    """Describe what processes must have in common that run an ensemble together."""
+def values_manifest(work: Work) -> dict[str, Any]:
+    """Describe the parameters of a run whose values are kept in memory."""
     leaves = jax.tree.leaves(work.structure)
-    return _common(work) | {"values": [f"{x.dtype}{x.shape}" for x in leaves]} | others
+    return _common(work) | {"values": [f"{x.dtype}{x.shape}" for x in leaves]}
+
+
+def call_of(
+    made: dict[str, Any], text: str, out: bool = False, **others: Any
+) -> dict[str, Any]:
+    """Describe what processes must have in common that run an ensemble together.
+
+    It is a manifest, a digest of what `program` writes, whether there is an `out`, and
+    what else is given.
+    """
+    run = hashlib.sha256(text.encode()).hexdigest()
+    return {"out": out, "reduce": None} | made | {"run": run} | others
 
 
 def program(work: Work, reductions: Any = ()) -> str:
@@ -118,11 +130,6 @@ def check_resumable(
                 f"{where} has no {name!r}: it was not made by `{maker}`, or is "
                 "damaged. Name another folder, or put the file back."
             )
-
-
-def digest(text: str) -> str:
-    """Compute a checksum of a text."""
-    return hashlib.sha256(text.encode()).hexdigest()
 
 
 def check_shared(lock: Path, token: str, processes: Processes) -> None:

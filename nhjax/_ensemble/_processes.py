@@ -2,6 +2,7 @@
 
 import json
 import time
+from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from typing import Any
@@ -29,6 +30,8 @@ class Processes:
 
     def __init__(self):
         self.index, self.count = jax.process_index(), jax.process_count()
+        if self.count > 1:
+            check_devices([device.process_index for device in jax.devices()])
         self._is_over = False
 
     @contextmanager
@@ -73,11 +76,13 @@ class Processes:
     def agree(self, call: dict[str, Any]) -> None:
         """Raise if `call`, which says in terms of JSON what is run, differs anywhere.
 
+        It does so in all processes alike.
+
         **Raises:** `ValueError` with the names of what differs.
         """
         calls = [json.loads(x) for x in self.exchange(json.dumps(call).encode())]
         for index, other in enumerate(calls):
-            for name in call:
+            for name in calls[0] | other:
                 if other.get(name) != calls[0].get(name):
                     raise ValueError(
                         "All processes must call `nhjax.ensemble` alike, but process "
@@ -106,6 +111,17 @@ class Processes:
             (bool(failed), bytes(rows[i][:length]))
             for i, (failed, length) in enumerate(heads)
         ]
+
+
+def check_devices(owners: list[int]) -> None:
+    """Raise, in all processes alike, unless each owns as many devices as any other."""
+    numbers = Counter(owners)
+    if len(set(numbers.values())) > 1:
+        listed = ", ".join(f"process {i} has {numbers[i]}" for i in sorted(numbers))
+        raise ValueError(
+            "JAX lets processes meet that have as many devices each, but "
+            f"{listed}: start them with equal numbers."
+        )
 
 
 class Pace:

@@ -1,14 +1,17 @@
 """The statistics of an ensemble, collected on the way."""
 
+import json
+import math
 from collections.abc import Iterable
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from .._errors import IntegrationError
 from ._failed import Failed
-from ._manifest import call_of, without_addresses
+from ._manifest import call_of, program, statistics_manifest
 from ._outcome import EnsembleOutcome
 from ._program import (
     Chunk,
@@ -42,11 +45,9 @@ class Reduced(AbstractSink):
         """Raise if processes collect other statistics."""
         work = self.work
         if work.processes.count > 1:
-            call = call_of(
-                work,
-                reduce=without_addresses(repr(self.reductions)),
-                fixed_order=self.in_rounds,
-            )
+            made = statistics_manifest(work, self.reductions)
+            text = program(work, self.reductions)
+            call = call_of(made, text, fixed_order=self.in_rounds)
             work.processes.agree(call)
 
     def todo(self) -> Iterable[int]:
@@ -124,19 +125,22 @@ class Reduced(AbstractSink):
         return jax.device_put(state, self.work.layout.devices[0])
 
     def _packed(self, state: Any, failed: Failed) -> bytes:
-        leaves = [np.asarray(x).tobytes() for x in jax.tree.leaves(state)]
-        return b"".join([*leaves, failed.to_bytes()])
+        # With their dtypes, which need not be those of the state of no members.
+        leaves = [np.asarray(x) for x in jax.tree.leaves(state)]
+        kinds = json.dumps([[x.dtype.name, x.shape] for x in leaves]).encode()
+        head = np.int64(len(kinds)).tobytes() + kinds
+        return b"".join([head, *[x.tobytes() for x in leaves], failed.to_bytes()])
 
     def _unpacked(self, data: bytes) -> tuple[Any, Failed]:
-        leaves, structure = jax.tree.flatten(self.neutral)
-        made, at = [], 0
-        for x in leaves:
-            found = np.frombuffer(data, x.dtype, x.size, at)
-            made.append(found.reshape(x.shape))
+        at = 8 + int(np.frombuffer(data, np.int64, 1)[0])
+        made = []
+        for name, shape in json.loads(data[8:at]):
+            found = np.frombuffer(data, jnp.dtype(name), math.prod(shape), at)
+            made.append(found.reshape(shape))
             at += found.nbytes
         failed = Failed()
         failed.add_bytes(data[at:])
-        return jax.tree.unflatten(structure, made), failed
+        return jax.tree.unflatten(jax.tree.structure(self.neutral), made), failed
 
 
 def check_reductions(reductions: Any) -> None:

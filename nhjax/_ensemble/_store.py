@@ -18,7 +18,6 @@ from ._manifest import (
     check_resumable,
     check_same_run,
     check_shared,
-    digest,
     manifest,
     program,
 )
@@ -50,14 +49,18 @@ class Stored(AbstractSink):
         units: Mapping[str, str],
         resume: bool,
     ):
-        self.work, self.given, self.path = work, path, Path(path).resolve()
+        self.work, self.given, self.path = work, path, Path(path).absolute()
+        # The others do not look for it before it is there: NFS would go on to tell
+        # them for up to a minute that it is not.
+        if work.processes.index == 0:
+            self.path = self.path.resolve()
         self.where = f"The store {str(self.path)!r}"
         self.variables = variables_of(work)
         self.attributes = attributes_of(work.structure, self.variables, units)
         self.files, self.lock = Files(), Lock()
         self.manifest = manifest(work, self.variables)
         self.program = program(work)
-        call = call_of(work, run=digest(self.program), units=dict(units))
+        call = call_of(self.manifest, self.program, out=True, units=dict(units))
         work.processes.agree(call)
         self._open(self.variables)
         self.journal = Journal(self.path / "manifest", work.processes.index)

@@ -1,6 +1,7 @@
 """Two processes of JAX run an ensemble together, as one does."""
 
 import ast
+import json
 import os
 import shutil
 import signal
@@ -145,14 +146,34 @@ def test_both_and_one_alone_go_on_to_the_same_bytes(said, folder, whole, monkeyp
     for name in ("killed", "bad"):
         assert content(folder / name) == whole
     one, other = [spoken(out) for out, _ in found]
-    assert one[0] == other[0]
+    assert one[:3] == other[:3]
     assert "process 0 and process 1 differ in `chunk_size`: 4 and 5" in one[0]
-    assert one[1].startswith("RuntimeError Process 1 of 2 has failed, and so this one")
-    assert other[1].startswith("ValueError Process 1 does not see the store")
-    assert "ends: OSError: [Errno 28] No space left" in one[2]
-    assert other[2].startswith("OSError [Errno 28] No space left")
+    assert "differ in `fixed_order`: False and True" in one[1]
+    assert "differ in `run`" in one[2]
+    assert one[3].startswith("RuntimeError Process 1 of 2 has failed, and so this one")
+    assert other[3].startswith("ValueError Process 1 does not see the store")
+    assert "ends: OSError: [Errno 28] No space left" in one[4]
+    assert other[4].startswith("OSError [Errno 28] No space left")
     alone = processes.statistics(fixed_order=True).statistics
-    assert one[3] == other[3] == processes.bits(alone)
+    assert one[5] == other[5] == processes.bits(alone)
+
+
+def test_what_only_one_process_is_given_is_refused_in_all():
+    calls = {"out": False}, {"out": False, "reduce": "Mean()"}
+
+    class Told(_processes.Processes):
+        def exchange(self, data=b""):
+            return [json.dumps(call).encode() for call in calls]
+
+    for call in calls:
+        with pytest.raises(ValueError, match=r"differ in `reduce`: None and Mean\(\)"):
+            Told().agree(call)
+
+
+def test_processes_with_other_numbers_of_devices_are_named():
+    _processes.check_devices([0, 1, 1, 0])
+    with pytest.raises(ValueError, match="process 0 has 2, process 1 has 1"):
+        _processes.check_devices([0, 0, 1])
 
 
 def test_processes_of_unequal_shares_meet_as_often(monkeypatch):

@@ -6,14 +6,17 @@ What processes say of it goes to standard output.
 import errno
 import os
 import sys
+from functools import partial
 from pathlib import Path
 from typing import Any
+from unittest import mock
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 import nhjax
+from nhjax._ensemble import _collected
 
 
 CHUNKS, CHUNK = 200, 4
@@ -47,7 +50,31 @@ class Digits(nhjax.AbstractReduction):
         return int(state[0])
 
 
-REDUCTIONS = {"mean": nhjax.Mean(), "variance": nhjax.Variance()}
+class Total(nhjax.AbstractReduction):
+    """A sum whose dtype is only known from the first members."""
+
+    def init(self, value):
+        """Nothing, as an integer that is short."""
+        return jnp.zeros((), jnp.int8)
+
+    def update(self, state, values, counts):
+        """Add the members of a chunk."""
+        return self.merge(state, jnp.sum(jnp.where(counts, values[0][:, 1], 0.0)))
+
+    def merge(self, one, other):
+        """Add sums."""
+        return one.astype(float) + other
+
+    def finish(self, state):
+        """Return the sum."""
+        return state
+
+
+REDUCTIONS = {
+    "mean": nhjax.Mean(),
+    "total": Total(),
+    "variance": nhjax.Variance(),
+}
 
 
 def judged(x):
@@ -99,6 +126,9 @@ def bits(tree: Any) -> str:
 def summary(folder: Path) -> dict[str, Any]:
     """What must be the same in both processes, and in one that is alone."""
     kept = statistics(folder / "kept")
+    # In blocks that do not end with those of a process.
+    with mock.patch.object(_collected, "_BLOCK", 80):
+        values = nhjax.ensemble(judged, MEMBERS, chunk_size=2).values
     assert kept.failures() == statistics().failures()
     return {
         "failures": kept.failures(),
@@ -107,7 +137,7 @@ def summary(folder: Path) -> dict[str, Any]:
         "again": bits(statistics(folder / "kept").statistics),
         "digits": digits(),
         "rounds": digits(fixed_order=True),
-        "values": bits(nhjax.ensemble(judged, MEMBERS, chunk_size=2).values),
+        "values": bits(values),
     }
 
 
@@ -127,13 +157,15 @@ def together(index: int, folder: Path) -> None:
 def again(index: int, folder: Path) -> None:
     """Calls that are not alike, an error of one process, and the rest of stores."""
 
-    def refused(*args, **options):
+    def refused(*args, call=stored, **options):
         try:
-            stored(*args, **options)
+            call(*args, **options)
         except (ValueError, RuntimeError, OSError) as error:
             print(type(error).__name__, error)
 
     refused(folder / "new", chunk_size=4 + index)
+    refused(call=digits, fixed_order=index == 1)
+    refused(lambda i: i + index, num_members=3, call=partial(nhjax.ensemble, power))
     refused(folder / f"new-{index}")
     meter = Failing() if index == 1 else nhjax.NoProgressMeter()
     refused(folder / "bad", progress_meter=meter)
