@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 from pathlib import Path
 from typing import Any
 
@@ -78,6 +79,10 @@ class Kept(Reduced):
             self._resume()
 
     def _resume(self) -> None:
+        for path in self.path.glob(".*"):
+            # What a kill in the midst of `save` has left.
+            if re.fullmatch("[.][0-9a-f]{32}", path.name):
+                path.unlink()
         try:
             old = json.loads((self.path / _MANIFEST).read_text())
         except ValueError as error:

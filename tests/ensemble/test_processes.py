@@ -136,6 +136,8 @@ def test_both_and_one_alone_go_on_to_the_same_bytes(said, folder, whole, monkeyp
     with pytest.raises(OSError, match="No space"):
         processes.statistics(folder / "begun", progress_meter=processes.Failing())
     assert int(nhjax.load(folder / "begun" / "state.npz")["chunks"]) == 1
+    left = folder / "begun" / f".{'0' * 32}"
+    left.touch()
     assert 20 < lines(folder / "killed", 1) < processes.CHUNKS // 2
     shutil.copytree(folder / "killed", folder / "alone")
     processes.stored(folder / "alone")
@@ -156,6 +158,7 @@ def test_both_and_one_alone_go_on_to_the_same_bytes(said, folder, whole, monkeyp
     assert other[4].startswith("OSError [Errno 28] No space left")
     alone = processes.statistics(fixed_order=True).statistics
     assert one[5] == other[5] == processes.bits(alone)
+    assert not left.exists()
 
 
 def test_what_only_one_process_is_given_is_refused_in_all():
