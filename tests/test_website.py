@@ -6,7 +6,7 @@ import tomllib
 import pytest
 
 from docs import gallery
-from docs.website import api, groups, links, pages
+from docs.website import api, groups, links, notebooks, pages
 
 
 PAGES = {
@@ -65,12 +65,32 @@ def test_links_lead_to_the_places_of_the_site():
     assert moved == "[a](a.md)"
 
 
+def test_a_notebook_that_was_run_shows_what_it_printed_and_drew():
+    outputs = [
+        {"output_type": "stream", "name": "stdout", "text": ["one\n"]},
+        {"output_type": "stream", "name": "stderr", "text": "a warning"},
+        {"output_type": "stream", "name": "stdout", "text": "two\n"},
+        {"output_type": "display_data", "data": {"image/png": "AAEC"}},
+    ]
+    notebook = {
+        "cells": [
+            {"cell_type": "markdown", "source": ["# Title"]},
+            {"cell_type": "code", "source": "f()", "outputs": outputs},
+        ]
+    }
+    text, pictures = notebooks.page(notebook, "notebooks/n.ipynb")
+    assert pictures == {"n-1.png": b"\x00\x01\x02"}
+    assert text.startswith("# Title\n\n*The notebook is `notebooks/n.ipynb`")
+    assert "```python\nf()\n```\n\n![Picture 1](n-1.png)" in text
+    assert text.endswith("```text\none\ntwo\n```\n")
+
+
 def test_every_page_is_in_the_navigation():
     settings = pages.ROOT / "docs" / "website" / "zensical.toml"
     nav = tomllib.loads(settings.read_text(encoding="utf-8"))["project"]["nav"]
     written = str(nav)
     for source, place in pages.sources().items():
-        if source in PAGES and not place.startswith("results/"):
+        if place.endswith(".md") and not place.startswith("results/"):
             assert f"'{place}'" in written, source
 
 

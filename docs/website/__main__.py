@@ -2,6 +2,8 @@
 
 python -m docs.website build    writes build/website/site
 python -m docs.website serve    shows it at http://localhost:8000
+
+With --run-notebooks the pages of notebooks have the outputs of runs at full size.
 """
 
 import argparse
@@ -16,7 +18,7 @@ import tomllib
 from pathlib import Path, PurePosixPath
 from typing import Any
 
-from docs.website import api, links, pages
+from docs.website import api, links, notebooks, pages
 
 
 HERE = Path(__file__).parent
@@ -28,8 +30,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("command", choices=("build", "serve"))
     parser.add_argument("--port", type=int, default=8000)
+    parser.add_argument("--run-notebooks", action="store_true")
     options = parser.parse_args()
-    complaints = build()
+    complaints = build(options.run_notebooks)
     for complaint in complaints:
         print(complaint, file=sys.stderr)
     if complaints:
@@ -40,13 +43,13 @@ def main() -> None:
         serve(site, options.port)
 
 
-def build() -> list[str]:
+def build(run_notebooks: bool = False) -> list[str]:
     """Write pages and settings, run the generator, and say what is wrong."""
     complaints = api.misplaced()
     if complaints:
         return complaints
     folder = BUILD / "pages"
-    pages.write(folder)
+    pages.write(folder, notebook=notebooks.run if run_notebooks else notebooks.read)
     for place, text in api.pages().items():
         (folder / place).parent.mkdir(parents=True, exist_ok=True)
         (folder / place).write_text(text, encoding="utf-8")
@@ -72,7 +75,6 @@ def settings() -> dict[str, Any]:
     parts = {
         "API": api.navigation(),
         "Benchmarks": _pages_in("results"),
-        "Notebooks": _pages_in("notebooks"),
     }
     project["nav"] = _filled(project["nav"], parts)
     extension = {"names": api.links() | pages.titles()}

@@ -4,7 +4,6 @@
 the repository join them, so that a link to one of these leads to a page.
 """
 
-import json
 import os
 import re
 import shutil
@@ -12,6 +11,8 @@ import unicodedata
 from collections.abc import Callable
 from pathlib import Path, PurePosixPath
 from typing import Any
+
+from docs.website import notebooks
 
 
 ROOT = Path(__file__).parents[2]
@@ -41,8 +42,13 @@ def sources(root: Path = ROOT) -> dict[str, str]:
     return found
 
 
-def write(folder: Path, root: Path = ROOT) -> None:
-    """Write all pages but those of the API, and copy pictures, into a fresh folder."""
+def write(
+    folder: Path, root: Path = ROOT, *, notebook: Callable[[Path], Any] = notebooks.read
+) -> None:
+    """Write all pages but those of the API, and copy pictures, into a fresh folder.
+
+    `notebook` reads a notebook from its path: as it is, without outputs, or run.
+    """
     shutil.rmtree(folder, ignore_errors=True)
     places = sources(root)
     for source, place in places.items():
@@ -51,9 +57,12 @@ def write(folder: Path, root: Path = ROOT) -> None:
         if target.suffix != ".md":
             shutil.copyfile(root / source, target)
             continue
-        text = (root / source).read_text(encoding="utf-8")
         if source.endswith(".ipynb"):
-            text = notebook_page(json.loads(text), source)
+            text, pictures = notebooks.page(notebook(root / source), source)
+            for name, picture in pictures.items():
+                (target.parent / name).write_bytes(picture)
+        else:
+            text = (root / source).read_text(encoding="utf-8")
         target.write_text(moved(text, source, places), encoding="utf-8")
 
 
@@ -147,20 +156,3 @@ def titles(root: Path = ROOT) -> dict[str, str]:
         title = path.read_text(encoding="utf-8").split("\n", 1)[0]
         found[f"docs/{path.name}"] = slug(title.removeprefix("# "))
     return found
-
-
-def notebook_page(notebook: dict[str, Any], source: str) -> str:
-    """The text and the code of a notebook as a page, with what output it holds."""
-    parts = []
-    for cell in notebook["cells"]:
-        text = "".join(cell["source"])
-        parts.append(
-            text if cell["cell_type"] == "markdown" else f"```python\n{text}\n```"
-        )
-        for output in cell.get("outputs", []):
-            shown = output.get("text") or output.get("data", {}).get("text/plain")
-            if shown:
-                parts.append(f"```text\n{''.join(shown).rstrip()}\n```")
-    title, *others = parts
-    where = f"*The notebook is `{source}` in the repository.*"
-    return "\n\n".join([title, where, *others]) + "\n"
