@@ -179,7 +179,7 @@ def timed(members: int) -> list[float]:
     return found
 
 
-def speedup(rounds: int, members: int = 40_000) -> dict[str, Any]:
+def speedup(rounds: int, members: int = 200_000) -> dict[str, Any]:
     """Wall times of one and of two processes, in turn."""
     found: dict[str, list[list[float]]] = {"one": [], "two": []}
     for i in range(rounds):

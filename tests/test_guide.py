@@ -19,11 +19,8 @@ def _closed_figures():
 
 PAGES = (
     *("index", "start", "constraints", "lie_groups", "theory", "gallery"),
-    *("systems", "events", "derivatives", "engines", "performance"),
+    *("systems", "events", "derivatives", "engines", "performance", "machines"),
 )
-# Its one block compiles the bicycle for eight seconds; what it calls is tested with
-# smaller systems in tests/analysis.
-TOO_LONG = ("machines",)
 
 
 @pytest.mark.parametrize("name", PAGES)
@@ -37,5 +34,5 @@ def test_every_page_with_code_is_run_by_a_test():
         path.read_text(encoding="utf-8") for path in Path(__file__).parent.rglob("*.py")
     )
     for name in (path.stem for path in DOCS.glob("*.md")):
-        if blocks(page(name)) and name not in (*PAGES, *TOO_LONG):
+        if blocks(page(name)) and name not in PAGES:
             assert f'page("{name}")' in tests, name

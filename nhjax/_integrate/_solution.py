@@ -246,7 +246,7 @@ def _failure_message(
     where = "" if lane is None else f"lane {lane}, "
     others = f" ({len(failures) - 1} more lanes failed)" if failures[1:] else ""
     if dt is not None and "smaller `dt`" in reason:
-        reason += f" The present one is {dt:.6g}: try {0.5 * dt:.6g}."
+        reason += f" `dt` is {dt:.6g}: try {0.5 * dt:.6g}."
     return (
         f"Integration failed in {where}step {k}{others}: {reason} "
         "With `throw=False` the part before the failure is returned."

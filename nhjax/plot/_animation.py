@@ -38,8 +38,10 @@ def animate(
     - `points`: the saved positions by name: points of shape (times, 2) or (times, 3),
         outlines of bodies of shape (times, corners, 2) or (times, corners, 3). The
         machines of `nhjax.systems` have a method `points`, which
-        `SaveAt(fn=lambda t, y, args: machine.points(t, y.q))` saves.
-    - `rods`: chains of names of points that are connected by lines.
+        `SaveAt(fn=lambda t, y, args: machine.points(t, y.q))` saves; of a run that has
+        saved its states they are `jax.vmap(machine.points)(sol.ts, sol.ys.q)`.
+    - `rods`: chains of names of points that are connected by lines, such as
+        `[("hub", "end")]`.
     - `traced`: the names of points whose paths so far are drawn.
     - `follow`: the name of a point that the picture moves along with.
     - `speed`: the seconds of the motion that one second of the animation shows.
@@ -158,6 +160,7 @@ def _check_point(argument: str, name: Any, moving: dict[str, np.ndarray]) -> Non
         raise ValueError(
             f"`{argument}` must name points, of which there are {', '.join(names)}, "
             f"got {name!r}."
+            + (" It is a list of chains: [('a', 'b')]." if argument == "rods" else "")
         )
 
 

@@ -46,7 +46,8 @@ def trajectory(
 
     **Returns:** the axes.
 
-    **Raises:** `ValueError` if `sol` holds no states or `coordinates` do not fit it.
+    **Raises:** `ValueError` if `sol` holds no states, or a single one, or `coordinates`
+    do not fit it.
 
     !!! example
 
@@ -59,6 +60,11 @@ def trajectory(
     """
     _, ys = saved_states(sol)
     lead = np.asarray(ys.p).shape[:-1]
+    if lead[-1] < 2:
+        raise ValueError(
+            "The solution holds a single state of each trajectory, which is no path: "
+            "pass `saveat=nhjax.SaveAt(t0=True, steps=True)` to `integrate`."
+        )
     parts = [np.asarray(leaf).reshape(*lead, -1) for leaf in jax.tree.leaves(ys.q)]
     q = np.concatenate(parts, axis=-1)
     n = q.shape[-1]
