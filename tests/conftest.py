@@ -113,3 +113,14 @@ def engine(request, monkeypatch):
     jax.clear_caches()
     yield request.param
     jax.clear_caches()
+
+
+@pytest.fixture
+def closed_figures():
+    """Draw without a screen, and leave no figures open."""
+    import matplotlib
+    from matplotlib import pyplot as plt
+
+    matplotlib.use("Agg")
+    yield
+    plt.close("all")

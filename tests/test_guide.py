@@ -2,19 +2,9 @@
 
 from pathlib import Path
 
-import matplotlib
 import pytest
 
 from oracles.pages import blocks, DOCS, page, run_page
-
-
-@pytest.fixture(autouse=True)
-def _closed_figures():
-    from matplotlib import pyplot as plt
-
-    matplotlib.use("Agg")
-    yield
-    plt.close("all")
 
 
 PAGES = (
@@ -23,6 +13,7 @@ PAGES = (
 )
 
 
+@pytest.mark.usefixtures("closed_figures")
 @pytest.mark.parametrize("name", PAGES)
 def test_blocks_run_as_printed(name, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)

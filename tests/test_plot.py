@@ -5,7 +5,6 @@ import sys
 
 import jax
 import jax.numpy as jnp
-import matplotlib
 import numpy as np
 import pytest
 from matplotlib.figure import Figure
@@ -15,15 +14,7 @@ import nhjax
 from nhjax import plot
 
 
-matplotlib.use("Agg")
-
-
-@pytest.fixture(autouse=True)
-def _close_figures():
-    from matplotlib import pyplot as plt
-
-    yield
-    plt.close("all")
+pytestmark = pytest.mark.usefixtures("closed_figures")
 
 
 @pytest.fixture(scope="module")

@@ -3,7 +3,6 @@
 import re
 from pathlib import Path
 
-import matplotlib
 import pytest
 
 from oracles.pages import blocks
@@ -13,16 +12,7 @@ ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
 
 
-@pytest.fixture
-def _closed_figures():
-    from matplotlib import pyplot as plt
-
-    matplotlib.use("Agg")
-    yield
-    plt.close("all")
-
-
-@pytest.mark.usefixtures("_closed_figures")
+@pytest.mark.usefixtures("closed_figures")
 def test_python_blocks_run_as_printed(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     namespace = {}
