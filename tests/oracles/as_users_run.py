@@ -422,6 +422,15 @@ def stability_up_to_a_symmetry():
         symmetry=lambda q: jnp.stack([-q[1], q[0], 0 * q[2]]),
     )
     assert stability.basis.shape == (6, 3)
+    y0 = nhjax.initial_state(cone.system, cone.q0, 1.1 * cone.v0)
+    y, rates = nhjax.steady_motion(
+        cone.system,
+        0.0,
+        y0,
+        symmetry=lambda q: jnp.stack([-q[1], q[0], 0 * q[2]]),
+        held_positions=(2,),
+    )
+    close([*rates, y.q[2]], [-2.0, -cosine])
     frequency = (1 / cosine + 3 * cosine) ** 0.5
     close([*jnp.sort(stability.eigenvalues.imag)], [-frequency, 0.0, frequency])
 
