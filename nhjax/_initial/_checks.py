@@ -33,7 +33,7 @@ class Found(NamedTuple):
     - `regularity`, `compatibility`: the reciprocal condition numbers of the metric on
         the fibre and of the compatibility matrix.
     - `ranks`, `deficient`: the derivatives that must have full rank, and which lack it;
-        those of redundant constraints must not mix their two kinds.
+        redundant constraints must only have derivatives.
     - `allowed`, `allowed_positions`, `allowed_off_group`: the bounds on violations.
     - `legendre_solved`: whether the Legendre transform could be inverted.
     - `projected`: whether the projection onto the constraints has converged.
@@ -102,7 +102,6 @@ class _Case(NamedTuple):
     project: bool
     words: _Words
     group: str
-    is_redundant: bool
 
     @property
     def where(self) -> str:
@@ -138,8 +137,7 @@ def judged(
     singular = 10 * state.v.shape[0] * jnp.finfo(state.v.dtype).eps
     name, given = ("p", p) if v is None else ("v", v)
     words, group = _WORDS[system.generator], f"{system.manifold_of(q)}"
-    of_system = words, group, system.constraints == "redundant"
-    case = (_Case(found, q, name, given, project, *of_system),)
+    case = (_Case(found, q, name, given, project, words, group),)
     return [
         Check(found.off_group <= found.allowed_off_group, _group_error, case),
         # The negated "<=" lets NaN pass, which ">" would not: a matrix that is not
@@ -236,7 +234,6 @@ def _dependence_error(case: _Case, rank: Rank) -> DependentConstraintsError:
         case.found.positions.shape[0],
         case.words.constraint,
         f"q = {rank.q}, {case.given_name} = {case.given}",
-        case.is_redundant,
     )
 
 

@@ -9,8 +9,8 @@ from .._numerics import (
     conditioning,
     frozen,
     inverse,
+    is_without_entries,
     max_norm,
-    mixes_kinds,
     nan_unless,
     Rank,
     rank_of_gram,
@@ -162,8 +162,7 @@ def _solve(system, t, q, v, p, args, project: bool) -> Found:
         else those_that_count([*starts, here])
     )
     positions = system.position_constraint(t, q, args)
-    m = lin.violation.shape[0] - positions.shape[0]
-    deficient, compatibility = _ranks_judged(system, lin, ranks, m)
+    deficient, compatibility = _ranks_judged(system, lin, ranks)
     tolerance = jnp.asarray(1e3 * float(jnp.finfo(u.dtype).eps), u.dtype)
     return Found(
         state=state,
@@ -197,11 +196,12 @@ def _motion(
 
 
 def _ranks_judged(
-    system: AbstractMechanicalSystem, lin: Linearisation, ranks: list[Rank], m: int
+    system: AbstractMechanicalSystem, lin: Linearisation, ranks: list[Rank]
 ) -> tuple[list[BoolScalar], FloatScalar]:
     """Tell which derivatives of constraints are deficient, and how compatible C is.
 
-    Redundant constraints are compatible if C has the rank of their derivatives.
+    Redundant constraints lack a rank where one has no derivatives at all, and are
+    compatible if C has the rank of their derivatives.
     """
     jacobian, reaction, _ = lin.dense
     compliance = jacobian @ reaction
@@ -209,7 +209,7 @@ def _ranks_judged(
         return [rank.deficient for rank in ranks], conditioning(compliance)
     rank = rank_of_gram(jacobian @ jacobian.T)
     full = (rank_of_gram(compliance) == rank).astype(compliance.dtype)
-    return [rank.counts & mixes_kinds(rank.jacobian, m) for rank in ranks], full
+    return [rank.counts & is_without_entries(rank.jacobian) for rank in ranks], full
 
 
 def _inverse_legendre(

@@ -37,8 +37,8 @@ from ._iteration import (
 from ._least_norm import (
     conditioning_of_range as conditioning_of_range,
     least_norm_inverse as least_norm_inverse,
+    least_norm_inverse_in_turn as least_norm_inverse_in_turn,
     least_norm_solve as least_norm_solve,
-    mixes_kinds as mixes_kinds,
     NEARLY_DEPENDENT as NEARLY_DEPENDENT,
     rank_of_gram as rank_of_gram,
 )
@@ -57,6 +57,7 @@ from ._rank import (
     dependent_rows as dependent_rows,
     is_deficient as is_deficient,
     is_nearly_singular as is_nearly_singular,
+    is_without_entries as is_without_entries,
     Rank as Rank,
     those_that_count as those_that_count,
 )

@@ -1,9 +1,11 @@
 """Inverses and solutions of equations of which some follow from the others."""
 
+import jax
 import jax.numpy as jnp
+import jax.scipy.linalg
 from jaxtyping import Array, Float, Int
 
-from .._custom_types import BoolScalar, FloatScalar
+from .._custom_types import FloatScalar
 
 
 def _negligible(dtype: jnp.dtype) -> float:
@@ -23,9 +25,13 @@ NEARLY_DEPENDENT = 1e-4
 
 def _unit_diagonal(matrix: Float[Array, "l l"]) -> tuple[Array, Array]:
     """Scale rows and columns alike, so that the diagonal is one or zero."""
-    diagonal = jnp.abs(jnp.diagonal(matrix))
-    root = jnp.sqrt(jnp.where(diagonal > 0, diagonal, 1))
+    root = _roots(matrix)
     return matrix / root[:, None] / root[None, :], root
+
+
+def _roots(matrix: Float[Array, "l l"]) -> Float[Array, " l"]:
+    diagonal = jnp.abs(jnp.diagonal(matrix))
+    return jnp.sqrt(jnp.where(diagonal > 0, diagonal, 1))
 
 
 def least_norm_inverse(
@@ -45,6 +51,32 @@ def least_norm_inverse(
         negligible = _negligible(matrix.dtype)
     found = jnp.linalg.pinv(scaled, rtol=negligible, hermitian=True)
     return found / root[:, None] / root[None, :]
+
+
+def least_norm_inverse_in_turn(
+    matrix: Float[Array, "l l"], first: int
+) -> Float[Array, "l l"]:
+    """Compute a symmetric inverse of C that asks the last unknowns before the others.
+
+    As far as the `first` equations follow from the other ones, their unknowns are zero.
+    For the rest, each of the two parts of x has the least norm of `least_norm_inverse`.
+    Where equations of neither part follow from those of the other it is that inverse.
+    """
+    if first in (0, matrix.shape[0]):
+        return least_norm_inverse(matrix)
+    others = least_norm_inverse(matrix[first:, first:])
+    onto = matrix[:first, first:] @ others
+    # What follows from the other equations leaves round-off here: it is compared with a
+    # one, the size of the diagonal before.
+    left = matrix[:first, :first] - onto @ matrix[first:, :first]
+    root = _roots(matrix[:first, :first])
+    scaled = jax.scipy.linalg.block_diag(
+        left / root[:, None] / root[None, :], jnp.ones((1, 1), matrix.dtype)
+    )
+    found = jnp.linalg.pinv(scaled, rtol=_negligible(matrix.dtype), hermitian=True)
+    found = found[:first, :first] / root[:, None] / root[None, :]
+    coupled = found @ onto
+    return jnp.block([[found, -coupled], [-coupled.T, others + onto.T @ coupled]])
 
 
 def rank_of_gram(matrix: Float[Array, "l l"]) -> Int[Array, ""]:
@@ -83,13 +115,3 @@ def least_norm_solve(matrix: Float[Array, "l l"], b: Array) -> Array:
     scaled = matrix / rows / columns
     found = jnp.linalg.pinv(scaled, rtol=NEARLY_DEPENDENT) @ (b / rows[:, 0])
     return found / columns[0]
-
-
-def mixes_kinds(jacobian: Float[Array, "l n"], m: int) -> BoolScalar:
-    """Tell whether some of the first m rows follow from others with the help of these.
-
-    Rows may depend on others of the same part. A row without entries counts as a mix.
-    """
-    gram = jacobian @ jacobian.T
-    parts = rank_of_gram(gram[:m, :m]) + rank_of_gram(gram[m:, m:])
-    return (parts != rank_of_gram(gram)) | jnp.any(jnp.all(jacobian == 0, axis=1))

@@ -73,6 +73,11 @@ def is_deficient(matrix: Float[Array, "k l"]) -> BoolScalar:
     return conditioning(matrix) <= 10 * matrix.shape[1] * eps
 
 
+def is_without_entries(matrix: Float[Array, "k l"]) -> BoolScalar:
+    """Tell whether some row is zero."""
+    return jnp.any(jnp.all(matrix == 0, axis=1))
+
+
 def is_nearly_singular(
     matrix: Float[Array, "l l"], inverse: Float[Array, "l l"]
 ) -> BoolScalar:

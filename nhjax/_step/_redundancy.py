@@ -21,19 +21,28 @@ class Redundancy(eqx.Module):
     (1 - P) diag(C) h δΛ = 0,
 
     so that multipliers stay among those of the least norm, up to what the derivatives
-    change within the step. Nonholonomic and holonomic constraints do not mix in P,
-    since `initial_state` refuses constraints of one kind that follow from the other.
+    change within the step.
+
+    Nonholonomic and holonomic constraints do not mix in P: the former hold at the nodes
+    and the latter at the stages, where the rates of these are no zeros. A combination
+    of nonholonomic ones that follows from holonomic ones is among what is left over,
+    and P has the first diagonal block of C C⁻ for the former and the last for the
+    latter. At the end of the step both hold, and so does what follows.
     """
 
     projector: Float[Array, "l l"]  # P
     rest: Float[Array, "l l"]  # (1 - P) diag(C)
 
     @classmethod
-    def at(cls, lin: Linearisation) -> "Redundancy":
-        """Make the equations for a step from the state of a linearisation."""
+    def at(cls, lin: Linearisation, m: int) -> "Redundancy":
+        """Make the equations for a step from the state of a linearisation.
+
+        `m` is the number of nonholonomic constraints.
+        """
         jacobian, reaction, inverse = lin.dense
         compliance = small_einsum("kn,nl->kl", jacobian, reaction)
-        projector = small_einsum("kl,lm->km", compliance, inverse)
+        whole = small_einsum("kl,lm->km", compliance, inverse)
+        projector = jax.scipy.linalg.block_diag(whole[:m, :m], whole[m:, m:])
         unit = jnp.eye(projector.shape[0], dtype=projector.dtype)
         sizes = jnp.sum(jnp.abs(compliance) * unit, axis=1)
         # A row without derivatives is left out; its multiplier has no unit.

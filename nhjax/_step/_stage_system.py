@@ -1,5 +1,7 @@
 """The data of the equations of one step, and the layout of their unknowns."""
 
+from dataclasses import replace
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -61,9 +63,11 @@ class StageSystem(eqx.Module):
         kept: StartImpulses | None = None,
     ) -> "StageSystem":
         """Make the equations of a step of size h from the state y at t."""
-        given = system, method, t, h, y.q, y.p, y.multiplier, args
-        is_reduced = system.constraints == "redundant" and y.multiplier.shape[0] > 0
-        return cls(*given, Redundancy.at(lin) if is_reduced else None, kept)
+        stages = cls(system, method, t, h, y.q, y.p, y.multiplier, args, kept=kept)
+        if system.constraints != "redundant" or not stages.constrained:
+            return stages
+        redundancy = Redundancy.at(lin, stages.num_nonholonomic)
+        return replace(stages, redundancy=redundancy)
 
     @property
     def num_holonomic(self) -> int:

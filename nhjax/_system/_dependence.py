@@ -6,7 +6,7 @@ from jaxtyping import Array, Float
 
 from .._custom_types import Args, FloatScalar
 from .._errors import DependentConstraintsError
-from .._numerics import dependent_rows, is_deficient
+from .._numerics import dependent_rows, is_deficient, is_without_entries
 from ._abstract import AbstractMechanicalSystem
 from ._state import State
 
@@ -26,7 +26,6 @@ def dependence_error(
     num_holonomic: int,
     letter: str,
     where: str,
-    is_redundant: bool,
 ) -> DependentConstraintsError:
     """Make the error that names the constraints which depend on each other.
 
@@ -37,8 +36,6 @@ def dependence_error(
     - `num_holonomic`: the number k of holonomic constraints.
     - `letter`: the letter of nonholonomic constraints, Φ or Ψ.
     - `where`: the state, as text.
-    - `is_redundant`: whether constraints of one kind may depend on each other, so that
-        the error is about something else.
     """
     rows, k = np.asarray(jacobian), num_holonomic
     m = rows.shape[0] - k
@@ -54,10 +51,12 @@ def dependence_error(
             f"{names[zero[0]]} has no gradient there; a constraint must have one "
             "where it vanishes."
         )
-    elif is_redundant:
+    elif _rank(rows[:m]) + _rank(rows[m:]) > _rank(rows):
         advice = (
-            "Constraints of one kind may be redundant, but a nonholonomic one may not "
-            "follow from holonomic ones: remove it."
+            "A nonholonomic one of them follows from holonomic ones, which say more: "
+            "the rate of a constraint on positions is kept with it. Remove it, start "
+            "from a state at which it does not follow, or give the system "
+            '`constraints="redundant"`.'
         )
     else:
         advice = (
@@ -79,14 +78,21 @@ def require_independent(
     """Raise a `DependentConstraintsError` if constraints are dependent at a state."""
     u = system.fibre_coordinate(y)
     jacobian = jax.jacrev(system.constraint, argnums=2)(t, y.q, u, args)
-    if jacobian.shape[0] == 0 or not is_deficient(jacobian):
+    is_redundant = system.constraints == "redundant"
+    lacking = is_without_entries if is_redundant else is_deficient
+    if jacobian.shape[0] == 0 or not lacking(jacobian):
         return
     k = system.position_constraint(t, y.q, args).shape[0]
     letter = "Φ" if system.fibre_coordinate_name == "v" else "Ψ"
     where = f"q = {y.q}, {system.fibre_coordinate_name} = {u}"
-    raise dependence_error(
-        jacobian, k, letter, where, system.constraints == "redundant"
-    )
+    raise dependence_error(jacobian, k, letter, where)
+
+
+def _rank(rows: np.ndarray) -> int:
+    if not rows.size:
+        return 0
+    scaled = rows / np.max(np.abs(rows), axis=1, keepdims=True)
+    return int(np.linalg.matrix_rank(scaled, rtol=np.finfo(rows.dtype).eps ** 0.5))
 
 
 def _enumerated(names: list[str]) -> str:

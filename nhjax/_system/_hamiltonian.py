@@ -40,10 +40,11 @@ class HamiltonianSystem(AbstractMechanicalSystem):
     - `force`: an external covector F, called as `force(t, q, p, args)`, of shape (n,).
     - `manifold`: the configuration manifold; R^n with the n of the state if left out.
     - `constraints`: `"independent"`, by which dependent constraints are refused, or
-        `"redundant"`, by which some may follow from others of their kind. Of all
-        multipliers with the same reaction the result is then the one with the least
-        Σ |λ_a B_a|², the sizes of the reactions of single constraints in the metric
-        M⁻¹; it marks reactions as not unique. `docs/systems.md` has the details.
+        `"redundant"`, by which some may follow from others, nonholonomic ones from
+        holonomic ones too. Of all multipliers with the same reaction the result is then
+        the one with the least Σ |λ_a B_a|², the sizes of the reactions of single
+        constraints in the metric M⁻¹, and none of a nonholonomic one that follows; it
+        marks reactions as not unique. `docs/systems.md` has the details.
     - `coordinates`: a tuple of the names of the n coordinates, for
         `Solution.to_xarray`; None by default.
 

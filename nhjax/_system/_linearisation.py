@@ -16,6 +16,7 @@ from .._numerics import (
     is_nearly_singular,
     jacobian,
     least_norm_inverse,
+    least_norm_inverse_in_turn,
     Matrix,
     matvec,
     small_einsum,
@@ -87,10 +88,10 @@ class Linearisation(eqx.Module):
         """Tell which multipliers are determined, which redundant ones are not."""
         if not self.is_redundant:
             return jnp.ones(self.violation.shape, bool)
-        # C C⁻ projects onto what the derivatives of the constraints can reach.
-        jacobian, reaction, inverse = self.dense
+        # It projects onto what the derivatives of the constraints can reach.
+        jacobian, reaction, _ = self.dense
         compliance = small_einsum("kn,nl->kl", jacobian, reaction)
-        kept = small_einsum("kl,lm->km", compliance, inverse)
+        kept = small_einsum("kl,lm->km", compliance, least_norm_inverse(compliance))
         small = float(jnp.finfo(kept.dtype).eps) ** 0.5
         return jnp.abs(1 - jnp.diagonal(kept)) <= small
 
@@ -217,8 +218,12 @@ def linearise(
         slopes = jax.jacrev(system.constraint, argnums=2)(t, q, u, args)
         reaction = matvec(metric_inverse, slopes).T
         compliance = small_einsum("kn,nl->kl", slopes, reaction)
-        redundant = system.constraints == "redundant"
-        compliance_inverse = (least_norm_inverse if redundant else inverse)(compliance)
+        if system.constraints == "redundant":
+            k = jax.eval_shape(lambda: system.position_constraint(t, q, args)).size
+            m = slopes.shape[0] - k
+            compliance_inverse = least_norm_inverse_in_turn(compliance, m)
+        else:
+            compliance_inverse = inverse(compliance)
     else:
         slopes = sparse_jacobian(lambda u: system.constraint(t, q, u, args), u, pattern)
         reaction = WeightedTranspose(metric_inverse, slopes)

@@ -242,6 +242,93 @@ def test_nonholonomic_constraints_may_be_redundant(closure):
     np.testing.assert_allclose(np.asarray(two) @ [1.0, -2.5], one[0], atol=1e-11)
 
 
+# Nonholonomic constraints that follow from holonomic ones ----------------------------
+
+
+def on_a_sphere(rows, form="lagrangian"):
+    """A particle on a sphere with a blade, whose speeds also say that it stays there.
+
+    The rows are the blade, the rate of the sphere times its radius, and their sum.
+    """
+
+    def given(t, q, v, args):
+        blade, rate = v[0] - 0.3 * q[2] * v[1], q @ v
+        return jnp.stack([blade, rate, blade + rate])[jnp.asarray(rows)]
+
+    functions = {
+        "nonholonomic": given,
+        "holonomic": lambda t, q, args: jnp.sqrt(q @ q) - 1.0,
+        "constraints": "redundant" if len(rows) > 1 else "independent",
+    }
+    if form == "lagrangian":
+        return nhjax.LagrangianSystem(
+            lambda t, q, v, args: 0.5 * v @ v - q[2], **functions
+        )
+    return nhjax.HamiltonianSystem(
+        lambda t, q, p, args: 0.5 * p @ p + q[2], **functions
+    )
+
+
+def run_on_a_sphere(rows, form, closure):
+    system = on_a_sphere(rows, form)
+    q, u = jnp.array([0.6, 0.0, 0.8]), jnp.array([0.1, 0.5, 0.0])
+    given: dict[str, Any] = {"v" if form == "lagrangian" else "p": u}
+    y0 = nhjax.initial_state(system, q, project=True, **given)
+    method = nhjax.LobattoIIIAB(3, closure)
+    return system, nhjax.integrate(system, method, y0, dt=0.05, num_steps=40)
+
+
+@pytest.mark.parametrize(
+    ("form", "closure"), [("lagrangian", "symmetric"), ("hamiltonian", "consistent")]
+)
+def test_a_rate_that_is_a_constraint_again_changes_nothing(form, closure):
+    _, one = run_on_a_sphere((0,), form, closure)
+    system, two = run_on_a_sphere((0, 1), form, closure)
+    for name in ("q", "v", "p"):
+        got, expected = getattr(two.ys, name), getattr(one.ys, name)
+        np.testing.assert_allclose(got, expected, atol=1e-12)
+    blade, rate, sphere = two.ys.multiplier[0]
+    np.testing.assert_allclose([blade, sphere], one.ys.multiplier[0], atol=1e-11)
+    np.testing.assert_allclose(rate, 0, atol=1e-12)
+    assert int(two.stats["num_redundant"]) == 1
+    y = jax.tree.map(lambda x: x[-1], two.ys)
+    unique = nhjax.motion(system, 2.0, y).is_unique
+    np.testing.assert_array_equal(unique, [True, False, False])
+
+
+def sphere_with_a_blade(t, x):
+    """The rates of (q, v), with both reactions from the accelerations' constraints."""
+    q, v = x[:3], x[3:]
+    rows = np.array([[1.0, -0.3 * q[2], 0.0], q])
+    load = np.array([0.0, 0.0, -1.0])
+    hidden = np.array([-0.3 * v[2] * v[1], v @ v])
+    multiplier = np.linalg.solve(rows @ rows.T, -hidden - rows @ load)
+    return np.concatenate([v, load + multiplier @ rows])
+
+
+def test_what_does_not_follow_of_such_constraints_is_kept_with_the_order():
+    # Of the rate and of its sum with the blade, the blade alone is new.
+    counts = (10, 20, 40)
+    q, v = jnp.array([0.6, 0.0, 0.8]), jnp.array([0.1, 0.5, 0.0])
+    system = on_a_sphere((1, 2))
+    y0 = nhjax.initial_state(system, q, v, project=True)
+    lanes = orders.trajectories(system, THREE, y0, counts)
+    ends = [jax.tree.map(lambda x: x[-1], lane) for lane in lanes]
+    exact = solve_ivp(
+        sphere_with_a_blade,
+        (0, orders.DURATION),
+        np.concatenate([y0.q, y0.v]),
+        method="DOP853",
+        rtol=1e-13,
+        atol=1e-13,
+    ).y[:, -1]
+    for name, expected in (("q", exact[:3]), ("v", exact[3:])):
+        errors = [np.max(np.abs(getattr(y, name) - expected)) for _, y, _ in ends]
+        orders.assert_order(4, counts, errors, orders.SCIPY_FLOOR)
+    blade = [1.0, -0.3 * y0.q[2], 0.0]
+    np.testing.assert_allclose(np.dot(blade, y0.v), 0, atol=1e-15)
+
+
 # What is refused ----------------------------------------------------------------------
 
 NAMED = r"fails for holonomic\[0\], holonomic\[1\] and holonomic\[2\]\).*redundant"
@@ -278,14 +365,13 @@ def test_constraints_that_are_dependent_for_an_instant_are_not_redundant():
         nhjax.integrate(system, nhjax.LobattoIIIAB(2), y0, dt=0.1, num_steps=2)
 
 
-def test_a_nonholonomic_constraint_that_follows_from_holonomic_ones_is_refused():
+def test_a_nonholonomic_constraint_that_follows_from_holonomic_ones_is_named():
     system = nhjax.LagrangianSystem(
         lambda t, q, v, args: 0.5 * v @ v,
         nonholonomic=lambda t, q, v, args: jnp.stack([v[0], q @ v]),
         holonomic=lambda t, q, args: q @ q - 1.0,
-        constraints="redundant",
     )
-    message = r"nonholonomic\[1\] and holonomic\[0\]\).*may not follow from holonomic"
+    message = r"nonholonomic\[1\] and holonomic\[0\]\).*follows from holonomic ones"
     with pytest.raises(nhjax.DependentConstraintsError, match=message):
         nhjax.initial_state(system, jnp.array([0.6, 0.0, 0.8]), jnp.zeros(3))
 
