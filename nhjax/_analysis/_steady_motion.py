@@ -6,9 +6,9 @@ from typing import overload
 import equinox as eqx
 from jaxtyping import Array, Float
 
-from .._custom_types import Args, BoolScalar, FloatScalarLike
-from .._errors import Check, DependentConstraintsError, require
-from .._numerics import frozen, is_deficient
+from .._custom_types import Args, FloatScalarLike
+from .._errors import require
+from .._numerics import frozen
 from .._system import (
     AbstractMechanicalSystem,
     parameters,
@@ -159,11 +159,10 @@ def steady_motion(
     outcome = steady_along(system, t, y, args, symmetry, held, max_iterations)
     # What tells symmetries is the program of `linear_stability`, which mostly follows.
     given = frozen((system, t, outcome.state, args))
-    verdict, determined = _verdict(slopes_along_symmetry(*given, symmetry), given[2])
+    verdict = _verdict(slopes_along_symmetry(*given, symmetry), given[2])
     return require(
         (outcome.state, outcome.rates),
         *outcome.checks,
-        Check(determined, _dependent_constraints, ()),
         *checks_of(frozen(verdict)),
     )
 
@@ -180,18 +179,10 @@ def _chosen(
     return indices("positions", positions, dim), indices("velocities", velocities, dim)
 
 
-def _dependent_constraints() -> DependentConstraintsError:
-    return DependentConstraintsError(
-        "The constraints are dependent at the steady motion, so that nothing tells "
-        "whether generators are symmetries. Remove redundant constraints."
-    )
-
-
 @eqx.filter_jit
-def _verdict(slopes: Slopes, y: State) -> tuple[Verdict, BoolScalar]:
-    """Judge the generators, and tell whether the constraints are independent."""
+def _verdict(slopes: Slopes, y: State) -> Verdict:
+    """Judge the generators at a state."""
     orbit = slopes.orbit
     assert orbit is not None
     permitted = orthonormal_basis(slopes.rows, orbit.directions)
-    verdict = judged(orbit, slopes.rows, permitted, size_of(y))
-    return verdict, ~is_deficient(slopes.rows)
+    return judged(orbit, slopes.rows, permitted, size_of(y))

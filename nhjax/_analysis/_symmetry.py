@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Array, Float, PyTree
 
 from .._custom_types import Args, BoolScalar, FloatScalar
-from .._errors import Check, ShapeError
+from .._errors import Check, DependentConstraintsError, ShapeError
 from .._numerics import is_deficient, max_norm
 from .._system import AbstractMechanicalSystem, State
 from ._permitted import Permitted
@@ -119,8 +119,12 @@ class Bounded(NamedTuple):
 
 
 class Verdict(NamedTuple):
-    """How well a motion and the generators of symmetries fit, one a row if of each."""
+    """How well a motion and the generators of symmetries fit, one a row if of each.
 
+    Nothing of it is a number where constraints are dependent, and not `determined`.
+    """
+
+    determined: BoolScalar
     independent: BoolScalar
     on_constraints: Bounded
     drift: Bounded
@@ -165,6 +169,7 @@ def judged(
         (bend_terms @ size(basis)).reshape(flat),
     ]
     return Verdict(
+        determined=~is_deficient(rows),
         independent=~is_deficient(ways),
         on_constraints=bounded(ways @ rows.T, size(ways) @ size(rows.T)),
         drift=bounded(
@@ -215,7 +220,8 @@ def checks_of(verdict: Verdict) -> list[Check]:
         _not_closed: verdict.closed,
     }
     checks = [Check(x.holds, error, tuple(x)) for error, x in measures.items()]
-    return [Check(verdict.independent, _dependent), *checks]
+    constraints = Check(verdict.determined, _dependent_constraints)
+    return [constraints, Check(verdict.independent, _dependent), *checks]
 
 
 def _worst(values: np.ndarray, allowed: np.ndarray) -> tuple[int, str]:
@@ -223,6 +229,13 @@ def _worst(values: np.ndarray, allowed: np.ndarray) -> tuple[int, str]:
     worst = np.unravel_index(np.argmax(ratio), ratio.shape)
     numbers = f"{float(values[worst]):.3g} (allowed {float(allowed[worst]):.1g})"
     return int(worst[0]), numbers
+
+
+def _dependent_constraints() -> DependentConstraintsError:
+    return DependentConstraintsError(
+        "The constraints are dependent at `y`, so that nothing tells whether the "
+        "generators of `symmetry` are any. Remove redundant constraints."
+    )
 
 
 def _dependent() -> ValueError:

@@ -20,6 +20,7 @@ from .._system import (
     AbstractMechanicalSystem,
     all_finite,
     dependence_error,
+    dependent_names,
     Linearisation,
     State,
 )
@@ -210,11 +211,14 @@ def _value_error(case: _Case) -> NonFiniteError:
 
 
 def _compatibility_error(case: _Case) -> IncompatibleConstraintsError:
+    jacobian, reaction, _ = case.found.lin.dense
+    which = dependent_names(jacobian @ reaction, case.found.positions.shape[0])
     return IncompatibleConstraintsError(
         f"The constraints are not compatible with the {case.words.generator}: C = D2Φ "
-        f"M⁻¹ D2Φᵀ is singular at {case.where} (the paper's compatibility condition; "
-        f"reciprocal condition number {float(case.found.compatibility):.1e}). No "
-        "multiplier is determined there."
+        f"M⁻¹ D2Φᵀ is singular at {case.where} (the paper's compatibility condition "
+        f"fails for {which}; reciprocal condition number "
+        f"{float(case.found.compatibility):.1e}). Nothing determines "
+        "these multipliers."
     )
 
 

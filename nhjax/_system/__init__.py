@@ -19,6 +19,7 @@ from ._checks import (
 from ._closure import closure_converted as closure_converted
 from ._dependence import (
     dependence_error as dependence_error,
+    dependent_names as dependent_names,
     require_independent as require_independent,
 )
 from ._hamiltonian import HamiltonianSystem as HamiltonianSystem

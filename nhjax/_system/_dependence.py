@@ -65,11 +65,21 @@ def dependence_error(
         )
     derivatives = " and ".join([f"D2{letter}"] * (m > 0) + ["DΓ"] * (k > 0))
     have = "have" if m > 0 and k > 0 else "has"
-    which = _enumerated([names[a] for a in dependent_rows(rows)])
+    which = dependent_names(jacobian, k)
     return DependentConstraintsError(
         f"The constraints are dependent: {derivatives} {have} not full rank at {where} "
         f"(the paper's admissibility condition fails for {which}). {advice}"
     )
+
+
+def dependent_names(matrix: Float[Array, "l c"], num_holonomic: int) -> str:
+    """Name the constraints whose rows of a matrix depend on each other.
+
+    The rows of the `num_holonomic` holonomic constraints are the last.
+    """
+    rows = np.asarray(matrix)
+    names = _names(rows.shape[0] - num_holonomic, num_holonomic)
+    return _enumerated([names[a] for a in dependent_rows(rows)])
 
 
 def require_independent(

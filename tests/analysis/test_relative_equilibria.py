@@ -117,8 +117,9 @@ def test_what_is_wrong_is_named(chosen: Any, error, message):
         nhjax.steady_motion(FREE, 0.0, y, **chosen)
 
 
-def test_redundant_constraints_are_refused_with_a_symmetry():
+@pytest.mark.parametrize("function", [nhjax.steady_motion, nhjax.linear_stability])
+def test_redundant_constraints_are_refused_with_a_symmetry(function):
     v = jnp.asarray([1.0, 0.0])
     y = nhjax.State(jnp.asarray([0.0, 0.5]), v, v, AXIS[:2])
-    with pytest.raises(nhjax.DependentConstraintsError, match="whether generators are"):
-        nhjax.steady_motion(TWICE, 0.0, y, symmetry=lambda q: jnp.eye(2)[0])
+    with pytest.raises(nhjax.DependentConstraintsError, match="whether the generators"):
+        function(TWICE, 0.0, y, **ALONG)

@@ -209,7 +209,8 @@ BY_VALUE = {
     "incompatible": (
         adjusted(mass=jnp.array([1.0, 1.0, -1.0])),
         nhjax.IncompatibleConstraintsError,
-        r"C = D2Φ M⁻¹ D2Φᵀ is singular at q = .*compatibility condition",
+        r"C = D2Φ M⁻¹ D2Φᵀ is singular at q = .*compatibility condition fails "
+        r"for nonholonomic\[0\]; reciprocal",
     ),
     "irregular": (
         adjusted(mass=jnp.array([1.0, 1.0, 0.0])),
