@@ -1,5 +1,6 @@
 """The kinds of operations, which decide if a program can be one kernel of the CPU."""
 
+import itertools
 import math
 from collections.abc import Iterator
 from typing import Any
@@ -37,6 +38,8 @@ _MOVING = """
 """.split()  # noqa: SIM905
 ARITHMETIC_AND_SHAPES = (*ELEMENTWISE, *_REDUCING, *_SHAPING, *_MOVING)
 _ARITHMETIC = {"add", "add_any", "div", "mul", "neg", "sub"}
+# nhjax's own operation, which is written out in arithmetic and shapes.
+SMALL_PRODUCT = "small_product"
 # These operations contain programs, whose operations are examined in turn.
 CALLING = """
     checkpoint closed_call custom_jvp_call custom_vjp_call jit remat2
@@ -59,10 +62,18 @@ def _is_elementary(equation: Any) -> bool:
         return all(map(is_elementary, _programs(equation.params)))
     if name in _MOVING:
         return True
+    if name == SMALL_PRODUCT and not equation.params["by_terms"]:
+        return _terms(equation) * _size(equation.outvars[0]) <= LARGEST_REDUCTION
     if name.startswith("reduce_") and _size(equation.invars[0]) > LARGEST_REDUCTION:
         return False
     small = all(_size(x) <= LARGEST_ARRAY for x in equation.outvars)
-    return small and name in (*ELEMENTWISE, *_REDUCING, *_SHAPING)
+    return small and name in (*ELEMENTWISE, *_REDUCING, *_SHAPING, SMALL_PRODUCT)
+
+
+def _terms(product: Any) -> int:
+    """Count the terms of each sum of a small product."""
+    pairs = zip(product.params["first"], product.invars[0].aval.shape, strict=True)
+    return math.prod(n for index, n in pairs if index not in product.params["result"])
 
 
 def _size(variable: Any) -> int:
@@ -86,5 +97,16 @@ def _arithmetic_sizes(program: Any) -> Iterator[int]:
     for equation in program.eqns:
         if equation.primitive.name in _ARITHMETIC:
             yield _size(equation.outvars[0])
+        if equation.primitive.name == SMALL_PRODUCT:
+            yield from _sizes_of_product(equation)
         for part in _programs(equation.params):
             yield from _arithmetic_sizes(part)
+
+
+def _sizes_of_product(product: Any) -> Iterator[int]:
+    """List the sizes of arrays in the arithmetic of a small product, written out."""
+    size, terms = _size(product.outvars[0]), _terms(product)
+    if product.params["by_terms"]:
+        yield from itertools.repeat(size, 2 * terms - 1)
+    else:
+        yield size * terms

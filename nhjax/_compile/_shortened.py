@@ -12,12 +12,14 @@ import jax
 import jax.extend
 import numpy as np
 
-from ._elementary import ARITHMETIC_AND_SHAPES
+from ._elementary import ARITHMETIC_AND_SHAPES, SMALL_PRODUCT
 
 
 # Only these are left out where they are repeated: they have no state, as random numbers
 # may have, and no parameters that a user chooses.
-_REPEATABLE = frozenset((*ARITHMETIC_AND_SHAPES, "dot_general", "gather"))
+_REPEATABLE = frozenset(
+    (*ARITHMETIC_AND_SHAPES, "dot_general", "gather", SMALL_PRODUCT)
+)
 # Operations whose programs are those of the parameters listed here. Other operations
 # with programs have rules that rely on them, and stay as they are.
 _INNER = {

@@ -133,6 +133,36 @@ def _arranged(x: np.ndarray, batch: Sequence[int], summed: Sequence[int]) -> np.
     return x.transpose([*batch, *free, *summed]).reshape(sizes)
 
 
+def _small_product(builder: Builder, equation: Any, values: list[Value]) -> Value:
+    first, second, result = (equation.params[k] for k in ("first", "second", "result"))
+    graph, aval = builder.graph, equation.outvars[0].aval
+    a, b = map(builder.memory.registers, values)
+    lengths = {
+        **dict(zip(first, a.shape, strict=True)),
+        **dict(zip(second, b.shape, strict=True)),
+    }
+    order = [*result, *(index for index in first if index not in result)]
+    shape = [lengths[index] for index in order]
+
+    def rows(x: np.ndarray, indices: str) -> np.ndarray:
+        """Repeat the numbers of an operand for each sum, one after the other."""
+        x = x.transpose([indices.index(index) for index in order if index in indices])
+        x = x.reshape([lengths[index] if index in indices else 1 for index in order])
+        terms = math.prod(shape[len(result) :])
+        return np.broadcast_to(x, shape).reshape(aval.size, terms)
+
+    products = [
+        [graph.op("mul", x, y) for x, y in zip(*pair, strict=True)]
+        for pair in zip(rows(a, first), rows(b, second), strict=True)
+    ]
+    out = np.empty(aval.size, object)
+    for index, row in enumerate(products):
+        out[index] = _folded(builder, "add", row)
+        if out[index] is None:
+            out[index] = graph.zero(dtype_name(aval.dtype))
+    return out.reshape(aval.shape)
+
+
 REDUCTIONS: dict[str, Operation] = {
     **dict.fromkeys(_REDUCTIONS, _reduce),
     "argmax": partial(_arg, "gt"),
@@ -142,4 +172,5 @@ REDUCTIONS: dict[str, Operation] = {
     "cummax": partial(_cumulative, "max"),
     "cummin": partial(_cumulative, "min"),
     "dot_general": _dot_general,
+    "small_product": _small_product,
 }

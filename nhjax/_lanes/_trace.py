@@ -77,6 +77,9 @@ def _operations(jaxpr: Any) -> int:
     """Count the operations of a jaxpr and of those within."""
     count = len(jaxpr.eqns)
     for equation in jaxpr.eqns:
+        if equation.primitive.name == "small_product":
+            # It stands for two broadcasts, a product and a sum.
+            count += 3
         for part in jax.tree.leaves(equation.params):
             part = getattr(part, "jaxpr", part)
             count += _operations(part) if hasattr(part, "eqns") else 0

@@ -5,12 +5,10 @@ inside a time loop the calls cost more than the arithmetic, they cannot be compi
 one kernel with the operations around them, and batches of them run one by one.
 """
 
-import itertools
 import math
 import string
 from abc import abstractmethod
 from collections.abc import Callable
-from functools import reduce
 from typing import Any, TypeAlias
 
 import equinox as eqx
@@ -19,7 +17,7 @@ import jax.extend
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from .._compile import LARGEST_REDUCTION
+from .._compile import LARGEST_REDUCTION, small_product
 
 
 # Matrices with more rows are inverted by a library: a kernel may not sum more numbers
@@ -47,31 +45,36 @@ Matrix: TypeAlias = Float[Array, "n n"] | Float[Array, " n"]
 
 
 def small_einsum(subscripts: str, a: Array, b: Array) -> Array:
-    """Compute `jnp.einsum(subscripts, a, b)`, as single products and sums if small."""
+    """Compute `jnp.einsum(subscripts, a, b)`, as single products and sums if small.
+
+    Each index that is summed stands in both operands.
+    """
     operands, result = subscripts.split("->")
     first, second = operands.split(",")
-    summed = [index for index in dict.fromkeys(first + second) if index not in result]
-    order = [*result, *summed]
-    x, y = _aligned(a, first, order), _aligned(b, second, order)
-    shape = jnp.broadcast_shapes(x.shape, y.shape)
-    summed_shape = shape[len(result) :]
-    if math.prod(shape) <= LARGEST_REDUCTION:
-        return jnp.sum(x * y, axis=tuple(range(len(result), len(order))))
-    if math.prod(summed_shape) > LONGEST_SUM or math.prod(shape) > LARGEST_PRODUCT:
+    params = _small_product(first, second, result, a.shape, b.shape)
+    if params is None:
         return jnp.einsum(subscripts, a, b)
-    # The terms are added one by one, since a reduction of this size would be a call
-    # into a library.
-    terms = (
-        _term(x, index) * _term(y, index)
-        for index in itertools.product(*map(range, summed_shape))
-    )
-    return reduce(jnp.add, terms)
+    both = isinstance(a, jax.Array) and isinstance(b, jax.Array)
+    if not both or a.dtype != b.dtype:
+        dtype = jnp.result_type(a, b)
+        a, b = jnp.asarray(a, dtype), jnp.asarray(b, dtype)
+    return small_product.bind(a, b, **params)
 
 
-def _term(x: Array, index: tuple[int, ...]) -> Array:
-    """Take x at an index of its last axes; axes of length one are constant."""
-    lengths = x.shape[x.ndim - len(index) :]
-    return x[(..., *(k if n > 1 else 0 for k, n in zip(index, lengths, strict=True)))]
+def _small_product(
+    first: str, second: str, result: str, a: tuple[int, ...], b: tuple[int, ...]
+) -> dict[str, Any] | None:
+    """Make the parameters of a product of arrays of these shapes; None if large."""
+    lengths = dict(zip(first, a, strict=True))
+    for index, length in zip(second, b, strict=True):
+        if lengths.setdefault(index, length) != length:
+            raise ValueError(f"Shapes {a} and {b} do not fit {first},{second}.")
+    size = math.prod(lengths.values())
+    summed = math.prod(n for index, n in lengths.items() if index not in result)
+    by_terms = size > LARGEST_REDUCTION
+    if by_terms and (summed > LONGEST_SUM or size > LARGEST_PRODUCT):
+        return None
+    return {"first": first, "second": second, "result": result, "by_terms": by_terms}
 
 
 def absolute(matrix: Array | AbstractLinearMap) -> Array | AbstractLinearMap:
@@ -95,15 +98,6 @@ def matvec(
         return jnp.expand_dims(matrix, range(x.ndim - 1)) * x
     rows = "abc"[: x.ndim - 1]
     return small_einsum(f"kn,{rows}n->{rows}k", matrix, x)
-
-
-def _aligned(x: Array, indices: str, order: list[str]) -> Array:
-    """Put the axes of x in the given order; missing axes get length one."""
-    present = [index for index in order if index in indices]
-    x = jnp.transpose(x, [indices.index(index) for index in present])
-    return jnp.expand_dims(
-        x, [k for k, index in enumerate(order) if index not in indices]
-    )
 
 
 def _contract_axes(dimension_numbers, a: Array, b: Array) -> Array:
@@ -216,6 +210,6 @@ def _evaluated(program, consts, args):
 
 
 def _is_plain(equation) -> bool:
-    """Tell whether the factors of a product have the dtype of its result."""
+    """Tell whether a product and its factors are numbers of one floating dtype."""
     types = {variable.aval.dtype for variable in (*equation.invars, *equation.outvars)}
-    return len(types) == 1
+    return len(types) == 1 and jnp.issubdtype(types.pop(), jnp.inexact)

@@ -10,7 +10,7 @@ import jax.extend
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from .._compile import CALLING, ELEMENTWISE
+from .._compile import CALLING, ELEMENTWISE, SMALL_PRODUCT
 
 
 # These operations put elements of their operands into other places, which NumPy does on
@@ -133,6 +133,8 @@ def _sets(
         return _moved(name, params, sets, known)
     if name.startswith("reduce_") and "axes" in params:
         return [np.asarray(sets[0].any(axis=tuple(params["axes"])))]
+    if name == SMALL_PRODUCT:
+        return [_of_product(params, *sets)]
     if name == "dot_general":
         (left, right), (on_left, on_right) = params["dimension_numbers"]
         parts = []
@@ -148,6 +150,22 @@ def _sets(
         second = second.reshape(*split[0], *(1,) * free, *split[1], n)
         return [first | second]
     return None
+
+
+def _of_product(
+    params: dict[str, Any], first: np.ndarray, second: np.ndarray
+) -> np.ndarray:
+    """Unite the sets of the numbers that a small product combines."""
+    result, parts = params["result"], []
+    for indices, part in ((params["first"], first), (params["second"], second)):
+        summed = [k for k, index in enumerate(indices) if index not in result]
+        part = part.any(axis=tuple(summed))
+        kept = [index for index in indices if index in result]
+        order = [kept.index(index) for index in result if index in kept]
+        part = np.transpose(part, (*order, part.ndim - 1))
+        missing = [k for k, index in enumerate(result) if index not in kept]
+        parts.append(np.expand_dims(part, missing))
+    return parts[0] | parts[1]
 
 
 def _moved(

@@ -3,6 +3,8 @@
 The data have NaN, infinities, both zeros, and the extremes of integers.
 """
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -11,6 +13,7 @@ from jax import lax
 
 from nhjax._compile import _elementary
 from nhjax._lanes import _trace, Unsupported
+from nhjax._numerics import small_einsum
 from oracles import lanes_run
 from oracles.random_steps import Kind, numbers
 
@@ -151,6 +154,15 @@ _CASES = {
     ],
     "rev": _unary(lambda x: x[::-1]),
     "slice": _unary(lambda x: x[::2]),
+    # A sum, an index that stays in both operands, and an empty result.
+    "small_product": [
+        (partial(small_einsum, "ab,cb->ca"), [Kind("float32", (2, 3))] * 2),
+        (partial(small_einsum, "ia,ib->bai"), [Kind(*MATRIX)] * 2),
+        (
+            lambda x, y: small_einsum("ab,b->a", x[:0], y),
+            [Kind(*MATRIX), _of("float64")],
+        ),
+    ],
     "split": [(lambda x: lax.split(x, (1, 2), 1), [Kind(*MATRIX)])],
     "squeeze": [(lambda x: lax.squeeze(x[:1], (0,)), [Kind(*MATRIX)])],
     "stack": [(lambda x, y: jnp.stack([x, y], 1), [_of("float64")] * 2)],
@@ -218,7 +230,7 @@ _CASES = {
 _INEXACT = """
     acos acosh asin asinh atan atan2 atanh cbrt cos cosh erf exp exp2 expm1 log log1p
     logistic pow rsqrt sin sinh tan tanh reduce_sum reduce_prod add_any scan
-    stop_gradient
+    stop_gradient small_product
 """.split()  # noqa: SIM905
 
 
@@ -229,6 +241,7 @@ def test_every_primitive_of_a_kernel_has_a_case():
         *_elementary._SHAPING,
         *_elementary._MOVING,
         *_elementary._CONTAINING,
+        _elementary.SMALL_PRODUCT,
     ]
     assert set(names) <= set(_CASES)
 

@@ -30,6 +30,68 @@ def test_contractions_are_those_of_einsum(subscripts, size):
     np.testing.assert_allclose(got, expected, rtol=1e-12, atol=1e-13)
 
 
+@pytest.mark.parametrize("size", [3, 20])
+def test_contractions_are_mapped_and_differentiated_as_einsum_is(size):
+    """Also in reverse mode over forward mode, and where one operand has no batch."""
+    a, b, c = np.random.default_rng(0).normal(size=(3, size, size, size))
+
+    def derivatives(contract):
+        def loss(x, y):
+            rows = jax.vmap(lambda x: contract("nm,m->n", x, y[0]), in_axes=2)
+            each = jax.vmap(lambda x, y: contract("ij,jk->ki", x, y), (1, 2))(x, x)
+            return jnp.sum(jnp.sin(rows(x))) + jnp.sum(each**3)
+
+        def pushed(x, y):
+            return jax.jvp(loss, (x, y), (c, c[0]))[1]
+
+        return jax.jit(jax.value_and_grad(pushed, (0, 1)))(a, b[0])
+
+    for x, y in zip(
+        jax.tree.leaves(derivatives(small_einsum)),
+        jax.tree.leaves(derivatives(jnp.einsum)),
+        strict=True,
+    ):
+        np.testing.assert_allclose(x, y, rtol=1e-10, atol=1e-10)
+
+
+def test_a_contraction_is_one_operation_until_it_is_lowered():
+    def gradient(x):
+        return jax.grad(lambda x: jnp.sum(small_einsum("ij,jk->ik", x, x)))(x)
+
+    program = jax.make_jaxpr(gradient)(jnp.ones((3, 3)))
+    names = [equation.primitive.name for equation in program.eqns]
+    assert names.count("small_product") <= 3
+    assert not {"mul", "dot_general"} & set(names)
+    text = jax.jit(gradient).lower(jnp.ones((3, 3))).as_text()
+    assert "multiply" in text
+    assert "dot_general" not in text
+
+
+@pytest.mark.parametrize("mode", ["auto", "explicit"])
+def test_contractions_of_arrays_that_are_spread_over_devices(mode):
+    kind = getattr(jax.sharding.AxisType, mode.capitalize())
+    mesh = jax.make_mesh((1,), ("x",), axis_types=(kind,))
+    spec = jax.sharding.PartitionSpec("x")
+    a, b = np.random.default_rng(0).normal(size=(2, 4, 3, 3))
+    a, b = (jax.device_put(x, jax.NamedSharding(mesh, spec)) for x in (a, b))
+
+    def function(a, b):
+        product = jax.vmap(lambda x, y: small_einsum("ij,jk->ik", x, y))
+        return jax.grad(lambda a: jnp.sum(product(a, b) ** 2))(a)
+
+    with jax.set_mesh(mesh):
+        mapped = jax.shard_map(
+            function, mesh=mesh, in_specs=(spec, spec), out_specs=spec
+        )
+        got = jax.jit(mapped)(a, b)
+    np.testing.assert_allclose(got, jax.jit(function)(*map(np.asarray, (a, b))))
+
+
+def test_operands_that_do_not_fit_are_refused():
+    with pytest.raises(ValueError, match="do not fit ij,jk"):
+        small_einsum("ij,jk->ik", jnp.ones((2, 1)), jnp.ones((3, 2)))
+
+
 def test_products_of_a_program_are_written_out():
     def function(x, y):
         inner = jax.jit(lambda x: x @ y)
