@@ -23,15 +23,16 @@ if tuple(map(int, importlib.metadata.version("jaxlib").split(".")[:3])) < (0, 11
     QUICK_FLAGS = f"--xla_cpu_use_fusion_emitters=false {QUICK_FLAGS}"
 os.environ["XLA_FLAGS"] = f"{QUICK_FLAGS} {os.environ.get('XLA_FLAGS', '')}".strip()
 
+# Python's collector looks for cycles each time that 700 objects have been made, which
+# takes a third of the time of a long trace; what is traced here stays in caches anyway.
+# The libraries below are loaded in less time, too.
+gc.set_threshold(100_000)
+
 import jax
 import pytest
 
 from nhjax._lanes import _registration
 
-
-# Python's collector looks for cycles each time that 700 objects have been made, which
-# takes a third of the time of a long trace; what is traced here stays in caches anyway.
-gc.set_threshold(100_000)
 
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_numpy_dtype_promotion", "strict")

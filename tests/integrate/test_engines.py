@@ -1,6 +1,9 @@
 """Ensembles in lanes are those of XLA to round-off, whatever their members do."""
 
+from functools import lru_cache
+
 import jax
+import jax.extend
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -29,10 +32,21 @@ def ensemble(example, members, num_steps):
     return y0, np.linspace(0.8, 1.0, members) * end / num_steps
 
 
-def by_engine(engine, monkeypatch, function, *args):
-    monkeypatch.setenv("NHJAX_ENGINE", engine)
-    # A function of its own, as programs that have been compiled keep their engine.
-    return jax.jit(jax.vmap(lambda *args: function(*args)))(*args)
+def by_both(function, args, monkeypatch):
+    """What members give in lanes, and by XLA, of one program that is traced once."""
+    program, shapes = jax.make_jaxpr(jax.vmap(function), return_shape=True)(*args)
+    found = []
+    for engine in ("lanes", "xla"):
+        monkeypatch.setenv("NHJAX_ENGINE", engine)
+
+        # A function of its own, as programs that have been compiled keep their engine.
+        @jax.jit
+        def run(leaves):
+            return jax.extend.core.jaxpr_as_fun(program)(*leaves)
+
+        leaves = jax.tree.leaves(args)
+        found.append(jax.tree.unflatten(jax.tree.structure(shapes), run(leaves)))
+    return found
 
 
 @pytest.mark.parametrize("name", GALLERY)
@@ -40,8 +54,7 @@ def test_an_ensemble_in_lanes_is_that_of_xla(name, monkeypatch):
     num_steps = 20
     function = program(GALLERY[name], "end", 2, num_steps)
     args = ensemble(GALLERY[name], 9, num_steps)
-    lanes, lane_counts = by_engine("lanes", monkeypatch, function, *args)
-    expected, counts = by_engine("xla", monkeypatch, function, *args)
+    (lanes, lane_counts), (expected, counts) = by_both(function, args, monkeypatch)
     assert np.all(np.asarray(counts) > 0)
     assert difference(lanes, expected) < 1e-12
     change = np.asarray(lane_counts) / np.asarray(counts) - 1
@@ -53,27 +66,32 @@ def test_an_ensemble_in_lanes_is_that_of_xla(name, monkeypatch):
 def test_output_and_derivatives_in_lanes_are_those_of_xla(kind, monkeypatch):
     function = program(PARTICLE, kind, 2, 10)
     args = ensemble(PARTICLE, 5, 10)
-    lanes, _ = by_engine("lanes", monkeypatch, function, *args)
-    expected, counts = by_engine("xla", monkeypatch, function, *args)
+    (lanes, _), (expected, counts) = by_both(function, args, monkeypatch)
     assert np.all(np.asarray(counts) > 0)
     assert difference(lanes, expected) < 1e-12
+
+
+@lru_cache
+def ten_steps(name):
+    """The states at the end of each member of an ensemble, and how they ran."""
+
+    @jax.jit
+    @jax.vmap
+    def run(y0, dt):
+        sol = nhjax.integrate(
+            GALLERY[name].system, LobattoIIIAB(2), y0, dt=dt, num_steps=10, throw=False
+        )
+        return sol.ys, sol.stats["num_iterations"], sol.stats["failed_step"]
+
+    return run
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, 1e200, 1e308, -0.0])
 @pytest.mark.parametrize("name", ["NonholonomicParticle", "ChaplyginSleigh"])
 def test_a_wild_member_changes_no_other(name, value):
     """Of 11 members, which fill a vector and a part of one, some are wild."""
-    example, wild = GALLERY[name], [1, 4, 10]
-
-    @jax.jit
-    @jax.vmap
-    def run(y0, dt):
-        sol = nhjax.integrate(
-            example.system, LobattoIIIAB(2), y0, dt=dt, num_steps=10, throw=False
-        )
-        return sol.ys, sol.stats["num_iterations"], sol.stats["failed_step"]
-
-    y0, dt = ensemble(example, 11, 10)
+    run, wild = ten_steps(name), [1, 4, 10]
+    y0, dt = ensemble(GALLERY[name], 11, 10)
     expected = run(y0, dt)
     q = np.array(y0.q)
     q[wild] = value

@@ -19,6 +19,10 @@ from jaxtyping import install_import_hook
 _checked = beartype(conf=BeartypeConf(is_pep484_tower=True))
 
 
+# They transform programs and write native code.
+WITHOUT_SHAPES = ("nhjax._compile", "nhjax._lanes")
+
+
 def checked(function: Callable[..., Any]) -> Callable[..., Any]:
     """The function with its annotations checked, where the checker knows their kind.
 
@@ -31,11 +35,11 @@ def checked(function: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def rooms_with_shapes() -> list[str]:
-    """All rooms but that which writes native code: it has no shapes, and many calls."""
+    """All rooms but the two that transform programs: no shapes, and many calls."""
     package = find_spec("nhjax")
     assert package is not None
     rooms = pkgutil.iter_modules(package.submodule_search_locations, "nhjax.")
-    return [room.name for room in rooms if room.name != "nhjax._lanes"]
+    return [room.name for room in rooms if room.name not in WITHOUT_SHAPES]
 
 
 if __name__ == "__main__":

@@ -1,5 +1,7 @@
 """A step is accepted if its equations are solved, and not because it took long."""
 
+from functools import cache
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -15,6 +17,7 @@ ROUND_OFF = 1e-13
 WITH_NEWTON = nhjax.SimplifiedNewton(fallback=True)
 
 
+@cache
 def double_pendulum():
     """Two rods from rest, in Cartesian coordinates."""
 
@@ -25,8 +28,10 @@ def double_pendulum():
     system = nhjax.LagrangianSystem(
         lambda t, q, v, args: 0.5 * v @ v - 9.81 * (q[1] + q[3]), holonomic=rods
     )
-    start = jnp.array([0.6, -0.8, 1.2, -1.6])
-    return system, nhjax.initial_state(system, start, jnp.zeros(4))
+    # It may be needed first where a run is traced.
+    with jax.ensure_compile_time_eval():
+        start = jnp.array([0.6, -0.8, 1.2, -1.6])
+        return system, nhjax.initial_state(system, start, jnp.zeros(4))
 
 
 def swing(num_steps=9, **options):
