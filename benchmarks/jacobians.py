@@ -1,20 +1,26 @@
 """Iterations a step with the Jacobian of simplified Newton, and with fuller ones.
 
 `SimplifiedNewton` inverts the leading part of the Jacobian of the stage equations, with
-the mass matrix at the start of the step and without the derivatives of forces and of
-constraints by velocities and positions, which enter at order h. Beside it are the exact
-Jacobian at the starting values, kept for the whole step, which is the most that one
-factorisation a step can do, and the exact Jacobian of every iterate (`Newton`). Runs
-that fail are shown with the number of steps that they made.
+the mass matrix at the start of the step, or this with the terms of order h. Beside it
+are the exact Jacobian at the starting values, kept for the whole step, which is the
+most that one factorisation a step can do, and the exact Jacobian of every iterate
+(`Newton`). Runs that fail are shown with the number of steps that they made.
+
+A second table has the time of a step with the terms of order h over that without, of
+one trajectory and of a batch, run in turn, and that of compiling.
 
     python -m benchmarks.jacobians
 """
 
 import argparse
+import time
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.flatten_util import ravel_pytree
 
 import nhjax
@@ -27,6 +33,7 @@ from ._report import markdown_table, write
 
 
 NUM_STEPS = 20
+MEMBERS, REPEATS = 64, 60
 CASES = [
     ("Unicycle", 3, 0.1),
     ("Unicycle", 5, 0.25),
@@ -40,6 +47,8 @@ CASES = [
     ("ChaplyginSleigh", 5, 0.5),
     ("RollingDisc", 3, 0.1),
     ("CarWithTrailers", 3, 0.1),
+    ("TwoWheeledRobot", 3, 0.1),
+    ("RollingTorus", 3, 0.1),
     ("ChaoticSystem", 3, 0.1),
     ("NonholonomicParticle", 3, 0.1),
 ]
@@ -77,29 +86,83 @@ class ExactAtStart(nhjax.AbstractStageSolver):
         return nhjax.Newton().frozen_newton_map(stages, lin, x)
 
 
+LEADING = nhjax.SimplifiedNewton(fallback=False, jacobian="leading")
+FIRST_ORDER = nhjax.SimplifiedNewton(fallback=False, jacobian="first_order")
 SOLVERS = {
-    "leading part": nhjax.SimplifiedNewton(fallback=False),
+    "leading part": LEADING,
+    "with terms of order h": FIRST_ORDER,
     "exact at the start": ExactAtStart(),
     "exact": nhjax.Newton(),
 }
+
+
+def integrated(
+    name: str, stages: int, dt: float, solver: nhjax.AbstractStageSolver
+) -> tuple[Callable[[nhjax.State], nhjax.Solution], nhjax.State]:
+    """The function from a state to a run, and the state."""
+    example = getattr(systems, name)()
+
+    def run(y0):
+        return nhjax.integrate(
+            example.system,
+            nhjax.LobattoIIIAB(stages),
+            y0,
+            dt=dt,
+            num_steps=NUM_STEPS,
+            stage_solver=solver,
+            saveat=nhjax.SaveAt(t1=True),
+            throw=False,
+        )
+
+    return run, example.initial_state()
 
 
 def iterations(
     name: str, stages: int, dt: float, solver: nhjax.AbstractStageSolver
 ) -> tuple[int, float]:
     """The number of steps that a run makes, and the iterations of each on average."""
-    example = getattr(systems, name)()
-    stats = nhjax.integrate(
-        example.system,
-        nhjax.LobattoIIIAB(stages),
-        example.initial_state(),
-        dt=dt,
-        num_steps=NUM_STEPS,
-        stage_solver=solver,
-        throw=False,
-    ).stats
+    run, y0 = integrated(name, stages, dt, solver)
+    stats = jax.jit(run)(y0).stats
     steps = int(stats["num_steps"])
     return steps, int(stats["num_iterations"]) / max(steps, 1)
+
+
+class Programs(NamedTuple):
+    """Compiled runs of one trajectory and of a batch, and seconds of compiling."""
+
+    one: Callable[[], Any]
+    batch: Callable[[], Any]
+    compiling: float
+
+
+def programs(
+    name: str, stages: int, dt: float, solver: nhjax.AbstractStageSolver
+) -> Programs:
+    """Compile a run, for one trajectory and for a batch."""
+    run, y0 = integrated(name, stages, dt, solver)
+    members = jax.tree.map(lambda x: jnp.broadcast_to(x, (MEMBERS, *x.shape)), y0)
+    one = jax.jit(run).lower(y0).compile()
+    start = time.process_time()
+    batch = jax.jit(jax.vmap(run)).lower(members).compile()
+    compiling = time.process_time() - start
+    return Programs(lambda: one(y0), lambda: batch(members), compiling)
+
+
+def ratios(name: str, stages: int, dt: float) -> dict[str, float]:
+    """Times with the terms of order h over those without, run in turn."""
+    both = [programs(name, stages, dt, solver) for solver in (FIRST_ORDER, LEADING)]
+    seconds: dict[tuple[str, int], list[float]] = {}
+    for _ in range(REPEATS):
+        for k, compiled in enumerate(both):
+            for kind in ("one", "batch"):
+                start = time.perf_counter()
+                jax.block_until_ready(getattr(compiled, kind)().ys.p)
+                took = time.perf_counter() - start
+                seconds.setdefault((kind, k), []).append(took)
+    # Other programs on the machine make runs longer, never shorter.
+    quick = {key: float(np.quantile(times, 0.2)) for key, times in seconds.items()}
+    found = {kind: quick[kind, 0] / quick[kind, 1] for kind in ("one", "batch")}
+    return found | {"compiling": both[0].compiling / both[1].compiling}
 
 
 def main() -> None:
@@ -118,11 +181,25 @@ def main() -> None:
                 | {"num_steps": steps, "iterations": mean}
             )
         rows.append(row)
+    times, measured = [], []
+    for name, stages, dt in CASES:
+        if iterations(name, stages, dt, LEADING)[0] < NUM_STEPS:
+            # A run that fails is no measure of time.
+            continue
+        found = ratios(name, stages, dt)
+        measured.append({"system": name, "stages": stages, "dt": dt} | found)
+        columns = [f"{found[key]:.2f}" for key in ("one", "batch", "compiling")]
+        times.append([name, str(stages), f"{dt:g}", *columns])
+    header = ["system", "s", "h"]
     text = (
         f"Iterations a step, mean of {NUM_STEPS} steps.\n\n"
-        f"{markdown_table(['system', 's', 'h', *SOLVERS], rows)}"
+        f"{markdown_table([*header, *SOLVERS], rows)}\n\n"
+        "Times with the terms of order h over those without: a step of one trajectory, "
+        f"one of {MEMBERS} members, and compiling the latter.\n\n"
+        f"{markdown_table([*header, 'one', 'batch', 'compiling'], times)}"
     )
-    write("jacobians", "Jacobians of the stage equations", text, {"rows": data})
+    data = {"rows": data, "times": measured}
+    write("jacobians", "Jacobians of the stage equations", text, data)
 
 
 if __name__ == "__main__":

@@ -14,7 +14,7 @@ from ._contraction import (
     matvec as matvec,
     small_einsum as small_einsum,
 )
-from ._diagonal import jacobian as jacobian
+from ._diagonal import full_jacobian as full_jacobian, jacobian as jacobian
 from ._implicit import (
     ClosureConverted as ClosureConverted,
     frozen as frozen,

@@ -11,6 +11,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array
 
 from .._custom_types import FloatScalar, FloatScalarLike
+from .._errors import check_choice
 from .._numerics import (
     iterate,
     jacobian_and_value,
@@ -21,7 +22,8 @@ from .._numerics import (
     Solved,
 )
 from .._system import all_finite, check_flag, Linearisation
-from ._leading_structure import leading_structure
+from ._factorisation import leading_structure
+from ._first_order import JacobianName
 from ._scale import fibre_coordinate_scale
 from ._stage_iteration import (
     corrected,
@@ -97,12 +99,15 @@ def _iterated(
 
 
 class SimplifiedNewton(AbstractStageSolver):
-    """Simplified Newton on the stage equations, with their leading part as Jacobian.
+    """Simplified Newton on the stage equations, with part of their Jacobian.
 
     The mass matrix M and the Schur complement of the constraints are inverted once a
     step, at its start; each iteration costs one evaluation of the stage equations and a
-    few small products. An iteration reduces the error by a factor O(h²) where M is
-    constant and the constraints are linear in v, and by a factor O(h) elsewhere.
+    few small products. With this leading part alone an iteration reduces the error by a
+    factor O(h²) where M is constant, forces do not depend on v and the constraints are
+    linear in v, and by a factor O(h) elsewhere and on Lie groups. With the terms of
+    order h, derivatives of momenta by positions and of forces by velocities at the
+    start of the step, it is O(h²) there too.
 
     Where this iteration does not converge, Newton's method with the exact Jacobian may.
     With the fallback it takes over in such a step, and
@@ -122,6 +127,11 @@ class SimplifiedNewton(AbstractStageSolver):
         True, False, or None, the default, which means in plain calls alone. Derivatives
         of a run with the fallback use the exact Jacobian, as those of `nhjax.Newton()`
         do.
+    - `jacobian`: `"leading"`; `"first_order"`, which has the terms of order h as well;
+        or None, the default, which has them where they pay: with at most five stages
+        and six coordinates, and without holonomic constraints. They are not available
+        for Hamiltonian systems, redundant constraints, and constraints so many that
+        they are kept sparse.
 
     !!! example
 
@@ -137,8 +147,11 @@ class SimplifiedNewton(AbstractStageSolver):
     max_iterations: int = eqx.field(static=True, default=100)
     tolerance: FloatScalarLike = eqx.field(converter=tolerance_array, default=0.0)
     fallback: bool | None = eqx.field(static=True, default=None)
+    jacobian: JacobianName = eqx.field(static=True, default=None)
 
     def __check_init__(self):
+        if self.jacobian is not None:
+            check_choice("jacobian", self.jacobian, ("leading", "first_order"))
         if self.fallback is not None:
             check_flag("fallback", self.fallback)
 
@@ -146,7 +159,7 @@ class SimplifiedNewton(AbstractStageSolver):
         self, stages: StageSystem, x0: Stages, lin: Linearisation, skip: Array
     ) -> Solved[Stages, Evaluation]:
         """Solve the stage equations from `x0`; do nothing where `skip` is true."""
-        structure = leading_structure(stages, x0, lin)
+        structure = leading_structure(stages, x0, lin, self.jacobian)
         scale = fibre_coordinate_scale(stages, x0, lin)
 
         def sweep(x: Stages):
@@ -183,7 +196,7 @@ class SimplifiedNewton(AbstractStageSolver):
         """
         if self.fallback:
             return self._newton.frozen_newton_map(stages, lin, x)
-        structure = leading_structure(stages, x, lin)
+        structure = leading_structure(stages, x, lin, self.jacobian)
         return lambda stages, x: corrected(stages, structure, x)[0]
 
 

@@ -106,6 +106,15 @@ def holonomic_constraint(stages: StageSystem, x: Stages) -> Float[Array, "s k"]:
     return stages.redundancy.reduced(values, stages.h * x.holonomic, m)
 
 
+def constraint_values(stages: StageSystem, x: Stages) -> tuple[Array, Array]:
+    """Compute the nonholonomic constraints at the nodes and the holonomic ones."""
+    none = jnp.zeros((0,), stages.p.dtype)
+    return (
+        node_constraint(stages, x) if stages.num_nonholonomic else none,
+        holonomic_constraint(stages, x) if stages.num_holonomic else none,
+    )
+
+
 def constraint_jacobian(stages: StageSystem, x: Stages) -> Float[Array, "r l n"]:
     """Compute B = ∂Φ/∂u of all constraints on velocities at the nodes i >= 2."""
     return _at_nodes(stages, x, jax.jacrev)

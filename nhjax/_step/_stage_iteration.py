@@ -14,12 +14,11 @@ from .._numerics import frozen, matvec, max_norm, Sizes, unit
 from .._system import Linearisation
 from ._leading_structure import LeadingStructure
 from ._stage_equations import (
+    constraint_values,
     end_residual,
-    holonomic_constraint,
     impulse_weights,
     in_chart,
     invariant_errors,
-    node_constraint,
     node_residual,
     stage_forces,
     stage_velocities,
@@ -48,7 +47,8 @@ def corrected(
     forces = stage_forces(stages, x)
     x_next = structure.correct_stages(stages, x, forces.residual)
     r_nodes = node_residual(stages, x_next, forces.force)
-    x_next = structure.correct_nodes(x_next, r_nodes)
+    change = x_next.velocity - x.velocity
+    x_next = structure.correct_nodes(stages, x_next, r_nodes, change)
     if stages.kept is not None:
         # Before the constraints, so that these see what impulses change: where a system
         # is nearly at rest, the work of reactions on that is not small beside it.
@@ -60,22 +60,13 @@ def corrected(
 
 
 def _constrain(stages: StageSystem, structure: LeadingStructure, x: Stages) -> Stages:
-    kinematic, holonomic = _constraints(stages, x)
+    kinematic, holonomic = constraint_values(stages, x)
     x = structure.correct_multipliers(stages, x, kinematic, holonomic)
     if stages.symmetric:
         # λ_c depends on v_{k+1} at zeroth order: it must see the new velocity, or the
         # two errors would feed each other and contract only as the root of the rate.
         x = structure.correct_end(stages, x, end_residual(stages, x))
     return x
-
-
-def _constraints(stages: StageSystem, x: Stages) -> tuple[Array, Array]:
-    """Compute the nonholonomic constraints at the nodes and the holonomic ones."""
-    none = jnp.zeros((0,), stages.p.dtype)
-    return (
-        node_constraint(stages, x) if stages.num_nonholonomic else none,
-        holonomic_constraint(stages, x) if stages.num_holonomic else none,
-    )
 
 
 def stage_residual(
@@ -120,7 +111,7 @@ def stage_residual(
     parts = [forces.residual, r_nodes]
     if stages.hamiltonian:
         parts.append(x.velocity - stage_velocities(stages, x))
-    parts += _constraints(stages, x)
+    parts += constraint_values(stages, x)
     if stages.symmetric:
         parts += end_residual(stages, x)
     if stages.kept is not None:

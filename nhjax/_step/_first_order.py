@@ -1,0 +1,291 @@
+"""The terms of order h in the linearised stage equations of one step."""
+
+from typing import Literal, NamedTuple, TypeAlias
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from .._numerics import dependence, full_jacobian, small_einsum, SparseMatrix
+from .._system import Linearisation, whole_force
+from ._stage_system import StageSystem
+from ._unknowns import Stages
+
+
+# What of the Jacobian simplified Newton inverts; None means what pays.
+JacobianName: TypeAlias = Literal["leading", "first_order"] | None
+
+
+class FirstOrderTerms(eqx.Module):
+    """The terms of order h in the linearised stage equations of a Lagrangian system.
+
+    The equations of the stages, r_i = Π_i - base - h Σ â_ij F^j, change with the stage
+    velocities by
+
+    δr_i = N_i δH_i + ∂Π/∂y δy_i - h Σ_j â_ij ∂F/∂H δH_j - ∂base/∂ξ δξ - ...,
+    δy_i = h Σ_j a_ij δH_j,
+
+    and those of the nodes likewise. The leading part is N δH_i with the mass matrix N
+    at the start of the step. All others are of the order of h: how the mass matrix
+    turns until the stage, N_i = N + h c_i Ṅ, how momenta change with positions, and how
+    forces change with velocities. Their derivatives are those at the start of the step,
+    multiplied by N⁻¹, so that with z_i = N⁻¹ r_i
+
+    δH_i = z_i - N⁻¹ (the terms, of z),
+
+    of which the error is of the order of h². The first product of the Neumann series is
+    enough: what it leaves out is as small as what the derivatives at the start leave
+    out.
+    """
+
+    inertia: Float[Array, "s n n"]  # N⁻¹ (N_i - N) of the stages
+    momentum: Float[Array, "n n"]  # h N⁻¹ ∂Π/∂y
+    force: Float[Array, "n n"]  # h N⁻¹ ∂F/∂H
+    base: Float[Array, "n n"]  # h N⁻¹ times the derivative of the constant term by ξ
+    node_inertia: Float[Array, "r n n"]  # N⁻¹ (N_i - N) of the nodes
+    node_momentum: Float[Array, "n n"]  # the same as above, of the momenta at nodes
+    node_force: Float[Array, "n n"]
+
+    def of_stages(
+        self, stages: StageSystem, z: Float[Array, "s n *c"]
+    ) -> Float[Array, "s n *c"]:
+        """Compute the changes of the stage velocities that balance N z."""
+        a, a_hat, b = (stages.coefficients(name) for name in ("a", "a_hat", "b"))
+        by_node = _weighted(a, z)
+        return (
+            z
+            - _each(self.inertia, z)
+            - _all(self.momentum, by_node)
+            + _all(self.force, _weighted(a_hat, z))
+            + _all(self.base, _weighted(b[None], z))
+        )
+
+    def of_nodes(self, z: Float[Array, "r n *c"]) -> Float[Array, "r n *c"]:
+        """Compute the changes of the velocities at the nodes that balance N z."""
+        return z - _each(self.node_inertia, z)
+
+    def by_force(
+        self, stages: StageSystem, change: Float[Array, "s n *c"]
+    ) -> Float[Array, "r n *c"]:
+        """Compute how forces move the nodes if the stage velocities change."""
+        return _all(self.node_force, _weighted(stages.node_weights, change))
+
+    def by_position(
+        self, stages: StageSystem, change: Float[Array, "s n *c"]
+    ) -> Float[Array, "r n *c"]:
+        """Compute how positions move the nodes if the stage velocities change."""
+        return -_all(self.node_momentum, _weighted(stages.node_weights, change))
+
+
+def _weighted(
+    weights: Float[Array, "r s"], z: Float[Array, "s n *c"]
+) -> Float[Array, "r n *c"]:
+    rest = "nc"[: z.ndim - 1]
+    return small_einsum(f"ij,j{rest}->i{rest}", weights, z)
+
+
+def _all(
+    matrix: Float[Array, "k n"], z: Float[Array, "r n *c"]
+) -> Float[Array, "r k *c"]:
+    rest = "c"[: z.ndim - 2]
+    return small_einsum(f"kn,in{rest}->ik{rest}", matrix, z)
+
+
+def _each(
+    matrices: Float[Array, "r n n"], z: Float[Array, "r n *c"]
+) -> Float[Array, "r n *c"]:
+    rest = "c"[: z.ndim - 2]
+    return small_einsum(f"ikn,in{rest}->ik{rest}", matrices, z)
+
+
+# Terms of order h pay where they make a step quicker than the sweeps that they save:
+# up to this many stages and coordinates, and without holonomic constraints.
+_MOST_STAGES, _MOST_COORDINATES = 5, 6
+
+
+def takes_first_order_terms(
+    stages: StageSystem, lin: Linearisation, jacobian: JacobianName
+) -> bool:
+    """Tell whether the Jacobian of simplified Newton has terms of order h.
+
+    **Raises:** `ValueError` if they are asked for and not available.
+    """
+    if jacobian == "leading":
+        return False
+    has_them = not stages.hamiltonian
+    has_them &= stages.redundancy is None and not isinstance(lin.jacobian, SparseMatrix)
+    if jacobian == "first_order":
+        if not has_them:
+            raise ValueError(
+                '`SimplifiedNewton(jacobian="first_order")` is not available for '
+                "Hamiltonian systems, redundant constraints, or constraints so many "
+                'that they are kept sparse; use "leading" or None.'
+            )
+        return True
+    pays = stages.method.stages <= _MOST_STAGES and stages.num_holonomic == 0
+    if not (has_them and pays and stages.p.shape[0] <= _MOST_COORDINATES):
+        return False
+    return not stages.manifold.is_flat or _has_terms(stages)
+
+
+def _has_terms(stages: StageSystem) -> bool:
+    # On a vector space they vanish unless momenta depend on positions, or forces on
+    # velocities, which the programs of the system tell.
+    system, t, args = stages.system, stages.t, stages.args
+    q, zero = stages.q, jnp.zeros_like(stages.p)
+    by_position = dependence(
+        lambda xi: system.momentum(t, stages.manifold.act(q, xi), zero, args), zero
+    )
+    by_velocity = dependence(
+        lambda u: whole_force(system, t, q, u, stages.multiplier, args), zero
+    )
+    return bool(by_position.any() or by_velocity.any())
+
+
+def first_order_terms(
+    stages: StageSystem, x: Stages, lin: Linearisation
+) -> FirstOrderTerms:
+    """Compute the terms at the start of the step, in the chart of the stages x."""
+    h, c = stages.h, stages.coefficients("c")
+    # The starting values begin at u_k.
+    first = jnp.sum(stages.coefficients("a_hat"), axis=1)[0]
+    u = x.velocity[0] - first * h * lin.acceleration
+    inverse = lin.momentum_inverse
+    if inverse.ndim == 1:
+        inverse = jnp.diag(inverse)
+
+    def scaled(matrix):
+        return small_einsum("kl,ln->kn", inverse, matrix)
+
+    def moved(times, rate):
+        return h * times[:, None, None] * scaled(rate)[None]
+
+    body = _in_body(stages, u, lin.acceleration)
+    if stages.manifold.is_flat:
+        force = _force_slope(stages, x, u)
+        none = jnp.zeros_like(force)
+        chart = _ChartSlopes(none, body.momentum, force, force, none)
+    else:
+        chart = _in_chart(stages, x, u)
+    coordinates = c - 0.5 if stages.method.chart == "middle" else c
+    node_times = c[1:] if stages.num_nonholonomic else c[-1:]
+    return FirstOrderTerms(
+        inertia=moved(c, body.inertia_rate) + moved(coordinates, chart.turning),
+        momentum=h * scaled(chart.momentum),
+        force=h * scaled(chart.force),
+        base=h * scaled(chart.base),
+        node_inertia=moved(node_times, body.inertia_rate),
+        node_momentum=h * scaled(body.momentum),
+        node_force=h * scaled(chart.body_force),
+    )
+
+
+def momenta_of_forces(
+    stages: StageSystem, x: Stages, forces: Float[Array, "s n c"]
+) -> tuple[Float[Array, "s n c"], Float[Array, "r n c"]]:
+    """Compute the momenta of stages and nodes from forces at the stages, for h = 1.
+
+    The chart carries forces from stage to stage, which is of the order of h too.
+    """
+    a_hat, b = stages.coefficients("a_hat"), stages.coefficients("b")
+    if stages.manifold.is_flat:
+        return _weighted(a_hat, forces), _weighted(stages.node_weights, forces)
+    chart, y = stages.in_stages(x)
+    nodes = stages.in_nodes(x)[1]
+
+    def one(force):
+        zero = jnp.zeros_like(force)
+        _, chart_force = chart.to_chart(y, zero, zero, force)
+        carried = chart.to_origin(y, force)
+        sums = (_weighted(b[None], part)[0] for part in (carried, chart_force))
+        base = chart.base_momentum(zero[0], *sums)
+        on_nodes = chart.from_origin(nodes, _weighted(stages.node_weights, carried))
+        return base[None] + _weighted(a_hat, chart_force), on_nodes
+
+    return jax.vmap(one, in_axes=2, out_axes=2)(forces)
+
+
+class _BodySlopes(NamedTuple):
+    """Derivatives at the start of a step, in the body frame.
+
+    They are the rate of N = ∂p/∂u along the motion, and the derivatives of the momenta
+    by positions, less how momenta are carried there.
+    """
+
+    inertia_rate: Array
+    momentum: Array
+
+
+class _ChartSlopes(NamedTuple):
+    """Derivatives at the start of a step, in its chart.
+
+    They are how ∂Π/∂H changes with dτ_y along y = v, then ∂Π/∂y, ∂F/∂H, ∂w/∂H, and the
+    derivative of the constant term of Π by the increment of the step.
+    """
+
+    turning: Array
+    momentum: Array
+    force: Array
+    body_force: Array
+    base: Array
+
+
+def _in_body(stages: StageSystem, u: Array, acceleration: Array) -> _BodySlopes:
+    system, args, manifold = stages.system, stages.args, stages.manifold
+    t, zero = stages.t, jnp.zeros_like(u)
+
+    def momentum(t, xi, u):
+        return system.momentum(t, manifold.act(stages.q, xi), u, args)
+
+    def carried(xi):
+        p = momentum(t, xi, u)
+        return p if manifold.is_flat else p - manifold.to_end(xi, stages.p)
+
+    _, rate = jax.jvp(
+        lambda t, xi, u: full_jacobian(lambda u: momentum(t, xi, u), u),
+        (t, zero, u),
+        (jnp.ones_like(t), u, acceleration),
+    )
+    return _BodySlopes(rate, full_jacobian(carried, zero))
+
+
+def _force_slope(stages: StageSystem, x: Stages, u: Array) -> Array:
+    system, t, q, args = stages.system, stages.t, stages.q, stages.args
+    multiplier = stages.multipliers(x)[0]
+    return full_jacobian(lambda u: whole_force(system, t, q, u, multiplier, args), u)
+
+
+def _in_chart(stages: StageSystem, x: Stages, u: Array) -> _ChartSlopes:
+    system, args, manifold = stages.system, stages.args, stages.manifold
+    t, multiplier, chart = stages.t, stages.multipliers(x)[0], stages.chart(x)
+    zero = jnp.zeros_like(u)
+
+    def pair(y, xi, velocity):
+        """Compute Π, F and w at q_k τ(ξ), as if its coordinates were y."""
+        q = manifold.act(stages.q, xi)
+        u = chart.body_velocities(y[None], velocity[None])[0]
+        p = system.momentum(t, q, u, args)
+        w = whole_force(system, t, q, u, multiplier, args)
+        in_chart = chart.to_chart(y[None], velocity[None], p[None], w[None])
+        return in_chart[0][0], in_chart[1][0], w
+
+    def inertia(y):
+        return full_jacobian(lambda v: pair(y, zero, v)[0], u)
+
+    def base(increment):
+        moved = eqx.tree_at(lambda z: z.increment, chart, increment)
+        momentum = moved.momentum_at_origin(stages.p)
+        return moved.base_momentum(momentum, 0 * increment, 0 * increment)
+
+    _, rate = jax.jvp(inertia, (zero,), (u,))
+    slope = full_jacobian(lambda y: pair(y, y, u)[0], zero)
+    force, body_force = full_jacobian(lambda v: pair(zero, zero, v)[1:], u)
+    of_base = full_jacobian(base, stages.increment(x))
+    if stages.method.chart == "middle":
+        # The coordinates of all points move by -½ δξ; of the constant term, the forces
+        # enter at both ends alike.
+        of_base = of_base + 0.5 * slope + 0.5 * (body_force - force)
+    else:
+        of_base = of_base + body_force - force
+    return _ChartSlopes(rate, slope, force, body_force, of_base)

@@ -1,0 +1,143 @@
+"""Terms of order h in the Jacobian of simplified Newton: what they are, and do."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax.flatten_util import ravel_pytree
+
+import nhjax
+from nhjax import systems
+from nhjax._step import first_step_state
+from nhjax._step._factorisation import leading_structure
+from nhjax._step._stage_iteration import corrected
+from nhjax._step._starting_values import starting_values
+from nhjax._step._step import equations_of_step
+from oracles.forms import in_space
+
+
+def contraction(example, method, h):
+    """The spectral radius of one sweep at the solution, with and without the terms.
+
+    The derivative of the whole sweep by the unknowns is taken by automatic
+    differentiation, which knows nothing of how the terms were found.
+    """
+    system, y0, t = example.system, example.initial_state(), jnp.zeros(())
+
+    @jax.jit
+    def rates(h):
+        start = first_step_state(system, method, t, y0, None)
+        stages = equations_of_step(system, method, t, h, start, None, None)
+        lin = start.lin
+        x0 = starting_values(stages, system.fibre_coordinate(y0), lin)
+        x = nhjax.Newton().solve(stages, x0, lin, jnp.asarray(False)).x
+        z, unravel = ravel_pytree(x)
+
+        def slope(jacobian):
+            structure = leading_structure(stages, x0, lin, jacobian)
+            return jax.jacfwd(
+                lambda z: ravel_pytree(corrected(stages, structure, unravel(z))[0])[0]
+            )(z)
+
+        return [slope(jacobian) for jacobian in ("leading", "first_order")]
+
+    sizes = (jnp.asarray(h), jnp.asarray(h / 2))
+    return np.array(
+        [[np.abs(np.linalg.eigvals(J)).max() for J in rates(h)] for h in sizes]
+    )
+
+
+@pytest.mark.parametrize(
+    ("example", "chart"),
+    [
+        (systems.ChaplyginSleigh(), "middle"),
+        (systems.CarWithTrailers(), "middle"),
+        (systems.Suslov(), "middle"),
+        (systems.Unicycle(), "start"),
+        (systems.HeavyTop(), "start"),
+        (systems.HeavyTopSE3(), "middle"),
+    ],
+    ids=lambda x: x if isinstance(x, str) else type(x).__name__,
+)
+def test_a_sweep_contracts_by_the_square_of_the_step(example, chart):
+    method = nhjax.LobattoIIIAB(3, chart=chart)
+    (leading, full), (leading_half, full_half) = contraction(example, method, 0.02)
+    # The leading part alone leaves out terms of order h, and shows it.
+    assert 1.8 < leading / leading_half < 2.2
+    assert 3.6 < full / full_half < 4.4
+
+
+def run(example, stages, dt, **solver):
+    return jax.jit(
+        lambda y0: nhjax.integrate(
+            example.system,
+            nhjax.LobattoIIIAB(stages),
+            y0,
+            dt=dt,
+            num_steps=20,
+            stage_solver=nhjax.SimplifiedNewton(fallback=False, **solver),
+            throw=False,
+        )
+    )(example.initial_state())
+
+
+def test_large_steps_of_a_sleigh_are_solved_that_the_leading_part_does_not_solve():
+    sleigh = systems.ChaplyginSleigh()
+    leading = run(sleigh, 5, 0.5, jacobian="leading")
+    assert leading.result == nhjax.RESULTS.nonlinear_max_iterations
+    sol = run(sleigh, 5, 0.5)
+    assert sol.result == nhjax.RESULTS.successful
+    assert sol.stats["num_iterations"] <= 20 * 20
+    newton = nhjax.integrate(
+        sleigh.system,
+        nhjax.LobattoIIIAB(5),
+        sleigh.initial_state(),
+        dt=0.5,
+        num_steps=20,
+        stage_solver=nhjax.Newton(),
+    )
+    for name in ("q", "v", "multiplier"):
+        one, other = (getattr(s.ys, name) for s in (sol, newton))
+        np.testing.assert_allclose(one, other, rtol=0, atol=1e-12, err_msg=name)
+
+
+def test_where_the_mass_is_constant_and_forces_do_not_depend_on_v_nothing_is_added():
+    particle = systems.NonholonomicParticle()
+    default, leading = (
+        jax.make_jaxpr(
+            lambda y0, solver=solver: (
+                nhjax.integrate(
+                    particle.system,
+                    nhjax.LobattoIIIAB(3),
+                    y0,
+                    dt=0.1,
+                    num_steps=2,
+                    stage_solver=solver,
+                    throw=False,
+                ).ys.q
+            )
+        )(particle.initial_state())
+        for solver in (
+            nhjax.SimplifiedNewton(fallback=False),
+            nhjax.SimplifiedNewton(fallback=False, jacobian="leading"),
+        )
+    )
+    assert str(default) == str(leading)
+
+
+def test_terms_that_are_not_available_are_refused():
+    wrong: Any = "exact"
+    with pytest.raises(ValueError, match="jacobian must be one of 'leading'"):
+        nhjax.SimplifiedNewton(jacobian=wrong)
+    start = in_space("none", False)
+    with pytest.raises(ValueError, match="not available for Hamiltonian systems"):
+        nhjax.integrate(
+            start.forms["hamiltonian"],
+            nhjax.LobattoIIIAB(2),
+            start.y0,
+            dt=0.1,
+            num_steps=1,
+            stage_solver=nhjax.SimplifiedNewton(jacobian="first_order"),
+        )
