@@ -100,8 +100,10 @@ def _each(
 
 
 # Terms of order h pay where they make a step quicker than the sweeps that they save:
-# up to this many stages and coordinates, and without holonomic constraints.
-_MOST_STAGES, _MOST_COORDINATES = 5, 6
+# up to this many stages, coordinates, and changes of stages with the multipliers, and
+# without holonomic constraints. Larger programs of one trajectory are no longer
+# compiled as scalars, and become several times slower.
+_MOST_STAGES, _MOST_COORDINATES, _MOST_RESPONSES = 5, 6, 100
 
 
 def takes_first_order_terms(
@@ -123,8 +125,10 @@ def takes_first_order_terms(
                 'that they are kept sparse; use "leading" or None.'
             )
         return True
-    pays = stages.method.stages <= _MOST_STAGES and stages.num_holonomic == 0
-    if not (has_them and pays and stages.p.shape[0] <= _MOST_COORDINATES):
+    s, n, m = stages.method.stages, stages.p.shape[0], stages.num_nonholonomic
+    is_small = s <= _MOST_STAGES and n <= _MOST_COORDINATES
+    is_small &= s * n * (s - 1) * m <= _MOST_RESPONSES
+    if not has_them or not is_small or stages.num_holonomic > 0:
         return False
     return not stages.manifold.is_flat or _has_terms(stages)
 

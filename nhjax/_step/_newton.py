@@ -128,10 +128,10 @@ class SimplifiedNewton(AbstractStageSolver):
         of a run with the fallback use the exact Jacobian, as those of `nhjax.Newton()`
         do.
     - `jacobian`: `"leading"`; `"first_order"`, which has the terms of order h as well;
-        or None, the default, which has them where they pay: with at most five stages
-        and six coordinates, and without holonomic constraints. They are not available
-        for Hamiltonian systems, redundant constraints, and constraints so many that
-        they are kept sparse.
+        or None, the default, which has them where they pay: with s <= 5 stages, n <= 6
+        coordinates and m constraints with s (s - 1) n m <= 100, all nonholonomic. They
+        are not available for Hamiltonian systems, redundant constraints, and
+        constraints so many that they are kept sparse.
 
     !!! example
 
