@@ -20,10 +20,9 @@ from .._system import Linearisation
 from ._first_order import (
     first_order_terms,
     FirstOrderTerms,
-    JacobianName,
     momenta_of_forces,
-    takes_first_order_terms,
 )
+from ._jacobian_choice import JacobianName, takes_first_order_terms
 from ._leading_structure import LeadingStructure, Responses
 from ._stage_equations import (
     constraint_jacobian,

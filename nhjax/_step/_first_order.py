@@ -1,20 +1,17 @@
 """The terms of order h in the linearised stage equations of one step."""
 
-from typing import Literal, NamedTuple, TypeAlias
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from .._numerics import dependence, full_jacobian, small_einsum, SparseMatrix
+from .._custom_types import FloatScalar
+from .._numerics import full_jacobian, small_einsum
 from .._system import Linearisation, whole_force
 from ._stage_system import StageSystem
 from ._unknowns import Stages
-
-
-# What of the Jacobian simplified Newton inverts; None means what pays.
-JacobianName: TypeAlias = Literal["leading", "first_order"] | None
 
 
 class FirstOrderTerms(eqx.Module):
@@ -78,6 +75,11 @@ class FirstOrderTerms(eqx.Module):
         return -_all(self.node_momentum, _weighted(stages.node_weights, change))
 
 
+# Forces that change so much, as a friction that is steep at rest, are no part of a
+# series: the leading part alone does better, and more so if friction soon saturates.
+_LARGEST = 5.0
+
+
 def _weighted(
     weights: Float[Array, "r s"], z: Float[Array, "s n *c"]
 ) -> Float[Array, "r n *c"]:
@@ -97,54 +99,6 @@ def _each(
 ) -> Float[Array, "r n *c"]:
     rest = "c"[: z.ndim - 2]
     return small_einsum(f"ikn,in{rest}->ik{rest}", matrices, z)
-
-
-# Terms of order h pay where they make a step quicker than the sweeps that they save:
-# up to this many stages, coordinates, and changes of stages with the multipliers, and
-# without holonomic constraints. Larger programs of one trajectory are no longer
-# compiled as scalars, and become several times slower.
-_MOST_STAGES, _MOST_COORDINATES, _MOST_RESPONSES = 5, 6, 100
-
-
-def takes_first_order_terms(
-    stages: StageSystem, lin: Linearisation, jacobian: JacobianName
-) -> bool:
-    """Tell whether the Jacobian of simplified Newton has terms of order h.
-
-    **Raises:** `ValueError` if they are asked for and not available.
-    """
-    if jacobian == "leading":
-        return False
-    has_them = not stages.hamiltonian
-    has_them &= stages.redundancy is None and not isinstance(lin.jacobian, SparseMatrix)
-    if jacobian == "first_order":
-        if not has_them:
-            raise ValueError(
-                '`SimplifiedNewton(jacobian="first_order")` is not available for '
-                "Hamiltonian systems, redundant constraints, or constraints so many "
-                'that they are kept sparse; use "leading" or None.'
-            )
-        return True
-    s, n, m = stages.method.stages, stages.p.shape[0], stages.num_nonholonomic
-    is_small = s <= _MOST_STAGES and n <= _MOST_COORDINATES
-    is_small &= s * n * (s - 1) * m <= _MOST_RESPONSES
-    if not has_them or not is_small or stages.num_holonomic > 0:
-        return False
-    return not stages.manifold.is_flat or _has_terms(stages)
-
-
-def _has_terms(stages: StageSystem) -> bool:
-    # On a vector space they vanish unless momenta depend on positions, or forces on
-    # velocities, which the programs of the system tell.
-    system, t, args = stages.system, stages.t, stages.args
-    q, zero = stages.q, jnp.zeros_like(stages.p)
-    by_position = dependence(
-        lambda xi: system.momentum(t, stages.manifold.act(q, xi), zero, args), zero
-    )
-    by_velocity = dependence(
-        lambda u: whole_force(system, t, q, u, stages.multiplier, args), zero
-    )
-    return bool(by_position.any() or by_velocity.any())
 
 
 def first_order_terms(
@@ -174,7 +128,7 @@ def first_order_terms(
         chart = _in_chart(stages, x, u)
     coordinates = c - 0.5 if stages.method.chart == "middle" else c
     node_times = c[1:] if stages.num_nonholonomic else c[-1:]
-    return FirstOrderTerms(
+    terms = FirstOrderTerms(
         inertia=moved(c, body.inertia_rate) + moved(coordinates, chart.turning),
         momentum=h * scaled(chart.momentum),
         force=h * scaled(chart.force),
@@ -183,6 +137,15 @@ def first_order_terms(
         node_momentum=h * scaled(body.momentum),
         node_force=h * scaled(chart.body_force),
     )
+    # A derivative may not be finite, as that of |v| at rest.
+    keeps = [jnp.all(jnp.isfinite(x)) for x in jax.tree.leaves(terms)]
+    keeps = jnp.all(jnp.stack(keeps)) & (_size(terms.force) <= _LARGEST)
+    return jax.tree.map(lambda x: jnp.where(keeps, x, 0), terms)
+
+
+def _size(matrix: Float[Array, "n n"]) -> FloatScalar:
+    """Measure a matrix, whatever the units of the coordinates are."""
+    return jnp.sqrt(jnp.sum(jnp.abs(matrix * matrix.T)))
 
 
 def momenta_of_forces(

@@ -23,7 +23,7 @@ from .._numerics import (
 )
 from .._system import all_finite, check_flag, Linearisation
 from ._factorisation import leading_structure
-from ._first_order import JacobianName
+from ._jacobian_choice import JacobianName
 from ._scale import fibre_coordinate_scale
 from ._stage_iteration import (
     corrected,

@@ -127,6 +127,57 @@ def test_where_the_mass_is_constant_and_forces_do_not_depend_on_v_nothing_is_add
     assert str(default) == str(leading)
 
 
+@jax.custom_vjp
+def in_reverse_mode_alone(v):
+    """A force of v with a rule of derivatives for reverse mode alone."""
+    return -0.1 * v
+
+
+in_reverse_mode_alone.defvjp(
+    lambda v: (in_reverse_mode_alone(v), None), lambda _, rate: (-0.1 * rate,)
+)
+
+
+def from_outside(v):
+    """The same force, computed outside of JAX."""
+    shape = jax.ShapeDtypeStruct(v.shape, v.dtype)
+    return jax.pure_callback(
+        lambda v: -0.1 * np.asarray(v), shape, v, vmap_method="expand_dims"
+    )
+
+
+@pytest.mark.parametrize(
+    ("force", "like"),
+    [
+        (in_reverse_mode_alone, lambda v: -0.1 * v),
+        (from_outside, lambda v: -0.1 * v),
+        # Their slopes at rest are not finite, or too large for a series.
+        (lambda v: -jnp.linalg.norm(v) * v, lambda v: -jnp.abs(v) * v),
+        (lambda v: -0.5 * jnp.tanh(v / 0.01), lambda v: -0.5 * jnp.tanh(v / 0.01)),
+    ],
+    ids=["reverse mode", "callback", "drag at rest", "steep friction"],
+)
+def test_forces_need_no_finite_slopes(force, like):
+    def fall(force, solver):
+        system = nhjax.LagrangianSystem(
+            lambda t, q, v, args: 0.5 * v @ v - q[0],
+            force=lambda t, q, v, args: force(v),
+        )
+        y0 = nhjax.initial_state(system, jnp.zeros(2), jnp.zeros(2))
+        return nhjax.integrate(
+            system,
+            nhjax.LobattoIIIAB(3),
+            y0,
+            dt=0.1,
+            num_steps=10,
+            stage_solver=solver,
+        )
+
+    sol = fall(force, nhjax.SimplifiedNewton(fallback=False))
+    leading = fall(like, nhjax.SimplifiedNewton(fallback=False, jacobian="leading"))
+    np.testing.assert_allclose(sol.ys.v, leading.ys.v, rtol=0, atol=1e-13)
+
+
 def test_terms_that_are_not_available_are_refused():
     wrong: Any = "exact"
     with pytest.raises(ValueError, match="jacobian must be one of 'leading'"):
