@@ -17,15 +17,16 @@ import jax.extend
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from .._compile import LARGEST_REDUCTION, small_product
+from .._compile import LARGEST_REDUCTION, LONGEST_SUM, small_product
 
 
 # Matrices with more rows are inverted by a library: a kernel may not sum more numbers
 # than a matrix of this size has.
 LARGEST = math.isqrt(LARGEST_REDUCTION)
-# Longer sums and larger products are left to a library too: the program that is written
-# out must stay short, and from some 10⁵ terms on the library was faster (measured).
-LONGEST_SUM, LARGEST_PRODUCT = 128, 2**15
+# Larger products, and sums longer than `LONGEST_SUM`, are left to a library too: the
+# program that is written out must stay short. From some 10⁵ terms on the library was
+# faster (measured).
+LARGEST_PRODUCT = 2**15
 
 
 class AbstractLinearMap(eqx.Module):

@@ -130,3 +130,18 @@ def test_derivatives_of_inverses():
     gradient = jax.grad(lambda m: jnp.sum(inverse(m) ** 2))(jnp.asarray(matrix))
     expected = np.sum(2 * np.asarray(x) * change)
     np.testing.assert_allclose(np.sum(gradient * rate), expected, rtol=1e-12)
+
+
+def test_a_sum_over_the_members_of_a_batch_is_not_written_out():
+    """The gradient by an operand that all members share has a term for each of them."""
+    matrix, vectors = jnp.ones((40, 40)), jnp.arange(40000.0).reshape(1000, 40)
+
+    @jax.jit
+    @jax.grad
+    def gradient(matrix):
+        products = jax.vmap(lambda x: small_einsum("ij,j->i", matrix, x))
+        return products(vectors).sum()
+
+    assert gradient.lower(matrix).as_text().count("\n") < 1000
+    expected = jnp.broadcast_to(vectors.sum(axis=0), (40, 40))
+    np.testing.assert_allclose(gradient(matrix), expected, rtol=1e-13)
