@@ -52,27 +52,27 @@ class FirstOrderTerms(eqx.Module):
         by_node = _weighted(a, z)
         return (
             z
-            - _each(self.inertia, z)
-            - _all(self.momentum, by_node)
-            + _all(self.force, _weighted(a_hat, z))
-            + _all(self.base, _weighted(b[None], z))
+            - _times(self.inertia, z)
+            - _times(self.momentum, by_node)
+            + _times(self.force, _weighted(a_hat, z))
+            + _times(self.base, _weighted(b[None], z))
         )
 
     def of_nodes(self, z: Float[Array, "r n *c"]) -> Float[Array, "r n *c"]:
         """Compute the changes of the velocities at the nodes that balance N z."""
-        return z - _each(self.node_inertia, z)
+        return z - _times(self.node_inertia, z)
 
     def by_force(
         self, stages: StageSystem, change: Float[Array, "s n *c"]
     ) -> Float[Array, "r n *c"]:
         """Compute how forces move the nodes if the stage velocities change."""
-        return _all(self.node_force, _weighted(stages.node_weights, change))
+        return _times(self.node_force, _weighted(stages.node_weights, change))
 
     def by_position(
         self, stages: StageSystem, change: Float[Array, "s n *c"]
     ) -> Float[Array, "r n *c"]:
         """Compute how positions move the nodes if the stage velocities change."""
-        return -_all(self.node_momentum, _weighted(stages.node_weights, change))
+        return -_times(self.node_momentum, _weighted(stages.node_weights, change))
 
 
 # Forces that change so much, as a friction that is steep at rest, are no part of a
@@ -87,18 +87,12 @@ def _weighted(
     return small_einsum(f"ij,j{rest}->i{rest}", weights, z)
 
 
-def _all(
-    matrix: Float[Array, "k n"], z: Float[Array, "r n *c"]
+def _times(
+    matrix: Float[Array, "... k n"], z: Float[Array, "r n *c"]
 ) -> Float[Array, "r k *c"]:
-    rest = "c"[: z.ndim - 2]
-    return small_einsum(f"kn,in{rest}->ik{rest}", matrix, z)
-
-
-def _each(
-    matrices: Float[Array, "r n n"], z: Float[Array, "r n *c"]
-) -> Float[Array, "r n *c"]:
-    rest = "c"[: z.ndim - 2]
-    return small_einsum(f"ikn,in{rest}->ik{rest}", matrices, z)
+    """Multiply the rows of z by one matrix, or each by a matrix of its own."""
+    own, rest = "i"[: matrix.ndim - 2], "c"[: z.ndim - 2]
+    return small_einsum(f"{own}kn,in{rest}->ik{rest}", matrix, z)
 
 
 def first_order_terms(
