@@ -20,6 +20,7 @@ from .._system import Linearisation
 from ._first_order import (
     first_order_terms,
     FirstOrderTerms,
+    full_momentum_inverse,
     momenta_of_forces,
 )
 from ._jacobian_choice import JacobianName, takes_first_order_terms
@@ -38,7 +39,7 @@ def leading_structure(
     stages: StageSystem,
     x: Stages,
     lin: Linearisation,
-    jacobian: JacobianName = "leading",
+    jacobian: JacobianName,
 ) -> LeadingStructure:
     """Factorise the leading structure, with N and K at the start and B_i at x.
 
@@ -155,9 +156,7 @@ def _with_inertia_at_end(
 
     Otherwise u̇ and λ_c at the end would converge no faster than without these terms.
     """
-    inverse_at_start = lin.momentum_inverse
-    if inverse_at_start.ndim == 1:
-        inverse_at_start = jnp.diag(inverse_at_start)
+    inverse_at_start = full_momentum_inverse(lin)
     turned = small_einsum("kl,ln->kn", terms.node_inertia[-1], inverse_at_start)
     at_end = inverse_at_start - turned
     reaction = small_einsum("kn,ln->kl", at_end, jacobian)

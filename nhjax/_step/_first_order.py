@@ -95,6 +95,12 @@ def _times(
     return small_einsum(f"{own}kn,in{rest}->ik{rest}", matrix, z)
 
 
+def full_momentum_inverse(lin: Linearisation) -> Float[Array, "n n"]:
+    """Return N⁻¹ as a matrix, also where only its diagonal is kept."""
+    inverse = lin.momentum_inverse
+    return jnp.diag(inverse) if inverse.ndim == 1 else inverse
+
+
 def first_order_terms(
     stages: StageSystem, x: Stages, lin: Linearisation
 ) -> FirstOrderTerms:
@@ -103,9 +109,7 @@ def first_order_terms(
     # The starting values begin at u_k.
     first = jnp.sum(stages.coefficients("a_hat"), axis=1)[0]
     u = x.velocity[0] - first * h * lin.acceleration
-    inverse = lin.momentum_inverse
-    if inverse.ndim == 1:
-        inverse = jnp.diag(inverse)
+    inverse = full_momentum_inverse(lin)
 
     def scaled(matrix):
         return small_einsum("kl,ln->kn", inverse, matrix)
