@@ -4,6 +4,7 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
+from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, Int
 
 from .._compile import as_cpu_kernel, tracked_jit
@@ -113,7 +114,8 @@ def _outcome(
         return as_cpu_kernel(residual, z)
 
     free = jnp.ones(2 * dim + count, y.p.dtype).at[jnp.asarray(held, int)].set(0)
-    positions_now = y.q if system.manifold_of(y.q).is_flat else jnp.ones_like(y.p)
+    is_flat = system.manifold_of(y.q).is_flat
+    positions_now = ravel_pytree(y.q)[0] if is_flat else jnp.ones_like(y.p)
     start = jnp.concatenate([positions_now, system.fibre_coordinate(y), guess])
     z, left, solved = nearest_root(
         in_one_program, free, start, (dim, dim, count), max_iterations

@@ -67,3 +67,4 @@ from ._sparse import (
     SparseMatrix as SparseMatrix,
     WeightedTranspose as WeightedTranspose,
 )
+from ._uneven_moves import uneven_moves as uneven_moves

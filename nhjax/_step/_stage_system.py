@@ -5,13 +5,12 @@ from dataclasses import replace
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Float, PyTree
 
 from .._custom_types import Args, FloatScalar
 from .._manifold import AbstractLieGroup
 from .._method import AbstractMethod
-from .._numerics import max_norm, small_einsum
+from .._numerics import max_norm, small_einsum, uneven_moves
 from .._system import AbstractMechanicalSystem, Linearisation, State
 from ._chart import AbstractChart
 from ._curved_chart import chart_of_step
@@ -224,11 +223,11 @@ def nudged(stages: StageSystem, nudge: FloatScalar) -> StageSystem:
     the round-off of positions, divided by the unit round-off. The coordinates are moved
     by different amounts, so that the moves do not cancel in the difference of two.
     """
-    manifold, n = stages.manifold, stages.p.shape[0]
-    size = max_norm(*jax.tree.leaves(stages.q))
-    if manifold.is_flat:
-        size = jnp.abs(stages.q)
-    k = np.arange(n)
-    moves = (-1.0) ** k * (1 - 0.5 * (0.618 * k % 1))
-    xi = nudge * size * jnp.asarray(moves, stages.p.dtype)
-    return eqx.tree_at(lambda z: z.q, stages, manifold.act(stages.q, xi))
+    if stages.manifold.is_flat:
+        moves = uneven_moves(stages.q)
+        moved = jax.tree.map(lambda x, dx: x + nudge * dx, stages.q, moves)
+    else:
+        size = max_norm(*jax.tree.leaves(stages.q))
+        xi = nudge * uneven_moves(jnp.broadcast_to(size, stages.p.shape))
+        moved = stages.manifold.act(stages.q, xi)
+    return replace(stages, q=moved)

@@ -96,6 +96,19 @@ def test_equilibrium_on_a_constraint_and_on_a_group():
     np.testing.assert_allclose(vertical.v, [0, 0, 2.0], rtol=0, atol=1e-13)
 
 
+def test_equilibrium_on_a_product_of_vector_spaces():
+    def lagrangian(t, q, v, args):
+        return 0.5 * v @ v - jnp.sum(jnp.cosh(q[0] - 3.0)) - (q[1][0] + 2.0) ** 2
+
+    system = nhjax.LagrangianSystem(
+        lagrangian, manifold=nhjax.ProductGroup(nhjax.Euclidean(2), nhjax.Euclidean(1))
+    )
+    y0 = nhjax.initial_state(system, (jnp.array([2.5, 3.4]), -jnp.ones(1)), jnp.ones(3))
+    y = nhjax.steady_motion(system, 0.0, y0, positions=(0, 1, 2), velocities=(0, 1, 2))
+    np.testing.assert_allclose(jnp.concatenate(y.q), [3, 3, -2], rtol=0, atol=1e-13)
+    np.testing.assert_allclose(y.v, 0, rtol=0, atol=1e-13)
+
+
 def test_a_search_that_fails_says_where_it_stopped():
     # A pendulum that turns slowly has no cone.
     system = polar_pendulum()["lagrangian"]

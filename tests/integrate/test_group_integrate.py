@@ -185,7 +185,10 @@ def test_a_users_own_group_is_integrated(stages, group):
     assert there_and_back(system, nhjax.LobattoIIIAB(stages), y0) <= 1e-13
 
 
-def test_a_product_of_vector_spaces_is_the_vector_space():
+@pytest.mark.parametrize(
+    "solver", [nhjax.SimplifiedNewton(), nhjax.Newton()], ids=["simplified", "newton"]
+)
+def test_a_product_of_vector_spaces_is_the_vector_space(solver):
     particle = systems.NonholonomicParticle()
     product = nhjax.ProductGroup(nhjax.Euclidean(2), nhjax.Euclidean(1))
 
@@ -203,8 +206,9 @@ def test_a_product_of_vector_spaces_is_the_vector_space():
     )
     q0 = (particle.q0[:2], particle.q0[2:])
     y0 = nhjax.initial_state(system, q0, particle.v0)
-    split = nhjax.integrate(system, METHOD, y0, dt=0.1, num_steps=20).ys
-    plain = run(particle, dt=0.1, num_steps=20).ys
+    options = {"dt": 0.1, "num_steps": 20, "stage_solver": solver}
+    split = nhjax.integrate(system, METHOD, y0, **options).ys
+    plain = run(particle, **options).ys
     np.testing.assert_allclose(jnp.concatenate(split.q, axis=1), plain.q, atol=1e-14)
     np.testing.assert_allclose(split.p, plain.p, atol=1e-14)
 

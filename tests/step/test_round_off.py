@@ -189,3 +189,21 @@ def test_motion_from_rest_is_solved_to_its_own_round_off(dtype, size):
     y0 = nhjax.initial_state(system, q=zero, v=zero)
     sol = nhjax.integrate(system, nhjax.LobattoIIIAB(3), y0, dt=0.2, num_steps=1)
     assert sol.stats["max_residual"] <= 4 * jnp.finfo(dtype).eps
+
+
+def test_a_heading_of_many_turns_is_felt_in_constraints():
+    car = systems.CarWithTrailers.turning(num_trailers=2)
+    q0 = jnp.asarray(car.q0).at[jnp.array([2, 4, 5])].add(200 * jnp.pi)
+    y0 = nhjax.initial_state(car.system, q0, car.v0)
+
+    @jax.jit
+    def run(y0):
+        return nhjax.integrate(
+            car.system, METHOD, y0, dt=0.04, num_steps=400, throw=False
+        )
+
+    sol, before = run(y0), run(car.initial_state())
+    assert sol.result == nhjax.RESULTS.successful
+    # The circle is that of a heading of the first turn, up to round-off of many.
+    eps = 1000 * np.finfo(float).eps
+    np.testing.assert_allclose(final(sol).v, final(before).v, rtol=0, atol=400 * eps)

@@ -1,0 +1,18 @@
+"""Moves of numbers by about their own size that do not cancel one another."""
+
+import jax.numpy as jnp
+import numpy as np
+from jax.flatten_util import ravel_pytree
+from jaxtyping import Array, PyTree
+
+
+def uneven_moves(q: PyTree[Array]) -> PyTree[Array]:
+    """Return a move for each number in q, of half its size to its size.
+
+    The moves differ and have both signs, so that they do not cancel in differences and
+    sums of a few numbers.
+    """
+    numbers, unravel = ravel_pytree(q)
+    k = np.arange(numbers.size)
+    weights = (-1.0) ** k * (1 - 0.5 * (0.618 * k % 1))
+    return unravel(jnp.abs(numbers) * jnp.asarray(weights, numbers.dtype))
