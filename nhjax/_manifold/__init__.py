@@ -2,6 +2,7 @@
 
 from ._abstract import AbstractLieGroup as AbstractLieGroup
 from ._euclidean import Euclidean as Euclidean
+from ._frames import framed as framed, is_framed as is_framed, unframed as unframed
 from ._product import ProductGroup as ProductGroup
 from ._retraction import (
     AbstractRetraction as AbstractRetraction,

@@ -43,14 +43,7 @@ class ProductGroup(AbstractLieGroup):
         self.factors = factors
 
     def __check_init__(self):
-        if not self.factors:
-            raise ValueError("ProductGroup: give at least one factor.")
-        for k, factor in enumerate(self.factors):
-            if not isinstance(factor, AbstractLieGroup):
-                raise TypeError(
-                    f"ProductGroup: factor {k} must be a Lie group, such as `SO3()` or "
-                    f"`Euclidean(2)`, got {factor!r}."
-                )
+        _check_factors(self.factors)
 
     @property
     def dim(self) -> int:
@@ -112,6 +105,10 @@ class ProductGroup(AbstractLieGroup):
     def act(self, g: Element, xi: Vector) -> Element:
         """Compute the tuple of the factors' g τ(ξ)."""
         return self._tuple(lambda group, g, x: group.act(g, x), g, xi)
+
+    def act_back(self, g: Element, xi: Vector) -> Element:
+        """Compute the tuple of the factors' g τ(ξ)⁻¹."""
+        return self._tuple(lambda group, g, x: group.act_back(g, x), g, xi)
 
     def no_compensation(self, q: Element) -> Element:
         """Return the tuple of the compensations to start `advance` from."""
@@ -217,3 +214,14 @@ class ProductGroup(AbstractLieGroup):
     def _split(self, vector: Vector) -> list[Array]:
         ends = accumulate(group.dim for group in self.factors)
         return [vector[k - f.dim : k] for k, f in zip(ends, self.factors, strict=True)]
+
+
+def _check_factors(factors: tuple[object, ...]) -> None:
+    if not factors:
+        raise ValueError("ProductGroup: give at least one factor.")
+    for k, factor in enumerate(factors):
+        if not isinstance(factor, AbstractLieGroup):
+            raise TypeError(
+                f"ProductGroup: factor {k} must be a Lie group, such as `SO3()` or "
+                f"`Euclidean(2)`, got {factor!r}."
+            )

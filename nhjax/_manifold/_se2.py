@@ -4,6 +4,7 @@ from jaxtyping import Array, DTypeLike, Float
 from .._custom_types import BoolScalar
 from .._numerics import two_sum
 from ._abstract import check_shape
+from ._framed_pose import FramedPose
 from ._homogeneous import homogeneous
 from ._motions import AbstractMotionGroup
 from ._plane import rotate, turn, wrapped_angle
@@ -57,7 +58,20 @@ class SE2(AbstractMotionGroup):
 
     def compose(self, g: Pose, h: Pose) -> Pose:
         """Compute the product (x + R(θ) x', θ + θ') of (x, θ) and (x', θ')."""
-        return g + self.tangent(g, h)
+        return g + _moved(g, h)
+
+    def act(self, g: Pose | FramedPose, xi: Vector) -> Pose | FramedPose:
+        """Compute g τ(ξ), with its frame if g has one."""
+        if not isinstance(g, FramedPose):
+            return self.compose(g, self.retract(xi))
+        translation = g.rotate(self._translation(xi))
+        turned = self.retraction.angle(xi[2:])
+        less, sin = self.retraction.plane_rotation(xi[2])
+        return FramedPose(
+            g.pose + jnp.concatenate([translation, turned]),
+            g.cos + (less * g.cos - sin * g.sin),
+            g.sin + (less * g.sin + sin * g.cos),
+        )
 
     def inverse(self, g: Pose) -> Pose:
         """Compute the inverse (-R(θ)ᵀ x, -θ) of (x, θ)."""
@@ -87,7 +101,7 @@ class SE2(AbstractMotionGroup):
     def advance(self, q: Pose, xi: Vector, compensation: Pose) -> tuple[Pose, Pose]:
         """Compute g τ(ξ) by compensated summation."""
         direction = self.wrapped(q, compensation)
-        return two_sum(q, self.tangent(direction, self.retract(xi)) + compensation)
+        return two_sum(q, _moved(direction, self.retract(xi)) + compensation)
 
     def matrix(self, g: Pose) -> Float[Array, "3 3"]:
         """Return the matrix of the motion in homogeneous coordinates."""
@@ -98,9 +112,15 @@ class SE2(AbstractMotionGroup):
         """Return the matrix [[ω J, v], [0, 0]] of ξ = (v, ω)."""
         return homogeneous(SO2(self.retraction).hat(xi[2:]), xi[:2], 0.0)
 
-    def tangent(self, g: Pose, eta: Vector) -> Pose:
-        """Compute the tangent (R(θ) v, ω) at g = (x, θ) of η = (v, ω)."""
-        return jnp.concatenate([rotate(g[2], eta[:2]), eta[2:]])
+    def tangent(self, g: Pose | FramedPose, eta: Vector) -> Pose | FramedPose:
+        """Compute the tangent (R(θ) v, ω) at g = (x, θ) of η = (v, ω).
+
+        The frame, if there is one, changes by -ω sin θ and ω cos θ.
+        """
+        if not isinstance(g, FramedPose):
+            return _moved(g, eta)
+        rate = jnp.concatenate([g.rotate(eta[:2]), eta[2:]])
+        return FramedPose(rate, -eta[2] * g.sin, eta[2] * g.cos)
 
     def dtau(self, xi: Vector, eta: Vector) -> Vector:
         """Compute dτ_ξ η, by the formula of `SO3` for motions of the plane."""
@@ -142,3 +162,8 @@ class SE2(AbstractMotionGroup):
         """Compute [ξ, η] = (ω J u - σ J v, 0) of ξ = (v, ω) and η = (u, σ)."""
         linear = xi[2] * turn(eta[:2]) - eta[2] * turn(xi[:2])
         return jnp.concatenate([linear, jnp.zeros_like(eta[2:])])
+
+
+def _moved(g: Pose, move: Pose | Vector) -> Pose:
+    """Turn the first two numbers of a move from the frame of the body g."""
+    return jnp.concatenate([rotate(g[2], move[:2]), move[2:]])

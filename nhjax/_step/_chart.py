@@ -40,6 +40,11 @@ class AbstractChart(eqx.Module):
     def origin(self) -> PyTree[Array]:
         """Compute g_o, the origin of the chart."""
 
+    @property
+    @abstractmethod
+    def ends(self) -> tuple[Vector, Vector]:
+        """Compute the coordinates of the start and of the end of the step."""
+
     def positions(self, y: Vectors) -> PyTree[Array]:
         """Compute the positions g_o τ(y), one for each row of y."""
         origin = self.origin
@@ -124,6 +129,11 @@ class FlatChart(AbstractChart):
     def origin(self) -> PyTree[Array]:
         """Return q_k."""
         return self.start
+
+    @property
+    def ends(self) -> tuple[Vector, Vector]:
+        """Return 0 and ξ."""
+        return jnp.zeros_like(self.increment), self.increment
 
     def coordinates(self, increment: Vectors) -> Vectors:
         """Return the increments Ξ, since the origin is q_k."""

@@ -69,6 +69,11 @@ class StartChart(AbstractCurvedChart):
         """Return g_k."""
         return self.start
 
+    @property
+    def ends(self) -> tuple[Vector, Vector]:
+        """Return 0 and ξ."""
+        return jnp.zeros_like(self.increment), self.increment
+
     def coordinates(self, increment: Vectors) -> Vectors:
         """Return the increments Ξ, since the origin is g_k."""
         return increment
@@ -120,6 +125,11 @@ class MiddleChart(AbstractCurvedChart):
     def origin(self) -> PyTree[Array]:
         """Compute g_k τ(-ξ/2)⁻¹."""
         return self.manifold.act_back(self.start, -self._half)
+
+    @property
+    def ends(self) -> tuple[Vector, Vector]:
+        """Return -ξ/2 and ξ/2."""
+        return -self._half, self._half
 
     def coordinates(self, increment: Vectors) -> Vectors:
         """Compute y = Ξ - ξ/2."""

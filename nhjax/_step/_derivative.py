@@ -8,6 +8,7 @@ import jax
 
 from .._compile import as_cpu_kernel, Programs
 from .._custom_types import Args, BoolScalar, FloatScalar
+from .._manifold import unframed
 from .._method import AbstractMethod
 from .._numerics import (
     ClosureConverted,
@@ -21,6 +22,7 @@ from .._system import AbstractMechanicalSystem, linearise, State
 from ._end import end_state, step_record
 from ._invariants import Invariants
 from ._newton import AbstractStageSolver
+from ._positions import end_position
 from ._record import StepRecord
 from ._stage_equations import stage_forces
 from ._stage_iteration import unknown_units
@@ -180,7 +182,7 @@ def _end(
     system, args, start = arguments.system, arguments.args, arguments.step_state.state
     stages = _stage_system(arguments, method)
     t, u = arguments.t + arguments.h, x.node_fibre_coordinate[-1]
-    q = stages.end_position(x)
+    q = unframed(end_position(stages, x))
     p = system.momentum(t, q, u, args)
 
     def continuous():

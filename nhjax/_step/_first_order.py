@@ -10,6 +10,7 @@ from jaxtyping import Array, Float
 from .._custom_types import FloatScalar
 from .._numerics import full_jacobian, small_einsum
 from .._system import Linearisation, whole_force
+from ._positions import in_nodes, in_stages
 from ._stage_system import StageSystem
 from ._unknowns import Stages
 
@@ -156,8 +157,8 @@ def momenta_of_forces(
     a_hat, b = stages.coefficients("a_hat"), stages.coefficients("b")
     if stages.manifold.is_flat:
         return _weighted(a_hat, forces), _weighted(stages.node_weights, forces)
-    chart, y = stages.in_stages(x)
-    nodes = stages.in_nodes(x)[1]
+    chart, y = in_stages(stages, x)
+    nodes = in_nodes(stages, x)[1]
 
     def one(force):
         zero = jnp.zeros_like(force)

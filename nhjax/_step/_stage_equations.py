@@ -11,6 +11,7 @@ from .._custom_types import BoolScalar
 from .._numerics import Pattern, small_einsum, sparse_jacobian, SparseMatrix
 from .._system import motion_residual, whole_force
 from ._invariants import ImpulseWeights, moving_part
+from ._positions import end_position, in_nodes, in_stages, stage_positions
 from ._stage_system import StageSystem
 from ._unknowns import StageForces, Stages
 
@@ -20,9 +21,9 @@ T = TypeVar("T")
 
 def stage_velocities(stages: StageSystem, x: Stages) -> Float[Array, "s n"]:
     """Compute the chart velocities dτ_y⁻¹ D2H(Q^i, P^i) of a Hamiltonian system."""
-    chart, y = stages.in_stages(x)
+    chart, y = in_stages(stages, x)
     v = jax.vmap(lambda t, q, u: stages.system.velocity(t, q, u, stages.args))(
-        stages.stage_times, chart.positions(y), x.momentum
+        stages.stage_times, stage_positions(stages, chart, y), x.momentum
     )
     return chart.chart_velocities(y, v)
 
@@ -31,8 +32,8 @@ def stage_forces(stages: StageSystem, x: Stages) -> StageForces:
     """Compute the forces n^i, multipliers Λ^i and residuals of the stage momenta."""
     h, a_hat, b = stages.h, stages.coefficients("a_hat"), stages.coefficients("b")
     multiplier = stages.multipliers(x)
-    chart, y = stages.in_stages(x)
-    q = chart.positions(y)
+    chart, y = in_stages(stages, x)
+    q = stage_positions(stages, chart, y)
     u = x.momentum if stages.hamiltonian else chart.body_velocities(y, x.velocity)
     force, momentum = jax.vmap(
         lambda t, q, u, lam: (
@@ -61,7 +62,7 @@ def node_residual(
     They are p(q^i, u^i) - Ad^*_{τ(y^i)} (M + h Σ a_ij n^j), at the end of the step less
     the impulse there.
     """
-    chart, y = stages.in_nodes(x)
+    chart, y = in_nodes(stages, x)
     momentum = jax.vmap(lambda t, q, u: stages.system.momentum(t, q, u, stages.args))(
         stages.node_times, chart.positions(y), x.node_fibre_coordinate
     )
@@ -76,7 +77,7 @@ def node_residual(
 
 def node_constraint(stages: StageSystem, x: Stages) -> Float[Array, "r m"]:
     """Compute the nonholonomic constraints Φ(q^i, u^i) at the nodes."""
-    chart, y = stages.in_nodes(x)
+    chart, y = in_nodes(stages, x)
     values = jax.vmap(
         lambda t, q, u: stages.system.kinematic_constraint(t, q, u, stages.args)
     )(stages.node_times, chart.positions(y), x.node_fibre_coordinate)
@@ -90,7 +91,7 @@ def holonomic_constraint(stages: StageSystem, x: Stages) -> Float[Array, "s k"]:
 
     The division by h makes the values the size of velocities, as the tangency is.
     """
-    chart, y = stages.in_stages(x)
+    chart, y = in_stages(stages, x)
     nodes = chart.positions(y[1:])
     on_positions = jax.vmap(
         lambda t, q: stages.system.position_constraint(t, q, stages.args)
@@ -137,7 +138,7 @@ def _at_nodes(
     times, fibre = stages.stage_times[1:], x.node_fibre_coordinate
     if not stages.num_nonholonomic:
         fibre = jnp.broadcast_to(fibre, (stages.method.stages - 1, fibre.shape[1]))
-    chart, y = stages.in_stages(x)
+    chart, y = in_stages(stages, x)
     nodes = chart.positions(y[1:])
     return jax.vmap(
         lambda t, q, u: differentiated(
@@ -156,7 +157,7 @@ def end_residual(
     on_momentum, hidden = motion_residual(
         stages.system,
         stages.t + stages.h,
-        stages.end_position(x),
+        end_position(stages, x),
         x.node_fibre_coordinate[-1],
         x.end_acceleration,
         x.end_multiplier,
@@ -218,6 +219,5 @@ def _end_point(stages: StageSystem, x: Stages) -> tuple[Any, ...]:
 
 def in_chart(stages: StageSystem, x: Stages) -> BoolScalar:
     """Tell whether stages, nodes and end lie where the chart is invertible."""
-    chart, y = stages.in_stages(x)
-    end = chart.coordinates(stages.increment(x)[None])
-    return chart.in_domain(jnp.concatenate([y, end]))
+    chart, y = in_stages(stages, x)
+    return chart.in_domain(jnp.concatenate([y, chart.ends[1][None]]))

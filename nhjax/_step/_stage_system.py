@@ -5,13 +5,14 @@ from dataclasses import replace
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float, PyTree
 
 from .._custom_types import Args, FloatScalar
 from .._manifold import AbstractLieGroup
 from .._method import AbstractMethod
 from .._numerics import max_norm, small_einsum, uneven_moves
-from .._system import AbstractMechanicalSystem, Linearisation, State
+from .._system import AbstractMechanicalSystem, Linearisation, State, with_frames
 from ._chart import AbstractChart
 from ._curved_chart import chart_of_step
 from ._invariants import StartImpulses
@@ -62,7 +63,8 @@ class StageSystem(eqx.Module):
         kept: StartImpulses | None = None,
     ) -> "StageSystem":
         """Make the equations of a step of size h from the state y at t."""
-        stages = cls(system, method, t, h, y.q, y.p, y.multiplier, args, kept=kept)
+        system, q = with_frames(system, y.q)
+        stages = cls(system, method, t, h, q, y.p, y.multiplier, args, kept=kept)
         if system.constraints != "redundant" or not stages.constrained:
             return stages
         redundancy = Redundancy.at(lin, stages.num_nonholonomic)
@@ -131,16 +133,18 @@ class StageSystem(eqx.Module):
 
     @property
     def node_weights(self) -> Float[Array, "r s"]:
+        """Return `node_rows` in the working precision."""
+        return jnp.asarray(self.node_rows, self.p.dtype)
+
+    @property
+    def node_rows(self) -> np.ndarray:
         """Return the rows of a_ij for the nodes at which momenta are formed.
 
         With nonholonomic constraints these are the nodes i >= 2, otherwise only the end
         of the step, whose row is that of the weights b.
         """
-        return (
-            self.coefficients("a")[1:]
-            if self.num_nonholonomic
-            else self.coefficients("b")[None]
-        )
+        method = self.method
+        return method.a[1:] if self.num_nonholonomic else method.b[None]
 
     @property
     def node_times(self) -> Float[Array, " r"]:
@@ -194,26 +198,6 @@ class StageSystem(eqx.Module):
         # The product is formed as h * (b @ H): coefficients h b_j, rounded once and for
         # all, would bias every step in the same way.
         return self.h * small_einsum("s,sn->n", self.coefficients("b"), x.velocity)
-
-    def in_stages(self, x: Stages) -> tuple[AbstractChart, Float[Array, "s n"]]:
-        """Make the chart and the coordinates y^i of the stages, from h Σ a_ij H^j."""
-        return self._in_chart(x, self.coefficients("a"))
-
-    def in_nodes(self, x: Stages) -> tuple[AbstractChart, Float[Array, "r n"]]:
-        """Make the chart and the coordinates of the nodes with momenta of their own."""
-        return self._in_chart(x, self.node_weights)
-
-    def end_position(self, x: Stages) -> PyTree[Array]:
-        """Compute q_{k+1}."""
-        end, _ = self.chart(x).advance(self.q, self.manifold.no_compensation(self.q))
-        return end
-
-    def _in_chart(
-        self, x: Stages, weights: Float[Array, "r s"]
-    ) -> tuple[AbstractChart, Array]:
-        chart = self.chart(x)
-        increments = self.h * small_einsum("ij,jn->in", weights, x.velocity)
-        return chart, chart.coordinates(increments)
 
 
 def nudged(stages: StageSystem, nudge: FloatScalar) -> StageSystem:

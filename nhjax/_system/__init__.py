@@ -22,6 +22,7 @@ from ._dependence import (
     dependent_names as dependent_names,
     require_independent as require_independent,
 )
+from ._framed import with_frames as with_frames
 from ._hamiltonian import HamiltonianSystem as HamiltonianSystem
 from ._lagrangian import LagrangianSystem as LagrangianSystem
 from ._linearisation import (

@@ -9,6 +9,7 @@ from jax.flatten_util import ravel_pytree
 
 import nhjax
 from nhjax._step import first_step_state
+from nhjax._step._positions import end_position
 from nhjax._step._stage_equations import (
     holonomic_constraint,
     node_residual,
@@ -88,7 +89,7 @@ def end_of(stages, x):
     """(q_{k+1}, p_{k+1})."""
     chart, none = stages.chart(x), jnp.zeros_like(stages.p)
     gained = stages.h * (stages.method.b @ stage_forces(stages, x).force)
-    return stages.end_position(x), chart.advance_momentum(stages.p, gained, none)[0]
+    return end_position(stages, x), chart.advance_momentum(stages.p, gained, none)[0]
 
 
 def one_step(system, method, y0):

@@ -1,0 +1,93 @@
+"""Steps with the frames of poses have the same equations as steps without."""
+
+from dataclasses import replace
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import nhjax
+from nhjax._manifold import unframed
+from nhjax._step._positions import end_position
+from nhjax._step._stage_system import StageSystem
+from nhjax._step._starting_values import starting_values
+from nhjax._step._step import equations_of_step, first_step_state
+
+
+RETRACTIONS = {"cayley": nhjax.Cayley(), "exponential": nhjax.Exponential()}
+# A body in the plane, and a wheel on its axle.
+INERTIA = jnp.array([[1.3, 0.1, 0.2, 0.0], [0.1, 1.1, 0.3, 0.1], [0.2, 0.3, 0.8, 0.2],
+                     [0.0, 0.1, 0.2, 0.5]])  # fmt: skip
+
+
+def potential(q):
+    (x, y, angle), (wheel,) = q
+    return x * jnp.cos(angle) + 0.5 * y**2 + jnp.sin(angle - wheel)
+
+
+def metric(q):
+    return INERTIA + 0.1 * jnp.cos(q[0][2]) * jnp.eye(4)
+
+
+def lagrangian(t, q, v, args):
+    return 0.5 * v @ metric(q) @ v - potential(q)
+
+
+def hamiltonian(t, q, p, args):
+    return 0.5 * p @ jnp.linalg.inv(metric(q)) @ p + potential(q)
+
+
+def height(t, q, args):
+    return q[0][1] + 0.3 * jnp.sin(q[0][2])
+
+
+def blade(t, q, v, args):
+    return v[0] * jnp.cos(q[1][0]) - v[3] + 0.2 * jnp.sin(q[0][2])
+
+
+def push(t, q, v, args):
+    return jnp.stack([jnp.sin(q[0][2]), q[0][0], -v[2], 0.3 * q[1][0]])
+
+
+def body(form, retraction):
+    group = nhjax.ProductGroup(nhjax.SE2(RETRACTIONS[retraction]), nhjax.Euclidean(1))
+    if form == "lagrangian":
+        system = nhjax.LagrangianSystem(
+            lagrangian,
+            manifold=group,
+            holonomic=height,
+            nonholonomic=blade,
+            force=push,
+        )
+        u = {"v": jnp.array([0.4, 0.1, 0.6, 0.3])}
+    else:
+        system = nhjax.HamiltonianSystem(
+            hamiltonian, manifold=group, holonomic=height, nonholonomic=blade
+        )
+        u = {"p": jnp.array([0.4, 0.1, 0.6, 0.3])}
+    q = (jnp.array([0.5, 0.2, 0.8]), jnp.array([0.3]))
+    return system, nhjax.initial_state(system, q, **u, project=True)
+
+
+@pytest.mark.parametrize("chart", ["start", "middle"])
+@pytest.mark.parametrize("retraction", RETRACTIONS)
+@pytest.mark.parametrize("form", ["lagrangian", "hamiltonian"])
+def test_equations_of_a_step_are_the_same_with_frames(form, retraction, chart):
+    system, y0 = body(form, retraction)
+    method, t = nhjax.LobattoIIIAB(3, chart=chart), jnp.asarray(0.0)
+    given = first_step_state(system, method, t, y0, None)
+    stages = equations_of_step(system, method, t, jnp.asarray(0.1), given, None, None)
+    plain = replace(stages, system=system, q=unframed(stages.q))
+    assert isinstance(plain, StageSystem)
+    x = starting_values(stages, system.fibre_coordinate(y0), given.lin)
+    key = jax.random.key(0)
+    x = jax.tree.map(lambda z: z + 0.1 * jax.random.normal(key, z.shape), x)
+    residual, _ = eqx.filter_jit(nhjax.stage_residual)(stages, x)
+    expected, _ = eqx.filter_jit(nhjax.stage_residual)(plain, x)
+    assert np.max(np.abs(expected)) > 0.1
+    np.testing.assert_allclose(residual, expected, rtol=0, atol=2e-14)
+    end, same = unframed(end_position(stages, x)), end_position(plain, x)
+    for ours, theirs in zip(end, same, strict=True):
+        np.testing.assert_allclose(ours, theirs, rtol=0, atol=1e-15)
