@@ -53,6 +53,9 @@ def conditioning(matrix: Float[Array, "k l"]) -> FloatScalar:
     if matrix.shape[0] == 0:
         return jnp.ones((), matrix.dtype)
     rows = jnp.max(jnp.abs(matrix), axis=1)
+    if matrix.shape[0] == 1:
+        # There is one singular value. A library's call takes long to compile.
+        return jnp.where(rows[0] == 0, 0, rows[0] / rows[0])
     rows = jnp.where(rows > 0, rows, 1)
     if matrix.shape[0] == matrix.shape[1]:
         # The matrix is divided by each root on its own: their product could overflow.

@@ -71,8 +71,9 @@ def body(form, retraction):
     return system, nhjax.initial_state(system, q, **u, project=True)
 
 
-@pytest.mark.parametrize("chart", ["start", "middle"])
-@pytest.mark.parametrize("retraction", RETRACTIONS)
+@pytest.mark.parametrize(
+    ("retraction", "chart"), [("cayley", "middle"), ("exponential", "start")]
+)
 @pytest.mark.parametrize("form", ["lagrangian", "hamiltonian"])
 def test_equations_of_a_step_are_the_same_with_frames(form, retraction, chart):
     system, y0 = body(form, retraction)
