@@ -71,12 +71,14 @@ class ExactAtStart(nhjax.AbstractStageSolver):
             x_next = unravel(ravel_pytree(x)[0] - jacobian_inverse @ residual)
             return x_next, sizes(stages, x, x_next, lin), evaluation
 
+        scale = fibre_coordinate_scale(stages, x0, lin)
         return iterate(
             sweep,
             x0,
-            fibre_coordinate_scale(stages, x0, lin),
+            scale.size,
             max_iterations=self.max_iterations,
             tolerance=self.tolerance,
+            round_off=scale.round_off,
             noise_units=NOISE_UNITS,
             skip=skip,
         )

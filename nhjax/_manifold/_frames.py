@@ -18,9 +18,10 @@ def framed(group: AbstractLieGroup, q: PyTree[Array]) -> PyTree[Array]:
     The methods `act`, `act_back` and `tangent` of the group take it in the place of the
     element. Where no part is such a pose it is the element itself.
     """
-    if isinstance(group, SE2):
+    # A subclass may have methods of its own, which know nothing of frames.
+    if type(group) is SE2:
         return FramedPose(q, jnp.cos(q[2]), jnp.sin(q[2]))
-    if isinstance(group, ProductGroup):
+    if type(group) is ProductGroup:
         return tuple(map(framed, group.factors, q))
     return q
 

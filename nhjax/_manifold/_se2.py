@@ -61,7 +61,10 @@ class SE2(AbstractMotionGroup):
         return g + _moved(g, h)
 
     def act(self, g: Pose | FramedPose, xi: Vector) -> Pose | FramedPose:
-        """Compute g τ(ξ), with its frame if g has one."""
+        """Compute g τ(ξ), with its frame if g has one.
+
+        Inside of a step poses are given with their frames, the cosine and sine of θ.
+        """
         if not isinstance(g, FramedPose):
             return self.compose(g, self.retract(xi))
         translation = g.rotate(self._translation(xi))

@@ -96,6 +96,9 @@ def _results(equation: Any, inputs: list[_Value], n: int) -> list[_Value]:
     if constant and not equation.effects:
         out = _applied(equation, known)
         return [(np.zeros((*x.shape, n), bool), x) for x in out]
+    if not inputs:
+        # Numbers from nothing, such as those of a range.
+        return [(np.zeros((*shape, n), bool), None) for shape in shapes]
     sets = [s for s, _ in inputs]
     found = _sets(equation, sets, known, shapes)
     if found is not None:

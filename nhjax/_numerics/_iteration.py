@@ -63,7 +63,9 @@ class _Rules(NamedTuple):
     """The constants by which `iterate` judges the increments of an iteration."""
 
     scale: FloatScalar
-    floor: FloatScalar
+    round_off: FloatScalar
+    eps: float
+    tolerance: FloatScalar
     noisiest: float
     growth: float
     max_iterations: int
@@ -94,6 +96,7 @@ def iterate(
     *,
     max_iterations: int,
     tolerance: FloatScalarLike = 0.0,
+    round_off: FloatScalarLike = 0.0,
     noise_units: float | None = None,
     skip: Bool[Array, ""] | bool = False,
 ) -> Solved[X, Aux]:
@@ -101,11 +104,12 @@ def iterate(
 
     `sweep(x)` returns the next iterate, the sizes of the increment and of the iterate,
     and whatever was evaluated at x. Increments are measured relative to `scale`, the
-    size to which the round-off of x is proportional, or relative to the size of the
-    iterate if that is larger, because x may start from zero. If both are zero,
-    increments are measured relative to the first one, which is measured as it is.
+    size of x, or relative to the size of the iterate if that is larger, because x may
+    start from zero. If both are zero, increments are measured relative to the first
+    one, which is measured as it is. The round-off of x is proportional to the same size
+    or, where data are larger than x, to `scale` plus `round_off`.
 
-    An increment below the unit round-off (or `tolerance`) ends the iteration. Small
+    An increment below the unit round-off or `tolerance` ends the iteration. Small
     increments that have stopped falling end it too, because they are round-off. How
     large round-off can be depends on the conditioning of the problem, so that one
     absolute threshold would be either too coarse or never met (Hairer, Lubich, Wanner,
@@ -124,7 +128,9 @@ def iterate(
     eps = float(jnp.finfo(dtype).eps)
     rules = _Rules(
         scale=jnp.asarray(scale, dtype),
-        floor=jnp.maximum(jnp.asarray(eps, dtype), jnp.asarray(tolerance, dtype)),
+        round_off=jnp.asarray(round_off, dtype),
+        eps=eps,
+        tolerance=jnp.asarray(tolerance, dtype),
         noisiest=eps**0.5 if noise_units is None else noise_units * eps,
         growth=_GROWTH if noise_units is None else _GROWTH_IF_SLOW,
         max_iterations=max_iterations,
@@ -151,10 +157,15 @@ def _progress(rules: _Rules, before: _Progress, sizes: Sizes) -> _Progress:
     """Update the progress of an iteration by an increment; decide whether it ends."""
     increment = sizes.increment
     first = jnp.where(before.iterations == 0, increment, before.first)
-    size = jnp.maximum(rules.scale, sizes.iterate)
     # Sizes are compared without forming quotients, which would have to be computed one
     # after the other.
-    measure = jnp.where(size > 0, size, before.first)
+    size, measure = (
+        jnp.where(found > 0, found, before.first)
+        for found in (
+            jnp.maximum(rules.scale, sizes.iterate),
+            jnp.maximum(rules.scale + rules.round_off, sizes.iterate),
+        )
+    )
     magnified = measure
     if sizes.noise is not None:
         noise = jnp.minimum(sizes.noise, _LARGEST_NOISE * measure)
@@ -166,7 +177,9 @@ def _progress(rules: _Rules, before: _Progress, sizes: Sizes) -> _Progress:
     more = jnp.minimum(rules.growth * before.believed, rules.noisiest)
     believed = jnp.where(stalls, more, before.believed)
     stagnant = stalls & (increment <= believed * magnified)
-    converged = (increment <= rules.floor * measure) | stagnant
+    # A tolerance is relative to x itself, whatever its round-off is.
+    small = (increment <= rules.eps * measure) | (increment <= rules.tolerance * size)
+    converged = small | stagnant
     count = before.iterations + 1
     # This is False if the increment is not finite.
     bounded = increment < _HOPELESS * (measure + first)

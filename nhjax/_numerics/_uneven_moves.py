@@ -1,4 +1,4 @@
-"""Moves of numbers by about their own size that do not cancel one another."""
+"""Moves of numbers by about their own size that hardly cancel one another."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -9,8 +9,9 @@ from jaxtyping import Array, PyTree
 def uneven_moves(q: PyTree[Array]) -> PyTree[Array]:
     """Return a move for each number in q, of half its size to its size.
 
-    The moves differ and have both signs, so that they do not cancel in differences and
-    sums of a few numbers.
+    The moves differ and have both signs, so that they hardly cancel in differences and
+    sums of a few numbers. Multiples of the golden ratio, less their whole parts, differ
+    from one another as much as they can.
     """
     numbers, unravel = ravel_pytree(q)
     k = np.arange(numbers.size)

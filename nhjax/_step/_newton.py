@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array
 
-from .._custom_types import FloatScalar, FloatScalarLike
+from .._custom_types import FloatScalarLike
 from .._errors import check_choice
 from .._numerics import (
     iterate,
@@ -24,7 +24,7 @@ from .._numerics import (
 from .._system import all_finite, check_flag, Linearisation
 from ._factorisation import leading_structure
 from ._jacobian_choice import JacobianName
-from ._scale import fibre_coordinate_scale
+from ._scale import fibre_coordinate_scale, Scale
 from ._stage_iteration import (
     corrected,
     Evaluation,
@@ -83,16 +83,17 @@ def _iterated(
     solver: AbstractStageSolver,
     sweep: Callable[[Stages], tuple[Stages, Sizes, Evaluation]],
     x0: Stages,
-    scale: FloatScalar,
+    scale: Scale,
     skip: Array,
 ) -> Solved[Stages, Evaluation]:
     """Run the iteration on the stages of a solver, whose own sweep is an argument."""
     return iterate(
         sweep,
         x0,
-        scale,
+        scale.size,
         max_iterations=solver.max_iterations,
         tolerance=solver.tolerance,
+        round_off=scale.round_off,
         noise_units=NOISE_UNITS,
         skip=skip,
     )
@@ -262,9 +263,12 @@ class Newton(AbstractStageSolver):
         # Where forces grow without bound, increments are small even far from any
         # solution, so that the residual is checked too.
         gross = matvec(lin.momentum_inverse, solved.aux.forces.residual)
-        allowed = jnp.maximum(_GROSS, 1e3 * self.tolerance).astype(scale.dtype)
-        size = jnp.maximum(scale, fibre_coordinate_size(stages, solved.x))
-        is_near = skip | (max_norm(gross) <= allowed * size)
+        found = fibre_coordinate_size(stages, solved.x)
+        measure = jnp.maximum(scale.size + scale.round_off, found)
+        allowed = 1e3 * jnp.asarray(self.tolerance, measure.dtype)
+        size = jnp.maximum(scale.size, found)
+        near = jnp.maximum(_GROSS * measure, allowed * size)
+        is_near = skip | (max_norm(gross) <= near)
         return solved._replace(
             converged=solved.converged & is_near,
             exhausted=solved.exhausted | (solved.converged & ~is_near),

@@ -28,7 +28,7 @@ def in_nodes(
 def stage_positions(
     stages: StageSystem, chart: AbstractChart, y: Float[Array, "s n"]
 ) -> PyTree[Array]:
-    """Compute the positions of the stages, of which the first one may be known."""
+    """Compute the positions of the stages, the first of which is q_k if c_1 = 0."""
     if np.any(stages.method.a[0]):
         return chart.positions(y)
     return jax.tree.map(
@@ -50,8 +50,8 @@ def _in_chart(
 ) -> tuple[AbstractChart, Float[Array, "r n"]]:
     chart = stages.chart(x)
     start, end = chart.ends
-    # What is computed at the ends of the step is the same for a node as for the chart
-    # itself, so that a compiler finds it needed once.
+    # A node at an end of the step is given the very coordinates that the chart has for
+    # this end, so that the compiler computes once what depends on them.
     first = 0 if np.any(rows[0]) else 1
     last = len(rows) - int(np.array_equal(rows[-1], stages.method.b))
     parts = [start[None]] * first

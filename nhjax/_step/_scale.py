@@ -1,10 +1,13 @@
 """The scale of a step, to which the round-off of its stages is proportional."""
 
+from typing import NamedTuple
+
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from .._custom_types import FloatScalar
+from .._manifold import unframed
 from .._numerics import absolute, matvec, max_norm, uneven_moves
 from .._system import Linearisation, position_scale
 from ._stage_equations import impulse_weights
@@ -12,51 +15,68 @@ from ._stage_system import StageSystem
 from ._unknowns import Stages
 
 
+class Scale(NamedTuple):
+    """The size of the fibre coordinates of a step, and what adds to their round-off.
+
+    Both are in units of fibre coordinates: the round-off of these is about the unit
+    round-off times the sum of the two.
+    """
+
+    size: FloatScalar
+    round_off: FloatScalar
+
+
 def fibre_coordinate_scale(
     stages: StageSystem, x0: Stages, lin: Linearisation
-) -> FloatScalar:
-    """Estimate the round-off of the fibre coordinates of a step, in units of round-off.
+) -> Scale:
+    """Estimate the size of the fibre coordinates of a step and their round-off.
 
-    The estimate adds to the size of the coordinates themselves, at the starting values
-    x0, the size of the terms that cancel in them: the forces and reactions over the
-    step, and the effect on velocities of the round-off of positions: through holonomic
-    constraints, which are divided by h, and through nonholonomic ones, which matters
-    where a coordinate has grown large, as the heading of a car after many turns. For a
-    system at rest these terms are all there is. With invariants the round-off of these
-    is added, as far as impulses have it.
+    The size is that of the coordinates at the starting values x0, plus that of the
+    terms that cancel in them, the forces and reactions over the step. For a system at
+    rest these terms are all there is. Round-off of the positions adds to it, in so far
+    as velocities feel it: through holonomic constraints, whose round-off is divided by
+    h, and through nonholonomic ones, which matters where a coordinate has grown large,
+    as the heading of a car after many turns. With invariants the round-off of these is
+    added, as far as impulses have it.
     """
     h = jnp.abs(stages.h)
     rate = max_norm(lin.acceleration)
     if stages.constrained:
         rate = rate + max_norm(matvec(absolute(lin.reaction), jnp.abs(lin.multiplier)))
-    scale = h * rate + max_norm(
+    size = h * rate + max_norm(
         x0.node_fibre_coordinate, x0.momentum if stages.hamiltonian else x0.velocity
     )
+    round_off = jnp.zeros_like(size)
     m, k = stages.num_nonholonomic, stages.num_holonomic
+    t, q, args = stages.t, unframed(stages.q), stages.args
 
     def response(sizes):
         multipliers = matvec(absolute(lin.compliance_inverse), sizes)
         return max_norm(matvec(absolute(lin.reaction), multipliers))
 
     if k:
-        sizes = position_scale(stages.system, stages.t, stages.q, stages.args, lin)
-        scale = scale + response(jnp.pad(sizes, (m, 0))) / h
+        sizes = position_scale(stages.system, t, q, args, lin)
+        round_off = round_off + response(jnp.pad(sizes, (m, 0))) / h
     if m:
-        scale = scale + response(jnp.pad(_kinematic_scale(stages, x0), (0, k)))
+        round_off = round_off + response(jnp.pad(_kinematic_scale(stages, x0), (0, k)))
     if stages.kept is not None:
-        scale = scale + impulse_weights(stages, x0).noise
-    return scale
+        round_off = round_off + impulse_weights(stages, x0).noise
+    return Scale(size, round_off)
 
 
 def _kinematic_scale(stages: StageSystem, x0: Stages) -> Float[Array, " m"]:
-    # How far nonholonomic constraints move if each number of the position moves by
-    # about its size.
+    """Estimate how far nonholonomic constraints move if positions move by their size.
+
+    One direction of the moves is enough for an estimate: to take each number by itself
+    would cost as many derivatives as there are coordinates.
+    """
     system, t, args = stages.system, stages.t, stages.args
+    q = unframed(stages.q)
     u = x0.momentum[0] if stages.hamiltonian else x0.velocity[0]
     change = jax.jvp(
         lambda q: system.kinematic_constraint(t, q, u, args),
-        (stages.q,),
-        (uneven_moves(stages.q),),
+        (q,),
+        (uneven_moves(q),),
     )[1]
     # Where a constraint has no finite slope this tells nothing of its round-off.
     return jnp.where(jnp.isfinite(change), jnp.abs(change), 0)

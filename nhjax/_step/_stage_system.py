@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Array, Float, PyTree
 
 from .._custom_types import Args, FloatScalar
-from .._manifold import AbstractLieGroup
+from .._manifold import AbstractLieGroup, unframed
 from .._method import AbstractMethod
 from .._numerics import max_norm, small_einsum, uneven_moves
 from .._system import AbstractMechanicalSystem, Linearisation, State, with_frames
@@ -211,7 +211,7 @@ def nudged(stages: StageSystem, nudge: FloatScalar) -> StageSystem:
         moves = uneven_moves(stages.q)
         moved = jax.tree.map(lambda x, dx: x + nudge * dx, stages.q, moves)
     else:
-        size = max_norm(*jax.tree.leaves(stages.q))
+        size = max_norm(*jax.tree.leaves(unframed(stages.q)))
         xi = nudge * uneven_moves(jnp.broadcast_to(size, stages.p.shape))
         moved = stages.manifold.act(stages.q, xi)
     return replace(stages, q=moved)

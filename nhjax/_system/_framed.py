@@ -9,6 +9,8 @@ from jaxtyping import Array, PyTree
 from .._custom_types import PhaseFunction, PositionFunction
 from .._manifold import framed, is_framed, unframed
 from ._abstract import AbstractMechanicalSystem
+from ._hamiltonian import HamiltonianSystem
+from ._lagrangian import LagrangianSystem
 
 
 S = TypeVar("S", bound=AbstractMechanicalSystem)
@@ -22,6 +24,9 @@ def with_frames(system: S, q: PyTree[Array]) -> tuple[S, PyTree[Array]]:
     with frames and without. Its functions are called with positions alone. Where the
     manifold has no frames nothing changes.
     """
+    # A subclass may have methods of its own, which know nothing of frames.
+    if type(system) not in (LagrangianSystem, HamiltonianSystem):
+        return system, q
     position = framed(system.manifold_of(q), q)
     if not any(map(is_framed, jax.tree.leaves(position, is_leaf=is_framed))):
         return system, q
@@ -36,7 +41,7 @@ def with_frames(system: S, q: PyTree[Array]) -> tuple[S, PyTree[Array]]:
 
 
 class _OfPosition(eqx.Module):
-    """A function of (t, q, ...) that is called with q alone, without its frames."""
+    """A function of (t, q, args) or (t, q, u, args), for a q that may have frames."""
 
     function: PhaseFunction | PositionFunction
 

@@ -25,6 +25,7 @@ SEPARATE = {
     "named": lambda v: 0.5 * (v[0] ** 2 + 2 * v[1] ** 2) + v[2] ** 4 + v[-1] ** 2,
     "parts": lambda v: jnp.sum(v[:2] ** 2) + 3 * jnp.sum(v[2:] ** 2),
     "relativistic": lambda v: -jnp.sum(jnp.sqrt(1 - 0.1 * v**2)),
+    "numbered": lambda v: jnp.sum(jnp.arange(1.0, 5.0) * v**2),
     "unused": lambda v: v[1] ** 2 + v[2] ** 2,
     "jit": jax.jit(lambda v: 0.5 * v @ v),
     "checkpoint": jax.checkpoint(lambda v: jnp.sum(v**2)),

@@ -57,3 +57,20 @@ def test_increments_that_do_not_fall_and_are_no_noise_never_end_well():
     )
     assert not solved.converged
     assert solved.exhausted
+
+
+@pytest.mark.parametrize(("tolerance", "iterations"), [(0.0, 13), (1e-6, 6)])
+def test_round_off_of_data_ends_an_iteration_and_multiplies_no_tolerance(
+    tolerance, iterations
+):
+    # Increments 10⁻¹, 10⁻², ...; the data are a thousand times as large as x.
+    solved = iterate(
+        lambda k: (k + 1, Sizes(0.9 * 10.0**-k), None),
+        jnp.asarray(1.0),
+        jnp.asarray(1.0),
+        max_iterations=50,
+        tolerance=tolerance,
+        round_off=jnp.asarray(999.0),
+    )
+    assert solved.converged
+    assert int(solved.num_iterations) == iterations

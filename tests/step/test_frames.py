@@ -92,3 +92,41 @@ def test_equations_of_a_step_are_the_same_with_frames(form, retraction, chart):
     end, same = unframed(end_position(stages, x)), end_position(plain, x)
     for ours, theirs in zip(end, same, strict=True):
         np.testing.assert_allclose(ours, theirs, rtol=0, atol=1e-15)
+
+
+class TurnsByHand(nhjax.SE2):
+    """A group of a user, whose methods know elements of three numbers alone."""
+
+    def act(self, g, xi):
+        return self.compose(g, self.retract(xi))
+
+    def tangent(self, g, eta):
+        cos, sin = jnp.cos(g[2]), jnp.sin(g[2])
+        return jnp.stack(
+            [cos * eta[0] - sin * eta[1], sin * eta[0] + cos * eta[1], eta[2]]
+        )
+
+
+class WithAMomentum(nhjax.LagrangianSystem):
+    """A system of a user, with a method that reads a position."""
+
+    def momentum(self, t, q, u, args=None):
+        return u * (1 + 0 * q[2])
+
+
+@pytest.mark.parametrize("own", ["group", "system"])
+def test_subclasses_of_a_user_are_given_positions_alone(own):
+    kind = WithAMomentum if own == "system" else nhjax.LagrangianSystem
+
+    def run(kind, group):
+        system = kind(
+            lambda t, q, v, args: 0.5 * v @ v - q[0] * jnp.sin(q[2]), manifold=group
+        )
+        start = jnp.array([0.3, 0.2, 0.5]), jnp.array([0.1, 0.4, 1.0])
+        y0 = nhjax.initial_state(system, *start)
+        method = nhjax.LobattoIIIAB(3)
+        return nhjax.integrate(system, method, y0, dt=0.1, num_steps=5).ys.q
+
+    found = run(kind, TurnsByHand() if own == "group" else nhjax.SE2())
+    expected = run(nhjax.LagrangianSystem, nhjax.SE2())
+    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-13)

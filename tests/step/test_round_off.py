@@ -207,3 +207,50 @@ def test_a_heading_of_many_turns_is_felt_in_constraints():
     # The circle is that of a heading of the first turn, up to round-off of many.
     eps = 1000 * np.finfo(float).eps
     np.testing.assert_allclose(final(sol).v, final(before).v, rtol=0, atol=400 * eps)
+
+
+def test_a_tolerance_does_not_grow_with_the_turns_of_a_heading():
+    unicycle = systems.Unicycle().in_coordinates()
+    start = jnp.asarray(unicycle.q0).at[2].add(200 * jnp.pi)
+    y0 = nhjax.initial_state(unicycle.system, start, unicycle.v0, project=True)
+
+    def run(tolerance):
+        return nhjax.integrate(
+            unicycle.system,
+            METHOD,
+            y0,
+            dt=0.2,
+            num_steps=50,
+            stage_solver=nhjax.SimplifiedNewton(tolerance=tolerance),
+        )
+
+    coarse, exact = run(1e-6), run(0.0)
+    error = np.max(np.abs(final(coarse).v - final(exact).v))
+    assert 1e-14 < error < 1e-7
+    assert coarse.stats["num_iterations"] < exact.stats["num_iterations"]
+    assert coarse.stats["max_residual"] < 1e-5
+
+
+@pytest.mark.parametrize("solver", SOLVERS, ids=["simplified", "dense"])
+def test_a_unit_of_length_does_not_matter_on_the_plane(solver):
+    def runs(unit):
+        """A particle on a circle, in the plane of SE(2)."""
+        system = nhjax.LagrangianSystem(
+            lambda t, q, v, args: (
+                0.5 * (v[:2] @ v[:2] + (unit * v[2]) ** 2) - 0.3 * unit * q[0]
+            ),
+            manifold=nhjax.SE2(),
+            holonomic=lambda t, q, args: (q[0] ** 2 + q[1] ** 2 - unit**2) / unit,
+        )
+        q0 = unit * jnp.array([1.0, 0.0, 0.0])
+        v0 = unit * jnp.array([0.0, 1.0, 0.0])
+        y0 = nhjax.initial_state(system, q0, v0, project=True)
+        return nhjax.integrate(
+            system, METHOD, y0, dt=0.1, num_steps=50, stage_solver=solver
+        )
+
+    small = runs(2.0**-33)
+    assert small.stats["max_residual"] < 1e-14
+    np.testing.assert_allclose(
+        final(small).q[:2] * 2.0**33, final(runs(1.0)).q[:2], rtol=0, atol=1e-10
+    )
