@@ -3,7 +3,7 @@ from jaxtyping import Array, DTypeLike, Float
 
 from .._custom_types import BoolScalar
 from .._numerics import two_sum
-from ._abstract import check_shape
+from ._abstract import check_shape, Element
 from ._framed_pose import FramedPose
 from ._homogeneous import homogeneous
 from ._motions import AbstractMotionGroup
@@ -60,7 +60,7 @@ class SE2(AbstractMotionGroup):
         """Compute the product (x + R(θ) x', θ + θ') of (x, θ) and (x', θ')."""
         return g + _moved(g, h)
 
-    def act(self, g: Pose | FramedPose, xi: Vector) -> Pose | FramedPose:
+    def act(self, g: Element, xi: Vector) -> Element:
         """Compute g τ(ξ), with its frame if g has one.
 
         Inside of a step poses are given with their frames, the cosine and sine of θ.
@@ -115,7 +115,7 @@ class SE2(AbstractMotionGroup):
         """Return the matrix [[ω J, v], [0, 0]] of ξ = (v, ω)."""
         return homogeneous(SO2(self.retraction).hat(xi[2:]), xi[:2], 0.0)
 
-    def tangent(self, g: Pose | FramedPose, eta: Vector) -> Pose | FramedPose:
+    def tangent(self, g: Element, eta: Vector) -> Element:
         """Compute the tangent (R(θ) v, ω) at g = (x, θ) of η = (v, ω).
 
         The frame, if there is one, changes by -ω sin θ and ω cos θ.

@@ -61,14 +61,15 @@ def body(form, retraction):
             nonholonomic=blade,
             force=push,
         )
-        u = {"v": jnp.array([0.4, 0.1, 0.6, 0.3])}
     else:
         system = nhjax.HamiltonianSystem(
             hamiltonian, manifold=group, holonomic=height, nonholonomic=blade
         )
-        u = {"p": jnp.array([0.4, 0.1, 0.6, 0.3])}
     q = (jnp.array([0.5, 0.2, 0.8]), jnp.array([0.3]))
-    return system, nhjax.initial_state(system, q, **u, project=True)
+    u = jnp.array([0.4, 0.1, 0.6, 0.3])
+    if form == "lagrangian":
+        return system, nhjax.initial_state(system, q, v=u, project=True)
+    return system, nhjax.initial_state(system, q, p=u, project=True)
 
 
 @pytest.mark.parametrize(
