@@ -36,7 +36,7 @@ def interpolate(
     chart = chart_of_step(manifold, method.chart, start.q, whole)
     y = chart.coordinates(h * (weights @ record.velocity)[None])
     known = chart.momentum_at_origin(start.p) + h * (weights @ record.force)
-    q = jax.tree.map(lambda leaf: leaf[0], chart.positions(y))
+    q = chart.position(y[0])
     p = chart.from_origin(y, known[None])[0]
     u = p
     if system.fibre_coordinate_name == "v":

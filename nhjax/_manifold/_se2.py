@@ -66,12 +66,10 @@ class SE2(AbstractMotionGroup):
         Inside of a step poses are given with their frames, the cosine and sine of θ.
         """
         if not isinstance(g, FramedPose):
-            return self.compose(g, self.retract(xi))
-        translation = g.rotate(self._translation(xi))
-        turned = self.retraction.angle(xi[2:])
+            return super().act(g, xi)
         less, sin = self.retraction.plane_rotation(xi[2])
         return FramedPose(
-            g.pose + jnp.concatenate([translation, turned]),
+            g.pose + _moved(g, self.retract(xi)),
             g.cos + (less * g.cos - sin * g.sin),
             g.sin + (less * g.sin + sin * g.cos),
         )
@@ -120,9 +118,9 @@ class SE2(AbstractMotionGroup):
 
         The frame, if there is one, changes by -ω sin θ and ω cos θ.
         """
+        rate = _moved(g, eta)
         if not isinstance(g, FramedPose):
-            return _moved(g, eta)
-        rate = jnp.concatenate([g.rotate(eta[:2]), eta[2:]])
+            return rate
         return FramedPose(rate, -eta[2] * g.sin, eta[2] * g.cos)
 
     def dtau(self, xi: Vector, eta: Vector) -> Vector:
@@ -167,6 +165,8 @@ class SE2(AbstractMotionGroup):
         return jnp.concatenate([linear, jnp.zeros_like(eta[2:])])
 
 
-def _moved(g: Pose, move: Pose | Vector) -> Pose:
+def _moved(g: Pose | FramedPose, move: Pose | Vector) -> Pose:
     """Turn the first two numbers of a move from the frame of the body g."""
-    return jnp.concatenate([rotate(g[2], move[:2]), move[2:]])
+    v = move[:2]
+    turned = g.rotate(v) if isinstance(g, FramedPose) else rotate(g[2], v)
+    return jnp.concatenate([turned, move[2:]])

@@ -45,10 +45,13 @@ class AbstractChart(eqx.Module):
     def ends(self) -> tuple[Vector, Vector]:
         """Compute the coordinates of the start and of the end of the step."""
 
+    def position(self, y: Vector) -> PyTree[Array]:
+        """Compute the position g_o τ(y)."""
+        return self.manifold.act(self.origin, y)
+
     def positions(self, y: Vectors) -> PyTree[Array]:
         """Compute the positions g_o τ(y), one for each row of y."""
-        origin = self.origin
-        return jax.vmap(lambda y: self.manifold.act(origin, y))(y)
+        return jax.vmap(self.position)(y)
 
     @abstractmethod
     def body_velocities(self, y: Vectors, velocity: Vectors) -> Vectors:

@@ -41,8 +41,7 @@ def stage_positions(
 def end_position(stages: StageSystem, x: Stages) -> PyTree[Array]:
     """Compute q_{k+1}."""
     chart = stages.chart(x)
-    end = chart.positions(chart.ends[1][None])
-    return jax.tree.map(lambda leaf: leaf[0], end)
+    return chart.position(chart.ends[1])
 
 
 def _in_chart(

@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, PyTree
 
 from .._custom_types import FloatScalar
 from .._manifold import unframed
@@ -58,20 +58,23 @@ def fibre_coordinate_scale(
         sizes = position_scale(stages.system, t, q, args, lin)
         round_off = round_off + response(jnp.pad(sizes, (m, 0))) / h
     if m:
-        round_off = round_off + response(jnp.pad(_kinematic_scale(stages, x0), (0, k)))
+        round_off = round_off + response(
+            jnp.pad(_kinematic_scale(stages, q, x0), (0, k))
+        )
     if stages.kept is not None:
         round_off = round_off + impulse_weights(stages, x0).noise
     return Scale(size, round_off)
 
 
-def _kinematic_scale(stages: StageSystem, x0: Stages) -> Float[Array, " m"]:
+def _kinematic_scale(
+    stages: StageSystem, q: PyTree[Array], x0: Stages
+) -> Float[Array, " m"]:
     """Estimate how far nonholonomic constraints move if positions move by their size.
 
     One direction of the moves is enough for an estimate: to take each number by itself
     would cost as many derivatives as there are coordinates.
     """
     system, t, args = stages.system, stages.t, stages.args
-    q = unframed(stages.q)
     u = x0.momentum[0] if stages.hamiltonian else x0.velocity[0]
     change = jax.jvp(
         lambda q: system.kinematic_constraint(t, q, u, args),

@@ -14,9 +14,9 @@ from nhjax._step._positions import end_position
 from nhjax._step._stage_system import StageSystem
 from nhjax._step._starting_values import starting_values
 from nhjax._step._step import equations_of_step, first_step_state
+from oracles.group_problems import RETRACTIONS
 
 
-RETRACTIONS = {"cayley": nhjax.Cayley(), "exponential": nhjax.Exponential()}
 # A body in the plane, and a wheel on its axle.
 INERTIA = jnp.array([[1.3, 0.1, 0.2, 0.0], [0.1, 1.1, 0.3, 0.1], [0.2, 0.3, 0.8, 0.2],
                      [0.0, 0.1, 0.2, 0.5]])  # fmt: skip
