@@ -13,6 +13,9 @@ import pytest
 from oracles import as_users_run, shapes
 
 
+pytestmark = pytest.mark.long
+
+
 QUICK = ("XLA_FLAGS", "JAX_DISABLE_MOST_OPTIMIZATIONS")
 
 

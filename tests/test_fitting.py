@@ -9,6 +9,9 @@ import pytest
 from oracles.notebook_runs import FITS, run_notebook
 
 
+pytestmark = pytest.mark.long
+
+
 @pytest.fixture(scope="module")
 def results_of(tmp_path_factory):
     """What the last cell of a notebook prints, in JSON; each notebook runs once."""

@@ -5,6 +5,9 @@ import pytest
 from oracles.notebook_runs import FITS, NOTEBOOKS, run_notebook
 
 
+pytestmark = pytest.mark.long
+
+
 @pytest.mark.parametrize("name", sorted(NOTEBOOKS.keys() - FITS))
 def test_notebook(name, tmp_path):
     run_notebook(name, tmp_path)

@@ -126,6 +126,7 @@ def test_circling_wheels_have_the_eigenvalues_of_newton_and_euler(body):
     assert_eigenvalues(stability, expected, 1e-9)
 
 
+@pytest.mark.long
 def test_a_wheel_finds_the_circle_on_which_it_rolls():
     wheel = RollingTorus.circling(1.2, 0.6, tube_radius=0.04)
     moved = wheel.manifold.act(wheel.q0, 0.05 * jnp.asarray([2, -1, 1, 3, 0, 0.0]))

@@ -14,6 +14,7 @@ PARTICLE = nhjax.systems.NonholonomicParticle()
 METHOD = nhjax.LobattoIIIAB(2)
 
 
+@pytest.mark.long
 def test_three_steps_and_their_gradient_are_those_of_the_compiled_program():
     y0 = PARTICLE.initial_state()
 

@@ -165,6 +165,7 @@ print("the same")
 """
 
 
+@pytest.mark.long
 def test_members_and_statistics_on_several_devices_are_those_of_one():
     flags = f"{os.environ['XLA_FLAGS']} --xla_force_host_platform_device_count=3"
     root = Path(__file__).parents[2]

@@ -131,6 +131,7 @@ def test_one_that_is_killed_ends_the_other_with_an_error(said):
     assert len(said[1]) == 2
 
 
+@pytest.mark.long
 def test_both_and_one_alone_go_on_to_the_same_bytes(said, folder, whole, monkeypatch):
     monkeypatch.setattr(nhjax._ensemble._ensemble, "_SECONDS", 0.0)
     with pytest.raises(OSError, match="No space"):

@@ -17,6 +17,7 @@ from oracles.helpers import (
     dot,
     scalar,
 )
+from oracles.long import long
 
 
 DIRECT = nhjax.DirectAdjoint()
@@ -95,9 +96,9 @@ def driven(given, adjoint, method, num_steps=10, samples=False, **options):
 @pytest.mark.parametrize(
     ("method", "options"),
     [
-        (LobattoIIIAB(2), {"samples": True}),
-        (LobattoIIIAB(2, "consistent"), {"stage_solver": nhjax.Newton()}),
-        (LobattoIIIAB(2, "propagated"), {}),
+        long(LobattoIIIAB(2), {"samples": True}),
+        long(LobattoIIIAB(2, "consistent"), {"stage_solver": nhjax.Newton()}),
+        long(LobattoIIIAB(2, "propagated"), {}),
     ],
     ids=["samples", "Newton", "propagated"],
 )
@@ -194,8 +195,8 @@ ORDERS = {
     ("adjoint", "order"),
     [
         (DIRECT, "hessian"),
-        (DIRECT, "reverse over reverse"),
-        (CHECKPOINTS, "reverse over forward"),
+        long(DIRECT, "reverse over reverse"),
+        long(CHECKPOINTS, "reverse over forward"),
         (REVERSIBLE, "hessian"),
     ],
     ids=["direct", "direct in reverse", "blocks", "reversible"],
@@ -235,6 +236,7 @@ def test_the_reversible_adjoint_has_no_forward_mode():
 # Memory -------------------------------------------------------------------------------
 
 
+@pytest.mark.long
 def test_memory_grows_as_each_adjoint_promises():
     example = systems.NonholonomicParticle()
     y0 = example.initial_state()

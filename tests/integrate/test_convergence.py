@@ -20,6 +20,7 @@ import nhjax
 from nhjax.systems import ChaplyginSleigh, NonholonomicParticle
 from oracles import helpers, paper_mechanics as paper
 from oracles.driven import FIELD, FRICTION
+from oracles.long import long_but
 from oracles.orders import assert_order, rms, SCIPY_FLOOR, trajectories
 
 
@@ -85,7 +86,7 @@ def solved_errors(part, stages, closure):
 
 every_part = pytest.mark.parametrize("part", PARTS)
 every_closure = pytest.mark.parametrize("closure", helpers.CLOSURES)
-every_stages = pytest.mark.parametrize("stages", COUNTS)
+every_stages = pytest.mark.parametrize("stages", long_but((2, 3, 4), COUNTS))
 some_methods = pytest.mark.parametrize(
     ("stages", "closure"),
     [

@@ -10,6 +10,7 @@ import nhjax
 from nhjax import SaveAt
 from nhjax.systems import Appell, NonholonomicParticle
 from oracles import helpers
+from oracles.long import long
 
 
 PARTICLE = NonholonomicParticle()
@@ -147,7 +148,7 @@ def test_an_integer_time(sol):
     np.testing.assert_array_equal(sol.evaluate(0).q, sol.evaluate(0.0).q)
 
 
-@pytest.mark.parametrize("closure", ["propagated", "symmetric"])
+@pytest.mark.parametrize("closure", [long("propagated"), "symmetric"])
 def test_a_failed_trajectory_stays_at_its_last_good_state(closure):
     # It rises to an apex where D2Φ vanishes.
     appell = Appell(v0=(0.15, 0.2, 0.5))

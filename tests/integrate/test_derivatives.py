@@ -14,6 +14,7 @@ from oracles.gradients import assert_gradient, split, STEPS
 from oracles.helpers import (
     scalar,
 )
+from oracles.long import long
 
 
 # What is given, and what is saved -----------------------------------------------------
@@ -88,7 +89,7 @@ def dense_output(given):
     return scalar((sol.ys, between, sol.evaluate(sol.t1)))
 
 
-@pytest.mark.parametrize("loss", [samples, thinned_nodes, dense_output])
+@pytest.mark.parametrize("loss", [long(samples), thinned_nodes, long(dense_output)])
 def test_the_gradient_in_all_that_is_given(loss):
     assert_gradient(loss, GIVEN, epsilon=3e-5)
 

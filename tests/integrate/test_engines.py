@@ -11,11 +11,21 @@ import pytest
 import nhjax
 from benchmarks.engines import difference, FINAL_TIMES, gallery, program
 from nhjax import LobattoIIIAB, systems
+from oracles.long import long_but
 
 
 pytestmark = pytest.mark.usefixtures("optimised_kernels")
 
 GALLERY = gallery()
+# On vector spaces and on each group, with each kind of constraints.
+QUICK = (
+    "ChaoticSystem",
+    "ChaplyginSleigh",
+    "RodSleigh",
+    "Unicycle",
+    "Suslov",
+    "HeavyTop",
+)
 PARTICLE = systems.NonholonomicParticle()
 # Iterations end in round-off: some steps have one more or one less.
 LARGEST_DIFFERENCE_OF_COUNTS, OF_A_MEMBER = 0.03, 0.15
@@ -49,7 +59,7 @@ def by_both(function, args, monkeypatch):
     return found
 
 
-@pytest.mark.parametrize("name", GALLERY)
+@pytest.mark.parametrize("name", long_but(QUICK, GALLERY))
 def test_an_ensemble_in_lanes_is_that_of_xla(name, monkeypatch):
     num_steps = 20
     function = program(GALLERY[name], "end", 2, num_steps)

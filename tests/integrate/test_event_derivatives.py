@@ -11,6 +11,7 @@ import nhjax
 from integrate.test_events import rod_run, SLIDE, slide, START
 from nhjax import Event, LobattoIIIAB, SaveAt
 from oracles.helpers import central_difference, direction, dot, moved, scalar
+from oracles.long import long
 
 
 DIRECT, CHECKPOINTS, REVERSIBLE = (
@@ -36,7 +37,7 @@ def times_places_and_rows(given, on_group, adjoint):
     return scalar((log, sol.ys.q, sol.ys.v, sol.events.after.v[:2])), sol.events.num
 
 
-@pytest.mark.parametrize("on_group", [False, True])
+@pytest.mark.parametrize("on_group", [False, long(True)])
 def test_gradients_are_those_of_differences(on_group):
     along = direction(GIVEN)
     adjoints = [DIRECT, REVERSIBLE] if on_group else [DIRECT, CHECKPOINTS, REVERSIBLE]
@@ -55,6 +56,7 @@ def test_gradients_are_those_of_differences(on_group):
         np.testing.assert_allclose(dot(gradient, along), expected, rtol=1e-7)
 
 
+@pytest.mark.long
 def test_members_on_a_group_have_rates_of_their_own():
     """In forward mode, by blocks, of the same start with two restitutions."""
     along = direction(GIVEN)
@@ -75,6 +77,7 @@ def test_members_on_a_group_have_rates_of_their_own():
         np.testing.assert_allclose(found, expected, rtol=1e-7)
 
 
+@pytest.mark.long
 def test_second_derivatives_are_those_of_closed_forms():
     """Of a ball that falls from the height 1/2 at the time g^(-1/2), and rises half.
 

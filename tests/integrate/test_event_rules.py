@@ -294,6 +294,7 @@ def test_wrong_options_are_refused(options, message):
 
 
 @pytest.mark.usefixtures("optimised_kernels")
+@pytest.mark.long
 def test_runs_with_events_in_lanes_are_those_of_xla(monkeypatch):
     """Values and gradients of nine members with up to six bounces."""
 

@@ -18,6 +18,7 @@ from oracles.helpers import (
     scalar,
     SideBySide,
 )
+from oracles.long import long_but
 
 
 def assert_gradients_of_examples(examples, method, turning):
@@ -92,31 +93,43 @@ BESIDE = {
 }
 
 
+# On a vector space and on each kind of group, with each closure.
+QUICK = (
+    ("unicycle", 2, "propagated"),
+    ("Suslov", 2, "consistent"),
+    ("oscillator and pendulums", 2, "symmetric"),
+    ("heavy top", 2, "symmetric"),
+)
+
+
 @pytest.mark.parametrize(
     ("name", "stages", "closure"),
-    [
-        ("attracting and linear", 2, "symmetric"),
-        ("attracting and linear", 2, "propagated"),
-        ("chaotic and integrable", 3, "symmetric"),
-        ("chaotic and integrable", 2, "propagated"),
-        ("rod sleigh", 2, "symmetric"),
-        ("rod sleigh", 2, "propagated"),
-        ("unicycle", 2, "symmetric"),
-        ("unicycle", 2, "propagated"),
-        ("disc", 2, "symmetric"),
-        ("disc", 2, "propagated"),
-        ("ball", 2, "symmetric"),
-        ("ball", 2, "propagated"),
-        ("Suslov", 2, "symmetric"),
-        ("Suslov", 2, "propagated"),
-        ("Suslov", 2, "consistent"),
-        ("Veselova", 2, "symmetric"),
-        # Without nonholonomic constraints there is nothing to close.
-        ("oscillator and pendulums", 2, "symmetric"),
-        ("rigid body", 2, "symmetric"),
-        ("heavy top", 2, "symmetric"),
-        ("heavy top on SE(3)", 2, "symmetric"),
-    ],
+    long_but(
+        QUICK,
+        [
+            ("attracting and linear", 2, "symmetric"),
+            ("attracting and linear", 2, "propagated"),
+            ("chaotic and integrable", 3, "symmetric"),
+            ("chaotic and integrable", 2, "propagated"),
+            ("rod sleigh", 2, "symmetric"),
+            ("rod sleigh", 2, "propagated"),
+            ("unicycle", 2, "symmetric"),
+            ("unicycle", 2, "propagated"),
+            ("disc", 2, "symmetric"),
+            ("disc", 2, "propagated"),
+            ("ball", 2, "symmetric"),
+            ("ball", 2, "propagated"),
+            ("Suslov", 2, "symmetric"),
+            ("Suslov", 2, "propagated"),
+            ("Suslov", 2, "consistent"),
+            ("Veselova", 2, "symmetric"),
+            # Without nonholonomic constraints there is nothing to close.
+            ("oscillator and pendulums", 2, "symmetric"),
+            ("rigid body", 2, "symmetric"),
+            ("heavy top", 2, "symmetric"),
+            ("heavy top on SE(3)", 2, "symmetric"),
+        ],
+    ),
 )
 def test_the_gradient_of_systems_of_the_gallery(name, stages, closure):
     # The sleigh amplifies rounding errors of propagated multipliers; with a force of

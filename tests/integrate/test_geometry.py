@@ -10,13 +10,16 @@ import pytest
 import nhjax
 from oracles import helpers
 from oracles.helpers import CLOSURES, GALLERY, integrate_recorded, problem, recorded
+from oracles.long import long, long_but
 
 
-EVERYTHING = [*GALLERY, "driven"]
+# Linear, affine, nonlinear and time-dependent constraints, and chaos.
+QUICK = ["particle", "sleigh", "Appell", "chaotic", "driven"]
+EVERYTHING = long_but([*QUICK, "oscillator"], [*GALLERY, "driven"])
 CONSTRAINED = [name for name in EVERYTHING if name != "oscillator"]
 
 every_closure = pytest.mark.parametrize("closure", CLOSURES)
-every_number_of_stages = pytest.mark.parametrize("stages", [2, 3, 4, 5])
+every_number_of_stages = pytest.mark.parametrize("stages", [2, 3, long(4), long(5)])
 symmetric_closures = pytest.mark.parametrize("closure", ["propagated", "symmetric"])
 
 

@@ -12,6 +12,7 @@ import nhjax
 from nhjax import systems
 from oracles import group_oracle
 from oracles.helpers import SideBySide
+from oracles.long import long, long_but
 from oracles.orders import assert_order, DURATION, rms, SCIPY_FLOOR, trajectories
 
 
@@ -28,7 +29,7 @@ COUNTS = {
     5: (6, 8, 12, 16, 24),
 }
 FLOOR = 2e-14
-every_stages = pytest.mark.parametrize("stages", COUNTS)
+every_stages = pytest.mark.parametrize("stages", long_but((2, 3), COUNTS))
 
 
 @eqx.filter_jit
@@ -100,7 +101,10 @@ def assert_finest_order(order, errors, quantity):
 # The stages do not know of the retraction: an even and an odd number are enough.
 @pytest.mark.parametrize(
     ("retraction", "stages"),
-    [*(("cayley", s) for s in COUNTS), ("exponential", 3), ("exponential", 4)],
+    long_but(
+        [("cayley", 2), ("cayley", 3), ("exponential", 4)],
+        [*(("cayley", s) for s in COUNTS), ("exponential", 3), ("exponential", 4)],
+    ),
 )
 @pytest.mark.parametrize("part", range(2), ids=ON_GROUPS)
 def test_state_on_a_group_is_of_order_2s_minus_2(part, retraction, stages):
@@ -181,7 +185,7 @@ def top_oracle(count):
 
 @pytest.mark.parametrize(
     ("stages", "retraction"),
-    [(2, "cayley"), (3, "cayley"), (4, "cayley"), (3, "exponential")],
+    [(2, "cayley"), long(3, "cayley"), long(4, "cayley"), (3, "exponential")],
 )
 @pytest.mark.parametrize("kind", ["on SO(3)", "on SE(3) with a fixed point"])
 def test_heavy_top_is_of_order_2s_minus_2(kind, retraction, stages):
@@ -212,7 +216,10 @@ def holonomic_errors(stages, closure):
 
 @pytest.mark.parametrize(
     ("stages", "closure"),
-    [*((s, "symmetric") for s in COUNTS), (3, "propagated"), (4, "propagated")],
+    long_but(
+        [(2, "symmetric"), (3, "symmetric"), (4, "propagated")],
+        [*((s, "symmetric") for s in COUNTS), (3, "propagated"), (4, "propagated")],
+    ),
 )
 @pytest.mark.parametrize(
     ("part", "quantities"),

@@ -11,6 +11,7 @@ import pytest
 import nhjax
 from nhjax import SaveAt, systems
 from oracles.helpers import SideBySide
+from oracles.long import long
 from oracles.own_groups import Heisenberg, HeisenbergBySecondKind
 
 
@@ -108,7 +109,7 @@ def test_a_step_back_does_not_retrace_a_step_in_the_chart_at_its_start():
 
 @pytest.mark.parametrize(
     ("retraction", "stages"),
-    [(nhjax.Cayley(), 2), (nhjax.Exponential(), 3), (nhjax.Cayley(), 4)],
+    [(nhjax.Cayley(), 2), long(nhjax.Exponential(), 3), long(nhjax.Cayley(), 4)],
     ids=str,
 )
 def test_a_step_back_retraces_a_step_in_the_chart_in_its_middle(retraction, stages):

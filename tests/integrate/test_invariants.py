@@ -15,6 +15,7 @@ from benchmarks._examples import suslov_in_a_potential
 from nhjax import LobattoIIIAB, SaveAt, systems
 from oracles import paper_equations as paper, paper_mechanics as mechanics
 from oracles.helpers import central_difference, scalar
+from oracles.long import long, long_but
 from oracles.orders import assert_order, rms, SCIPY_FLOOR, trajectories
 from oracles.pages import run_page
 
@@ -137,10 +138,10 @@ def to_run(name):
 @pytest.mark.parametrize(
     ("name", "stages", "bound"),
     [
-        ("chaotic", 2, 3e-15),
+        long("chaotic", 2, 3e-15),
         ("chaotic", 4, 3e-15),
         ("chaotic, Hamiltonian", 3, 3e-15),
-        ("Suslov in a potential", 3, 3e-15),
+        long("Suslov in a potential", 3, 3e-15),
         ("Veselova", 2, 3e-15),
         ("both kinds of constraints", 3, 3e-15),
     ],
@@ -177,7 +178,7 @@ def test_energy_and_constraints_stay_at_round_off_there_and_back(name, stages, b
 COUNTS = {2: (32, 64, 128), 3: (16, 32, 64), 4: (8, 16, 32)}
 
 
-@pytest.mark.parametrize("stages", COUNTS)
+@pytest.mark.parametrize("stages", long_but((2, 3), COUNTS))
 @pytest.mark.parametrize("part", ["R^n", "group"])
 def test_the_order_is_2s_minus_2(part, stages):
     example = {"R^n": PARTICLE, "group": SUSLOV}[part]
@@ -276,7 +277,7 @@ def differences():
     )
 
 
-@pytest.mark.parametrize("name", ADJOINTS)
+@pytest.mark.parametrize("name", long_but(["reversible"], ADJOINTS))
 def test_gradients_are_those_of_differences(name):
     gradient = jax.jit(jax.grad(loss_of(ADJOINTS[name])))(jnp.array([0.2, 1.0]))
     np.testing.assert_allclose(gradient, differences(), rtol=1e-9)

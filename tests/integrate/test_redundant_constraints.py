@@ -11,6 +11,7 @@ from scipy.integrate import solve_ivp
 import nhjax
 from nhjax import systems
 from oracles import orders, paper_equations
+from oracles.long import long
 
 
 THREE = nhjax.LobattoIIIAB(3)
@@ -136,6 +137,7 @@ def test_a_state_near_the_constraints_is_projected_onto_them():
     np.testing.assert_allclose(got.v, expected.v, atol=1e-14)
 
 
+@pytest.mark.long
 def test_gradients_are_those_without_the_redundant_rod():
     def loss(system, count, x):
         place = jnp.stack([jnp.sin(x[0]), -jnp.cos(x[0]), 0.0 * x[0]])
@@ -279,7 +281,8 @@ def run_on_a_sphere(rows, form, closure):
 
 
 @pytest.mark.parametrize(
-    ("form", "closure"), [("lagrangian", "symmetric"), ("hamiltonian", "consistent")]
+    ("form", "closure"),
+    [long("lagrangian", "symmetric"), ("hamiltonian", "consistent")],
 )
 def test_a_rate_that_is_a_constraint_again_changes_nothing(form, closure):
     _, one = run_on_a_sphere((0,), form, closure)

@@ -13,6 +13,7 @@ import pytest
 import nhjax
 from nhjax import LobattoIIIAB, systems
 from oracles.helpers import scalar
+from oracles.long import long
 
 
 PARTICLE = systems.NonholonomicParticle()
@@ -46,7 +47,7 @@ LANES = (
 )
 
 
-@pytest.mark.parametrize("axes", [(0, None, None, None), (None, 0, 0, 0)])
+@pytest.mark.parametrize("axes", [long((0, None, None, None)), (None, 0, 0, 0)])
 def test_gradients_of_a_batch_are_those_of_its_lanes(axes, single):
     given = [x if axis == 0 else x[0] for x, axis in zip(LANES, axes, strict=True)]
     batch = jax.jit(
@@ -165,6 +166,7 @@ for adjoint in (nhjax.DirectAdjoint(), nhjax.ReversibleAdjoint()):
 """
 
 
+@pytest.mark.long
 def test_shards_are_what_one_device_computes():
     flags = os.environ.get("XLA_FLAGS", "")
     flags = f"{flags} --xla_force_host_platform_device_count=4"

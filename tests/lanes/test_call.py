@@ -185,6 +185,7 @@ def test_an_executable_from_jaxs_cache(tmp_path):
     assert printed("cached", tmp_path) != "hits: 0"
 
 
+@pytest.mark.long
 def test_an_executable_that_was_saved(tmp_path):
     path = tmp_path / "executable"
     printed("saved", path)

@@ -74,11 +74,13 @@ def compare(program, seed, width, batched):
         assert_identical(one, np.asarray(other), name)
 
 
+@pytest.mark.long
 @fuzzed(EXAMPLES)
 def test_lanes_compute_what_jax_does(program, seed, width, batched):
     compare(program, seed, width, batched)
 
 
+@pytest.mark.long
 @fuzzed(max(EXAMPLES // 4, 1))
 def test_arrays_in_memory_hold_what_those_of_jax_do(program, seed, width, batched):
     names = [name for name in sys.modules if name.startswith("nhjax._lanes.")]

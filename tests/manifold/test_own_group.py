@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from nhjax._manifold import AbstractLieGroup, ProductGroup, SO3
+from oracles.long import long
 from oracles.own_groups import (
     Heisenberg,
     SL2,
@@ -48,7 +49,9 @@ def test_sl2_tangents_are_those_of_matrices():
     close(group.tangent(g, ETA), g @ Y)
 
 
-@pytest.mark.parametrize("group", [Heisenberg(), SL2()], ids=["Heisenberg", "SL2"])
+@pytest.mark.parametrize(
+    "group", [Heisenberg(), long(SL2())], ids=["Heisenberg", "SL2"]
+)
 def test_second_tangents_duals_and_gradients_follow(group):
     g = group.retract(DELTA)
     slope = jax.jvp(lambda x: group.dtau(x, ETA), (XI,), (DELTA,))[1]

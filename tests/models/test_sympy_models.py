@@ -54,6 +54,7 @@ def printed_by_sympy(v):
     )
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("speed", range(6))
 def test_the_bicycle_of_sympys_tests_has_the_slopes_printed_there(bicycle, speed):
     rolling = {"x": speed, "q3": speed / 0.3, "q6": speed / 0.35}
@@ -110,6 +111,7 @@ def test_the_disc_turns_steadily_where_pydys_equation_says(disc, lean, turn):
     )
 
 
+@pytest.mark.long
 def test_the_disc_moves_as_that_of_the_gallery(disc):
     """The gallery's has SE(3), z upward and the axle as its third axis."""
     q, v = {"q1": 0.4, "q0": 0.0, "q2": 0.0}, {"q0": 1.2, "q1": -0.3, "q2": 5.0}

@@ -11,6 +11,7 @@ import nhjax
 from benchmarks._random_systems import random_systems
 from benchmarks.acceptance import ALLOWED, gallery, measure, measure_starts, SAME
 from nhjax import RESULTS
+from oracles.long import long
 
 
 ROUND_OFF = 1e-13
@@ -126,9 +127,9 @@ SYSTEMS = gallery() | random_systems()
 # Both kinds of constraints, alone and together, and a group.
 SEARCHED = [
     ("DoublePendulum", 3),
-    ("Suslov", 4),
-    ("random 5, m = 2", 3),
-    ("random 6, m = k = 1", 2),
+    long("Suslov", 4),
+    long("random 5, m = 2", 3),
+    long("random 6, m = k = 1", 2),
 ]
 
 
@@ -144,7 +145,7 @@ def test_no_accepted_step_is_unsolved(name, stages):
     assert figures["distance"] <= SAME
 
 
-@pytest.mark.parametrize("name", ["Morse", "body, exponential"])
+@pytest.mark.parametrize("name", ["Morse", long("body, exponential")])
 def test_no_start_leads_to_an_unsolved_step(name):
     figures = measure_starts(name, 3, number=1500)
     for solver in ("simplified", "newton"):

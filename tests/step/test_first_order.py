@@ -16,6 +16,7 @@ from nhjax._step._stage_iteration import corrected
 from nhjax._step._starting_values import starting_values
 from nhjax._step._step import equations_of_step
 from oracles.forms import in_space
+from oracles.long import long
 
 
 def contraction(example, method, h):
@@ -53,11 +54,11 @@ def contraction(example, method, h):
     ("example", "chart"),
     [
         (systems.ChaplyginSleigh(), "middle"),
-        (systems.CarWithTrailers(), "middle"),
-        (systems.Suslov(), "middle"),
+        long(systems.CarWithTrailers(), "middle"),
+        long(systems.Suslov(), "middle"),
         (systems.Unicycle(), "start"),
-        (systems.HeavyTop(), "start"),
-        (systems.HeavyTopSE3(), "middle"),
+        long(systems.HeavyTop(), "start"),
+        long(systems.HeavyTopSE3(), "middle"),
     ],
     ids=lambda x: x if isinstance(x, str) else type(x).__name__,
 )

@@ -34,19 +34,20 @@ from oracles.group_problems import (
     QUATERNION,
     RETRACTIONS,
 )
+from oracles.long import long
 
 
 @pytest.mark.parametrize(
     ("build", "constraint", "in_time", "stages"),
     [
-        (in_space, "none", False, 2),
+        long(in_space, "none", False, 2),
         (in_space, "holonomic", False, 3),
-        (in_space, "nonholonomic", False, 4),
-        (in_space, "holonomic", True, 4),
+        long(in_space, "nonholonomic", False, 4),
+        long(in_space, "holonomic", True, 4),
         (in_space, "nonholonomic", True, 2),
-        (in_space, "nonholonomic", True, 3),
-        (in_rotation, "none", True, 4),
-        (in_rotation, "holonomic", False, 2),
+        long(in_space, "nonholonomic", True, 3),
+        long(in_rotation, "none", True, 4),
+        long(in_rotation, "holonomic", False, 2),
         (in_rotation, "nonholonomic", True, 3),
     ],
 )
@@ -150,11 +151,11 @@ def form_defect(start, form, method, tangent=None):
 @pytest.mark.parametrize(
     ("method", "form"),
     [
-        (LOBATTO[0], "lagrangian"),
-        (LOBATTO[0], "hamiltonian"),
+        long(LOBATTO[0], "lagrangian"),
+        long(LOBATTO[0], "hamiltonian"),
         (LOBATTO[1], "lagrangian"),
-        (LOBATTO[2], "hamiltonian"),
-        (GAUSS, "lagrangian"),
+        long(LOBATTO[2], "hamiltonian"),
+        long(GAUSS, "lagrangian"),
         (GAUSS, "hamiltonian"),
     ],
     ids=str,
@@ -167,10 +168,10 @@ def test_steps_in_space_are_symplectic(method, form):
     ("method", "form", "retraction"),
     [
         (LOBATTO[0], "lagrangian", "cayley"),
-        (LOBATTO[1], "hamiltonian", "exponential"),
+        long(LOBATTO[1], "hamiltonian", "exponential"),
         (nhjax.LobattoIIIAB(3, chart="start"), "hamiltonian", "cayley"),
-        (LOBATTO[2], "lagrangian", "exponential"),
-        (GAUSS, "hamiltonian", "cayley"),
+        long(LOBATTO[2], "lagrangian", "exponential"),
+        long(GAUSS, "hamiltonian", "cayley"),
     ],
     ids=str,
 )

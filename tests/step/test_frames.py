@@ -15,6 +15,7 @@ from nhjax._step._stage_system import StageSystem
 from nhjax._step._starting_values import starting_values
 from nhjax._step._step import equations_of_step, first_step_state
 from oracles.group_problems import RETRACTIONS
+from oracles.long import long
 
 
 # A body in the plane, and a wheel on its axle.
@@ -73,9 +74,14 @@ def body(form, retraction):
 
 
 @pytest.mark.parametrize(
-    ("retraction", "chart"), [("cayley", "middle"), ("exponential", "start")]
+    ("form", "retraction", "chart"),
+    [
+        ("lagrangian", "exponential", "start"),
+        long("lagrangian", "cayley", "middle"),
+        long("hamiltonian", "exponential", "start"),
+        long("hamiltonian", "cayley", "middle"),
+    ],
 )
-@pytest.mark.parametrize("form", ["lagrangian", "hamiltonian"])
 def test_equations_of_a_step_are_the_same_with_frames(form, retraction, chart):
     system, y0 = body(form, retraction)
     method, t = nhjax.LobattoIIIAB(3, chart=chart), jnp.asarray(0.0)

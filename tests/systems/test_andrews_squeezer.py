@@ -7,6 +7,7 @@ from nhjax.systems import AndrewsSqueezer
 from oracles import andrews
 from oracles.flow import flow
 from oracles.library_motion import library_motion
+from oracles.long import long
 from oracles.mechanisms import (
     assert_motion,
     assert_order,
@@ -59,7 +60,7 @@ def reference():
     return {"q": q, "v": v, "multiplier": andrews.motion(q, v)[1]}
 
 
-@pytest.fixture(scope="module", params=(2, 3))
+@pytest.fixture(scope="module", params=(long(2), 3))
 def lanes(request):
     return request.param, runs(SQUEEZER, request.param, COUNTS, END)
 

@@ -105,6 +105,7 @@ def test_accelerations_and_forces_are_those_of_newton_and_euler(ball):
         np.testing.assert_allclose(multiplier[k] / scale, wanted / scale, atol=1e-11)
 
 
+@pytest.mark.long
 def test_order_is_that_of_the_method(runs_of):
     ball = BALLS["paraboloid"]
     oracle = newton_euler(ball)
@@ -130,6 +131,7 @@ def test_order_is_that_of_the_method(runs_of):
         assert_orders(runs_of[stages], 2 * stages - 2, errors_at, floor=1e-11)
 
 
+@pytest.mark.long
 def test_constraints_hold_to_round_off_and_moving_energy_stays(runs_of):
     ball = BALLS["paraboloid"]
     # Of 2 J; the coarsest runs take four times the duration.
@@ -199,6 +201,7 @@ def test_accelerations_are_those_of_the_steady_circle(ball):
     np.testing.assert_allclose(slope[0, 3:], moving, rtol=0, atol=1e-13)
 
 
+@pytest.mark.long
 def test_runs_stay_on_the_circle_to_the_order_of_the_method(runs_of):
     ball = CIRCLING["paraboloid"]
 

@@ -85,7 +85,11 @@ def reference(stages):
     return q, v, np.array(reactions)
 
 
-@pytest.mark.parametrize("stages", [2, 3], ids=["steered-2", "free-3"])
+each_bicycle = pytest.mark.parametrize("stages", [2, 3], ids=["steered-2", "free-3"])
+
+
+@pytest.mark.long
+@each_bicycle
 @pytest.mark.parametrize("part", range(3), ids=["q", "v", "multiplier"])
 def test_the_motion_converges_to_that_of_kanes_method(stages, part):
     _, states, continuous = runs(stages)
@@ -109,19 +113,22 @@ def checks(stages):
     return *map(np.asarray, at(states.q[0], states.v[0])), start
 
 
-@pytest.mark.parametrize("stages", [2, 3], ids=["steered-2", "free-3"])
+@pytest.mark.long
+@each_bicycle
 def test_constraints_hold_in_a_run_of_five_seconds(stages):
     _, slip, depth, _ = checks(stages)
     np.testing.assert_allclose(slip, 0.0, atol=2e-13)
     np.testing.assert_allclose(depth, 0.0, atol=2e-15)
 
 
+@pytest.mark.long
 def test_energy_stays_in_a_run_of_five_seconds():
     energy, _, _, start = checks(3)
     # The library of benchmarks allows 1e-5.
     assert np.max(np.abs(energy / start - 1)) < 5e-7
 
 
+@pytest.mark.long
 def test_the_rider_does_the_work_that_becomes_energy():
     bicycle = BICYCLES[2]
     q, v, _ = reference(2)

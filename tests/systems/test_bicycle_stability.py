@@ -43,6 +43,7 @@ def test_the_linear_equations_of_the_oracle_are_those_of_meijaard():
         np.testing.assert_allclose(matrix, printed, rtol=0, atol=1.5e-14 * 10)
 
 
+# Compiling its derivative takes most of a minute.
 @pytest.fixture(scope="module")
 def multipliers():
     """A function (speeds, step sizes) -> eigenvalues of the linearised step.
@@ -94,11 +95,13 @@ def printed_eigenvalues():
     return np.array(rows)
 
 
+@pytest.mark.long
 def test_eigenvalues_are_those_of_table_2_of_meijaard(multipliers):
     found = multipliers(np.arange(11.0), 0.015)
     np.testing.assert_allclose(found, printed_eigenvalues(), rtol=0, atol=2e-12)
 
 
+@pytest.mark.long
 def test_small_steps_have_derivatives_also_at_rest(multipliers):
     # At rest the derivatives of multipliers are smaller than their round-off, which
     # grows like 1 / h.
@@ -106,6 +109,7 @@ def test_small_steps_have_derivatives_also_at_rest(multipliers):
     np.testing.assert_allclose(found, printed_eigenvalues(), rtol=0, atol=1e-9)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("printed", "first"),
     [(WEAVE, "complex"), (CAPSIZE, "real")],

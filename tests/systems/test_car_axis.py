@@ -8,6 +8,7 @@ from nhjax.systems import CarAxis
 from oracles import car_axis
 from oracles.flow import flow
 from oracles.library_motion import library_motion
+from oracles.long import long
 from oracles.mechanisms import (
     assert_motion,
     assert_order,
@@ -42,7 +43,7 @@ def reference():
     return {"q": q, "v": v, "multiplier": multiplier, "work": end[4]}
 
 
-@pytest.fixture(scope="module", params=(2, 3))
+@pytest.fixture(scope="module", params=(long(2), 3))
 def lanes(request):
     return request.param, runs(AXIS, request.param, COUNTS, END)
 

@@ -12,6 +12,7 @@ import nhjax
 from nhjax.systems import CarWithTrailers
 from oracles.cars import Train
 from oracles.library_motion import library_motion
+from oracles.long import long
 from oracles.orders import Ladder
 
 
@@ -131,7 +132,7 @@ def reference():
     return Train(car).trajectory(np.asarray(car.q0), 5.0, 0.0, times, *CONTROLS)
 
 
-@pytest.mark.parametrize("stages", [2, 3])
+@pytest.mark.parametrize("stages", [long(2), 3])
 @pytest.mark.parametrize("part", range(3), ids=["q", "v", "multiplier"])
 def test_the_motion_converges_to_that_of_the_reduced_equations(stages, part):
     _, states, continuous = runs(stages)

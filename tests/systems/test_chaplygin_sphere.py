@@ -63,6 +63,7 @@ def test_accelerations_and_forces_are_those_of_newton_and_euler(ball):
     assert_newton_and_euler(ball, newton_euler(ball), states, accelerations)
 
 
+@pytest.mark.long
 def test_order_is_that_of_the_method(runs_of):
     ball = SPHERES["default"]
     start = np.asarray(ball.q0[:4]), np.asarray(ball.v0[3:])
@@ -71,6 +72,7 @@ def test_order_is_that_of_the_method(runs_of):
         assert_orders(runs_of[stages], 2 * stages - 2, errors_at, floor=1e-11)
 
 
+@pytest.mark.long
 def test_order_is_the_same_against_chaplygins_equations(runs_of):
     ball = SPHERES["default"]
     field, velocity = chaplygin(ball)
@@ -88,6 +90,7 @@ def test_order_is_the_same_against_chaplygins_equations(runs_of):
         assert_orders(runs_of[stages], 2 * stages - 2, errors_at, floor=1e-11)
 
 
+@pytest.mark.long
 def test_constraints_hold_to_round_off_and_invariants_stay(runs_of):
     # Of 2 to 14 in SI units; the coarsest runs take four times the duration.
     largest = {2: (1e-3, 3e-4, 6e-5), 3: (1e-5, 5e-7, 3e-8)}

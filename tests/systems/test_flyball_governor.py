@@ -8,6 +8,7 @@ from nhjax.systems import FlyballGovernor
 from oracles import governor
 from oracles.flow import flow
 from oracles.library_motion import library_motion
+from oracles.long import long
 from oracles.mechanisms import (
     assert_motion,
     assert_order,
@@ -38,7 +39,7 @@ def reference():
     return {"q": q, "v": v, "multiplier": multiplier}
 
 
-@pytest.fixture(scope="module", params=(2, 3))
+@pytest.fixture(scope="module", params=(long(2), 3))
 def lanes(request):
     return request.param, runs(RIGID, request.param, COUNTS, END)
 
@@ -100,6 +101,7 @@ def test_energy_and_momentum_are_conserved(lanes):
     assert drift < {2: 3e-4, 3: 2e-9}[stages]
 
 
+@pytest.mark.long
 def test_stiff_springs_and_a_motor_move_as_kanes_equations_say():
     def field(_, y):
         q, v = np.split(y, 2)

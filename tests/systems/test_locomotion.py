@@ -10,6 +10,7 @@ from nhjax.systems import RollerRacer, Snakeboard
 from oracles import locomotion
 from oracles.flow import flow
 from oracles.library_motion import library_motion
+from oracles.long import long
 from oracles.mechanisms import (
     assert_motion,
     assert_order,
@@ -152,7 +153,7 @@ def reference(case):
     return {"q": q, "v": v, "multiplier": multiplier, "work": end[-1]}
 
 
-@pytest.fixture(scope="module", params=(2, 3))
+@pytest.fixture(scope="module", params=(long(2), 3))
 def lanes(request, case):
     return request.param, runs(case.example, request.param, COUNTS, END, case.args)
 

@@ -10,6 +10,7 @@ from nhjax.systems import FourBar, SliderCrank
 from oracles import linkages
 from oracles.flow import flow
 from oracles.library_motion import library_motion
+from oracles.long import long
 from oracles.mechanisms import (
     assert_motion,
     assert_order,
@@ -53,7 +54,7 @@ def reference(machine):
     return {"q": q, "v": v, "multiplier": multiplier}
 
 
-@pytest.fixture(scope="module", params=(2, 3))
+@pytest.fixture(scope="module", params=(long(2), 3))
 def lanes(request, machine):
     return request.param, runs(machine[0], request.param, COUNTS, END)
 

@@ -119,11 +119,13 @@ def test_a_stone_at_rest_rocks_as_its_radii_of_curvature_say():
     np.testing.assert_allclose(stiffness, expected, rtol=2e-6, atol=0)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("stages", [2, 3])
 def test_order_is_that_of_the_method(runs_of, errors_at, stages):
     assert_orders(runs_of[stages], 2 * stages - 2, errors_at, floor=1e-11)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("stages", [2, 3])
 def test_constraints_hold_to_round_off_and_energy_stays(runs_of, stages):
     assert np.max(runs_of[stages].violation) < 1e-13
@@ -183,6 +185,7 @@ def spins(first_reversal):
     return jax.tree.map(np.asarray, run(stones[0], y0, jnp.asarray(end / steps)))
 
 
+@pytest.mark.long
 def test_spin_reverses_when_the_equations_of_the_paper_say(first_reversal, spins):
     _, v, _ = spins
     end, state, afterwards = first_reversal
@@ -192,11 +195,13 @@ def test_spin_reverses_when_the_equations_of_the_paper_say(first_reversal, spins
     assert abs(v[0, -1, 5]) < 1e-6
 
 
+@pytest.mark.long
 def test_a_spin_in_the_other_sense_does_not_reverse(spins):
     _, v, _ = spins
     assert np.all(v[1, :, 5] < -4.0)
 
 
+@pytest.mark.long
 def test_damping_takes_the_energy_that_its_power_says(spins):
     for ts, v, energy in zip(*spins, strict=True):
         power = -DAMPING * np.sum(v[:, 3:] ** 2, axis=1)

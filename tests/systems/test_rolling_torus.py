@@ -135,6 +135,7 @@ def test_steady_motion_solves_the_equations_of_newton_and_euler(body):
     np.testing.assert_allclose(omega, spin, rtol=0, atol=1e-10)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", ["disc", "torus"])
 def test_runs_stay_on_the_circle_to_the_order_of_the_method(tumbling, name):
     for stages, found in runs_of_both(STEADY[name], COUNTS, DURATION).items():
@@ -142,6 +143,7 @@ def test_runs_stay_on_the_circle_to_the_order_of_the_method(tumbling, name):
         assert_orders(found, 2 * stages - 2, errors_at, floor=1e-12)
 
 
+@pytest.mark.long
 def test_order_is_that_of_the_method(tumbling):
     body, found = tumbling
     start = np.asarray(body.q0[:4]), np.asarray(body.v0[3:])
@@ -150,6 +152,7 @@ def test_order_is_that_of_the_method(tumbling):
         assert_orders(found[stages], 2 * stages - 2, errors_at, floor=1e-11)
 
 
+@pytest.mark.long
 def test_constraints_hold_to_round_off_and_energy_stays(tumbling):
     body, found = tumbling
     # Of 12 J; the coarsest runs take four times the duration.

@@ -7,6 +7,7 @@ from scipy.integrate import quad
 from nhjax.systems import SpatialSliderCrank
 from oracles.flow import flow
 from oracles.library_motion import library_motion
+from oracles.long import long
 from oracles.mechanisms import (
     assert_motion,
     assert_order,
@@ -52,7 +53,7 @@ def reference():
     return {"q": q, "v": v, "multiplier": multiplier}
 
 
-@pytest.fixture(scope="module", params=(2, 3))
+@pytest.fixture(scope="module", params=(long(2), 3))
 def lanes(request):
     return request.param, runs(MACHINE, request.param, COUNTS, END)
 

@@ -11,6 +11,7 @@ import nhjax
 from nhjax.systems import TwoWheeledRobot
 from oracles.cars import Robot
 from oracles.library_motion import library_motion
+from oracles.long import long
 from oracles.orders import Ladder
 
 
@@ -83,7 +84,7 @@ def reference():
     return Robot(robot).trajectory(np.asarray(robot.q0), 0.8, 1.1, times, TORQUES)
 
 
-@pytest.mark.parametrize("stages", [2, 3])
+@pytest.mark.parametrize("stages", [long(2), 3])
 @pytest.mark.parametrize("part", range(3), ids=["q", "v", "multiplier"])
 def test_the_motion_converges_to_that_of_the_reduced_equations(stages, part):
     _, states, continuous = runs(stages)
