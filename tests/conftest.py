@@ -108,7 +108,9 @@ def few_compiled_programs():
         gc.collect()
 
 
-@pytest.fixture(params=("lanes", "kernels", "xla"))
+@pytest.fixture(
+    params=("lanes", "kernels", pytest.param("xla", marks=pytest.mark.long))
+)
 def engine(request, monkeypatch):
     """The first engine that may be taken; programs of others are forgotten."""
     monkeypatch.setenv("NHJAX_ENGINE", request.param)

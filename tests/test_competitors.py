@@ -73,6 +73,7 @@ def test_every_layout_of_an_ensemble_ends_at_the_reference(layout):
     assert seconds > 0
 
 
+@pytest.mark.long
 def test_the_errors_of_heyoka_follow_its_tolerance():
     runs = [*heyoka_runs(Case("CVT", 2.0, 3), limit=6, longest=math.inf)]
     assert all(math.isfinite(run.compile) for run in runs)

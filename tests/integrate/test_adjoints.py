@@ -194,7 +194,7 @@ ORDERS = {
 @pytest.mark.parametrize(
     ("adjoint", "order"),
     [
-        (DIRECT, "hessian"),
+        long(DIRECT, "hessian"),
         long(DIRECT, "reverse over reverse"),
         long(CHECKPOINTS, "reverse over forward"),
         (REVERSIBLE, "hessian"),

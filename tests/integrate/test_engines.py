@@ -11,7 +11,7 @@ import pytest
 import nhjax
 from benchmarks.engines import difference, FINAL_TIMES, gallery, program
 from nhjax import LobattoIIIAB, systems
-from oracles.long import long_but
+from oracles.long import long, long_but
 
 
 pytestmark = pytest.mark.usefixtures("optimised_kernels")
@@ -72,7 +72,9 @@ def test_an_ensemble_in_lanes_is_that_of_xla(name, monkeypatch):
     assert np.all(np.abs(change) <= OF_A_MEMBER)
 
 
-@pytest.mark.parametrize("kind", ["rows", "dense", "jvp", "checkpoints", "reversible"])
+@pytest.mark.parametrize(
+    "kind", ["rows", "dense", "jvp", long("checkpoints"), "reversible"]
+)
 def test_output_and_derivatives_in_lanes_are_those_of_xla(kind, monkeypatch):
     function = program(PARTICLE, kind, 2, 10)
     args = ensemble(PARTICLE, 5, 10)

@@ -10,6 +10,7 @@ import pytest
 import nhjax
 from nhjax import Event, LobattoIIIAB, RESULTS, SaveAt, systems
 from oracles.impacts import Latch, Rod, Slide
+from oracles.long import long
 
 
 ROD, LATCH, SLIDE = Rod(), Latch(), Slide()
@@ -156,7 +157,7 @@ def slide(stages, dt, gravity: Any = 1.0, closure="symmetric", **options: Any):
 
 
 @pytest.mark.parametrize("closure", ["symmetric", "propagated"])
-@pytest.mark.parametrize("stages", [2, 3])
+@pytest.mark.parametrize("stages", [long(2), 3])
 def test_a_multiplier_vanishes_at_the_order_of_the_method(stages, closure):
     """A particle leaves a sphere where cos θ = 2/3, if it starts from rest on top."""
     steps = [0.1, 0.05]

@@ -102,7 +102,7 @@ def assert_finest_order(order, errors, quantity):
 @pytest.mark.parametrize(
     ("retraction", "stages"),
     long_but(
-        [("cayley", 2), ("cayley", 3), ("exponential", 4)],
+        [("cayley", 3), ("exponential", 4)],
         [*(("cayley", s) for s in COUNTS), ("exponential", 3), ("exponential", 4)],
     ),
 )
@@ -145,7 +145,11 @@ COUNTS_BY_ORDER = {2: (32, 64), 4: (16, 32), 6: (16, 24)}
 
 @pytest.mark.parametrize(
     "method",
-    [nhjax.Gauss(1), nhjax.Gauss(2), *map(nhjax.LobattoIIIAB, (2, 3, 4))],
+    [
+        long(nhjax.Gauss(1)),
+        nhjax.Gauss(2),
+        *map(long, map(nhjax.LobattoIIIAB, (2, 3, 4))),
+    ],
     ids=["Gauss(1)", "Gauss(2)", "Lobatto(2)", "Lobatto(3)", "Lobatto(4)"],
 )
 @every_retraction
@@ -156,7 +160,7 @@ def test_free_rigid_body_is_of_the_order_of_the_method(method, retraction):
         assert_finest_order(method.order, errors, quantity)
 
 
-@pytest.mark.parametrize("stages", [2, 3, 4])
+@pytest.mark.parametrize("stages", [long(2), 3, long(4)])
 def test_ball_on_a_product_of_groups_is_of_order_2s_minus_2(stages):
     ball = systems.TurntableBall.rolling((0.3, -0.2), (0.5, 0.3))
     method = nhjax.LobattoIIIAB(stages)
@@ -185,7 +189,7 @@ def top_oracle(count):
 
 @pytest.mark.parametrize(
     ("stages", "retraction"),
-    [(2, "cayley"), long(3, "cayley"), long(4, "cayley"), (3, "exponential")],
+    [long(2, "cayley"), long(3, "cayley"), long(4, "cayley"), (3, "exponential")],
 )
 @pytest.mark.parametrize("kind", ["on SO(3)", "on SE(3) with a fixed point"])
 def test_heavy_top_is_of_order_2s_minus_2(kind, retraction, stages):
@@ -217,7 +221,7 @@ def holonomic_errors(stages, closure):
 @pytest.mark.parametrize(
     ("stages", "closure"),
     long_but(
-        [(2, "symmetric"), (3, "symmetric"), (4, "propagated")],
+        [(3, "symmetric"), (4, "propagated")],
         [*((s, "symmetric") for s in COUNTS), (3, "propagated"), (4, "propagated")],
     ),
 )

@@ -10,6 +10,7 @@ import nhjax
 from nhjax._numerics import SparseMatrix
 from nhjax._system import linearise
 from oracles import orders
+from oracles.long import long
 
 
 LINKS = 9
@@ -144,7 +145,7 @@ def skates(t, q, v, args):
     return v[:LINKS] - q[LINKS:] * jnp.roll(v[LINKS:], -1)
 
 
-@pytest.mark.parametrize("form", ["lagrangian", "hamiltonian"])
+@pytest.mark.parametrize("form", [long("lagrangian"), "hamiltonian"])
 def test_nonholonomic_constraints_and_both_forms_agree_with_dense_matrices(form):
     q = jnp.asarray(np.cos(np.arange(2.0 * LINKS)))
     v = jnp.asarray(0.5 * np.sin(2.0 * np.arange(2 * LINKS)))

@@ -179,6 +179,7 @@ def test_a_child_of_a_process_that_forks():
     assert printed("forked") == "child: 0"
 
 
+@pytest.mark.long
 def test_an_executable_from_jaxs_cache(tmp_path):
     assert printed("cached", tmp_path) == "hits: 0"
     assert list(tmp_path.iterdir())

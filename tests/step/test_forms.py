@@ -195,7 +195,7 @@ def test_steps_with_holonomic_constraints_are_symplectic(stages, form):
 @pytest.mark.parametrize(
     ("method", "form", "retraction"),
     [
-        (LOBATTO[0], "lagrangian", "exponential"),
+        long(LOBATTO[0], "lagrangian", "exponential"),
         (nhjax.LobattoIIIAB(3, chart="start"), "lagrangian", "cayley"),
         (LOBATTO[2], "hamiltonian", "cayley"),
     ],

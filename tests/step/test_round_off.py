@@ -234,9 +234,8 @@ def test_a_tolerance_does_not_grow_with_the_turns_of_a_heading():
     assert coarse.stats["max_residual"] < 1e-5
 
 
-@pytest.mark.parametrize(
-    "solver", [SOLVERS[0], long(SOLVERS[1])], ids=["simplified", "dense"]
-)
+@pytest.mark.long
+@pytest.mark.parametrize("solver", SOLVERS, ids=["simplified", "dense"])
 def test_a_unit_of_length_does_not_matter_on_the_plane(solver):
     def runs(unit):
         """A particle on a circle, in the plane of SE(2)."""

@@ -124,6 +124,7 @@ def test_the_equations_hold_backwards_from_a_later_time():
     assert_equations_hold("driven", run_of(sol, h=-0.08), "symmetric")
 
 
+@pytest.mark.long
 def test_the_equations_hold_for_large_steps():
     start = helpers.problem("side by side")[1]
     sol = helpers.integrate_recorded(

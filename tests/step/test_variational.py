@@ -23,6 +23,7 @@ from oracles.group_problems import (
     RETRACTIONS,
     solved_steps,
 )
+from oracles.long import long
 
 
 def momenta_along(start, form, momentum, chart="middle"):
@@ -158,11 +159,11 @@ def slopes(function, directions):
     ("stages", "form", "chart"),
     [
         (2, "lagrangian", "middle"),
-        (2, "hamiltonian", "start"),
-        (3, "lagrangian", "start"),
+        long(2, "hamiltonian", "start"),
+        long(3, "lagrangian", "start"),
         (3, "hamiltonian", "middle"),
         (4, "hamiltonian", "start"),
-        (4, "lagrangian", "middle"),
+        long(4, "lagrangian", "middle"),
     ],
 )
 def test_unconstrained_steps_on_groups_extremise_the_discrete_action(

@@ -15,7 +15,6 @@ from nhjax import studies
 from nhjax.__main__ import main
 from nhjax.studies import _chaotic_run
 from nhjax.systems import ChaoticSystem, NonholonomicParticle
-from oracles.long import long
 
 
 PNG = b"\x89PNG\r\n\x1a\n"
@@ -254,7 +253,8 @@ def test_particle_order_leaves_round_off_out():
     assert "-" in result.table().splitlines()[-1]
 
 
-@pytest.mark.parametrize("retraction", ["cayley", long("exponential")])
+@pytest.mark.long
+@pytest.mark.parametrize("retraction", ["cayley", "exponential"])
 def test_unicycle_order_finds_the_orders(retraction):
     result = studies.unicycle_order(
         stages=(2, 3), dt=(0.125, 0.0625), retraction=retraction

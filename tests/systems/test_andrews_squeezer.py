@@ -60,7 +60,7 @@ def reference():
     return {"q": q, "v": v, "multiplier": andrews.motion(q, v)[1]}
 
 
-@pytest.fixture(scope="module", params=(long(2), 3))
+@pytest.fixture(scope="module", params=(long(2), long(3)))
 def lanes(request):
     return request.param, runs(SQUEEZER, request.param, COUNTS, END)
 

@@ -41,6 +41,7 @@ def test_accelerations_and_forces_are_those_of_newton_and_euler(top):
     assert_newton_and_euler(top, newton_euler(top), states, accelerations)
 
 
+@pytest.mark.long
 def test_order_is_that_of_the_method(runs_of):
     top = TOPS["Routh"]
     start = np.asarray(top.q0[:4]), np.asarray(top.v0[3:])
@@ -49,6 +50,7 @@ def test_order_is_that_of_the_method(runs_of):
         assert_orders(runs_of[stages], 2 * stages - 2, errors_at, floor=1e-11)
 
 
+@pytest.mark.long
 def test_constraints_hold_to_round_off_and_energy_stays(runs_of):
     # Of 12 J; the coarsest runs take four times the duration.
     largest = {2: (6e-3, 2e-3, 4e-4), 3: (3e-6, 2e-7, 1e-8)}
@@ -76,6 +78,7 @@ def test_integrals_of_routh_are_constant_by_the_independent_equations():
         assert w[2] * np.sqrt(moments[0] * value) == pytest.approx(routh, rel=1e-12)
 
 
+@pytest.mark.long
 def test_runs_keep_the_integrals_of_routh_at_least_to_the_order_of_the_method(runs_of):
     top = TOPS["Routh"]
     start = np.array(top.integrals_of_routh(top.q0, top.v0))
