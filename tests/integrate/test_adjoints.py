@@ -93,12 +93,13 @@ def driven(given, adjoint, method, num_steps=10, samples=False, **options):
     return scalar((sol.ts, sol.ys, inside))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("method", "options"),
     [
-        long(LobattoIIIAB(2), {"samples": True}),
-        long(LobattoIIIAB(2, "consistent"), {"stage_solver": nhjax.Newton()}),
-        long(LobattoIIIAB(2, "propagated"), {}),
+        (LobattoIIIAB(2), {"samples": True}),
+        (LobattoIIIAB(2, "consistent"), {"stage_solver": nhjax.Newton()}),
+        (LobattoIIIAB(2, "propagated"), {}),
     ],
     ids=["samples", "Newton", "propagated"],
 )
