@@ -207,7 +207,8 @@ def forms() -> dict[str, tuple[Any, Any, Any]]:
     (rotation, hub), (rate, velocity) = jax.jvp(pose, (q,), (v,))
     skew = rotation.T @ rate
     turning = jnp.stack([skew[2, 1], skew[0, 2], skew[1, 0]])
-    xyzw = Rotation.from_matrix(np.asarray(rotation)).as_quat()
+    # A copy, since SciPy 1.14 takes no array that cannot be written.
+    xyzw = Rotation.from_matrix(np.array(rotation)).as_quat()
     attitude = jnp.asarray(np.roll(xyzw, 1))
     on_pose = (jnp.concatenate([attitude, hub]), q[5:])
     on_attitude = (attitude, jnp.concatenate([q[:2], q[5:]]))
