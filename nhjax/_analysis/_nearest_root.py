@@ -8,7 +8,16 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from .._numerics import iterate, jacobian_and_value, max_norm, Sizes, Solved, unit
+from .._numerics import (
+    ClosureConverted,
+    frozen,
+    iterate,
+    jacobian_and_value,
+    max_norm,
+    Sizes,
+    Solved,
+    unit,
+)
 
 
 def nearest_root(
@@ -34,23 +43,25 @@ def nearest_root(
 
     **Returns:** the root, the residual there, and how the method ended.
     """
+    residual = ClosureConverted(residual, start)
+    # Derivatives come from the two steps after the iteration. Without this they would
+    # also be traced through its loop, which jax 0.10.1 cannot do twice.
+    fixed_residual, start = frozen((residual, start))
 
     def sweep(x):
-        slopes, value, _ = jacobian_and_value(lambda x: (residual(x), None), x)
+        slopes, value, _ = jacobian_and_value(lambda x: (fixed_residual(x), None), x)
         # Where the equations are dependent, the pseudo-inverse leaves them out.
         inverse = free[:, None] * jnp.linalg.pinv(slopes * free[None, :])
         increment = inverse @ value
         return x - increment, Sizes(max_norm(increment)), (inverse, slopes)
 
-    fixed = jax.lax.stop_gradient
-    start = fixed(start)
     solved = iterate(
         sweep,
         jnp.zeros_like(free),
         unit(max_norm(start)),
         max_iterations=max_iterations,
     )
-    x, (inverse, slopes) = fixed((solved.x, solved.aux))
+    x, (inverse, slopes) = frozen((solved.x, solved.aux))
 
     # With the slopes frozen, each step more makes one more order of derivatives right.
     def refined(x, _):
@@ -58,13 +69,15 @@ def nearest_root(
         return x - inverse @ left, left
 
     x, left = jax.lax.scan(refined, x, length=2)
-    # Increments vanish also where all that may change has no influence.
-    # How large the terms of the equations are tells the size of what they depend on.
+    # An increment also vanishes where the unknowns that may change have no influence:
+    # the residual is checked too. It is compared with the sum of the derivatives, each
+    # times the size of its unknown; an unknown without influence has size zero.
     sizes = jnp.where(
-        jnp.any(slopes != 0, axis=0), jnp.abs(start) + jnp.abs(fixed(x)), 0
+        jnp.any(slopes != 0, axis=0), jnp.abs(start) + jnp.abs(frozen(x)), 0
     )
     eps = float(jnp.finfo(x.dtype).eps)
-    # At rest, and at the origin, nothing does: there it is a small part of a unit.
+    # Unknowns of one kind share the largest of their sizes. Where all are zero, as at
+    # rest or at the origin, a small part of a unit stands for them.
     ends = np.cumsum(groups)
     kinds = jnp.split(sizes, ends[:-1])
     sizes = jnp.concatenate(
