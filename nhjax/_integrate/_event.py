@@ -1,12 +1,13 @@
 """Events: zeros of functions along a trajectory, and what happens there."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import equinox as eqx
 import numpy as np
 
 from .._system import check_flag, check_type
+from ._saveat import SaveAt
 
 
 class Event(eqx.Module):
@@ -89,7 +90,7 @@ class Event(eqx.Module):
         self.max_events = 1 if self.terminate else int(max_events)
 
 
-def as_events(event: Any) -> tuple[Event, ...] | None:
+def _as_events(event: Any) -> tuple[Event, ...] | None:
     """Return the events of a run as a tuple, or None if there are none."""
     if event is None:
         return None
@@ -100,3 +101,30 @@ def as_events(event: Any) -> tuple[Event, ...] | None:
     for one in events:
         check_type("event", one, Event, advice)
     return events or None
+
+
+def checked_events(
+    event: Event | Sequence[Event] | None, saveat: SaveAt, invariants: object
+) -> tuple[Event, ...] | None:
+    """Return the events of a run, or raise if something asked for goes without them."""
+    events = _as_events(event)
+    if events is not None and saveat.checkpoint:
+        raise ValueError(
+            "SaveAt: `checkpoint=True` is not available together with `event`, since "
+            "the run may end between two nodes. Go on from its last state with the "
+            "`t0` that is `sol.t1`."
+        )
+    if events is not None and invariants is not None:
+        raise ValueError(
+            "`invariants` are not available together with `event`, since a reset "
+            "changes them. Leave out one of the two."
+        )
+    if events is not None and (saveat.dense or saveat.ts is not None):
+        option = "dense=True" if saveat.dense else "ts=..."
+        raise ValueError(
+            f"SaveAt: `{option}` is not available together with `event`, since a step "
+            "that is cut has two polynomials. Save at `steps`; `Solution.events` has "
+            "the times and states of the events, and runs from one to the next have "
+            "dense output."
+        )
+    return events

@@ -4,20 +4,10 @@ from typing import Literal
 
 import jax.numpy as jnp
 
-from .._custom_types import (
-    Args,
-    FloatScalar,
-    FloatScalarLike,
-    IntScalar,
-    PhaseFunction,
-)
+from .._custom_types import Args, FloatScalar, FloatScalarLike, IntScalar, PhaseFunction
 from .._errors import Check, require
 from .._method import AbstractMethod
-from .._step import (
-    AbstractStageSolver,
-    leaves_steps_to_newton,
-    SimplifiedNewton,
-)
+from .._step import AbstractStageSolver, leaves_steps_to_newton, SimplifiedNewton
 from .._system import (
     AbstractMechanicalSystem,
     check_flag,
@@ -32,16 +22,9 @@ from .._system import (
 )
 from ._adjoint import AbstractAdjoint, DirectAdjoint
 from ._checkpoint import check_start, Checkpoint, countable_from, time_of
-from ._checks import (
-    advancing,
-    check_num_steps,
-    countable,
-    is_tracing,
-)
-from ._event import as_events, Event
-from ._interpolation import (
-    require_collocation,
-)
+from ._checks import advancing, check_num_steps, countable, is_tracing
+from ._event import checked_events, Event
+from ._interpolation import require_collocation
 from ._progress_meter import AbstractProgressMeter, NoProgressMeter
 from ._run import run
 from ._saveat import SaveAt
@@ -173,7 +156,7 @@ def integrate(
     args = parameters(args)
     state = check_start(system, y0, args)
     t0, dt = _checked_times(y0, state, t0, dt, num_steps)
-    events = _checked_events(event, saveat, invariants)
+    events = checked_events(event, saveat, invariants)
     _check_method(method, state, saveat)
     saveat = saveat.within(t0, dt, num_steps)
     # A plain call has no use for a length that is known, but for one that changes.
@@ -237,33 +220,6 @@ def _check_method(method: AbstractMethod, y0: State, saveat: SaveAt) -> None:
         method.require_constraint_hypotheses()
     if saveat.dense or saveat.ts is not None:
         require_collocation(method)
-
-
-def _checked_events(
-    event: Event | Sequence[Event] | None, saveat: SaveAt, invariants: object
-) -> tuple[Event, ...] | None:
-    """Return the events of a run, or raise if something asked for goes without them."""
-    events = as_events(event)
-    if events is not None and saveat.checkpoint:
-        raise ValueError(
-            "SaveAt: `checkpoint=True` is not available together with `event`, since "
-            "the run may end between two nodes. Go on from its last state with the "
-            "`t0` that is `sol.t1`."
-        )
-    if events is not None and invariants is not None:
-        raise ValueError(
-            "`invariants` are not available together with `event`, since a reset "
-            "changes them. Leave out one of the two."
-        )
-    if events is not None and (saveat.dense or saveat.ts is not None):
-        option = "dense=True" if saveat.dense else "ts=..."
-        raise ValueError(
-            f"SaveAt: `{option}` is not available together with `event`, since a step "
-            "that is cut has two polynomials. Save at `steps`; `Solution.events` has "
-            "the times and states of the events, and runs from one to the next have "
-            "dense output."
-        )
-    return events
 
 
 def _zero_step() -> ValueError:
