@@ -1,4 +1,4 @@
-"""Checks of the arguments that the functions of this room have in common."""
+"""Checks of the arguments that the functions of `nhjax._analysis` have in common."""
 
 import operator
 from typing import Any

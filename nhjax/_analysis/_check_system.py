@@ -13,13 +13,13 @@ from .._custom_types import Args, FloatScalarLike
 from .._errors import is_traced, require
 from .._initial import checked_inputs
 from .._numerics import (
-    conditioning,
-    conditioning_of_range,
     dependent_rows,
     inverse,
     is_deficient,
     max_norm,
     rank_of_gram,
+    reciprocal_condition,
+    reciprocal_condition_of_range,
 )
 from .._system import AbstractMechanicalSystem, check_functions, finite, parameters
 from ._motion import in_velocities
@@ -144,11 +144,11 @@ def check_system(
         (2, (0, 1, 2), ('mass matrix',))
     """
     q, v, p, t = checked_inputs(system, q, v, p, t)
-    fibre = system.fibre_coordinate_name
-    u = {"v": v, "p": p}[fibre]
+    coordinate = system.fibre_coordinate_name
+    u = {"v": v, "p": p}[coordinate]
     if u is None:
         raise ValueError(
-            f"Give `{fibre}`, the fibre coordinate of a {type(system).__name__}."
+            f"Give `{coordinate}`, the fibre coordinate of a {type(system).__name__}."
         )
     args = parameters(args)
     if is_traced(*jax.tree.leaves((q, u, t, args))):
@@ -156,7 +156,7 @@ def check_system(
             "`check_system` looks at numbers and makes text of them: call it outside "
             "of `jax.jit`, `jax.vmap` and `jax.grad`."
         )
-    for name, x in (("q", q), (fibre, u), ("t", t)):
+    for name, x in (("q", q), (coordinate, u), ("t", t)):
         require(x, finite(name, x))
     check_functions(system, t, q, args)
     found = jax.tree.map(np.asarray, _measured(system, t, q, u, args))
@@ -207,7 +207,7 @@ def _condition(reciprocal: np.ndarray) -> float:
 
 @tracked_jit("system", "args")
 def _measured(system, t, q, u, args) -> dict[str, Any]:
-    manifold, fibre = system.manifold_of(q), system.fibre_coordinate_name
+    manifold, coordinate = system.manifold_of(q), system.fibre_coordinate_name
 
     def metric(t, xi, u):
         return system.metric(t, manifold.act(q, xi), u, args)
@@ -220,7 +220,7 @@ def _measured(system, t, q, u, args) -> dict[str, Any]:
         arguments, function = system.signatures()[name], getattr(system, name)
 
         def value(t, xi, u):
-            given = {"t": t, "q": manifold.act(q, xi), fibre: u, "args": args}
+            given = {"t": t, "q": manifold.act(q, xi), coordinate: u, "args": args}
             return jnp.atleast_1d(function(*(given[x] for x in arguments)))
 
         return value
@@ -249,14 +249,14 @@ def _measured(system, t, q, u, args) -> dict[str, Any]:
     rows = jax.jacfwd(system.constraint, argnums=2)(t, q, u, args)
     mass, rows = in_velocities(system, metric(t, jnp.zeros_like(u), u), rows)
     compatibility = rows @ inverse(mass) @ rows.T
-    redundant, condition = jnp.zeros((), int), conditioning
+    redundant, condition = jnp.zeros((), int), reciprocal_condition
     if system.constraints == "redundant":
         redundant = rows.shape[0] - rank_of_gram(compatibility)
-        condition = conditioning_of_range
+        condition = reciprocal_condition_of_range
     return {
         "constraints": system.constraint(t, q, u, args),
         "positions": system.position_constraint(t, q, args),
-        "regularity": conditioning(mass),
+        "regularity": reciprocal_condition(mass),
         "compatibility": condition(compatibility),
         "redundant": redundant,
         "jacobian": rows,

@@ -173,12 +173,12 @@ def _check_alone(independent: object, must_be_steady: bool) -> None:
 def _drift(
     slopes: Slopes, y: State, independent: tuple[Indices, Indices] | None
 ) -> Bounded:
-    """Find how fast what must be constant changes, and how fast it may.
+    """Compute the rates of what a steady motion keeps constant, and their bounds.
 
-    That is the velocity of what is perturbed, and where nothing is chosen that of the
-    velocities alone, which must keep this rate too: a pendulum that passes its lowest
-    point does not. The bound is for states that were computed or printed with some
-    digits.
+    Constant are the chosen coordinates, or all velocities where none are chosen. Their
+    first and second derivatives by time must vanish: where a pendulum passes its lowest
+    point, the first derivative of its velocity vanishes, but not the second. The bounds
+    allow for states that were computed or printed with some digits.
     """
     dim = slopes.on_positions.shape[1]
     if independent is None:

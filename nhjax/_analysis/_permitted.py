@@ -52,7 +52,11 @@ def independent_basis(
     positions: tuple[int, ...],
     velocities: tuple[int, ...],
 ) -> Permitted:
-    """Compute the perturbations of the chosen coordinates, and what picks these."""
+    """Compute a basis of the permitted perturbations, one for each chosen coordinate.
+
+    Each changes its own coordinate by one and no other chosen one; `left` takes the
+    chosen coordinates from a perturbation.
+    """
     dim, dtype = on_positions.shape[1], on_positions.dtype
     count, others = len(positions), len(velocities)
     unit = jnp.eye(dim, dtype=dtype)

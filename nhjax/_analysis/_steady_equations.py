@@ -93,11 +93,12 @@ def steady_along(system, t, y, args, symmetry, held, max_iterations) -> Outcome:
 
 
 def _phases(ways: Float[Array, "k x"], held: Indices) -> Float[Array, "k x"]:
-    """Compute what of a perturbation symmetries could undo, as rows.
+    """Compute phase conditions, which keep perturbations from going along symmetries.
 
-    Steady motions come in families that differ by symmetries, along which Newton's
-    increments would be any. Combinations of generators that move what is held do not
-    count: they are no freedom.
+    Steady motions come in families that differ by symmetries, and nothing else tells
+    Newton's method which one of a family to find. Each row is a direction in which a
+    perturbation must have no part. Combinations of generators that change what is held
+    are left out, since holding it excludes them already.
     """
     moved = ways[:, jnp.asarray(held, int)]
     unit = jnp.eye(ways.shape[0], dtype=ways.dtype)
@@ -115,8 +116,8 @@ def _outcome(
 
     free = jnp.ones(2 * dim + count, y.p.dtype).at[jnp.asarray(held, int)].set(0)
     is_flat = system.manifold_of(y.q).is_flat
-    positions_now = ravel_pytree(y.q)[0] if is_flat else jnp.ones_like(y.p)
-    start = jnp.concatenate([positions_now, system.fibre_coordinate(y), guess])
+    positions_here = ravel_pytree(y.q)[0] if is_flat else jnp.ones_like(y.p)
+    start = jnp.concatenate([positions_here, system.fibre_coordinate(y), guess])
     z, left, solved = nearest_root(
         in_one_program, free, start, (dim, dim, count), max_iterations
     )

@@ -101,7 +101,7 @@ class Orbit(NamedTuple):
 
     @property
     def rates(self) -> Float[Array, "x x"]:
-        """Return the derivative of what is left of the motion in the moving frame."""
+        """Return the derivative of the motion relative to the moving frame."""
         frame = jnp.einsum("k,kxy->xy", self.coefficients, self.slopes)
         return self.motion_slopes - frame
 
@@ -119,9 +119,11 @@ class Bounded(NamedTuple):
 
 
 class Verdict(NamedTuple):
-    """How well a motion and the generators of symmetries fit, one a row if of each.
+    """How well a motion and the generators of symmetries fit together.
 
-    Nothing of it is a number where constraints are dependent, and not `determined`.
+    The arrays have a row for each generator, but `drift` has one entry for each
+    component of the motion. Where the constraints are dependent, `determined` is false
+    and the other fields mean nothing.
     """
 
     determined: BoolScalar
@@ -158,7 +160,7 @@ def judged(
         return Bounded(size(value), small * (1 + terms))
 
     rates = orbit.rates
-    bends, bend_terms = _bends(orbit)
+    bends, bend_terms = _bracket_slopes(orbit)
     flat = (len(ways), -1)
     brackets = [
         slopes @ orbit.motion - ways @ orbit.motion_slopes.T,
@@ -182,7 +184,9 @@ def judged(
     )
 
 
-def _bends(orbit: Orbit) -> tuple[Float[Array, "k x x"], Float[Array, "k x x"]]:
+def _bracket_slopes(
+    orbit: Orbit,
+) -> tuple[Float[Array, "k x x"], Float[Array, "k x x"]]:
     """Differentiate the brackets of the motion with each generator.
 
     Second derivatives are central differences: they serve for a check alone, and

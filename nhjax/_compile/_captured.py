@@ -99,7 +99,7 @@ class _Walk:
         self.numbers: dict[int, int] = {}
 
     def arguments(self, tree: Any) -> None:
-        """Record the leaves of a tree but for arrays, and the code of its classes."""
+        """Record static fields, leaves that are no arrays, and the code of classes."""
         nodes = []
 
         def note(node: Any) -> bool:

@@ -44,7 +44,7 @@ SMALL_PRODUCT = "small_product"
 CALLING = """
     checkpoint closed_call custom_jvp_call custom_vjp_call jit remat2
 """.split()  # noqa: SIM905
-_CONTAINING = [*CALLING, "cond", "custom_linear_solve", "one_kernel", "scan", "while"]
+_CONTAINING = [*CALLING, "cond", "custom_linear_solve", "cpu_kernel", "scan", "while"]
 # Numbers of elements: reductions of more are left to a library, and work on arrays of
 # more to several threads, which a kernel cannot start.
 LARGEST_REDUCTION = 1024

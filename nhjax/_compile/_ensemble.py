@@ -70,7 +70,7 @@ batching.primitive_batchers[kernel] = _batched_kernel
 
 
 def _batched_ensemble(operands, axes, *, program, is_batched):
-    """Make one ensemble of an ensemble of ensembles."""
+    """Flatten an ensemble under `jax.vmap` to one ensemble with one axis of members."""
     pairs = list(zip(operands, axes, strict=True))
     size = next(x.shape[axis] for x, axis in pairs if axis is not None)
     member_shapes = [aval.shape for aval in program.in_avals]

@@ -110,7 +110,7 @@ def _is_repeatable(equation: Any) -> bool:
 
 
 def _key(equation: Any, operands: list[Any]) -> Hashable:
-    """Make what two operations have in common only if they compute the same."""
+    """Make a key that two operations share only if they compute the same."""
     params = tuple((name, _exact(equation.params[name])) for name in equation.params)
     # The context holds settings of JAX, such as where an operation is computed.
     context = _exact(getattr(equation, "ctx", None))

@@ -35,11 +35,11 @@ class Collected(AbstractSink):
         return self.work.share(self.work.processes.index)
 
     def start(self, chunk: int) -> Chunk:
-        """Set a chunk running."""
+        """Start the program of a chunk, without waiting for its results."""
         return self.work.values(chunk)
 
     def take(self, chunk: int, content: Any, failed: list[list[int]]) -> None:
-        """Copy the rows of a chunk."""
+        """Copy the results of a chunk into the rows of its members."""
         first, count = self.work.start(chunk), self.work.filled(chunk)
         pairs = zip(jax.tree.leaves(self.whole), jax.tree.leaves(content), strict=True)
         for array, x in pairs:
@@ -47,7 +47,7 @@ class Collected(AbstractSink):
         self.failed.add(failed)
 
     def outcome(self) -> EnsembleOutcome:
-        """Return the values."""
+        """Return the outcome of the ensemble, with the values of all members."""
         if self.work.processes.count > 1:
             own, self.failed = self.failed, Failed()
             for data in self.work.processes.exchange(own.to_bytes()):

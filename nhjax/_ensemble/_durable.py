@@ -7,7 +7,7 @@ from pathlib import Path
 
 
 def write(path: Path, content: bytes) -> None:
-    """Write a file beside its place, onto the disk, and put it into its place then.
+    """Write a file atomically: under another name, to the disk, and rename it then.
 
     The name of what is unfinished follows from `path`, so that what an interrupted run
     has left is written over by the next one.
@@ -18,7 +18,7 @@ def write(path: Path, content: bytes) -> None:
         file.flush()
         os.fsync(file.fileno())
     os.replace(_unfinished(path), path)
-    settle(path.parent)
+    sync_folder(path.parent)
 
 
 def ensure(path: Path, content: bytes) -> None:
@@ -41,8 +41,8 @@ def append(path: Path, line: bytes) -> None:
         os.fsync(file.fileno())
 
 
-def settle(folder: Path) -> None:
-    """Bring the names in a folder onto the disk, where the system can do so."""
+def sync_folder(folder: Path) -> None:
+    """Sync the entries of a folder to the disk, where the system can do so."""
     if os.name != "posix":
         return
     opened = os.open(folder, os.O_RDONLY)
@@ -53,8 +53,8 @@ def settle(folder: Path) -> None:
 
 
 @contextmanager
-def telling(what: str) -> Iterator[None]:
-    """Say with errors of the system what could not be done."""
+def explaining(what: str) -> Iterator[None]:
+    """Begin the message of an `OSError` with `what`, which says what has failed."""
     try:
         yield
     except OSError as error:

@@ -42,11 +42,11 @@ class _AbstractExtreme(AbstractReduction):
         return self.merge(state, found)
 
     def merge(self, one: PyTree[Array], other: PyTree[Array]) -> PyTree[Array]:
-        """Choose the better of two."""
+        """Combine the extremes of two sets of members, entry by entry."""
         return jax.tree.map(lambda x, y: self.best(jnp.stack([x, y])), one, other)
 
     def finish(self, state: PyTree[Array]) -> PyTree[Array]:
-        """Return the best."""
+        """Return the extremes of all members."""
         return state
 
     def _limit(self, dtype: Any) -> Any:
@@ -85,7 +85,7 @@ class Minimum(_AbstractExtreme):
     worst: ClassVar[float] = np.inf
 
     def best(self, rows: Array) -> Array:
-        """Choose the least."""
+        """Compute the smallest of the values along the first axis."""
         return jnp.min(rows, axis=0)
 
 
@@ -110,5 +110,5 @@ class Maximum(_AbstractExtreme):
     worst: ClassVar[float] = -np.inf
 
     def best(self, rows: Array) -> Array:
-        """Choose the largest."""
+        """Compute the largest of the values along the first axis."""
         return jnp.max(rows, axis=0)

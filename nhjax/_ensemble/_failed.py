@@ -18,7 +18,7 @@ class Failed:
         self.rows = [] if rows is None else rows
 
     def add(self, rows: list[list[int]]) -> None:
-        """Append rows."""
+        """Append the failed members of a chunk to the table."""
         self.rows += rows
 
     def to_bytes(self) -> bytes:
@@ -26,7 +26,7 @@ class Failed:
         return np.array(self.rows, np.int64).tobytes()
 
     def add_bytes(self, data: bytes) -> None:
-        """Append rows that were written so."""
+        """Append rows that `to_bytes` has written."""
         self.rows += np.frombuffer(data, np.int64).reshape(-1, 3).tolist()
 
     def outcome(self, count: int, **parts: Any) -> EnsembleOutcome:

@@ -90,7 +90,7 @@ class Histogram(AbstractReduction):
         return self.merge(state, found)
 
     def merge(self, one: PyTree[Array], other: PyTree[Array]) -> PyTree[Array]:
-        """Add counts."""
+        """Add the counts of two sets of members."""
         return jax.tree.map(jnp.add, one, other)
 
     def finish(self, state: PyTree[Array]) -> Any:

@@ -41,13 +41,13 @@ class Journal:
                 durable.append(self.path, lines)
             part.unlink()
             lock.release()
-        durable.settle(self.folder)
+        durable.sync_folder(self.folder)
         return self._read()
 
     def open_part(self) -> None:
         """Begin the part of a process that is not the first."""
         self._lock.take(self.path, self._where)
-        durable.settle(self.folder)
+        durable.sync_folder(self.folder)
 
     def append(self, line: Line) -> None:
         """Add the line of a chunk whose files are on the disk."""
@@ -85,7 +85,7 @@ def _written(lines: list[Line]) -> bytes:
 
 
 def _whole_lines(path: Path, is_cut: bool = False) -> bytes:
-    """Read what ends with a line break; the rest was interrupted, and goes if cut."""
+    """Read the complete lines; `is_cut` removes a last line that was interrupted."""
     content = path.read_bytes()
     whole = content[: content.rfind(b"\n") + 1]
     if is_cut and len(whole) < len(content):

@@ -48,7 +48,7 @@ class Kept(Reduced):
         content = b""
         try:
             if work.processes.index == 0:
-                with durable.telling(f"{self.where} cannot be used"):
+                with durable.explaining(f"{self.where} cannot be used"):
                     self._begin(resume)
                 number = np.int64(self.first).tobytes()
                 content = number + self._packed(self.state, self.failed)
@@ -114,14 +114,14 @@ class Kept(Reduced):
             f"{str(self.path)!r}; the one before is kept, and the same call goes "
             "on once this is mended"
         )
-        with durable.telling(what):
+        with durable.explaining(what):
             save(
                 self.path / _STATE,
                 {"chunks": done, "failed": rows, "state": leaves},
             )
 
     def outcome(self) -> EnsembleOutcome:
-        """Finish the statistics."""
+        """Return the outcome of the ensemble, with its finished statistics."""
         made = super().outcome()
         return self.failed.outcome(
             made.num_members, statistics=made.statistics, path=self.given

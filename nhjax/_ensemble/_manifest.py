@@ -17,7 +17,7 @@ from ._verdict import without_results
 
 
 FORMAT = 1
-# What does not decide the bits of what is done already.
+# Entries that may differ where a run is complete: nothing is left to be computed.
 _VERSIONS = ("nhjax", "jax")
 
 
@@ -116,7 +116,7 @@ def _constants(closed: Any) -> list[str]:
 def check_resumable(
     where: str, folder: Path, names: tuple[str, ...], maker: str, resume: bool
 ) -> None:
-    """Raise unless a folder may be gone on with, and has the files of these names.
+    """Raise unless the run in a folder may be resumed and the folder has these files.
 
     `where` says which folder it is, and `maker` which call makes folders of its kind.
     """

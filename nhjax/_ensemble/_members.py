@@ -13,13 +13,13 @@ from .._errors import is_traced, ShapeError
 
 
 class _FromArrays(eqx.Module):
-    """Make a member of its leaves; random keys come as the integers they are of."""
+    """Make a member from its leaves, and random keys from the integers in them."""
 
     treedef: Any = eqx.field(static=True)
     keys: tuple[Any, ...] = eqx.field(static=True)
 
     def __call__(self, leaves: list[Any]) -> Any:
-        """Make the member."""
+        """Make the member from its leaves."""
         made = [
             x if impl is None else jax.random.wrap_key_data(x, impl=impl)
             for x, impl in zip(leaves, self.keys, strict=True)
@@ -68,7 +68,7 @@ class Members:
         self.make = _FromArrays(treedef, tuple(keys))
 
     def inputs(self, start: int, size: int) -> Any:
-        """Take the inputs of `size` members; the last one again after the end."""
+        """Return the inputs of `size` members; after the end the last is repeated."""
         indices = np.minimum(np.arange(start, start + size), self.count - 1)
         if self._leaves is None:
             return indices.astype(jnp.result_type(int))

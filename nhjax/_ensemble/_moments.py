@@ -80,7 +80,7 @@ class Mean(AbstractReduction):
     of: Callable[[Any], Any] | None = eqx.field(static=True, default=None)
 
     def init(self, value: PyTree[jax.ShapeDtypeStruct]) -> Any:
-        """Make sums of no members."""
+        """Make the sums of an empty set of members."""
         return _Sums(jnp.zeros((), int), _zeros(selected_structure(self.of, value)))
 
     def update(
@@ -93,7 +93,7 @@ class Mean(AbstractReduction):
         return _Sums(counts.astype(int), _lifted(selected(self.of, value), counts))
 
     def merge(self, one: Any, other: Any) -> Any:
-        """Add two sets of sums."""
+        """Combine the sums of two sets of members."""
         return _Sums(one.number + other.number, _pairs(plus, one.sums, other.sums))
 
     def finish(self, state: Any) -> PyTree[Array]:

@@ -21,7 +21,7 @@ _SECONDS = 60.0
 
 
 class Processes:
-    """How many processes run an ensemble, which of them this is, and what others say.
+    """The processes that run an ensemble together, and how they exchange data.
 
     There is one unless `jax.distributed.initialize` has been called. All of them meet
     in the same order: each meeting is a collective operation of JAX, in which every
@@ -99,7 +99,7 @@ class Processes:
             row = np.zeros(size, np.uint8)
             row[: len(data)] = np.frombuffer(data, np.uint8)
             rows = np.asarray(process_allgather(row)) if size else [row] * self.count
-        # JAX calls it now the one and now the other.
+        # JAX raises one or the other of these if a process is gone.
         except (jax.errors.JaxRuntimeError, ValueError) as error:
             self._is_over = True
             raise RuntimeError(

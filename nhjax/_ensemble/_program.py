@@ -18,7 +18,10 @@ AXIS = "members"
 
 
 class Layout(NamedTuple):
-    """On which devices chunks run, and whether statistics depend on how many."""
+    """The devices on which chunks run, and the order in which statistics are formed.
+
+    `is_fixed` is true if this order must not depend on the number of devices.
+    """
 
     devices: tuple[Any, ...]
     is_fixed: bool
@@ -38,7 +41,7 @@ def is_reduction(x: Any) -> bool:
 
 
 def each_reduction(function: Callable[..., Any], reductions: Any, *trees: Any) -> Any:
-    """Call a function with every reduction of a tree, and the parts beside it."""
+    """Map a function over a tree of reductions and the like parts of other trees."""
     return jax.tree.map(function, reductions, *trees, is_leaf=is_reduction)
 
 

@@ -59,7 +59,7 @@ class Reduced(AbstractSink):
         return self.work.share(processes.index)
 
     def start(self, chunk: int) -> Chunk:
-        """Set a chunk running."""
+        """Start the program of a chunk, without waiting for its results."""
         work = self.work
         inputs = work.members.inputs(work.start(chunk), work.size)
         is_there = np.arange(work.size) < work.filled(chunk)
@@ -77,7 +77,7 @@ class Reduced(AbstractSink):
             self._add(content, Failed(failed))
 
     def outcome(self) -> EnsembleOutcome:
-        """Finish the statistics.
+        """Return the outcome of the ensemble, with its finished statistics.
 
         **Raises:** `nhjax.IntegrationError` if all members have failed.
         """

@@ -47,12 +47,12 @@ def selected(of: Callable[[Any], Any] | None, value: Any) -> Any:
 
 
 def selected_of_each(of: Callable[[Any], Any] | None, values: Any) -> Any:
-    """Take that part of the value of each member of a chunk."""
+    """Take, from the value of each member, the part that a reduction is of."""
     return values if of is None else jax.vmap(of)(values)
 
 
 def selected_structure(of: Callable[[Any], Any] | None, value: Any) -> Any:
-    """Find shapes and dtypes of that part."""
+    """Find the shapes and dtypes of the part of a value that a reduction is of."""
     return value if of is None else jax.eval_shape(of, value)
 
 
@@ -103,7 +103,7 @@ def where_counted(counts: Bool[Array, ""], x: Array, otherwise: Any) -> Array:
 
 
 def as_floating(x: Any) -> Any:
-    """Return the dtype in which means of `x` are computed: its own, if it has digits.
+    """Return the dtype in which means of `x` are computed: its own if it is floating.
 
     Means of integers and booleans are computed in JAX's default precision.
     """

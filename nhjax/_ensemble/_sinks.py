@@ -41,7 +41,7 @@ class Work:
         return min(self.size, self.members.count - self.start(chunk))
 
     def share(self, index: int) -> range:
-        """Return the chunks of a process, if each has those that follow one another."""
+        """Return the chunks of a process, where each process has consecutive ones."""
         count = self.processes.count
         ends = [self.chunks * i // count for i in (index, index + 1)]
         return range(*ends)
@@ -84,5 +84,5 @@ class AbstractSink(abc.ABC):
         """Return the outcome once no chunk is left."""
 
     def close(self) -> None:
-        """Let go of files."""
+        """Close files and give up locks, if any are held."""
         return

@@ -65,7 +65,7 @@ class Stored(AbstractSink):
         self._open(self.variables)
         self.journal = Journal(self.path / "manifest", work.processes.index)
         try:
-            with durable.telling(f"{self.where} cannot be used"):
+            with durable.explaining(f"{self.where} cannot be used"):
                 self.lines = self._begin(resume)
                 self._check_files()
         except BaseException:
@@ -119,9 +119,9 @@ class Stored(AbstractSink):
         content |= {_PROGRAM: self.program.encode(), _JOURNAL: b""}
         for name, data in content.items():
             durable.write(unfinished / name, data)
-        # At once there, as a whole.
+        # The complete store appears under its name in one operation.
         os.replace(unfinished, self.path)
-        durable.settle(self.path.parent)
+        durable.sync_folder(self.path.parent)
 
     def _resume(self, resume: bool) -> dict[int, Line]:
         names = _MANIFEST, _PROGRAM, _JOURNAL
@@ -167,7 +167,7 @@ class Stored(AbstractSink):
         return left[processes.index :: processes.count]
 
     def start(self, chunk: int) -> Chunk:
-        """Set a chunk running."""
+        """Start the program of a chunk, without waiting for its results."""
         return self.work.values(chunk)
 
     def take(self, chunk: int, content: Any, failed: list[list[int]]) -> None:
@@ -181,7 +181,7 @@ class Stored(AbstractSink):
             f"{str(self.path)!r}; those of finished chunks are kept, and the same "
             "call goes on once this is mended"
         )
-        with durable.telling(what):
+        with durable.explaining(what):
             for name, (_, x) in rows.items():
                 for file, data in self.files.chunk(name, first, x).items():
                     durable.write(self.path / file, data)
@@ -196,7 +196,7 @@ class Stored(AbstractSink):
         for lines in map(json.loads, processes.exchange(new)):
             self.lines |= {line["chunk"]: line for line in lines}
         if processes.index == 0:
-            with durable.telling(f"{self.where} could not be finished"):
+            with durable.explaining(f"{self.where} could not be finished"):
                 if "t" in self.variables and not (self.path / "time").is_dir():
                     times = {line["times"] for line in self.lines.values()}
                     if len(times) == 1 and None not in times:
@@ -215,7 +215,7 @@ class Stored(AbstractSink):
         times = np.asarray(array[0])
         self.files = Files()
         self._open(self.variables | {"time": (("time",), times)})
-        # The folder stands for all of it, and so comes last.
+        # The folder `time` tells that all of this has been done, and so comes last.
         for name, data in self.files.chunk("time", 0, times).items():
             durable.write(self.path / ".time.unfinished" / name, data)
         metadata = self.files.metadata()
@@ -224,7 +224,7 @@ class Stored(AbstractSink):
         durable.write(self.path / "zarr.json", metadata["zarr.json"])
         os.replace(self.path / ".time.unfinished/time", self.path / "time")
         (self.path / ".time.unfinished").rmdir()
-        durable.settle(self.path)
+        durable.sync_folder(self.path)
 
     def close(self) -> None:
         """Let others write to the store."""

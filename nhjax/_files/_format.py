@@ -166,7 +166,7 @@ def as_text(header: dict[str, Any]) -> np.ndarray:
 
 
 def from_text(array: np.ndarray) -> dict[str, Any]:
-    """Read a header again."""
+    """Read the header of a file from its text."""
     header = json.loads(array.tobytes().decode("utf-8"))
     kinds = {"format": int, "nhjax": str, "tree": dict}
     if not isinstance(header, dict) or any(

@@ -6,7 +6,6 @@ from .._compile import as_cpu_kernel, tracked_jit
 from .._custom_types import Args, BoolScalar, FloatScalar, FloatScalarLike
 from .._errors import DTypeError, require, ShapeError
 from .._numerics import (
-    conditioning,
     frozen,
     inverse,
     is_without_entries,
@@ -14,6 +13,7 @@ from .._numerics import (
     nan_unless,
     Rank,
     rank_of_gram,
+    reciprocal_condition,
     root,
     those_that_count,
     tree_where,
@@ -125,7 +125,7 @@ def initial_state(
 def _solve(system, t, q, v, p, args, project: bool) -> Found:
     manifold = system.manifold_of(q)
     given = p if v is None else v
-    is_fibre = (v is None) == (system.fibre_coordinate_name == "p")
+    is_fibre_coordinate = (v is None) == (system.fibre_coordinate_name == "p")
     legendre_solved = projected = jnp.asarray(True)
     off_group = manifold.distance_to_group(frozen(q))
     starts = []
@@ -135,13 +135,13 @@ def _solve(system, t, q, v, p, args, project: bool) -> Found:
         q = tree_where(possible, normal, q)
         off_group = jnp.where(possible, 0, off_group)
         if system.holonomic is not None:
-            guess = given if is_fibre else jnp.zeros_like(given)
+            guess = given if is_fibre_coordinate else jnp.zeros_like(given)
             start = q
             nearest = project_position(system, t, q, guess, args)
             q, projected = manifold.act(q, nearest.x), nearest.found
             starts.append(Rank(nearest.jacobian, start, ~projected))
     u = given
-    if not is_fibre:
+    if not is_fibre_coordinate:
         u, legendre_solved = _inverse_legendre(system, t, q, given, args)
     if project and (system.nonholonomic is not None or system.holonomic is not None):
         nearest = project_fibre_coordinate(system, t, q, u, args)
@@ -170,7 +170,7 @@ def _solve(system, t, q, v, p, args, project: bool) -> Found:
         generator=getattr(system, system.generator)(t, q, u, args),
         positions=positions,
         off_group=off_group,
-        regularity=conditioning(system.metric(t, q, u, args)),
+        regularity=reciprocal_condition(system.metric(t, q, u, args)),
         ranks=ranks,
         deficient=deficient,
         compatibility=compatibility,
@@ -198,15 +198,16 @@ def _motion(
 def _ranks_judged(
     system: AbstractMechanicalSystem, lin: Linearisation, ranks: list[Rank]
 ) -> tuple[list[BoolScalar], FloatScalar]:
-    """Tell which derivatives of constraints are deficient, and how compatible C is.
+    """Judge the ranks of constraint derivatives, and the condition number of C.
 
-    Redundant constraints lack a rank where one has no derivatives at all, and are
-    compatible if C has the rank of their derivatives.
+    The latter is returned as its reciprocal. For redundant constraints it is one if C
+    has the rank of their derivatives, which makes them compatible, and zero otherwise;
+    their ranks are deficient only where a constraint has no derivatives at all.
     """
     jacobian, reaction, _ = lin.dense
     compliance = jacobian @ reaction
     if system.constraints != "redundant":
-        return [rank.deficient for rank in ranks], conditioning(compliance)
+        return [rank.deficient for rank in ranks], reciprocal_condition(compliance)
     rank = rank_of_gram(jacobian @ jacobian.T)
     full = (rank_of_gram(compliance) == rank).astype(compliance.dtype)
     return [rank.counts & is_without_entries(rank.jacobian) for rank in ranks], full
@@ -235,8 +236,8 @@ def checked_inputs(system, q, v, p, t):
     if (v is None) == (p is None):
         given = "neither" if v is None else "both"
         raise ValueError(f"Give either `v` or `p`; got {given} of them.")
-    name, fibre = ("v", v) if p is None else ("p", p)
-    q, fibre = configuration(q), floating(name, fibre)
+    name, u = ("v", v) if p is None else ("p", p)
+    q, u = configuration(q), floating(name, u)
     require_manifold(system, "q", q)
     if system.manifold is None and q.ndim != 1:
         raise ShapeError(
@@ -246,19 +247,19 @@ def checked_inputs(system, q, v, p, t):
     manifold = system.manifold_of(q)
     q = manifold.check(q)
     leaves = jax.tree.leaves(q)
-    if fibre.shape != (manifold.dim,):
+    if u.shape != (manifold.dim,):
         raise ShapeError(
-            f"`{name}` has shape {fibre.shape}, but `q` has shape "
+            f"`{name}` has shape {u.shape}, but `q` has shape "
             f"{' x '.join(str(leaf.shape) for leaf in leaves)} and needs a `{name}` of "
             f"shape ({manifold.dim},)."
         )
     for leaf in leaves:
-        if fibre.dtype != leaf.dtype:
+        if u.dtype != leaf.dtype:
             raise DTypeError(
-                f"`{name}` has dtype {fibre.dtype}, but `q` has {leaf.dtype}: they "
+                f"`{name}` has dtype {u.dtype}, but `q` has {leaf.dtype}: they "
                 "must agree."
             )
-    t = real_scalar("t", t, fibre.dtype)
+    t = real_scalar("t", t, u.dtype)
     # All checks are attached to q, which no system ignores: `jax.jit` drops a check of
     # what is not used.
-    return (q, fibre, None, t) if p is None else (q, None, fibre, t)
+    return (q, u, None, t) if p is None else (q, None, u, t)

@@ -170,7 +170,7 @@ def resumed(y0: Checkpoint, fresh: StepState) -> StepState:
 
     `fresh` are those that a run from the state alone would start from. Its
     linearisation replaces that of the checkpoint where their matrices differ by more
-    than round-off: the run goes on with another system, or with other args.
+    than eps^(1/4), as they may if the run goes on with another system or other args.
     """
     new, structure = jax.tree.flatten(fresh.lin)
     _check_arrays("linearisation", y0.linearisation, new)
@@ -181,7 +181,7 @@ def resumed(y0: Checkpoint, fresh: StepState) -> StepState:
 
 
 def _agree(old: Linearisation, new: Linearisation) -> BoolScalar:
-    """Tell whether the matrices of two linearisations differ by round-off at most."""
+    """Tell whether the matrices of two linearisations agree up to eps^(1/4)."""
     pairs = [
         pair
         for name in ("metric_inverse", "jacobian", "reaction", "compliance_inverse")

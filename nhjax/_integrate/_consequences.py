@@ -20,7 +20,7 @@ from ._reset import completed
 from ._stepping import is_consistent, Stepping
 
 
-class Met(NamedTuple):
+class AfterEvent(NamedTuple):
     """What follows from an event: the state to go on with, and what is known there."""
 
     step_state: StepState
@@ -41,13 +41,13 @@ class Consequences(eqx.Module):
 
     @property
     def ends_only(self) -> bool:
-        """Tell whether the run ends at its first event, in the state that it is in.
+        """Tell whether every event ends the run, and none resets the state.
 
         Then there is no log to be kept on the way.
         """
         return all(self.terminates) and not any(self.resets)
 
-    def met(
+    def after_event(
         self,
         conditions: Conditions,
         stepping: Stepping,
@@ -57,18 +57,18 @@ class Consequences(eqx.Module):
         step_state: StepState,
         value: FloatScalar,
         before: Progress,
-    ) -> Met:
+    ) -> AfterEvent:
         """Find what follows from an event; nothing follows unless it `fires`.
 
         Its condition has this `value`, zero up to round-off.
         """
         ends = jnp.asarray(self.terminates)[which]
         result = RESULTS.where(ends, RESULTS.event_occurred, RESULTS.successful)
-        nothing = Met(step_state, before.sides, before.pending, result)
+        nothing = AfterEvent(step_state, before.sides, before.pending, result)
         if self.ends_only:
             return nothing
 
-        def met() -> Met:
+        def reset() -> AfterEvent:
             resets = [partial(_reset, stepping, x, t, step_state) for x in self.resets]
             after, consistent = jax.lax.switch(which, resets)
             others = jnp.arange(len(self.resets), dtype=jnp.int32) != which
@@ -79,9 +79,9 @@ class Consequences(eqx.Module):
             found = RESULTS.where(known, result, RESULTS.nonfinite_event)
             found = RESULTS.where(consistent, found, RESULTS.inconsistent_reset)
             after = tree_where(consistent, after, step_state)
-            return Met(after.differentiated_in_state(), sides, pending, found)
+            return AfterEvent(after.differentiated_in_state(), sides, pending, found)
 
-        return jax.lax.cond(fires, met, lambda: nothing)
+        return jax.lax.cond(fires, reset, lambda: nothing)
 
 
 def consequences_of(

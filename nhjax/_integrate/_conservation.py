@@ -143,7 +143,7 @@ def conserves(
         u = jax.lax.fori_loop(0, _ITERATIONS, nearer, u0 + w * (1 + jnp.abs(u0)))
         lin = linearise(system, t, q, u, args)
         v = system.velocity(t, q, u, args)
-        by_time, by_position, by_fibre = jax.jacrev(
+        by_time, by_position, by_fibre_coordinate = jax.jacrev(
             lambda t, xi, u: invariants.error(system, t, manifold.act(q, xi), u, args),
             argnums=(0, 1, 2),
         )(t, jnp.zeros_like(v), u)
@@ -151,11 +151,11 @@ def conserves(
             [
                 by_time[:, None],
                 by_position * v[None],
-                by_fibre * lin.acceleration[None],
+                by_fibre_coordinate * lin.acceleration[None],
             ],
             axis=1,
         )
-        sizes = invariants.sizes(system, t, q, u, args, by_fibre)
+        sizes = invariants.sizes(system, t, q, u, args, by_fibre_coordinate)
         noise = small * jnp.sum(jnp.abs(terms), axis=1) + _UNITS * eps * sizes / abs(h)
         is_off = max_norm(lin.violation) > small * (1 + max_norm(u))
         return is_off | ~jnp.any(jnp.abs(jnp.sum(terms, axis=1)) > noise)

@@ -61,10 +61,12 @@ class CutOptions(eqx.Module):
     far: Float[Array, " e"]
     known: Int[Array, ""] | None
 
-    def signed(self, values: Float[Array, " e"], h: FloatScalar) -> Float[Array, " e"]:
-        """Divide the conditions that start from zero by the size of the step.
+    def without_start_zero(
+        self, values: Float[Array, " e"], h: FloatScalar
+    ) -> Float[Array, " e"]:
+        """Divide the conditions that are zero at the start by the size of the step.
 
-        Their other zeros are left.
+        This removes the zero at the start; their other zeros stay where they are.
         """
         return jnp.where(self.sides.at_zero, values / jnp.abs(h), values)
 
@@ -118,7 +120,7 @@ def _first(
 ) -> _Found:
     """Find the first event in a step, by steps of different sizes from its start."""
     h, sign = arguments.h, options.sides.sign
-    far = options.signed(options.far, h)
+    far = options.without_start_zero(options.far, h)
     one = jnp.ones((), h.dtype)
     whole = Bracket.open_from(options.sides.value)
     whole = whole.with_point(one, far, conditions.crossed(sign, far))
@@ -127,7 +129,7 @@ def _first(
         bracket, _, _ = search
         theta = bracket.next_place()
         cut = _trial(arguments, conditions, options, programs, theta * h)
-        values = options.signed(cut.values, cut.h)
+        values = options.without_start_zero(cut.values, cut.h)
         return bracket.with_point(theta, values, cut.crossed), theta, cut.outcome.result
 
     bracket, last, result = jax.lax.while_loop(
@@ -153,7 +155,9 @@ def _trial(
     solved = outcome.result == RESULTS.successful
     unknown = solved & ~jnp.all(jnp.isfinite(values))
     result = RESULTS.where(unknown, RESULTS.nonfinite_event, outcome.result)
-    crossed = conditions.crossed(options.sides.sign, options.signed(values, h))
+    crossed = conditions.crossed(
+        options.sides.sign, options.without_start_zero(values, h)
+    )
     none = -jnp.ones((), jnp.int32)
     return Cut(outcome._replace(result=result), h, none, values, crossed)
 

@@ -150,7 +150,7 @@ class EventStepping(eqx.Module):
         """
         before, it = progress_of(carry), self._tried(carry, known)
         place = it.fires, it.which, it.t + it.size, it.reached, it.value, before
-        met = self.consequences.met(self.conditions, self.stepping, *place)
+        met = self.consequences.after_event(self.conditions, self.stepping, *place)
         result = RESULTS.where(it.steps, it.cut.outcome.result, carry.result)
         result = RESULTS.where(it.meets, RESULTS.too_many_events, result)
         result = RESULTS.where(it.fires, met.result, result)
@@ -213,7 +213,8 @@ class EventStepping(eqx.Module):
         meets = (stepped | (alive & at_once)) & (which >= 0)
         reached = tree_where(stepped, cut.outcome.step_state, carry.step_state)
         size = jnp.where(stepped, cut.h, 0)
-        # Events that follow themselves like this would do so for ever.
+        # An event that is met again within round-off of its own time would be met for
+        # ever.
         at_last = (before.num > 0) & before.sides.at_zero[which]
         small = 16 * float(jnp.finfo(t.dtype).eps) * jnp.abs(self.stepping.dt)
         again = stepped & at_last & (jnp.abs(size) <= small)

@@ -118,12 +118,12 @@ class Loop(eqx.Module):
         return jax.eval_shape(rows)
 
     def moving(self, carry: Carry) -> Carry:
-        """Return the same carry, its state differentiated wherever the run is."""
+        """Return the same carry, whose state has tangents wherever the run has some."""
         state = moving_with(carry.step_state.state, self.stepping)
         return eqx.tree_at(lambda x: x.step_state.state, carry, state)
 
     def no_rows(self, carry: Carry) -> Rows:
-        """Make rows of zeros, which `write` puts nowhere after the end of the run."""
+        """Make rows of zeros for steps beyond the run's end, which `write` drops."""
         rows = jax.tree.map(
             lambda x: jnp.zeros(x.shape, x.dtype), self.row_shapes(carry)
         )

@@ -74,7 +74,7 @@ def _run_bwd(residuals, cotangents, perturbed, arguments):
     loop = replace(loop, meter=NoProgressMeter())  # the forward pass has shown all
     of_end, row_cotangents = cotangents
     way = way_back(loop, start, end, log)
-    cotangent = _filled(way.moving(of_end), way.moving(end))
+    cotangent = _filled(way.differentiable_part(of_end), way.differentiable_part(end))
     row_cotangents = _filled(row_cotangents, shapes)
     parameters, fixed = eqx.partition(loop, eqx.is_inexact_array)
     nothing = jax.tree.map(jnp.zeros_like, parameters)
@@ -83,13 +83,15 @@ def _run_bwd(residuals, cotangents, perturbed, arguments):
         place, step_state, cotangent, total = state
         place, step_state = way.back(place, step_state, k)
 
-        def forward(parameters, moving):
+        def forward(parameters, part):
             loop = eqx.combine(parameters, fixed)
-            carry, rows = way.again(loop, place, step_state, moving, k)
-            return way.moving(carry), eqx.filter(rows, eqx.is_inexact_array)
+            carry, rows = way.rerun(loop, place, step_state, part, k)
+            return way.differentiable_part(carry), eqx.filter(
+                rows, eqx.is_inexact_array
+            )
 
-        moving = way.starts_moving(place, step_state)
-        _, pullback = jax.vjp(forward, parameters, moving)
+        part = way.differentiable_part_at(place, step_state)
+        _, pullback = jax.vjp(forward, parameters, part)
         row = eqx.filter(way.rows(row_cotangents, place, k), eqx.is_inexact_array)
         change, cotangent = pullback((cotangent, row))
         return place, step_state, cotangent, jax.tree.map(jnp.add, total, change)

@@ -13,8 +13,8 @@ from .._system import State
 from ._stepping import Stepping
 
 
-class AbstractStretch(eqx.Module):
-    """The stretch of time over which a step went that is to be retraced."""
+class AbstractStepInterval(eqx.Module):
+    """The time interval of a step that is to be retraced."""
 
     @property
     @abstractmethod
@@ -32,7 +32,7 @@ class AbstractStretch(eqx.Module):
         """Return the size of the step."""
 
 
-class WholeStep(AbstractStretch):
+class WholeStep(AbstractStepInterval):
     """The stretch of step k of a run without events."""
 
     stepping: Stepping
@@ -40,21 +40,21 @@ class WholeStep(AbstractStretch):
 
     @property
     def start(self) -> FloatScalar:
-        """Return t_k."""
+        """Return the time t_k at which the step started."""
         return self.stepping.time(self.k)
 
     @property
     def end(self) -> FloatScalar:
-        """Return t_{k+1}."""
+        """Return the time t_{k+1} at which the step ended."""
         return self.stepping.time(self.k + 1)
 
     @property
     def size(self) -> FloatScalar:
-        """Return dt."""
+        """Return the step size dt."""
         return self.stepping.dt
 
 
-class PartOfStep(AbstractStretch):
+class PartOfStep(AbstractStepInterval):
     """A stretch from a time `since`, over a `length`."""
 
     since: FloatScalar
@@ -77,7 +77,7 @@ class PartOfStep(AbstractStretch):
 
 
 def step_back(
-    stepping: Stepping, step_state: StepState, stretch: AbstractStretch
+    stepping: Stepping, step_state: StepState, stretch: AbstractStepInterval
 ) -> StepState:
     """Compute the state that a step started from, given the one that it led to."""
     go_on = jnp.asarray(False)

@@ -22,9 +22,9 @@ from ._stepping import Carry
 
 
 class AbstractWayBack(eqx.Module):
-    """The way back along a run: where each iteration of it started from.
+    """The retracing of a run from its end, which finds where each iteration started.
 
-    A place is what is known of a point on the way besides the state.
+    A place is what is known of such a starting point besides the state.
     """
 
     loop: eqx.AbstractVar[Loop]
@@ -48,23 +48,25 @@ class AbstractWayBack(eqx.Module):
         """Find the place and the state that iteration i started from."""
 
     @abstractmethod
-    def moving(self, carry: Carry) -> PyTree[Array]:
+    def differentiable_part(self, carry: Carry) -> PyTree[Array]:
         """Return the part through which derivatives pass, of a carry or a cotangent."""
 
     @abstractmethod
-    def again(
+    def rerun(
         self,
         loop: Loop,
         place: Any,
         step_state: StepState,
-        moving: PyTree[Array],
+        part: PyTree[Array],
         i: Int[Array, ""],
     ) -> tuple[Carry, Rows]:
-        """Run iteration i again from a place, with the moving part as given."""
+        """Run iteration i again from a place, with its differentiable part as given."""
 
     @abstractmethod
-    def starts_moving(self, place: Any, step_state: StepState) -> PyTree[Array]:
-        """Return the moving part of the carry at a place."""
+    def differentiable_part_at(
+        self, place: Any, step_state: StepState
+    ) -> PyTree[Array]:
+        """Return the differentiable part of the carry at a place."""
 
     @abstractmethod
     def rows(self, rows: Rows, place: Any, i: Int[Array, ""]) -> Rows:
@@ -95,28 +97,28 @@ class WayBackOverNodes(AbstractWayBack):
         stepping = self.loop.stepping
         return None, step_back(stepping, step_state, WholeStep(stepping, i))
 
-    def moving(self, carry: Carry) -> State:
+    def differentiable_part(self, carry: Carry) -> State:
         """Return the state, or its cotangent."""
         return carry.step_state.state
 
-    def again(
+    def rerun(
         self,
         loop: Loop,
         place: None,
         step_state: StepState,
-        moving: State,
+        part: State,
         i: Int[Array, ""],
     ) -> tuple[Carry, Rows]:
-        """Take step i again."""
-        node_at_y = eqx.tree_at(lambda step_state: step_state.state, step_state, moving)
-        return loop.step(self.start._replace(step_state=node_at_y), i)
+        """Take step i again, from the state given."""
+        start = eqx.tree_at(lambda step_state: step_state.state, step_state, part)
+        return loop.step(self.start._replace(step_state=start), i)
 
-    def starts_moving(self, place: None, step_state: StepState) -> State:
-        """Return the state."""
+    def differentiable_part_at(self, place: None, step_state: StepState) -> State:
+        """Return the state that the step started from."""
         return step_state.state
 
     def rows(self, rows: Rows, place: None, i: Int[Array, ""]) -> Rows:
-        """Read the rows of step i."""
+        """Read the rows that step i has written."""
         return self.loop.saving.read(rows, i)
 
 
@@ -223,20 +225,20 @@ class WayBackOverEvents(AbstractWayBack):
         )
         return place, step_state
 
-    def moving(self, carry: Carry) -> tuple[Any, Any]:
+    def differentiable_part(self, carry: Carry) -> tuple[Any, Any]:
         """Return the state and the time since the last node, or their cotangents."""
         return carry.step_state.state, carry.progress.offset
 
-    def again(
+    def rerun(
         self,
         loop: Loop,
         place: EventPlace,
         step_state: StepState,
-        moving: tuple[State, FloatScalar],
+        part: tuple[State, FloatScalar],
         i: Int[Array, ""],
     ) -> tuple[Carry, Rows]:
         """Run iteration i again, as far as it went."""
-        state, offset = moving
+        state, offset = part
         # Constants come back as arrays of NumPy.
         start = jax.tree.map(jnp.asarray, progress_of(self.start))
         which = place.known.which
@@ -256,13 +258,14 @@ class WayBackOverEvents(AbstractWayBack):
             pending=is_one & (place.known.size == 0),
         )
         at_state = eqx.tree_at(lambda step_state: step_state.state, step_state, state)
-        # Where nothing was done, nothing is done as after the end of a run.
+        # An iteration that did nothing is run again as one after the end of a run, and
+        # does nothing again.
         ended = RESULTS.event_occurred
         result = RESULTS.where(place.active, RESULTS.successful, ended)
         carry = Carry(at_state, result, self.start.stats, progress)
         return loop.step(carry, i, place.known)
 
-    def starts_moving(
+    def differentiable_part_at(
         self, place: EventPlace, step_state: StepState
     ) -> tuple[State, FloatScalar]:
         """Return the state and the time since the last node."""

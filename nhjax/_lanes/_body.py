@@ -48,7 +48,7 @@ class Body:
 
     @contextmanager
     def exact(self) -> Iterator[None]:
-        """Keep products apart from sums, where round-off is computed or ruled out.
+        """Forbid fused products and sums, so that each operation rounds by itself.
 
         Elsewhere a product and a sum may become one operation, which rounds once.
         """
@@ -98,15 +98,15 @@ class Body:
             Value(self, kind, name) for kind, name in zip(kinds, names, strict=True)
         )
 
-    def unless_usual(
+    def with_rare_case(
         self,
         unusual: "Value",
         usual: tuple["Value", ...],
         otherwise: Callable[[], tuple["Value", ...]],
     ) -> tuple["Value", ...]:
-        """Return what is usual, and in lanes that are unusual what is otherwise.
+        """Return `usual`, but what `otherwise` computes in the lanes of `unusual`.
 
-        The latter is computed only if there is such a lane.
+        The function `otherwise` is computed only if there is such a lane.
         """
         any_lane = unusual
         if self.width > 1:

@@ -11,7 +11,7 @@ from ._buffers import InMemory, Value
 from ._builder import Builder, Operation
 from ._graph import dtype_name, Node
 from ._memory import LARGE, places
-from ._regions import BranchInMaking
+from ._regions import BranchBuilder
 
 
 def _call(builder: Builder, equation: Any, values: list[Value]) -> list[Value]:
@@ -74,7 +74,7 @@ def _branch(
     if predicate.is_constant:
         return yes() if predicate.attr else no()
     memory = builder.memory
-    branch = BranchInMaking(builder.graph, predicate)
+    branch = BranchBuilder(builder.graph, predicate)
     outs = []
     for side, run in enumerate((yes, no)):
         builder.path.append(side)
@@ -146,7 +146,7 @@ def _expanded(builder: Builder, equation: Any, values: list[Value]) -> list[Valu
 
 _CALLS = """
     checkpoint closed_call core_call custom_jvp_call custom_vjp_call
-    custom_vjp_call_jaxpr jit one_kernel pjit remat remat2
+    custom_vjp_call_jaxpr jit cpu_kernel pjit remat remat2
 """.split()  # noqa: SIM905
 BRANCHES: dict[str, Operation] = {
     **dict.fromkeys(_CALLS, _call),

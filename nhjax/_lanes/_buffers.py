@@ -15,10 +15,11 @@ Registers: TypeAlias = np.ndarray[Any, Any]
 
 
 class Buffer:
-    """A piece of memory.
+    """A piece of memory that a kernel reads or writes.
 
-    The kind is "operand", "result", "constant" or "scratch". Only scratch memory is
-    written and read; `is_fixed` says that nothing is stored any more.
+    The kind is "operand", "result", "constant" or "scratch". Operands and constants are
+    only read, results are only written, and scratch memory is both; `is_fixed` says
+    that nothing more is stored into it.
     """
 
     __slots__ = (
@@ -79,6 +80,6 @@ def hold(value: Value) -> None:
 
 
 def release(value: Value) -> None:
-    """Undo `hold`."""
+    """Allow a piece of memory that `hold` has kept to be used again."""
     if isinstance(value, InMemory):
         value.buffer.holders -= 1

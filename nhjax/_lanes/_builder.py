@@ -148,7 +148,7 @@ class Builder:
         return self.graph.convert(node, "int64")
 
     def integer(self, value: int) -> Node:
-        """Make a constant index."""
+        """Make an integer constant, for indices."""
         return self.graph.constant(value, "int64")
 
     def clamped(self, index: Node, most: int) -> Node:

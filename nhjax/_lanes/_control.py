@@ -16,7 +16,7 @@ _STATEMENTS = ("loop", "branch", "store", "load")
 
 
 class Control:
-    """The regions of a program.
+    """The writer of a program's regions, its loops and branches, as blocks of LLVM.
 
     `mask` has the lanes that are running; None stands for all of them. At least one
     lane is, wherever instructions are written: a region that no lane enters is jumped

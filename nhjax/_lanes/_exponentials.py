@@ -7,14 +7,14 @@ from ._body import Value, where
 from ._coefficients import COSH, EXP, SINH
 from ._intrinsics import absolute, with_sign
 from ._pairs import (
-    exact_sum,
+    fast_two_sum,
     nearest,
-    ordered_sum,
     Pair,
     polynomial,
     power_of_two,
     rounded_quotient,
     times_power_of_two,
+    two_sum,
 )
 
 
@@ -71,9 +71,9 @@ def _expm1_parts(x: Value) -> tuple[Value, Pair, Value]:
     exponent, (r, rest) = reduced(x)
     # 2^-n would be subnormal for the largest x, where it does not count.
     unit = where(x > 100.0, 0.0, power_of_two(-exponent))
-    high, low = ordered_sum(1.0 - unit, r)
+    high, low = fast_two_sum(1.0 - unit, r)
     tail = low + (r * r * polynomial(r, EXP) + rest)
-    return exponent, ordered_sum(high, tail), unit
+    return exponent, fast_two_sum(high, tail), unit
 
 
 def expm1(x: Value) -> Value:
@@ -87,7 +87,7 @@ def tanh(x: Value) -> Value:
     double = absolute(x) * 2.0
     _, above, unit = _expm1_parts(where(double > 44.0, 44.0, double))
     # exp(2x) - 1 was divided by 2^n, and so is the 2 by which exp(2x) + 1 is more.
-    high, low = exact_sum(above[0], unit * 2.0)
+    high, low = two_sum(above[0], unit * 2.0)
     return with_sign(rounded_quotient(above, (high, low + above[1])), x)
 
 
@@ -97,10 +97,10 @@ def logistic(x: Value) -> Value:
     size = -absolute(x)
     size = where(size < LOWEST, LOWEST, size)
     exponent, (r, rest) = reduced(size)
-    high, low = ordered_sum(1.0, r)
-    p = ordered_sum(high, low + (r * r * polynomial(r, EXP) + rest))
+    high, low = fast_two_sum(1.0, r)
+    p = fast_two_sum(high, low + (r * r * polynomial(r, EXP) + rest))
     scale = where(size < -700.0, 0.0, power_of_two(exponent))
-    below, error = ordered_sum(1.0, p[0] * scale)
+    below, error = fast_two_sum(1.0, p[0] * scale)
     is_negative = x < 0.0
     above = where(is_negative, p[0], 1.0), where(is_negative, p[1], 0.0)
     ratio = rounded_quotient(above, (below, error + p[1] * scale))
@@ -119,7 +119,7 @@ def _hyperbolic(x: Value, odd: bool) -> Value:
     u = u if odd else -u
     z = r * r
     c, s = z * polynomial(z, COSH), r * z * polynomial(z, SINH) + rest
-    high, low = ordered_sum(1.0 - u, r)
+    high, low = fast_two_sum(1.0 - u, r)
     # What r is multiplied by besides 1 stands alone, so that sinh(r) = r for small r.
     tail = u * r + (low + ((1.0 - u) * c + (1.0 + u) * s))
     return times_power_of_two(high + tail, exponent - 1)

@@ -166,7 +166,7 @@ def _scatter(
 def _combined(
     builder: Builder, equation: Any, op: str | None, old: Node, new: Node
 ) -> Node:
-    """Make what a scatter stores where one number stands and another one comes."""
+    """Combine the number in an array with its update, as a scatter stores it."""
     if op is not None:
         return builder.graph.op(op, old, new)
     # `x.at[index].apply(function)` is a scatter whose numbers come from a program.

@@ -58,7 +58,7 @@ class Region:
 
 
 class Node:
-    """A number, or a statement.
+    """A node of the graph: a number that is computed, or a statement.
 
     `attr` is what the operation needs beside its arguments: the value of a constant,
     the place of a load, the loop of a parameter. The fields from `live` on belong to
@@ -95,7 +95,7 @@ class Node:
 
     @property
     def is_constant(self) -> bool:
-        """Tell whether the value is known now."""
+        """Tell whether the value is known while the graph is made."""
         return self.op == "const" or self.op == "zero"
 
 
@@ -157,7 +157,7 @@ class Graph:
         return self.count
 
     def constant(self, value: Any, dtype: str, is_structural: bool = False) -> Node:
-        """Make a constant.
+        """Make the node of a constant.
 
         Of a structural zero it is known that a product with it is zero, whatever the
         other factor: the zeros around an array that is padded, or those of tangents.
@@ -172,7 +172,7 @@ class Graph:
         return node
 
     def zero(self, dtype: str) -> Node:
-        """Make a structural zero."""
+        """Make the node of a zero that is known while the graph is made."""
         return self.constant(0, dtype, is_structural=True)
 
     def pure(

@@ -242,7 +242,10 @@ _SHIFTS = {
 
 
 def _shift(writer: Writer, node: Node, width: int, args: list[str]) -> str:
-    """Shift; all bits are gone if there are too few of them."""
+    """Shift integers, also by as many bits as they have, or more, as XLA does.
+
+    Such a shift leaves zero, and an arithmetic one to the right leaves sign bits.
+    """
     kind, flag = vector(scalar_type(node.dtype), width), vector("i1", width)
     size, op = bits(node.dtype), _SHIFTS[node.op]
     limit = writer.splat(str(size), node.dtype, width)

@@ -6,7 +6,7 @@ from typing import NamedTuple
 from ._body import Value, where
 from ._coefficients import ASIN, ATAN
 from ._intrinsics import absolute, square_root, with_sign
-from ._pairs import ordered_sum, polynomial
+from ._pairs import fast_two_sum, polynomial
 
 
 _HALF_PI, _HALF_PI_LOW = math.pi / 2, 6.123233995736766e-17
@@ -35,7 +35,7 @@ class _Angle(NamedTuple):
         first, second = (
             where(self.is_low, x, where(self.is_high, z, y)) for x, y, z in multiples
         )
-        total, error = ordered_sum(first, sign * self.t)
+        total, error = fast_two_sum(first, sign * self.t)
         return total + (error + (sign * self.rest + second))
 
 
@@ -88,7 +88,7 @@ def _half_angle(x: Value) -> tuple[Value, Value, Value]:
 def asin(x: Value) -> Value:
     """Return the inverse sine of x."""
     is_large, t, rest = _half_angle(x)
-    high, low = ordered_sum(_HALF_PI, t * -2.0)
+    high, low = fast_two_sum(_HALF_PI, t * -2.0)
     large = high + (low - (2.0 * rest - _HALF_PI_LOW))
     return with_sign(where(is_large, large, t + rest), x)
 

@@ -63,8 +63,9 @@ class Live:
 def find_varying(live: Live, is_batched: tuple[bool, ...]) -> None:
     """Mark the nodes and the memory whose values differ between lanes.
 
-    Only what lanes that are still running see counts: in a loop that lanes leave at
-    different times, a counter that starts equal stays so, but its last value differs.
+    Values are compared between the lanes that are still running: in a loop that lanes
+    leave at different times, a counter that starts equal in all of them varies after
+    the loop, but not inside of it.
     """
     for buffer in live.buffers:
         if buffer.kind == "operand":

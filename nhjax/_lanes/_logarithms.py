@@ -11,14 +11,14 @@ from ._coefficients import LOG
 from ._exponentials import LN2_HIGH, LN2_LOW
 from ._intrinsics import absolute, with_sign
 from ._pairs import (
-    exact_product,
-    exact_sum,
+    fast_two_sum,
     ONE_BITS,
-    ordered_sum,
     polynomial,
     product,
     quotient,
     root,
+    two_product,
+    two_sum,
 )
 
 
@@ -58,7 +58,7 @@ def log(x: Value) -> Value:
 def _log1p(x: Value, low: Value | float = 0.0, doublings: Value | float = 0.0) -> Value:
     """Return log(1 + x + low) + doublings log(2), for finite x + low > -1."""
     with x.body.exact():
-        high, rest = exact_sum(x.body.constant("double", 1.0), x)
+        high, rest = two_sum(x.body.constant("double", 1.0), x)
         rest = rest + low
     k, m = parts(high)
     is_near = k.equals(0.0)
@@ -79,11 +79,11 @@ def asinh(x: Value) -> Value:
     """Return the inverse hyperbolic sine, log(1 + (x + sqrt(1 + x^2) - 1)), x > 0."""
     size = absolute(x)
     is_large = size > 2.0**100
-    square, error = exact_product(size, size)
-    more, lost = exact_sum(x.body.constant("double", 1.0), square)
-    length, rest = root(ordered_sum(more, lost + error))
-    length, error = exact_sum(length, x.body.constant("double", -1.0))
-    total, lost = exact_sum(size, length)
+    square, error = two_product(size, size)
+    more, lost = two_sum(x.body.constant("double", 1.0), square)
+    length, rest = root(fast_two_sum(more, lost + error))
+    length, error = two_sum(length, x.body.constant("double", -1.0))
+    total, lost = two_sum(size, length)
     result = _log1p(
         where(is_large, size, total),
         where(is_large, 0.0, lost + (error + rest)),
@@ -95,10 +95,10 @@ def asinh(x: Value) -> Value:
 def acosh(x: Value) -> Value:
     """Return the inverse hyperbolic cosine, log(1 + (x - 1 + sqrt(x^2 - 1)))."""
     is_large = x > 2.0**100
-    less = exact_sum(x, x.body.constant("double", -1.0))
-    more = exact_sum(x, x.body.constant("double", 1.0))
+    less = two_sum(x, x.body.constant("double", -1.0))
+    more = two_sum(x, x.body.constant("double", 1.0))
     length, rest = root(product(less, more))
-    total, lost = exact_sum(less[0], length)
+    total, lost = two_sum(less[0], length)
     result = _log1p(
         where(is_large, x, total),
         where(is_large, 0.0, lost + (less[1] + rest)),
@@ -111,7 +111,7 @@ def acosh(x: Value) -> Value:
 def atanh(x: Value) -> Value:
     """Return the inverse hyperbolic tangent, log(1 + 2x / (1 - x)) / 2 for x > 0."""
     size = absolute(x)
-    below = exact_sum(x.body.constant("double", 1.0), -size)
+    below = two_sum(x.body.constant("double", 1.0), -size)
     ratio, low = quotient((size * 2.0, size * 0.0), below)
     result = 0.5 * _log1p(ratio, low)
     result = where(size < 1.0, result, where(size.equals(1.0), math.inf, math.nan))

@@ -14,7 +14,7 @@ from ._buffers import hold, InMemory, Registers, release, Value
 from ._builder import Builder
 from ._graph import Node
 from ._memory import places
-from ._regions import LoopInMaking
+from ._regions import LoopBuilder
 
 
 _Predicate = Callable[[list[Value]], Node]
@@ -73,11 +73,14 @@ def _starts(values: Sequence[Value]) -> list[tuple[int, Registers]]:
 
 
 class _Attempt:
-    """A loop in which all numbers but those known to change are taken as constant."""
+    """A loop in which numbers that start as constants are taken to remain so.
+
+    Those whose positions are in `changing` are known to change.
+    """
 
     def __init__(self, builder: Builder, carried: list[Value], changing: set[int]):
         self.builder, self.carried = builder, carried
-        self.loop = LoopInMaking(builder.graph)
+        self.loop = LoopBuilder(builder.graph)
         self.changing = changing
         # By position: the constants that are assumed not to change, and the positions
         # of the parameters.

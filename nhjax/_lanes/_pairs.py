@@ -22,10 +22,10 @@ _HALF_UNIT = 1 << 26
 
 
 def polynomial(x: Value, coefficients: Sequence[float]) -> Value:
-    """Evaluate a polynomial, whose coefficients begin with the constant one.
+    """Evaluate a polynomial, given its coefficients by rising powers.
 
-    Even and odd powers are evaluated apart, and so on: the products then wait less for
-    one another than in a nest of products.
+    The even and the odd powers are evaluated apart, each in the same way, much as in
+    Estrin's scheme: fewer products wait for one another than in Horner's.
     """
     powers = [x]
     while 2 ** len(powers) < len(coefficients):
@@ -69,14 +69,14 @@ def power_of_two(exponent: Value) -> Value:
     return ((exponent << 52) + ONE_BITS).number()
 
 
-def ordered_sum(a: Value | float, b: Value) -> Pair:
+def fast_two_sum(a: Value | float, b: Value) -> Pair:
     """Return a + b without error, where a is 0 or |a| is at least |b|."""
     with b.body.exact():
         high = a + b
         return high, b - (high - a)
 
 
-def exact_sum(a: Value, b: Value) -> Pair:
+def two_sum(a: Value, b: Value) -> Pair:
     """Return a + b without error."""
     with a.body.exact():
         high = a + b
@@ -96,7 +96,7 @@ def halves(x: Value) -> Pair:
         return upper, x - upper
 
 
-def exact_product(a: Value, b: Value) -> Pair:
+def two_product(a: Value, b: Value) -> Pair:
     """Return a b without error, if there is no underflow."""
     with a.body.exact():
         high = a * b
@@ -106,17 +106,17 @@ def exact_product(a: Value, b: Value) -> Pair:
 
 def product(a: Pair, b: Pair) -> Pair:
     """Return the product of two pairs."""
-    high, low = exact_product(a[0], b[0])
-    return ordered_sum(high, low + (a[0] * b[1] + a[1] * b[0]))
+    high, low = two_product(a[0], b[0])
+    return fast_two_sum(high, low + (a[0] * b[1] + a[1] * b[0]))
 
 
 def quotient(a: Pair, b: Pair) -> Pair:
     """Return the quotient of two pairs."""
     high = a[0] / b[0]
-    back, error = exact_product(high, b[0])
+    back, error = two_product(high, b[0])
     with high.body.exact():
         rest = (a[0] - back) - error
-    return ordered_sum(high, (rest + (a[1] - high * b[1])) / b[0])
+    return fast_two_sum(high, (rest + (a[1] - high * b[1])) / b[0])
 
 
 def rounded_quotient(a: Pair, b: Pair) -> Value:
@@ -132,7 +132,7 @@ def rounded_quotient(a: Pair, b: Pair) -> Value:
 def root(a: Pair) -> Pair:
     """Return the square root of a pair that is positive."""
     high = square_root(a[0])
-    back, error = exact_product(high, high)
+    back, error = two_product(high, high)
     with high.body.exact():
         rest = ((a[0] - back) - error) + a[1]
-    return ordered_sum(high, rest / (high + high))
+    return fast_two_sum(high, rest / (high + high))

@@ -18,7 +18,7 @@ ALIGNMENT = 64
 
 
 class Places:
-    """The memory of a kernel."""
+    """Where the arrays of a kernel lie in memory."""
 
     def __init__(self, text: Text, buffers: list[Buffer]):
         self.text, self.width = text, text.width

@@ -8,10 +8,10 @@ from ._exponentials import clamped, exp_of_pair, HIGHEST, LN2_HIGH, LN2_LOW, LOW
 from ._intrinsics import absolute, with_sign
 from ._logarithms import parts
 from ._pairs import (
+    fast_two_sum,
     halves,
     leading_bits,
     nearest,
-    ordered_sum,
     Pair,
     polynomial,
     times_power_of_two,
@@ -39,11 +39,11 @@ def _long_log(x: Value) -> Pair:
         z = a * a
         c = leading_bits(z * _THIRD, 24)
         left = (z - 3.0 * c) * _THIRD
-        high, low = ordered_sum(a, a * c)
+        high, low = fast_two_sum(a, a * c)
     more = a * (left + z * z * polynomial(z, LOG_LONG))
     # The difference of artanh(s) and artanh(a) is that of an argument.
     more = low + (more + rest / (d - d * (a * ratio)))
-    total, lost = ordered_sum(k * LN2_HIGH, high * 2.0)
+    total, lost = fast_two_sum(k * LN2_HIGH, high * 2.0)
     low = lost + (k * LN2_LOW + more * 2.0)
     with x.body.exact():
         first = leading_bits(total + low, 26)

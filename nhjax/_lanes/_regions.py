@@ -9,7 +9,7 @@ from ._graph import BranchInfo, Graph, LoopInfo, Node, Region
 T = TypeVar("T")
 
 
-class LoopInMaking:
+class LoopBuilder:
     """A loop whose body is made inside of a `with` statement."""
 
     def __init__(self, graph: Graph):
@@ -18,7 +18,7 @@ class LoopInMaking:
         self.info = LoopInfo(Region(graph.region, self.node, is_side=False))
         self.node.attr = self.info
 
-    def __enter__(self) -> "LoopInMaking":
+    def __enter__(self) -> "LoopBuilder":
         self.graph.region = self.info.region
         return self
 
@@ -51,7 +51,7 @@ class LoopInMaking:
         for index, (param, init, after) in enumerate(
             zip(info.params, info.inits, info.outs, strict=True)
         ):
-            # What is handed on as it is never changes.
+            # A parameter that the body returns unchanged keeps its first value.
             if after is param:
                 out.append(init)
             else:
@@ -66,14 +66,14 @@ def counted(graph: Graph, length: int, body: Callable[[Node], None]) -> None:
     """Make a loop over a counter from 0 to `length`, whose body only stores."""
     if length == 0:
         return
-    with LoopInMaking(graph) as loop:
+    with LoopBuilder(graph) as loop:
         k = loop.parameter(graph.constant(0, "int64"))
         loop.goes_on_while(graph.op("lt", k, graph.constant(length, "int64")))
         body(k)
         loop.end([graph.op("add", k, graph.constant(1, "int64"))])
 
 
-class BranchInMaking:
+class BranchBuilder:
     """A branch; its two sides are made one after the other."""
 
     def __init__(self, graph: Graph, predicate: Node):

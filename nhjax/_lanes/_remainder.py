@@ -4,7 +4,7 @@ import math
 
 from ._body import Value, where
 from ._intrinsics import absolute, with_sign
-from ._pairs import exact_product, nearest
+from ._pairs import nearest, two_product
 
 
 _LARGEST_QUOTIENT = 2.0**50
@@ -67,7 +67,7 @@ def rem(x: Value, y: Value) -> Value:
     a, b = absolute(x), absolute(y)
     ratio = a / b
     whole, _ = nearest(ratio)
-    high, low = exact_product(whole, b)
+    high, low = two_product(whole, b)
     with x.body.exact():
         rest = (a - high) - low
         rest = where(rest < 0.0, rest + b, rest)
@@ -81,5 +81,5 @@ def rem(x: Value, y: Value) -> Value:
         x.body.needed[_NAME] = _FUNCTION
         return x.body.lane_by_lane(f"@{_NAME}", ("double",), a, b)
 
-    (rest,) = x.body.unless_usual(is_long, (rest,), otherwise)
+    (rest,) = x.body.with_rare_case(is_long, (rest,), otherwise)
     return with_sign(rest, x)

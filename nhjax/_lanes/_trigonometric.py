@@ -11,7 +11,7 @@ from ._body import Value, where
 from ._coefficients import COS, SIN
 from ._intrinsics import absolute
 from ._large_arguments import FUNCTION, NAME
-from ._pairs import exact_sum, nearest, ordered_sum, Pair, polynomial, rounded_quotient
+from ._pairs import fast_two_sum, nearest, Pair, polynomial, rounded_quotient, two_sum
 
 
 _PER_HALF_PI = 0.6366197723675814
@@ -26,7 +26,7 @@ def _reduced(x: Value) -> tuple[Value, Pair]:
     n, bits = nearest(x * _PER_HALF_PI)
     with x.body.exact():
         first, second = x - n * _PARTS[0], n * _PARTS[1]
-        difference, error = exact_sum(first, -second)
+        difference, error = two_sum(first, -second)
         small = n * _PARTS[2] - error
         high = difference - small
         low = (difference - high) - small
@@ -38,7 +38,7 @@ def _reduced(x: Value) -> tuple[Value, Pair]:
         x.body.needed[NAME] = FUNCTION
         return x.body.lane_by_lane(f"@{NAME}", ("i64", "double", "double"), x)
 
-    n, high, low = x.body.unless_usual(is_large, (bits, high, low), otherwise)
+    n, high, low = x.body.with_rare_case(is_large, (bits, high, low), otherwise)
     return n, (high, low)
 
 
@@ -47,7 +47,7 @@ def _sine_and_cosine(r: Pair) -> tuple[Pair, Pair]:
     high, low = r
     z = high * high
     half = 0.5 * z
-    one, error = ordered_sum(1.0, -half)
+    one, error = fast_two_sum(1.0, -half)
     sine = high * z * polynomial(z, SIN) + low * one
     cosine = error + (z * z * polynomial(z, COS) - high * low)
     return (high, sine), (one, cosine)
@@ -68,7 +68,7 @@ def sine_and_cosine(x: Value) -> tuple[Value, Value]:
 def tan(x: Value) -> Value:
     """Return the tangent of x."""
     n, r = _reduced(x)
-    s, c = (ordered_sum(*pair) for pair in _sine_and_cosine(r))
+    s, c = (fast_two_sum(*pair) for pair in _sine_and_cosine(r))
     is_odd = (n & 1).equals(1)
     above = [where(is_odd, b, a) for a, b in zip(s, c, strict=True)]
     below = [where(is_odd, a, b) for a, b in zip(s, c, strict=True)]

@@ -34,7 +34,7 @@ def suffix(dtype: str, width: int, is_memory: bool = False) -> str:
 
 
 def literal(value: Any, dtype: str) -> str:
-    """Write a constant."""
+    """Write a constant as LLVM reads it."""
     if is_float(dtype):
         # LLVM writes numbers of all precisions with 64 bits.
         return f"0x{struct.unpack('<Q', struct.pack('<d', float(value)))[0]:016X}"

@@ -41,12 +41,12 @@ class Text:
         return len(self.lines) - 1
 
     def label(self, name: str) -> None:
-        """Start a block."""
+        """Start a block of LLVM with its label."""
         self.lines.append(f"{name}:")
         self.block = name
 
     def declare(self, name: str, declaration: str) -> None:
-        """Declare a function, once."""
+        """Declare a function to LLVM, unless it is declared already."""
         self.declared[name] = declaration
 
     def want(self, op: str, dtype: str, width: int) -> None:

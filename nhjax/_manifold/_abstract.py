@@ -103,7 +103,7 @@ class AbstractLieGroup(eqx.Module):
         return jax.tree.map(jnp.zeros_like, q)
 
     def wrapped(self, q: Element, compensation: Element) -> Element:
-        """Return g as functions on the group are given it by a step.
+        """Return `q` with its angles reduced to one turn, as functions are given it.
 
         An angle that has grown over many turns is replaced by the one of the first turn
         that means the same, which holds more of its digits; to these the compensation

@@ -96,7 +96,7 @@ class SE2(AbstractMotionGroup):
         return jnp.concatenate([v, rate])
 
     def wrapped(self, q: Pose, compensation: Pose) -> Pose:
-        """Return the pose with the angle of the first turn, between -π and π."""
+        """Return the pose with its angle reduced to one turn, between -π and π."""
         return jnp.concatenate([q[:2], wrapped_angle(q[2:], compensation[2:])])
 
     def advance(self, q: Pose, xi: Vector, compensation: Pose) -> tuple[Pose, Pose]:

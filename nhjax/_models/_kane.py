@@ -146,12 +146,12 @@ def _check_velocity(body: Any, frame: Any, solved: dict[Any, Any]) -> None:
 
 
 def _vanishes(expression: Any) -> bool:
-    """Tell whether an expression is zero, at some point that is nothing special."""
+    """Tell whether an expression vanishes at a generic point."""
     return abs(_at_a_point(expression)) < 1e-9
 
 
 def _at_a_point(expression: Any) -> complex:
-    """Evaluate an expression where its variables have values that are nothing special.
+    """Evaluate an expression at a generic point, in the numbers of `_value_of`.
 
     The value of a variable depends on its name alone, so that several expressions are
     evaluated at the same point.

@@ -35,12 +35,12 @@ from ._iteration import (
     Solved as Solved,
 )
 from ._least_norm import (
-    conditioning_of_range as conditioning_of_range,
     least_norm_inverse as least_norm_inverse,
-    least_norm_inverse_in_turn as least_norm_inverse_in_turn,
+    least_norm_inverse_by_blocks as least_norm_inverse_by_blocks,
     least_norm_solve as least_norm_solve,
     NEARLY_DEPENDENT as NEARLY_DEPENDENT,
     rank_of_gram as rank_of_gram,
+    reciprocal_condition_of_range as reciprocal_condition_of_range,
 )
 from ._max_norm import (
     largest_column as largest_column,
@@ -53,12 +53,12 @@ from ._no_gradient import (
     nan_tangent_unless as nan_tangent_unless,
 )
 from ._rank import (
-    conditioning as conditioning,
     dependent_rows as dependent_rows,
     is_deficient as is_deficient,
     is_nearly_singular as is_nearly_singular,
     is_without_entries as is_without_entries,
     Rank as Rank,
+    reciprocal_condition as reciprocal_condition,
     those_that_count as those_that_count,
 )
 from ._sparse import (
@@ -67,4 +67,4 @@ from ._sparse import (
     SparseMatrix as SparseMatrix,
     WeightedTranspose as WeightedTranspose,
 )
-from ._uneven_moves import uneven_moves as uneven_moves
+from ._uneven_perturbations import uneven_perturbations as uneven_perturbations

@@ -15,11 +15,12 @@ from ._static_take import static_take
 def couplings(
     left: SparseMatrix, right: SparseMatrix, weights: Float[Array, " n"]
 ) -> Float[Array, "r s c b l"]:
-    """Compute what is needed of the products L_i K R_jᵀ, with K = diag(weights).
+    """Compute the products L_i K R_jᵀ in compressed form, with K = diag(weights).
 
-    Of the columns those whose blocks have the same number modulo three are added up:
-    each row meets one block of the three at most. The result holds sum c, of column b
-    of its blocks.
+    They are block tridiagonal in the order of the pattern, so that a row has entries in
+    at most one of the blocks whose numbers are equal modulo three: their columns can be
+    added up. Entry [i, j, c, b, a] of the result is that of row a in the sum of the
+    columns b of all blocks whose number is c modulo three.
     """
     pattern = left.pattern
     place = np.argsort(pattern.order)
@@ -32,11 +33,11 @@ def couplings(
         ]
     )
     seeds = jnp.asarray(chosen, left.values.dtype)
-    pushed = weights[None, None] * SparseMatrix(
-        right.values[:, None], pattern
-    ).apply_transposed(seeds[None])
+    pushed = weights[None, None] * SparseMatrix(right.values[:, None], pattern).rmatvec(
+        seeds[None]
+    )
     rows = SparseMatrix(left.values[:, None, None], pattern)
-    found = rows.apply(pushed[None])
+    found = rows.matvec(pushed[None])
     return found.reshape(*found.shape[:2], 3, pattern.group, -1)
 
 
@@ -59,7 +60,7 @@ class BlockTridiagonalInverse(AbstractLinearMap):
     upper: Float[Array, "N g g"]
     pattern: Pattern = eqx.field(static=True)
 
-    def apply(self, x: Float[Array, "..."]) -> Float[Array, "..."]:
+    def matvec(self, x: Float[Array, "..."]) -> Float[Array, "..."]:
         """Compute the solution for a residual."""
         pattern, count = self.pattern, self.inverses.shape[0]
         size, shape = pattern.shape[0], x.shape
@@ -103,23 +104,24 @@ class BlockTridiagonalInverse(AbstractLinearMap):
 
 
 class _Estimated(AbstractLinearMap):
-    """The largest of what an inverse makes of vectors of sizes with any signs.
+    """An estimate of |C⁻¹|, by products with C⁻¹ alone.
 
-    Two choices of signs stand for all of them. They are exact for the matrices of
-    springs or rods in a row, whose inverse has entries of one sign, or of two that
-    alternate.
+    For x >= 0, |C⁻¹| x is, entry by entry, the largest |C⁻¹ y| of all y that differ
+    from x in signs alone. Two choices of signs stand for all of them. They are exact
+    for the matrices of springs or rods in a row, whose inverse has entries of one sign,
+    or of two that alternate.
     """
 
     map: BlockTridiagonalInverse
 
-    def apply(self, x: Float[Array, " l"]) -> Float[Array, " l"]:
+    def matvec(self, x: Float[Array, " l"]) -> Float[Array, " l"]:
         """Estimate |C⁻¹| x for sizes x."""
         signs = (-1.0) ** np.argsort(self.map.pattern.order)
-        other = self.map.apply(x * jnp.asarray(signs, x.dtype))
-        return jnp.maximum(jnp.abs(self.map.apply(x)), jnp.abs(other))
+        other = self.map.matvec(x * jnp.asarray(signs, x.dtype))
+        return jnp.maximum(jnp.abs(self.map.matvec(x)), jnp.abs(other))
 
     def absolute(self) -> AbstractLinearMap:
-        """Return the map itself."""
+        """Return the map of absolute values, which is the map itself."""
         return self
 
 

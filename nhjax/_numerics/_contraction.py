@@ -33,7 +33,7 @@ class AbstractLinearMap(eqx.Module):
     """A matrix that is not kept as an array of its entries."""
 
     @abstractmethod
-    def apply(self, x: Float[Array, "..."]) -> Float[Array, "..."]:
+    def matvec(self, x: Float[Array, "..."]) -> Float[Array, "..."]:
         """Multiply the vectors along the last axis of x by the matrix."""
 
     @abstractmethod
@@ -94,7 +94,7 @@ def matvec(
     axes.
     """
     if isinstance(matrix, AbstractLinearMap):
-        return matrix.apply(x)
+        return matrix.matvec(x)
     if matrix.ndim == 1:
         return jnp.expand_dims(matrix, range(x.ndim - 1)) * x
     rows = "abc"[: x.ndim - 1]

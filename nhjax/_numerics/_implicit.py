@@ -161,7 +161,7 @@ def root(
 
 
 def moving_with(tree: X, parameters: PyTree[Any]) -> X:
-    """Return the same values, which are differentiated wherever a parameter is.
+    """Return the same values, with tangents wherever any parameter has one.
 
     JAX traces the body of a loop once more if a part of the carry that had no
     derivative at the start has one after a round. What starts a loop is given a

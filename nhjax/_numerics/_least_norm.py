@@ -11,9 +11,8 @@ from .._custom_types import FloatScalar
 def _negligible(dtype: jnp.dtype) -> float:
     """Return the size of eigenvalues of a scaled matrix that count as zero.
 
-    Round-off leaves some units of itself where an eigenvalue is zero, and independent
-    constraints that are as close to dependent ones as this are none that any solution
-    could tell from these.
+    Round-off leaves a few units of itself in the place of an eigenvalue that is zero.
+    Constraints that are so close to being dependent cannot be told from dependent ones.
     """
     return float(jnp.finfo(dtype).eps) ** 0.75
 
@@ -53,10 +52,10 @@ def least_norm_inverse(
     return found / root[:, None] / root[None, :]
 
 
-def least_norm_inverse_in_turn(
+def least_norm_inverse_by_blocks(
     matrix: Float[Array, "l l"], first: int
 ) -> Float[Array, "l l"]:
-    """Compute a symmetric inverse of C that asks the last unknowns before the others.
+    """Compute a generalised inverse of C that solves the last equations first.
 
     As far as the `first` equations follow from the other ones, their unknowns are zero.
     For the rest, each of the two parts of x has the least norm of `least_norm_inverse`.
@@ -86,7 +85,7 @@ def rank_of_gram(matrix: Float[Array, "l l"]) -> Int[Array, ""]:
     return jnp.sum(_eigenvalues(matrix)[1])
 
 
-def conditioning_of_range(matrix: Float[Array, "l l"]) -> FloatScalar:
+def reciprocal_condition_of_range(matrix: Float[Array, "l l"]) -> FloatScalar:
     """Compute the ratio of the smallest eigenvalue that is not zero to the largest."""
     if matrix.shape[0] == 0:
         return jnp.ones((), matrix.dtype)

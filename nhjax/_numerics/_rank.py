@@ -44,8 +44,8 @@ def those_that_count(ranks: list[Rank]) -> list[Rank]:
     return list(merged.values())
 
 
-def conditioning(matrix: Float[Array, "k l"]) -> FloatScalar:
-    """Compute the ratio of the smallest to the largest singular value, after scaling.
+def reciprocal_condition(matrix: Float[Array, "k l"]) -> FloatScalar:
+    """Compute the reciprocal condition number of the rows of a matrix, after scaling.
 
     Rows, and of square matrices the columns too, are scaled to size one, which makes
     the ratio independent of the units of single coordinates and constraints.
@@ -73,7 +73,7 @@ def conditioning(matrix: Float[Array, "k l"]) -> FloatScalar:
 def is_deficient(matrix: Float[Array, "k l"]) -> BoolScalar:
     """Tell whether the rows are dependent up to round-off; NaN does not count so."""
     eps = jnp.finfo(matrix.dtype).eps
-    return conditioning(matrix) <= 10 * matrix.shape[1] * eps
+    return reciprocal_condition(matrix) <= 10 * matrix.shape[1] * eps
 
 
 def is_without_entries(matrix: Float[Array, "k l"]) -> BoolScalar:

@@ -96,7 +96,7 @@ class SparseMatrix(AbstractLinearMap):
     def __getitem__(self, k: int | slice) -> "SparseMatrix":
         return SparseMatrix(self.values[k], self.pattern)
 
-    def apply(self, x: Float[Array, "... n"]) -> Float[Array, "... l"]:
+    def matvec(self, x: Float[Array, "... n"]) -> Float[Array, "... l"]:
         """Compute B x for vectors along the last axis."""
         taken = [static_take(x, columns) for columns in self.pattern.columns]
         rows = [self.values[..., e, :] for e in range(len(taken))]
@@ -105,7 +105,7 @@ class SparseMatrix(AbstractLinearMap):
             [_raised(row, x) * x for row, x in zip(rows, taken, strict=True)],
         )
 
-    def apply_transposed(self, y: Float[Array, "... l"]) -> Float[Array, "... n"]:
+    def rmatvec(self, y: Float[Array, "... l"]) -> Float[Array, "... n"]:
         """Compute Bᵀ y for vectors along the last axis."""
         y = y[..., None, :]
         products = _raised(self.values, y) * _raised(y, self.values)
@@ -131,9 +131,9 @@ class WeightedTranspose(AbstractLinearMap):
     def __getitem__(self, k: int | slice) -> "WeightedTranspose":
         return WeightedTranspose(self.weights, self.matrix[k])
 
-    def apply(self, x: Float[Array, "... l"]) -> Float[Array, "... n"]:
+    def matvec(self, x: Float[Array, "... l"]) -> Float[Array, "... n"]:
         """Compute diag(w) Bᵀ x for vectors along the last axis."""
-        product = self.matrix.apply_transposed(x)
+        product = self.matrix.rmatvec(x)
         return jnp.expand_dims(self.weights, range(product.ndim - 1)) * product
 
     def absolute(self) -> "WeightedTranspose":

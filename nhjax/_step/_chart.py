@@ -130,12 +130,12 @@ class FlatChart(AbstractChart):
 
     @property
     def origin(self) -> PyTree[Array]:
-        """Return q_k."""
+        """Return the origin of the chart, which is q_k."""
         return self.start
 
     @property
     def ends(self) -> tuple[Vector, Vector]:
-        """Return 0 and ξ."""
+        """Return the coordinates 0 and ξ of both ends of the step."""
         return jnp.zeros_like(self.increment), self.increment
 
     def coordinates(self, increment: Vectors) -> Vectors:

@@ -66,12 +66,12 @@ class StartChart(AbstractCurvedChart):
 
     @property
     def origin(self) -> PyTree[Array]:
-        """Return g_k."""
+        """Return the origin of the chart, which is g_k."""
         return self.start
 
     @property
     def ends(self) -> tuple[Vector, Vector]:
-        """Return 0 and ξ."""
+        """Return the coordinates 0 and ξ of both ends of the step."""
         return jnp.zeros_like(self.increment), self.increment
 
     def coordinates(self, increment: Vectors) -> Vectors:
@@ -79,7 +79,7 @@ class StartChart(AbstractCurvedChart):
         return increment
 
     def momentum_at_origin(self, momentum: Vector) -> Vector:
-        """Return μ_k unchanged."""
+        """Return the momentum μ_k, which is given at the origin."""
         return momentum
 
     def base_momentum(
@@ -123,16 +123,16 @@ class MiddleChart(AbstractCurvedChart):
 
     @property
     def origin(self) -> PyTree[Array]:
-        """Compute g_k τ(-ξ/2)⁻¹."""
+        """Compute the origin of the chart, g_k τ(-ξ/2)⁻¹."""
         return self.manifold.act_back(self.start, -self._half)
 
     @property
     def ends(self) -> tuple[Vector, Vector]:
-        """Return -ξ/2 and ξ/2."""
+        """Return the coordinates -ξ/2 and ξ/2 of both ends of the step."""
         return -self._half, self._half
 
     def coordinates(self, increment: Vectors) -> Vectors:
-        """Compute y = Ξ - ξ/2."""
+        """Compute the coordinates y = Ξ - ξ/2 of the stages."""
         return increment - self._half[None]
 
     def momentum_at_origin(self, momentum: Vector) -> Vector:

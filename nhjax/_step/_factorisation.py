@@ -113,17 +113,17 @@ def _first_order(
         for p in momenta
     )
     velocity = terms.of_stages(stages, on_stages)
-    fibre = terms.of_nodes(on_nodes) + terms.by_force(stages, velocity)
-    fibre = fibre + terms.by_position(stages, velocity)
+    at_nodes = terms.of_nodes(on_nodes) + terms.by_force(stages, velocity)
+    at_nodes = at_nodes + terms.by_position(stages, velocity)
 
-    def constraints(velocity, fibre):
-        moved = replace(x, velocity=velocity, node_fibre_coordinate=fibre)
+    def constraints(velocity, at_nodes):
+        moved = replace(x, velocity=velocity, node_fibre_coordinate=at_nodes)
         return jnp.concatenate(
             [value.reshape(-1) for value in constraint_values(stages, moved)]
         )
 
     _, push = jax.linearize(constraints, x.velocity, x.node_fibre_coordinate)
-    schur = jax.vmap(push, in_axes=2, out_axes=1)(velocity, fibre)
+    schur = jax.vmap(push, in_axes=2, out_axes=1)(velocity, at_nodes)
     return LeadingStructure(
         momentum_inverse=lin.momentum_inverse,
         reaction=reaction,
@@ -131,7 +131,7 @@ def _first_order(
         schur_inverse=inverse(schur),
         end=_with_inertia_at_end(lin, terms, jacobian[-1]),
         first_order=terms,
-        responses=Responses(velocity, fibre),
+        responses=Responses(velocity, at_nodes),
     )
 
 

@@ -9,7 +9,7 @@ from jaxtyping import Array, Float
 
 from .._custom_types import FloatScalar
 from .._numerics import full_jacobian, small_einsum
-from .._system import Linearisation, whole_force
+from .._system import Linearisation, total_force
 from ._positions import in_nodes, in_stages
 from ._stage_system import StageSystem
 from ._unknowns import Stages
@@ -48,7 +48,7 @@ class FirstOrderTerms(eqx.Module):
     def of_stages(
         self, stages: StageSystem, z: Float[Array, "s n *c"]
     ) -> Float[Array, "s n *c"]:
-        """Compute the changes of the stage velocities that balance N z."""
+        """Solve for changes of stage velocities that change the residuals by N z."""
         a, a_hat, b = (stages.coefficients(name) for name in ("a", "a_hat", "b"))
         by_node = _weighted(a, z)
         return (
@@ -66,7 +66,7 @@ class FirstOrderTerms(eqx.Module):
     def by_force(
         self, stages: StageSystem, change: Float[Array, "s n *c"]
     ) -> Float[Array, "r n *c"]:
-        """Compute how forces move the nodes if the stage velocities change."""
+        """Compute the changes of the node velocities by forces, given the stages'."""
         return _times(self.node_force, _weighted(stages.node_weights, change))
 
     def by_position(
@@ -219,7 +219,7 @@ def _in_body(stages: StageSystem, u: Array, acceleration: Array) -> _BodySlopes:
 def _force_slope(stages: StageSystem, x: Stages, u: Array) -> Array:
     system, t, q, args = stages.system, stages.t, stages.q, stages.args
     multiplier = stages.multipliers(x)[0]
-    return full_jacobian(lambda u: whole_force(system, t, q, u, multiplier, args), u)
+    return full_jacobian(lambda u: total_force(system, t, q, u, multiplier, args), u)
 
 
 def _in_chart(stages: StageSystem, x: Stages, u: Array) -> _ChartSlopes:
@@ -232,7 +232,7 @@ def _in_chart(stages: StageSystem, x: Stages, u: Array) -> _ChartSlopes:
         q = manifold.act(stages.q, xi)
         u = chart.body_velocities(y[None], velocity[None])[0]
         p = system.momentum(t, q, u, args)
-        w = whole_force(system, t, q, u, multiplier, args)
+        w = total_force(system, t, q, u, multiplier, args)
         in_chart = chart.to_chart(y[None], velocity[None], p[None], w[None])
         return in_chart[0][0], in_chart[1][0], w
 

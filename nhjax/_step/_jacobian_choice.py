@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 
 from .._numerics import dependence, full_jacobian, SparseMatrix
-from .._system import Linearisation, whole_force
+from .._system import Linearisation, total_force
 from ._stage_system import StageSystem
 
 
@@ -57,7 +57,7 @@ def _forces_have_slopes(stages: StageSystem) -> bool:
     """
 
     def force(u):
-        return whole_force(
+        return total_force(
             stages.system, stages.t, stages.q, u, stages.multiplier, stages.args
         )
 
@@ -78,6 +78,6 @@ def _has_terms(stages: StageSystem) -> bool:
         lambda xi: system.momentum(t, stages.manifold.act(q, xi), zero, args), zero
     )
     by_velocity = dependence(
-        lambda u: whole_force(system, t, q, u, stages.multiplier, args), zero
+        lambda u: total_force(system, t, q, u, stages.multiplier, args), zero
     )
     return bool(by_position.any() or by_velocity.any())

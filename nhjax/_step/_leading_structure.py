@@ -89,8 +89,8 @@ class LeadingStructure(eqx.Module):
         if self.first_order is not None:
             du = self.first_order.of_nodes(du)
             du = du + self.first_order.by_force(stages, change)
-        fibre = x.node_fibre_coordinate + du
-        return eqx.tree_at(lambda z: z.node_fibre_coordinate, x, fibre)
+        at_nodes = x.node_fibre_coordinate + du
+        return eqx.tree_at(lambda z: z.node_fibre_coordinate, x, at_nodes)
 
     def correct_multipliers(
         self,
@@ -105,12 +105,12 @@ class LeadingStructure(eqx.Module):
         h_dy = change[: x.closure.size].reshape(x.closure.shape)
         h_dholonomic = change[x.closure.size :].reshape(x.holonomic.shape)
         if self.responses is not None:
-            velocity, fibre = self.responses
+            velocity, at_nodes = self.responses
             return replace(
                 x,
                 velocity=x.velocity + small_einsum("inc,c->in", velocity, change),
                 node_fibre_coordinate=x.node_fibre_coordinate
-                + small_einsum("inc,c->in", fibre, change),
+                + small_einsum("inc,c->in", at_nodes, change),
                 closure=x.closure + h_dy / stages.h,
                 holonomic=x.holonomic + h_dholonomic / stages.h,
             )
@@ -185,7 +185,8 @@ class LeadingStructure(eqx.Module):
     ) -> Stages:
         """Change ε so that the linearised equations of the invariants hold.
 
-        The stages and nodes change with it, for the reason that the end does with λ_c.
+        The stages and nodes change with ε, so that to leading order their momentum
+        equations, which have just been solved, still hold.
         """
         weights = self.impulses
         assert weights is not None
@@ -197,12 +198,14 @@ class LeadingStructure(eqx.Module):
         momentum = x.momentum
         if stages.hamiltonian:
             momentum = momentum + start[None]
-        fibre = x.node_fibre_coordinate + start[None]
+        at_nodes = x.node_fibre_coordinate + start[None]
         return replace(
             x,
             velocity=x.velocity + velocity[None],
             momentum=momentum,
-            node_fibre_coordinate=jnp.concatenate([fibre[:-1], fibre[-1:] + end[None]]),
+            node_fibre_coordinate=jnp.concatenate(
+                [at_nodes[:-1], at_nodes[-1:] + end[None]]
+            ),
             impulse=x.impulse + change,
         )
 
@@ -211,5 +214,5 @@ def _pushed(
     reaction: Float[Array, "s n l"] | WeightedTranspose, multiplier: Float[Array, "s l"]
 ) -> Float[Array, "s n"]:
     if isinstance(reaction, WeightedTranspose):
-        return reaction.apply(multiplier)
+        return reaction.matvec(multiplier)
     return small_einsum("jnm,jm->jn", reaction, multiplier)

@@ -39,7 +39,7 @@ def stage_positions(
 
 
 def end_position(stages: StageSystem, x: Stages) -> PyTree[Array]:
-    """Compute q_{k+1}."""
+    """Compute the configuration q_{k+1} at the end of the step."""
     chart = stages.chart(x)
     return chart.position(chart.ends[1])
 

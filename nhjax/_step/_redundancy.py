@@ -52,14 +52,14 @@ class Redundancy(eqx.Module):
     def reduced(
         self, values: Float[Array, "r c"], multipliers: Float[Array, "r c"], first: int
     ) -> Float[Array, "r c"]:
-        """Reduce constraints and the h Λ that belong to them, from row `first` on."""
+        """Compute P Φ + (1 - P) diag(C) h Λ for the rows from `first` on."""
         rows = slice(first, first + values.shape[1])
         return small_einsum(
             "ab,rb->ra", self.projector[rows, rows], values
         ) + small_einsum("ab,rb->ra", self.rest[rows, rows], multipliers)
 
     def schur_rest(self, stages: int, m: int) -> Float[Array, "c c"]:
-        """Compute the derivative of what `reduced` adds, for m nonholonomic rows."""
+        """Compute the derivative of (1 - P) diag(C) h Λ by all h Λ; m is as in `at`."""
         k = self.rest.shape[0] - m
         counts = (stages - 1) * (m > 0), stages * (k > 0)
         blocks = [self.rest[:m, :m]] * counts[0] + [self.rest[m:, m:]] * counts[1]

@@ -8,7 +8,7 @@ from jaxtyping import Array, Float, PyTree
 
 from .._custom_types import FloatScalar
 from .._manifold import unframed
-from .._numerics import absolute, matvec, max_norm, uneven_moves
+from .._numerics import absolute, matvec, max_norm, uneven_perturbations
 from .._system import Linearisation, position_scale
 from ._stage_equations import impulse_weights
 from ._stage_system import StageSystem
@@ -79,7 +79,7 @@ def _kinematic_scale(
     change = jax.jvp(
         lambda q: system.kinematic_constraint(t, q, u, args),
         (q,),
-        (uneven_moves(q),),
+        (uneven_perturbations(q),),
     )[1]
     # Where a constraint has no finite slope this tells nothing of its round-off.
     return jnp.where(jnp.isfinite(change), jnp.abs(change), 0)

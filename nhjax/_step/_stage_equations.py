@@ -9,7 +9,7 @@ from jaxtyping import Array, Float
 
 from .._custom_types import BoolScalar
 from .._numerics import Pattern, small_einsum, sparse_jacobian, SparseMatrix
-from .._system import motion_residual, whole_force
+from .._system import motion_residual, total_force
 from ._invariants import ImpulseWeights, moving_part
 from ._positions import end_position, in_nodes, in_stages, stage_positions
 from ._stage_system import StageSystem
@@ -37,7 +37,7 @@ def stage_forces(stages: StageSystem, x: Stages) -> StageForces:
     u = x.momentum if stages.hamiltonian else chart.body_velocities(y, x.velocity)
     force, momentum = jax.vmap(
         lambda t, q, u, lam: (
-            whole_force(stages.system, t, q, u, lam, stages.args),
+            total_force(stages.system, t, q, u, lam, stages.args),
             stages.system.momentum(t, q, u, stages.args),
         )
     )(stages.stage_times, q, u, multiplier)
@@ -135,16 +135,16 @@ def sparse_constraint_jacobian(
 def _at_nodes(
     stages: StageSystem, x: Stages, differentiated: Callable[..., Callable[..., T]]
 ) -> T:
-    times, fibre = stages.stage_times[1:], x.node_fibre_coordinate
+    times, u = stages.stage_times[1:], x.node_fibre_coordinate
     if not stages.num_nonholonomic:
-        fibre = jnp.broadcast_to(fibre, (stages.method.stages - 1, fibre.shape[1]))
+        u = jnp.broadcast_to(u, (stages.method.stages - 1, u.shape[1]))
     chart, y = in_stages(stages, x)
     nodes = chart.positions(y[1:])
     return jax.vmap(
         lambda t, q, u: differentiated(
             lambda u: stages.system.constraint(t, q, u, stages.args)
         )(u)
-    )(times, nodes, fibre)
+    )(times, nodes, u)
 
 
 def end_residual(

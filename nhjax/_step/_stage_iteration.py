@@ -140,8 +140,8 @@ def fibre_coordinate_size(stages: StageSystem, x: Stages) -> FloatScalar:
     While an iteration is far from a solution, one of the two can be much larger than
     any size that has to do with the other.
     """
-    fibre = x.momentum if stages.hamiltonian else x.velocity
-    return jnp.minimum(max_norm(fibre), max_norm(x.node_fibre_coordinate))
+    u = x.momentum if stages.hamiltonian else x.velocity
+    return jnp.minimum(max_norm(u), max_norm(x.node_fibre_coordinate))
 
 
 def increment_size(

@@ -11,7 +11,7 @@ from jaxtyping import Array, Float, PyTree
 from .._custom_types import Args, FloatScalar
 from .._manifold import AbstractLieGroup, unframed
 from .._method import AbstractMethod
-from .._numerics import max_norm, small_einsum, uneven_moves
+from .._numerics import max_norm, small_einsum, uneven_perturbations
 from .._system import AbstractMechanicalSystem, Linearisation, State, with_frames
 from ._chart import AbstractChart
 from ._curved_chart import chart_of_step
@@ -208,10 +208,10 @@ def nudged(stages: StageSystem, nudge: FloatScalar) -> StageSystem:
     by different amounts, so that the moves do not cancel in the difference of two.
     """
     if stages.manifold.is_flat:
-        moves = uneven_moves(stages.q)
+        moves = uneven_perturbations(stages.q)
         moved = jax.tree.map(lambda x, dx: x + nudge * dx, stages.q, moves)
     else:
         size = max_norm(*jax.tree.leaves(unframed(stages.q)))
-        xi = nudge * uneven_moves(jnp.broadcast_to(size, stages.p.shape))
+        xi = nudge * uneven_perturbations(jnp.broadcast_to(size, stages.p.shape))
         moved = stages.manifold.act(stages.q, xi)
     return replace(stages, q=moved)

@@ -23,10 +23,13 @@ def starting_values(stages: StageSystem, u: Array, lin: Linearisation) -> Stages
     # other unknowns of a closure are multipliers.
     free = (jnp.arange(s - 1) >= int(stages.symmetric)).astype(u.dtype)
     nothing = jnp.zeros((0,), u.dtype)
-    fibre = u[None] + jnp.outer(stage_times, push)
-    velocity, momentum, kept = fibre, jnp.zeros((s, 0), u.dtype), stages.kept
+    in_stages = u[None] + jnp.outer(stage_times, push)
+    velocity, momentum, kept = in_stages, jnp.zeros((s, 0), u.dtype), stages.kept
     if stages.hamiltonian:
-        velocity, momentum = _starting_velocities(stages, u, lin, stage_times), fibre
+        velocity, momentum = (
+            _starting_velocities(stages, u, lin, stage_times),
+            in_stages,
+        )
     return Stages(
         velocity=velocity,
         momentum=momentum,

@@ -30,7 +30,7 @@ from ._linearisation import (
     Linearisation as Linearisation,
     linearise as linearise,
     motion_residual as motion_residual,
-    whole_force as whole_force,
+    total_force as total_force,
 )
 from ._scales import (
     keeps_constraints as keeps_constraints,

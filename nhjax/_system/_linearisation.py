@@ -16,7 +16,7 @@ from .._numerics import (
     is_nearly_singular,
     jacobian,
     least_norm_inverse,
-    least_norm_inverse_in_turn,
+    least_norm_inverse_by_blocks,
     Matrix,
     matvec,
     small_einsum,
@@ -85,7 +85,7 @@ class Linearisation(eqx.Module):
 
     @property
     def is_unique(self) -> Bool[Array, " l"]:
-        """Tell which multipliers are determined, which redundant ones are not."""
+        """Tell which multipliers are unique; of redundant constraints not all are."""
         if not self.is_redundant:
             return jnp.ones(self.violation.shape, bool)
         # It projects onto what the derivatives of the constraints can reach.
@@ -151,7 +151,7 @@ def _inertial_force(system, q, p: Array, v: Array) -> Array:
     return jnp.zeros_like(p) if manifold.is_flat else manifold.ad_dual(v, p)
 
 
-def whole_force(
+def total_force(
     system: AbstractMechanicalSystem,
     t: FloatScalar,
     q: PyTree[Array],
@@ -185,7 +185,7 @@ def motion_residual(
         (t, jnp.zeros_like(u), u),
         (jnp.ones_like(t), v, acceleration),
     )
-    w = whole_force(system, t, q, u, multiplier, args)
+    w = total_force(system, t, q, u, multiplier, args)
     return p_dot - (w + _inertial_force(system, q, p, v)), phi_dot
 
 
@@ -221,7 +221,7 @@ def linearise(
         if system.constraints == "redundant":
             k = jax.eval_shape(lambda: system.position_constraint(t, q, args)).size
             m = slopes.shape[0] - k
-            compliance_inverse = least_norm_inverse_in_turn(compliance, m)
+            compliance_inverse = least_norm_inverse_by_blocks(compliance, m)
         else:
             compliance_inverse = inverse(compliance)
     else:

@@ -1,4 +1,4 @@
-"""Which constraints share coordinates, if so few do that it pays to know."""
+"""The sparsity pattern of the constraints' Jacobian, where it is worth using."""
 
 from jaxtyping import Array, Float, PyTree
 

@@ -183,7 +183,7 @@ def _at(shown: np.ndarray, times: np.ndarray, positions: np.ndarray) -> np.ndarr
 def _window(
     frames: dict[str, np.ndarray], follow: str | None
 ) -> tuple[np.ndarray, float]:
-    """The middle of the picture in each frame, and half its size."""
+    """Compute the centre of the picture in each frame, and half of its width."""
     everything = np.concatenate(
         [x.reshape(len(x), -1, x.shape[-1]) for x in frames.values()], axis=1
     )

@@ -14,7 +14,7 @@ ENERGY_FLOOR = 4e-15
 
 @dataclasses.dataclass(frozen=True)
 class BallRun:
-    """One run, at every step.
+    """What is measured of one run, with an entry for every step.
 
     - `integrals`: shape (k + 1, 4), the three linear first integrals and the moving
         energy.

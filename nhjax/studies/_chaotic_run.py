@@ -51,7 +51,7 @@ class ChaoticRun:
 
 
 class Case(NamedTuple):
-    """What one run of the ensemble is."""
+    """The method, step size, length and output of one run of the ensemble."""
 
     method: LobattoIIIAB
     h: float

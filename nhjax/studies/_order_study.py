@@ -1,4 +1,4 @@
-"""Orders of convergence on a system with an exact solution, of whichever system."""
+"""Orders of convergence on any system that has an exact solution."""
 
 import dataclasses
 import math

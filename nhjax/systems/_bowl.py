@@ -24,7 +24,7 @@ class Bowl(eqx.Module):
     shape: Shape = eqx.field(static=True)
 
     def value(self, x: Vector3) -> Array:
-        """Compute Φ at a point."""
+        """Compute the function Φ that vanishes on the bowl, at a point."""
         round_part = x if self.shape == "sphere" else x[:2]
         return x[2] - 0.5 * self.curvature * (round_part @ round_part)
 

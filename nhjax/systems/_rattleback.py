@@ -143,7 +143,7 @@ class Rattleback(AbstractRollingBody):
         return (-scaled / jnp.sqrt(up @ scaled)).at[2].add(self.depth)
 
     def force(self, t: FloatScalarLike, q: Array, v: Array, args: Args) -> Array:
-        """Compute the torque -σω of the air, below a force that vanishes."""
+        """Compute the generalised force (0, -σω), with the torque -σω of the air."""
         damping = 0.0 if self.damping is None else self.damping
         return jnp.concatenate([jnp.zeros_like(v[:3]), -damping * v[3:]])
 

@@ -48,7 +48,10 @@ class AbstractRollingBody(AbstractConstrainedGroupExample):
 
     @abc.abstractmethod
     def lowest_point(self, up: Vector3) -> Vector3:
-        """Compute s, where `up` is the upward vertical; both in body axes."""
+        """Compute s, from the centre of mass to the lowest point, in body axes.
+
+        `up` is the upward vertical in body axes.
+        """
 
     @property
     def manifold(self) -> SE3:

@@ -149,7 +149,7 @@ def test_wherever_it_is_interrupted_the_same_call_goes_on(tmp_path, whole, monke
         return operation
 
     # Folders cannot be cut in half.
-    monkeypatch.setattr(_durable, "settle", lambda folder: None)
+    monkeypatch.setattr(_durable, "sync_folder", lambda folder: None)
     monkeypatch.setattr(_durable.os, "fsync", counted(fsync))
     monkeypatch.setattr(_durable.os, "replace", counted(replace))
     for operations in (1, 2, 7, 13, 14, 1, 2, 3, 4, 5, 6, 7, 9, 10, 11):

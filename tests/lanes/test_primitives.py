@@ -202,7 +202,7 @@ _CASES = {
         ),
     ],
     "custom_linear_solve": _unary(_solved),
-    "one_kernel": _unary(_kernel),
+    "cpu_kernel": _unary(_kernel),
     "scan": [
         (
             lambda x: lax.scan(lambda c, y: (c + y, c * y), x, jnp.outer(x, x)),

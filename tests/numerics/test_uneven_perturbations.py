@@ -5,12 +5,12 @@ import itertools
 import jax.numpy as jnp
 import numpy as np
 
-from nhjax._numerics import uneven_moves
+from nhjax._numerics import uneven_perturbations
 
 
 def test_moves_are_of_the_size_of_the_numbers_and_do_not_cancel():
     q = (jnp.full(3, -2.0), jnp.full((2, 2), 2.0))
-    moves = uneven_moves(q)
+    moves = uneven_perturbations(q)
     assert [x.shape for x in moves] == [(3,), (2, 2)]
     numbers = np.concatenate([np.ravel(x) for x in moves])
     assert np.all((np.abs(numbers) >= 1.0) & (np.abs(numbers) <= 2.0))
@@ -22,4 +22,4 @@ def test_moves_are_of_the_size_of_the_numbers_and_do_not_cancel():
 
 
 def test_what_is_zero_does_not_move():
-    np.testing.assert_array_equal(uneven_moves(jnp.zeros(2)), 0)
+    np.testing.assert_array_equal(uneven_perturbations(jnp.zeros(2)), 0)

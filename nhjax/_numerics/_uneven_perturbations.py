@@ -6,8 +6,8 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, PyTree
 
 
-def uneven_moves(q: PyTree[Array]) -> PyTree[Array]:
-    """Return a move for each number in q, of half its size to its size.
+def uneven_perturbations(q: PyTree[Array]) -> PyTree[Array]:
+    """Return a perturbation of each number in q, of half its size to its size.
 
     The moves differ and have both signs, so that they hardly cancel in differences and
     sums of a few numbers. Multiples of the golden ratio, less their whole parts, differ
