@@ -7,24 +7,30 @@ The checks act while programs are traced, and leave the programs as they are.
 import os
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
-from oracles import as_users_run, shapes
+from oracles import as_users_run, with_shapes
 
 
 pytestmark = pytest.mark.long
 
 
 QUICK = ("XLA_FLAGS", "JAX_DISABLE_MOST_OPTIMIZATIONS")
+# As errors, but what older releases of Zarr say while they are imported.
+WARNINGS = ("-W", "error", "-W", "default::DeprecationWarning:numcodecs")
 
 
 @pytest.fixture(scope="module")
 def lines():
     """The lines that a program of its own prints, which runs all features."""
+    env = {key: x for key, x in os.environ.items() if key not in QUICK}
+    path = [str(Path(__file__).parent), env.get("PYTHONPATH", "")]
+    env |= {"PYTHONPATH": os.pathsep.join(filter(None, path)), "MPLBACKEND": "Agg"}
     done = subprocess.run(
-        [sys.executable, shapes.__file__],
-        env={key: x for key, x in os.environ.items() if key not in QUICK},
+        [sys.executable, *WARNINGS, "-m", with_shapes.__name__],
+        env=env,
         capture_output=True,
         text=True,
         check=False,

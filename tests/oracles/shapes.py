@@ -1,18 +1,12 @@
-"""Annotations of shapes that are checked while functions run.
-
-As a program it does so while every feature runs.
-"""
+"""Annotations of shapes that are checked while functions run."""
 
 import pkgutil
-import runpy
 from collections.abc import Callable
 from importlib.util import find_spec
-from pathlib import Path
 from typing import Any
 
 from beartype import beartype, BeartypeConf
 from beartype.roar import BeartypeDecorHintException
-from jaxtyping import install_import_hook
 
 
 # An int is a float, as type checkers have it.
@@ -40,9 +34,3 @@ def rooms_with_shapes() -> list[str]:
     assert package is not None
     rooms = pkgutil.iter_modules(package.submodule_search_locations, "nhjax.")
     return [room.name for room in rooms if room.name not in WITHOUT_SHAPES]
-
-
-if __name__ == "__main__":
-    with install_import_hook(rooms_with_shapes(), "shapes.checked"):
-        features = Path(__file__).with_name("as_users_run.py")
-        runpy.run_path(str(features), run_name="__main__")
