@@ -2,6 +2,7 @@
 
 import ast
 import re
+from pathlib import Path
 
 import pytest
 
@@ -11,6 +12,8 @@ from docs import rooms
 SOURCES = rooms.read_sources()
 IMPORTS = rooms.read_imports(SOURCES)
 
+# In lines. A function counts without its docstring, since the public ones say in it all
+# that the reader of the API needs; their code is what must be read at once.
 LONGEST_FILE, LONGEST_CLASS, LONGEST_FUNCTION = 300, 200, 60
 
 # What may be longer, and why. An entry that is not needed fails.
@@ -160,7 +163,8 @@ def test_nothing_is_longer_than_can_be_read():
 # Parts of JAX and equinox that may go without notice.
 INTERNAL = re.compile(
     r"\bjax\.(core|extend|interpreters|_src)\b|\bjaxlib\.|\.primitive\b"
-    r"|\b(eqx|equinox)\.internal\b|xla_cpu_\w+"
+    r"|\b(eqx|equinox)\.internal\b|xla_cpu_\w+|XLA_FFI|\._value\b|\.eqns\b"
+    r"|\bequation\.params\b|get_bind_params|GatherScatterMode|DropVar"
 )
 
 
@@ -169,3 +173,21 @@ def test_what_leans_on_internals_is_on_their_page():
     leaning = {module for module, text in SOURCES.items() if INTERNAL.search(text)}
     named = re.findall(r"`((?:_\w+/)?_\w+)\.py`", page)
     assert leaning == {name.replace("/", ".") for name in named}
+
+
+def test_no_test_imports_from_another():
+    """What several tests need is in `tests/oracles` and in `conftest.py`."""
+    folder = Path(__file__).parent
+    tests = {path.stem: path for path in folder.rglob("test_*.py")}
+    assert len(tests) > 100
+    found = []
+    for name, path in tests.items():
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            modules = []
+            if isinstance(node, ast.Import):
+                modules = [alias.name for alias in node.names]
+            elif isinstance(node, ast.ImportFrom):
+                modules = [node.module or "", *(alias.name for alias in node.names)]
+            parts = {part for module in modules for part in module.split(".")}
+            found += [f"{name} <- {other}" for other in parts & tests.keys()]
+    assert found == []

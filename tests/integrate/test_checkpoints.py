@@ -10,25 +10,14 @@ import pytest
 
 import nhjax
 from nhjax import LobattoIIIAB, SaveAt, systems
+from oracles.driven import ARGS, DRIVEN, driven_state
 
 
 CHECKPOINT = SaveAt(checkpoint=True)
-DRIVEN = nhjax.LagrangianSystem(
-    lambda t, q, v, args: 0.5 * v @ v - 0.5 * q @ q + args * q[0] * jnp.cos(0.3 * t),
-    nonholonomic=lambda t, q, v, args: v[2] - q[1] * v[0] - 0.1 * jnp.sin(t),
-)
 PARTICLE, SUSLOV = systems.NonholonomicParticle(), systems.Suslov()
-ARGS = jnp.asarray(0.7)
-
-
-def driven_start():
-    q, v = jnp.array([1.0, 0.5, 0.0]), jnp.array([0.3, 1.0, 0.15])
-    return nhjax.initial_state(DRIVEN, q, v, args=ARGS)
-
-
 CASES = {
     "particle": (PARTICLE.system, LobattoIIIAB(2), PARTICLE.initial_state),
-    "driven": (DRIVEN, LobattoIIIAB(3, "propagated"), driven_start),
+    "driven": (DRIVEN.system, LobattoIIIAB(3, "propagated"), driven_state),
     "group": (SUSLOV.system, LobattoIIIAB(2), SUSLOV.initial_state),
 }
 
@@ -112,7 +101,7 @@ def test_derivatives_pass_through_a_checkpoint():
 def test_steps_of_another_size_and_other_args_start_at_the_same_time():
     run, y0 = run_of("driven")
     half = run(y0, num_steps=10, saveat=CHECKPOINT).checkpoint
-    other = {"dt": 0.05, "num_steps": 20, "args": ARGS + 0.5}
+    other = {"dt": 0.05, "num_steps": 20, "args": jax.tree.map(lambda x: x + 0.5, ARGS)}
     from_state = run(half.state, t0=half.t, **other)
     from_checkpoint = run(half, **other, saveat=SaveAt(t1=True, checkpoint=True))
     np.testing.assert_allclose(from_checkpoint.ts, from_state.ts, rtol=1e-15)

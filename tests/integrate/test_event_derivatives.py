@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 import nhjax
-from integrate.test_events import rod_run, SLIDE, slide, START
 from nhjax import Event, LobattoIIIAB, SaveAt
 from oracles.helpers import central_difference, direction, dot, moved, scalar
+from oracles.impacts import rod_run, SLIDE, slide, START
 from oracles.long import long
 
 

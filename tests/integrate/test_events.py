@@ -1,7 +1,5 @@
 """Events against motions in closed form: where runs end, and how they go on."""
 
-from typing import Any
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -9,62 +7,11 @@ import pytest
 
 import nhjax
 from nhjax import Event, LobattoIIIAB, RESULTS, SaveAt, systems
-from oracles.impacts import Latch, Rod, Slide
+from oracles.impacts import Latch, ROD, rod_run, SLIDE, slide, START, turned
 from oracles.long import long
 
 
-ROD, LATCH, SLIDE = Rod(), Latch(), Slide()
-START = np.array([0.2, 1.0, 0.4]), np.array([0.3, 0.2, 1.5])
-
-
-def turned(q, v, back=1.0):
-    """Turn a velocity in the plane between the body and space."""
-    c, s = jnp.cos(q[2]), back * jnp.sin(q[2])
-    return jnp.stack([c * v[0] - s * v[1], s * v[0] + c * v[1], v[2]])
-
-
-def rod_system(manifold=None):
-    masses = jnp.array([ROD.mass, ROD.mass, ROD.inertia])
-    return nhjax.LagrangianSystem(
-        lambda t, q, v, args: (
-            0.5 * jnp.sum(masses * v**2) - ROD.mass * ROD.gravity * q[1]
-        ),
-        manifold=manifold,
-    )
-
-
-def impact(tip, on_group=False):
-    def height(t, y, args):
-        return y.q[1] + tip * ROD.half * jnp.sin(y.q[2])
-
-    def reset(t, y, args):
-        v = turned(y.q, y.v) if on_group else y.v
-        arm = tip * ROD.half * jnp.cos(y.q[2])
-        normal = jnp.stack([jnp.zeros_like(arm), jnp.ones_like(arm), arm])
-        inverse = jnp.array([1 / ROD.mass, 1 / ROD.mass, 1 / ROD.inertia])
-        impulse = (1 + args) * (normal @ v) / (normal @ (inverse * normal))
-        v = v - impulse * inverse * normal
-        return y.q, turned(y.q, v, -1.0) if on_group else v
-
-    return Event(height, direction=False, reset=reset, max_events=8)
-
-
-def rod_run(
-    on_group, method, dt, num_steps, q, v, restitution, tips=(1, -1), **options
-):
-    """Of the rod, in coordinates of the plane or on the group of its motions."""
-    system = rod_system(nhjax.SE2() if on_group else None)
-    v = turned(q, v, -1.0) if on_group else v
-    return nhjax.integrate(
-        system,
-        method,
-        nhjax.initial_state(system, q, v),
-        dt=dt,
-        num_steps=num_steps,
-        args=restitution,
-        event=[impact(tip, on_group) for tip in tips],
-        **options,
-    )
+LATCH = Latch()
 
 
 @pytest.mark.parametrize("on_group", [False, True])
@@ -133,27 +80,6 @@ def test_a_joint_latches_as_in_closed_form():
     q, v = LATCH.locked(2.0)
     np.testing.assert_allclose(sol.ys.q[0], q, rtol=0, atol=1e-12)
     np.testing.assert_allclose(sol.ys.v[0], v, rtol=0, atol=1e-12)
-
-
-def slide(stages, dt, gravity: Any = 1.0, closure="symmetric", **options: Any):
-    """Until the pressure of the sphere, its multiplier, changes sign."""
-    system = nhjax.LagrangianSystem(
-        lambda t, q, v, args: 0.5 * v @ v - args * q[2],
-        holonomic=lambda t, q, args: 0.5 * (q @ q - 1.0),
-    )
-    s, c = np.sin(SLIDE.angle), np.cos(SLIDE.angle)
-    q, v = jnp.array([s, 0.0, c]), SLIDE.rate * jnp.array([c, 0.0, -s])
-    y0 = nhjax.initial_state(system, q, v, args=gravity, project=True)
-    return nhjax.integrate(
-        system,
-        LobattoIIIAB(stages, closure),
-        y0,
-        dt=dt,
-        num_steps=round(3 / dt),
-        args=gravity,
-        event=Event(lambda t, y, args: y.multiplier[0]),
-        **options,
-    )
 
 
 @pytest.mark.parametrize("closure", ["symmetric", "propagated"])

@@ -1,5 +1,7 @@
 """One step, as users of their own time loops take it."""
 
+import itertools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -17,11 +19,30 @@ SYSTEMS = {
 }
 
 
-@pytest.mark.parametrize("name", SYSTEMS)
-@pytest.mark.parametrize("closure", ["symmetric", "propagated"])
-def test_a_step_is_that_of_integrate_bit_for_bit(name, closure):
-    system, y0 = SYSTEMS[name].system, SYSTEMS[name].initial_state()
-    method = LobattoIIIAB(3, closure)
+def hamiltonian_pendulum():
+    pendulum = systems.SphericalPendulum()
+    system = nhjax.HamiltonianSystem(
+        lambda t, q, p, args: 0.5 * p @ p + q[2], holonomic=pendulum.holonomic
+    )
+    return system, nhjax.initial_state(system, pendulum.q0, p=pendulum.v0)
+
+
+@pytest.mark.parametrize(
+    ("name", "method"),
+    [
+        *itertools.product(
+            [*SYSTEMS, "Hamiltonian"],
+            [LobattoIIIAB(3), LobattoIIIAB(3, "propagated")],
+        ),
+        ("nonholonomic", LobattoIIIAB(3, "consistent")),
+        ("on a group", LobattoIIIAB(3, chart="start")),
+    ],
+)
+def test_a_step_is_that_of_integrate_bit_for_bit(name, method):
+    if name == "Hamiltonian":
+        system, y0 = hamiltonian_pendulum()
+    else:
+        system, y0 = SYSTEMS[name].system, SYSTEMS[name].initial_state()
     y = nhjax.step(system, method, 0.5, H, y0)
     sol = nhjax.integrate(system, method, y0, t0=0.5, dt=H, num_steps=1)
     first = nhjax.integrate(
@@ -32,6 +53,20 @@ def test_a_step_is_that_of_integrate_bit_for_bit(name, closure):
     ):
         np.testing.assert_array_equal(one, of_run[0])
         np.testing.assert_array_equal(one, of_long_run[0])
+
+
+@pytest.mark.parametrize("name", SYSTEMS)
+def test_a_compiled_step_is_that_of_compiled_integrate_bit_for_bit(name):
+    system, y0 = SYSTEMS[name].system, SYSTEMS[name].initial_state()
+    method = LobattoIIIAB(2)
+
+    @jax.jit
+    def by_integrate(y, dt):
+        sol = nhjax.integrate(system, method, y, t0=0.5, dt=dt, num_steps=1)
+        return jax.tree.map(lambda x: x[0], sol.ys)
+
+    y = jax.jit(lambda y, dt: nhjax.step(system, method, 0.5, dt, y))(y0, H)
+    jax.tree.map(np.testing.assert_array_equal, y, by_integrate(y0, H))
 
 
 def height_by_steps(system, method, y, g, num_steps):
