@@ -15,6 +15,7 @@ from nhjax import studies
 from nhjax.__main__ import main
 from nhjax.studies import _chaotic_run
 from nhjax.systems import ChaoticSystem, NonholonomicParticle
+from oracles.long import long_but
 
 
 PNG = b"\x89PNG\r\n\x1a\n"
@@ -51,7 +52,10 @@ def test_list(capsys):
     assert [line.split()[0] for line in lines] == list(studies.STUDIES)
 
 
-@pytest.mark.parametrize("study", studies.STUDIES)
+@pytest.mark.parametrize(
+    "study",
+    long_but(["particle-order", "cvt-energy", "chaotic-energy"], studies.STUDIES),
+)
 def test_run_writes_figures_data_and_record(study, tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
     assert main(["run", study, *TINY[study].split(), "--json", "--progress"]) == 0
@@ -271,6 +275,7 @@ def test_unicycle_order_finds_the_orders(retraction):
     assert shown[:2] == ["relative error of $g$", "relative error of $v$"]
 
 
+@pytest.mark.long
 def test_ball_invariants_are_kept(ball):
     for run in ball.runs:
         assert run.integrals.shape == (51, 4)
@@ -280,6 +285,7 @@ def test_ball_invariants_are_kept(ball):
     assert re.search(r"kept to \de-1[56]; the moving energy", ball.verdict())
 
 
+@pytest.mark.long
 def test_ball_invariants_finds_the_orders(ball):
     assert ball.dt == (0.2, 0.1)
     assert ball.final_time == 5.0
@@ -290,6 +296,7 @@ def test_ball_invariants_finds_the_orders(ball):
         assert float(ball.energy_slopes(s)[1]) == pytest.approx(4, abs=0.15)
 
 
+@pytest.mark.long
 def test_ball_invariants_record_and_figures(ball):
     parameters = ball.parameters()
     assert parameters["last_times"] == [10.0, 5.0]
