@@ -32,7 +32,13 @@ import nhjax
 from nhjax import systems
 from nhjax._method import AbstractMethod
 from nhjax._numerics import max_norm
-from nhjax._step import first_step_state, step, StepOutcome, StepState
+from nhjax._step import (
+    first_step_state,
+    step,
+    StepArguments,
+    StepOutcome,
+    StepState,
+)
 from nhjax._step._stage_iteration import stage_residual
 from nhjax._step._stage_system import nudged, StageSystem
 from nhjax._step._unknowns import Stages
@@ -190,9 +196,9 @@ def run(
             t = k * h
             given = step_state.state, None, step_state.lin
             stages = StageSystem.at(system, method, t, h, *given)
+            arguments = StepArguments(system, t, h, step_state, None)
             first, second = (
-                step(system, method, solver, t, h, step_state, None, go_on)
-                for solver in solvers
+                step(arguments, method, solver, go_on) for solver in solvers
             )
             row = Row(judge(stages, first), judge(stages, second), apart(first, second))
             good = first.result == nhjax.RESULTS.successful
@@ -231,10 +237,8 @@ def single_steps(
         step_state = first_step_state(system, method, t, y0, None)
         given = step_state.state, None, step_state.lin
         stages = StageSystem.at(system, method, t, h, *given)
-        first, second = (
-            step(system, method, solver, t, h, step_state, None, go_on)
-            for solver in solvers
-        )
+        arguments = StepArguments(system, t, h, step_state, None)
+        first, second = (step(arguments, method, solver, go_on) for solver in solvers)
         return Row(judge(stages, first), judge(stages, second), apart(first, second))
 
     return jax.lax.map(one, (starts, sizes))

@@ -69,7 +69,7 @@ def transmission_figure(
 def chaotic_figure(curves: dict[int, dict[str, Any]], h: float) -> "Figure":
     """Draw μ(E) against time, a panel for each number of stages.
 
-    `curves` holds (times, μ, standard error) by name, in stretches of time.
+    `curves` holds (times, μ, standard error) by name, in intervals of time.
     """
     from matplotlib.figure import Figure
 

@@ -8,7 +8,7 @@ from scipy.optimize import curve_fit
 
 
 class Curve(NamedTuple):
-    """μ(E) in stretches of time, with its standard error over the members."""
+    """μ(E) in intervals of time, with its standard error over the members."""
 
     times: np.ndarray
     mu: np.ndarray
@@ -32,7 +32,7 @@ class Growth(NamedTuple):
 
 
 def in_stretches(times, mu, error, final_time: float) -> Curve:
-    """Average over stretches of time that grow as time does."""
+    """Average over intervals of time that grow as time does."""
     edges = np.geomspace(10.0, final_time, 13)
     # A window that begins after one sample and ends with another.
     chosen = [(times > a) & (times <= b) for a, b in itertools.pairwise(edges)]

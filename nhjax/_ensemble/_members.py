@@ -28,7 +28,7 @@ class _FromArrays(eqx.Module):
 
 
 class Members:
-    """Where the members come from.
+    """The members of an ensemble, given by their number and a function that makes one.
 
     - `count`: how many there are.
     - `make`: a function of one member's input that makes the member, for JAX to trace.

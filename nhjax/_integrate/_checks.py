@@ -71,7 +71,7 @@ def _count_error(num_steps: Any) -> ValueError:
     return ValueError(f"`num_steps` must be in 1..2^31 - 1, got {num_steps}.")
 
 
-def known(num_steps: int | IntScalar) -> int:
+def static_length(num_steps: int | IntScalar) -> int:
     """Return a number of steps that `check_num_steps` has made an int, as an int."""
     assert isinstance(num_steps, int)
     return num_steps

@@ -14,6 +14,7 @@ from .._numerics import ClosureConverted
 from .._step import StepState
 from .._system import AbstractMechanicalSystem, linearise, State
 from ._event import Event
+from ._sides import Sides
 from ._stepping import Stepping
 
 
@@ -89,33 +90,6 @@ def with_continuous_multiplier(
     u = system.fibre_coordinate(y)
     lin = linearise(system, t, y.q, u, args, may_be_sparse=True)
     return State(y.q, y.v, y.p, lin.multiplier)
-
-
-class Sides(eqx.Module):
-    """The side of zero on which each condition is where a step starts.
-
-    - `sign`: its sign there, 0 if it is not known.
-    - `value`: its value, or its rate along the run where `at_zero`: there the condition
-        is zero and takes the sign of its rate.
-    """
-
-    sign: Float[Array, " e"]
-    value: Float[Array, " e"]
-    at_zero: Bool[Array, " e"]
-
-    def moved(self, at_node: BoolScalar, values: Float[Array, " e"]) -> "Sides":
-        """Return the sides at the end of a whole step if it leads to a node."""
-        sign = jnp.where(values == 0, self.sign, jnp.sign(values))
-        return Sides(
-            sign=jnp.where(at_node, sign, self.sign),
-            value=jnp.where(at_node, values, self.value),
-            at_zero=self.at_zero & ~at_node,
-        )
-
-    def scale(self, h: FloatScalar) -> Float[Array, " e"]:
-        """Compute the size of each condition in a step of size h from here."""
-        value = jnp.where(self.at_zero, self.value * h, self.value)
-        return jax.lax.stop_gradient(jnp.abs(value))
 
 
 def sides_at(

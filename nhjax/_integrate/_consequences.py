@@ -13,10 +13,11 @@ from .._numerics import ClosureConverted, tree_where
 from .._results import RESULTS
 from .._step import first_step_state, StepState
 from .._system import AbstractMechanicalSystem, all_finite, State
-from ._conditions import Conditions, Sides, sides_at, with_continuous_multiplier
+from ._conditions import Conditions, sides_at, with_continuous_multiplier
 from ._event import Event
 from ._progress import Progress
 from ._reset import completed
+from ._sides import Sides
 from ._stepping import is_consistent, Stepping
 
 

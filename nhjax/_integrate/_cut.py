@@ -22,7 +22,8 @@ from .._step import (
 )
 from .._system import State
 from ._bracket import Bracket
-from ._conditions import Conditions, Sides, with_continuous_multiplier
+from ._conditions import Conditions, with_continuous_multiplier
+from ._sides import Sides
 
 
 class Cut(NamedTuple):
@@ -43,7 +44,7 @@ class Cut(NamedTuple):
 
 
 class CutOptions(eqx.Module):
-    """How a step is taken: by which method and solver, and whether it is to be cut.
+    """How a step is taken: by which method and stage solver, and whether it is cut.
 
     - `skip`: whether nothing is to be done, and the result to be discarded.
     - `sides`: the sides of zero of the conditions at the start of the step.
@@ -54,7 +55,7 @@ class CutOptions(eqx.Module):
     """
 
     method: AbstractMethod = eqx.field(static=True)
-    solver: AbstractStageSolver
+    stage_solver: AbstractStageSolver
     skip: BoolScalar
     sides: Sides
     is_cut: BoolScalar
@@ -150,7 +151,8 @@ def _trial(
 ) -> Cut:
     """Take a step of any size, and compute the conditions at its end."""
     at, method = eqx.tree_at(lambda x: x.h, arguments, h), options.method
-    outcome = primitive_step(at, method, options.solver, options.skip, programs)
+    stage_solver, skip = options.stage_solver, options.skip
+    outcome = primitive_step(at, method, stage_solver, skip, programs)
     values = _values(at, conditions, method, outcome.step_state.state)
     solved = outcome.result == RESULTS.successful
     unknown = solved & ~jnp.all(jnp.isfinite(values))
@@ -214,13 +216,13 @@ def _changes(
     is_size = eqx.tree_at(lambda x: x.h, jax.tree.map(lambda _: False, arguments), True)
     size, rest = eqx.partition(arguments, is_size)
     unit = eqx.tree_at(lambda x: x.h, size, jnp.ones_like(cut.h))
-    step = arguments, options.method, options.solver
-    change_with = change_of_step(*step, ok, cut.outcome.stages, fixed)
-    change_with_size = change_of_step(*step, is_cut, cut.outcome.stages, rest)
+    method, stage_solver, x = options.method, options.stage_solver, cut.outcome.stages
+    change_with = change_of_step(arguments, method, stage_solver, ok, x, fixed)
+    change_with_size = change_of_step(arguments, method, stage_solver, is_cut, x, rest)
 
     def condition(given, fixed, functions, y):
         at, all_of_them = eqx.combine(given, fixed), eqx.combine(functions, others)
-        return _values(at, all_of_them, options.method, y)[cut.fired]
+        return _values(at, all_of_them, method, y)[cut.fired]
 
     def changes(given, functions, x, y, rates):
         change = change_with(given, x, rates[0])
@@ -265,5 +267,11 @@ def primitive_cut_step(
 ) -> Cut:
     """Take a step by `differentiable_cut_step`, in a program that is traced once."""
     # The reason is that of `primitive_step`.
-    given = arguments, conditions, options, programs
-    return as_cpu_kernel(differentiable_cut_step, *given, programs=programs)
+    return as_cpu_kernel(
+        differentiable_cut_step,
+        arguments,
+        conditions,
+        options,
+        programs,
+        programs=programs,
+    )

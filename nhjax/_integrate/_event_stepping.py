@@ -1,69 +1,26 @@
 """The steps of a run with events: each iteration ends at a node or at an event."""
 
 from dataclasses import replace
-from typing import NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Int
 
 from .._custom_types import BoolScalar, FloatScalar, IntScalar
 from .._numerics import tree_where
 from .._results import RESULTS
-from .._step import StepArguments, StepState
+from .._step import StepArguments
 from .._system import State
 from ._checkpoint import Checkpoint
 from ._conditions import Conditions, conditions_of, sides_at
 from ._consequences import Consequences, consequences_of
 from ._cut import Cut, CutOptions, primitive_cut_step
 from ._event import Event
+from ._event_iteration import progress_after, statistics_after, Tried
 from ._log import LogEntry
-from ._progress import Known, Progress, progress_of
-from ._statistics import updated_statistics
-from ._stepping import Carry, Stepping, Taken
-
-
-class _Tried(NamedTuple):
-    """An iteration of the time loop, before what follows from its event.
-
-    - `alive`: whether the run had not ended before.
-    - `steps`: whether it took a step from the time `t`, and did not meet an event at
-        once; `cut` is that step.
-    - `is_next`: whether the step is discarded, since there is an event in it at which
-        the next iteration is to end.
-    - `stepped`: whether the step, of the given `size`, is kept. It led to the state
-        that is `reached`.
-    - `which`: the index of the event at its end, -1 if it ended at a node.
-    - `far`: the conditions at the end of the whole step, if it is cut.
-    - `meets`, `fires`: whether there is an event, and whether there is room for it.
-    """
-
-    alive: BoolScalar
-    steps: BoolScalar
-    t: FloatScalar
-    cut: Cut
-    is_next: BoolScalar
-    stepped: BoolScalar
-    which: Int[Array, ""]
-    far: Float[Array, " e"]
-    meets: BoolScalar
-    fires: BoolScalar
-    size: FloatScalar
-    reached: StepState
-
-    @property
-    def at_node(self) -> BoolScalar:
-        """Tell whether the step led to the next node."""
-        return self.stepped & ~self.meets
-
-    @property
-    def value(self) -> FloatScalar:
-        """Return the value of the condition at the event, if it is round-off."""
-        value, far = self.cut.values[self.which], self.far[self.which]
-        small = float(jnp.finfo(value.dtype).eps) ** 0.5
-        is_small = self.stepped & (jnp.abs(value) <= small * jnp.abs(far))
-        return jnp.where(is_small, value, 0)
+from ._progress import Known, Progress
+from ._stepping import Carry, progress_of, Stepping, Taken
 
 
 class EventStepping(eqx.Module):
@@ -87,7 +44,10 @@ class EventStepping(eqx.Module):
         y: State,
         num_steps: int | IntScalar,
     ) -> "EventStepping | None":
-        """Make them from the events that a user gave, if any; raise if one is wrong."""
+        """Make the stepping of a run from the user's events; None without events.
+
+        A wrong event raises an error.
+        """
         if events is None:
             return None
         given = stepping.time(0), y, stepping.args
@@ -149,13 +109,21 @@ class EventStepping(eqx.Module):
         event is not looked for.
         """
         before, it = progress_of(carry), self._tried(carry, known)
-        place = it.fires, it.which, it.t + it.size, it.reached, it.value, before
-        met = self.consequences.after_event(self.conditions, self.stepping, *place)
+        met = self.consequences.after_event(
+            self.conditions,
+            self.stepping,
+            fires=it.fires,
+            which=it.which,
+            t=it.t + it.size,
+            step_state=it.reached,
+            value=it.value,
+            before=before,
+        )
         result = RESULTS.where(it.steps, it.cut.outcome.result, carry.result)
         result = RESULTS.where(it.meets, RESULTS.too_many_events, result)
         result = RESULTS.where(it.fires, met.result, result)
         ends = it.alive & (result != RESULTS.successful)
-        after = _progress(self.stepping.dt, before, it, met.pending, ends)
+        after = progress_after(self.stepping.dt, before, it, met.pending, ends)
         has_ended = carry.result != RESULTS.successful
         fills = (after.node > before.node) | ends | has_ended
         sides = before.sides.moved(it.at_node, it.cut.values)
@@ -170,7 +138,8 @@ class EventStepping(eqx.Module):
             which=it.which,
             before=it.reached.state,
             after=met.step_state.state,
-            iteration=iteration.astype(jnp.int32),
+            # Under `jax.disable_jit` a loop counts by ints of Python.
+            iteration=jnp.asarray(iteration, jnp.int32),
             node=before.node,
             offset=before.offset,
             size=it.size,
@@ -179,21 +148,13 @@ class EventStepping(eqx.Module):
             offset_after=after.offset,
             slot=jnp.where(it.fires, before.num, self.consequences.max_events),
         )
-        stats = updated_statistics(
-            carry.stats, it.cut.outcome, it.steps, it.stepped, before.node
-        )
-        for name in ("failed_step", "worst_coordinate"):
-            # A step that is discarded has not failed.
-            stats[name] = jnp.where(ends, stats[name], carry.stats[name])
         failed = ends & (result != RESULTS.event_occurred)
-        stats["failed_step"] = jnp.where(failed, before.node, stats["failed_step"])
-        stats |= {"num_steps": after.node, "num_events": after.num}
-        stats = jax.lax.stop_gradient(stats)
+        stats = statistics_after(carry, it, after, ends, failed)
         taken = Taken(it.cut.outcome.record, it.stepped)
         row = jnp.where(fills, before.row, self.num_steps)
         return Carry(met.step_state, result, stats, after), taken, entry, row
 
-    def _tried(self, carry: Carry, known: Known | None) -> _Tried:
+    def _tried(self, carry: Carry, known: Known | None) -> Tried:
         """Take the rest of a step, or as far as the event that is known to be in it."""
         before = progress_of(carry)
         alive = (carry.result == RESULTS.successful) & (before.node < self.num_steps)
@@ -218,7 +179,7 @@ class EventStepping(eqx.Module):
         at_last = (before.num > 0) & before.sides.at_zero[which]
         small = 16 * float(jnp.finfo(t.dtype).eps) * jnp.abs(self.stepping.dt)
         again = stepped & at_last & (jnp.abs(size) <= small)
-        return _Tried(
+        return Tried(
             alive=alive,
             steps=steps,
             t=t,
@@ -232,36 +193,6 @@ class EventStepping(eqx.Module):
             size=size,
             reached=reached.differentiated_in_state(),
         )
-
-
-def _progress(
-    dt: FloatScalar,
-    before: Progress,
-    it: _Tried,
-    pending: Bool[Array, " e"],
-    ends: BoolScalar,
-) -> Progress:
-    """Find the place after an iteration, but for the sides of the conditions.
-
-    The events that are `pending` come before the node at the same time.
-    """
-    here = before.offset + it.size
-    # What is left of a step by round-off is left out.
-    small = 4 * float(jnp.finfo(dt.dtype).eps)
-    at_end = it.fires & ~ends & (jnp.abs(dt - here) <= small * jnp.abs(dt))
-    at_end = at_end & ~jnp.any(pending)
-    offset = jnp.where(it.fires, here, before.offset)
-    offset = jnp.where(at_end, here - dt, jnp.where(it.at_node, 0, offset))
-    return replace(
-        before,
-        node=before.node + (it.at_node | at_end).astype(jnp.int32),
-        offset=offset,
-        active=before.active + it.alive.astype(jnp.int32),
-        num=before.num + it.fires.astype(jnp.int32),
-        last=jnp.where(it.fires, it.which, before.last),
-        is_cut=it.is_next,
-        far=jax.lax.stop_gradient(it.cut.values),
-    )
 
 
 def _cut(
@@ -280,7 +211,7 @@ def _cut(
     progress = progress_of(carry)
     options = CutOptions(
         method=stepping.method,
-        solver=stepping.stage_solver,
+        stage_solver=stepping.stage_solver,
         skip=skip,
         sides=progress.sides,
         is_cut=progress.is_cut & ~skip,

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 
 from .._custom_types import Args, FloatScalar, FloatScalarLike, IntScalar, PhaseFunction
 from .._errors import Check, require
-from .._method import AbstractMethod
+from .._method import AbstractMethod, Gauss, LobattoIIIAB, PartitionedRungeKutta
 from .._step import AbstractStageSolver, leaves_steps_to_newton, SimplifiedNewton
 from .._system import (
     AbstractMechanicalSystem,
@@ -25,6 +25,7 @@ from ._checkpoint import check_start, Checkpoint, countable_from, time_of
 from ._checks import advancing, check_num_steps, countable, is_tracing
 from ._event import checked_events, Event
 from ._interpolation import require_collocation
+from ._options import Means, Options, TimeGrid
 from ._progress_meter import AbstractProgressMeter, NoProgressMeter
 from ._run import run
 from ._saveat import SaveAt
@@ -34,6 +35,9 @@ from ._solution import (
     raise_failures,
     Solution,
 )
+
+
+METHODS = LobattoIIIAB, Gauss, PartitionedRungeKutta
 
 
 def integrate(
@@ -143,7 +147,7 @@ def integrate(
         (1, 4)
     """
     check_type("system", system, (LagrangianSystem, HamiltonianSystem))
-    check_type("method", method, AbstractMethod, "Such as nhjax.LobattoIIIAB(3).")
+    check_type("method", method, METHODS, "Such as nhjax.LobattoIIIAB(3).")
     check_type("y0", y0, (State, Checkpoint), "Make one with nhjax.initial_state.")
     check_type("saveat", saveat, SaveAt, "Such as nhjax.SaveAt(t0=True, steps=True).")
     newton = "Such as nhjax.Newton()."
@@ -162,17 +166,15 @@ def integrate(
     # A plain call has no use for a length that is known, but for one that changes.
     if not isinstance(num_steps, int) or (needed_by is None and not is_tracing()):
         num_steps = jnp.asarray(num_steps, jnp.int32)
-
-    def run_with(
-        stage_solver: AbstractStageSolver, meter: AbstractProgressMeter
-    ) -> Solution:
-        given = (adjoint, y0, t0, dt, num_steps, args, saveat, meter)
-        return run(system, method, stage_solver, *given, invariants, events)
-
-    sol = run_with(stage_solver, progress_meter)
+    grid = TimeGrid(t0, dt, num_steps)
+    options = Options(saveat, invariants, events)
+    means = Means(stage_solver, adjoint, progress_meter)
+    sol = run(system, method, y0, grid, args, options, means)
     if not is_tracing() and leaves_steps_to_newton(stage_solver) and is_unsolved(sol):
         # Silently: the meter has shown its run already.
-        sol = run_with(replace(stage_solver, fallback=True), NoProgressMeter())
+        solver = replace(stage_solver, fallback=True)
+        means = Means(solver, adjoint, NoProgressMeter())
+        sol = run(system, method, y0, grid, args, options, means)
     if not throw:
         return sol
     _require_constraints(sol, system, t0, state, args)

@@ -10,13 +10,13 @@ from .._numerics import moving_with
 from .._results import RESULTS
 from .._system import State
 from ._checkpoint import Checkpoint
-from ._checks import known as known_length
+from ._checks import static_length
 from ._event_stepping import EventStepping
 from ._log import LogEntry, no_entry
-from ._progress import Known, progress_of
+from ._progress import Known
 from ._progress_meter import AbstractProgressMeter
 from ._saving import Rows, Saving
-from ._stepping import Carry, Stepping, Taken
+from ._stepping import Carry, progress_of, Stepping, Taken
 
 
 class Loop(eqx.Module):
@@ -59,7 +59,7 @@ class Loop(eqx.Module):
             return self._go_on(self.events, carry, k, known)
         carry, taken = self.stepping.advance(carry, k)
         if not self.meter.silent:
-            self.meter.report(k, known_length(self.num_steps))
+            self.meter.report(k, static_length(self.num_steps))
         return carry, self._rows(carry, taken, k)
 
     def _go_on(
@@ -74,8 +74,8 @@ class Loop(eqx.Module):
         if not self.meter.silent:
             # So many steps are surely done, in all members of a batch: with numbers of
             # their own each member would report, and in all iterations.
-            length = known_length(self.num_steps)
-            k = iteration + np.int32(length - known_length(self.num_iterations))
+            length = static_length(self.num_steps)
+            k = iteration + np.int32(length - static_length(self.num_iterations))
             jax.lax.cond(k >= 0, lambda: self.meter.report(k, length), lambda: None)
         return carry, self._event_rows(events, carry, taken, entry, row)
 

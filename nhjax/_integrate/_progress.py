@@ -6,8 +6,7 @@ import equinox as eqx
 from jaxtyping import Array, Bool, Float, Int
 
 from .._custom_types import FloatScalar
-from ._conditions import Sides
-from ._stepping import Carry
+from ._sides import Sides
 
 
 class Progress(eqx.Module):
@@ -36,12 +35,6 @@ class Progress(eqx.Module):
     far: Float[Array, " e"]
     sides: Sides
     pending: Bool[Array, " e"]
-
-
-def progress_of(carry: Carry) -> Progress:
-    """Return the progress of a run that has events."""
-    assert isinstance(carry.progress, Progress)
-    return carry.progress
 
 
 class Known(NamedTuple):

@@ -1,8 +1,7 @@
 """The compiled program of a run: its loop, what is saved of it, and the solution."""
 
-from collections.abc import Callable
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -14,85 +13,81 @@ from .._custom_types import Args, FloatScalar, IntScalar
 from .._method import AbstractMethod
 from .._numerics import ClosureConverted, nan_gradient_unless
 from .._results import RESULTS
-from .._step import AbstractStageSolver, StepRecord
+from .._step import StepRecord
 from .._system import AbstractMechanicalSystem, closure_converted, State
 from ._adjoint import AbstractAdjoint
 from ._checkpoint import Checkpoint, start_of
-from ._checks import check_saved, known
+from ._checks import check_saved, static_length
 from ._conservation import kept_invariants
-from ._event import Event
 from ._event_stepping import EventStepping
 from ._interpolation import DenseInterpolation, interpolate, step_index
 from ._log import EventLog, log_at_end, reported
 from ._loop import Loop
-from ._progress import progress_of
-from ._progress_meter import AbstractProgressMeter
+from ._options import Means, Options, TimeGrid
 from ._saveat import SaveAt, stack_saved
 from ._saving import record_places, RecordPlaces, Rows, Saving
 from ._solution import Solution
-from ._stepping import as_checkpoint, Carry, Stepping
+from ._stepping import as_checkpoint, Carry, progress_of, Stepping
 
 
-@tracked_jit("system", "args", "saveat", "invariants", "events")
+@tracked_jit("system", "args", "options")
 def run(
     system: AbstractMechanicalSystem,
     method: AbstractMethod,
-    stage_solver: AbstractStageSolver,
-    adjoint: AbstractAdjoint,
     y0: State | Checkpoint,
-    t0: FloatScalar,
-    dt: FloatScalar,
-    num_steps: int | IntScalar,
+    grid: TimeGrid,
     args: Args,
-    saveat: SaveAt,
-    meter: AbstractProgressMeter,
-    invariants: str | Callable[..., Any] | None,
-    events: tuple[Event, ...] | None,
+    options: Options,
+    means: Means,
 ) -> Solution:
     """Integrate with arguments that have been checked, and return the solution."""
-    state, origin = start_of(y0, t0, dt)
+    t0, saveat = grid.t0, options.saveat
+    state, origin = start_of(y0, t0, grid.dt)
     check_saved(saveat.fn, t0, state, args)
     # Arrays that the user's functions close over become leaves, for derivatives.
     system = closure_converted(system, t0, state, args)
-    kept = kept_invariants(invariants, system, t0, state, args)
-    given = system, method, stage_solver, origin, dt, args, kept, Programs()
-    stepping = Stepping(*given)
-    ts, sampled = saveat.ts, None
-    if ts is not None:
-        length = known(num_steps)
-        sampled = jax.vmap(lambda t: step_index(t, t0, dt, length))(ts)
-    places = record_places(saveat.dense, sampled, num_steps)
-    event_stepping = EventStepping.of(events, stepping, state, num_steps)
+    stepping = Stepping(
+        system=system,
+        method=method,
+        stage_solver=means.stage_solver,
+        origin=origin,
+        dt=grid.dt,
+        args=args,
+        invariants=kept_invariants(options.invariants, system, t0, state, args),
+        programs=Programs(),
+    )
+    sampled = _sampled_steps(saveat, grid)
+    places = record_places(saveat.dense, sampled, grid.num_steps)
+    events = EventStepping.of(options.events, stepping, state, grid.num_steps)
     fn = ClosureConverted(saveat.fn, t0, state, args)
-    saving = _saving(saveat, fn, num_steps, places, event_stepping)
-    loop = Loop(stepping, saving, meter, event_stepping)
-    start, carry, rows = _all_steps(adjoint, loop, y0, saveat.checkpoint)
-    found, given = (carry.step_state.state, rows), (system, y0, t0, dt, args)
-    log = None
-    if event_stepping is None:
-        successful = carry.result == RESULTS.successful
-        end, rows = nan_gradient_unless(successful, found, given)
-        t1 = stepping.time(num_steps)
-    else:
-        given = *given, events
-        end, rows, t1, log = _end_with_events(event_stepping, carry, found, given)
-    first = [_one(saving.saved(t0, start, args))] if saveat.t0 else []
-    on_the_way = [jax.tree.map(lambda x: x[:-1], rows.saved)] if saveat.steps else []
-    if ts is not None and sampled is not None and places.slots is not None:
-        row = places.slots[sampled]
-        records = jax.tree.map(lambda x: x[row], rows.record)
-        on_the_way = [jax.vmap(partial(_sample, loop))(ts, sampled, records)]
-    last = [_one(saving.saved(t1, end, args))] if saveat.saves_end(num_steps) else []
-    pieces = first + on_the_way + last
-    times, ys = stack_saved(pieces) if pieces else (None, None)
-    interpolation = None
-    if saveat.dense:
-        records = jax.tree.map(lambda x: x[:-1], rows.record)
-        given = system, method, known(num_steps), t0, dt, records, args
-        interpolation = DenseInterpolation(*given)
-    checkpoint = as_checkpoint(stepping, carry, end) if saveat.checkpoint else None
-    how = carry.stats, carry.result, interpolation, checkpoint, system.coordinates
-    return Solution(t0, t1, times, ys, *how, events=log)
+    saving = _saving(saveat, fn, grid.num_steps, places, events)
+    loop = Loop(stepping, saving, means.meter, events)
+    start, carry, rows = _all_steps(means.adjoint, loop, y0, saveat.checkpoint)
+    given = system, y0, t0, grid.dt, args
+    end = _end(loop, carry, rows, (given, options.events))
+    ts, ys = _output(saveat, loop, grid, start, end, sampled)
+    return Solution(
+        t0=t0,
+        t1=end.t,
+        ts=ts,
+        ys=ys,
+        stats=carry.stats,
+        result=carry.result,
+        interpolation=_interpolation(loop, grid, end.rows) if saveat.dense else None,
+        checkpoint=(
+            as_checkpoint(stepping, carry, end.state) if saveat.checkpoint else None
+        ),
+        coordinates=system.coordinates,
+        events=end.log,
+    )
+
+
+def _sampled_steps(saveat: SaveAt, grid: TimeGrid) -> Int[Array, " k"] | None:
+    """Find the steps in which the times of `SaveAt(ts=...)` lie; None without these."""
+    if saveat.ts is None:
+        return None
+    length = static_length(grid.num_steps)
+    return jax.vmap(lambda t: step_index(t, grid.t0, grid.dt, length))(saveat.ts)
 
 
 def _all_steps(
@@ -129,29 +124,76 @@ def _saving(
         fn=fn,
         num_steps=num_steps,
         stride=saveat.steps,
-        num_saved=known(num_steps) // saveat.steps if saveat.steps else 0,
+        num_saved=static_length(num_steps) // saveat.steps if saveat.steps else 0,
         num_records=places.number,
         record_slots=places.slots,
         num_events=0 if events is None else events.num_kept,
     )
 
 
-def _end_with_events(
-    events: EventStepping, carry: Carry, found: tuple[State, Rows], given: Any
-) -> tuple[State, Rows, FloatScalar, EventLog]:
-    """Find the state and the time at the end of a run with events, and their log.
+class _End(NamedTuple):
+    """The state and the time at the end of a run, the rows that it saved, and its log.
 
-    Derivatives with respect to what is `given` are NaN if the run failed.
+    The log of events is None in a run without events.
     """
+
+    state: State
+    t: FloatScalar
+    rows: Rows
+    log: EventLog | None
+
+
+def _end(loop: Loop, carry: Carry, rows: Rows, given: Any) -> _End:
+    """Find the end of a run; derivatives by what is `given` are NaN if it failed."""
+    stepping, events, state = loop.stepping, loop.events, carry.step_state.state
+    went_well, t1 = carry.result == RESULTS.successful, stepping.time(loop.num_steps)
+    if events is None:
+        state, rows = nan_gradient_unless(went_well, (state, rows), given)
+        return _End(state, t1, rows, None)
     progress, ended = progress_of(carry), carry.result == RESULTS.event_occurred
-    last = events.stepping.time(events.num_steps)
-    t1 = jnp.where(ended, events.time(progress), last)
-    went_well = ended | (carry.result == RESULTS.successful)
-    end, rows, t1 = nan_gradient_unless(went_well, (*found, t1), given)
-    log = rows.log
-    if log is None:
-        log = log_at_end(progress, t1, end)
-    return end, rows, t1, reported(log, progress.num)
+    t1 = jnp.where(ended, events.time(progress), t1)
+    found = state, rows, t1
+    state, rows, t1 = nan_gradient_unless(ended | went_well, found, given)
+    log = log_at_end(progress, t1, state) if rows.log is None else rows.log
+    return _End(state, t1, rows, reported(log, progress.num))
+
+
+def _output(
+    saveat: SaveAt,
+    loop: Loop,
+    grid: TimeGrid,
+    start: State,
+    end: _End,
+    sampled: Int[Array, " k"] | None,
+) -> tuple[PyTree[Array], PyTree[Array]]:
+    """Join what was saved at the start, on the way and at the end: times and values."""
+    saving, args, ts = loop.saving, loop.stepping.args, saveat.ts
+    pieces = []
+    if saveat.t0:
+        pieces.append(_one(saving.saved(grid.t0, start, args)))
+    if saveat.steps:
+        pieces.append(jax.tree.map(lambda x: x[:-1], end.rows.saved))
+    if ts is not None and sampled is not None and saving.record_slots is not None:
+        row = saving.record_slots[sampled]
+        records = jax.tree.map(lambda x: x[row], end.rows.record)
+        pieces.append(jax.vmap(partial(_sample, loop))(ts, sampled, records))
+    if saveat.saves_end(grid.num_steps):
+        pieces.append(_one(saving.saved(end.t, end.state, args)))
+    return stack_saved(pieces) if pieces else (None, None)
+
+
+def _interpolation(loop: Loop, grid: TimeGrid, rows: Rows) -> DenseInterpolation:
+    """Make the dense output from the records of all steps."""
+    stepping = loop.stepping
+    return DenseInterpolation(
+        system=stepping.system,
+        method=stepping.method,
+        num_steps=static_length(grid.num_steps),
+        t0=grid.t0,
+        dt=grid.dt,
+        records=jax.tree.map(lambda x: x[:-1], rows.record),
+        args=stepping.args,
+    )
 
 
 def _one(saved: PyTree[Array]) -> PyTree[Array]:

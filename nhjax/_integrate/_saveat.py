@@ -11,7 +11,7 @@ from jaxtyping import Array, Float, PyTree
 from .._custom_types import FloatScalar, IntScalar
 from .._errors import Check, DTypeError, is_traced, NonFiniteError, require
 from .._system import State
-from ._checks import known
+from ._checks import static_length
 from ._interpolation import step_position
 
 
@@ -123,7 +123,7 @@ class SaveAt(eqx.Module):
         ts = self.ts.astype(dt.dtype)
         # Positions in units of steps make the checks the same for both directions of
         # time and for all dtypes.
-        position, inside = step_position(ts, t0, dt, known(num_steps))
+        position, inside = step_position(ts, t0, dt, static_length(num_steps))
         ts = require(
             ts,
             Check(jnp.all(inside), _outside, (ts, t0, dt, num_steps)),
@@ -134,12 +134,12 @@ class SaveAt(eqx.Module):
     def num_saved(self, num_steps: int | IntScalar) -> int:
         """Return the number of entries of the output for a run of `num_steps` steps."""
         sampled = 0 if self.ts is None else self.ts.shape[0]
-        strided = known(num_steps) // self.steps if self.steps else 0
+        strided = static_length(num_steps) // self.steps if self.steps else 0
         return self.t0 + sampled + strided + self.saves_end(num_steps)
 
     def saves_end(self, num_steps: int | IntScalar) -> bool:
         """Tell whether `t1` adds an entry for a final state that `steps` leaves out."""
-        last_is_saved = bool(self.steps) and known(num_steps) % self.steps == 0
+        last_is_saved = bool(self.steps) and static_length(num_steps) % self.steps == 0
         return self.t1 and not last_is_saved
 
 

@@ -11,7 +11,7 @@ from jaxtyping import Array, Int, PyTree
 from .._custom_types import Args, FloatScalar
 from .._step import StepRecord
 from .._system import State
-from ._checks import known
+from ._checks import static_length
 from ._log import LogEntry
 from ._stepping import Taken
 
@@ -48,7 +48,7 @@ def record_places(
     """Find the places of the records for dense output or for the sampled steps."""
     if not dense and sampled is None:
         return RecordPlaces(0, None)
-    length = known(num_steps)
+    length = static_length(num_steps)
     if dense or sampled is None:
         return RecordPlaces(length, jnp.arange(length + 1, dtype=jnp.int32))
     # There is one row for each sample, and samples in the same step share the row of

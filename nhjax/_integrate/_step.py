@@ -3,13 +3,14 @@
 from typing import Literal
 
 import jax
+import jax.numpy as jnp
 
 from .._custom_types import Args, FloatScalarLike, PhaseFunction
 from .._method import AbstractMethod
 from .._numerics import nan_unless
 from .._results import RESULTS
 from .._step import AbstractStageSolver, SimplifiedNewton
-from .._system import AbstractMechanicalSystem, State
+from .._system import AbstractMechanicalSystem, check_type, real_scalar, State
 from ._integrate import integrate
 
 
@@ -61,6 +62,8 @@ def step(
         >>> y.q.shape
         (4,)
     """
+    check_type("y", y, State, "Make one with nhjax.initial_state.")
+    t = real_scalar("t", t, jnp.result_type(float))
     sol = integrate(
         system,
         method,

@@ -33,7 +33,7 @@ class AbstractStepInterval(eqx.Module):
 
 
 class WholeStep(AbstractStepInterval):
-    """The stretch of step k of a run without events."""
+    """The time interval of step k of a run without events."""
 
     stepping: Stepping
     k: Int[Array, ""]
@@ -55,7 +55,7 @@ class WholeStep(AbstractStepInterval):
 
 
 class PartOfStep(AbstractStepInterval):
-    """A stretch from a time `since`, over a `length`."""
+    """The time interval of a part of a step, from a time `since`, of some `length`."""
 
     since: FloatScalar
     length: FloatScalar
@@ -77,13 +77,13 @@ class PartOfStep(AbstractStepInterval):
 
 
 def step_back(
-    stepping: Stepping, step_state: StepState, stretch: AbstractStepInterval
+    stepping: Stepping, step_state: StepState, interval: AbstractStepInterval
 ) -> StepState:
     """Compute the state that a step started from, given the one that it led to."""
     go_on = jnp.asarray(False)
 
     def back_from(step_state: StepState) -> StepState:
-        t, h = stretch.end, -stretch.size
+        t, h = interval.end, -interval.size
         return stepping.one_step(step_state, t, h, go_on).step_state
 
     if _retraces(stepping, step_state):
@@ -99,7 +99,7 @@ def step_back(
 
     def sweep(z: State):
         y = back_from(eqx.tree_at(lambda x: x.state, step_state, z))
-        t, h = stretch.start, stretch.size
+        t, h = interval.start, interval.size
         reached = stepping.one_step(y, t, h, go_on).step_state.state
         to_reached = manifold.inverse(reached.q)
         xi = manifold.local(manifold.compose(to_reached, target.q))
@@ -107,7 +107,7 @@ def step_back(
         multiplier = z.multiplier
         if propagated:
             miss = target.multiplier - reached.multiplier
-            misses.append(stretch.size * miss)
+            misses.append(interval.size * miss)
             multiplier = multiplier + miss
         size = max_norm(*misses)
         z = State(manifold.act(z.q, xi), z.v, z.p + misses[1], multiplier)

@@ -1,6 +1,6 @@
 """The steps of a run: what is carried from one to the next, and how each is taken."""
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -31,6 +31,7 @@ from .._system import (
 )
 from ._checkpoint import Checkpoint, Origin, resumed
 from ._conservation import conserves
+from ._progress import Progress
 from ._statistics import first_statistics, Statistics, updated_statistics
 
 
@@ -44,7 +45,13 @@ class Carry(NamedTuple):
     step_state: StepState
     result: RESULTS
     stats: Statistics
-    progress: Any = None
+    progress: Progress | None = None
+
+
+def progress_of(carry: Carry) -> Progress:
+    """Return the progress of a run that has events."""
+    assert carry.progress is not None
+    return carry.progress
 
 
 class Taken(NamedTuple):
@@ -99,11 +106,9 @@ class Stepping(eqx.Module):
                 result,
             )
         if self.invariants is not None:
-            given = self.invariants, t, self.dt, y0, args
+            kept = conserves(system, self.invariants, t, self.dt, y0, args)
             result = RESULTS.where(
-                (result == RESULTS.successful) & ~conserves(system, *given),
-                RESULTS.not_conserved,
-                result,
+                (result == RESULTS.successful) & ~kept, RESULTS.not_conserved, result
             )
         result = RESULTS.where(all_finite(y0), result, RESULTS.nonfinite_state)
         violation = largest_violation(system, t, step_state, args)
@@ -119,8 +124,8 @@ class Stepping(eqx.Module):
         """Take one step of size h from t; h may be negative, to go back."""
         start = step_state.differentiated_in_state()
         arguments = StepArguments(self.system, t, h, start, self.args, self.invariants)
-        given = arguments, self.method, self.stage_solver, skip, self.programs
-        return primitive_step(*given)
+        method, stage_solver = self.method, self.stage_solver
+        return primitive_step(arguments, method, stage_solver, skip, self.programs)
 
     def nothing_taken(self, carry: Carry) -> Taken:
         """Make the record of a step that was not taken, all zeros at the stages."""

@@ -12,13 +12,13 @@ from .._custom_types import BoolScalar, FloatScalar
 from .._results import RESULTS
 from .._step import first_step_state, StepState
 from .._system import State
-from ._conditions import Sides
 from ._log import log_at_end, LogEntry
 from ._loop import Loop
-from ._progress import Known, Progress, progress_of
+from ._progress import Known, Progress
 from ._saving import Rows
+from ._sides import Sides
 from ._step_back import PartOfStep, step_back, WholeStep
-from ._stepping import Carry
+from ._stepping import Carry, progress_of
 
 
 class AbstractWayBack(eqx.Module):
@@ -227,7 +227,7 @@ class WayBackOverEvents(AbstractWayBack):
 
     def differentiable_part(self, carry: Carry) -> tuple[Any, Any]:
         """Return the state and the time since the last node, or their cotangents."""
-        return carry.step_state.state, carry.progress.offset
+        return carry.step_state.state, progress_of(carry).offset
 
     def rerun(
         self,

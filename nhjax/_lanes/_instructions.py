@@ -14,7 +14,7 @@ from ._types import bits, is_signed, literal, scalar_type, suffix, vector
 
 
 class Writer(Protocol):
-    """What instructions are written to."""
+    """A text of LLVM's language in the making, to which instructions are written."""
 
     contract: str
 

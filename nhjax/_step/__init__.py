@@ -5,7 +5,6 @@ from ._curved_chart import chart_of_step as chart_of_step
 from ._derivative import (
     change_of_step as change_of_step,
     primitive_step as primitive_step,
-    StepArguments as StepArguments,
     tangent_of_outcome as tangent_of_outcome,
 )
 from ._invariants import (
@@ -24,6 +23,7 @@ from ._step import (
     first_step_state as first_step_state,
     largest_violation as largest_violation,
     step as step,
+    StepArguments as StepArguments,
     StepOutcome as StepOutcome,
     StepState as StepState,
 )

@@ -7,7 +7,7 @@ import equinox as eqx
 import jax
 
 from .._compile import as_cpu_kernel, Programs
-from .._custom_types import Args, BoolScalar, FloatScalar
+from .._custom_types import BoolScalar
 from .._manifold import unframed
 from .._method import AbstractMethod
 from .._numerics import (
@@ -18,39 +18,22 @@ from .._numerics import (
     zero_unless,
 )
 from .._results import RESULTS
-from .._system import AbstractMechanicalSystem, linearise, State
+from .._system import linearise, State
 from ._end import end_state, step_record
-from ._invariants import Invariants
 from ._newton import AbstractStageSolver
 from ._positions import end_position
 from ._record import StepRecord
 from ._stage_equations import stage_forces
 from ._stage_iteration import unknown_units
-from ._stage_system import StageSystem
-from ._step import equations_of_step, step, StepOutcome, StepState
+from ._step import equations_of_step, step, StepArguments, StepOutcome
 from ._unknowns import Stages
-
-
-class StepArguments(eqx.Module):
-    """The arguments of a step with respect to which it can be differentiated.
-
-    Of `step_state` this is the state alone; see `StepState.differentiated_in_state`.
-    Without `invariants` the step keeps none.
-    """
-
-    system: AbstractMechanicalSystem
-    t: FloatScalar
-    h: FloatScalar
-    step_state: StepState
-    args: Args
-    invariants: Invariants | None
 
 
 @eqx.filter_custom_jvp
 def differentiable_step(
     arguments: StepArguments,
     method: AbstractMethod,
-    solver: AbstractStageSolver,
+    stage_solver: AbstractStageSolver,
     skip: BoolScalar,
     programs: Programs,
 ) -> StepOutcome:
@@ -66,19 +49,17 @@ def differentiable_step(
     step failed.
     """
     del programs
-    system, t, h = arguments.system, arguments.t, arguments.h
-    given = arguments.step_state, arguments.args, skip, arguments.invariants
-    return step(system, method, solver, t, h, *given)
+    return step(arguments, method, stage_solver, skip)
 
 
 @differentiable_step.def_jvp
 def _differentiable_step_jvp(primals, tangents):
-    arguments, method, solver, skip, _ = primals
+    arguments, method, stage_solver, skip, _ = primals
     # The program that the derivative was asked of is found again.
     outcome = primitive_step(*primals)
     x, ok = outcome.stages, ~skip & (outcome.result == RESULTS.successful)
     perturbed, fixed = eqx.partition(arguments, has_tangent(tangents[0]))
-    change = change_of_step(arguments, method, solver, ok, x, fixed)
+    change = change_of_step(arguments, method, stage_solver, ok, x, fixed)
     # By the checkpoint nothing but states and stages is kept for a reverse pass.
     change = jax.checkpoint(change, prevent_cse=False)
     return outcome, tangent_of_outcome(outcome, change(perturbed, x, tangents[0]))
@@ -90,7 +71,7 @@ Changes: TypeAlias = tuple[Stages, State, StepRecord]
 def change_of_step(
     arguments: StepArguments,
     method: AbstractMethod,
-    solver: AbstractStageSolver,
+    stage_solver: AbstractStageSolver,
     ok: BoolScalar,
     x: Stages,
     fixed: StepArguments,
@@ -101,16 +82,16 @@ def change_of_step(
     change if the `perturbed` part of its arguments changes at `rates`; the other part
     is `fixed`. The changes are zero unless the step is `ok`.
     """
-    stages = _stage_system(arguments, method)
-    given = frozen((stages, arguments.step_state.lin, x))
-    frozen_newton_map = solver.frozen_newton_map(*given)
+    stages = equations_of_step(arguments, method)
+    at, lin, solved = frozen((stages, arguments.step_state.lin, x))
+    frozen_newton_map = stage_solver.frozen_newton_map(at, lin, solved)
 
     def change(perturbed, x, rates):
         rates = zero_unless(ok, rates)
 
         def sweep(perturbed, x):
             arguments = eqx.combine(perturbed, fixed)
-            return frozen_newton_map(_stage_system(arguments, method), x)
+            return frozen_newton_map(equations_of_step(arguments, method), x)
 
         # The program of a sweep is made once, and differentiated twice.
         corrected = ClosureConverted(sweep, perturbed, x)
@@ -123,8 +104,8 @@ def change_of_step(
         _, contraction = jax.linearize(lambda x: corrected(perturbed, x), x)
         # This iteration starts from zero, while that of the step starts from a good
         # guess, so that it is allowed twice as many iterations.
-        limit = 2 * solver.max_iterations
-        units = unknown_units(*given[:2])
+        limit = 2 * stage_solver.max_iterations
+        units = unknown_units(at, lin)
         dx = solve_contraction(contraction, b, units, max_iterations=limit)
         _, dend = jax.jvp(end, (perturbed, x), (rates, zero_unless(ok, dx)))
         return zero_unless(ok, (dx, *dend))
@@ -146,7 +127,7 @@ def tangent_of_outcome(outcome: StepOutcome, changes: Changes) -> StepOutcome:
 def primitive_step(
     arguments: StepArguments,
     method: AbstractMethod,
-    solver: AbstractStageSolver,
+    stage_solver: AbstractStageSolver,
     skip: BoolScalar,
     programs: Programs,
 ) -> StepOutcome:
@@ -154,19 +135,14 @@ def primitive_step(
     # When JAX splits a scan into a known and a linear part, it drops the derivative
     # rules of functions, but not those of primitives. Without its rule a step could be
     # differentiated in reverse mode only once, and not again.
-    given = arguments, method, solver, skip, programs
-    return as_cpu_kernel(differentiable_step, *given, programs=programs)
-
-
-def _stage_system(arguments: StepArguments, method: AbstractMethod) -> StageSystem:
-    return equations_of_step(
-        arguments.system,
+    return as_cpu_kernel(
+        differentiable_step,
+        arguments,
         method,
-        arguments.t,
-        arguments.h,
-        arguments.step_state,
-        arguments.args,
-        arguments.invariants,
+        stage_solver,
+        skip,
+        programs,
+        programs=programs,
     )
 
 
@@ -180,7 +156,7 @@ def _end(
     to round-off.
     """
     system, args, start = arguments.system, arguments.args, arguments.step_state.state
-    stages = _stage_system(arguments, method)
+    stages = equations_of_step(arguments, method)
     t, u = arguments.t + arguments.h, x.node_fibre_coordinate[-1]
     q = unframed(end_position(stages, x))
     p = system.momentum(t, q, u, args)

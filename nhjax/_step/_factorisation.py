@@ -106,7 +106,7 @@ def _first_order(
     jacobian: Float[Array, "s l n"],
     reaction: Float[Array, "s n l"],
 ) -> LeadingStructure:
-    """Do what `leading_structure` does, with the terms of order h."""
+    """Make the leading structure with the terms of order h."""
     momenta = momenta_of_forces(stages, x, _reactions(stages, jacobian))
     on_stages, on_nodes = (
         jnp.swapaxes(matvec(lin.momentum_inverse, jnp.swapaxes(p, 1, 2)), 1, 2)
@@ -171,7 +171,7 @@ def _with_inertia_at_end(
 def _sparse(
     stages: StageSystem, x: Stages, lin: Linearisation, start: SparseMatrix
 ) -> LeadingStructure:
-    """Do what `leading_structure` does, for constraints that share few coordinates."""
+    """Make the leading structure for constraints that share few coordinates."""
     pattern = start.pattern
     nodes = sparse_constraint_jacobian(stages, x, pattern)
     rows = SparseMatrix(jnp.concatenate([start.values[None], nodes.values]), pattern)

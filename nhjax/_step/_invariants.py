@@ -133,7 +133,7 @@ class StartImpulses(eqx.Module):
         args: Args,
         lin: Linearisation,
     ) -> "StartImpulses":
-        """Make them at the state y, of which `lin` is the linearisation."""
+        """Make the start impulses at the state y, whose linearisation is `lin`."""
         u = system.fibre_coordinate(y)
         slopes, covectors = invariants.slopes(system, t, y.q, u, args)
         given = slopes, covectors, lin.momentum_inverse, moving_part(slopes, u)

@@ -80,7 +80,7 @@ class AbstractStageSolver(eqx.Module):
 
 
 def _iterated(
-    solver: AbstractStageSolver,
+    stage_solver: AbstractStageSolver,
     sweep: Callable[[Stages], tuple[Stages, Sizes, Evaluation]],
     x0: Stages,
     scale: Scale,
@@ -91,8 +91,8 @@ def _iterated(
         sweep,
         x0,
         scale.size,
-        max_iterations=solver.max_iterations,
-        tolerance=solver.tolerance,
+        max_iterations=stage_solver.max_iterations,
+        tolerance=stage_solver.tolerance,
         round_off=scale.round_off,
         noise_units=NOISE_UNITS,
         skip=skip,
@@ -201,9 +201,9 @@ class SimplifiedNewton(AbstractStageSolver):
         return lambda stages, x: corrected(stages, structure, x)[0]
 
 
-def leaves_steps_to_newton(solver: AbstractStageSolver) -> bool:
+def leaves_steps_to_newton(stage_solver: AbstractStageSolver) -> bool:
     """Tell whether a plain call that fails is to be repeated with the fallback."""
-    return isinstance(solver, SimplifiedNewton) and solver.fallback is None
+    return isinstance(stage_solver, SimplifiedNewton) and stage_solver.fallback is None
 
 
 class Newton(AbstractStageSolver):

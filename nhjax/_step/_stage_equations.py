@@ -124,7 +124,7 @@ def constraint_jacobian(stages: StageSystem, x: Stages) -> Float[Array, "r l n"]
 def sparse_constraint_jacobian(
     stages: StageSystem, x: Stages, pattern: Pattern
 ) -> SparseMatrix:
-    """Compute what `constraint_jacobian` does, for a B whose pattern is known."""
+    """Compute B = ∂Φ/∂u at the nodes i >= 2 as a sparse matrix of a known pattern."""
     return _at_nodes(
         stages,
         x,

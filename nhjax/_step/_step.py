@@ -68,6 +68,21 @@ class StepState(eqx.Module):
         return eqx.tree_at(lambda x: x.state, jax.lax.stop_gradient(self), self.state)
 
 
+class StepArguments(eqx.Module):
+    """The arguments of a step with respect to which it can be differentiated.
+
+    Of `step_state` this is the state alone; see `StepState.differentiated_in_state`.
+    Without `invariants` the step keeps none.
+    """
+
+    system: AbstractMechanicalSystem
+    t: FloatScalar
+    h: FloatScalar
+    step_state: StepState
+    args: Args
+    invariants: Invariants | None = None
+
+
 class StepOutcome(NamedTuple):
     """The outcome of a step: the next state or the reason why there is none.
 
@@ -147,42 +162,33 @@ def _continuous_multiplier_jvp(primals, tangents):
     return multiplier, zero_unless(ok, change)
 
 
-def equations_of_step(
-    system: AbstractMechanicalSystem,
-    method: AbstractMethod,
-    t: FloatScalar,
-    h: FloatScalar,
-    step_state: StepState,
-    args: Args,
-    invariants: Invariants | None,
-) -> StageSystem:
+def equations_of_step(arguments: StepArguments, method: AbstractMethod) -> StageSystem:
     """Make the equations of a step, with those of the invariants that it keeps."""
+    system, t, args = arguments.system, arguments.t, arguments.args
+    step_state, invariants = arguments.step_state, arguments.invariants
     y, lin, kept = step_state.wrapped(system), step_state.lin, None
     if invariants is not None:
         position = step_state.state.q, step_state.q_compensation
         kept = StartImpulses.at(invariants, system, t, y, position, args, lin)
-    return StageSystem.at(system, method, t, h, y, args, lin, kept)
+    return StageSystem.at(system, method, t, arguments.h, y, args, lin, kept)
 
 
 def step(
-    system: AbstractMechanicalSystem,
+    arguments: StepArguments,
     method: AbstractMethod,
-    solver: AbstractStageSolver,
-    t: FloatScalar,
-    h: FloatScalar,
-    step_state: StepState,
-    args: Args,
+    stage_solver: AbstractStageSolver,
     skip: BoolScalar,
-    invariants: Invariants | None = None,
 ) -> StepOutcome:
     """Take one step of size h, from (q_k, p_k, λ_k) to (q_{k+1}, p_{k+1}, λ_{k+1}).
 
     Where `skip` is true nothing is solved, and the outcome is to be discarded.
     """
+    system, args, step_state = arguments.system, arguments.args, arguments.step_state
+    t, h, keeps_invariants = arguments.t, arguments.h, arguments.invariants is not None
     state, lin = step_state.state, step_state.lin
-    stages = equations_of_step(system, method, t, h, step_state, args, invariants)
+    stages = equations_of_step(arguments, method)
     x0 = starting_values(stages, system.fibre_coordinate(state), lin)
-    solved = solver.solve(stages, x0, lin, skip)
+    solved = stage_solver.solve(stages, x0, lin, skip)
     x, forces = solved.x, solved.aux.forces
 
     chart = stages.chart(x)
@@ -190,10 +196,10 @@ def step(
     at_end = chart.manifold.wrapped(q, q_compensation)
     gained = h * small_einsum("s,sn->n", stages.coefficients("b"), forces.force)
     p, p_compensation = state.p, step_state.p_compensation
-    if invariants is not None:
+    if keeps_invariants:
         p_compensation = p_compensation + start_impulse(stages, x)
     p, p_compensation = chart.advance_momentum(p, gained, p_compensation)
-    if invariants is not None:
+    if keeps_invariants:
         p, p_compensation = two_sum(p, p_compensation + end_impulse(stages, x))
     u = p if stages.hamiltonian else x.node_fibre_coordinate[-1]
     lin_next = linearise(system, t + h, at_end, u, args, may_be_sparse=True)
@@ -203,7 +209,7 @@ def step(
 
     result = _result(solved, lin, next_state, in_chart(stages, x))
     if stages.redundancy is not None:
-        small = float(jnp.finfo(p.dtype).eps) ** 0.5 + 100 * solver.tolerance
+        small = float(jnp.finfo(p.dtype).eps) ** 0.5 + 100 * stage_solver.tolerance
         kept = keeps_constraints(system, lin_next, t + h, end, args, small)
         lost = (result == RESULTS.successful) & ~kept
         result = RESULTS.where(lost, RESULTS.lost_constraints, result)

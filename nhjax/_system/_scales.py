@@ -37,7 +37,7 @@ def velocity_scale(
     u: Float[Array, " n"],
     args: Args,
 ) -> Float[Array, " l"]:
-    """Do what `violation_scale` does, given the Jacobian ∂Φ/∂u alone."""
+    """Estimate the sizes of the terms of Φ from its Jacobian ∂Φ/∂u alone."""
     affine = _finite_or_zero(system.constraint(t, q, jnp.zeros_like(u), args))
     slopes = _row_sums(jacobian)
     return slopes * unit(max_norm(u)) + affine

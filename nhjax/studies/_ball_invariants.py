@@ -147,7 +147,7 @@ class BallInvariants(AbstractStudyResult):
         return ball_verdict(self.runs)
 
     def figures(self) -> "dict[str, Figure]":
-        """For each s the errors of the four integrals against time, as in the paper."""
+        """Draw the errors of the four integrals against time, a figure for each s."""
         return {f"{self.name}-s{s}": self._figure(s) for s in self.stages}
 
     def _with_slopes(self, s: int) -> "zip[tuple[BallRun, float, float]]":

@@ -21,8 +21,8 @@ from ._result import Timing
 from ._run import meter
 
 
-# Means are taken over this long a stretch to either side of a time: μ(E, k) of one
-# step fluctuates with the fast motion of the system.
+# Means are taken over an interval of this length to either side of a time: μ(E, k) of
+# one step fluctuates with the fast motion of the system.
 WINDOW = 5.0
 # So many members run at a time, if the energies that are saved of all fit in so many
 # bytes: memory does not grow with the number of members.

@@ -16,10 +16,10 @@ BINS = 200
 def envelope(
     times: np.ndarray, values: np.ndarray, bins: int = BINS
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Compute the least and greatest of `values` in each of `bins` stretches of time.
+    """Compute the least and greatest of `values` in each of `bins` intervals of time.
 
-    Returns the middles of the stretches, the least and the greatest values. What is not
-    finite is left out, and a stretch of nothing else is NaN.
+    Returns the middles of the intervals, the least and the greatest values. What is not
+    finite is left out, and an interval of nothing else is NaN.
     """
     starts = np.linspace(0, len(times), bins + 1).astype(int)[:-1]
     finite = np.isfinite(values)

@@ -45,7 +45,7 @@ class ExactExample(Protocol):
 
 @dataclasses.dataclass(frozen=True)
 class AbstractOrderStudy(AbstractStudyResult):
-    """Relative errors at the final time.
+    """The result of a study of orders: relative errors at the final time.
 
     - `errors`: shape (stages, step sizes, quantities). Of the two multipliers the first
         is that which the method reports, the second the continuous λ_c(q, p).

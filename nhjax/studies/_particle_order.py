@@ -15,10 +15,10 @@ EXAMPLES = {"particle": NonholonomicParticle, "sleigh": ChaplyginSleigh}
 
 @dataclasses.dataclass(frozen=True)
 class ParticleOrder(AbstractOrderStudy):
-    """Relative errors at the final time.
+    """The errors of the nonholonomic particle at the final time, by stages and step.
 
-    - `errors`: shape (stages, step sizes, 4), for q, p, the multiplier λ that the
-        method reports and the continuous one λ_c(q, p).
+    - `errors`: relative ones, of shape (stages, step sizes, 4), for q, p, the
+        multiplier λ that the method reports and the continuous one λ_c(q, p).
     - `timings`: one for each number of stages.
     """
 

@@ -12,11 +12,11 @@ from ._retractions import RETRACTIONS
 
 @dataclasses.dataclass(frozen=True)
 class UnicycleOrder(AbstractOrderStudy):
-    """Relative errors at the final time.
+    """The errors of the unicycle on SE(2) at the final time, by stages and step size.
 
-    - `errors`: shape (stages, step sizes, 5), for g = (x, y, θ), the body velocity v
-        and momentum p, the multiplier λ that the method reports and the continuous one
-        λ_c(g, p).
+    - `errors`: relative ones, of shape (stages, step sizes, 5), for g = (x, y, θ), the
+        body velocity v and momentum p, the multiplier λ that the method reports and the
+        continuous one λ_c(g, p).
     - `timings`: one for each number of stages.
     """
 

@@ -35,6 +35,22 @@ def test_three_steps_and_their_gradient_are_those_of_the_compiled_program():
     assert int(other.stats["num_steps"]) == 3
 
 
+def test_the_end_of_a_run_at_an_event_is_that_of_the_compiled_program():
+    fall = nhjax.LagrangianSystem(lambda t, q, v, args: 0.5 * v[0] ** 2 - q[0])
+    y0 = nhjax.initial_state(fall, jnp.array([1.0]), jnp.array([0.0]))
+    ground = nhjax.Event(lambda t, y, args: y.q[0])
+
+    def end(y0):
+        return nhjax.integrate(fall, METHOD, y0, dt=2.0, num_steps=1, event=ground)
+
+    expected = end(y0)
+    with jax.disable_jit():
+        sol = end(y0)
+    np.testing.assert_allclose(sol.t1, np.sqrt(2), rtol=1e-14)
+    np.testing.assert_allclose(sol.t1, expected.t1, rtol=1e-15)
+    assert int(sol.stats["num_events"]) == 1
+
+
 def test_a_function_in_a_kernel_sees_numbers():
     seen = []
 

@@ -55,6 +55,32 @@ def test_a_step_is_that_of_integrate_bit_for_bit(name, method):
         np.testing.assert_array_equal(one, of_long_run[0])
 
 
+@pytest.mark.parametrize(
+    ("t", "y", "error", "message"),
+    [
+        (None, None, TypeError, "`y` must be an nhjax.State, got None"),
+        (0.0, "checkpoint", TypeError, "`y` must be an nhjax.State, got Checkpoint"),
+        (None, "state", nhjax.DTypeError, "`t` must be a real number, got None"),
+        ([0.0, 1.0], "state", nhjax.DTypeError, "`t` must be a real number, got"),
+        (np.zeros(2), "state", nhjax.ShapeError, r"`t` has shape \(2,\), but a scalar"),
+    ],
+)
+def test_wrong_arguments_are_named_as_those_of_a_step(t, y, error, message):
+    example, method = SYSTEMS["nonholonomic"], LobattoIIIAB(2)
+    y0 = example.initial_state()
+    sol = nhjax.integrate(
+        example.system,
+        method,
+        y0,
+        dt=H,
+        num_steps=1,
+        saveat=nhjax.SaveAt(checkpoint=True),
+    )
+    given = {"checkpoint": sol.checkpoint, "state": y0, None: None}[y]
+    with pytest.raises(error, match=message):
+        nhjax.step(example.system, method, t, H, given)
+
+
 @pytest.mark.parametrize("name", SYSTEMS)
 def test_a_compiled_step_is_that_of_compiled_integrate_bit_for_bit(name):
     system, y0 = SYSTEMS[name].system, SYSTEMS[name].initial_state()

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Array
 
 import nhjax
-from nhjax._step import first_step_state, step
+from nhjax._step import first_step_state, step, StepArguments
 from nhjax._step._unknowns import Stages
 from nhjax._system import State
 from oracles import group_mechanics as by_hand
@@ -342,9 +342,8 @@ def solved_steps(
     never = jnp.asarray(False)
 
     def advance(step_state, t):
-        outcome = step(
-            system, method, solver, t, jnp.asarray(h), step_state, None, never
-        )
+        arguments = StepArguments(system, t, jnp.asarray(h), step_state, None)
+        outcome = step(arguments, method, solver, never)
         x, record = outcome.stages, outcome.record
         taken = SolvedStep(
             step_state.state,

@@ -14,7 +14,7 @@ from nhjax._step import first_step_state
 from nhjax._step._factorisation import leading_structure
 from nhjax._step._stage_iteration import corrected
 from nhjax._step._starting_values import starting_values
-from nhjax._step._step import equations_of_step
+from nhjax._step._step import equations_of_step, StepArguments
 from oracles.forms import in_space
 from oracles.long import long
 
@@ -30,7 +30,8 @@ def contraction(example, method, h):
     @jax.jit
     def rates(h):
         start = first_step_state(system, method, t, y0, None)
-        stages = equations_of_step(system, method, t, h, start, None, None)
+        arguments = StepArguments(system, t, h, start, None)
+        stages = equations_of_step(arguments, method)
         lin = start.lin
         x0 = starting_values(stages, system.fibre_coordinate(y0), lin)
         x = nhjax.Newton().solve(stages, x0, lin, jnp.asarray(False)).x

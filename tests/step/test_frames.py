@@ -13,7 +13,7 @@ from nhjax._manifold import unframed
 from nhjax._step._positions import end_position
 from nhjax._step._stage_system import StageSystem
 from nhjax._step._starting_values import starting_values
-from nhjax._step._step import equations_of_step, first_step_state
+from nhjax._step._step import equations_of_step, first_step_state, StepArguments
 from oracles.group_problems import RETRACTIONS
 from oracles.long import long
 
@@ -86,7 +86,8 @@ def test_equations_of_a_step_are_the_same_with_frames(form, retraction, chart):
     system, y0 = body(form, retraction)
     method, t = nhjax.LobattoIIIAB(3, chart=chart), jnp.asarray(0.0)
     given = first_step_state(system, method, t, y0, None)
-    stages = equations_of_step(system, method, t, jnp.asarray(0.1), given, None, None)
+    arguments = StepArguments(system, t, jnp.asarray(0.1), given, None)
+    stages = equations_of_step(arguments, method)
     plain = replace(stages, system=system, q=unframed(stages.q))
     assert isinstance(plain, StageSystem)
     x = starting_values(stages, system.fibre_coordinate(y0), given.lin)
