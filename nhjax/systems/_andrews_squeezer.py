@@ -46,6 +46,8 @@ class AndrewsSqueezer(AbstractExample):
         >>> from nhjax.systems import AndrewsSqueezer
         >>> squeezer = AndrewsSqueezer(torque=0.033)
         >>> system, y0 = squeezer.system, squeezer.initial_state()
+        >>> round(float(y0.multiplier[0]), 3)
+        -98.567
     """
 
     masses: Array = eqx.field(

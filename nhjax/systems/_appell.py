@@ -33,6 +33,8 @@ class Appell(AbstractConstrainedExample):
         >>> from nhjax.systems import Appell
         >>> appell = Appell(gravity=9.81)
         >>> y0, (q, v, multiplier) = appell.initial_state(), appell.exact(1.0)
+        >>> [round(x, 3) for x in q.tolist()]
+        [1.577, 2.17, -4.624]
     """
 
     mass: Array = eqx.field(converter=parameter, default=1.0)

@@ -56,6 +56,8 @@ class BallInBowl(AbstractConstrainedGroupExample):
         >>> from nhjax.systems import BallInBowl
         >>> ball = BallInBowl.rolling((0.5, 0.0), (0.0, 1.2), shape="sphere")
         >>> system, y0 = ball.system, ball.initial_state()
+        >>> round(float(y0.multiplier[2]), 3)
+        10.737
     """
 
     mass: Array = eqx.field(converter=parameter, default=1.0)

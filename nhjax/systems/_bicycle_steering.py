@@ -39,6 +39,8 @@ class LeanToSteer(eqx.Module):
         >>> from nhjax.systems import LeanToSteer, WhippleBicycle
         >>> bicycle = WhippleBicycle(steering=LeanToSteer(lean_rate_gain=10.0))
         >>> y0 = bicycle.initial_state()
+        >>> round(float(y0.multiplier[4]), 1)
+        -302.2
     """
 
     lean_gain: Array = eqx.field(converter=parameter, default=0.0)

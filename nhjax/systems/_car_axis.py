@@ -44,6 +44,8 @@ class CarAxis(AbstractExample):
         >>> from nhjax.systems import CarAxis
         >>> axis = CarAxis.level(amplitude=0.05)
         >>> system, y0 = axis.system, axis.initial_state()
+        >>> [round(x, 3) for x in y0.v.tolist()]
+        [-0.25, 0.0, -0.25, 0.0]
     """
 
     mass: Array = eqx.field(converter=parameter, default=10.0)

@@ -60,6 +60,8 @@ class CarWithTrailers(AbstractNonholonomicExample):
         >>> from nhjax.systems import CarWithTrailers
         >>> car = CarWithTrailers(num_trailers=3)
         >>> system, y0 = car.system, car.initial_state()
+        >>> [round(x, 1) for x in y0.multiplier.tolist()]
+        [2599.5, 2119.3, -1049.3, 419.9, -99.9]
     """
 
     num_trailers: int = eqx.field(static=True, default=1)

@@ -33,6 +33,8 @@ class ChaoticSystem(AbstractConstrainedExample):
         >>> q0, v0 = chaotic.ensemble(100)
         >>> start = lambda q, v: nhjax.initial_state(chaotic.system, q, v)
         >>> y0 = jax.vmap(start)(q0, v0)
+        >>> y0.multiplier.shape
+        (101, 1)
     """
 
     m: int = eqx.field(static=True)

@@ -37,6 +37,8 @@ class ChaplyginSphere(AbstractRollingBody):
         >>> from nhjax.systems import ChaplyginSphere
         >>> sphere = ChaplyginSphere(moments=(0.2, 0.3, 0.45))
         >>> system, y0 = sphere.system, sphere.initial_state()
+        >>> [round(x, 3) for x in y0.multiplier.tolist()]
+        [-0.038, -0.25, 9.81]
     """
 
     mass: Array = eqx.field(converter=parameter, default=1.0)

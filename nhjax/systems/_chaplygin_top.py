@@ -46,6 +46,8 @@ class ChaplyginTop(AbstractRollingBody):
         >>> from nhjax.systems import ChaplyginTop
         >>> top = ChaplyginTop(moments=(0.3, 0.35, 0.4))
         >>> system, y0 = top.system, top.initial_state()
+        >>> [round(x, 3) for x in y0.multiplier.tolist()]
+        [-0.091, 1.772, 9.879]
     """
 
     mass: Array = eqx.field(converter=parameter, default=1.0)

@@ -34,6 +34,8 @@ class ContinuouslyVariableTransmission(AbstractConstrainedExample):
         >>> from nhjax.systems import ContinuouslyVariableTransmission as CVT
         >>> cvt = CVT.high(epsilon=0.0)
         >>> y0, (y, dy) = cvt.initial_state(), cvt.exact_driver(1.0)
+        >>> round(float(y), 3), round(float(dy), 3)
+        (2.51, 2.094)
     """
 
     epsilon: Array = eqx.field(converter=parameter, default=0.5)

@@ -32,7 +32,9 @@ class DoublePendulum(AbstractExample):
 
         >>> from nhjax.systems import DoublePendulum
         >>> pendulum = DoublePendulum.swinging(angles=(0.5, -0.3), lengths=(1.0, 0.7))
-        >>> system = pendulum.system
+        >>> y0 = pendulum.initial_state()
+        >>> [round(x, 3) for x in y0.multiplier.tolist()]
+        [-0.579, -0.288]
     """
 
     masses: Array = eqx.field(converter=coordinates, default=(1.0, 1.0))

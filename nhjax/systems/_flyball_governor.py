@@ -53,6 +53,8 @@ class FlyballGovernor(AbstractExample):
         >>> from nhjax.systems import FlyballGovernor
         >>> governor = FlyballGovernor.turning(angle=0.6, rate=5.0)
         >>> system, y0 = governor.system, governor.initial_state()
+        >>> round(float(y0.multiplier[0]), 3)
+        -29.359
     """
 
     shaft_inertia: Array = eqx.field(converter=parameter, default=5e-6)
@@ -125,12 +127,11 @@ class FlyballGovernor(AbstractExample):
             jnp.isfinite(s),
             f"`coupler_length` {coupler} does not reach from rod to slider.",
         )
-        merged: dict[str, Any] = dict(parameters)
-        merged.update(
-            q0=jnp.stack([jnp.zeros_like(beta), beta, beta, s]),
-            v0=jnp.stack([dphi, dbeta, dbeta, ds]),
-        )
-        return cls(**merged)
+        start: dict[str, Any] = {
+            "q0": jnp.stack([jnp.zeros_like(beta), beta, beta, s]),
+            "v0": jnp.stack([dphi, dbeta, dbeta, ds]),
+        }
+        return cls(**(parameters | start))
 
     @property
     def system(self) -> LagrangianSystem:

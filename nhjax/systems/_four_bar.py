@@ -45,6 +45,8 @@ class FourBar(AbstractExample):
         >>> from nhjax.systems import FourBar
         >>> linkage = FourBar.turning(angle=0.3, rate=20.0)
         >>> system, y0 = linkage.system, FourBar.parallelogram().initial_state()
+        >>> round(float(y0.multiplier[1]), 3)
+        4.405
     """
 
     lengths: Array = eqx.field(converter=coordinates, default=(0.1, 0.4, 0.3, 0.4))

@@ -36,6 +36,8 @@ class HeavyTop(AbstractExample):
         >>> from nhjax.systems import HeavyTop
         >>> top = HeavyTop(gravity=9.81)
         >>> y0, on_se3 = top.initial_state(), top.on_se3()
+        >>> [round(x, 3) for x in y0.p.tolist()]
+        [0.11, -0.055, 1.2]
     """
 
     mass: Array = eqx.field(converter=parameter, default=1.0)
@@ -124,7 +126,9 @@ class HeavyTopSE3(AbstractExample):
 
         >>> from nhjax.systems import HeavyTop
         >>> top = HeavyTop(gravity=9.81).on_se3()
-        >>> system = top.system
+        >>> y0 = top.initial_state()
+        >>> [round(x, 3) for x in y0.multiplier.tolist()]
+        [0.218, -2.1, 8.442]
     """
 
     mass: Array = eqx.field(converter=parameter, default=1.0)

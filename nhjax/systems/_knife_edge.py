@@ -36,6 +36,8 @@ class KnifeEdge(AbstractConstrainedExample):
         >>> from nhjax.systems import KnifeEdge
         >>> edge = KnifeEdge(gravity=2.0)
         >>> y0, (q, v, multiplier) = edge.initial_state(), edge.exact(1.0)
+        >>> [round(x, 3) for x in q.tolist()]
+        [0.764, 0.612, 1.2]
     """
 
     mass: Array = eqx.field(converter=parameter, default=1.0)

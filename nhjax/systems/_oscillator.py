@@ -28,6 +28,8 @@ class HarmonicOscillator(AbstractExample):
         >>> from nhjax.systems import HarmonicOscillator
         >>> oscillator = HarmonicOscillator(stiffness=4.0)
         >>> y0, (q, v, _) = oscillator.initial_state(), oscillator.exact(1.0)
+        >>> [round(x, 3) for x in q.tolist()]
+        [-0.189]
     """
 
     mass: Array = eqx.field(converter=parameter, default=1.0)

@@ -37,6 +37,8 @@ class NonholonomicParticle(AbstractConstrainedExample):
         >>> from nhjax.systems import NonholonomicParticle
         >>> particle = NonholonomicParticle(stiffness=4.0)
         >>> y0, (q, v, multiplier) = particle.initial_state(), particle.exact(1.0)
+        >>> [round(x, 3) for x in q.tolist()]
+        [-0.089, 0.193, -0.203]
     """
 
     mass: Array = eqx.field(converter=parameter, default=1.0)

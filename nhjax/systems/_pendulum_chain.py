@@ -38,6 +38,8 @@ class PendulumChain(AbstractExample):
         >>> from nhjax.systems import PendulumChain
         >>> chain = PendulumChain.swinging(angles=(0.5, -0.3, 1.0), gravity=9.81)
         >>> system, y0 = chain.system, PendulumChain(num_links=5).initial_state()
+        >>> [round(x, 3) for x in y0.multiplier.tolist()]
+        [-21.523, -17.218, -12.914, -8.609, -4.305]
     """
 
     num_links: int = eqx.field(static=True)

@@ -50,6 +50,8 @@ class Rattleback(AbstractRollingBody):
         >>> from nhjax.systems import Rattleback
         >>> stone = Rattleback.spinning(5.0, (0.5, 0.5), damping=1e-4)
         >>> system, y0 = stone.system, stone.initial_state()
+        >>> [round(x, 3) for x in y0.multiplier.tolist()]
+        [0.453, 0.378, 8.305]
     """
 
     mass: Array = eqx.field(converter=parameter, default=1.0)

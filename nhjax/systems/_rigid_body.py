@@ -37,6 +37,8 @@ class FreeRigidBody(AbstractExample):
         >>> from nhjax.systems import FreeRigidBody
         >>> body = FreeRigidBody(moments=(1.0, 1.0, 2.0))
         >>> y0, (q, v, _) = body.initial_state(), body.exact(1.0)
+        >>> [round(x, 3) for x in q.tolist()]
+        [0.862, 0.031, 0.437, 0.256]
     """
 
     moments: Array = eqx.field(converter=coordinates, default=(1.0, 2.0, 2.5))

@@ -44,6 +44,8 @@ class RodSleigh(AbstractNonholonomicExample):
         >>> from nhjax.systems import RodSleigh
         >>> sleigh = RodSleigh.sliding(speed=0.7, turn_rate=1.1, angle=0.3, length=2.0)
         >>> q, v, multiplier = sleigh.exact(1.0)
+        >>> [round(x, 3) for x in q.tolist()]
+        [0.694, 0.721, 2.018, 2.221]
     """
 
     mass1: Array = eqx.field(converter=parameter, default=1.0)

@@ -49,6 +49,8 @@ class RollerRacer(AbstractGaitMachine):
         >>> from nhjax.systems import RollerRacer
         >>> racer = RollerRacer.driving(amplitude=0.6, rate=4.0)
         >>> system, y0 = racer.system, racer.initial_state()
+        >>> round(float(y0.p[2]), 3)
+        -0.42
     """
 
     masses: Array = eqx.field(converter=coordinates, default=(10.0, 1.0))

@@ -36,6 +36,8 @@ class VerticalRollingDisc(AbstractConstrainedExample):
         >>> from nhjax.systems import VerticalRollingDisc
         >>> disc = VerticalRollingDisc(radius=0.5, v0=(0.5, 0.0, 1.0, 0.3))
         >>> y0, (q, v, multiplier) = disc.initial_state(), disc.exact(1.0)
+        >>> [round(x, 3) for x in q.tolist()]
+        [0.693, -0.026, 1.0, 0.3]
     """
 
     mass: Array = eqx.field(converter=parameter, default=1.0)

@@ -38,6 +38,8 @@ class RollingDisc(AbstractConstrainedGroupExample):
         >>> from nhjax.systems import RollingDisc
         >>> disc = RollingDisc(radius=0.5, v0=(0.5, 0.0, 0.3, 1.0))
         >>> y0, (q, v, multiplier) = disc.initial_state(), disc.exact(1.0)
+        >>> [round(x, 3) for x in multiplier.tolist()]
+        [0.0, 0.15]
     """
 
     mass: Array = eqx.field(converter=parameter, default=1.0)

@@ -46,6 +46,8 @@ class RollingTorus(AbstractRollingBody):
         >>> from nhjax.systems import RollingTorus
         >>> disc = RollingTorus.circling(tilt=1.0, radius_of_path=0.3, radius=0.1)
         >>> system, y0 = disc.system, disc.initial_state()
+        >>> round(float(y0.multiplier[2]), 3)
+        9.81
     """
 
     mass: Array = eqx.field(converter=parameter, default=1.0)

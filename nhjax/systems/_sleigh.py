@@ -39,6 +39,8 @@ class ChaplyginSleigh(AbstractConstrainedExample):
         >>> from nhjax.systems import ChaplyginSleigh
         >>> sleigh = ChaplyginSleigh(offset=0.2)
         >>> y0, (q, v, multiplier) = sleigh.initial_state(), sleigh.exact(1.0)
+        >>> [round(x, 3) for x in q.tolist()]
+        [-0.245, -0.116, 1.146]
     """
 
     mass: Array = eqx.field(converter=parameter, default=1.0)

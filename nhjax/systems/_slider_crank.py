@@ -42,6 +42,8 @@ class SliderCrank(AbstractExample):
         >>> from nhjax.systems import SliderCrank
         >>> engine = SliderCrank.turning(angle=0.3, rate=50.0, torque=0.2)
         >>> system, y0 = engine.system, engine.initial_state()
+        >>> [round(x, 3) for x in y0.multiplier.tolist()]
+        [185.331, -49.506]
     """
 
     crank_length: Array = eqx.field(converter=parameter, default=0.08)

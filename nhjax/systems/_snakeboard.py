@@ -52,6 +52,8 @@ class Snakeboard(AbstractGaitMachine):
         >>> from nhjax.systems import Snakeboard
         >>> board = Snakeboard.driving((0.7, 0.3, -0.3), (1.0, 1.0, 1.0))
         >>> system, y0 = board.system, board.initial_state()
+        >>> round(float(y0.p[2]), 3)
+        0.05
     """
 
     mass: Array = eqx.field(converter=parameter, default=6.0)

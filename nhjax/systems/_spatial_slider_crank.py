@@ -48,6 +48,8 @@ class SpatialSliderCrank(AbstractExample):
         >>> from nhjax.systems import SpatialSliderCrank
         >>> machine = SpatialSliderCrank.turning(angle=0.3, rate=6.0)
         >>> system, y0 = machine.system, machine.initial_state()
+        >>> [round(x, 3) for x in y0.multiplier.tolist()]
+        [1.552, -0.377, 0.617]
     """
 
     crank_length: Array = eqx.field(converter=parameter, default=0.08)

@@ -39,6 +39,8 @@ class SphericalPendulum(AbstractExample):
         >>> pendulum = SphericalPendulum.swinging(
         ...     angle=0.5, azimuth_rate=1.2, gravity=9.81)
         >>> q, v, multiplier = pendulum.exact(1.0)
+        >>> [round(x, 3) for x in q.tolist()]
+        [-0.477, -0.04, -0.878]
     """
 
     mass: Array = eqx.field(converter=parameter, default=1.0)

@@ -41,6 +41,8 @@ class Suslov(AbstractConstrainedGroupExample):
         >>> from nhjax.systems import Suslov
         >>> suslov = Suslov(products=(0.2, 0.1))
         >>> y0, (q, v, multiplier) = suslov.initial_state(), suslov.exact(1.0)
+        >>> [round(x, 3) for x in q.tolist()]
+        [0.883, 0.157, 0.441, 0.006]
     """
 
     moments: Array = eqx.field(converter=coordinates, default=(1.0, 1.5, 2.0))

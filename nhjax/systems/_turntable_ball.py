@@ -57,6 +57,8 @@ class TurntableBall(AbstractConstrainedGroupExample):
         >>> from nhjax.systems import TurntableBall
         >>> ball = TurntableBall(moments=(0.4, 0.4, 0.4))
         >>> y0, (q, v, multiplier) = ball.initial_state(), ball.exact(1.0)
+        >>> [round(x, 3) for x in v.tolist()]
+        [0.791, -0.057, 0.533, 0.108, 0.145]
     """
 
     radius: Array = eqx.field(converter=parameter, default=0.5)

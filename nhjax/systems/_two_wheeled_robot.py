@@ -53,6 +53,8 @@ class TwoWheeledRobot(AbstractNonholonomicExample):
         >>> from nhjax.systems import TwoWheeledRobot
         >>> robot = TwoWheeledRobot.rolling(speed=1.0, turn_rate=0.5)
         >>> system, y0 = robot.system, robot.initial_state()
+        >>> [round(x, 3) for x in y0.multiplier.tolist()]
+        [13.945, 0.023, -0.053]
     """
 
     mass: Array = eqx.field(converter=parameter, default=30.0)

@@ -38,6 +38,8 @@ class Unicycle(AbstractConstrainedGroupExample):
         >>> from nhjax.systems import Unicycle
         >>> unicycle = Unicycle(spring=2.0)
         >>> y0, (q, v, multiplier) = unicycle.initial_state(), unicycle.exact(1.0)
+        >>> [round(x, 3) for x in q.tolist()]
+        [0.747, -0.155, 1.1]
     """
 
     mass: Array = eqx.field(converter=parameter, default=1.0)
@@ -127,6 +129,8 @@ class UnicycleInCoordinates(AbstractConstrainedExample):
         >>> from nhjax.systems import Unicycle
         >>> unicycle = Unicycle(spring=2.0).in_coordinates()
         >>> y0, (q, v, multiplier) = unicycle.initial_state(), unicycle.exact(1.0)
+        >>> [round(x, 3) for x in q.tolist()]
+        [0.747, -0.155, 1.1]
     """
 
     mass: Array = eqx.field(converter=parameter, default=1.0)

@@ -71,6 +71,8 @@ class WhippleBicycle(AbstractNonholonomicExample):
         >>> from nhjax.systems import WhippleBicycle
         >>> bicycle = WhippleBicycle.running(speed=5.0, lean_rate=0.3)
         >>> system, y0 = bicycle.system, bicycle.initial_state()
+        >>> round(float(y0.multiplier[4]), 1)
+        -306.8
     """
 
     wheelbase: Array = eqx.field(converter=parameter, default=1.02)
