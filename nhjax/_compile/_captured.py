@@ -97,6 +97,8 @@ class _Walk:
         # structures have equal numbers. Identities are not reused meanwhile, as the
         # entries hold the objects.
         self.numbers: dict[int, int] = {}
+        # The identities of the classes whose attributes have been recorded.
+        self.searched: set[int] = set()
 
     def arguments(self, tree: Any) -> None:
         """Record static fields, leaves that are no arrays, and the code of classes."""
@@ -182,9 +184,11 @@ class _Walk:
     def methods(self, kind: type) -> None:
         """Record the attributes of a user's class, and what its methods read."""
         for base in kind.__mro__:
-            if is_installed(base.__module__) or id(base) in self.numbers:
+            if is_installed(base.__module__) or id(base) in self.searched:
                 continue
-            self.numbers[id(base)] = len(self.numbers)
+            self.searched.add(id(base))
+            # A class that a function reads has a number before it is searched.
+            self.numbers.setdefault(id(base), len(self.numbers))
             for name, item in list(vars(base).items()):
                 if isinstance(item, property):
                     item = item.fget

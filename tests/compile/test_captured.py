@@ -44,6 +44,10 @@ def reads_numpy(t, q, v, args):
     return falling(v, q, MASSES[0])
 
 
+def reads_a_class(t, q, v, args):
+    return falling(v, q, Planet.share)
+
+
 def reads_module(t, q, v, args):
     return falling(v, q, SETTINGS.g)
 
@@ -135,6 +139,10 @@ def a_class():
     return Planet().lagrangian, partial(setattr, Planet, "share")
 
 
+def a_class_that_is_named():
+    return reads_a_class, partial(setattr, Planet, "share")
+
+
 def a_partial():
     options = {"g": 1.0}
 
@@ -211,6 +219,7 @@ READERS = [
     an_object_with_slots,
     a_method,
     a_class,
+    a_class_that_is_named,
     a_partial,
     a_default,
     a_namespace,
