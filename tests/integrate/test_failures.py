@@ -106,7 +106,10 @@ def test_a_solver_that_gives_up():
     sol = run(stage_solver=solver, throw=False, num_steps=2)
     assert sol.result == nhjax.RESULTS.nonlinear_max_iterations
     assert "within the `max_iterations`" in sol.failures()[0][2]
-    assert_trees_equal(jax.tree.map(lambda x: x[0], sol.ys), PARTICLE.initial_state())
+    last, start = jax.tree.map(lambda x: x[0], sol.ys), PARTICLE.initial_state()
+    assert_trees_equal((last.q, last.v, last.p), (start.q, start.v, start.p))
+    # The run computes the continuous multiplier again, in another program.
+    np.testing.assert_allclose(last.multiplier, start.multiplier, rtol=1e-14)
 
 
 def test_a_failure_names_the_coordinate_and_a_step_to_try():
