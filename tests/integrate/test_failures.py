@@ -103,10 +103,13 @@ def test_a_lane_without_a_number_fails_alone():
 
 def test_a_solver_that_gives_up():
     solver = nhjax.SimplifiedNewton(max_iterations=2, fallback=False)
-    sol = run(stage_solver=solver, throw=False, num_steps=2)
+    saveat = SaveAt(t0=True, t1=True)
+    sol = run(stage_solver=solver, throw=False, num_steps=2, saveat=saveat)
     assert sol.result == nhjax.RESULTS.nonlinear_max_iterations
     assert "within the `max_iterations`" in sol.failures()[0][2]
-    last, start = jax.tree.map(lambda x: x[0], sol.ys), PARTICLE.initial_state()
+    first, last = (jax.tree.map(lambda x, k=k: x[k], sol.ys) for k in (0, 1))
+    assert_trees_equal(last, first)
+    start = PARTICLE.initial_state()
     assert_trees_equal((last.q, last.v, last.p), (start.q, start.v, start.p))
     # The run computes the continuous multiplier again, in another program.
     np.testing.assert_allclose(last.multiplier, start.multiplier, rtol=1e-14)
