@@ -33,6 +33,7 @@ class Checkpoint(eqx.Module):
     - `state`: the last state of the run; of one that failed the last good one.
     - `q_compensation`, `p_compensation`: the rounding errors of the sums q and p.
     - `linearisation`: the arrays of the linearised equations of motion at the state.
+    - `round_off`: the round-off of the system's functions, measured in the first run.
     - `t0`: the time from which steps are counted, that of the first run.
     - `dt`: the size of the steps.
     - `num_steps`: how many steps have been taken since `t0`.
@@ -64,6 +65,7 @@ class Checkpoint(eqx.Module):
     q_compensation: PyTree[Array]
     p_compensation: Float[Array, "*b n"]
     linearisation: tuple[Array, ...]
+    round_off: tuple[Array, ...]
     t0: Float[Array, "*b"]
     dt: Float[Array, "*b"]
     num_steps: Int[Array, "*b"]
@@ -126,6 +128,7 @@ def check_start(
     expected = {
         "q_compensation": system.manifold_of(y.q).no_compensation(y.q),
         "p_compensation": y.p,
+        "round_off": (scalar,) * 3,
         "t0": scalar,
         "dt": scalar,
         "num_steps": jax.ShapeDtypeStruct((), jnp.int32),

@@ -206,8 +206,8 @@ def _cut(
 ) -> Cut:
     """Take the rest of a step as far as the first event in it."""
     start = carry.step_state.differentiated_in_state()
-    args, kept = stepping.args, stepping.invariants
-    arguments = StepArguments(stepping.system, t, h, start, args, kept)
+    given = stepping.args, stepping.invariants, stepping.round_off
+    arguments = StepArguments(stepping.system, t, h, start, *given)
     progress = progress_of(carry)
     options = CutOptions(
         method=stepping.method,

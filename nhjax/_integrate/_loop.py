@@ -1,5 +1,7 @@
 """The body of the time loop: it takes a step and saves what is to be saved of it."""
 
+from dataclasses import replace
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -8,6 +10,7 @@ from jaxtyping import Array, Int
 
 from .._numerics import moving_with
 from .._results import RESULTS
+from .._step import RoundOff
 from .._system import State
 from ._checkpoint import Checkpoint
 from ._checks import static_length
@@ -47,6 +50,14 @@ class Loop(eqx.Module):
     def start(self, y0: State | Checkpoint) -> Carry:
         """Make the carry before the first step."""
         return (self.stepping if self.events is None else self.events).start(y0)
+
+    def with_round_off(self, round_off: RoundOff) -> "Loop":
+        """Return the same loop, whose steps know the round-off of the system."""
+        stepping = replace(self.stepping, round_off=round_off)
+        events = self.events
+        if events is not None:
+            events = replace(events, stepping=stepping)
+        return replace(self, stepping=stepping, events=events)
 
     def step(
         self, carry: Carry, k: Int[Array, ""], known: Known | None = None

@@ -13,7 +13,7 @@ from .._custom_types import Args, FloatScalar, IntScalar
 from .._method import AbstractMethod
 from .._numerics import ClosureConverted, nan_gradient_unless
 from .._results import RESULTS
-from .._step import StepRecord
+from .._step import FunctionNoise, RoundOff, StepRecord
 from .._system import AbstractMechanicalSystem, closure_converted, State
 from ._adjoint import AbstractAdjoint
 from ._checkpoint import Checkpoint, start_of
@@ -62,7 +62,9 @@ def run(
     fn = ClosureConverted(saveat.fn, t0, state, args)
     saving = _saving(saveat, fn, grid.num_steps, places, events)
     loop = Loop(stepping, saving, means.meter, events)
-    start, carry, rows = _all_steps(means.adjoint, loop, y0, saveat.checkpoint)
+    round_off, start, carry, rows = _all_steps(
+        means.adjoint, loop, y0, saveat.checkpoint
+    )
     given = system, y0, t0, grid.dt, args
     end = _end(loop, carry, rows, (given, options.events))
     ts, ys = _output(saveat, loop, grid, start, end, sampled)
@@ -75,7 +77,9 @@ def run(
         result=carry.result,
         interpolation=_interpolation(loop, grid, end.rows) if saveat.dense else None,
         checkpoint=(
-            as_checkpoint(stepping, carry, end.state) if saveat.checkpoint else None
+            as_checkpoint(stepping, round_off, carry, end.state)
+            if saveat.checkpoint
+            else None
         ),
         coordinates=system.coordinates,
         events=end.log,
@@ -92,24 +96,39 @@ def _sampled_steps(saveat: SaveAt, grid: TimeGrid) -> Int[Array, " k"] | None:
 
 def _all_steps(
     adjoint: AbstractAdjoint, loop: Loop, y0: State | Checkpoint, checkpoint: bool
-) -> tuple[State, Carry, Rows]:
-    """Take all steps; return the first state, what is carried at the end, and rows."""
+) -> tuple[RoundOff, State, Carry, Rows]:
+    """Take all steps.
 
-    def start(loop: Loop, y0: State | Checkpoint):
-        return loop.start(y0)
+    Return the measured round-off, the first state, what is carried at the end, and the
+    rows that were saved.
+    """
 
-    def steps(loop: Loop, first: Carry):
-        return first.step_state.state, *adjoint.run(loop, loop.moving(first))
+    def start(loop: Loop, y0: State | Checkpoint, noise: FunctionNoise | None):
+        first = loop.start(y0)
+        return loop.stepping.round_off_at(y0, first.step_state, noise), first
 
-    if not checkpoint and isinstance(y0, State):
-        return as_cpu_kernel(lambda loop, y0: steps(loop, start(loop, y0)), loop, y0)
+    def steps(loop: Loop, round_off: RoundOff, first: Carry):
+        loop = loop.with_round_off(round_off)
+        run = adjoint.run(loop, loop.moving(first))
+        return round_off, first.step_state.state, *run
+
+    def whole(loop: Loop, y0: State, noise: FunctionNoise):
+        return steps(loop, *start(loop, y0, noise))
+
+    noise = None
+    if isinstance(y0, State):
+        # A kernel of its own: the loop over steps is compiled to faster code without
+        # another loop before it.
+        noise = as_cpu_kernel(lambda loop, y0: loop.stepping.noise(y0), loop, y0)
+        if not checkpoint:
+            return as_cpu_kernel(whole, loop, y0, noise)
     # What a compiler knows of the start of a loop, such as zeros in the matrices there,
     # changes how it rounds in the loop. Here it knows nothing, so that a run which goes
     # on from another takes its steps by the same instructions.
-    first = as_cpu_kernel(start, loop, y0)
+    first = as_cpu_kernel(start, loop, y0, noise)
     given, rest = eqx.partition((loop, first), eqx.is_array)
     loop, first = eqx.combine(jax.lax.optimization_barrier(given), rest)
-    return as_cpu_kernel(steps, loop, first)
+    return as_cpu_kernel(steps, loop, *first)
 
 
 def _saving(

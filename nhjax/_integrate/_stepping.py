@@ -15,9 +15,13 @@ from .._results import RESULTS
 from .._step import (
     AbstractStageSolver,
     first_step_state,
+    function_noise,
+    FunctionNoise,
     Invariants,
     largest_violation,
     primitive_step,
+    round_off_of_steps,
+    RoundOff,
     StepArguments,
     StepOutcome,
     StepRecord,
@@ -66,7 +70,8 @@ class Stepping(eqx.Module):
 
     `programs` keeps the program of a step, which is the same for each way in which the
     run is differentiated. The first step is number `origin.first_step` of those counted
-    from `origin.t0`.
+    from `origin.t0`. The `round_off` of the functions of the system is measured at the
+    start; see `round_off_at`.
     """
 
     system: AbstractMechanicalSystem
@@ -77,6 +82,7 @@ class Stepping(eqx.Module):
     args: Args
     invariants: Invariants | None
     programs: Programs
+    round_off: RoundOff | None = None
 
     def time(self, k: Int[Array, ""] | int) -> FloatScalar:
         """Compute the time t_k as a product, since a running sum of dt would drift."""
@@ -118,12 +124,32 @@ class Stepping(eqx.Module):
             stats["max_invariant_error"] = jnp.zeros_like(violation)
         return Carry(step_state, result, stats)
 
+    def noise(self, y0: State) -> FunctionNoise:
+        """Measure the round-off of the functions of the system at the first state."""
+        u = self.system.fibre_coordinate(y0)
+        given = self.time(0), y0.q, u, y0.multiplier, self.args
+        return function_noise(self.system, *given)
+
+    def round_off_at(
+        self, y0: State | Checkpoint, first: StepState, noise: FunctionNoise | None
+    ) -> RoundOff:
+        """Compute the round-off of the steps of a run from that of the functions.
+
+        A checkpoint has that of the first run, so that the run goes on by the same
+        steps.
+        """
+        if isinstance(y0, Checkpoint):
+            return jax.lax.stop_gradient(RoundOff(*y0.round_off))
+        assert noise is not None
+        return round_off_of_steps(self.method, first.lin, noise)
+
     def one_step(
         self, step_state: StepState, t: FloatScalar, h: FloatScalar, skip: BoolScalar
     ) -> StepOutcome:
         """Take one step of size h from t; h may be negative, to go back."""
         start = step_state.differentiated_in_state()
-        arguments = StepArguments(self.system, t, h, start, self.args, self.invariants)
+        given = self.system, t, h, start, self.args, self.invariants, self.round_off
+        arguments = StepArguments(*given)
         method, stage_solver = self.method, self.stage_solver
         return primitive_step(arguments, method, stage_solver, skip, self.programs)
 
@@ -152,10 +178,13 @@ class Stepping(eqx.Module):
         return carry, Taken(outcome.record, good)
 
 
-def as_checkpoint(stepping: Stepping, carry: Carry, end: State) -> Checkpoint:
+def as_checkpoint(
+    stepping: Stepping, round_off: RoundOff, carry: Carry, end: State
+) -> Checkpoint:
     """Make the checkpoint of what is carried after the last step, with the state `end`.
 
-    That is the last state with the derivatives that it is to have.
+    That is the last state with the derivatives that it is to have. The round-off is the
+    one that the run started with.
     """
     origin, last = stepping.origin, carry.step_state
     return Checkpoint(
@@ -163,6 +192,7 @@ def as_checkpoint(stepping: Stepping, carry: Carry, end: State) -> Checkpoint:
         last.q_compensation,
         last.p_compensation,
         tuple(jax.tree.leaves(last.lin)),
+        tuple(jax.tree.leaves(round_off)),
         origin.t0 + origin.shift,
         stepping.dt,
         origin.first_step + carry.stats["num_steps"],

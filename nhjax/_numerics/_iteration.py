@@ -64,8 +64,8 @@ class _Rules(NamedTuple):
 
     scale: FloatScalar
     round_off: FloatScalar
-    eps: float
-    tolerance: FloatScalar
+    least: FloatScalar
+    tolerance_or_eps: FloatScalar
     noisiest: float
     growth: float
     max_iterations: int
@@ -126,11 +126,13 @@ def iterate(
     aux = jax.tree.map(lambda s: jnp.zeros(s.shape, s.dtype), aux_shape)
     dtype = jnp.result_type(*[leaf.dtype for leaf in jax.tree.leaves(x)])
     eps = float(jnp.finfo(dtype).eps)
+    scale, round_off = jnp.asarray(scale, dtype), jnp.asarray(round_off, dtype)
+    tolerance = jnp.asarray(tolerance, dtype)
     rules = _Rules(
-        scale=jnp.asarray(scale, dtype),
-        round_off=jnp.asarray(round_off, dtype),
-        eps=eps,
-        tolerance=jnp.asarray(tolerance, dtype),
+        scale=scale,
+        round_off=round_off,
+        least=jnp.maximum(eps * (scale + round_off), tolerance * scale),
+        tolerance_or_eps=jnp.maximum(tolerance, eps),
         noisiest=eps**0.5 if noise_units is None else noise_units * eps,
         growth=_GROWTH if noise_units is None else _GROWTH_IF_SLOW,
         max_iterations=max_iterations,
@@ -159,13 +161,9 @@ def _progress(rules: _Rules, before: _Progress, sizes: Sizes) -> _Progress:
     first = jnp.where(before.iterations == 0, increment, before.first)
     # Sizes are compared without forming quotients, which would have to be computed one
     # after the other.
-    size, measure = (
-        jnp.where(found > 0, found, before.first)
-        for found in (
-            jnp.maximum(rules.scale, sizes.iterate),
-            jnp.maximum(rules.scale + rules.round_off, sizes.iterate),
-        )
-    )
+    found = jnp.maximum(rules.scale + rules.round_off, sizes.iterate)
+    has_size = found > 0
+    measure = jnp.where(has_size, found, before.first)
     magnified = measure
     if sizes.noise is not None:
         noise = jnp.minimum(sizes.noise, _LARGEST_NOISE * measure)
@@ -178,7 +176,9 @@ def _progress(rules: _Rules, before: _Progress, sizes: Sizes) -> _Progress:
     believed = jnp.where(stalls, more, before.believed)
     stagnant = stalls & (increment <= believed * magnified)
     # A tolerance is relative to x itself, whatever its round-off is.
-    small = (increment <= rules.eps * measure) | (increment <= rules.tolerance * size)
+    least = jnp.maximum(rules.least, rules.tolerance_or_eps * sizes.iterate)
+    least = jnp.where(has_size, least, rules.tolerance_or_eps * before.first)
+    small = increment <= least
     converged = small | stagnant
     count = before.iterations + 1
     # This is False if the increment is not finite.

@@ -18,6 +18,12 @@ from ._newton import (
     SimplifiedNewton as SimplifiedNewton,
 )
 from ._record import StepRecord as StepRecord
+from ._round_off import (
+    function_noise as function_noise,
+    FunctionNoise as FunctionNoise,
+    round_off_of_steps as round_off_of_steps,
+    RoundOff as RoundOff,
+)
 from ._stage_iteration import stage_residual as stage_residual
 from ._step import (
     first_step_state as first_step_state,

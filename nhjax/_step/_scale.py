@@ -37,7 +37,8 @@ def fibre_coordinate_scale(
     as velocities feel it: through holonomic constraints, whose round-off is divided by
     h, and through nonholonomic ones, which matters where a coordinate has grown large,
     as the heading of a car after many turns. With invariants the round-off of these is
-    added, as far as impulses have it.
+    added, as far as impulses have it. Last comes the measured round-off of the
+    functions of the system.
     """
     h = jnp.abs(stages.h)
     rate = max_norm(lin.acceleration)
@@ -63,6 +64,8 @@ def fibre_coordinate_scale(
         )
     if stages.kept is not None:
         round_off = round_off + impulse_weights(stages, x0).noise
+    if stages.round_off is not None:
+        round_off = jnp.maximum(round_off, stages.round_off.size(h))
     return Scale(size, round_off)
 
 

@@ -17,6 +17,7 @@ from ._chart import AbstractChart
 from ._curved_chart import chart_of_step
 from ._invariants import StartImpulses
 from ._redundancy import Redundancy
+from ._round_off import RoundOff
 from ._unknowns import Stages
 
 
@@ -49,6 +50,7 @@ class StageSystem(eqx.Module):
     args: Args
     redundancy: Redundancy | None = None
     kept: StartImpulses | None = None
+    round_off: RoundOff | None = None
 
     @classmethod
     def at(
@@ -61,10 +63,12 @@ class StageSystem(eqx.Module):
         args: Args,
         lin: Linearisation,
         kept: StartImpulses | None = None,
+        round_off: RoundOff | None = None,
     ) -> "StageSystem":
         """Make the equations of a step of size h from the state y at t."""
         system, q = with_frames(system, y.q)
-        stages = cls(system, method, t, h, q, y.p, y.multiplier, args, kept=kept)
+        given = t, h, q, y.p, y.multiplier, args
+        stages = cls(system, method, *given, kept=kept, round_off=round_off)
         if system.constraints != "redundant" or not stages.constrained:
             return stages
         redundancy = Redundancy.at(lin, stages.num_nonholonomic)

@@ -34,6 +34,7 @@ from ._end import end_state, step_record
 from ._invariants import Invariants, StartImpulses
 from ._newton import AbstractStageSolver
 from ._record import StepRecord
+from ._round_off import RoundOff
 from ._stage_equations import end_impulse, in_chart, start_impulse
 from ._stage_iteration import Evaluation
 from ._stage_system import StageSystem
@@ -72,7 +73,8 @@ class StepArguments(eqx.Module):
     """The arguments of a step with respect to which it can be differentiated.
 
     Of `step_state` this is the state alone; see `StepState.differentiated_in_state`.
-    Without `invariants` the step keeps none.
+    Without `invariants` the step keeps none. Without `round_off` the sizes of the
+    unknowns tell how large round-off is.
     """
 
     system: AbstractMechanicalSystem
@@ -81,6 +83,7 @@ class StepArguments(eqx.Module):
     step_state: StepState
     args: Args
     invariants: Invariants | None = None
+    round_off: RoundOff | None = None
 
 
 class StepOutcome(NamedTuple):
@@ -170,7 +173,8 @@ def equations_of_step(arguments: StepArguments, method: AbstractMethod) -> Stage
     if invariants is not None:
         position = step_state.state.q, step_state.q_compensation
         kept = StartImpulses.at(invariants, system, t, y, position, args, lin)
-    return StageSystem.at(system, method, t, arguments.h, y, args, lin, kept)
+    given = t, arguments.h, y, args, lin, kept, arguments.round_off
+    return StageSystem.at(system, method, *given)
 
 
 def step(

@@ -1,0 +1,137 @@
+"""The round-off of the functions of a system, as the equations of a step feel it."""
+
+import functools
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, PyTree
+
+from .._custom_types import Args, FloatScalar
+from .._method import AbstractMethod
+from .._numerics import absolute, frozen, matvec, max_norm, measured_noise
+from .._system import AbstractMechanicalSystem, Linearisation
+
+
+class RoundOff(eqx.Module):
+    """The round-off of the functions of a system, as sizes of fibre coordinates.
+
+    A size is the round-off in units of the unit round-off, so that it is comparable to
+    the sizes of the coordinates themselves. It is measured once, at the start of a run:
+    constants inside the functions do not change, and sizes of coordinates are taken
+    into account in each step. The size in a step of length h is
+
+    `by_velocity` + h `by_force` + `by_position` / h:
+
+    momenta and nonholonomic constraints; forces; and holonomic constraints.
+    """
+
+    by_velocity: FloatScalar
+    by_force: FloatScalar
+    by_position: FloatScalar
+
+    def size(self, h: FloatScalar) -> FloatScalar:
+        """Compute the size in a step of length h > 0."""
+        return self.by_velocity + h * self.by_force + self.by_position / h
+
+
+# An increment of stages that has stopped falling can be six times as large as the
+# round-off that the functions of a system leave in it. It counts as noise up to 400
+# units of a size, so that a size is this part of the measured round-off.
+_PART = 1 / 8
+
+
+class FunctionNoise(NamedTuple):
+    """The round-off of the functions of a system at a state, one number for each value.
+
+    The functions are the momentum, the free force, all constraints on velocities and
+    the holonomic constraints on positions.
+    """
+
+    momentum: Float[Array, " n"]
+    force: Float[Array, " n"]
+    on_velocities: Float[Array, " l"]
+    on_positions: Float[Array, " k"]
+
+
+def function_noise(
+    system: AbstractMechanicalSystem,
+    t: FloatScalar,
+    q: PyTree[Array],
+    u: Float[Array, " n"],
+    multiplier: Float[Array, " l"],
+    args: Args,
+) -> FunctionNoise:
+    """Measure the round-off of the functions of a system at (t, q, u).
+
+    Of the multiplier only the shape matters.
+    """
+    system, t, q, u, args = frozen((system, t, q, u, args))
+    n, manifold = u.shape[0], system.manifold_of(q)
+
+    def values(z):
+        at, there, w = t + z[0], manifold.act(q, z[1 : n + 1]), u + z[n + 1 :]
+        return FunctionNoise(
+            system.momentum(at, there, w, args),
+            system.free_force(at, there, w, args),
+            system.constraint(at, there, w, args),
+            system.position_constraint(at, there, args),
+        )
+
+    positions = jax.eval_shape(system.position_constraint, t, q, args)
+    like = FunctionNoise(u, u, multiplier, positions)
+    return measured_noise(values, 2 * n + 1, like)
+
+
+def round_off_of_steps(
+    method: AbstractMethod, lin: Linearisation, noise: FunctionNoise
+) -> RoundOff:
+    """Compute the round-off of the steps of a method from that of the functions.
+
+    `lin` is the linearisation at the state. The iteration on the stages magnifies the
+    round-off of constraints by the inverse of the method's coefficients.
+    """
+    lin = frozen(lin)
+    inverse = absolute(lin.momentum_inverse)
+    by_velocity, by_force = (
+        max_norm(matvec(inverse, x)) for x in (noise.momentum, noise.force)
+    )
+    by_position = jnp.zeros_like(by_velocity)
+    if lin.violation.shape[0]:
+        kinematic, holonomic = magnifications(method)
+
+        def response(sizes):
+            multipliers = matvec(absolute(lin.compliance_inverse), sizes)
+            return max_norm(matvec(absolute(lin.reaction), multipliers))
+
+        by_velocity = by_velocity + kinematic * response(noise.on_velocities)
+        k = noise.on_positions.shape[0]
+        if k:
+            m = lin.violation.shape[0] - k
+            by_position = holonomic * response(jnp.pad(noise.on_positions, (m, 0)))
+    units = _PART / float(jnp.finfo(by_velocity.dtype).eps)
+    return RoundOff(units * by_velocity, units * by_force, units * by_position)
+
+
+@functools.lru_cache
+def magnifications(method: AbstractMethod) -> tuple[float, float]:
+    """Compute how much a step magnifies random errors of its constraints.
+
+    The first number is that of nonholonomic constraints, the second that of holonomic
+    ones: h N⁻¹ R δΛ is so much larger than the change that would make up for the error
+    of one constraint. They are largest root sums of squares of rows of the inverses of
+    R E and of (A Â, b); see `StageSystem`.
+    """
+
+    def largest_row(matrix):
+        return float(np.max(np.linalg.norm(matrix, axis=1)))
+
+    a, a_hat, b = (np.asarray(x) for x in (method.a, method.a_hat, method.b))
+    e = np.asarray(method.closure_weights.E)
+    on_positions = np.concatenate([a[1:] @ a_hat, b[None]])
+    return (
+        largest_row(e @ np.linalg.inv(a[1:] @ e)),
+        largest_row(np.linalg.inv(on_positions)),
+    )
