@@ -27,6 +27,7 @@ from .._system import (
     configuration,
     finite,
     floating,
+    function_noise,
     HamiltonianSystem,
     LagrangianSystem,
     Linearisation,
@@ -40,6 +41,10 @@ from .._system import (
 )
 from ._checks import Found, judged
 from ._projection import project_fibre_coordinate, project_position
+
+
+# A violation is not told from round-off up to so many standard deviations of it.
+_NOISE_UNITS = 100
 
 
 def initial_state(
@@ -164,6 +169,8 @@ def _solve(system, t, q, v, p, args, project: bool) -> Found:
     positions = system.position_constraint(t, q, args)
     deficient, compatibility = _ranks_judged(system, lin, ranks)
     tolerance = jnp.asarray(1e3 * float(jnp.finfo(u.dtype).eps), u.dtype)
+    # Where q and v are small, constants inside the constraints leave larger round-off.
+    noise = function_noise(system, t, q, u, lin.multiplier, args)
     return Found(
         state=state,
         lin=lin,
@@ -174,8 +181,14 @@ def _solve(system, t, q, v, p, args, project: bool) -> Found:
         ranks=ranks,
         deficient=deficient,
         compatibility=compatibility,
-        allowed=tolerance * violation_scale(system, lin, t, q, u, args),
-        allowed_positions=tolerance * position_scale(system, t, q, args),
+        allowed=jnp.maximum(
+            tolerance * violation_scale(system, lin, t, q, u, args),
+            _NOISE_UNITS * noise.on_velocities,
+        ),
+        allowed_positions=jnp.maximum(
+            tolerance * position_scale(system, t, q, args),
+            _NOISE_UNITS * noise.on_positions,
+        ),
         allowed_off_group=tolerance,
         legendre_solved=legendre_solved,
         projected=projected,

@@ -13,8 +13,13 @@ from .._custom_types import Args, FloatScalar, IntScalar
 from .._method import AbstractMethod
 from .._numerics import ClosureConverted, nan_gradient_unless
 from .._results import RESULTS
-from .._step import FunctionNoise, RoundOff, StepRecord
-from .._system import AbstractMechanicalSystem, closure_converted, State
+from .._step import RoundOff, StepRecord
+from .._system import (
+    AbstractMechanicalSystem,
+    closure_converted,
+    FunctionNoise,
+    State,
+)
 from ._adjoint import AbstractAdjoint
 from ._checkpoint import Checkpoint, start_of
 from ._checks import check_saved, static_length

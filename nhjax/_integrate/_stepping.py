@@ -15,8 +15,6 @@ from .._results import RESULTS
 from .._step import (
     AbstractStageSolver,
     first_step_state,
-    function_noise,
-    FunctionNoise,
     Invariants,
     largest_violation,
     primitive_step,
@@ -30,6 +28,8 @@ from .._step import (
 from .._system import (
     AbstractMechanicalSystem,
     all_finite,
+    function_noise,
+    FunctionNoise,
     keeps_constraints,
     State,
 )

@@ -19,8 +19,6 @@ from ._newton import (
 )
 from ._record import StepRecord as StepRecord
 from ._round_off import (
-    function_noise as function_noise,
-    FunctionNoise as FunctionNoise,
     round_off_of_steps as round_off_of_steps,
     RoundOff as RoundOff,
 )

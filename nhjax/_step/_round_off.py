@@ -1,18 +1,15 @@
 """The round-off of the functions of a system, as the equations of a step feel it."""
 
 import functools
-from typing import NamedTuple
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, PyTree
 
-from .._custom_types import Args, FloatScalar
+from .._custom_types import FloatScalar
 from .._method import AbstractMethod
-from .._numerics import absolute, frozen, matvec, max_norm, measured_noise
-from .._system import AbstractMechanicalSystem, Linearisation
+from .._numerics import absolute, frozen, matvec, max_norm
+from .._system import FunctionNoise, Linearisation
 
 
 class RoundOff(eqx.Module):
@@ -41,48 +38,6 @@ class RoundOff(eqx.Module):
 # round-off that the functions of a system leave in it. It counts as noise up to 400
 # units of a size, so that a size is this part of the measured round-off.
 _PART = 1 / 8
-
-
-class FunctionNoise(NamedTuple):
-    """The round-off of the functions of a system at a state, one number for each value.
-
-    The functions are the momentum, the free force, all constraints on velocities and
-    the holonomic constraints on positions.
-    """
-
-    momentum: Float[Array, " n"]
-    force: Float[Array, " n"]
-    on_velocities: Float[Array, " l"]
-    on_positions: Float[Array, " k"]
-
-
-def function_noise(
-    system: AbstractMechanicalSystem,
-    t: FloatScalar,
-    q: PyTree[Array],
-    u: Float[Array, " n"],
-    multiplier: Float[Array, " l"],
-    args: Args,
-) -> FunctionNoise:
-    """Measure the round-off of the functions of a system at (t, q, u).
-
-    Of the multiplier only the shape matters.
-    """
-    system, t, q, u, args = frozen((system, t, q, u, args))
-    n, manifold = u.shape[0], system.manifold_of(q)
-
-    def values(z):
-        at, there, w = t + z[0], manifold.act(q, z[1 : n + 1]), u + z[n + 1 :]
-        return FunctionNoise(
-            system.momentum(at, there, w, args),
-            system.free_force(at, there, w, args),
-            system.constraint(at, there, w, args),
-            system.position_constraint(at, there, args),
-        )
-
-    positions = jax.eval_shape(system.position_constraint, t, q, args)
-    like = FunctionNoise(u, u, multiplier, positions)
-    return measured_noise(values, 2 * n + 1, like)
 
 
 def round_off_of_steps(

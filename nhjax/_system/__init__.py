@@ -33,6 +33,8 @@ from ._linearisation import (
     total_force as total_force,
 )
 from ._scales import (
+    function_noise as function_noise,
+    FunctionNoise as FunctionNoise,
     keeps_constraints as keeps_constraints,
     position_scale as position_scale,
     velocity_scale as velocity_scale,

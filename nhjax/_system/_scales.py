@@ -1,11 +1,13 @@
-"""The sizes of the terms of constraints, which tell violations from round-off."""
+"""The sizes of terms and the noise of functions, which tell errors from round-off."""
+
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PyTree
 
 from .._custom_types import Args, BoolScalar, FloatScalar, FloatScalarLike
-from .._numerics import max_norm, SparseMatrix, unit
+from .._numerics import frozen, max_norm, measured_noise, SparseMatrix, unit
 from ._abstract import AbstractMechanicalSystem
 from ._linearisation import Linearisation
 from ._state import State
@@ -103,3 +105,45 @@ def _row_sums(matrix: Float[Array, "l n"] | SparseMatrix) -> Float[Array, " l"]:
 def _finite_or_zero(x: Array) -> Array:
     # Where a constraint is singular at zero, that value says nothing of its size.
     return jnp.abs(jnp.nan_to_num(x, nan=0.0, posinf=0.0, neginf=0.0))
+
+
+class FunctionNoise(NamedTuple):
+    """The round-off of the functions of a system at a state, one number for each value.
+
+    The functions are the momentum, the free force, all constraints on velocities and
+    the holonomic constraints on positions.
+    """
+
+    momentum: Float[Array, " n"]
+    force: Float[Array, " n"]
+    on_velocities: Float[Array, " l"]
+    on_positions: Float[Array, " k"]
+
+
+def function_noise(
+    system: AbstractMechanicalSystem,
+    t: FloatScalar,
+    q: PyTree[Array],
+    u: Float[Array, " n"],
+    multiplier: Float[Array, " l"],
+    args: Args,
+) -> FunctionNoise:
+    """Measure the round-off of the functions of a system at (t, q, u).
+
+    Of the multiplier only the shape matters.
+    """
+    system, t, q, u, args = frozen((system, t, q, u, args))
+    n, manifold = u.shape[0], system.manifold_of(q)
+
+    def values(z):
+        at, there, w = t + z[0], manifold.act(q, z[1 : n + 1]), u + z[n + 1 :]
+        return FunctionNoise(
+            system.momentum(at, there, w, args),
+            system.free_force(at, there, w, args),
+            system.constraint(at, there, w, args),
+            system.position_constraint(at, there, args),
+        )
+
+    positions = jax.eval_shape(system.position_constraint, t, q, args)
+    like = FunctionNoise(u, u, multiplier, positions)
+    return measured_noise(values, 2 * n + 1, like)
