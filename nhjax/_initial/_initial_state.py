@@ -168,9 +168,7 @@ def _solve(system, t, q, v, p, args, project: bool) -> Found:
     )
     positions = system.position_constraint(t, q, args)
     deficient, compatibility = _ranks_judged(system, lin, ranks)
-    tolerance = jnp.asarray(1e3 * float(jnp.finfo(u.dtype).eps), u.dtype)
-    # Where q and v are small, constants inside the constraints leave larger round-off.
-    noise = function_noise(system, t, q, u, lin.multiplier, args)
+    allowed, allowed_positions, tolerance = _allowed(system, lin, t, q, u, args)
     return Found(
         state=state,
         lin=lin,
@@ -181,17 +179,30 @@ def _solve(system, t, q, v, p, args, project: bool) -> Found:
         ranks=ranks,
         deficient=deficient,
         compatibility=compatibility,
-        allowed=jnp.maximum(
-            tolerance * violation_scale(system, lin, t, q, u, args),
-            _NOISE_UNITS * noise.on_velocities,
-        ),
-        allowed_positions=jnp.maximum(
-            tolerance * position_scale(system, t, q, args),
-            _NOISE_UNITS * noise.on_positions,
-        ),
+        allowed=allowed,
+        allowed_positions=allowed_positions,
         allowed_off_group=tolerance,
         legendre_solved=legendre_solved,
         projected=projected,
+    )
+
+
+def _allowed(
+    system, lin: Linearisation, t, q, u, args
+) -> tuple[Float[Array, " l"], Float[Array, " k"], FloatScalar]:
+    """Bound what violations of velocity and position constraints can be by round-off.
+
+    The third number bounds the distance to a group. Where q and v are small, constants
+    inside the constraints leave larger round-off than these, which is measured.
+    """
+    tolerance = jnp.asarray(1e3 * float(jnp.finfo(u.dtype).eps), u.dtype)
+    noise = function_noise(system, t, q, u, lin.multiplier, args)
+    on_velocities = tolerance * violation_scale(system, lin, t, q, u, args)
+    on_positions = tolerance * position_scale(system, t, q, args)
+    return (
+        jnp.maximum(on_velocities, _NOISE_UNITS * noise.on_velocities),
+        jnp.maximum(on_positions, _NOISE_UNITS * noise.on_positions),
+        tolerance,
     )
 
 
