@@ -133,9 +133,9 @@ class Stepping(eqx.Module):
     def round_off_at(
         self, y0: State | Checkpoint, first: StepState, noise: FunctionNoise | None
     ) -> RoundOff:
-        """Compute the round-off of the steps of a run from that of the functions.
+        """Compute the round-off of steps from the noise of the functions.
 
-        A checkpoint has that of the first run, so that the run goes on by the same
+        A checkpoint holds the value of the first run, so that a resumed run takes the same
         steps.
         """
         if isinstance(y0, Checkpoint):

@@ -43,7 +43,7 @@ _PART = 1 / 8
 def round_off_of_steps(
     method: AbstractMethod, lin: Linearisation, noise: FunctionNoise
 ) -> RoundOff:
-    """Compute the round-off of the steps of a method from that of the functions.
+    """Compute the round-off of steps from the noise of the functions of a system.
 
     `lin` is the linearisation at the state. The iteration on the stages magnifies the
     round-off of constraints by the inverse of the method's coefficients.
@@ -77,7 +77,8 @@ def magnifications(method: AbstractMethod) -> tuple[float, float]:
     The first number is that of nonholonomic constraints, the second that of holonomic
     ones: h N⁻¹ R δΛ is so much larger than the change that would make up for the error
     of one constraint. They are largest root sums of squares of rows of the inverses of
-    R E and of (A Â, b); see `StageSystem`.
+    R E and of (A Â, b); see `StageSystem`. Pseudo-inverses, since a method that is not
+    meant for one kind of constraints may have a singular matrix for it.
     """
 
     def largest_row(matrix):
@@ -87,6 +88,6 @@ def magnifications(method: AbstractMethod) -> tuple[float, float]:
     e = np.asarray(method.closure_weights.E)
     on_positions = np.concatenate([a[1:] @ a_hat, b[None]])
     return (
-        largest_row(e @ np.linalg.inv(a[1:] @ e)),
-        largest_row(np.linalg.inv(on_positions)),
+        largest_row(e @ np.linalg.pinv(a[1:] @ e)),
+        largest_row(np.linalg.pinv(on_positions)),
     )

@@ -130,7 +130,7 @@ def function_noise(
 ) -> FunctionNoise:
     """Measure the round-off of the functions of a system at (t, q, u).
 
-    Of the multiplier only the shape matters.
+    Only the shape of the multiplier is used.
     """
     system, t, q, u, args = frozen((system, t, q, u, args))
     n, manifold = u.shape[0], system.manifold_of(q)
