@@ -135,7 +135,7 @@ class Stepping(eqx.Module):
     ) -> RoundOff:
         """Compute the round-off of steps from the noise of the functions.
 
-        A checkpoint holds the value of the first run, so that a resumed run takes the same
+        A checkpoint holds the value of the first run: a resumed run takes the same
         steps.
         """
         if isinstance(y0, Checkpoint):
