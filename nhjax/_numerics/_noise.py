@@ -2,15 +2,12 @@
 
 import math
 from collections.abc import Callable
-from typing import TypeVar
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PyTree
 
-
-T = TypeVar("T", bound=PyTree[Array])
 
 # The points of one difference lie on a ray that starts at the point of interest.
 _NUM_POINTS = 6
@@ -21,8 +18,10 @@ _NUM_RAYS = 2
 
 
 def measured_noise(
-    function: Callable[[Float[Array, " k"]], T], size: int, like: T
-) -> T:
+    function: Callable[[Float[Array, " k"]], PyTree[Array]],
+    size: int,
+    like: PyTree[Array | jax.ShapeDtypeStruct],
+) -> PyTree[Array]:
     """Estimate the round-off of a function, for each number that it returns.
 
     Values at points that are close to each other differ by a smooth change and by
