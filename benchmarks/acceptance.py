@@ -44,6 +44,7 @@ from nhjax._step._stage_system import nudged, StageSystem
 from nhjax._step._unknowns import Stages
 from nhjax._system import position_scale, violation_scale
 
+from . import _near_rest
 from ._examples import of_the_gallery
 from ._random_systems import random_systems
 from ._report import markdown_table, number, RESULTS, write
@@ -363,11 +364,20 @@ def main() -> None:
         action="store_true",
         help="keep the rows of the saved table that are not measured now",
     )
+    parser.add_argument(
+        "--near-rest",
+        action="store_true",
+        help="judge steps of all systems near rest, in 50 digits, instead",
+    )
+    parser.add_argument("--judged", type=int, default=2, help="steps, near rest")
     options = parser.parse_args()
     jax.config.update("jax_enable_x64", True)
     # The programs run for seconds and would be optimised for minutes.
     jax.config.update("jax_disable_most_optimizations", True)
     wanted = options.systems or [""]
+    if options.near_rest:
+        judge_near_rest(wanted, options.stages, options.judged)
+        return
     makers = {
         name: make
         for name, make in (gallery() | random_systems()).items()
@@ -387,6 +397,18 @@ def main() -> None:
                 data.append(measure_starts(name, stages, options.starts))
                 print(data[-1], flush=True)
     save(with_saved(data) if options.keep else data)
+
+
+def judge_near_rest(wanted: list[str], stages: list[int], most: int) -> None:
+    """Judge steps near rest of all systems whose names contain what is wanted."""
+    rows = []
+    for name, make in _near_rest.examples().items():
+        for s in stages if any(part in name for part in wanted) else []:
+            for row in _near_rest.near_rest(name, s, make, most):
+                rows.append(row)
+                print(json.dumps(row), flush=True)
+            jax.clear_caches()
+    _near_rest.save(rows)
 
 
 def save(data: list[dict]) -> None:

@@ -6,6 +6,16 @@ import equinox as eqx
 import jax
 
 
+JUMPS = (
+    "that jump, such as friction with `jnp.sign(v)`, have no solution in a step across "
+    "the jump, however small: smooth them, as in `jnp.tanh(v / 0.01)`, or split the "
+    "run at the jump with an `nhjax.Event`."
+)
+# Advice for those alone whose stage solver does not turn to Newton's method itself.
+FALLBACK = (
+    ", or `stage_solver=nhjax.SimplifiedNewton(fallback=True)`, by which Newton's "
+    "method takes over steps that are not solved"
+)
 EVENT_OCCURRED = "An event ended the run, as was asked for; this is no failure."
 
 
@@ -15,16 +25,19 @@ class RESULTS(eqx.Enumeration):
     successful = ""
     nonlinear_divergence = (
         "The stage equations of a step could not be solved: Newton's iteration "
-        "diverged. Try a smaller `dt`, or `stage_solver=nhjax.Newton()`."
+        "diverged. Try a smaller `dt`" + FALLBACK + ". Forces " + JUMPS
     )
     nonlinear_max_iterations = (
         "The stage equations of a step were not solved to round-off within the "
         "`max_iterations` of the stage solver: its iteration converges too slowly, or "
-        "not at all. Try a smaller `dt`, `stage_solver=nhjax.Newton()`, or more "
-        "iterations; where stiff forces magnify round-off, a `tolerance` of the stage "
-        "solver. None of these helps where constraints become dependent in the course "
-        "of the step, as those of a linkage whose bars come to lie in one line: the "
-        "multipliers and the way on are not determined there."
+        "not at all. Try a smaller `dt`"
+        + FALLBACK
+        + ", or more iterations; where stiff forces magnify round-off, a `tolerance` "
+        "of the stage solver. None of these helps in two cases. Forces "
+        + JUMPS
+        + " And where constraints become dependent in the course of the step, as those "
+        "of a linkage whose bars come to lie in one line, the multipliers and the way "
+        "on are not determined."
     )
     singular_stage_matrix = (
         "The mass matrix D2D2L (or D2D2H) or the compatibility matrix C = D2Φ M⁻¹ D2Φᵀ "

@@ -43,10 +43,6 @@ from ._checks import Found, judged
 from ._projection import project_fibre_coordinate, project_position
 
 
-# A violation is not told from round-off up to so many standard deviations of it.
-_NOISE_UNITS = 100
-
-
 def initial_state(
     system: AbstractMechanicalSystem,
     q: PyTree[Array],
@@ -199,9 +195,10 @@ def _allowed(
     noise = function_noise(system, t, q, u, lin.multiplier, args)
     on_velocities = tolerance * violation_scale(system, lin, t, q, u, args)
     on_positions = tolerance * position_scale(system, t, q, args)
+    violations = noise.violations
     return (
-        jnp.maximum(on_velocities, _NOISE_UNITS * noise.on_velocities),
-        jnp.maximum(on_positions, _NOISE_UNITS * noise.on_positions),
+        jnp.maximum(on_velocities, violations[0]),
+        jnp.maximum(on_positions, violations[1]),
         tolerance,
     )
 

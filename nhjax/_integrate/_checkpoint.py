@@ -125,10 +125,12 @@ def check_start(
     y = y0.state
     check_state(system, y, args, "y0.state")
     scalar = jax.ShapeDtypeStruct((), y.p.dtype)
+    on_positions = jax.eval_shape(lambda: system.position_constraint(y0.t, y.q, args))
+    violations = y.multiplier, on_positions
     expected = {
         "q_compensation": system.manifold_of(y.q).no_compensation(y.q),
         "p_compensation": y.p,
-        "round_off": (scalar,) * 3,
+        "round_off": (scalar, scalar, scalar, *violations),
         "t0": scalar,
         "dt": scalar,
         "num_steps": jax.ShapeDtypeStruct((), jnp.int32),

@@ -12,7 +12,7 @@ from .._errors import DTypeError, ShapeError
 from .._method import AbstractMethod
 from .._numerics import ClosureConverted
 from .._step import StepState
-from .._system import AbstractMechanicalSystem, linearise, State
+from .._system import AbstractMechanicalSystem, linearise, noise_near, State
 from ._event import Event
 from ._sides import Sides
 from ._stepping import Stepping
@@ -92,17 +92,22 @@ def with_continuous_multiplier(
     return State(y.q, y.v, y.p, lin.multiplier)
 
 
+# A condition is not told from zero up to so many standard deviations of its round-off.
+_NOISE_UNITS = 100
+
+
 def sides_at(
     conditions: Conditions,
     stepping: Stepping,
     t: FloatScalar,
     step_state: StepState,
-    round_off: Float[Array, " e"] | float = 0.0,
+    round_off: Float[Array, " e"] | None = None,
 ) -> tuple[Sides, BoolScalar]:
     """Find the sides of all conditions at a state, and whether all are finite.
 
     A condition that the motion would bring to zero, or has left zero, within a small
-    part of a step counts as zero; so does one that is not larger than its `round_off`.
+    part of a step counts as zero; so does one that is not larger than its `round_off`,
+    which is measured unless it is given.
     """
     step_state = jax.lax.stop_gradient(step_state)
     system, dt, args = stepping.system, stepping.dt, stepping.args
@@ -110,14 +115,19 @@ def sides_at(
     u = system.fibre_coordinate(y)
     manifold = system.manifold_of(y.q)
 
-    def along(t, xi, u):
-        q = manifold.act(y.q, xi)
+    def values_at(t, q, u):
         v, p = system.velocity(t, q, u, args), system.momentum(t, q, u, args)
         lin = linearise(system, t, q, u, args, may_be_sparse=True)
         return conditions(t, State(q, v, p, lin.multiplier), args)
 
     rates = jnp.ones_like(t), y.v, lin.acceleration
-    _, rate = jax.jvp(along, (t, jnp.zeros_like(u), u), rates)
+    _, rate = jax.jvp(
+        lambda t, xi, u: values_at(t, manifold.act(y.q, xi), u),
+        (t, jnp.zeros_like(u), u),
+        rates,
+    )
+    if round_off is None:
+        round_off = _NOISE_UNITS * noise_near(values_at, manifold, t, y.q, u, rate)
     y = with_continuous_multiplier(system, stepping.method, t, y, args)
     values = conditions(t, y, args)
     small = float(jnp.finfo(values.dtype).eps) ** 0.5

@@ -118,4 +118,6 @@ def _reset(
     y = with_continuous_multiplier(system, method, t, step_state.state, args)
     y = with_continuous_multiplier(system, method, t, reset(t, y, args), args)
     after = first_step_state(system, method, t, y, args)
-    return after, all_finite(y) & is_consistent(system, t, after, args)
+    assert stepping.round_off is not None
+    violations = stepping.round_off.violations
+    return after, all_finite(y) & is_consistent(system, t, after, args, violations)

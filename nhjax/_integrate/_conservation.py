@@ -8,13 +8,14 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, PyTree
+from jaxtyping import Array, Float, PyTree
 
+from .._compile import as_cpu_kernel
 from .._custom_types import Args, BoolScalar, FloatScalar
 from .._errors import DTypeError, ShapeError
-from .._numerics import ClosureConverted, dependence, matvec, max_norm
+from .._numerics import ClosureConverted, dependence, frozen, matvec, max_norm
 from .._step import invariant_values, Invariants
-from .._system import AbstractMechanicalSystem, linearise, State
+from .._system import AbstractMechanicalSystem, linearise, noise_near, State
 
 
 # Rates of change are looked at in the initial state and in this many around it.
@@ -53,7 +54,17 @@ def kept_invariants(
             f"{type(invariants).__name__}."
         )
     value = invariant_values(function, system, t, y.q, u, args)
-    return Invariants(function, value)
+    noise = as_cpu_kernel(_noise, function, system, t, y.q, u, args, value)
+    return Invariants(function, value, noise / float(jnp.finfo(value.dtype).eps))
+
+
+def _noise(function, system, t, q, u, args, value) -> Float[Array, " k"]:
+    function, system, args = frozen((function, system, args))
+    return noise_near(
+        lambda t, q, u: invariant_values(function, system, t, q, u, args),
+        system.manifold_of(q),
+        *(t, q, u, value),
+    )
 
 
 def _check_function(

@@ -11,7 +11,7 @@ from .._custom_types import BoolScalar, FloatScalar, IntScalar
 from .._numerics import tree_where
 from .._results import RESULTS
 from .._step import StepArguments
-from .._system import State
+from .._system import FunctionNoise, State
 from ._checkpoint import Checkpoint
 from ._conditions import Conditions, conditions_of, sides_at
 from ._consequences import Consequences, consequences_of
@@ -75,9 +75,9 @@ class EventStepping(eqx.Module):
         """Compute the time that a run has come to."""
         return self.stepping.time(progress.node) + progress.offset
 
-    def start(self, y0: State | Checkpoint) -> Carry:
+    def start(self, y0: State | Checkpoint, noise: FunctionNoise | None) -> Carry:
         """Make the carry of the time loop before the first step."""
-        carry = self.stepping.start(y0)
+        carry = self.stepping.start(y0, noise)
         t = self.stepping.time(0)
         sides, known = sides_at(self.conditions, self.stepping, t, carry.step_state)
         unknown = (carry.result == RESULTS.successful) & ~known

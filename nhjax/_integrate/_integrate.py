@@ -1,3 +1,4 @@
+import warnings
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Literal
@@ -5,9 +6,14 @@ from typing import Literal
 import jax.numpy as jnp
 
 from .._custom_types import Args, FloatScalar, FloatScalarLike, IntScalar, PhaseFunction
-from .._errors import Check, require
+from .._errors import Check, is_traced, require
 from .._method import AbstractMethod, Gauss, LobattoIIIAB, PartitionedRungeKutta
-from .._step import AbstractStageSolver, leaves_steps_to_newton, SimplifiedNewton
+from .._step import (
+    AbstractStageSolver,
+    is_simplified_alone,
+    leaves_steps_to_newton,
+    SimplifiedNewton,
+)
 from .._system import (
     AbstractMechanicalSystem,
     check_flag,
@@ -38,6 +44,23 @@ from ._solution import (
 
 
 METHODS = LobattoIIIAB, Gauss, PartitionedRungeKutta
+
+# The estimated error of a step, relative to the change in it, of which a plain call
+# warns. For steps that are ever larger the estimate tends to one.
+_NOTHING_IS_RIGHT = 0.9
+
+_TOO_LARGE = (
+    "`dt` = {:.6g} is too large: the error of a step is estimated to be as large as "
+    'the change of the state in it (`sol.stats["max_error_estimate"]` is {:.2g}). The '
+    "equations of each step are solved, but the trajectory means nothing. Try `dt` = "
+    "{:.6g}."
+)
+_TAKEN_OVER = (
+    "`SimplifiedNewton` did not solve step {} of this run, which is therefore repeated "
+    "with Newton's method for such steps. This compiles a second program. To compile "
+    "one alone, pass `stage_solver=nhjax.SimplifiedNewton(fallback=True)` or "
+    "`nhjax.Newton()`, or take a smaller `dt`."
+)
 
 
 def integrate(
@@ -170,15 +193,29 @@ def integrate(
     options = Options(saveat, invariants, events)
     means = Means(stage_solver, adjoint, progress_meter)
     sol = run(system, method, y0, grid, args, options, means)
+    used_newton = not is_simplified_alone(stage_solver)
     if not is_tracing() and leaves_steps_to_newton(stage_solver) and is_unsolved(sol):
-        # Silently: the meter has shown its run already.
+        used_newton = True
+        warnings.warn(_TAKEN_OVER.format(int(sol.stats["failed_step"])), stacklevel=2)
+        # Without the meter, which has shown its run already.
         solver = replace(stage_solver, fallback=True)
         means = Means(solver, adjoint, NoProgressMeter())
         sol = run(system, method, y0, grid, args, options, means)
-    if not throw:
-        return sol
-    _require_constraints(sol, system, t0, state, args)
-    return raise_failures(sol, dt)
+    if throw:
+        _require_constraints(sol, system, t0, state, args)
+        sol = raise_failures(sol, dt, used_newton)
+    _warn_of_errors(sol, dt)
+    return sol
+
+
+def _warn_of_errors(sol: Solution, dt: FloatScalar) -> None:
+    """Warn, in a plain call, of steps that are so large that nothing is right."""
+    estimate = sol.stats.get("max_error_estimate")
+    if estimate is None or is_traced(estimate, dt):
+        return
+    if float(estimate) > _NOTHING_IS_RIGHT:
+        size = float(dt)
+        warnings.warn(_TOO_LARGE.format(size, float(estimate), size / 4), stacklevel=3)
 
 
 def _require_constraints(

@@ -11,7 +11,7 @@ from jaxtyping import Array, Int
 from .._numerics import moving_with
 from .._results import RESULTS
 from .._step import RoundOff
-from .._system import State
+from .._system import FunctionNoise, State
 from ._checkpoint import Checkpoint
 from ._checks import static_length
 from ._event_stepping import EventStepping
@@ -47,9 +47,9 @@ class Loop(eqx.Module):
         """
         return self.num_steps if self.events is None else self.events.num_iterations
 
-    def start(self, y0: State | Checkpoint) -> Carry:
-        """Make the carry before the first step."""
-        return (self.stepping if self.events is None else self.events).start(y0)
+    def start(self, y0: State | Checkpoint, noise: FunctionNoise | None) -> Carry:
+        """Make the carry before the first step; see `Stepping.start`."""
+        return (self.stepping if self.events is None else self.events).start(y0, noise)
 
     def with_round_off(self, round_off: RoundOff) -> "Loop":
         """Return the same loop, whose steps know the round-off of the system."""

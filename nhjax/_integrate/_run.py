@@ -17,6 +17,7 @@ from .._step import RoundOff, StepRecord
 from .._system import (
     AbstractMechanicalSystem,
     closure_converted,
+    function_noise,
     FunctionNoise,
     State,
 )
@@ -109,7 +110,7 @@ def _all_steps(
     """
 
     def start(loop: Loop, y0: State | Checkpoint, noise: FunctionNoise | None):
-        first = loop.start(y0)
+        first = loop.start(y0, noise)
         return loop.stepping.round_off_at(y0, first.step_state, noise), first
 
     def steps(loop: Loop, round_off: RoundOff, first: Carry):
@@ -123,8 +124,11 @@ def _all_steps(
     noise = None
     if isinstance(y0, State):
         # A kernel of its own: the loop over steps is compiled to faster code without
-        # another loop before it.
-        noise = as_cpu_kernel(lambda loop, y0: loop.stepping.noise(y0), loop, y0)
+        # another loop before it. In a batch of runs from one state it is no batch.
+        stepping = loop.stepping
+        u = stepping.system.fibre_coordinate(y0)
+        given = stepping.time(0), y0.q, u, y0.multiplier, stepping.args
+        noise = as_cpu_kernel(function_noise, stepping.system, *given)
         if not checkpoint:
             return as_cpu_kernel(whole, loop, y0, noise)
     # What a compiler knows of the start of a loop, such as zeros in the matrices there,

@@ -1,4 +1,5 @@
 from collections.abc import Mapping, Sequence
+from functools import partial
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -7,7 +8,7 @@ from jaxtyping import Array, Float, PyTree
 
 from .._custom_types import FloatScalarLike
 from .._errors import IntegrationError, is_traced, lane_name, raise_where
-from .._results import EVENT_OCCURRED, messages, RESULTS
+from .._results import EVENT_OCCURRED, FALLBACK, JUMPS, messages, RESULTS
 from .._system import State
 from ._dataset import to_dataset
 from ._interpolation import DenseInterpolation
@@ -36,6 +37,9 @@ class Solution(eqx.Module):
         multiplier of a step from the continuous multiplier),
         `max_invariant_error` (with `invariants` alone: the largest |I - I_0| of a
         function that is kept, relative to the size of its terms),
+        `max_error_estimate` (the largest estimated error of a step, relative to the
+        change of the state in it, where 1 means that nothing of the step is right; not
+        of a method with one node),
         `failed_step` (the index of the step that failed, -1 if none did), and
         `worst_coordinate` (the index of the coordinate whose momentum equations had
         the largest residual in the step that failed, or one that is not a number; -1
@@ -198,27 +202,33 @@ def is_singular_from_the_start(sol: Solution) -> bool:
     return singular and int(sol.stats["failed_step"]) == 0
 
 
-def raise_failures(sol: Solution, dt: FloatScalarLike | None = None) -> Solution:
+def raise_failures(
+    sol: Solution, dt: FloatScalarLike | None = None, used_newton: bool = False
+) -> Solution:
     """Return `sol`, or raise an `IntegrationError` with lane, step and reason.
 
-    With the size `dt` of the steps, the message says which to try.
+    With the size `dt` of the steps, the message says which to try. It recommends
+    Newton's method unless the run has `used_newton` already.
     """
     outcome = _outcome(sol)
     bad = outcome.codes != messages().index("")
     if sol.events is not None:
         bad = bad & (outcome.codes != messages().index(EVENT_OCCURRED))
     if is_traced(*outcome, dt):
-        return raise_where(sol, bad, _failure, (outcome, dt))
+        return raise_where(sol, bad, partial(_failure, used_newton), (outcome, dt))
     if np.any(bad):
-        raise _failure(bad, (outcome, dt))
+        raise _failure(used_newton, bad, (outcome, dt))
     return sol
 
 
-def _failure(bad: Any, values: tuple[_Outcome, Any]) -> IntegrationError:
+def _failure(
+    used_newton: bool, bad: Any, values: tuple[_Outcome, Any]
+) -> IntegrationError:
     outcome, dt = values
     first = tuple(np.argwhere(bad)[0])
     size = None if dt is None else float(np.broadcast_to(dt, np.shape(bad))[first])
-    return IntegrationError(_failure_message(_failures(outcome), size))
+    message = _failure_message(_failures(outcome), size)
+    return IntegrationError(message.replace(FALLBACK, "") if used_newton else message)
 
 
 def _failures(
@@ -246,7 +256,8 @@ def _failure_message(
     where = "" if lane is None else f"lane {lane}, "
     others = f" ({len(failures) - 1} more lanes failed)" if failures[1:] else ""
     if dt is not None and "smaller `dt`" in reason:
-        reason += f" `dt` is {dt:.6g}: try {0.5 * dt:.6g}."
+        smooth = "if all forces are smooth, " if JUMPS in reason else ""
+        reason += f" `dt` is {dt:.6g}: {smooth}try {0.5 * dt:.6g}."
     return (
         f"Integration failed in {where}step {k}{others}: {reason} "
         "With `throw=False` the part before the failure is returned."

@@ -59,12 +59,12 @@ def updated_statistics(
         return jnp.where(good, jnp.maximum(stats[name], value), stats[name])
 
     failed = alive & ~good
-    kept = {}
-    if outcome.invariant_error is not None:
-        kept["max_invariant_error"] = larger(
-            "max_invariant_error", outcome.invariant_error
-        )
-    return kept | {
+    optional = {
+        "max_invariant_error": outcome.invariant_error,
+        "max_error_estimate": outcome.error_estimate,
+    }
+    present = {k: x for k, x in optional.items() if x is not None}
+    return {name: larger(name, x) for name, x in present.items()} | {
         "num_steps": stats["num_steps"] + good.astype(jnp.int32),
         "num_iterations": stats["num_iterations"]
         + jnp.where(alive, outcome.num_iterations, 0),

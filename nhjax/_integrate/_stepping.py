@@ -5,7 +5,7 @@ from typing import NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Int
+from jaxtyping import Array, Float, Int
 
 from .._compile import Programs
 from .._custom_types import Args, BoolScalar, FloatScalar
@@ -28,7 +28,6 @@ from .._step import (
 from .._system import (
     AbstractMechanicalSystem,
     all_finite,
-    function_noise,
     FunctionNoise,
     keeps_constraints,
     State,
@@ -90,8 +89,12 @@ class Stepping(eqx.Module):
         number = (first_step + k).astype(self.dt.dtype)
         return t0 + number * self.dt + shift
 
-    def start(self, y0: State | Checkpoint) -> Carry:
-        """Make the carry of the time loop before the first step."""
+    def start(self, y0: State | Checkpoint, noise: FunctionNoise | None) -> Carry:
+        """Make the carry of the time loop before the first step.
+
+        The noise of the functions of the system is given with a state, not with a
+        checkpoint, which has what follows from it.
+        """
         system, t, args = self.system, self.time(0), self.args
         checkpoint = y0 if isinstance(y0, Checkpoint) else None
         if isinstance(y0, Checkpoint):
@@ -99,8 +102,12 @@ class Stepping(eqx.Module):
         step_state = first_step_state(system, self.method, t, y0, args)
         if checkpoint is not None:
             step_state = resumed(checkpoint, step_state)
+            violations = RoundOff.of_arrays(checkpoint.round_off).violations
+        else:
+            assert noise is not None
+            violations = noise.violations
         result = RESULTS.where(
-            is_consistent(system, t, step_state, args),
+            is_consistent(system, t, step_state, args, violations),
             RESULTS.successful,
             RESULTS.inconsistent_start,
         )
@@ -122,13 +129,9 @@ class Stepping(eqx.Module):
         stats = first_statistics(violation, redundant, result == RESULTS.successful)
         if self.invariants is not None:
             stats["max_invariant_error"] = jnp.zeros_like(violation)
+        if self.method.embedded_difference is not None:
+            stats["max_error_estimate"] = jnp.zeros_like(violation)
         return Carry(step_state, result, stats)
-
-    def noise(self, y0: State) -> FunctionNoise:
-        """Measure the round-off of the functions of the system at the first state."""
-        u = self.system.fibre_coordinate(y0)
-        given = self.time(0), y0.q, u, y0.multiplier, self.args
-        return function_noise(self.system, *given)
 
     def round_off_at(
         self, y0: State | Checkpoint, first: StepState, noise: FunctionNoise | None
@@ -139,7 +142,7 @@ class Stepping(eqx.Module):
         steps.
         """
         if isinstance(y0, Checkpoint):
-            return jax.lax.stop_gradient(RoundOff(*y0.round_off))
+            return jax.lax.stop_gradient(RoundOff.of_arrays(y0.round_off))
         assert noise is not None
         return round_off_of_steps(self.method, first.lin, noise)
 
@@ -200,9 +203,15 @@ def as_checkpoint(
 
 
 def is_consistent(
-    system: AbstractMechanicalSystem, t: FloatScalar, start: StepState, args: Args
+    system: AbstractMechanicalSystem,
+    t: FloatScalar,
+    start: StepState,
+    args: Args,
+    violations: tuple[Float[Array, " l"], Float[Array, " k"]],
 ) -> BoolScalar:
     """Tell whether the initial state is consistent, up to small errors.
+
+    `violations` are those of constraints that are round-off.
 
     It is if it lies on the group, satisfies the constraints, and its v and p belong
     together by the Legendre transform. The bound on the errors is meant to find a state
@@ -216,7 +225,7 @@ def is_consistent(
     given = y.p if system.fibre_coordinate_name == "v" else y.v
     size = max_norm(derivative) + max_norm(given)
     return (
-        keeps_constraints(system, lin, t, y, args, small)
+        keeps_constraints(system, lin, t, y, args, small, violations)
         & (system.manifold_of(y.q).distance_to_group(y.q) <= small)
         & (max_norm(derivative - given) <= small * size)
     )

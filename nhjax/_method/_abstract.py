@@ -119,6 +119,35 @@ class AbstractMethod(eqx.Module):
         return self.orders.C - int(accumulates)
 
     @property
+    def embedded_difference(self) -> np.ndarray | None:
+        """Return b less the weights of a quadrature that leaves out the last node.
+
+        These are multiples of a divided difference over all nodes: a quadrature with
+        them vanishes for polynomials of a degree less than s - 1, and measures by what
+        the nodes resolve a function. Of nodes that coincide the first counts. None if
+        there is but one node.
+        """
+        nodes, first = np.unique(self.c, return_index=True)
+        if len(nodes) == 1:
+            return None
+        apart = nodes[:, None] - nodes + np.eye(len(nodes))
+        weights = 1 / np.prod(apart, axis=1)
+        last = np.sum(self.b[self.c == nodes[-1]])
+        difference = np.zeros(self.stages)
+        difference[first] = last * weights / weights[-1]
+        return difference
+
+    @property
+    def error_exponent(self) -> int | float:
+        """Return the power of `embedded_difference` that is as small as the error.
+
+        For smooth functions the difference is O(h^{s-1}) with s different nodes, and
+        the error of a step, relative to its change, O(h^p) with p = `order`.
+        """
+        exponent = self.order / (len(np.unique(self.c)) - 1)
+        return int(exponent) if exponent.is_integer() else exponent
+
+    @property
     def closure_weights(self) -> ClosureWeights:
         """Return the weights that give a step's multipliers, as in `ClosureWeights`.
 

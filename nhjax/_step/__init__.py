@@ -13,6 +13,7 @@ from ._invariants import (
 )
 from ._newton import (
     AbstractStageSolver as AbstractStageSolver,
+    is_simplified_alone as is_simplified_alone,
     leaves_steps_to_newton as leaves_steps_to_newton,
     Newton as Newton,
     SimplifiedNewton as SimplifiedNewton,

@@ -30,10 +30,13 @@ class Invariants(eqx.Module):
     - `function`: called as `function(t, q, u, args)`, of shape (k,); None stands for
         the energy of the system.
     - `value`: the k values.
+    - `least_sizes`: the measured round-off of the functions at the start of the run, in
+        units of the unit round-off; it includes constants that cancel.
     """
 
     function: Callable[..., Array] | None
     value: Float[Array, " k"]
+    least_sizes: Float[Array, " k"]
 
     def error(
         self,
@@ -83,7 +86,7 @@ class Invariants(eqx.Module):
             found = found + jnp.sum(
                 jnp.abs(slope * x[None]), axis=tuple(range(1, slope.ndim))
             )
-        return found
+        return jnp.maximum(found, self.least_sizes)
 
 
 def invariant_values(

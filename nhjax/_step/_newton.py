@@ -201,6 +201,11 @@ class SimplifiedNewton(AbstractStageSolver):
         return lambda stages, x: corrected(stages, structure, x)[0]
 
 
+def is_simplified_alone(stage_solver: AbstractStageSolver) -> bool:
+    """Tell whether a run does without Newton's method, unless it is repeated."""
+    return isinstance(stage_solver, SimplifiedNewton) and not stage_solver.fallback
+
+
 def leaves_steps_to_newton(stage_solver: AbstractStageSolver) -> bool:
     """Tell whether a plain call that fails is to be repeated with the fallback."""
     return isinstance(stage_solver, SimplifiedNewton) and stage_solver.fallback is None

@@ -5,6 +5,7 @@ import functools
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Float
 
 from .._custom_types import FloatScalar
 from .._method import AbstractMethod
@@ -22,12 +23,20 @@ class RoundOff(eqx.Module):
 
     `by_velocity` + h `by_force` + `by_position` / h:
 
-    momenta and nonholonomic constraints; forces; and holonomic constraints.
+    momenta and nonholonomic constraints; forces; and holonomic constraints. The
+    `violations` of constraints on velocities and positions that round-off can amount to
+    are in the units of these.
     """
 
     by_velocity: FloatScalar
     by_force: FloatScalar
     by_position: FloatScalar
+    violations: tuple[Float[Array, " l"], Float[Array, " k"]]
+
+    @classmethod
+    def of_arrays(cls, arrays: tuple[Array, ...]) -> "RoundOff":
+        """Make it from its arrays, in the order of the fields."""
+        return cls(*arrays[:3], arrays[3:])
 
     def size(self, h: FloatScalar) -> FloatScalar:
         """Compute the size in a step of length h > 0."""
@@ -67,7 +76,8 @@ def round_off_of_steps(
             m = lin.violation.shape[0] - k
             by_position = holonomic * response(jnp.pad(noise.on_positions, (m, 0)))
     units = _PART / float(jnp.finfo(by_velocity.dtype).eps)
-    return RoundOff(units * by_velocity, units * by_force, units * by_position)
+    sizes = units * by_velocity, units * by_force, units * by_position
+    return RoundOff(*sizes, noise.violations)
 
 
 @functools.lru_cache

@@ -31,6 +31,7 @@ from .._system import (
     State,
 )
 from ._end import end_state, step_record
+from ._error_estimate import error_estimate
 from ._invariants import Invariants, StartImpulses
 from ._newton import AbstractStageSolver
 from ._record import StepRecord
@@ -101,6 +102,8 @@ class StepOutcome(NamedTuple):
     - `newton`: whether Newton's method took over from simplified Newton.
     - `invariant_error`: the largest error of an invariant at the end, relative to the
         size of its terms; None if the run keeps none.
+    - `error_estimate`: the estimated error of the step, relative to the change of the
+        state in it; None for a method with one node.
     """
 
     step_state: StepState
@@ -114,6 +117,7 @@ class StepOutcome(NamedTuple):
     multiplier_defect: FloatScalar
     newton: BoolScalar
     invariant_error: FloatScalar | None
+    error_estimate: FloatScalar | None
 
 
 def first_step_state(
@@ -214,7 +218,8 @@ def step(
     result = _result(solved, lin, next_state, in_chart(stages, x))
     if stages.redundancy is not None:
         small = float(jnp.finfo(p.dtype).eps) ** 0.5 + 100 * stage_solver.tolerance
-        kept = keeps_constraints(system, lin_next, t + h, end, args, small)
+        allowed = None if stages.round_off is None else stages.round_off.violations
+        kept = keeps_constraints(system, lin_next, t + h, end, args, small, allowed)
         lost = (result == RESULTS.successful) & ~kept
         result = RESULTS.where(lost, RESULTS.lost_constraints, result)
     residual, worst = largest_column(forces.residual, solved.aux.node_residual)
@@ -231,6 +236,7 @@ def step(
         multiplier_defect=max_norm(last - lin_next.multiplier),
         newton=solved.aux.newton,
         invariant_error=_invariant_error(stages, at_end, u),
+        error_estimate=error_estimate(stages, x, forces.force, u, lin),
     )
 
 

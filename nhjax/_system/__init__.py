@@ -36,6 +36,7 @@ from ._scales import (
     function_noise as function_noise,
     FunctionNoise as FunctionNoise,
     keeps_constraints as keeps_constraints,
+    noise_near as noise_near,
     position_scale as position_scale,
     velocity_scale as velocity_scale,
     violation_scale as violation_scale,

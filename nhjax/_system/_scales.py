@@ -1,5 +1,6 @@
 """The sizes of terms and the noise of functions, which tell errors from round-off."""
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
@@ -7,10 +8,15 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, PyTree
 
 from .._custom_types import Args, BoolScalar, FloatScalar, FloatScalarLike
+from .._manifold import AbstractLieGroup
 from .._numerics import frozen, max_norm, measured_noise, SparseMatrix, unit
 from ._abstract import AbstractMechanicalSystem
 from ._linearisation import Linearisation
 from ._state import State
+
+
+# A violation is not told from round-off up to so many standard deviations of it.
+_NOISE_UNITS = 100
 
 
 def violation_scale(
@@ -85,14 +91,21 @@ def keeps_constraints(
     y: State,
     args: Args,
     small: FloatScalarLike,
+    round_off: tuple[Float[Array, " l"], Float[Array, " k"]] | None,
 ) -> BoolScalar:
-    """Tell whether all constraints hold at y, up to `small` times their terms."""
+    """Tell whether all constraints hold at y, up to `small` times their terms.
+
+    Violations of velocity and position constraints up to their `round_off` are none.
+    """
     u = system.fibre_coordinate(y)
-    scale = violation_scale(system, lin, t, y.q, u, args)
     positions = system.position_constraint(t, y.q, args)
-    allowed = position_scale(system, t, y.q, args)
-    return jnp.all(jnp.abs(lin.violation) <= small * scale) & jnp.all(
-        jnp.abs(positions) <= small * allowed
+    on_velocities = small * violation_scale(system, lin, t, y.q, u, args)
+    on_positions = small * position_scale(system, t, y.q, args)
+    if round_off is not None:
+        on_velocities = jnp.maximum(on_velocities, round_off[0])
+        on_positions = jnp.maximum(on_positions, round_off[1])
+    return jnp.all(jnp.abs(lin.violation) <= on_velocities) & jnp.all(
+        jnp.abs(positions) <= on_positions
     )
 
 
@@ -119,6 +132,11 @@ class FunctionNoise(NamedTuple):
     on_velocities: Float[Array, " l"]
     on_positions: Float[Array, " k"]
 
+    @property
+    def violations(self) -> tuple[Float[Array, " l"], Float[Array, " k"]]:
+        """Bound violations of velocity and position constraints that are round-off."""
+        return _NOISE_UNITS * self.on_velocities, _NOISE_UNITS * self.on_positions
+
 
 def function_noise(
     system: AbstractMechanicalSystem,
@@ -132,18 +150,37 @@ def function_noise(
 
     Only the shape of the multiplier is used.
     """
-    system, t, q, u, args = frozen((system, t, q, u, args))
-    n, manifold = u.shape[0], system.manifold_of(q)
+    # Not as arguments: `args` may hold what is no array.
+    positions = jax.eval_shape(lambda: system.position_constraint(t, q, args))
+    system, args = frozen((system, args))
 
-    def values(z):
-        at, there, w = t + z[0], manifold.act(q, z[1 : n + 1]), u + z[n + 1 :]
+    def values(t, q, u):
         return FunctionNoise(
-            system.momentum(at, there, w, args),
-            system.free_force(at, there, w, args),
-            system.constraint(at, there, w, args),
-            system.position_constraint(at, there, args),
+            system.momentum(t, q, u, args),
+            system.free_force(t, q, u, args),
+            system.constraint(t, q, u, args),
+            system.position_constraint(t, q, args),
         )
 
-    positions = jax.eval_shape(system.position_constraint, t, q, args)
     like = FunctionNoise(u, u, multiplier, positions)
-    return measured_noise(values, 2 * n + 1, like)
+    return noise_near(values, system.manifold_of(q), t, q, u, like)
+
+
+def noise_near(
+    function: Callable[[FloatScalar, PyTree[Array], Float[Array, " n"]], PyTree[Array]],
+    manifold: AbstractLieGroup,
+    t: FloatScalar,
+    q: PyTree[Array],
+    u: Float[Array, " n"],
+    like: PyTree[Array | jax.ShapeDtypeStruct],
+) -> PyTree[Array]:
+    """Measure the round-off of a function of (t, q, u) near a state.
+
+    `like` has the shapes and the type of what it returns; see `measured_noise`.
+    """
+    (t, q, u), n = frozen((t, q, u)), u.shape[0]
+    return measured_noise(
+        lambda z: function(t + z[0], manifold.act(q, z[1 : n + 1]), u + z[n + 1 :]),
+        2 * n + 1,
+        like,
+    )

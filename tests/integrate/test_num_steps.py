@@ -111,7 +111,8 @@ def test_a_batch_in_step_has_lengths_of_its_own(monkeypatch):
 def test_a_run_whose_length_is_traced_is_compiled_as_a_whole(monkeypatch, engine):
     monkeypatch.setenv("NHJAX_ENGINE", engine)
     y0 = PARTICLE.initial_state()
-    (use,) = nhjax.engines(lambda n: run(n, y0, throw=False).ys.q, 3)
+    # The first kernel measures round-off.
+    _, use = nhjax.engines(lambda n: run(n, y0, throw=False).ys.q, 3)
     assert use.engine == engine
 
 

@@ -1,0 +1,288 @@
+"""Steps near rest, judged in 50 digits: is a refused step solved, an accepted one not?
+
+Near rest the numbers of a state are small, and the constants inside of the functions of
+a system, a wheel's radius or a weight, leave round-off of their own size. Each system
+starts from its reference with v scaled by 1e-8 to 1, and takes steps of four sizes over
+three decades with both solvers, compiled.
+
+A step is judged at the stages that the solver ended with, whether it accepts them or
+not. The stage equations are evaluated there in 50 digits. Newton's correction with
+these values is the distance from the solution; with what float64 misses of them, at the
+same stages and at four that are moved by a few units of the last digit, it is the noise
+which no iteration in float64 can remove. Both count in units of velocities, as in the
+solvers, and a unit of the last digit of the velocities is always noise. A refused step
+whose distance is at most `SOLVED` times the noise should have been accepted. An
+accepted one whose distance is more than `WRONG` times the noise should have been
+refused.
+"""
+
+from collections.abc import Callable, Iterator
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.flatten_util import ravel_pytree
+from jaxtyping import Array, Float
+
+import nhjax
+from nhjax import systems
+from nhjax._numerics import max_norm
+from nhjax._step import (
+    first_step_state,
+    round_off_of_steps,
+    step,
+    StepArguments,
+)
+from nhjax._step._stage_iteration import increment_size, stage_residual
+from nhjax._step._step import equations_of_step
+from nhjax._step._unknowns import Stages
+from nhjax._system import function_noise
+from nhjax.systems._base import AbstractExample
+
+from ._high_precision import evaluate, to_float
+from ._report import markdown_table, number, write
+
+
+SCALES = 1e-8, 1e-6, 1e-4, 1e-2, 1.0
+SIZES = 1e-3, 1e-2, 1e-1, 1.0
+SOLVED, WRONG = 10, 1e4
+SOLVERS = {"simplified": nhjax.SimplifiedNewton(), "newton": nhjax.Newton()}
+NUM_STEPS = 10
+
+
+class Tried(NamedTuple):
+    """A step that was tried: its arguments, its last stages and its result."""
+
+    arguments: StepArguments
+    stages: Any
+    code: Any
+    num_iterations: Any
+
+
+class Distance(NamedTuple):
+    """How far stages are from the solution, and the noise, in units of velocities."""
+
+    distance: float
+    noise: float
+
+
+@eqx.filter_jit
+def steps(system, method, solver, y0, h) -> Tried:
+    """Take `NUM_STEPS` steps as `integrate` does; after one that fails, none."""
+    zero = jnp.zeros_like(h)
+    first = first_step_state(system, method, zero, y0, None)
+    given = zero, y0.q, system.fibre_coordinate(y0), y0.multiplier, None
+    noise = function_noise(system, *given)
+    round_off = round_off_of_steps(method, first.lin, noise)
+
+    def advance(carry, k):
+        step_state, alive = carry
+        arguments = StepArguments(
+            system, k * h, h, step_state, None, round_off=round_off
+        )
+        outcome = step(arguments, method, solver, ~alive)
+        good = alive & (outcome.result == nhjax.RESULTS.successful)
+        after = jax.tree.map(
+            lambda new, old: jnp.where(good, new, old), outcome.step_state, step_state
+        )
+        code = jnp.where(alive, outcome.result._value, -1)
+        dynamic, _ = eqx.partition(arguments, eqx.is_array)
+        tried = Tried(dynamic, outcome.stages, code, outcome.num_iterations)
+        return (after, good), tried
+
+    numbers = jnp.arange(NUM_STEPS, dtype=h.dtype)
+    _, tried = jax.lax.scan(advance, (first, jnp.asarray(True)), numbers)
+    return tried
+
+
+@eqx.filter_jit
+def equations(method, arguments: StepArguments, x: Stages) -> Float[Array, " k"]:
+    """Evaluate all stage equations of a step."""
+    return stage_residual(equations_of_step(arguments, method), x)[0]
+
+
+@eqx.filter_jit
+def inverse_jacobian(method, arguments, x: Stages) -> Float[Array, "k k"]:
+    """Invert the Jacobian of all stage equations."""
+    z, unravel = ravel_pytree(x)
+    return jnp.linalg.inv(
+        jax.jacfwd(lambda z: equations(method, arguments, unravel(z)))(z)
+    )
+
+
+@eqx.filter_jit
+def size_of_change(method, arguments, x: Stages, dz: Float[Array, " k"]) -> Array:
+    """Measure a change of the unknowns as the solvers do."""
+    z, unravel = ravel_pytree(x)
+    stages = equations_of_step(arguments, method)
+    return increment_size(stages, x, unravel(z + dz), arguments.step_state.lin)
+
+
+@np.errstate(over="ignore", invalid="ignore")
+def distance(method, arguments: StepArguments, x: Stages) -> Distance:
+    """Find how far stages are from the solution of their step, and the noise."""
+    z, unravel = ravel_pytree(x)
+    z = np.asarray(z)
+    if not np.all(np.isfinite(z)):
+        return Distance(np.inf, 0.0)
+    dynamic, static = eqx.partition(arguments, eqx.is_array)
+    exact = evaluate(
+        lambda dynamic, x: equations(method, eqx.combine(dynamic, static), x),
+        dynamic,
+        x,
+    )
+    inverse = np.asarray(inverse_jacobian(method, arguments, x))
+
+    def size(r):
+        dz = jnp.asarray(inverse @ to_float(r))
+        return float(size_of_change(method, arguments, x, dz))
+
+    eps = float(np.finfo(z.dtype).eps)
+    missed = [np.asarray(equations(method, arguments, x)) - exact]
+    rng, jacobian = np.random.default_rng(0), np.linalg.inv(inverse)
+    for _ in range(4):
+        there = z * (1 + eps * rng.integers(-4, 5, z.size))
+        # The change of the equations by the move itself is no noise.
+        r = equations(method, arguments, unravel(jnp.asarray(there)))
+        missed.append(np.asarray(r) - jacobian @ (there - z) - exact)
+    last_digit = eps * float(max_norm(x.node_fibre_coordinate, x.velocity))
+    found = Distance(size(exact), max(last_digit, *map(size, missed)))
+    return found if np.all(np.isfinite(found)) else Distance(np.inf, 0.0)
+
+
+def examples() -> dict[str, Callable]:
+    """All systems of the gallery, each as a function of no arguments."""
+    made = {}
+    for name in vars(systems):
+        kind = getattr(systems, name)
+        if isinstance(kind, type) and issubclass(kind, AbstractExample):
+            made[name] = kind
+    return made
+
+
+def near_rest(
+    name: str, stages: int, make: Callable, most: int
+) -> Iterator[dict[str, Any]]:
+    """Measure one system with one number of stages, a row for each solver and scale.
+
+    At most so many steps of each kind are judged in 50 digits for a row.
+    """
+    example = make()
+    system, y0 = example.system, example.initial_state()
+    method = nhjax.LobattoIIIAB(stages)
+    refusals = {
+        int(getattr(nhjax.RESULTS, name)._value)
+        for name in ("nonlinear_max_iterations", "nonlinear_divergence")
+    }
+    for solver_name, solver in SOLVERS.items():
+        for scale in SCALES:
+            y = nhjax.initial_state(system, y0.q, scale * y0.v, project=True)
+            row: dict[str, Any] = {"system": name, "stages": stages}
+            row |= {"solver": solver_name, "scale": scale}
+            row |= {"accepted": 0, "refused": 0, "other": 0, "most iterations": 0}
+            kept: dict[str, list] = {"accepted": [], "refused": []}
+            for size in SIZES:
+                h = jnp.asarray(size)
+                tried = steps(system, method, solver, y, h)
+                static = eqx.filter(_arguments(system, method, y, h), _is_no_array)
+                for k, code in enumerate(np.asarray(tried.code)):
+                    if code < 0:
+                        continue
+                    kind = "accepted" if code == 0 else "other"
+                    kind = "refused" if int(code) in refusals else kind
+                    row[kind] += 1
+                    this = jax.tree.map(lambda x, k=k: x[k], tried)
+                    if kind == "accepted":
+                        count = int(this.num_iterations)
+                        row["most iterations"] = max(row["most iterations"], count)
+                    if kind in kept:
+                        arguments = eqx.combine(this.arguments, static)
+                        kept[kind].append((arguments, this.stages))
+            row |= _judged(method, kept, most)
+            yield row
+
+
+def _is_no_array(x: Any) -> bool:
+    return not eqx.is_array(x)
+
+
+def _arguments(system, method, y, h) -> StepArguments:
+    """Make arguments of a step, of which only what is static is used."""
+    zero = jnp.zeros_like(h)
+    first = first_step_state(system, method, zero, y, None)
+    given = zero, y.q, system.fibre_coordinate(y), y.multiplier, None
+    noise = function_noise(system, *given)
+    round_off = round_off_of_steps(method, first.lin, noise)
+    return StepArguments(system, zero, h, first, None, round_off=round_off)
+
+
+def _judged(method, kept: dict[str, list], most: int) -> dict[str, Any]:
+    """Judge a sample of the steps: all of few, else some that are spread evenly."""
+    found: dict[str, Any] = {}
+    for kind, them in kept.items():
+        places = np.unique(np.linspace(0, len(them) - 1, most).round().astype(int))
+        sample = [them[k] for k in places] if them else []
+        ratios = []
+        for arguments, x in sample:
+            d = distance(method, arguments, x)
+            ratios.append(d.distance / d.noise if d.noise > 0 else np.inf)
+        found[f"{kind} judged"] = len(ratios)
+        if kind == "accepted":
+            found["largest distance accepted"] = max(ratios, default=0.0)
+            found["wrongly accepted"] = sum(r > WRONG for r in ratios)
+        else:
+            found["smallest distance refused"] = min(ratios, default=np.inf)
+            found["wrongly refused"] = sum(r <= SOLVED for r in ratios)
+    return found
+
+
+COLUMNS = {
+    "s": "stages",
+    "solver": "solver",
+    "v scaled by": "scale",
+    "accepted": "accepted",
+    "judged": "accepted judged",
+    "largest distance": "largest distance accepted",
+    "wrongly accepted": "wrongly accepted",
+    "refused": "refused",
+    "judged ": "refused judged",
+    "smallest distance": "smallest distance refused",
+    "wrongly refused": "wrongly refused",
+    "other": "other",
+    "most iterations": "most iterations",
+}
+
+
+def save(rows: list[dict[str, Any]]) -> None:
+    """Print and save the table of all rows, those of one system and stages together."""
+    cells = [
+        [row["system"]]
+        + [
+            number(row[key]) if isinstance(row[key], float) else str(row[key])
+            for key in COLUMNS.values()
+        ]
+        for row in rows
+    ]
+    total = {
+        key: sum(row[key] for row in rows)
+        for key in (
+            "accepted",
+            "accepted judged",
+            "wrongly accepted",
+            "refused",
+            "refused judged",
+            "wrongly refused",
+        )
+    }
+    summary = (
+        "{accepted} steps were accepted, of which {accepted judged} were judged: "
+        "{wrongly accepted} of them wrongly. {refused} were refused, of which "
+        "{refused judged} were judged: {wrongly refused} of them wrongly. Distances "
+        "are in units of the noise."
+    ).format(**total)
+    text = "\n\n".join([(__doc__ or "").strip(), summary])
+    text += "\n\n" + markdown_table(["system", *COLUMNS], cells)
+    title = "Are steps near rest judged rightly?"
+    write("acceptance_near_rest", title, text, {"rows": rows})
