@@ -138,16 +138,6 @@ class AbstractMethod(eqx.Module):
         return difference
 
     @property
-    def error_exponent(self) -> int | float:
-        """Return the power of `embedded_difference` that is as small as the error.
-
-        For smooth functions the difference is O(h^{s-1}) with s different nodes, and
-        the error of a step, relative to its change, O(h^p) with p = `order`.
-        """
-        exponent = self.order / (len(np.unique(self.c)) - 1)
-        return int(exponent) if exponent.is_integer() else exponent
-
-    @property
     def closure_weights(self) -> ClosureWeights:
         """Return the weights that give a step's multipliers, as in `ClosureWeights`.
 

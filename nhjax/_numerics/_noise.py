@@ -11,10 +11,12 @@ from jaxtyping import Array, Float, PyTree
 
 # The points of one difference lie on a ray that starts at the point of interest.
 _NUM_POINTS = 6
-# Two distances of neighbouring points, as powers of the unit round-off.
-_DISTANCES = 0.7, 0.85
+# Distances of neighbouring points, as powers of the unit round-off, smallest first.
+_DISTANCES = 0.85, 0.68, 0.5
 # Two rays for each distance, since one difference may be small by chance.
 _NUM_RAYS = 2
+# Of a smooth function the fifth difference is a smaller part than this of the fourth.
+_SMOOTH = 1 / 30
 
 
 def measured_noise(
@@ -30,9 +32,11 @@ def measured_noise(
     2011). Such a measurement includes constants inside the function, cancellation, the
     rounding of arguments and its magnification by steep functions.
 
-    Round-off does not depend on the distance of the points, and a smooth change does:
-    the smaller of the results for two distances, 1e-11 and 5e-14 in double precision,
-    is returned. The points lie on rays from the point of interest, so that a kink or a
+    Points that are very close may not differ at all beside a constant inside the
+    function, and those farther away may differ by more than round-off. Of three
+    distances (5e-14, 2e-11 and 1e-8 in double precision) the largest result is
+    returned, up to the first at which the differences fall with their order as those of
+    a smooth function do. The points lie on rays from the point of interest, so that a kink or a
     jump at this point, as that of friction at rest, is not taken for round-off.
 
     **Arguments:**
@@ -52,34 +56,41 @@ def measured_noise(
     shape = len(_DISTANCES), _NUM_RAYS, size
     rays = rng.uniform(0.5, 1.5, shape) * rng.choice([-1.0, 1.0], shape)
     rays *= np.reshape([eps**power for power in _DISTANCES], (-1, 1, 1))
-    order = _NUM_POINTS - 1
-    weights = np.array([(-1.0) ** k * math.comb(order, k) for k in range(order + 1)])
-    weights /= np.linalg.norm(weights)
-    # One row for each point: its distance along its ray, its weight, and for each ray
-    # whether it is that one.
-    columns = np.arange(1.0, _NUM_POINTS + 1), weights
-    points = np.tile(np.stack(columns, axis=1), (shape[0] * shape[1], 1))
-    is_on = np.repeat(np.eye(shape[0] * shape[1]), _NUM_POINTS, axis=0)
-    rows = jnp.asarray(np.concatenate([points, is_on], axis=1), dtype)
+    # One row for each point: its distance along its ray and its weights in a fourth and
+    # a fifth difference. Another array tells for each ray whether the point is on it.
+    numbers = np.arange(1.0, _NUM_POINTS + 1)
+    columns = numbers, np.append(_weights(4), 0.0), _weights(5)
+    num_rays = len(_DISTANCES) * _NUM_RAYS
+    points = jnp.asarray(np.tile(np.stack(columns, axis=1), (num_rays, 1)), dtype)
+    is_on = jnp.asarray(np.repeat(np.eye(num_rays), _NUM_POINTS, axis=0), dtype)
     rays = jnp.asarray(rays.reshape(-1, size), dtype)
     # The function is traced once, in the loop, which takes longer than all of the rest.
     lengths = [math.prod(x.shape) for x in jax.tree.leaves(like)]
 
-    def add(total, row):
-        step, weight, on = row[0], row[1], row[2:]
+    def add(totals, row):
+        (step, *weights), on = row
         found = function(step * jnp.sum(on[:, None] * rays, axis=0))
         values = jnp.concatenate([x.reshape(-1) for x in jax.tree.leaves(found)])
         # Values that are not finite must not reach other rays.
-        change = jnp.where(on[:, None] > 0, weight * values, 0)
-        return total + change, None
+        changes = (jnp.where(on[:, None] > 0, w * values, 0) for w in weights)
+        return tuple(x + dx for x, dx in zip(totals, changes, strict=True)), None
 
     # A loop, so that the program contains the function once.
-    total = jnp.zeros((rays.shape[0], sum(lengths)), dtype)
-    total = jnp.abs(jax.lax.scan(add, total, rows)[0])
-    total = jnp.where(jnp.isfinite(total), total, 0)
-    total = total.reshape(*shape[:2], -1)
-    noise = jnp.min(jnp.max(total, axis=1), axis=0)
+    zero = jnp.zeros((num_rays, sum(lengths)), dtype)
+    totals = jax.lax.scan(add, (zero, zero), (points, is_on))[0]
+    totals = (jnp.where(jnp.isfinite(x), jnp.abs(x), 0) for x in totals)
+    fourth, fifth = (jnp.max(x.reshape(*shape[:2], -1), axis=1) for x in totals)
+    noise, smooth = fifth[0], fifth[0] < _SMOOTH * fourth[0]
+    for k in range(1, len(_DISTANCES)):
+        smooth = smooth | (fifth[k] < _SMOOTH * fourth[k])
+        noise = jnp.where(smooth, noise, jnp.maximum(noise, fifth[k]))
     parts = jnp.split(noise, np.cumsum(lengths)[:-1])
     leaves, structure = jax.tree.flatten(like)
     shaped = [x.reshape(y.shape) for x, y in zip(parts, leaves, strict=True)]
     return jax.tree.unflatten(structure, shaped)
+
+
+def _weights(order: int) -> np.ndarray:
+    """Return the weights of a difference, under which noise keeps its deviation."""
+    weights = np.array([(-1.0) ** k * math.comb(order, k) for k in range(order + 1)])
+    return weights / np.linalg.norm(weights)

@@ -1,6 +1,7 @@
 """An estimate of the error of a step, from the values at its stages."""
 
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from .._custom_types import FloatScalar
@@ -19,12 +20,14 @@ def error_estimate(
 ) -> FloatScalar | None:
     """Estimate the error of a step, relative to the change of the state in it.
 
-    The change of the state is h Σ b_j (H^j, N⁻¹ n^j), with the velocities H^j and the
-    forces n^j of the stages. A second quadrature, which leaves out the last node,
-    differs from it by the same sum with the weights `method.embedded_difference`. The
-    ratio r of the two is O(h^{s-1}), while the relative error is O(h^p) with the order
-    p of the method: the estimate is r^{p/(s-1)}, with the number of different nodes for
-    s. Positions, divided by h, and fibre coordinates count alike.
+    The state changes by h Σ b_j (H^j, N⁻¹ n^j), with the velocities H^j and the forces
+    n^j of the stages. A second quadrature, which leaves out the last node, differs from
+    it by the same sum with the weights `method.embedded_difference`. With s different
+    nodes this difference, relative to the change of the state, is O(h^{s-1}) in
+    positions, divided by h, and O(h^s) in fibre coordinates. The relative error of the
+    step is O(h^p), with the order p of the method. The estimate is the larger of the
+    two ratios, each raised to the power that makes it O(h^p). It tends to one for steps
+    in which nothing is resolved.
 
     **Arguments:**
 
@@ -40,18 +43,28 @@ def error_estimate(
     if difference is None:
         return None
 
-    def change(weights: Float[Array, " s"]) -> FloatScalar:
-        gained = h * small_einsum("s,sn->n", weights, force)
+    def change(weights: Float[Array, " s"]) -> tuple[FloatScalar, FloatScalar]:
         moved = small_einsum("s,sn->n", weights, x.velocity)
+        gained = h * small_einsum("s,sn->n", weights, force)
         if stages.hamiltonian:
             moved = matvec(lin.metric_inverse, moved)
-        return max_norm(matvec(lin.momentum_inverse, gained), moved)
+        return max_norm(moved), max_norm(matvec(lin.momentum_inverse, gained))
 
     # A change that is round-off tells nothing of the error.
     size = max_norm(u)
     if stages.round_off is not None:
         size = jnp.maximum(size, stages.round_off.size(jnp.abs(h)))
     floor = NOISE_UNITS * float(jnp.finfo(u.dtype).eps) * size
-    difference = jnp.asarray(difference, u.dtype)
-    ratio = relative(change(difference), change(stages.coefficients("b")) + floor)
-    return ratio**method.error_exponent
+    whole = jnp.maximum(*change(stages.coefficients("b"))) + floor
+    in_position, in_fibre = change(jnp.asarray(difference, u.dtype))
+    nodes = len(np.unique(method.c))
+    return jnp.maximum(
+        _power(relative(in_position, whole), method.order, nodes - 1),
+        _power(relative(in_fibre, whole), method.order, nodes),
+    )
+
+
+def _power(x: FloatScalar, numerator: int, denominator: int) -> FloatScalar:
+    """Raise x to a rational power, by multiplications if it is a whole number."""
+    whole, rest = divmod(numerator, denominator)
+    return x**whole if rest == 0 else x ** (numerator / denominator)

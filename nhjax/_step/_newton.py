@@ -20,10 +20,12 @@ from .._numerics import (
     NOISE_UNITS,
     Sizes,
     Solved,
+    uneven_perturbations,
 )
 from .._system import all_finite, check_flag, Linearisation
 from ._factorisation import leading_structure
 from ._jacobian_choice import JacobianName
+from ._round_off import PART
 from ._scale import fibre_coordinate_scale, Scale
 from ._stage_iteration import (
     corrected,
@@ -242,7 +244,8 @@ class Newton(AbstractStageSolver):
         _, unravel = ravel_pytree(x0)
         scale = fibre_coordinate_scale(stages, x0, lin)
 
-        nudge = float(jnp.finfo(stages.p.dtype).eps) ** 0.5
+        eps = float(jnp.finfo(stages.p.dtype).eps)
+        nudge = eps**0.5
         moved = nudged(stages, jnp.asarray(nudge, stages.p.dtype))
 
         def residual(z):
@@ -252,11 +255,20 @@ class Newton(AbstractStageSolver):
             z, _ = ravel_pytree(x)
             jacobian, r, evaluation = jacobian_and_value(residual, z)
             change = stage_residual(moved, x)[0] - r
-            dz, noise = jnp.linalg.solve(jacobian, -jnp.stack([r, change], axis=1)).T
+            # What the Jacobian misses of a change by a few units of the last digits is
+            # the round-off of the equations.
+            near = z + 8 * eps * uneven_perturbations(z)
+            missed = residual(near)[0] - r - jacobian @ (near - z)
+            rights = jnp.stack([r, change, missed], axis=1)
+            dz, *noises = jnp.linalg.solve(jacobian, -rights).T
             x_next = unravel(z + dz)
-            # This is how far the round-off of the positions moves the stages: stiff
-            # forces magnify it.
-            noise = increment_size(stages, x, unravel(z + noise), lin) / nudge
+            # The first is how far round-off of the positions moves the stages, which
+            # stiff forces magnify; the second how far that of the equations does, where
+            # they are nearly dependent.
+            by_positions, by_equations = (
+                increment_size(stages, x, unravel(z + noise), lin) for noise in noises
+            )
+            noise = jnp.maximum(by_positions / nudge, PART * by_equations / eps)
             found = Sizes(
                 increment_size(stages, x, x_next, lin),
                 fibre_coordinate_size(stages, x_next),

@@ -46,7 +46,7 @@ class RoundOff(eqx.Module):
 # An increment of stages that has stopped falling can be six times as large as the
 # round-off that the functions of a system leave in it. It counts as noise up to 400
 # units of a size, so that a size is this part of the measured round-off.
-_PART = 1 / 8
+PART = 1 / 8
 
 
 def round_off_of_steps(
@@ -75,7 +75,7 @@ def round_off_of_steps(
         if k:
             m = lin.violation.shape[0] - k
             by_position = holonomic * response(jnp.pad(noise.on_positions, (m, 0)))
-    units = _PART / float(jnp.finfo(by_velocity.dtype).eps)
+    units = PART / float(jnp.finfo(by_velocity.dtype).eps)
     sizes = units * by_velocity, units * by_force, units * by_position
     return RoundOff(*sizes, noise.violations)
 

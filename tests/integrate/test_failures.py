@@ -140,7 +140,7 @@ def test_a_failure_names_the_coordinate_and_a_step_to_try():
     stats = run_with(0.25, throw=False).stats
     assert (stats["failed_step"], stats["worst_coordinate"]) == (0, 1)
     assert run_with(1e-6).stats["worst_coordinate"] == -1
-    message = r"of coordinate 1\. `dt` is 0\.25: try 0\.125\."
+    message = r"of coordinate 1\. `dt` is 0\.25: if all forces are smooth, try 0\.125\."
     with pytest.raises(nhjax.IntegrationError, match=message):
         run_with(0.25)
     # Each lane has a step of its own.

@@ -76,6 +76,7 @@ def test_stats():
         "max_residual",
         "max_constraint_violation",
         "max_multiplier_defect",
+        "max_error_estimate",
         "failed_step",
         "worst_coordinate",
     }

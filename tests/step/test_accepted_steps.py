@@ -1,5 +1,6 @@
 """A step is accepted if its equations are solved, and not because it took long."""
 
+import warnings
 from functools import cache
 
 import jax
@@ -60,8 +61,16 @@ def test_a_diverging_iteration_is_told_from_a_slow_one():
 
 @pytest.mark.parametrize("compiled", [False, True], ids=["plain", "jit"])
 def test_newtons_method_takes_over_steps_that_need_it(compiled):
-    run = jax.jit(lambda: swing(stage_solver=WITH_NEWTON)) if compiled else swing
-    sol, expected = run(), swing(stage_solver=nhjax.Newton())
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        if compiled:
+            sol = jax.jit(lambda: swing(stage_solver=WITH_NEWTON))()
+        else:
+            sol = swing()
+        expected = swing(stage_solver=nhjax.Newton())
+    told = [str(warning.message) for warning in caught]
+    taken_over = any("did not solve step 1 of this run" in text for text in told)
+    assert taken_over is not compiled
     assert sol.result == expected.result == RESULTS.successful
     assert 0 < int(sol.stats["num_newton_steps"]) < 9
     assert int(expected.stats["num_newton_steps"]) == 0
@@ -70,6 +79,58 @@ def test_newtons_method_takes_over_steps_that_need_it(compiled):
         np.testing.assert_allclose(
             getattr(sol.ys, name), getattr(expected.ys, name), rtol=1e-9
         )
+
+
+def test_message_under_jit_names_the_fallback_that_solves_the_step():
+    with pytest.raises((RuntimeError, ValueError)) as failure:
+        jax.block_until_ready(jax.jit(lambda: swing(throw=True))())
+    assert "`stage_solver=nhjax.SimplifiedNewton(fallback=True)`" in str(failure.value)
+    sol = jax.jit(lambda: swing(throw=True, stage_solver=WITH_NEWTON))()
+    assert sol.result == RESULTS.successful
+
+
+@pytest.mark.parametrize("solver", [nhjax.SimplifiedNewton(), nhjax.Newton()])
+def test_message_after_newtons_method_has_failed_does_not_recommend_it(solver):
+    # Friction that jumps: there is no solution in the step in which the body stops.
+    system = nhjax.LagrangianSystem(
+        lambda t, q, v, args: 0.5 * v @ v, force=lambda t, q, v, args: -jnp.sign(v)
+    )
+    y0 = nhjax.initial_state(system, jnp.zeros(1), jnp.ones(1))
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        with pytest.raises(nhjax.IntegrationError) as failure:
+            nhjax.integrate(
+                system,
+                nhjax.LobattoIIIAB(3),
+                y0,
+                dt=0.03,
+                num_steps=100,
+                stage_solver=solver,
+            )
+    message = str(failure.value)
+    assert "Newton" not in message
+    assert "Forces that jump" in message
+    assert "`jnp.tanh(v / 0.01)`" in message
+    assert "if all forces are smooth, try 0.015" in message
+
+
+def test_friction_smoothed_as_the_message_says_brings_a_body_to_rest():
+    system = nhjax.LagrangianSystem(
+        lambda t, q, v, args: 0.5 * v @ v,
+        force=lambda t, q, v, args: -jnp.tanh(v / 0.01),
+    )
+    y0 = nhjax.initial_state(system, jnp.zeros(1), jnp.ones(1))
+    sol = nhjax.integrate(
+        system,
+        nhjax.LobattoIIIAB(3),
+        y0,
+        dt=0.03,
+        num_steps=100,
+        stage_solver=WITH_NEWTON,
+    )
+    # It stops after one second, half a unit away.
+    np.testing.assert_allclose(sol.ys.q[0], 0.5, atol=1e-2)
+    assert abs(float(sol.ys.v[0, 0])) < 1e-10
 
 
 def test_a_plain_call_that_needs_no_newton_step_counts_none():

@@ -1,5 +1,6 @@
 """Solved steps near rest are not refused, and starts with round-off alone are taken."""
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -7,11 +8,16 @@ import pytest
 
 import nhjax
 from nhjax._numerics import measured_noise
+from oracles import hub_bicycle
+from oracles.long import long
 
 
-@pytest.mark.parametrize("dt", [1e-3, 5e-2])
+NEWTON = nhjax.Newton()
+
+
+@pytest.mark.parametrize("dt", [long(1e-3), 5e-2])
 @pytest.mark.parametrize(
-    "solver", [nhjax.SimplifiedNewton(fallback=False), nhjax.Newton()]
+    "solver", [nhjax.SimplifiedNewton(fallback=False), long(NEWTON)]
 )
 def test_steps_of_slow_bicycle_are_accepted_by_both_solvers(dt, solver):
     bicycle = nhjax.systems.WhippleBicycle()
@@ -49,6 +55,16 @@ def test_noise_at_jump_or_kink_of_friction_at_rest_is_round_off(jump):
     assert noise < 1e-15
 
 
+@pytest.mark.parametrize("constant", [1.0, 1e2, 1e4])
+def test_noise_of_function_that_hides_small_changes_beside_a_constant(constant):
+    def hides(dx):
+        return (constant + dx / constant) ** 2 - constant**2 + dx**2
+
+    (noise,) = measured_noise(hides, 1, jnp.zeros(1))
+    # The round-off of numbers of the size of the square of the constant.
+    assert 1e-17 * constant**2 < noise < 1e-15 * constant**2
+
+
 def test_noise_of_smooth_function_in_small_units_is_round_off():
     # A length of 1e-8 units in which the function turns.
     (noise,) = measured_noise(lambda dx: jnp.sin(0.4 + dx / 1e-8), 1, jnp.zeros(1))
@@ -79,3 +95,132 @@ def test_start_that_violates_height_by_more_than_round_off_is_refused(error):
     q = jnp.array([1e-5, 1e-5 + error, 0.0])
     with pytest.raises(nhjax.ConstraintViolationError, match="Γ"):
         nhjax.initial_state(system, q, jnp.zeros(3))
+
+
+# A height above which a weight balances, with a constant that cancels where q is small.
+def height(t, q, args):
+    return ((1.02 + q[1]) * jnp.cos(q[2]) - 1.02 - q[0])[None]
+
+
+def weight(t, q, v, args):
+    return 0.5 * v @ v - 9.81 * q[0]
+
+
+@pytest.mark.parametrize("size", [0.0, 1e-15, 1e-12, 1e-9])
+@pytest.mark.parametrize("constraints", ["independent", "redundant"])
+def test_runs_from_states_near_zero_are_not_refused(size, constraints):
+    given = 1 if constraints == "independent" else 2
+    system = nhjax.LagrangianSystem(
+        weight,
+        holonomic=lambda t, q, args: jnp.tile(height(t, q, args), given),
+        constraints=constraints,
+    )
+    y0 = nhjax.initial_state(system, jnp.array([size, size, 0.0]), jnp.zeros(3))
+    # Steps so short that velocities stay small.
+    sol = nhjax.integrate(
+        system, nhjax.LobattoIIIAB(3), y0, dt=1e-8, num_steps=5, throw=False
+    )
+    assert bool(sol.result == nhjax.RESULTS.successful)
+
+
+def test_start_off_by_more_than_round_off_near_zero_is_refused_by_a_run():
+    system = nhjax.LagrangianSystem(weight, holonomic=height)
+    y0 = nhjax.initial_state(system, jnp.array([1e-9, 1e-9, 0.0]), jnp.zeros(3))
+    moved = eqx.tree_at(lambda y: y.q, y0, y0.q.at[0].add(1e-9))
+    sol = nhjax.integrate(
+        system, nhjax.LobattoIIIAB(3), moved, dt=1e-3, num_steps=5, throw=False
+    )
+    assert bool(sol.result == nhjax.RESULTS.inconsistent_start)
+
+
+@pytest.mark.parametrize(("speed", "dt"), [(1e-6, 1e-3), (1e-4, 1e-1)])
+@pytest.mark.parametrize("solver", [nhjax.SimplifiedNewton(fallback=False), NEWTON])
+def test_energy_with_constants_that_cancel_is_kept_near_rest(speed, dt, solver):
+    # The potential is the difference of two numbers near 10.
+    system = nhjax.LagrangianSystem(
+        lambda t, q, v, args: (
+            0.5 * (1 + jnp.sin(q[0]) ** 2) * v @ v
+            - 1e-3 * ((100 + q[0] / 100) ** 2 - 100**2)
+            - 0.5 * q[1] ** 2
+            - q[0] * q[1]
+        )
+    )
+    given = speed * jnp.array([1.0, -1.0]), speed * jnp.ones(2)
+    sol = nhjax.integrate(
+        system,
+        nhjax.LobattoIIIAB(3),
+        nhjax.initial_state(system, *given),
+        dt=dt,
+        num_steps=50,
+        throw=False,
+        invariants="energy",
+        stage_solver=solver,
+    )
+    assert bool(sol.result == nhjax.RESULTS.successful)
+    assert float(sol.stats["max_invariant_error"]) < 1e-14
+
+
+def test_condition_that_starts_within_its_round_off_of_zero_starts_at_zero():
+    # The condition is -2e-16 at the start, at rest, from where it rises.
+    system = nhjax.LagrangianSystem(lambda t, q, v, args: 0.5 * v @ v + q[0])
+    y0 = nhjax.initial_state(system, jnp.array([0.0, 1.5e-8]), jnp.zeros(2))
+    event = nhjax.Event(lambda t, y, args: (1.02 + y.q[0]) * jnp.cos(y.q[1]) - 1.02)
+    assert float(event.cond_fn(0.0, y0, None)) < 0
+    sol = nhjax.integrate(
+        system, nhjax.LobattoIIIAB(3), y0, dt=1e-2, num_steps=9, event=event
+    )
+    assert int(sol.stats["num_events"]) == 0
+    assert bool(sol.result == nhjax.RESULTS.successful)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("lean", [1e-6, 1e-3, 1e-1])
+def test_slow_bicycle_in_other_coordinates_is_not_refused(lean):
+    system = hub_bicycle.make_system()
+    for speed in (0.0, 1e-6, 1e-2, 1.0):
+        y0 = nhjax.initial_state(
+            system, *hub_bicycle.upright(lean, speed), project=True
+        )
+        for dt in (1e-3, 1e-2):
+            sol = nhjax.integrate(
+                system,
+                nhjax.LobattoIIIAB(3),
+                y0,
+                dt=dt,
+                num_steps=5,
+                throw=False,
+                stage_solver=nhjax.SimplifiedNewton(fallback=False),
+            )
+            assert bool(sol.result == nhjax.RESULTS.successful), (speed, dt)
+            assert float(sol.stats["max_constraint_violation"]) < 1e-13
+
+
+@pytest.mark.parametrize("stages", [2, long(3), long(4), long(5), long(6)])
+def test_upright_bicycle_falls_from_rest_until_it_lies_at_45_degrees(stages):
+    bicycle = nhjax.systems.WhippleBicycle()
+    system, y0 = bicycle.system, bicycle.initial_state()
+    lean = 3
+    q = jnp.zeros_like(y0.q).at[lean].set(1e-6)
+    y0 = nhjax.initial_state(system, q, jnp.zeros_like(y0.v), project=True)
+
+    @jax.jit
+    def fall(y0):
+        return nhjax.integrate(
+            system,
+            nhjax.LobattoIIIAB(stages),
+            y0,
+            dt=1e-2,
+            num_steps=700,
+            throw=False,
+            event=nhjax.Event(lambda t, y, args: jnp.abs(y.q[lean]) - jnp.pi / 4),
+        )
+
+    sol = fall(y0)
+    assert bool(sol.result == nhjax.RESULTS.event_occurred)
+    np.testing.assert_allclose(jnp.abs(sol.ys.q[0, lean]), np.pi / 4, rtol=1e-12)
+    assert float(sol.stats["max_constraint_violation"]) < 1e-13
+    end = jax.tree.map(lambda x: x[0], sol.ys)
+    gained = system.energy(sol.t1, end, None) - system.energy(0.0, y0, None)
+    # Of a kinetic energy of some 250 J.
+    allowed = {2: 1.0, 3: 1e-3, 4: 1e-6, 5: 1e-8, 6: 1e-9}[stages]
+    assert abs(float(gained)) < allowed
