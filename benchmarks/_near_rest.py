@@ -18,6 +18,7 @@ that ran away, a refusal is never wrong.
 """
 
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -74,20 +75,24 @@ class Distance(NamedTuple):
     is_determined: bool
 
 
-@eqx.filter_jit
-def steps(system, method, solver, y0, h) -> Tried:
-    """Take `NUM_STEPS` steps as `integrate` does; after one that fails, none."""
+def first_arguments(system, method, y0, h) -> StepArguments:
+    """Make the arguments of the first step of a run, as `integrate` does."""
     zero = jnp.zeros_like(h)
     first = first_step_state(system, method, zero, y0, None)
     given = zero, y0.q, system.fibre_coordinate(y0), y0.multiplier, None
     noise = function_noise(system, *given)
     round_off = round_off_of_steps(method, first.lin, noise)
+    return StepArguments(system, zero, h, first, None, round_off=round_off)
+
+
+@eqx.filter_jit
+def steps(system, method, solver, y0, h) -> Tried:
+    """Take `NUM_STEPS` steps as `integrate` does; after one that fails, none."""
+    first = first_arguments(system, method, y0, h)
 
     def advance(carry, k):
         step_state, alive = carry
-        arguments = StepArguments(
-            system, k * h, h, step_state, None, round_off=round_off
-        )
+        arguments = replace(first, t=k * h, step_state=step_state)
         outcome = step(arguments, method, solver, ~alive)
         good = alive & (outcome.result == nhjax.RESULTS.successful)
         after = jax.tree.map(
@@ -99,7 +104,8 @@ def steps(system, method, solver, y0, h) -> Tried:
         return (after, good), tried
 
     numbers = jnp.arange(NUM_STEPS, dtype=h.dtype)
-    _, tried = jax.lax.scan(advance, (first, jnp.asarray(True)), numbers)
+    start = first.step_state, jnp.asarray(True)
+    _, tried = jax.lax.scan(advance, start, numbers)
     return tried
 
 
@@ -197,7 +203,7 @@ def near_rest(
             for size in SIZES:
                 h = jnp.asarray(size)
                 tried = steps(system, method, solver, y, h)
-                static = eqx.filter(_arguments(system, method, y, h), _is_no_array)
+                static = eqx.filter(first_arguments(system, method, y, h), _is_no_array)
                 for k, code in enumerate(np.asarray(tried.code)):
                     if code < 0:
                         continue
@@ -217,16 +223,6 @@ def near_rest(
 
 def _is_no_array(x: Any) -> bool:
     return not eqx.is_array(x)
-
-
-def _arguments(system, method, y, h) -> StepArguments:
-    """Make arguments of a step, of which only what is static is used."""
-    zero = jnp.zeros_like(h)
-    first = first_step_state(system, method, zero, y, None)
-    given = zero, y.q, system.fibre_coordinate(y), y.multiplier, None
-    noise = function_noise(system, *given)
-    round_off = round_off_of_steps(method, first.lin, noise)
-    return StepArguments(system, zero, h, first, None, round_off=round_off)
 
 
 def _judged(method, kept: dict[str, list], most: int) -> dict[str, Any]:

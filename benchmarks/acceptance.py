@@ -19,6 +19,7 @@ count by what they do in a step: |u̇| is at least |u| / h.
 import argparse
 import json
 from collections.abc import Callable
+from dataclasses import replace
 from typing import NamedTuple
 
 import equinox as eqx
@@ -32,15 +33,10 @@ import nhjax
 from nhjax import systems
 from nhjax._method import AbstractMethod
 from nhjax._numerics import max_norm
-from nhjax._step import (
-    first_step_state,
-    step,
-    StepArguments,
-    StepOutcome,
-    StepState,
-)
+from nhjax._step import step, StepOutcome, StepState
 from nhjax._step._stage_iteration import stage_residual
 from nhjax._step._stage_system import nudged, StageSystem
+from nhjax._step._step import equations_of_step
 from nhjax._step._unknowns import Stages
 from nhjax._system import position_scale, violation_scale
 
@@ -194,10 +190,8 @@ def run(
     def of_size(h):
         def advance(carry, k):
             step_state, alive = carry
-            t = k * h
-            given = step_state.state, None, step_state.lin
-            stages = StageSystem.at(system, method, t, h, *given)
-            arguments = StepArguments(system, t, h, step_state, None)
+            arguments = replace(start, t=k * h, step_state=step_state)
+            stages = equations_of_step(arguments, method)
             first, second = (
                 step(arguments, method, solver, go_on) for solver in solvers
             )
@@ -213,9 +207,10 @@ def run(
             )
             return (step_state, alive & (good | other)), (row, alive)
 
-        start = first_step_state(system, method, jnp.zeros_like(h), y0, None)
+        start = _near_rest.first_arguments(system, method, y0, h)
         steps = jnp.arange(num_steps, dtype=h.dtype)
-        _, rows = jax.lax.scan(advance, (start, jnp.asarray(True)), steps)
+        carry = start.step_state, jnp.asarray(True)
+        _, rows = jax.lax.scan(advance, carry, steps)
         return rows
 
     return jax.lax.map(of_size, sizes)
@@ -233,12 +228,8 @@ def single_steps(
     solvers = nhjax.SimplifiedNewton(), nhjax.Newton()
 
     def one(start):
-        y0, h = start
-        t = jnp.zeros_like(h)
-        step_state = first_step_state(system, method, t, y0, None)
-        given = step_state.state, None, step_state.lin
-        stages = StageSystem.at(system, method, t, h, *given)
-        arguments = StepArguments(system, t, h, step_state, None)
+        arguments = _near_rest.first_arguments(system, method, *start)
+        stages = equations_of_step(arguments, method)
         first, second = (step(arguments, method, solver, go_on) for solver in solvers)
         return Row(judge(stages, first), judge(stages, second), apart(first, second))
 

@@ -19,6 +19,7 @@ import nhjax
 from nhjax import systems
 from nhjax.systems._base import AbstractExample
 
+from . import _refusals_near_zero
 from ._report import markdown_table, write
 
 
@@ -153,12 +154,30 @@ def main() -> None:
                 )
                 print(*rows[-1], sep="\t", flush=True)
         jax.clear_caches()
+    near_zero, near_rows = [], []
+    for name, case in _refusals_near_zero.CASES.items():
+        for row in _refusals_near_zero.count(case, options.directions):
+            near_zero.append({"constraint": name} | row)
+            counts = map(str, row["refused"].values())
+            near_rows.append([name, f"{row['size']:.0e}", *counts])
+            print(*near_rows[-1], sep="\t", flush=True)
     rounded = rounded_unit_vectors(1000)
     header = ["system", "dtype", "disturbed", *(f"{x:.0e}" for x in OFFSETS)]
     text = (
         f"Refused of {options.directions}, by offset. At most {worst} below 1e-3. Of "
         f"1000 unit vectors rounded to ten digits {rounded} are refused.\n\n"
         + markdown_table(header, rows)
+        + "\n\n"
+        + (_refusals_near_zero.__doc__ or "").strip()
+        + f" Refused of {options.directions}:\n\n"
+        + markdown_table(
+            [
+                "constraint",
+                "size of q",
+                *(f"{k} units" for k in _refusals_near_zero.UNITS),
+            ],
+            near_rows,
+        )
     )
     write(
         "refusals",
@@ -169,6 +188,7 @@ def main() -> None:
             "offsets": OFFSETS,
             "rounded_unit_vectors_refused": rounded,
             "rows": data,
+            "near_zero": near_zero,
         },
     )
 

@@ -36,8 +36,9 @@ def measured_noise(
     function, and those farther away may differ by more than round-off. Of three
     distances (5e-14, 2e-11 and 1e-8 in double precision) the largest result is
     returned, up to the first at which the differences fall with their order as those of
-    a smooth function do. The points lie on rays from the point of interest, so that a kink or a
-    jump at this point, as that of friction at rest, is not taken for round-off.
+    a smooth function do. The points lie on rays from the point of interest, so that a
+    kink or a jump at this point, as that of friction at rest, is not taken for
+    round-off.
 
     **Arguments:**
 
