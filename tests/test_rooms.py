@@ -1,4 +1,4 @@
-"""The rooms of nhjax: no import points up, and no part is too long to be read."""
+"""The rooms of nhjax: no import points up, and each room has one door."""
 
 import ast
 import re
@@ -11,13 +11,6 @@ from docs import rooms
 
 SOURCES = rooms.read_sources()
 IMPORTS = rooms.read_imports(SOURCES)
-
-# In lines. A function counts without its docstring, since the public ones say in it all
-# that the reader of the API needs; their code is what must be read at once.
-LONGEST_FILE, LONGEST_CLASS, LONGEST_FUNCTION = 300, 200, 60
-
-# What may be longer, and why. An entry that is not needed fails.
-LONGER: dict[str, str] = {}
 
 
 def test_every_module_is_in_a_room():
@@ -129,35 +122,6 @@ def test_a_circle_is_found():
     chain = [("a", "b"), ("b", "c"), ("a", "c")]
     assert rooms.circle(chain) is None
     assert rooms.circle([*chain, ("c", "a")]) == ["a", "b", "c", "a"]
-
-
-def _length_of_code(node: ast.FunctionDef | ast.AsyncFunctionDef) -> int:
-    """The lines of a function without its docstring."""
-    length = (node.end_lineno or node.lineno) - node.lineno + 1
-    if ast.get_docstring(node) is None:
-        return length
-    text = node.body[0]
-    return length - ((text.end_lineno or text.lineno) - text.lineno + 1)
-
-
-def _too_long():
-    for module, text in SOURCES.items():
-        if len(text.splitlines()) > LONGEST_FILE:
-            yield module
-        for node in ast.walk(ast.parse(text)):
-            if isinstance(node, ast.ClassDef):
-                length = (node.end_lineno or node.lineno) - node.lineno + 1
-                if length > LONGEST_CLASS:
-                    yield f"{module}.{node.name}"
-            elif (
-                isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef)
-                and _length_of_code(node) > LONGEST_FUNCTION
-            ):
-                yield f"{module}.{node.name}"
-
-
-def test_nothing_is_longer_than_can_be_read():
-    assert sorted(_too_long()) == sorted(LONGER)
 
 
 # Parts of JAX and equinox that may go without notice.

@@ -43,24 +43,29 @@ def error_estimate(
     if difference is None:
         return None
 
-    def change(weights: Float[Array, " s"]) -> tuple[FloatScalar, FloatScalar]:
+    def change(weights: Float[Array, " s"]) -> tuple[Array, Array]:
         moved = small_einsum("s,sn->n", weights, x.velocity)
-        gained = h * small_einsum("s,sn->n", weights, force)
         if stages.hamiltonian:
             moved = matvec(lin.metric_inverse, moved)
-        return max_norm(moved), max_norm(matvec(lin.momentum_inverse, gained))
+        gained = h * small_einsum("s,sn->n", weights, force)
+        return moved, matvec(lin.momentum_inverse, gained)
 
     # A change that is round-off tells nothing of the error.
     size = max_norm(u)
     if stages.round_off is not None:
         size = jnp.maximum(size, stages.round_off.size(jnp.abs(h)))
     floor = NOISE_UNITS * float(jnp.finfo(u.dtype).eps) * size
-    whole = jnp.maximum(*change(stages.coefficients("b"))) + floor
-    in_position, in_fibre = change(jnp.asarray(difference, u.dtype))
+    whole = max_norm(*change(stages.coefficients("b"))) + floor
+    moved, gained = change(jnp.asarray(difference, u.dtype))
+    if stages.constrained:
+        # What violates the constraints is no error of the step, which satisfies them:
+        # multipliers of single stages may be wrong where their sum is right.
+        excess = matvec(lin.compliance_inverse, matvec(lin.jacobian, gained))
+        gained = gained - matvec(lin.reaction, excess)
     nodes = len(np.unique(method.c))
     return jnp.maximum(
-        _power(relative(in_position, whole), method.order, nodes - 1),
-        _power(relative(in_fibre, whole), method.order, nodes),
+        _power(relative(max_norm(moved), whole), method.order, nodes - 1),
+        _power(relative(max_norm(gained), whole), method.order, nodes),
     )
 
 

@@ -179,6 +179,8 @@ def noise_near(
     `like` has the shapes and the type of what it returns; see `measured_noise`.
     """
     (t, q, u), n = frozen((t, q, u)), u.shape[0]
+    # Steps are taken from angles of the first turn, which have no round-off of others.
+    q = manifold.wrapped(q, manifold.no_compensation(q))
     return measured_noise(
         lambda z: function(t + z[0], manifold.act(q, z[1 : n + 1]), u + z[n + 1 :]),
         2 * n + 1,

@@ -148,6 +148,7 @@ def test_an_integer_time(sol):
     np.testing.assert_array_equal(sol.evaluate(0).q, sol.evaluate(0.0).q)
 
 
+@pytest.mark.filterwarnings("ignore:.SimplifiedNewton. did not solve")
 @pytest.mark.parametrize("closure", [long("propagated"), "symmetric"])
 def test_a_failed_trajectory_stays_at_its_last_good_state(closure):
     # It rises to an apex where D2Φ vanishes.

@@ -110,6 +110,7 @@ def fall(speed, **others):
     )
 
 
+@pytest.mark.filterwarnings("ignore:.SimplifiedNewton. did not solve")
 def test_a_failure_names_step_and_reason():
     with pytest.raises(
         nhjax.IntegrationError,

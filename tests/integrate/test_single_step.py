@@ -149,6 +149,7 @@ def test_members_of_a_batch_step_on_their_own():
         np.testing.assert_allclose(batch.q[k], alone.q, rtol=1e-15)
 
 
+@pytest.mark.filterwarnings("ignore:.SimplifiedNewton. did not solve")
 def test_a_step_that_cannot_be_solved_raises_or_is_no_number():
     pendulum = SYSTEMS["holonomic"]
     system, y0 = pendulum.system, pendulum.initial_state()
