@@ -32,15 +32,19 @@ ensemble.is_high = never_high
 
 
 @ensemble.def_impl
-def _run(*operands, program, is_batched):
+def _run(*operands, program, is_batched, is_brief):
     if jax.config.jax_disable_jit:  # pyright: ignore[reportAttributeAccessIssue]
-        return _together(*operands, program=program, is_batched=is_batched)
-    run = partial(ensemble.bind, program=program, is_batched=is_batched)
+        return _together(
+            *operands, program=program, is_batched=is_batched, is_brief=is_brief
+        )
+    given = {"program": program, "is_batched": is_batched, "is_brief": is_brief}
+    run = partial(ensemble.bind, **given)
     return jax.jit(run)(*operands)
 
 
 @ensemble.def_abstract_eval
-def _shapes(*operands, program, is_batched):
+def _shapes(*operands, program, is_batched, is_brief):
+    del is_brief
     members = _members(operands, is_batched)
     return [
         jax.core.ShapedArray((members, *aval.shape), aval.dtype)
@@ -56,20 +60,21 @@ def _axes(is_batched: tuple[bool, ...]) -> list[int | None]:
     return [0 if mark else None for mark in is_batched]
 
 
-def _batched_kernel(operands, axes, *, program):
+def _batched_kernel(operands, axes, *, program, is_brief):
     is_batched = tuple(axis is not None for axis in axes)
     operands = [
         x if axis is None else jnp.moveaxis(x, axis, 0)
         for x, axis in zip(operands, axes, strict=True)
     ]
-    out = ensemble.bind(*operands, program=program, is_batched=is_batched)
+    given = {"program": program, "is_batched": is_batched, "is_brief": is_brief}
+    out = ensemble.bind(*operands, **given)
     return out, [0] * len(out)
 
 
 batching.primitive_batchers[kernel] = _batched_kernel
 
 
-def _batched_ensemble(operands, axes, *, program, is_batched):
+def _batched_ensemble(operands, axes, *, program, is_batched, is_brief):
     """Flatten an ensemble under `jax.vmap` to one ensemble with one axis of members."""
     pairs = list(zip(operands, axes, strict=True))
     size = next(x.shape[axis] for x, axis in pairs if axis is not None)
@@ -95,15 +100,17 @@ def _batched_ensemble(operands, axes, *, program, is_batched):
     marks = tuple(
         mark or axis is not None for mark, axis in zip(is_batched, axes, strict=True)
     )
-    out = ensemble.bind(*whole, program=program, is_batched=marks)
+    given = {"program": program, "is_batched": marks, "is_brief": is_brief}
+    out = ensemble.bind(*whole, **given)
     return [x.reshape(size, members, *x.shape[1:]) for x in out], [0] * len(out)
 
 
 batching.primitive_batchers[ensemble] = _batched_ensemble
 
 
-def _differentiated_ensemble(operands, tangents, *, program, is_batched):
+def _differentiated_ensemble(operands, tangents, *, program, is_batched, is_brief):
     """Compute values and tangents member by member, as for a single program."""
+    del is_brief
     is_moving = [not isinstance(tangent, ad.Zero) for tangent in tangents]
     rates, _ = split(is_moving, tangents)
     zeros = [ad.Zero(aval.to_tangent_aval()) for aval in program.in_avals]
@@ -125,8 +132,9 @@ def _differentiated_ensemble(operands, tangents, *, program, is_batched):
 ad.primitive_jvps[ensemble] = _differentiated_ensemble
 
 
-def _transposed_ensemble(cotangents, *operands, program, is_batched):
+def _transposed_ensemble(cotangents, *operands, program, is_batched, is_brief):
     """Transpose member by member, and sum where members share an operand."""
+    del is_brief
     is_linear = [ad.is_undefined_primal(x) for x in operands]
     is_asked = [not isinstance(cotangent, ad.Zero) for cotangent in cotangents]
     asked, known = split(is_asked, cotangents)[0], split(is_linear, operands)[1]
@@ -150,27 +158,29 @@ def _transposed_ensemble(cotangents, *operands, program, is_batched):
 ad.primitive_transposes[ensemble] = _transposed_ensemble
 
 
-def _together(*operands, program, is_batched):
+def _together(*operands, program, is_batched, is_brief):
+    del is_brief
     run = jax.extend.core.jaxpr_as_fun(program)
     return jax.vmap(run, in_axes=_axes(is_batched))(*operands)
 
 
-def _one_by_one(*operands, program, is_batched):
+def _one_by_one(*operands, program, is_batched, is_brief):
     batched, shared = split(is_batched, operands)
 
     def member(batched):
-        return kernel.bind(*merged(is_batched, batched, shared), program=program)
+        given = {"program": program, "is_brief": is_brief}
+        return kernel.bind(*merged(is_batched, batched, shared), **given)
 
     return jax.lax.map(member, batched)
 
 
 @rare_collections()
-def _lowered(ctx, *operands, program, is_batched):
+def _lowered(ctx, *operands, program, is_batched, is_brief):
     members = _members(ctx.avals_in, is_batched)
     reason = reason_against_lanes()
     if reason is None:
         try:
-            name = target(program, is_batched)
+            name = target(program, is_batched, is_brief)
         except Unsupported as error:
             reason = str(error)
         else:
@@ -183,7 +193,8 @@ def _lowered(ctx, *operands, program, is_batched):
     else:
         note("kernels", reason, members)
         lower = mlir.lower_fun(_one_by_one, multiple_results=True)
-    return lower(ctx, *operands, program=program, is_batched=is_batched)
+    given = {"program": program, "is_batched": is_batched, "is_brief": is_brief}
+    return lower(ctx, *operands, **given)
 
 
 _together_by_xla = mlir.lower_fun(_together, multiple_results=True)

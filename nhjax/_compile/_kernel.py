@@ -5,6 +5,7 @@ the device and on what the program holds: `_lowering` and `_ensemble` decide.
 """
 
 from collections.abc import Callable, Hashable
+from functools import partial
 from typing import Any, NamedTuple, TypeVar
 
 import equinox as eqx
@@ -47,7 +48,10 @@ class _Traced(NamedTuple):
 
 
 def as_cpu_kernel(
-    function: Callable[..., T], *args: Any, programs: Programs | None = None
+    function: Callable[..., T],
+    *args: Any,
+    programs: Programs | None = None,
+    is_brief: bool = False,
 ) -> T:
     """Compute `function(*args)`, in one kernel of the CPU if that is possible.
 
@@ -55,7 +59,8 @@ def as_cpu_kernel(
     derivatives, forward and transposed, go into kernels too. A batch of calls is an
     ensemble, whose members run in the lanes of vectors where that is possible. With
     `programs` the function is traced once for each kind of arguments, and must depend
-    on nothing but these.
+    on nothing but these. What `is_brief` runs once and shortly: it is compiled in less
+    time to slower code.
     """
     # Who asks for no compilation wants to look at one operation after the other.
     if jax.config.jax_disable_jit:  # pyright: ignore[reportAttributeAccessIssue]
@@ -71,7 +76,7 @@ def as_cpu_kernel(
         if traced is None:
             traced = _traced(function, static, treedef, leaves)
             programs.keep(key, traced)
-    out = run_program(traced.program, leaves)
+    out = run_program(traced.program, leaves, is_brief)
     return eqx.combine(jax.tree.unflatten(traced.structure, out), traced.rest)
 
 
@@ -95,13 +100,13 @@ def call(flat: Callable[..., list[Any]], leaves: list[Any]) -> list[Any]:
     return run_program(jax.make_jaxpr(flat)(*leaves), leaves)
 
 
-def run_program(program: Any, leaves: list[Any]) -> list[Any]:
+def run_program(program: Any, leaves: list[Any], is_brief: bool = False) -> list[Any]:
     """Compute a program in a kernel, or without one if it has effects."""
     program = shortened(program)
     # A primitive needs all traced values as operands, and may not print, for instance.
     if program.effects or _captures(program):
         return jax.extend.core.jaxpr_as_fun(program)(*leaves)
-    return kernel.bind(*leaves, program=program)
+    return kernel.bind(*leaves, program=program, is_brief=is_brief)
 
 
 def _captures(program: Any) -> bool:
@@ -123,14 +128,15 @@ kernel.is_high = never_high
 
 
 @kernel.def_impl
-def _run(*operands, program):
+def _run(*operands, program, is_brief):
     if jax.config.jax_disable_jit:  # pyright: ignore[reportAttributeAccessIssue]
         # A kernel that was traced before. `jax.jit` would call this very rule again.
         return jax.extend.core.jaxpr_as_fun(program)(*operands)
-    return jax.jit(lambda *x: kernel.bind(*x, program=program))(*operands)
+    run = partial(kernel.bind, program=program, is_brief=is_brief)
+    return jax.jit(run)(*operands)
 
 
 @kernel.def_abstract_eval
-def _shapes(*operands, program):
-    del operands
+def _shapes(*operands, program, is_brief):
+    del operands, is_brief
     return program.out_avals

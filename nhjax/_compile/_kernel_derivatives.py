@@ -14,12 +14,13 @@ from ._marks import merged, split
 
 
 @rare_collections()
-def differentiated(operands, tangents, *, program):
+def differentiated(operands, tangents, *, program, is_brief=False):
     """Compute values and tangents in two kernels, the second linear in the tangents.
 
     There are two kernels so that reverse mode can keep the results of the first and
     transpose the second.
     """
+    del is_brief
     run = jax.extend.core.jaxpr_as_fun(program)
     is_moving = [not isinstance(tangent, ad.Zero) for tangent in tangents]
     rates, _ = split(is_moving, tangents)
@@ -93,7 +94,8 @@ ad.primitive_jvps[kernel] = differentiated
 
 
 @rare_collections()
-def transposed(cotangents, *operands, program):
+def transposed(cotangents, *operands, program, is_brief=False):
+    del is_brief
     run = jax.extend.core.jaxpr_as_fun(program)
     is_linear = [ad.is_undefined_primal(x) for x in operands]
     linear, known = split(is_linear, operands)

@@ -70,15 +70,15 @@ _SMALL_ARRAYS = 40
 
 
 @rare_collections()
-def _lowered(ctx, *operands, program):
+def _lowered(ctx, *operands, program, is_brief):
     if is_within_kernel():
-        return _by_xla(ctx, *operands, program=program)
+        return _by_xla(ctx, *operands, program=program, is_brief=is_brief)
     reason = reason_against_lanes()
     if reason is None and array_size(program.jaxpr) > _SMALL_ARRAYS:
         reason = "its arrays are so large that XLA uses vectors for them"
     if reason is None:
         try:
-            name = single_target(program)
+            name = single_target(program, is_brief)
         except Unsupported as error:
             reason = str(error)
         else:
@@ -87,7 +87,7 @@ def _lowered(ctx, *operands, program):
     against = reason_against_kernel(program)
     if against is not None:
         note("xla", against, None)
-        return _by_xla(ctx, *operands, program=program)
+        return _by_xla(ctx, *operands, program=program, is_brief=is_brief)
     note("kernels", reason, None)
     return _marked(ctx, *operands, program=program)
 
@@ -134,7 +134,8 @@ def _tied(operands: tuple[Any, ...]) -> list[Any]:
     ]
 
 
-def _plain(*operands, program):
+def _plain(*operands, program, is_brief):
+    del is_brief
     return jax.extend.core.jaxpr_as_fun(program)(*operands)
 
 

@@ -192,7 +192,8 @@ def _allowed(
     inside the constraints leave larger round-off than these, which is measured.
     """
     tolerance = jnp.asarray(1e3 * float(jnp.finfo(u.dtype).eps), u.dtype)
-    noise = function_noise(system, t, q, u, lin.multiplier, args)
+    given = system, t, q, u, lin.multiplier, args
+    noise = as_cpu_kernel(function_noise, *given, is_brief=True)
     on_velocities = tolerance * violation_scale(system, lin, t, q, u, args)
     on_positions = tolerance * position_scale(system, t, q, args)
     violations = noise.violations

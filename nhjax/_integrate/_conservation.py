@@ -54,7 +54,8 @@ def kept_invariants(
             f"{type(invariants).__name__}."
         )
     value = invariant_values(function, system, t, y.q, u, args)
-    noise = as_cpu_kernel(_noise, function, system, t, y.q, u, args, value)
+    given = function, system, t, y.q, u, args, value
+    noise = as_cpu_kernel(_noise, *given, is_brief=True)
     return Invariants(function, value, noise / float(jnp.finfo(value.dtype).eps))
 
 

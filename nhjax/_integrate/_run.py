@@ -33,6 +33,7 @@ from ._options import Means, Options, TimeGrid
 from ._saveat import SaveAt, stack_saved
 from ._saving import record_places, RecordPlaces, Rows, Saving
 from ._solution import Solution
+from ._statistics import reported_statistics
 from ._stepping import as_checkpoint, Carry, progress_of, Stepping
 
 
@@ -79,7 +80,7 @@ def run(
         t1=end.t,
         ts=ts,
         ys=ys,
-        stats=carry.stats,
+        stats=reported_statistics(carry.stats, method),
         result=carry.result,
         interpolation=_interpolation(loop, grid, end.rows) if saveat.dense else None,
         checkpoint=(
@@ -128,7 +129,8 @@ def _all_steps(
         stepping = loop.stepping
         u = stepping.system.fibre_coordinate(y0)
         given = stepping.time(0), y0.q, u, y0.multiplier, stepping.args
-        noise = as_cpu_kernel(function_noise, stepping.system, *given)
+        given = stepping.system, *given
+        noise = as_cpu_kernel(function_noise, *given, is_brief=True)
         if not checkpoint:
             return as_cpu_kernel(whole, loop, y0, noise)
     # What a compiler knows of the start of a loop, such as zeros in the matrices there,

@@ -6,7 +6,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Int
 
 from .._custom_types import BoolScalar, FloatScalar
-from .._step import StepOutcome
+from .._method import AbstractMethod
+from .._step import estimated_error, StepOutcome
 
 
 Statistics: TypeAlias = dict[str, Any]
@@ -37,6 +38,15 @@ def first_statistics(
     }
 
 
+def reported_statistics(stats: Statistics, method: AbstractMethod) -> Statistics:
+    """Make the statistics that a solution has, of those that are carried."""
+    stats = dict(stats)
+    ratios = stats.pop("max_error_ratios", None)
+    if ratios is not None:
+        stats["max_error_estimate"] = estimated_error(ratios, method)
+    return stats
+
+
 def updated_statistics(
     stats: Statistics,
     outcome: StepOutcome,
@@ -61,7 +71,7 @@ def updated_statistics(
     failed = alive & ~good
     optional = {
         "max_invariant_error": outcome.invariant_error,
-        "max_error_estimate": outcome.error_estimate,
+        "max_error_ratios": outcome.error_ratios,
     }
     present = {k: x for k, x in optional.items() if x is not None}
     return {name: larger(name, x) for name, x in present.items()} | {

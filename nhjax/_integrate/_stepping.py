@@ -130,7 +130,7 @@ class Stepping(eqx.Module):
         if self.invariants is not None:
             stats["max_invariant_error"] = jnp.zeros_like(violation)
         if self.method.embedded_difference is not None:
-            stats["max_error_estimate"] = jnp.zeros_like(violation)
+            stats["max_error_ratios"] = jnp.zeros((2,), violation.dtype)
         return Carry(step_state, result, stats)
 
     def round_off_at(

@@ -66,7 +66,12 @@ def held() -> Held:
 
 
 def registered(
-    kernel_ir: str, num_operands: int, num_results: int, width: int, is_batched: bool
+    kernel_ir: str,
+    num_operands: int,
+    num_results: int,
+    width: int,
+    is_batched: bool,
+    is_brief: bool = False,
 ) -> str:
     """Compile and register a kernel, unless that has been done, and return its name.
 
@@ -81,13 +86,14 @@ def registered(
     - `width`: how many members it computes at once.
     - `is_batched`: whether the results have members, along the leading axis; else it
         is called once, for the member 0.
+    - `is_brief`: whether it runs so shortly that it is to be compiled quickly.
 
     **Returns:**
 
     A name for `jax.ffi.ffi_call` and `jax.ffi.ffi_lowering`.
     """
     handler = handler_ir(num_operands, num_results, width, is_batched)
-    quick = is_quick()
+    quick = is_brief or is_quick()
     name = _name(kernel_ir, handler, "quick" if quick else "optimised")
     with _lock:
         if name not in _programs:

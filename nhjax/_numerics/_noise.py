@@ -57,30 +57,29 @@ def measured_noise(
     shape = len(_DISTANCES), _NUM_RAYS, size
     rays = rng.uniform(0.5, 1.5, shape) * rng.choice([-1.0, 1.0], shape)
     rays *= np.reshape([eps**power for power in _DISTANCES], (-1, 1, 1))
-    # One row for each point: its distance along its ray and its weights in a fourth and
-    # a fifth difference. Another array tells for each ray whether the point is on it.
+    # One row for each point of a ray: its distance, and its weights in a fourth and a
+    # fifth difference.
     numbers = np.arange(1.0, _NUM_POINTS + 1)
     columns = numbers, np.append(_weights(4), 0.0), _weights(5)
-    num_rays = len(_DISTANCES) * _NUM_RAYS
-    points = jnp.asarray(np.tile(np.stack(columns, axis=1), (num_rays, 1)), dtype)
-    is_on = jnp.asarray(np.repeat(np.eye(num_rays), _NUM_POINTS, axis=0), dtype)
+    points = jnp.asarray(np.stack(columns, axis=1), dtype)
     rays = jnp.asarray(rays.reshape(-1, size), dtype)
-    # The function is traced once, in the loop, which takes longer than all of the rest.
     lengths = [math.prod(x.shape) for x in jax.tree.leaves(like)]
 
-    def add(totals, row):
-        (step, *weights), on = row
-        found = function(step * jnp.sum(on[:, None] * rays, axis=0))
-        values = jnp.concatenate([x.reshape(-1) for x in jax.tree.leaves(found)])
-        # Values that are not finite must not reach other rays.
-        changes = (jnp.where(on[:, None] > 0, w * values, 0) for w in weights)
-        return tuple(x + dx for x, dx in zip(totals, changes, strict=True)), None
+    # A loop of `while` contains the function once; a short `scan` may be unrolled.
+    def on_ray(_, ray):
+        def add(carry):
+            k, total = carry
+            found = function(points[k, 0] * ray)
+            values = jnp.concatenate([x.reshape(-1) for x in jax.tree.leaves(found)])
+            return k + 1, total + points[k, 1:, None] * values[None]
 
-    # A loop, so that the program contains the function once.
-    zero = jnp.zeros((num_rays, sum(lengths)), dtype)
-    totals = jax.lax.scan(add, (zero, zero), (points, is_on))[0]
-    totals = (jnp.where(jnp.isfinite(x), jnp.abs(x), 0) for x in totals)
-    fourth, fifth = (jnp.max(x.reshape(*shape[:2], -1), axis=1) for x in totals)
+        start = jnp.zeros((), jnp.int32), jnp.zeros((2, sum(lengths)), dtype)
+        return None, jax.lax.while_loop(lambda x: x[0] < _NUM_POINTS, add, start)[1]
+
+    differences = jnp.abs(jax.lax.scan(on_ray, None, rays)[1])
+    differences = jnp.where(jnp.isfinite(differences), differences, 0)
+    largest = jnp.max(differences.reshape(*shape[:2], 2, -1), axis=1)
+    fourth, fifth = largest[:, 0], largest[:, 1]
     noise, smooth = fifth[0], fifth[0] < _SMOOTH * fourth[0]
     for k in range(1, len(_DISTANCES)):
         smooth = smooth | (fifth[k] < _SMOOTH * fourth[k])

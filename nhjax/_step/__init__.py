@@ -7,6 +7,7 @@ from ._derivative import (
     primitive_step as primitive_step,
     tangent_of_outcome as tangent_of_outcome,
 )
+from ._error_estimate import estimated_error as estimated_error
 from ._invariants import (
     invariant_values as invariant_values,
     Invariants as Invariants,

@@ -5,29 +5,27 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from .._custom_types import FloatScalar
+from .._method import AbstractMethod
 from .._numerics import matvec, max_norm, NOISE_UNITS, relative, small_einsum
 from .._system import Linearisation
 from ._stage_system import StageSystem
 from ._unknowns import Stages
 
 
-def error_estimate(
+def error_ratios(
     stages: StageSystem,
     x: Stages,
     force: Float[Array, "s n"],
     u: Float[Array, " n"],
     lin: Linearisation,
-) -> FloatScalar | None:
-    """Estimate the error of a step, relative to the change of the state in it.
+) -> Float[Array, "2"] | None:
+    """Compare two quadratures of a step, in positions and in fibre coordinates.
 
     The state changes by h Σ b_j (H^j, N⁻¹ n^j), with the velocities H^j and the forces
     n^j of the stages. A second quadrature, which leaves out the last node, differs from
-    it by the same sum with the weights `method.embedded_difference`. With s different
-    nodes this difference, relative to the change of the state, is O(h^{s-1}) in
-    positions, divided by h, and O(h^s) in fibre coordinates. The relative error of the
-    step is O(h^p), with the order p of the method. The estimate is the larger of the
-    two ratios, each raised to the power that makes it O(h^p). It tends to one for steps
-    in which nothing is resolved.
+    it by the same sum with the weights `method.embedded_difference`. The ratios are
+    those of this difference to the change of the state, in positions, divided by h, and
+    in fibre coordinates; see `estimated_error`.
 
     **Arguments:**
 
@@ -35,7 +33,7 @@ def error_estimate(
     - `u`: the fibre coordinate at the end of the step.
     - `lin`: the linearisation at the start of the step.
 
-    **Returns:** the estimate, or None for a method with one node, which has no second
+    **Returns:** the two ratios, or None for a method with one node, which has no second
     quadrature.
     """
     method, h = stages.method, stages.h
@@ -62,14 +60,21 @@ def error_estimate(
         # multipliers of single stages may be wrong where their sum is right.
         excess = matvec(lin.compliance_inverse, matvec(lin.jacobian, gained))
         gained = gained - matvec(lin.reaction, excess)
+    return relative(jnp.stack([max_norm(moved), max_norm(gained)]), whole)
+
+
+def estimated_error(ratios: Float[Array, "2"], method: AbstractMethod) -> FloatScalar:
+    """Estimate the error of a step, relative to the change of the state in it.
+
+    With s different nodes the `error_ratios` are O(h^{s-1}) in positions and O(h^s) in
+    fibre coordinates. The relative error of a step is O(h^p), with the order p of the
+    method. The estimate is the larger of the two ratios, each raised to the power that
+    makes it O(h^p). It tends to one for steps in which nothing is resolved. It grows
+    with the ratios, so that the largest of many steps follows from the largest ratios.
+    """
     nodes = len(np.unique(method.c))
+    in_position, in_fibre = ratios
     return jnp.maximum(
-        _power(relative(max_norm(moved), whole), method.order, nodes - 1),
-        _power(relative(max_norm(gained), whole), method.order, nodes),
+        in_position ** (method.order / (nodes - 1)),
+        in_fibre ** (method.order / nodes),
     )
-
-
-def _power(x: FloatScalar, numerator: int, denominator: int) -> FloatScalar:
-    """Raise x to a rational power, by multiplications if it is a whole number."""
-    whole, rest = divmod(numerator, denominator)
-    return x**whole if rest == 0 else x ** (numerator / denominator)

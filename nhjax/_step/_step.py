@@ -31,7 +31,7 @@ from .._system import (
     State,
 )
 from ._end import end_state, step_record
-from ._error_estimate import error_estimate
+from ._error_estimate import error_ratios
 from ._invariants import Invariants, StartImpulses
 from ._newton import AbstractStageSolver
 from ._record import StepRecord
@@ -102,8 +102,8 @@ class StepOutcome(NamedTuple):
     - `newton`: whether Newton's method took over from simplified Newton.
     - `invariant_error`: the largest error of an invariant at the end, relative to the
         size of its terms; None if the run keeps none.
-    - `error_estimate`: the estimated error of the step, relative to the change of the
-        state in it; None for a method with one node.
+    - `error_ratios`: what tells how large the error of the step is; None for a method
+        with one node.
     """
 
     step_state: StepState
@@ -117,7 +117,7 @@ class StepOutcome(NamedTuple):
     multiplier_defect: FloatScalar
     newton: BoolScalar
     invariant_error: FloatScalar | None
-    error_estimate: FloatScalar | None
+    error_ratios: Float[Array, "2"] | None
 
 
 def first_step_state(
@@ -236,7 +236,7 @@ def step(
         multiplier_defect=max_norm(last - lin_next.multiplier),
         newton=solved.aux.newton,
         invariant_error=_invariant_error(stages, at_end, u),
-        error_estimate=error_estimate(stages, x, forces.force, u, lin),
+        error_ratios=error_ratios(stages, x, forces.force, u, lin),
     )
 
 
