@@ -108,18 +108,34 @@ def require(tree: T, *checks: Check) -> T:
         Check(check.ok, check.error, _without_tangents(check.values))
         for check in checks
     )
+    later = _undecided(checks)
+    if not later:
+        return tree
+    failed = ~jnp.stack([jnp.asarray(check.ok) for check in later])
+    details = [(check.error, check.values) for check in later]
+    return raise_where(tree, jnp.any(failed), _first_error, (failed, details))
+
+
+def hold(*checks: Check) -> Bool[Array, ""] | None:
+    """Tell in a compiled program whether all checks hold; None if that is known.
+
+    With concrete values an exception is raised for the first that fails.
+    """
+    later = _undecided(checks)
+    if not later:
+        return None
+    return jnp.all(jnp.stack([jnp.asarray(check.ok) for check in later]))
+
+
+def _undecided(checks: tuple[Check, ...]) -> list[Check]:
+    """Return the checks of traced values; raise for the first other one that fails."""
     later = []
     for check in checks:
         if is_traced(check.ok, *jax.tree.leaves(check.values)):
             later.append(check)
         elif not check.ok:
             raise check.error(*_on_host(check.values))
-    later = [check for check in later if is_traced(check.ok) or not check.ok]
-    if not later:
-        return tree
-    failed = ~jnp.stack([jnp.asarray(check.ok) for check in later])
-    details = [(check.error, check.values) for check in later]
-    return raise_where(tree, jnp.any(failed), _first_error, (failed, details))
+    return [check for check in later if is_traced(check.ok) or not check.ok]
 
 
 def _without_tangents(values: PyTree[Any]) -> PyTree[Any]:

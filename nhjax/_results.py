@@ -68,6 +68,12 @@ class RESULTS(eqx.Enumeration):
         "or its v and p do not belong together. Make `y0` with `nhjax.initial_state`, "
         "for the system, args and time of the integration."
     )
+    invalid_argument = (
+        "An argument of the run is not valid: `dt` or `t0` is not finite, `dt` is zero "
+        "or so small that time does not advance, `num_steps` is less than 1, or `ts` "
+        "of `SaveAt` is not sorted or reaches outside of the run. With `throw=True` "
+        "the message names it."
+    )
     not_conserved = (
         "The system does not conserve what `invariants` asks for: its rate of change "
         "along the motion is not zero at the start, or at a state near it. Reactions "
@@ -107,6 +113,7 @@ def result_codes() -> dict[str, int]:
         "left_chart",
         "lost_constraints",
         "inconsistent_start",
+        "invalid_argument",
         "not_conserved",
         "event_occurred",
         "nonfinite_event",

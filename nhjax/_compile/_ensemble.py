@@ -19,6 +19,7 @@ from ._engine import note
 from ._kernel import kernel, never_high
 from ._kernel_derivatives import differentiated, transposed
 from ._lowering import (
+    is_exported,
     is_within_kernel,
     reason_against_kernel,
     reason_against_lanes,
@@ -177,6 +178,10 @@ def _one_by_one(*operands, program, is_batched, is_brief):
 @rare_collections()
 def _lowered(ctx, *operands, program, is_batched, is_brief):
     members = _members(ctx.avals_in, is_batched)
+    given = {"program": program, "is_batched": is_batched, "is_brief": is_brief}
+    if is_exported(ctx):
+        note("xla", "the program is exported", members)
+        return _together_by_xla(ctx, *operands, **given)
     reason = reason_against_lanes()
     if reason is None:
         try:
@@ -193,7 +198,6 @@ def _lowered(ctx, *operands, program, is_batched, is_brief):
     else:
         note("kernels", reason, members)
         lower = mlir.lower_fun(_one_by_one, multiple_results=True)
-    given = {"program": program, "is_batched": is_batched, "is_brief": is_brief}
     return lower(ctx, *operands, **given)
 
 

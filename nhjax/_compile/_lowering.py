@@ -40,6 +40,11 @@ def is_within_kernel() -> bool:
     return _within.get()
 
 
+def is_exported(ctx: Any) -> bool:
+    """Tell whether a program is lowered to be run by other processes."""
+    return bool(ctx.module_context.lowering_parameters.for_export)
+
+
 def reason_against_lanes() -> str | None:
     """Say why nhjax's own compiler is not asked for; `None` if it is."""
     if chosen_engine() != "lanes":
@@ -71,6 +76,10 @@ _SMALL_ARRAYS = 40
 
 @rare_collections()
 def _lowered(ctx, *operands, program, is_brief):
+    if is_exported(ctx):
+        # Machine code of this process would mean nothing to another.
+        note("xla", "the program is exported", None)
+        return _by_xla(ctx, *operands, program=program, is_brief=is_brief)
     if is_within_kernel():
         return _by_xla(ctx, *operands, program=program, is_brief=is_brief)
     reason = reason_against_lanes()

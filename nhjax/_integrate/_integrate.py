@@ -1,13 +1,22 @@
 import warnings
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Literal
+from typing import Any, Literal
 
 import jax.numpy as jnp
+import numpy as np
 
-from .._custom_types import Args, FloatScalar, FloatScalarLike, IntScalar, PhaseFunction
-from .._errors import Check, is_traced, require
+from .._custom_types import (
+    Args,
+    BoolScalar,
+    FloatScalar,
+    FloatScalarLike,
+    IntScalar,
+    PhaseFunction,
+)
+from .._errors import Check, hold, is_traced, require
 from .._method import AbstractMethod, Gauss, LobattoIIIAB, PartitionedRungeKutta
+from .._results import RESULTS
 from .._step import (
     AbstractStageSolver,
     is_simplified_alone,
@@ -182,10 +191,16 @@ def integrate(
     num_steps = check_num_steps(num_steps, needed_by)
     args = parameters(args)
     state = check_start(system, y0, args)
-    t0, dt = _checked_times(y0, state, t0, dt, num_steps)
+    t0, dt, *checks = _times(y0, state, t0, dt, num_steps)
     events = checked_events(event, saveat, invariants)
     _check_method(method, state, saveat)
-    saveat = saveat.within(t0, dt, num_steps)
+    checks += saveat.checks(t0, dt, num_steps)
+    saveat, valid = saveat.within(dt), None
+    if throw:
+        # All on dt, which is always used: jit drops a check of what is not.
+        dt = require(dt, *checks)
+    else:
+        valid = hold(*checks)
     # A plain call has no use for a length that is known, but for one that changes.
     if not isinstance(num_steps, int) or (needed_by is None and not is_tracing()):
         num_steps = jnp.asarray(num_steps, jnp.int32)
@@ -201,6 +216,8 @@ def integrate(
         solver = replace(stage_solver, fallback=True)
         means = Means(solver, adjoint, NoProgressMeter())
         sol = run(system, method, y0, grid, args, options, means)
+    if valid is not None:
+        sol = _invalid_unless(valid, sol)
     if throw:
         _require_constraints(sol, system, t0, state, args)
         sol = raise_failures(sol, dt, used_newton)
@@ -230,27 +247,34 @@ def _require_constraints(
         require_independent(system, t0, y0, args)
 
 
-def _checked_times(
+def _invalid_unless(valid: BoolScalar, sol: Solution) -> Solution:
+    """Give a run of arguments that were not valid the result that says so."""
+    result = RESULTS.where(valid, sol.result, RESULTS.invalid_argument)
+    failed_step = jnp.where(valid, sol.stats["failed_step"], 0)
+    return replace(sol, result=result, stats=sol.stats | {"failed_step": failed_step})
+
+
+def _times(
     y0: State | Checkpoint,
     state: State,
     t0: FloatScalarLike | None,
     dt: FloatScalarLike,
     num_steps: int | IntScalar,
-) -> tuple[FloatScalar, FloatScalar]:
-    """Return the time of `y0` and the step size as arrays, if steps can be counted."""
+) -> tuple[Any, ...]:
+    """Return the time of `y0` and the step size as arrays, and the checks of both."""
     dt = real_scalar("dt", dt, state.p.dtype)
     t0 = real_scalar("t0", time_of(y0, t0), state.p.dtype)
-    # All on dt, which is always used: jit drops a check of what is not.
-    dt = require(
+    known = dt if is_traced(dt) else np.asarray(dt)
+    return (
+        t0,
         dt,
         finite("dt", dt),
         finite("t0", t0),
-        Check(dt != 0, _zero_step),
+        Check(known != 0, _zero_step),
         *countable(num_steps),
         *countable_from(y0, num_steps),
         advancing(t0, dt),
     )
-    return t0, dt
 
 
 def _check_method(method: AbstractMethod, y0: State, saveat: SaveAt) -> None:

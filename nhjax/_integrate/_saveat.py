@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Array, Float, PyTree
 
 from .._custom_types import FloatScalar, IntScalar
-from .._errors import Check, DTypeError, is_traced, NonFiniteError, require
+from .._errors import Check, DTypeError, is_traced, NonFiniteError
 from .._system import State
 from ._checks import static_length
 from ._interpolation import step_position
@@ -109,27 +109,31 @@ class SaveAt(eqx.Module):
         self.steps = int(steps)
         self.ts = None if ts is None else _times(ts)
 
-    def within(
+    def within(self, dt: FloatScalar) -> "SaveAt":
+        """Return the options with `ts` in the dtype of a run."""
+        if self.ts is None:
+            return self
+        return eqx.tree_at(lambda s: s.ts, self, self.ts.astype(dt.dtype))
+
+    def checks(
         self, t0: FloatScalar, dt: FloatScalar, num_steps: int | IntScalar
-    ) -> "SaveAt":
-        """Check the options against a run; return them with `ts` in the run's dtype."""
+    ) -> list[Check]:
+        """Make the checks of `ts` against a run; raise if nothing is saved in it."""
         if self.num_saved(num_steps) == 0 and not (self.dense or self.checkpoint):
             raise ValueError(
                 f"SaveAt: `steps={self.steps}` saves nothing in a run of {num_steps} "
                 "steps. Add `t1=True`."
             )
         if self.ts is None:
-            return self
+            return []
         ts = self.ts.astype(dt.dtype)
         # Positions in units of steps make the checks the same for both directions of
         # time and for all dtypes.
         position, inside = step_position(ts, t0, dt, static_length(num_steps))
-        ts = require(
-            ts,
+        return [
             Check(jnp.all(inside), _outside, (ts, t0, dt, num_steps)),
             Check(jnp.all(jnp.diff(position) >= 0), _unsorted, (dt,)),
-        )
-        return eqx.tree_at(lambda s: s.ts, self, ts)
+        ]
 
     def num_saved(self, num_steps: int | IntScalar) -> int:
         """Return the number of entries of the output for a run of `num_steps` steps."""
@@ -168,7 +172,12 @@ def _unsorted(dt: np.ndarray) -> ValueError:
 
 def _times(ts: Any) -> Float[Array, " k"]:
     try:
-        ts = jnp.asarray(ts)
+        if is_traced(*jax.tree.leaves(ts)):
+            ts = jnp.asarray(ts)
+        else:
+            # Known times stay known inside of `jit`.
+            with jax.ensure_compile_time_eval():
+                ts = jnp.asarray(ts)
     except (TypeError, ValueError):
         raise DTypeError(
             f"SaveAt: `ts` must be a vector of real numbers, got {reprlib.repr(ts)} of "
@@ -181,9 +190,11 @@ def _times(ts: Any) -> Float[Array, " k"]:
     if ts.ndim != 1 or ts.shape[0] == 0:
         raise ValueError(f"SaveAt: `ts` must have shape (k,), k >= 1, got {ts.shape}.")
     if not is_traced(ts):
-        if not jnp.all(jnp.isfinite(ts)):
+        # By NumPy: inside of `jit` operations of JAX on known numbers give none.
+        known = np.asarray(ts)
+        if not np.all(np.isfinite(known)):
             raise NonFiniteError(f"SaveAt: `ts` is not finite: {ts}.")
-        gaps = jnp.diff(ts)
-        if not (jnp.all(gaps >= 0) or jnp.all(gaps <= 0)):
+        gaps = np.diff(known)
+        if not (np.all(gaps >= 0) or np.all(gaps <= 0)):
             raise ValueError("SaveAt: `ts` must be sorted in the direction of time.")
     return ts

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Array, PyTree
 
 from .._custom_types import Args, FloatScalar, FloatScalarLike
-from .._errors import Check, DTypeError, NonFiniteError, ShapeError
+from .._errors import Check, DTypeError, is_traced, NonFiniteError, ShapeError
 
 
 Kind: TypeAlias = type | tuple[type, ...]
@@ -73,6 +73,14 @@ def real_scalar(name: str, x: FloatScalarLike, dtype: Any) -> FloatScalar:
 
     Anything else raises a `DTypeError`, and an array that is no scalar a `ShapeError`.
     """
+    # A number that is known stays known inside of `jit`.
+    if not is_traced(x):
+        with jax.ensure_compile_time_eval():
+            return _real_scalar(name, x, dtype)
+    return _real_scalar(name, x, dtype)
+
+
+def _real_scalar(name: str, x: FloatScalarLike, dtype: Any) -> FloatScalar:
     array = jnp.asarray(x) if eqx.is_array_like(x) else None
     if array is None or not (
         jnp.issubdtype(array.dtype, jnp.floating)
@@ -92,7 +100,12 @@ def real_scalar(name: str, x: FloatScalarLike, dtype: Any) -> FloatScalar:
 
 def finite(name: str, x: Any) -> Check:
     """Make the check that every number in `x` is finite."""
-    return Check(all_finite(x), _not_finite, (name, x))
+    leaves = jax.tree.leaves(x)
+    if is_traced(*leaves):
+        return Check(all_finite(x), _not_finite, (name, x))
+    # By NumPy, which gives a known answer also inside of `jit`.
+    ok = all(bool(np.all(np.isfinite(np.asarray(leaf)))) for leaf in leaves)
+    return Check(ok, _not_finite, (name, x))
 
 
 def _not_finite(name: str, x: Any) -> NonFiniteError:
