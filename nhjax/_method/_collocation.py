@@ -51,6 +51,11 @@ class LobattoIIIAB(AbstractMethod):
         self.closure = check_closure(closure)
         self.chart = check_chart(chart)
 
+    @property
+    def order(self) -> int:
+        """Return the order 2s - 2."""
+        return 2 * self.stages - 2
+
     def _tableau(self) -> Tableau:
         return lobatto_tableau(self.stages)
 
@@ -92,6 +97,11 @@ class Gauss(AbstractMethod):
     def closure(self) -> None:
         """Return None: the method takes no constraints, and so needs no closure."""
         return None
+
+    @property
+    def order(self) -> int:
+        """Return the order 2s."""
+        return 2 * self.stages
 
     def _tableau(self) -> Tableau:
         return gauss_tableau(self.stages)

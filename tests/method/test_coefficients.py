@@ -240,7 +240,7 @@ def test_a_tableau_rounded_to_float64_keeps_its_properties(s: int):
 
 def test_orders_of_classical_tableaux():
     assert RK4.orders == (4, 1, 1, 1)
-    assert RK4.order == 2
+    assert RK4.order == 4
     assert RADAU_IIA.orders[:3] == (3, 2, 1)
     assert IMPLICIT_EULER.order == EXPLICIT_EULER.order == 1
     assert not RK4.is_symmetric

@@ -1,0 +1,113 @@
+"""Tableaux other than Lobatto's and Gauss', and the orders that runs with them show."""
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import nhjax
+from nhjax._numerics import max_norm
+
+
+def collocation(
+    nodes: Sequence[float] | np.ndarray, closure: str = "consistent"
+) -> nhjax.PartitionedRungeKutta:
+    """Make the collocation method with the given nodes, and its conjugate."""
+    c = np.asarray(nodes, dtype=np.float64)
+    powers = np.arange(1, c.size + 1)
+    inverse = np.linalg.inv(np.vander(c, increasing=True))
+    a, b = (c[:, None] ** powers / powers) @ inverse, (1 / powers) @ inverse
+    if (c[0], c[-1]) == (0, 1):
+        # Exactly, as the hypotheses on systems with constraints ask for.
+        a[0], a[-1] = 0.0, b
+    return nhjax.PartitionedRungeKutta(a, b, closure=closure)
+
+
+RK4 = nhjax.PartitionedRungeKutta(
+    [[0, 0, 0, 0], [0.5, 0, 0, 0], [0, 0.5, 0, 0], [0, 0, 1, 0]],
+    [1 / 6, 1 / 3, 1 / 3, 1 / 6],
+)
+# Nodes with both ends, for systems with constraints too.
+CLOSED = {
+    "0, 1/3, 2/3, 1": (0, 1 / 3, 2 / 3, 1),
+    "0, .25, .5, .75, 1": (0, 0.25, 0.5, 0.75, 1),
+    "0, .4, 1": (0, 0.4, 1),
+    "0, .2, 2/3, 1": (0, 0.2, 2 / 3, 1),
+    "Chebyshev, s = 5": (1 - np.cos(np.pi * np.arange(5) / 4)) / 2,
+    "0, .35, .7, 1": (0, 0.35, 0.7, 1),
+    "0, .1, .4, .6, .9, 1": (0, 0.1, 0.4, 0.6, 0.9, 1),
+}
+# Nodes without one of the ends.
+OPEN = {
+    "Radau, s = 2": (1 / 3, 1),
+    "1/4, 3/4": (0.25, 0.75),
+    "1/6, 1/2, 5/6": (1 / 6, 0.5, 5 / 6),
+}
+
+
+class Slopes(NamedTuple):
+    """Observed orders in q, p and the multiplier, which is nan without constraints."""
+
+    q: float
+    p: float
+    multiplier: float
+
+
+def pendulum() -> tuple[nhjax.LagrangianSystem, nhjax.State]:
+    """A pendulum on a slide, whose mass depends on q; without constraints."""
+
+    def lagrangian(t, q, v, args):
+        mixed = 0.6 * jnp.cos(q[1]) * v[0] * v[1]
+        return v @ v + mixed + 1.3 * jnp.cos(q[1]) - 0.4 * q[0] ** 2
+
+    system = nhjax.LagrangianSystem(lagrangian)
+    start = jnp.array([0.3, 0.8]), jnp.array([0.5, -0.4])
+    return system, nhjax.initial_state(system, *start)
+
+
+def rolling() -> tuple[nhjax.LagrangianSystem, nhjax.State]:
+    """A mass that depends on q, with a constraint that is quadratic in velocities."""
+
+    def lagrangian(t, q, v, args):
+        return (
+            0.5 * (1 + 0.3 * q[1] ** 2) * v @ v
+            + 0.2 * jnp.sin(q[0]) * v[0] * v[2]
+            - 0.5 * q @ q
+        )
+
+    system = nhjax.LagrangianSystem(
+        lagrangian,
+        nonholonomic=lambda t, q, v, args: (v[2] - q[1] * v[0] - 0.2 * v[0] * v[1])[
+            None
+        ],
+    )
+    start = jnp.array([0.5, 0.4, -0.3]), jnp.array([0.7, -0.6, 0.2])
+    return system, nhjax.initial_state(system, *start, project=True)
+
+
+def observed(
+    system: Any, y0: nhjax.State, method: Any, counts: tuple[int, int], duration: float
+) -> Slopes:
+    """Measure the orders of a run between two numbers of steps."""
+
+    def end(method: Any, count: Any) -> nhjax.State:
+        return nhjax.integrate(
+            system,
+            method,
+            y0,
+            dt=duration / count,
+            num_steps=count,
+            stage_solver=nhjax.SimplifiedNewton(max_iterations=300),
+        ).ys
+
+    exact = end(nhjax.LobattoIIIAB(6, "symmetric"), 4 * counts[-1])
+    errors = []
+    for count in counts:
+        found = end(method, count)
+        apart = jax.tree.map(lambda a, b: max_norm(a - b), found, exact)
+        errors.append([float(x) for x in (apart.q, apart.p, apart.multiplier)])
+    first, last = np.asarray(errors)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return Slopes(*(np.log(first / last) / np.log(counts[1] / counts[0])))
