@@ -2,6 +2,7 @@
 
 import errno
 import os
+import warnings
 from pathlib import Path
 
 
@@ -10,7 +11,7 @@ _NONE = errno.ENOLCK, errno.EOPNOTSUPP, errno.ENOSYS
 
 
 class Lock:
-    """A lock on a file. Where there are no such locks, nothing is locked."""
+    """A lock on a file. Where a file system has none, a warning says so."""
 
     def __init__(self):
         self._opened: int | None = None
@@ -18,16 +19,21 @@ class Lock:
     def take(self, path: Path, what: str) -> None:
         """Lock a file, which is made if it is not there.
 
-        **Raises:** `RuntimeError` if another process has locked it; `what` says of
-        which folder it is.
+        **Raises:** `RuntimeError` if another process has locked it, or if the system
+        has no locks; `what` says of which folder it is.
         """
         self._opened = os.open(path, os.O_RDWR | os.O_CREAT, 0o666)
         try:
             import fcntl
 
             fcntl.flock(self._opened, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except ImportError:
-            return
+        except ImportError as error:
+            self.release()
+            raise RuntimeError(
+                f"{what} cannot be locked, so that two processes might write it at "
+                "once: this system has no module `fcntl`. Leave out `out=`, or run "
+                "where there is one, such as on Linux or macOS."
+            ) from error
         except BlockingIOError as error:
             self.release()
             raise RuntimeError(
@@ -37,6 +43,11 @@ class Lock:
             if error.errno not in _NONE:
                 self.release()
                 raise
+            warnings.warn(
+                f"{what} lies on a file system without locks: let no other process "
+                "write it.",
+                stacklevel=2,
+            )
 
     def write(self, text: bytes) -> None:
         """Let a text be the content of the locked file, on the disk."""

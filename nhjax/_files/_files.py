@@ -16,6 +16,15 @@ VERSION = 1
 _HEADER = "nhjax"
 
 
+# Names under which another program would look for something else, and what writes it.
+_XARRAY = "`sol.to_xarray()` and the methods of its result"
+_OTHER_FORMATS = {
+    **dict.fromkeys((".nc", ".nc4", ".h5", ".hdf5", ".zarr"), _XARRAY),
+    ".csv": "`sol.to_xarray().to_dataframe().to_csv(path)`",
+    ".npy": "`numpy.save` for a single array",
+}
+
+
 def save(path: str | os.PathLike[str], tree: Any) -> None:
     """Write a state, a solution or a checkpoint to a file, to be read by `load`.
 
@@ -37,7 +46,8 @@ def save(path: str | os.PathLike[str], tree: Any) -> None:
 
     **Raises:** `TypeError` with the place of what cannot be saved, such as the dense
     output of a run, which holds functions; `FileNotFoundError` if the folder does not
-    exist, `IsADirectoryError` if `path` is one itself.
+    exist, `IsADirectoryError` if `path` is one itself; `ValueError` for a name of
+        another format, such as one that ends in .nc.
 
     !!! example
 
@@ -53,6 +63,12 @@ def save(path: str | os.PathLike[str], tree: Any) -> None:
     """
     # A link stays one, to the new file.
     path = Path(path).resolve()
+    other = _OTHER_FORMATS.get(path.suffix.lower())
+    if other is not None:
+        raise ValueError(
+            f"{path.name!r} would be a file of NumPy's (.npz) under the name of "
+            f"another format: use {other}, or a name that ends in .npz."
+        )
     if path.is_dir():
         raise IsADirectoryError(
             f"{str(path)!r} is a folder: give the name of a file in it."

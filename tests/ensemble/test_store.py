@@ -315,6 +315,23 @@ def test_two_runs_do_not_write_to_one_store(name, store, whole):
     assert content(store) == whole
 
 
+def test_store_without_locks_of_the_system_is_refused(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "fcntl", None)
+    with pytest.raises(RuntimeError, match="has no module `fcntl`"):
+        call(tmp_path / "store")
+
+
+def test_store_on_a_file_system_without_locks_warns(tmp_path, monkeypatch):
+    fcntl = pytest.importorskip("fcntl")
+
+    def flock(opened, how):
+        raise OSError(errno.ENOLCK, "no locks")
+
+    monkeypatch.setattr(fcntl, "flock", flock)
+    with pytest.warns(UserWarning, match="a file system without locks"):
+        call(tmp_path / "store")
+
+
 def test_ctrl_c_leaves_a_store_that_goes_on(tmp_path, whole):
     class Interrupting(nhjax.AbstractProgressMeter):
         def update(self, done, total):

@@ -151,6 +151,13 @@ def test_a_flipped_bit_is_found(saved, tmp_path):
         nhjax.load(path)
 
 
+@pytest.mark.parametrize("name", ["run.nc", "run.H5", "run.csv"])
+def test_name_of_another_format_is_refused(name, tmp_path):
+    with pytest.raises(ValueError, match=r"the name of another format: use .*npz"):
+        nhjax.save(tmp_path / name, {"x": jnp.zeros(2)})
+    assert not list(tmp_path.iterdir())
+
+
 def test_what_cannot_be_saved_is_named(sol, tmp_path):
     path = tmp_path / "run.npz"
     wrong = {
