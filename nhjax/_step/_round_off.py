@@ -65,16 +65,13 @@ def round_off_of_steps(
     by_position = jnp.zeros_like(by_velocity)
     if lin.violation.shape[0]:
         kinematic, holonomic = magnifications(method)
-
-        def response(sizes):
-            multipliers = matvec(absolute(lin.compliance_inverse), sizes)
-            return max_norm(matvec(absolute(lin.reaction), multipliers))
-
-        by_velocity = by_velocity + kinematic * response(noise.on_velocities)
+        correction = lin.largest_correction(noise.on_velocities)
+        by_velocity = by_velocity + kinematic * correction
         k = noise.on_positions.shape[0]
         if k:
             m = lin.violation.shape[0] - k
-            by_position = holonomic * response(jnp.pad(noise.on_positions, (m, 0)))
+            sizes = jnp.pad(noise.on_positions, (m, 0))
+            by_position = holonomic * lin.largest_correction(sizes)
     units = PART / float(jnp.finfo(by_velocity.dtype).eps)
     sizes = units * by_velocity, units * by_force, units * by_position
     return RoundOff(*sizes, noise.violations)

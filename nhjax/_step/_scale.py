@@ -51,17 +51,13 @@ def fibre_coordinate_scale(
     m, k = stages.num_nonholonomic, stages.num_holonomic
     t, q, args = stages.t, unframed(stages.q), stages.args
 
-    def response(sizes):
-        multipliers = matvec(absolute(lin.compliance_inverse), sizes)
-        return max_norm(matvec(absolute(lin.reaction), multipliers))
-
     if k:
         sizes = position_scale(stages.system, t, q, args, lin)
-        round_off = round_off + response(jnp.pad(sizes, (m, 0))) / h
+        correction = lin.largest_correction(jnp.pad(sizes, (m, 0)))
+        round_off = round_off + correction / h
     if m:
-        round_off = round_off + response(
-            jnp.pad(_kinematic_scale(stages, q, x0), (0, k))
-        )
+        sizes = jnp.pad(_kinematic_scale(stages, q, x0), (0, k))
+        round_off = round_off + lin.largest_correction(sizes)
     if stages.kept is not None:
         round_off = round_off + impulse_weights(stages, x0).noise
     if stages.round_off is not None:

@@ -9,6 +9,7 @@ from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from .._custom_types import Args, FloatScalar, FloatScalarLike
 from .._numerics import (
+    absolute,
     block_tridiagonal_inverse,
     BlockTridiagonalInverse,
     couplings,
@@ -19,6 +20,7 @@ from .._numerics import (
     least_norm_inverse_by_blocks,
     Matrix,
     matvec,
+    max_norm,
     small_einsum,
     sparse_jacobian,
     SparseMatrix,
@@ -127,6 +129,11 @@ class Linearisation(eqx.Module):
         hidden = hidden_residual - matvec(self.jacobian, free)
         multiplier = matvec(self.compliance_inverse, hidden)
         return free + matvec(self.reaction, multiplier), multiplier
+
+    def largest_correction(self, sizes: Float[Array, " l"]) -> FloatScalar:
+        """Bound the change of u that makes up for violations of the given sizes."""
+        multipliers = matvec(absolute(self.compliance_inverse), sizes)
+        return max_norm(matvec(absolute(self.reaction), multipliers))
 
 
 def _momentum_and_constraint(
