@@ -1,5 +1,8 @@
 """The exceptions that nhjax raises, and the functions that enforce conditions."""
 
+import contextlib
+import functools
+import inspect
 import logging
 from collections.abc import Callable, Iterator
 from types import TracebackType
@@ -68,6 +71,54 @@ class IntegrationError(RuntimeError):
 
     The message names the lane of a batch, the step and the reason.
     """
+
+
+@contextlib.contextmanager
+def naming(called: str, function: Any, args: Any) -> Iterator[None]:
+    """Add a note to what is raised while a function of the user is traced.
+
+    The note names the function as it is `called`, with its file and line, and says what
+    helps if that is known. `args` is what the user gave as such.
+    """
+    try:
+        yield
+    except Exception as error:
+        note = f"This was raised by `{called}`{_place(function)}, called by nhjax."
+        for kind, advice in _ADVICE:
+            if isinstance(error, kind):
+                note += f" {advice}"
+                break
+        if args is None and "NoneType" in str(error):
+            note += " Here `args` is None: has `args=...` been left out of the call?"
+        error.add_note(note)
+        raise
+
+
+_NUMPY = (
+    "It is given arrays of JAX without values: use functions of `jax.numpy` in place "
+    "of those of `numpy` and `math`."
+)
+_ADVICE = (
+    (
+        jax.errors.TracerBoolConversionError,
+        "It is given arrays of JAX without values: write `jnp.where(condition, a, b)` "
+        "in place of `if`, and `jnp.maximum`, `jnp.minimum` in place of `max`, `min`.",
+    ),
+    (jax.errors.TracerArrayConversionError, _NUMPY),
+    # What is raised for the functions of `math`, which ask for a number.
+    (jax.errors.ConcretizationTypeError, _NUMPY),
+)
+
+
+def _place(function: Any) -> str:
+    """Write where a function is defined, if that is known."""
+    function = inspect.unwrap(getattr(function, "__func__", function))
+    while isinstance(function, functools.partial):
+        function = function.func
+    code = getattr(function, "__code__", None)
+    if code is None:
+        return ""
+    return f" ({function.__qualname__}, {code.co_filename}:{code.co_firstlineno})"
 
 
 def is_traced(*arrays: object) -> bool:

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Array, PyTree
 
 from .._custom_types import Args, FloatScalar, IntScalar
-from .._errors import Check, is_traced, ShapeError
+from .._errors import Check, is_traced, naming, ShapeError
 
 
 # Steps are counted in int32.
@@ -114,7 +114,8 @@ def check_saved(
     fn: Callable[[Any, Any, Any], PyTree[Array]], t: FloatScalar, y: Any, args: Args
 ) -> None:
     """Raise a `TypeError` unless `SaveAt(fn=...)` returns what can be saved, arrays."""
-    leaves = jax.tree.leaves(eqx.filter_eval_shape(fn, t, y, args))
+    with naming("SaveAt: fn(t, y, args)", fn, args):
+        leaves = jax.tree.leaves(eqx.filter_eval_shape(fn, t, y, args))
     wrong = [
         leaf
         for leaf in leaves

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from .._custom_types import Args, BoolScalar, FloatScalar
-from .._errors import DTypeError, ShapeError
+from .._errors import DTypeError, naming, ShapeError
 from .._method import AbstractMethod
 from .._numerics import ClosureConverted
 from .._step import StepState
@@ -55,8 +55,10 @@ def conditions_of(
 
 def _check(i: int, event: Event, t: FloatScalar, y: State, args: Args) -> None:
     """Raise unless the condition of an event returns a scalar of the state's dtype."""
-    out = eqx.filter_eval_shape(event.cond_fn, t, y, args)
-    name = f"Event {i}: `cond_fn(t, y, args)`"
+    called = "cond_fn(t, y, args)"
+    with naming(f"Event {i}: {called}", event.cond_fn, args):
+        out = eqx.filter_eval_shape(event.cond_fn, t, y, args)
+    name = f"Event {i}: `{called}`"
     shape, dtype = getattr(out, "shape", None), getattr(out, "dtype", None)
     if shape is None or dtype is None:
         raise ShapeError(

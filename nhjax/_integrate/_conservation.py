@@ -12,7 +12,7 @@ from jaxtyping import Array, Float, PyTree
 
 from .._compile import as_cpu_kernel
 from .._custom_types import Args, BoolScalar, FloatScalar
-from .._errors import DTypeError, ShapeError
+from .._errors import DTypeError, naming, ShapeError
 from .._numerics import ClosureConverted, dependence, frozen, matvec, max_norm
 from .._step import invariant_values, Invariants
 from .._system import AbstractMechanicalSystem, linearise, noise_near, State
@@ -76,7 +76,9 @@ def _check_function(
     args: Args,
 ) -> None:
     u = system.fibre_coordinate(y)
-    out = eqx.filter_eval_shape(function, t, y.q, u, args)
+    called = f"invariants(t, q, {system.fibre_coordinate_name}, args)"
+    with naming(called, function, args):
+        out = eqx.filter_eval_shape(function, t, y.q, u, args)
     shape, most = getattr(out, "shape", None), u.shape[0]
     if system.constraints == "independent":
         most -= y.multiplier.shape[0]

@@ -8,7 +8,7 @@ import equinox as eqx
 import jax
 
 from .._custom_types import Args, FloatScalar
-from .._errors import DTypeError, ShapeError
+from .._errors import DTypeError, naming, ShapeError
 from .._system import AbstractMechanicalSystem, configuration, floating, State
 
 
@@ -23,7 +23,8 @@ def completed(
     """Make a state of what a reset returns, a pair (q, u) or a state."""
     name = system.fibre_coordinate_name
     called = f"Event {i}: `reset(t, y, args)`"
-    out = reset(t, y, args)
+    with naming(f"Event {i}: reset(t, y, args)", reset, args):
+        out = reset(t, y, args)
     if isinstance(out, tuple | list) and len(out) == 2:
         q, u = configuration(out[0]), floating(name, out[1])
         _check_part(called, "q", q, y.q)
