@@ -30,6 +30,7 @@ def measure(example: Any) -> dict[str, float]:
     """Measure one system with and without the fallback."""
     system, y0 = example.system, example.initial_state()
     found: dict[str, float] = {}
+    dt = jnp.asarray(DT)
     for name, fallback in (("without", False), ("with", True)):
         solver = nhjax.SimplifiedNewton(fallback=fallback)
 
@@ -45,12 +46,15 @@ def measure(example: Any) -> dict[str, float]:
             )
 
         start = time.process_time()
-        compiled = jax.jit(run).lower(y0, jnp.asarray(DT)).compile()
+        compiled = jax.jit(run).lower(y0, dt).compile()
         found[f"compile {name}"] = time.process_time() - start
+        # Andrews' squeezer wants shorter steps than the others.
+        while not fallback and int(compiled(y0, dt).stats["num_steps"]) < NUM_STEPS:
+            dt = dt / 10
         times = []
         for _ in range(REPEATS):
             start = time.perf_counter()
-            sol = jax.block_until_ready(compiled(y0, jnp.asarray(DT)))
+            sol = jax.block_until_ready(compiled(y0, dt))
             times.append(time.perf_counter() - start)
         assert int(sol.stats["num_newton_steps"]) == 0
         steps = max(int(sol.stats["num_steps"]), 1)

@@ -3,12 +3,13 @@
 Writes the table to `benchmarks/results/verdicts.md` and `.json`, and into the page
 `docs/experiments.md`, whose figures go to `docs/experiments/`. With `--quick`
 everything runs in a small form, which shows that it runs but decides nothing, and with
-`--only` some parts alone; then nothing is written. It takes about seven minutes of one
-core.
+`--only` some parts alone; then nothing is written, unless `--keep` takes the other
+parts from the saved table. It takes about seven minutes of one core.
 """
 
 import argparse
 import dataclasses
+import json
 import time
 from pathlib import Path
 from typing import Any
@@ -18,7 +19,7 @@ import matplotlib
 
 from nhjax.studies import colour_blind_safe
 
-from ._report import markdown_table, write
+from ._report import markdown_table, RESULTS, write
 from ._verdicts import _ball, _chaotic, _errata, _orders, _ours, _transmission
 from ._verdicts._claim import Claim, Found
 
@@ -62,6 +63,19 @@ def filled(page: str, claims: dict[str, list[Claim]]) -> str:
     return page
 
 
+def with_saved(
+    claims: dict[str, list[Claim]], data: dict[str, Any]
+) -> tuple[dict[str, list[Claim]], dict[str, Any]]:
+    """Take what was not measured now from the saved table."""
+    saved = json.loads((RESULTS / "verdicts.json").read_text(encoding="utf-8"))
+    others = {
+        part: [Claim(**line) for line in lines]
+        for part, lines in saved.pop("claims").items()
+    }
+    about = ("date", "device", "jax", "nhjax", "command")
+    return others | claims, {k: x for k, x in saved.items() if k not in about} | data
+
+
 def main() -> None:
     """Print and save the table."""
     parser = argparse.ArgumentParser(description=__doc__)
@@ -69,13 +83,18 @@ def main() -> None:
     parser.add_argument(
         "--only", nargs="+", choices=PARTS, help="these parts; no files"
     )
+    parser.add_argument(
+        "--keep", action="store_true", help="keep the other parts of the saved table"
+    )
     asked = parser.parse_args()
     jax.config.update("jax_enable_x64", True)
     matplotlib.use("Agg")
     parts = asked.only or list(PARTS)
     claims, data, figures = measure(parts, asked.quick)
+    if asked.keep:
+        claims, data = with_saved(claims, data)
     text = table([claim for lines in claims.values() for claim in lines])
-    if asked.quick or asked.only:
+    if asked.quick or (asked.only and not asked.keep):
         print(text)
         return
     data["claims"] = {
