@@ -25,13 +25,13 @@ SIZES = 1e-12, 1e-9, 1e-6, 1e-3
 class Case(NamedTuple):
     """A holonomic constraint, and the coordinate that it determines.
 
-    `constraint` is a function of q. It is linear in the coordinate `index`, with the
+    `constraint` is a function of q. It is linear in the coordinate `place`, with the
     given slope.
     """
 
     constraint: Callable[[Any], Any]
     num_coordinates: int
-    index: int
+    place: int
     slope: float
 
 
@@ -69,8 +69,10 @@ def true_round_off(
     """Find the true round-off of a constraint near a state."""
     errors = []
     for _ in range(9):
-        near = jnp.asarray(q + 0.3 * size * rng.uniform(-1, 1, q.size))
-        errors.append(abs(float(case.constraint(near)) - exact(case, near)))
+        near = q + 0.3 * size * rng.uniform(-1, 1, q.size)
+        errors.append(
+            abs(float(case.constraint(jnp.asarray(near))) - exact(case, near))
+        )
     return max(errors)
 
 
@@ -88,12 +90,12 @@ def count(case: Case, number: int) -> list[dict[str, Any]]:
         refused = dict.fromkeys(UNITS, 0)
         for _ in range(number):
             q = size * rng.uniform(-1, 1, case.num_coordinates)
-            q[case.index] = 0.0
-            q[case.index] -= exact(case, q) / case.slope
+            q[case.place] = 0.0
+            q[case.place] -= exact(case, q) / case.slope
             unit = true_round_off(case, q, size, rng)
             for units in UNITS:
                 moved = q.copy()
-                moved[case.index] += units * unit / case.slope * rng.choice([-1, 1])
+                moved[case.place] += units * unit / case.slope * rng.choice([-1, 1])
                 y = start(jnp.asarray(moved))
                 refused[units] += not bool(jnp.all(jnp.isfinite(y.q)))
         rows.append({"size": size, "number": number, "refused": refused})

@@ -128,14 +128,15 @@ def sides_at(
         (t, jnp.zeros_like(u), u),
         rates,
     )
-    if round_off is None:
-        round_off = _NOISE_UNITS * noise_near(values_at, manifold, t, y.q, u, rate)
+    bound = round_off
+    if bound is None:
+        bound = _NOISE_UNITS * noise_near(values_at, manifold, t, y.q, u, rate)
     y = with_continuous_multiplier(system, stepping.method, t, y, args)
     values = conditions(t, y, args)
     small = float(jnp.finfo(values.dtype).eps) ** 0.5
     # A rate that is infinite, as that of a root, makes nothing zero that is not.
     near = jnp.isfinite(rate) & (jnp.abs(values) <= small * jnp.abs(rate * dt))
-    at_zero = near | ((jnp.abs(values) <= round_off) & ~jnp.isnan(rate))
+    at_zero = near | ((jnp.abs(values) <= bound) & ~jnp.isnan(rate))
     value = jnp.where(at_zero, rate * jnp.sign(dt), values)
     sides = Sides(jnp.sign(value), value, at_zero)
     return jax.lax.stop_gradient((sides, jnp.all(jnp.isfinite(values))))

@@ -1,7 +1,7 @@
 import warnings
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any, Literal
+from typing import Literal
 
 import jax.numpy as jnp
 import numpy as np
@@ -191,7 +191,7 @@ def integrate(
     num_steps = check_num_steps(num_steps, needed_by)
     args = parameters(args)
     state = check_start(system, y0, args)
-    t0, dt, *checks = _times(y0, state, t0, dt, num_steps)
+    t0, dt, checks = _times(y0, state, t0, dt, num_steps)
     events = checked_events(event, saveat, invariants)
     _check_method(method, state, saveat)
     checks += saveat.checks(t0, dt, num_steps)
@@ -260,21 +260,20 @@ def _times(
     t0: FloatScalarLike | None,
     dt: FloatScalarLike,
     num_steps: int | IntScalar,
-) -> tuple[Any, ...]:
+) -> tuple[FloatScalar, FloatScalar, list[Check]]:
     """Return the time of `y0` and the step size as arrays, and the checks of both."""
     dt = real_scalar("dt", dt, state.p.dtype)
     t0 = real_scalar("t0", time_of(y0, t0), state.p.dtype)
     known = dt if is_traced(dt) else np.asarray(dt)
-    return (
-        t0,
-        dt,
+    checks = [
         finite("dt", dt),
         finite("t0", t0),
         Check(known != 0, _zero_step),
         *countable(num_steps),
         *countable_from(y0, num_steps),
         advancing(t0, dt),
-    )
+    ]
+    return t0, dt, checks
 
 
 def _check_method(method: AbstractMethod, y0: State, saveat: SaveAt) -> None:

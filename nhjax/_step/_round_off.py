@@ -36,7 +36,10 @@ class RoundOff(eqx.Module):
     @classmethod
     def of_arrays(cls, arrays: tuple[Array, ...]) -> "RoundOff":
         """Make it from its arrays, in the order of the fields."""
-        return cls(*arrays[:3], arrays[3:])
+        by_velocity, by_force, by_position, *violations = arrays
+        on_velocities, on_positions = violations
+        sizes = by_velocity, by_force, by_position
+        return cls(*sizes, (on_velocities, on_positions))
 
     def size(self, h: FloatScalar) -> FloatScalar:
         """Compute the size in a step of length h > 0."""

@@ -108,8 +108,11 @@ def test_error_estimate_of_hamiltonian_system_is_that_of_the_lagrangian_one():
     )
     q, v = jnp.array([0.4]), jnp.array([0.9])
     estimates = []
-    for system, given in ((lagrangian, {"v": v}), (HAMILTONIAN, {"p": 3 * v})):
-        y0 = nhjax.initial_state(system, q, **given)
+    starts = (
+        (lagrangian, nhjax.initial_state(lagrangian, q, v=v)),
+        (HAMILTONIAN, nhjax.initial_state(HAMILTONIAN, q, p=3 * v)),
+    )
+    for system, y0 in starts:
         sol = nhjax.integrate(system, LobattoIIIAB(3), y0, dt=0.3, num_steps=1)
         estimates.append(float(sol.stats["max_error_estimate"]))
     # The one counts velocities and the other momenta, with a mass of 3.
