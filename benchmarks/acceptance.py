@@ -40,7 +40,7 @@ from nhjax._step._step import equations_of_step
 from nhjax._step._unknowns import Stages
 from nhjax._system import position_scale, violation_scale
 
-from . import _near_rest
+from . import near_rest
 from ._examples import of_the_gallery
 from ._random_systems import random_systems
 from ._report import markdown_table, number, RESULTS, write
@@ -207,7 +207,7 @@ def run(
             )
             return (step_state, alive & (good | other)), (row, alive)
 
-        start = _near_rest.first_arguments(system, method, y0, h)
+        start = near_rest.first_arguments(system, method, y0, h)
         steps = jnp.arange(num_steps, dtype=h.dtype)
         carry = start.step_state, jnp.asarray(True)
         _, rows = jax.lax.scan(advance, carry, steps)
@@ -228,7 +228,7 @@ def single_steps(
     solvers = nhjax.SimplifiedNewton(), nhjax.Newton()
 
     def one(start):
-        arguments = _near_rest.first_arguments(system, method, *start)
+        arguments = near_rest.first_arguments(system, method, *start)
         stages = equations_of_step(arguments, method)
         first, second = (step(arguments, method, solver, go_on) for solver in solvers)
         return Row(judge(stages, first), judge(stages, second), apart(first, second))
@@ -355,20 +355,11 @@ def main() -> None:
         action="store_true",
         help="keep the rows of the saved table that are not measured now",
     )
-    parser.add_argument(
-        "--near-rest",
-        action="store_true",
-        help="judge steps of all systems near rest, in 50 digits, instead",
-    )
-    parser.add_argument("--judged", type=int, default=2, help="steps, near rest")
     options = parser.parse_args()
     jax.config.update("jax_enable_x64", True)
     # The programs run for seconds and would be optimised for minutes.
     jax.config.update("jax_disable_most_optimizations", True)
     wanted = options.systems or [""]
-    if options.near_rest:
-        judge_near_rest(wanted, options.stages, options.judged)
-        return
     makers = {
         name: make
         for name, make in (gallery() | random_systems()).items()
@@ -388,18 +379,6 @@ def main() -> None:
                 data.append(measure_starts(name, stages, options.starts))
                 print(data[-1], flush=True)
     save(with_saved(data) if options.keep else data)
-
-
-def judge_near_rest(wanted: list[str], stages: list[int], most: int) -> None:
-    """Judge steps near rest of all systems whose names contain what is wanted."""
-    rows = []
-    for name, make in _near_rest.examples().items():
-        for s in stages if any(part in name for part in wanted) else []:
-            for row in _near_rest.near_rest(name, s, make, most):
-                rows.append(row)
-                print(json.dumps(row), flush=True)
-            jax.clear_caches()
-    _near_rest.save(rows)
 
 
 def save(data: list[dict]) -> None:

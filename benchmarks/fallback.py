@@ -18,8 +18,8 @@ import numpy as np
 
 import nhjax
 
-from ._near_rest import examples
 from ._report import markdown_table, number, write
+from .near_rest import examples
 
 
 NUM_STEPS, DT, REPEATS = 200, 1e-3, 5

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 import nhjax
+from benchmarks import near_rest
 from benchmarks._random_systems import random_systems
 from benchmarks.acceptance import ALLOWED, gallery, measure, measure_starts, SAME
 from nhjax import RESULTS
@@ -213,3 +214,15 @@ def test_no_start_leads_to_an_unsolved_step(name):
         assert figures[f"{solver} accepted"] > 300
         assert figures[f"{solver} accepted"] < 1500
         assert figures[f"{solver} residual"] <= ALLOWED
+
+
+@pytest.mark.parametrize(
+    ("name", "stages"),
+    [("KnifeEdge", 2), long("Appell", 3), long("SphericalPendulum", 4)],
+)
+def test_steps_near_rest_are_neither_refused_nor_accepted_wrongly(name, stages):
+    rows = list(near_rest.near_rest(name, stages, near_rest.examples()[name], 1))
+    assert sum(row["accepted"] for row in rows) > 100
+    assert sum(row["accepted judged"] for row in rows) > 0
+    for row in rows:
+        assert row["wrongly accepted"] == row["wrongly refused"] == 0, row

@@ -15,8 +15,12 @@ whose distance is at most `SOLVED` times the noise should have been accepted. An
 accepted one whose distance is more than `WRONG` times the noise should have been
 refused. Where the noise is more than `DETERMINED` of the velocities, as with iterates
 that ran away, a refusal is never wrong.
+
+    python -m benchmarks.near_rest
 """
 
+import argparse
+import json
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from typing import Any, NamedTuple
@@ -44,7 +48,7 @@ from nhjax._system import function_noise
 from nhjax.systems._base import AbstractExample
 
 from ._high_precision import evaluate, to_float
-from ._report import markdown_table, number, write
+from ._report import markdown_table, number, RESULTS, write
 
 
 SCALES = 1e-8, 1e-6, 1e-4, 1e-2, 1.0
@@ -293,4 +297,43 @@ def save(rows: list[dict[str, Any]]) -> None:
     text = "\n\n".join([(__doc__ or "").strip(), summary])
     text += "\n\n" + markdown_table(["system", *COLUMNS], cells)
     title = "Are steps near rest judged rightly?"
-    write("acceptance_near_rest", title, text, {"rows": rows})
+    write("near_rest", title, text, {"rows": rows})
+
+
+def with_saved(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Put the rows after those of the saved table of other systems or stages."""
+    measured = {(row["system"], row["stages"]) for row in rows}
+    saved = json.loads((RESULTS / "near_rest.json").read_text())["rows"]
+    others = [row for row in saved if (row["system"], row["stages"]) not in measured]
+    return others + rows
+
+
+def main() -> None:
+    """Print and save the table."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--systems", nargs="+", help="names of systems")
+    parser.add_argument("--stages", type=int, nargs="+", default=[2, 3, 4, 5, 6])
+    parser.add_argument("--judged", type=int, default=1, help="steps of each kind")
+    parser.add_argument(
+        "--keep",
+        action="store_true",
+        help="keep the rows of the saved table that are not measured now",
+    )
+    options = parser.parse_args()
+    jax.config.update("jax_enable_x64", True)
+    # The programs run for seconds and would be optimised for minutes.
+    jax.config.update("jax_disable_most_optimizations", True)
+    rows: list[dict[str, Any]] = []
+    for name, make in examples().items():
+        for s in options.stages:
+            if options.systems and name not in options.systems:
+                continue
+            for row in near_rest(name, s, make, options.judged):
+                rows.append(row)
+                print(json.dumps(row), flush=True)
+            jax.clear_caches()
+    save(with_saved(rows) if options.keep else rows)
+
+
+if __name__ == "__main__":
+    main()
