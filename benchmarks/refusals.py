@@ -7,6 +7,7 @@ them rounded, and along the group), in v, and in v at rest. None may be refused 
 """
 
 import argparse
+import json
 import logging
 from collections.abc import Callable, Iterator
 from typing import Any
@@ -20,11 +21,12 @@ from nhjax import systems
 from nhjax.systems._base import AbstractExample
 
 from . import _refusals_near_zero
-from ._report import markdown_table, write
+from ._report import markdown_table, RESULTS, write
 
 
 OFFSETS = (0.0, *(10.0**k for k in range(-16, -1)))
 LARGEST_THAT_MUST_PASS = 1e-4
+KEPT = "directions", "offsets", "rounded_unit_vectors_refused", "rows"
 
 
 def examples() -> Iterator[AbstractExample]:
@@ -123,74 +125,99 @@ def rounded_unit_vectors(number: int) -> int:
     )
 
 
-def main() -> None:
-    """Print and save the tables."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--directions", type=int, default=50)
-    options = parser.parse_args()
-    jax.config.update("jax_enable_x64", True)
-    # Each refusal would be a line.
-    logging.getLogger("jax._src.callback").disabled = True
-    rows, data, worst = [], [], 0
+def near_constraints(directions: int) -> dict[str, Any]:
+    """Count refusals of all systems of the gallery, and of rounded unit vectors."""
+    rows = []
     for example in examples():
         name = type(example).__name__
         for dtype in (jnp.float64, jnp.float32):
-            table = count(example, dtype, options.directions)
+            table = count(example, dtype, directions)
             for kind, counts in table.items():
-                below = [
-                    x
-                    for offset, x in zip(OFFSETS, counts, strict=True)
-                    if offset <= LARGEST_THAT_MUST_PASS
-                ]
-                worst = max(worst, *below)
-                rows.append([name, dtype.__name__, kind, *map(str, counts)])
-                data.append(
-                    {
-                        "system": name,
-                        "dtype": dtype.__name__,
-                        "disturbed": kind,
-                        "refused": counts,
-                    }
-                )
-                print(*rows[-1], sep="\t", flush=True)
+                about = {"system": name, "dtype": dtype.__name__, "disturbed": kind}
+                rows.append(about | {"refused": counts})
+                print(rows[-1], flush=True)
         jax.clear_caches()
-    near_zero, near_rows = [], []
-    for name, case in _refusals_near_zero.CASES.items():
-        for row in _refusals_near_zero.count(case, options.directions):
-            near_zero.append({"constraint": name} | row)
-            counts = map(str, row["refused"].values())
-            near_rows.append([name, f"{row['size']:.0e}", *counts])
-            print(*near_rows[-1], sep="\t", flush=True)
-    rounded = rounded_unit_vectors(1000)
-    header = ["system", "dtype", "disturbed", *(f"{x:.0e}" for x in OFFSETS)]
-    text = (
-        f"Refused of {options.directions}, by offset. At most {worst} below 1e-3. Of "
-        f"1000 unit vectors rounded to ten digits {rounded} are refused.\n\n"
-        + markdown_table(header, rows)
-        + "\n\n"
-        + (_refusals_near_zero.__doc__ or "").strip()
-        + f" Refused of {options.directions}:\n\n"
-        + markdown_table(
+    return {
+        "directions": directions,
+        "offsets": OFFSETS,
+        "rounded_unit_vectors_refused": rounded_unit_vectors(1000),
+        "rows": rows,
+    }
+
+
+def near_zero(directions: int) -> list[dict[str, Any]]:
+    """Count refusals of states near zero."""
+    return [
+        {"constraint": name} | row
+        for name, case in _refusals_near_zero.CASES.items()
+        for row in _refusals_near_zero.count(case, directions)
+    ]
+
+
+def report(data: dict[str, Any]) -> str:
+    """Write both tables."""
+    worst = max(
+        x
+        for row in data["rows"]
+        for offset, x in zip(OFFSETS, row["refused"], strict=True)
+        if offset <= LARGEST_THAT_MUST_PASS
+    )
+    tables = [
+        markdown_table(
+            ["system", "dtype", "disturbed", *(f"{x:.0e}" for x in OFFSETS)],
+            [
+                [row["system"], row["dtype"], row["disturbed"]]
+                + [str(x) for x in row["refused"]]
+                for row in data["rows"]
+            ],
+        ),
+        markdown_table(
             [
                 "constraint",
                 "size of q",
                 *(f"{k} units" for k in _refusals_near_zero.UNITS),
             ],
-            near_rows,
-        )
+            [
+                [row["constraint"], f"{row['size']:.0e}"]
+                + [str(x) for x in row["refused"].values()]
+                for row in data["near_zero"]
+            ],
+        ),
+    ]
+    number = data["near_zero"][0]["number"]
+    return "\n\n".join(
+        [
+            f"Refused of {data['directions']}, by offset. At most {worst} below 1e-3. "
+            "Of 1000 unit vectors rounded to ten digits "
+            f"{data['rounded_unit_vectors_refused']} are refused.",
+            tables[0],
+            f"{(_refusals_near_zero.__doc__ or '').strip()} Refused of {number}:",
+            tables[1],
+        ]
     )
-    write(
-        "refusals",
-        "States near the constraints that are refused",
-        text,
-        {
-            "directions": options.directions,
-            "offsets": OFFSETS,
-            "rounded_unit_vectors_refused": rounded,
-            "rows": data,
-            "near_zero": near_zero,
-        },
+
+
+def main() -> None:
+    """Print and save the tables."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--directions", type=int, default=50)
+    parser.add_argument(
+        "--near-zero",
+        action="store_true",
+        help="measure states near zero alone, and keep the rest of the saved tables",
     )
+    options = parser.parse_args()
+    jax.config.update("jax_enable_x64", True)
+    # Each refusal would be a line.
+    logging.getLogger("jax._src.callback").disabled = True
+    if options.near_zero:
+        data = json.loads((RESULTS / "refusals.json").read_text(encoding="utf-8"))
+        data = {k: data[k] for k in KEPT}
+    else:
+        data = near_constraints(options.directions)
+    data["near_zero"] = near_zero(options.directions)
+    title = "States near the constraints that are refused"
+    write("refusals", title, report(data), data)
 
 
 if __name__ == "__main__":
