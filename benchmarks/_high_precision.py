@@ -49,6 +49,8 @@ _ONE = {
     "square": lambda x: x * x,
     "abs": lambda x: abs(x),
     "sign": lambda x: _MP.sign(x),
+    "round": lambda x: _MP.nint(x),
+    "floor": lambda x: _MP.floor(x),
 }
 _TWO = {
     "add": lambda x, y: x + y,
