@@ -1,8 +1,7 @@
 """Functions of JAX evaluated in 50 digits, by an interpreter of their programs.
 
-Arrays of floating-point numbers become arrays of mpmath's numbers. What moves numbers
-without changing them, such as a transposition, is done by JAX itself, on the indices of
-the numbers.
+Arrays of floating-point numbers become arrays of mpmath's numbers. Operations that only
+move numbers, such as a transposition, are done by JAX on the indices of the numbers.
 """
 
 import math
@@ -244,7 +243,7 @@ def _dot_general(a: np.ndarray, b: np.ndarray, numbers: Any) -> np.ndarray:
     b = np.moveaxis(b, batch_b, range(len(batch_b)))
 
     def moved(axis: int, batch: tuple[int, ...]) -> int:
-        """Find where an axis lies once those of the batch are the first."""
+        """Find the index of an axis after the batch axes have moved to the front."""
         return len(batch) + axis - sum(other < axis for other in batch)
 
     k = len(batch_a)

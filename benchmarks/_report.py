@@ -56,3 +56,11 @@ def write(name: str, title: str, text: str, data: dict[str, Any]) -> None:
     (RESULTS / f"{name}.json").write_text(
         json.dumps(_finite(about | data), indent=1, allow_nan=False) + "\n"
     )
+
+
+def with_saved(name: str, rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Add rows to a saved table, in place of those of the same system and stages."""
+    measured = {(row["system"], row["stages"]) for row in rows}
+    saved = json.loads((RESULTS / f"{name}.json").read_text())["rows"]
+    others = [row for row in saved if (row["system"], row["stages"]) not in measured]
+    return others + rows

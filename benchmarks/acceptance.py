@@ -17,7 +17,6 @@ count by what they do in a step: |u̇| is at least |u| / h.
 """
 
 import argparse
-import json
 from collections.abc import Callable
 from dataclasses import replace
 from typing import NamedTuple
@@ -43,7 +42,7 @@ from nhjax._system import position_scale, violation_scale
 from . import near_rest
 from ._examples import of_the_gallery
 from ._random_systems import random_systems
-from ._report import markdown_table, number, RESULTS, write
+from ._report import markdown_table, number, with_saved, write
 
 
 SMALLEST, LARGEST, SIZES = 0.004, 4.0, 10
@@ -378,7 +377,7 @@ def main() -> None:
             for stages in options.stages:
                 data.append(measure_starts(name, stages, options.starts))
                 print(data[-1], flush=True)
-    save(with_saved(data) if options.keep else data)
+    save(with_saved("acceptance", data) if options.keep else data)
 
 
 def save(data: list[dict]) -> None:
@@ -392,14 +391,6 @@ def save(data: list[dict]) -> None:
     text = "\n\n".join([(__doc__ or "").strip(), summary(data)])
     text += "\n\n" + markdown_table(header, rows)
     write("acceptance", "Are accepted steps solved?", text, {"rows": data})
-
-
-def with_saved(data: list[dict]) -> list[dict]:
-    """The rows, after those of the saved table of other systems or stages."""
-    measured = {(row["system"], row["stages"]) for row in data}
-    saved = json.loads((RESULTS / "acceptance.json").read_text())["rows"]
-    others = [row for row in saved if (row["system"], row["stages"]) not in measured]
-    return others + data
 
 
 def summary(data: list[dict]) -> str:

@@ -1,4 +1,4 @@
-"""What it costs to have Newton's method at hand for steps that need it.
+"""The cost of `SimplifiedNewton(fallback=True)` where the fallback is never used.
 
 Each system of the gallery is run with three stages, once with
 `SimplifiedNewton(fallback=False)` and once with `fallback=True`, in steps that the

@@ -48,7 +48,7 @@ from nhjax._system import function_noise
 from nhjax.systems._base import AbstractExample
 
 from ._high_precision import evaluate, to_float
-from ._report import markdown_table, number, RESULTS, write
+from ._report import markdown_table, number, with_saved, write
 
 
 SCALES = 1e-8, 1e-6, 1e-4, 1e-2, 1.0
@@ -268,7 +268,7 @@ COLUMNS = {
 
 
 def save(rows: list[dict[str, Any]]) -> None:
-    """Print and save the table of all rows, those of one system and stages together."""
+    """Print and save the table of all rows."""
     cells = [
         [row["system"]]
         + [
@@ -300,14 +300,6 @@ def save(rows: list[dict[str, Any]]) -> None:
     write("near_rest", title, text, {"rows": rows})
 
 
-def with_saved(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Put the rows after those of the saved table of other systems or stages."""
-    measured = {(row["system"], row["stages"]) for row in rows}
-    saved = json.loads((RESULTS / "near_rest.json").read_text())["rows"]
-    others = [row for row in saved if (row["system"], row["stages"]) not in measured]
-    return others + rows
-
-
 def main() -> None:
     """Print and save the table."""
     parser = argparse.ArgumentParser(description=__doc__)
@@ -332,7 +324,7 @@ def main() -> None:
                 rows.append(row)
                 print(json.dumps(row), flush=True)
             jax.clear_caches()
-    save(with_saved(rows) if options.keep else rows)
+    save(with_saved("near_rest", rows) if options.keep else rows)
 
 
 if __name__ == "__main__":

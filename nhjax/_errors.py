@@ -105,7 +105,7 @@ _ADVICE = (
         "in place of `if`, and `jnp.maximum`, `jnp.minimum` in place of `max`, `min`.",
     ),
     (jax.errors.TracerArrayConversionError, _NUMPY),
-    # What is raised for the functions of `math`, which ask for a number.
+    # The functions of `math` ask for a number, which raises this.
     (jax.errors.ConcretizationTypeError, _NUMPY),
 )
 

@@ -10,7 +10,7 @@ from jaxtyping import Array, Bool, Float
 from .._custom_types import Args, BoolScalar, FloatScalar
 from .._errors import DTypeError, naming, ShapeError
 from .._method import AbstractMethod
-from .._numerics import ClosureConverted
+from .._numerics import ClosureConverted, NOISE_DEVIATIONS
 from .._step import StepState
 from .._system import AbstractMechanicalSystem, linearise, noise_near, State
 from ._event import Event
@@ -94,10 +94,6 @@ def with_continuous_multiplier(
     return State(y.q, y.v, y.p, lin.multiplier)
 
 
-# A condition is not told from zero up to so many standard deviations of its round-off.
-_NOISE_UNITS = 100
-
-
 def sides_at(
     conditions: Conditions,
     stepping: Stepping,
@@ -130,7 +126,7 @@ def sides_at(
     )
     bound = round_off
     if bound is None:
-        bound = _NOISE_UNITS * noise_near(values_at, manifold, t, y.q, u, rate)
+        bound = NOISE_DEVIATIONS * noise_near(values_at, manifold, t, y.q, u, rate)
     y = with_continuous_multiplier(system, stepping.method, t, y, args)
     values = conditions(t, y, args)
     small = float(jnp.finfo(values.dtype).eps) ** 0.5

@@ -142,10 +142,10 @@ class AbstractMethod(eqx.Module):
     def embedded_difference(self) -> np.ndarray | None:
         """Return b less the weights of a quadrature that leaves out the last node.
 
-        These are multiples of a divided difference over all nodes: a quadrature with
-        them vanishes for polynomials of a degree less than s - 1, and measures by what
-        the nodes resolve a function. Of nodes that coincide the first counts. None if
-        there is but one node.
+        These weights are a multiple of the divided difference over all nodes. A
+        quadrature with them is zero for polynomials of a degree less than s - 1, so
+        that it shows how well the nodes resolve a function. Where nodes coincide, only
+        the first of them has a weight. None if there is but one node.
         """
         nodes, first = np.unique(self.c, return_index=True)
         if len(nodes) == 1:

@@ -52,7 +52,10 @@ from ._no_gradient import (
     nan_gradient_unless as nan_gradient_unless,
     nan_tangent_unless as nan_tangent_unless,
 )
-from ._noise import measured_noise as measured_noise
+from ._noise import (
+    measured_noise as measured_noise,
+    NOISE_DEVIATIONS as NOISE_DEVIATIONS,
+)
 from ._rank import (
     dependent_rows as dependent_rows,
     is_deficient as is_deficient,

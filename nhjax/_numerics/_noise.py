@@ -9,13 +9,17 @@ import numpy as np
 from jaxtyping import Array, Float, PyTree
 
 
+# A value is not told from round-off up to so many standard deviations of its noise.
+NOISE_DEVIATIONS = 100
+
 # The points of one difference lie on a ray that starts at the point of interest.
 _NUM_POINTS = 6
 # Distances of neighbouring points, as powers of the unit round-off, smallest first.
 _DISTANCES = 0.85, 0.68, 0.5
 # Two rays for each distance, since one difference may be small by chance.
 _NUM_RAYS = 2
-# Of a smooth function the fifth difference is a smaller part than this of the fourth.
+# A function counts as smooth if its fifth difference is less than this part of the
+# fourth.
 _SMOOTH = 1 / 30
 
 

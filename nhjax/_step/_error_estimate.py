@@ -56,8 +56,8 @@ def error_ratios(
     whole = max_norm(*change(stages.coefficients("b"))) + floor
     moved, gained = change(jnp.asarray(difference, u.dtype))
     if stages.constrained:
-        # What violates the constraints is no error of the step, which satisfies them:
-        # multipliers of single stages may be wrong where their sum is right.
+        # The part that violates the constraints is left out, since the step satisfies
+        # them: multipliers of single stages may be wrong where their sum is right.
         excess = matvec(lin.compliance_inverse, matvec(lin.jacobian, gained))
         gained = gained - matvec(lin.reaction, excess)
     return relative(jnp.stack([max_norm(moved), max_norm(gained)]), whole)

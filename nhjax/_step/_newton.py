@@ -255,16 +255,16 @@ class Newton(AbstractStageSolver):
             z, _ = ravel_pytree(x)
             jacobian, r, evaluation = jacobian_and_value(residual, z)
             change = stage_residual(moved, x)[0] - r
-            # What the Jacobian misses of a change by a few units of the last digits is
-            # the round-off of the equations.
+            # After a change by a few units of the last digits the equations differ from
+            # what the Jacobian predicts by their round-off.
             near = z + 8 * eps * uneven_perturbations(z)
             missed = residual(near)[0] - r - jacobian @ (near - z)
             rights = jnp.stack([r, change, missed], axis=1)
             dz, *noises = jnp.linalg.solve(jacobian, -rights).T
             x_next = unravel(z + dz)
-            # The first is how far round-off of the positions moves the stages, which
-            # stiff forces magnify; the second how far that of the equations does, where
-            # they are nearly dependent.
+            # Two effects move the stages: the round-off of the positions, magnified by
+            # stiff forces, and that of the equations, magnified where these are nearly
+            # dependent.
             by_positions, by_equations = (
                 increment_size(stages, x, unravel(z + noise), lin) for noise in noises
             )

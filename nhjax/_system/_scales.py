@@ -9,14 +9,17 @@ from jaxtyping import Array, Float, PyTree
 
 from .._custom_types import Args, BoolScalar, FloatScalar, FloatScalarLike
 from .._manifold import AbstractLieGroup
-from .._numerics import frozen, max_norm, measured_noise, SparseMatrix, unit
+from .._numerics import (
+    frozen,
+    max_norm,
+    measured_noise,
+    NOISE_DEVIATIONS,
+    SparseMatrix,
+    unit,
+)
 from ._abstract import AbstractMechanicalSystem
 from ._linearisation import Linearisation
 from ._state import State
-
-
-# A violation is not told from round-off up to so many standard deviations of it.
-_NOISE_UNITS = 100
 
 
 def violation_scale(
@@ -135,7 +138,9 @@ class FunctionNoise(NamedTuple):
     @property
     def violations(self) -> tuple[Float[Array, " l"], Float[Array, " k"]]:
         """Bound violations of velocity and position constraints that are round-off."""
-        return _NOISE_UNITS * self.on_velocities, _NOISE_UNITS * self.on_positions
+        parts = self.on_velocities, self.on_positions
+        on_velocities, on_positions = (NOISE_DEVIATIONS * x for x in parts)
+        return on_velocities, on_positions
 
 
 def function_noise(
