@@ -67,8 +67,8 @@ def pendulum() -> tuple[nhjax.LagrangianSystem, nhjax.State]:
     return system, nhjax.initial_state(system, *start)
 
 
-def rolling() -> tuple[nhjax.LagrangianSystem, nhjax.State]:
-    """A mass that depends on q, with a constraint that is quadratic in velocities."""
+def rolling(quadratic: float = 0.2) -> tuple[nhjax.LagrangianSystem, nhjax.State]:
+    """A mass that depends on q; the constraint has a term that is quadratic in v."""
 
     def lagrangian(t, q, v, args):
         return (
@@ -77,12 +77,10 @@ def rolling() -> tuple[nhjax.LagrangianSystem, nhjax.State]:
             - 0.5 * q @ q
         )
 
-    system = nhjax.LagrangianSystem(
-        lagrangian,
-        nonholonomic=lambda t, q, v, args: (v[2] - q[1] * v[0] - 0.2 * v[0] * v[1])[
-            None
-        ],
-    )
+    def constraint(t, q, v, args):
+        return (v[2] - q[1] * v[0] - quadratic * v[0] * v[1])[None]
+
+    system = nhjax.LagrangianSystem(lagrangian, nonholonomic=constraint)
     start = jnp.array([0.5, 0.4, -0.3]), jnp.array([0.7, -0.6, 0.2])
     return system, nhjax.initial_state(system, *start, project=True)
 

@@ -9,10 +9,15 @@ import pytest
 
 from benchmarks import _baselines as baselines
 from benchmarks._report import RESULTS
+from benchmarks._tableaux import rolling
 from benchmarks._verdicts._claim import Claim
 from benchmarks._verdicts._errata import stability_at_infinity
 from benchmarks._verdicts._growth import Curve, growth, in_stretches
-from benchmarks._verdicts._orders import BASELINE_ORDERS, baseline_orders
+from benchmarks._verdicts._orders import (
+    BASELINE_ORDERS,
+    baseline_orders,
+    orders_from_wrong_multiplier,
+)
 from benchmarks._verdicts._ours import distances
 from benchmarks.verdicts import DOCS, filled, PAGE, table
 from nhjax import systems
@@ -24,6 +29,16 @@ def test_methods_of_others_have_their_orders():
     np.testing.assert_allclose(
         list(orders.values()), list(BASELINE_ORDERS.values()), atol=0.1
     )
+
+
+@pytest.mark.parametrize(
+    ("closure", "expected"), [("propagated", (2, 2)), ("symmetric", (4, 6))]
+)
+def test_order_from_wrong_multiplier_falls_to_two_where_it_is_propagated(
+    closure, expected
+):
+    found = orders_from_wrong_multiplier(*rolling(), (3, 4), closure)
+    np.testing.assert_allclose(found, expected, atol=0.05)
 
 
 def test_leapfrog_satisfies_the_discrete_lagrange_dalembert_equations():

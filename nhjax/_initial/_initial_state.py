@@ -59,8 +59,8 @@ def initial_state(
     Of velocity and momentum one is given, and the other follows by the Legendre
     transform p = D2L or v = D2H. The multiplier is that of the continuous problem,
     which follows from the hidden constraints: dΦ/dt = 0 of nonholonomic constraints and
-    d²Γ/dt² = 0 of holonomic ones. An inconsistent λ_0 would lower the order of the
-    method (paper, section 4).
+    d²Γ/dt² = 0 of holonomic ones. From an inconsistent λ_0 the order of a method with
+    the closure `"propagated"` falls, in general to 2 for any number of stages.
 
     **Arguments:**
 
