@@ -1,7 +1,10 @@
-"""The function that XLA calls, as text of LLVM IR: it runs a kernel on all members.
+"""The functions that XLA calls, as text of LLVM IR: they run kernels on all members.
 
 A handler of XLA's typed foreign function interface answers a query about itself, or
-computes results from operands. How the work is shared among threads is in `_pool`.
+computes results from operands. Each program has a handler of its own, which only passes
+a description of the program to `@nhjax.handle`. That function and all that it calls are
+the same for all programs, so that they are compiled once in a process: compiling them
+with each program took 20 to 50 ms. How the work is shared among threads is in `_pool`.
 """
 
 import time
@@ -18,11 +21,11 @@ from ._ffi_structs import (
     STRUCTS,
     type_definitions,
 )
-from ._pool import JOB, job_field, pool_ir, WORKERS
+from ._pool import JOB, job_field, POOL, PROGRAM, program_field, WORKERS
 
 
-# The handler's name in the module.
-HANDLER = "nhjax.handler"
+# The name of the handler of a program, and of the function that it calls.
+HANDLER, HANDLE = "nhjax.handler", "nhjax.handle"
 
 # The time of a block, in ns, as long as none has been run: long enough for as many
 # helpers as there are. Longer times are taken for this one, so that products with it do
@@ -35,6 +38,8 @@ def handler_ir(
 ) -> str:
     """Return the text of a module: the handler of the function `@kernel` of another.
 
+    It refers to the function `HANDLE` of the module `handle_ir()`.
+
     **Arguments:**
 
     - `num_operands`, `num_results`: how many arrays the kernel reads and writes.
@@ -42,28 +47,47 @@ def handler_ir(
     - `is_batched`: whether the results have members, along the leading axis; else there
         is one. A program without results has nothing to do.
     """
+    values = {
+        "kernel": "@kernel",
+        "num_operands": num_operands,
+        "num_results": num_results,
+        "width": width,
+        "is_batched": int(is_batched),
+        "block_time": _LONG,
+    }
+    fields = ", ".join(f"{PROGRAM[name]} {value}" for name, value in values.items())
+    return f"""
+{type_definitions({"Program": PROGRAM})}
+declare i1 @kernel(ptr, ptr, i64, i64)
+declare ptr @{HANDLE}(ptr, ptr)
+@nhjax.program = internal global %Program {{ {fields} }}
+define ptr @{HANDLER}(ptr %frame) {{
+  %error = call ptr @{HANDLE}(ptr %frame, ptr @nhjax.program)
+  ret ptr %error
+}}
+"""
+
+
+def handle_ir() -> str:
+    """Return the text of the module of `HANDLE`, which serves all programs."""
     parts = [
-        type_definitions({**STRUCTS, "Job": JOB}),
+        type_definitions({**STRUCTS, "Program": PROGRAM, "Job": JOB}),
         _DECLARATIONS,
         ERRORS,
         _METADATA,
-        pool_ir(width),
-        _members(num_results, is_batched),
+        POOL,
+        _MEMBERS,
         _CALL,
         _OUTCOME,
-        _execution(num_operands, num_results, width),
-        _ENTRY,
+        _EXECUTE,
+        _HANDLE,
     ]
     return "\n".join(parts)
 
 
 _DECLARATIONS = f"""
-declare i1 @kernel(ptr, ptr, i64, i64)
 declare ptr @malloc(i64)
 declare i32 @clock_gettime(i32, ptr)
-
-; How long the first block of the last call took.
-@nhjax.block_time = internal global i64 {_LONG}
 
 ; The time in ns, from some moment on.
 define internal i64 @nhjax.clock() {{
@@ -120,16 +144,24 @@ define internal void @nhjax.answer(ptr %extension) {{
 """
 
 
-def _members(num_results: int, is_batched: bool) -> str:
-    """Return the function that tells the number of members from the first result."""
-    if num_results == 0 or not is_batched:
-        return f"""
-define internal i64 @nhjax.members(ptr %rets) {{
-  ret i64 {1 if num_results else 0}
-}}
-"""
-    return f"""
-define internal i64 @nhjax.members(ptr %rets) {{
+_MEMBERS = f"""
+; The number of members: none without results, one where they are not batched, otherwise
+; the leading dimension of the first result.
+define internal i64 @nhjax.members(ptr %program, ptr %rets) {{
+  %num_results_at = {program_field("num_results")}
+  %num_results = load i64, ptr %num_results_at
+  %is_batched_at = {program_field("is_batched")}
+  %is_batched = load i64, ptr %is_batched_at
+  %is_empty = icmp eq i64 %num_results, 0
+  br i1 %is_empty, label %none, label %some
+none:
+  ret i64 0
+some:
+  %is_single = icmp eq i64 %is_batched, 0
+  br i1 %is_single, label %single, label %batch
+single:
+  ret i64 1
+batch:
   %result = load ptr, ptr %rets
   %dims_at = {field("%result", "XLA_FFI_Buffer", "dims")}
   %dims = load ptr, ptr %dims_at
@@ -144,11 +176,14 @@ _CALL = f"""
 ; guessed before it how many helpers are worth asking for, and if these were none and
 ; the block took longer, the guess is made again.
 define internal void @nhjax.call(ptr %frame, ptr %job) {{
+  %program_at = {job_field("program")}
+  %program = load ptr, ptr %program_at
+  %block_time_at = {program_field("block_time")}
   %blocks_at = {job_field("blocks")}
   %blocks = load i64, ptr %blocks_at
   atomicrmw add ptr @{WORKERS}, i64 1 monotonic
   %after_one = sub i64 %blocks, 1
-  %guess = load atomic i64, ptr @nhjax.block_time monotonic, align 8
+  %guess = load atomic i64, ptr %block_time_at monotonic, align 8
   %early = call i64 @nhjax.wanted(
     ptr %frame, ptr %job, i64 %after_one, i64 %guess)
   call void @nhjax.ask(ptr %frame, ptr %job, i64 %early)
@@ -162,7 +197,7 @@ first:
   %stop = call i64 @nhjax.clock()
   %elapsed = sub i64 %stop, %start
   %time = call i64 @llvm.umin.i64(i64 %elapsed, i64 {_LONG})
-  store atomic i64 %time, ptr @nhjax.block_time monotonic, align 8
+  store atomic i64 %time, ptr %block_time_at monotonic, align 8
   %is_alone = icmp eq i64 %early, 0
   %are_more = icmp ugt i64 %after_one, 1
   %is_asked_again = and i1 %is_alone, %are_more
@@ -203,8 +238,9 @@ lacking:
 
 
 _FRAME = "XLA_FFI_CallFrame"
-_ENTRY = f"""
-define ptr @{HANDLER}(ptr %frame) {{
+_HANDLE = f"""
+; Answer a call by XLA of the handler of a program.
+define ptr @{HANDLE}(ptr %frame, ptr %program) {{
   %extension_at = {field("%frame", _FRAME, "extension_start")}
   %extension = load ptr, ptr %extension_at
   %is_plain = icmp eq ptr %extension, null
@@ -218,22 +254,25 @@ query:
   call void @nhjax.answer(ptr %extension)
   ret ptr null
 execute:
-  %error = call ptr @nhjax.execute(ptr %frame)
+  %error = call ptr @nhjax.execute(ptr %frame, ptr %program)
   ret ptr %error
 }}
 """
 
 
-def _execution(num_operands: int, num_results: int, width: int) -> str:
-    """Return the function that computes results, which begins with its checks."""
-    return f"""
-define internal ptr @nhjax.execute(ptr %frame) {{
+_EXECUTE = f"""
+; Compute the results of a program, after checks.
+define internal ptr @nhjax.execute(ptr %frame, ptr %program) {{
   %num_operands_at = {field("%frame", _FRAME, "args", "size")}
   %num_operands = load i64, ptr %num_operands_at
   %num_results_at = {field("%frame", _FRAME, "rets", "size")}
   %num_results = load i64, ptr %num_results_at
-  %is_right_in = icmp eq i64 %num_operands, {num_operands}
-  %is_right_out = icmp eq i64 %num_results, {num_results}
+  %operands_expected_at = {program_field("num_operands")}
+  %operands_expected = load i64, ptr %operands_expected_at
+  %results_expected_at = {program_field("num_results")}
+  %results_expected = load i64, ptr %results_expected_at
+  %is_right_in = icmp eq i64 %num_operands, %operands_expected
+  %is_right_out = icmp eq i64 %num_results, %results_expected
   %is_right = and i1 %is_right_in, %is_right_out
   br i1 %is_right, label %measure, label %mismatch
 mismatch:
@@ -245,15 +284,15 @@ measure:
   %args = load ptr, ptr %args_at
   %rets_at = {field("%frame", _FRAME, "rets", "rets")}
   %rets = load ptr, ptr %rets_at
-  %members = call i64 @nhjax.members(ptr %rets)
+  %members = call i64 @nhjax.members(ptr %program, ptr %rets)
   %is_empty = icmp eq i64 %members, 0
   br i1 %is_empty, label %done, label %prepare
 prepare:
   ; Helpers read these addresses only within a block, for which the caller waits.
-  %operands = alloca [{max(num_operands, 1)} x ptr]
-  call void @nhjax.gather(ptr %args, i64 {num_operands}, ptr %operands)
-  %results = alloca [{max(num_results, 1)} x ptr]
-  call void @nhjax.gather(ptr %rets, i64 {num_results}, ptr %results)
+  %operands = alloca ptr, i64 %num_operands
+  call void @nhjax.gather(ptr %args, i64 %num_operands, ptr %operands)
+  %results = alloca ptr, i64 %num_results
+  call void @nhjax.gather(ptr %rets, i64 %num_results, ptr %results)
   %job = call ptr @malloc(i64 {size_of("Job")})
   %is_lacking = icmp eq ptr %job, null
   br i1 %is_lacking, label %lacking, label %run
@@ -262,10 +301,14 @@ lacking:
     ptr %frame, ptr @{NO_MEMORY}, i32 {RESOURCE_EXHAUSTED})
   ret ptr %no_memory
 run:
+  %width_at = {program_field("width")}
+  %width = load i64, ptr %width_at
   %before = sub i64 %members, 1
-  %before_last = udiv i64 %before, {width}
+  %before_last = udiv i64 %before, %width
   %blocks = add i64 %before_last, 1
   store %Job zeroinitializer, ptr %job
+  %program_at = {job_field("program")}
+  store ptr %program, ptr %program_at
   %holders_at = {job_field("holders")}
   store i64 1, ptr %holders_at
   %blocks_at = {job_field("blocks")}

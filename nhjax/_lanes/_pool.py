@@ -30,10 +30,22 @@ _WORTH_A_HELPER = 50_000
 # more.
 _YIELDS, _SHORTEST_SLEEP, _LONGEST_SLEEP = 100, 50, 10_000
 
+# What a program's handler passes on: its kernel, the numbers of its operands and
+# results, how many members the kernel computes at once, whether the results are
+# batched, and how long the first block of the last call took, in ns.
+PROGRAM = {
+    "kernel": "ptr",
+    "num_operands": "i64",
+    "num_results": "i64",
+    "width": "i64",
+    "is_batched": "i64",
+    "block_time": "i64",
+}
+
 # What the threads that work on a call share: how many blocks have been begun and are
 # done, how many threads hold the job, how many the pool has, how many blocks there are,
-# the last member, whether a block failed, and the addresses of the data. The first two
-# change all the time, and have cache lines of their own.
+# the last member, whether a block failed, the addresses of the data, and the program.
+# The first two change all the time, and have cache lines of their own.
 JOB = {
     "begun": "i64",
     "padding_1": "[7 x i64]",
@@ -46,22 +58,19 @@ JOB = {
     "failed": "i64",
     "operands": "ptr",
     "results": "ptr",
+    "program": "ptr",
 }
+
+
+def program_field(name: str) -> str:
+    """Return the instruction that finds the address of a field of `%program`."""
+    index = list(PROGRAM).index(name)
+    return f"getelementptr inbounds %Program, ptr %program, i32 0, i32 {index}"
 
 
 def job_field(name: str) -> str:
     """Return the instruction that finds the address of a field of the job `%job`."""
     return f"getelementptr inbounds %Job, ptr %job, i32 0, i32 {list(JOB).index(name)}"
-
-
-def pool_ir(width: int) -> str:
-    """Return the text of the functions that share the blocks of a call.
-
-    `@nhjax.run` runs one block and `@nhjax.work` all that are left; `@nhjax.wanted` and
-    `@nhjax.ask` are for helpers, `@nhjax.wait` waits for them, and `@nhjax.release`
-    lets go of the job. `width` is how many members the kernel computes at once.
-    """
-    return "\n".join([_DECLARATIONS, _run(width), _WORK, _WANTED, _ASK, _WAITING])
 
 
 # The counter of all threads that are at work in blocks, of all programs.
@@ -79,18 +88,23 @@ declare i64 @llvm.smax.i64(i64, i64)
 """
 
 
-def _run(width: int) -> str:
-    return f"""
-; Run one block. It is a function of its own so that the kernel's code is there once.
-define internal void @nhjax.run(ptr %job, i64 %block) noinline {{
+_RUN = f"""
+; Run one block.
+define internal void @nhjax.run(ptr %job, i64 %block) {{
+  %program_at = {job_field("program")}
+  %program = load ptr, ptr %program_at
+  %kernel_at = {program_field("kernel")}
+  %kernel = load ptr, ptr %kernel_at
+  %width_at = {program_field("width")}
+  %width = load i64, ptr %width_at
   %operands_at = {job_field("operands")}
   %operands = load ptr, ptr %operands_at
   %results_at = {job_field("results")}
   %results = load ptr, ptr %results_at
   %last_at = {job_field("last")}
   %last = load i64, ptr %last_at
-  %first = mul i64 %block, {width}
-  %has_failed = call i1 @kernel(
+  %first = mul i64 %block, %width
+  %has_failed = call i1 %kernel(
     ptr %operands, ptr %results, i64 %first, i64 %last)
   br i1 %has_failed, label %failed, label %done
 failed:
@@ -296,3 +310,9 @@ end:
   ret void
 }}
 """
+
+
+# The functions that share the blocks of a call. `@nhjax.run` runs one block and
+# `@nhjax.work` all that are left; `@nhjax.wanted` and `@nhjax.ask` are for helpers,
+# `@nhjax.wait` waits for them, and `@nhjax.release` releases the job.
+POOL = "\n".join([_DECLARATIONS, _RUN, _WORK, _WANTED, _ASK, _WAITING])

@@ -14,6 +14,7 @@ that has not registered the name, is refused by XLA.
 """
 
 import ctypes
+import functools
 import hashlib
 import os
 import threading
@@ -22,7 +23,7 @@ from typing import NamedTuple
 import jax
 import jax.ffi
 
-from ._handler import HANDLER, handler_ir
+from ._handler import HANDLE, handle_ir, HANDLER, handler_ir
 from ._native import host, load, object_code, version
 from ._pool import WORKERS
 
@@ -32,7 +33,6 @@ _programs: dict[str, int] = {}
 
 # How many threads are at work in kernels, which all programs count together.
 _workers = ctypes.c_int64(0)
-_IMPORTS = {WORKERS: ctypes.addressof(_workers)}
 
 # One program is compiled at a time: LLVM is not to be used by two threads at once, and
 # of two threads that want the same program the second then finds it.
@@ -98,12 +98,25 @@ def registered(
     with _lock:
         if name not in _programs:
             code = object_code([kernel_ir, handler], HANDLER, host(), quick)
-            address = ctypes.c_void_p(load(code, name, HANDLER, _IMPORTS))
+            imports = {HANDLE: _handle()}
+            address = ctypes.c_void_p(load(code, name, HANDLER, imports))
             jax.ffi.register_ffi_target(
                 name, jax.ffi.pycapsule(address), platform="cpu", api_version=1
             )
             _programs[name] = len(code)
     return name
+
+
+@functools.cache
+def _handle() -> int:
+    """Return the address of the function that the handlers of all programs call.
+
+    It runs for less than a microsecond beside the kernels, so that optimising it would
+    cost more than it gains.
+    """
+    code = object_code([handle_ir()], HANDLE, host(), is_quick=True)
+    imports = {WORKERS: ctypes.addressof(_workers)}
+    return load(code, "nhjax_lanes_handle", HANDLE, imports)
 
 
 def is_quick() -> bool:

@@ -73,16 +73,21 @@ def loaded(texts, symbol):
     return _native.load(code, f"test_{next(NUMBERS)}", symbol, imports)
 
 
+def with_handler(body, is_batched=True):
+    """A kernel and its handler, which refers to the module of `handle_ir`."""
+    return [kernel_ir(body), _handler.handler_ir(1, 1, WIDTH, is_batched)]
+
+
 class Program:
     """The handler of a kernel that triples, with its allocations and clock in hand."""
 
     def __init__(self, is_batched=True):
-        text = _handler.handler_ir(1, 1, WIDTH, is_batched)
+        text = _handler.handle_ir()
         for name, stand_in in STAND_INS.items():
             assert f"@{name}(" in text
             text = text.replace(f"@{name}(", f"@{stand_in}(")
         find = ctypes.CFUNCTYPE(ctypes.c_void_p, ctypes.c_int64)(
-            loaded([kernel_ir(TRIPLE), COUNTED, text], "address_of")
+            loaded([*with_handler(TRIPLE, is_batched), COUNTED, text], "address_of")
         )
         self.handler = find(0)
         self.held = ctypes.CFUNCTYPE(ctypes.c_int64)(find(1))
@@ -311,13 +316,13 @@ def test_another_number_of_arrays_is_an_error(program):
 
 
 def test_lack_of_memory_is_an_error():
-    text = _handler.handler_ir(1, 1, WIDTH, True)
+    text = _handler.handle_ir()
     declared = "declare ptr @malloc(i64)"
     assert declared in text
     text = text.replace(
         declared, "define internal ptr @malloc(i64 %size) { ret ptr null }"
     )
-    handler = loaded([kernel_ir(TRIPLE), text], _handler.HANDLER)
+    handler = loaded([*with_handler(TRIPLE), text], _handler.HANDLER)
     runtime = Runtime()
     error = runtime.call(handler, [np.ones(3)], [np.zeros(3)])
     assert error is not None
@@ -332,8 +337,8 @@ define i1 @kernel(ptr %operands, ptr %results, i64 %first, i64 %last) {
   ret i1 %is_later
 }
 """
-    text = _handler.handler_ir(1, 1, WIDTH, True)
-    handler = loaded([kernel, text], _handler.HANDLER)
+    texts = [kernel, _handler.handler_ir(1, 1, WIDTH, True), _handler.handle_ir()]
+    handler = loaded(texts, _handler.HANDLER)
     for members, is_lacking in ((WIDTH, False), (3 * WIDTH, True)):
         runtime = Runtime(threads=2)
         x = np.ones(members)
@@ -357,5 +362,6 @@ def test_a_program_without_members_runs_once():
 
 def test_a_program_without_results_does_nothing():
     kernel = "define i1 @kernel(ptr %operands, ptr %results, i64 %first, i64 %last) {"
-    texts = [f"{kernel} unreachable }}", _handler.handler_ir(1, 0, WIDTH, True)]
+    handler = _handler.handler_ir(1, 0, WIDTH, True)
+    texts = [f"{kernel} unreachable }}", handler, _handler.handle_ir()]
     assert Runtime().call(loaded(texts, _handler.HANDLER), [np.ones(3)], []) is None
