@@ -290,3 +290,17 @@ def test_steps_near_rest_are_judged_as_the_result_has():
         text.split()
     )
     assert sum(row["wrongly refused"] for row in rows) == 1
+
+
+def test_what_the_chart_in_the_middle_gains_is_what_the_result_has():
+    energies = {}
+    for row in results("charts")["rows"]:
+        key = row["system"], row["retraction"], row["stages"]
+        energies.setdefault(key, {})[row["chart"]] = row["energy"]
+    gains = [
+        energy["start"] / energy["middle"]
+        for (system, _, stages), energy in energies.items()
+        if system == "unicycle" and stages > 2
+    ]
+    pattern = r"over t = 1e4 is up to (\d+) times smaller"
+    assert_agree(quoted(page("groups"), pattern), [max(gains)])

@@ -115,3 +115,14 @@ def test_built_pages_with_dead_links_or_foreign_scripts_are_found(tmp_path):
         "a.html leads to c.html, which is not there",
         "a.html leads to #nowhere, an anchor that is not there",
     ]
+
+
+@pytest.mark.parametrize("source", PAGES)
+def test_extras_are_installed_in_one_way(source):
+    # Those for users work wherever nhjax is installed, the others need the repository.
+    project = tomllib.loads((pages.ROOT / "pyproject.toml").read_text(encoding="utf-8"))
+    extras = project["project"]["optional-dependencies"]
+    commands = re.findall(r"pip install (?:-e )?\"?([.\w]+)\[(\w+)\]", PAGES[source])
+    for name, extra in commands:
+        assert extra in extras
+        assert name == ("." if extra in ("docs", "dev") else "nhjax")
