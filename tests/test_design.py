@@ -53,7 +53,7 @@ def test_defaults_on_the_page_are_those_of_the_signatures():
     assert ("Event", "max_events", "32") in defaults
     for name, argument, value in defaults:
         expected = inspect.signature(getattr(nhjax, name)).parameters[argument].default
-        assert eval(value, vars(nhjax)) == expected, (name, argument)
+        assert eval(value, dict(vars(nhjax))) == expected, (name, argument)
 
 
 def test_results_and_statistics_are_on_the_page():
