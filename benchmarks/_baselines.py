@@ -123,7 +123,8 @@ def leapfrog_at_nodes(nat: Natural) -> Step:
 def spark(nat: Natural, stages: int) -> Step:
     """Make the step of the Lobatto IIIA-B SPARK method with s stages.
 
-    Jay (2009), after his methods for DAEs of index 2: the stages
+    Reconstructed from the definition of Jay's methods for DAEs of index 2, without his
+    report of 2009, which was not at hand: the stages
 
         Q_i = q_0 + h Σ_j a_ij V_j,  V_i = v_0 + h Σ_j â_ij (f + Λ_j b)(Q_j)
 

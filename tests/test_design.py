@@ -39,6 +39,23 @@ def test_a_signature_on_the_page_has_all_arguments(name):
     assert sorted(arguments) == sorted(parameters)
 
 
+def written_defaults():
+    """The defaults of the first signature of each name, as the page writes them."""
+    for name, arguments in re.findall(r"`(\w+)\(((?:[^`()]|\([^()]*\))*)\)`", PAGE):
+        found = re.findall(r"(\w+)=((?:[^,()]|\([^()]*\))+)", arguments)
+        for argument, value in found if hasattr(nhjax, name) else ():
+            yield name, argument, value.strip()
+
+
+def test_defaults_on_the_page_are_those_of_the_signatures():
+    defaults = list(written_defaults())
+    assert ("integrate", "throw", "True") in defaults
+    assert ("Event", "max_events", "32") in defaults
+    for name, argument, value in defaults:
+        expected = inspect.signature(getattr(nhjax, name)).parameters[argument].default
+        assert eval(value, dict(vars(nhjax))) == expected, (name, argument)
+
+
 def test_results_and_statistics_are_on_the_page():
     oscillator = nhjax.systems.HarmonicOscillator()
     sol = nhjax.integrate(

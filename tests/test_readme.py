@@ -1,14 +1,14 @@
-"""README keeps its word: its code runs as printed and its commands are the CI's."""
+"""README keeps its word: its code runs as printed, its commands are the CI's, and its
+figures are those of the committed results of the benchmarks.
+"""
 
 import re
-from pathlib import Path
 
 import pytest
 
-from oracles.pages import blocks
+from oracles.pages import assert_agree, blocks, page, quoted, results, ROOT, rows_of
 
 
-ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
 
 
@@ -37,3 +37,85 @@ def test_commands_are_those_of_the_continuous_integration():
 def test_linked_files_exist():
     for target in re.findall(r"\]\(([^)#:]+)\)|`(notebooks/[^`]+)`", README):
         assert (ROOT / (target[0] or target[1])).is_file()
+
+
+def claims(start):
+    """The claims of the paper in the committed results that begin with some words."""
+    parts = results("verdicts")["claims"].values()
+    found = [x for part in parts for x in part if x["claim"].startswith(start)]
+    assert found
+    return found
+
+
+def test_the_violation_of_constraints_is_that_of_the_result():
+    (claim,) = claims("Φ = 0 holds at the nodes")
+    (measured,) = re.findall(r": (\S+)$", claim["measured"])
+    members, time, printed = quoted(
+        README, r"violation of (\d+) members .*? over t = (\S+) is (\S+)\. If"
+    )
+    assert f"over {members} members" in claim["measured"]
+    assert f"t <= {float(time):g}:" in claim["measured"]
+    assert float(printed) == float(measured)
+
+
+def test_the_comparison_with_other_libraries_is_that_of_the_result():
+    (case,) = (
+        case
+        for case in results("work_precision")["cases"]
+        if (case["name"], case["members"], case["t"]) == ("chaotic", 101, 20.0)
+    )
+    errors = quoted(README, r"for errors of (\S+), (\S+) and (\S+) at t = 20")
+    assert [float(x) for x in errors] == [x["accuracy"] for x in case["contest"]]
+    best = [x["best"] for x in case["contest"]]
+    faster = quoted(README, r"(\S+), (\S+) and (\S+) times faster than diffrax")
+    assert_agree(faster, [1 / x["diffrax"]["ratio_seconds"] for x in best])
+    slower = quoted(README, r"(\S+), (\S+) and (\S+) times slower than heyoka")
+    assert_agree(slower, [x["heyoka"]["ratio_seconds"] for x in best])
+
+
+def test_the_memory_of_an_ensemble_is_that_of_the_result():
+    rows = results("ensembles")["rows"]
+    million = next(row for row in rows if row["members"] == 1_000_000)
+    steps, memory = quoted(README, r"A million members of (\d+) steps take (\d+) MB")
+    assert int(steps) == million["num_steps"]
+    assert_agree([memory], [million["megabytes"]])
+
+
+def test_the_eigenvalues_of_the_bicycle_are_those_of_the_page_on_machines():
+    pattern = r"eigenvalues to (\S+) \(\[`docs/machines"
+    (measured,) = quoted(page("machines"), r"eigenvalues ([\d.e-]+);")
+    assert_agree(quoted(README, pattern), [float(measured)])
+
+
+def test_verdicts_on_the_paper_are_those_of_the_result():
+    verdicts = dict(rows_of(README, "claim of the paper"))
+    starts = {
+        "q and p are of order": ["NonholonomicParticle", "Unicycle"],
+        "CVT: erratic": ["At h = π/10", "At h = 1/10"],
+        "chaotic ensemble: the energy walks": ["The energy walks at random"],
+        "its mean square goes as": ["μ(E) goes as h^4", "μ(E) goes as h^10"],
+        "no gain over SPARK and DLA": ["No gain over SPARK and DLA"],
+        "ball on a turntable": ["The three linear", "The moving energy"],
+    }
+    assert len(verdicts) == len(starts)
+    for beginning, claimed in starts.items():
+        (verdict,) = (x for claim, x in verdicts.items() if claim.startswith(beginning))
+        for start in claimed:
+            for claim in claims(start):
+                assert claim["verdict"] in verdict
+    # The figures in them.
+    runs = [x for x in results("verdicts")["chaotic"] if x["method"] == "propagated"]
+    alpha = [run["alpha"] for run in runs]
+    least, most = quoted(README, r"mean square ∝ t\^(\S+) to t\^(\S+) up to t = 1e4")
+    assert_agree([least, most], [min(alpha), max(alpha)])
+    ratios = [
+        [float(x) for x in pair]
+        for claim in claims("No gain over SPARK and DLA")
+        for pair in re.findall(r"([\d.]+) ± [\d.]+ / ([\d.]+) ±", claim["measured"])
+    ]
+    early, late = zip(*ratios, strict=True)
+    printed = quoted(
+        README,
+        r"([\d.]+) to ([\d.]+) times their mean square early, ([\d.]+) to ([\d.]+)",
+    )
+    assert_agree(printed, [min(early), max(early), min(late), max(late)])

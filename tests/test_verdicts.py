@@ -10,7 +10,7 @@ import pytest
 from benchmarks import _baselines as baselines
 from benchmarks._report import RESULTS
 from benchmarks._tableaux import rolling
-from benchmarks._verdicts._claim import Claim
+from benchmarks._verdicts._claim import Claim, RECONSTRUCTED
 from benchmarks._verdicts._errata import stability_at_infinity
 from benchmarks._verdicts._growth import Curve, growth, in_stretches
 from benchmarks._verdicts._orders import (
@@ -100,3 +100,11 @@ def test_the_page_has_the_tables_of_the_result_and_its_figures():
         found = DOCS / target
         assert found.is_file()
         assert found.suffix != ".png" or found.stat().st_size < 150_000
+
+
+def test_verdicts_that_rest_on_spark_say_that_it_is_reconstructed():
+    record = json.loads((RESULTS / "verdicts.json").read_text(encoding="utf-8"))
+    lines = [line for part in record["claims"].values() for line in part]
+    resting = [x for x in lines if "SPARK" in x["claim"] + x["measured"]]
+    assert resting
+    assert all(RECONSTRUCTED in line["why"] for line in resting)

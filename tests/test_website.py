@@ -14,6 +14,9 @@ PAGES = {
     for source in [*pages.sources(), "README.md"]
     if source.endswith(".md")
 }
+PROJECT = tomllib.loads((pages.ROOT / "pyproject.toml").read_text(encoding="utf-8"))[
+    "project"
+]
 
 
 def test_every_public_name_has_a_page():
@@ -115,3 +118,23 @@ def test_built_pages_with_dead_links_or_foreign_scripts_are_found(tmp_path):
         "a.html leads to c.html, which is not there",
         "a.html leads to #nowhere, an anchor that is not there",
     ]
+
+
+@pytest.mark.parametrize("source", PAGES)
+def test_extras_are_installed_in_one_way(source):
+    # Those for users work wherever nhjax is installed, the others need the repository.
+    extras = PROJECT["optional-dependencies"]
+    commands = re.findall(r"pip install (?:-e )?\"?([.\w]+)\[(\w+)\]", PAGES[source])
+    for name, extra in commands:
+        assert extra in extras
+        assert name == ("." if extra in ("docs", "dev") else "nhjax")
+
+
+def test_promised_versions_are_those_of_the_package():
+    start = PAGES["docs/start.md"]
+    ((python, jax),) = re.findall(r"needs Python ([\d.]+) and JAX ([\d.]+), or", start)
+    assert PROJECT["requires-python"] == f">={python}"
+    assert f"jax>={jax}" in PROJECT["dependencies"]
+    tried = set(re.findall(r"^\| (3\.\d+) \|", start, re.MULTILINE))
+    classified = re.findall(r"Python :: (3\.\d+)", " ".join(PROJECT["classifiers"]))
+    assert sorted(tried) == classified

@@ -15,6 +15,7 @@ from ._claim import (
     Found,
     OURS,
     PRINT,
+    RECONSTRUCTED,
     REFUTED,
     stages_text,
 )
@@ -260,6 +261,7 @@ def _against(curves: dict, fits: dict, s: int, final_time: float) -> Claim:
         verdict, why = CONFIRMED, "within a factor 1.5 to the end"
     if s == 2:
         why += "; DLA and SPARK 2 are one and the same method here (see below)"
+    why += f"; {RECONSTRUCTED}"
     return Claim(
         f"No gain over SPARK and DLA, but no loss either (7.3), s = {s}",
         "μ of the paper's method over that of the other, t in 10..200 / the second "

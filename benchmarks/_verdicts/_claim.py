@@ -15,6 +15,8 @@ CONFIRMED, REFUTED = "confirmed", "not confirmed"
 PRINT, DEPENDS = "wrong in print", "depends"
 # A claim of ours, not the paper's.
 OURS = "ours"
+# Belongs to each verdict that rests on runs of SPARK.
+RECONSTRUCTED = "SPARK is reconstructed here, without Jay's report"
 
 
 @dataclasses.dataclass(frozen=True)

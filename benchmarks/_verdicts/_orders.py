@@ -20,6 +20,7 @@ from ._claim import (
     Found,
     near,
     orders_text,
+    RECONSTRUCTED,
     REFUTED,
     slope,
     stages_text,
@@ -285,6 +286,7 @@ def _baseline_orders() -> Found:
         ", ".join(f"{k}: {x:.2f} ({BASELINE_ORDERS[k]})" for k, x in orders.items()),
         command(PART),
         CONFIRMED if good else REFUTED,
-        "on the particle, against the exact solution; expected orders in brackets",
+        "on the particle, against the exact solution; expected orders in brackets; "
+        + RECONSTRUCTED,
     )
     return Found([claim], {"baseline_orders": orders})

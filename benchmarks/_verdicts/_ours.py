@@ -15,6 +15,7 @@ from ._claim import (
     Found,
     orders_text,
     OURS,
+    RECONSTRUCTED,
     REFUTED,
     slope,
     stages_text,
@@ -85,7 +86,7 @@ def _coincidences() -> Found:
                 command(PART),
                 OURS if one else REFUTED,
                 "½ (b(q_k) + b(q_{k+1})) = b(½ (q_k + q_{k+1})) for such b; the CVT "
-                "has sin y",
+                f"has sin y; {RECONSTRUCTED}",
             ),
             Claim(
                 "Lobatto-2 of the paper is the leapfrog with the constraint at the "
@@ -96,7 +97,7 @@ def _coincidences() -> Found:
                 command(PART),
                 OURS if same else REFUTED,
                 "SPARK has s multipliers of its own in each step where the paper's "
-                "method carries one on; they differ by their errors",
+                f"method carries one on; they differ by their errors; {RECONSTRUCTED}",
             ),
         ],
         {"coincidences": apart},

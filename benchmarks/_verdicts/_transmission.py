@@ -12,7 +12,15 @@ from nhjax.studies import CVTEnergy
 from nhjax.systems import ContinuouslyVariableTransmission as CVT
 
 from .. import _baselines
-from ._claim import Claim, command, CONFIRMED, DEPENDS, Found, REFUTED
+from ._claim import (
+    Claim,
+    command,
+    CONFIRMED,
+    DEPENDS,
+    Found,
+    RECONSTRUCTED,
+    REFUTED,
+)
 from ._figures import transmission_figure
 from ._orders import baseline_steps
 
@@ -189,5 +197,5 @@ def _others(by_epsilon: dict[float, CVTEnergy], baselines: dict) -> Claim:
         DEPENDS,
         ("the paper's method gains where the rotating driver is perturbed" if gains else
          "none is better throughout")
-        + f"; drifting: {', '.join(drifts)}",
+        + f"; drifting: {', '.join(drifts)}; {RECONSTRUCTED}",
     )  # fmt: skip

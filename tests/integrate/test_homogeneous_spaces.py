@@ -89,6 +89,35 @@ def test_the_inertia_of_forbidden_turns_matters_no_more_than_errors_do():
     assert_order(4, *differences)
 
 
+@pytest.mark.parametrize("moments", [(1.0, 1.0), (1.0, 1.5)])
+def test_the_path_of_the_point_depends_on_the_attitude_only_if_moments_differ(moments):
+    # Attitudes that differ by a turn about the third body axis are one point of the
+    # sphere. The metric on it is invariant under such turns if the moments are equal.
+    system = nhjax.LagrangianSystem(
+        lambda t, q, v, args: (
+            0.5 * (args[0] * v[0] ** 2 + args[1] * v[1] ** 2 + v[2] ** 2)
+            - GRAVITY * upward(q)
+        ),
+        nonholonomic=lambda t, q, v, args: v[2],
+        manifold=GROUP,
+    )
+    turn = nhjax.SO3(nhjax.Exponential()).retract(jnp.array([0.0, 0.0, 1.0]))
+    v = jnp.array([1.3, -0.7, 0.0])
+    turned = GROUP.compose(ATTITUDE, turn), GROUP.Ad(GROUP.inverse(turn), v)
+    ends = []
+    for q, velocity in ((ATTITUDE, v), turned):
+        y0 = nhjax.initial_state(system, q, velocity, args=moments)
+        sol = nhjax.integrate(
+            system, nhjax.LobattoIIIAB(3), y0, dt=0.02, num_steps=50, args=moments
+        )
+        ends.append(axes(sol.ys.q)[-1, :, 2])
+    distance = np.max(np.abs(ends[0] - ends[1]))
+    if moments[0] == moments[1]:
+        assert distance < 1e-13
+    else:
+        assert distance > 0.01
+
+
 def test_a_skate_on_a_sphere_moves_as_its_reduced_equations_say():
     # The contact is the third body axis, the blade points along the first: the contact
     # may not move along the second, which is Suslov's constraint ω₁ = 0.

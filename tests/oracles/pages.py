@@ -1,11 +1,13 @@
-"""The blocks of code in pages of the documentation."""
+"""The blocks of code in pages of the documentation, and the figures that they quote."""
 
+import json
 import re
 from pathlib import Path
 from typing import Any
 
 
-DOCS = Path(__file__).parents[2] / "docs"
+ROOT = Path(__file__).parents[2]
+DOCS = ROOT / "docs"
 
 
 def blocks(text: str, language: str = "python") -> list[str]:
@@ -24,3 +26,44 @@ def run_page(name: str) -> dict[str, Any]:
     for block in blocks(page(name)):
         exec(compile(block, f"{name}.md", "exec"), namespace)
     return namespace
+
+
+def results(name: str) -> dict[str, Any]:
+    """The committed results of the benchmark `name`."""
+    path = ROOT / "benchmarks" / "results" / f"{name}.json"
+    return json.loads(path.read_text(encoding="utf-8"))
+
+
+def quoted(text: str, pattern: str) -> tuple[str, ...]:
+    """The groups of a pattern that is found once in a text, across its line breaks."""
+    found = re.findall(pattern, " ".join(text.split()))
+    assert len(found) == 1, f"found {len(found)} times: {pattern}"
+    return found[0] if isinstance(found[0], tuple) else (found[0],)
+
+
+def rows_of(text: str, *headings: str) -> list[list[str]]:
+    """The cells of the only table of a page whose first headings are these."""
+    cells = [
+        [
+            [cell.strip() for cell in line.strip("|").split("|")]
+            for line in table.splitlines()
+        ]
+        for table in re.findall(r"(?:^\|.*\n)+", text, re.MULTILINE)
+    ]
+    (table,) = [x for x in cells if tuple(x[0][: len(headings)]) == headings]
+    return table[2:]
+
+
+def assert_agree(printed: Any, measured: Any) -> None:
+    """Each printed number is the measured one, rounded to the digits that are printed.
+
+    Zeros at the end of a whole number above 100 are not digits: 600 stands for 598.
+    """
+    for text, value in zip(printed, measured, strict=True):
+        mantissa, _, exponent = text.partition("e")
+        _, _, decimals = mantissa.partition(".")
+        zeros = 0
+        if not decimals and not exponent and abs(float(text)) >= 100:
+            zeros = len(mantissa) - len(mantissa.rstrip("0"))
+        unit = 10.0 ** (int(exponent or 0) - len(decimals) + zeros)
+        assert abs(float(text) - value) <= 0.5001 * unit, (printed, measured)
