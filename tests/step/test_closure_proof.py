@@ -32,7 +32,7 @@ EXACT = {
     "not symmetric, r = 0": rational("0", "2/5", "1"),
     "not symmetric, r = 1": rational("0", "1/5", "2/3", "1"),
 }
-METHODS = EXACT | {f"Lobatto, s = {s}": lobatto(s) for s in range(4, 8)}
+METHODS = EXACT | {f"Lobatto, s = {s}": lobatto(s) for s in range(4, 9)}
 STAGES = range(2, 7)
 
 every_method = pytest.mark.parametrize("name", METHODS)
@@ -82,7 +82,7 @@ def test_kernel_is_the_slope_of_the_node_polynomial_and_orthogonal_to_degree_r(n
     assert m.vanishes(np.sum(m.b * w * (m.a_hat @ w)))
 
 
-@pytest.mark.parametrize("s", range(2, 8))
+@pytest.mark.parametrize("s", range(2, 9))
 def test_kernel_of_lobatto_is_the_legendre_polynomial_at_the_nodes(s):
     m = METHODS[f"Lobatto, s = {s}"]
     assert (m.p, m.r) == (2 * s - 2, s - 2)
@@ -207,6 +207,8 @@ def test_errors_of_a_symmetric_step_are_in_the_class_and_its_end_is_exact(s):
         2 * s - 1, abs=0.15
     )
     assert slope(*(largest(e.nu) for e in errors)) == pytest.approx(s, abs=0.15)
+    multipliers = [largest(e.stages[:, -steps.COUNT :]) for e in errors]
+    assert slope(*multipliers) == pytest.approx(s, abs=0.2)
 
 
 @pytest.mark.parametrize(
@@ -287,6 +289,17 @@ def test_sensitivity_to_the_first_multiplier_is_of_order_s_and_its_square_of_ord
     )
     assert linear == pytest.approx(s, abs=0.1)
     assert quadratic == pytest.approx(3, abs=0.1)
+
+
+@pytest.mark.parametrize("s", [4, long(5)])
+def test_first_multiplier_wrong_by_a_constant_changes_the_end_by_the_power_3(s):
+    m, wrong = lobatto(s), np.array([MP.mpf("0.3"), MP.mpf("-0.2")])
+
+    def change(h):
+        step = steps.Step(m, h)
+        return step.end(step.lambda0 + wrong) - step.end(step.lambda0)
+
+    assert slope_of(change, coarse=128) == pytest.approx(3, abs=0.15)
 
 
 # --- groups ---------------------------------------------------------------------------
