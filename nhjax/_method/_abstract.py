@@ -95,7 +95,9 @@ class AbstractMethod(eqx.Module):
         """Return the order of q and p in systems with constraints.
 
         It is min(p, 2r + 2) of B(p) and D(r), or the order without constraints if that
-        is less. This is what runs of many tableaux show; proved it is for Lobatto's.
+        is less. For collocation on nodes with both ends, such as Lobatto's, the page
+        on closures proves that the order is at least 2r + 2; runs of many tableaux
+        show that it is no more.
 
         **Raises:** a `ValueError` as `require_constraint_hypotheses` does.
         """

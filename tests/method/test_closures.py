@@ -124,17 +124,6 @@ def test_the_other_sign_of_the_symmetric_closure_is_singular(s: int):
     )
 
 
-@pytest.mark.parametrize("s", STAGES)
-def test_a_multiplier_error_is_orthogonal_to_smooth_reactions(s: int):
-    # Why an error O(h^s) of the multipliers does not lower the order 2s - 2.
-    method = LobattoIIIAB(s)
-    inner = np.linalg.solve(method.a[1:, 1:], -method.a[1:, 0])
-    w = np.concatenate([[1.0], inner])
-    moments = [np.sum(method.b * method.c**l * w) for l in range(s)]
-    np.testing.assert_allclose(moments[:-1], 0, atol=1e-15)
-    assert abs(moments[-1]) > 1e-6
-
-
 @pytest.mark.parametrize("multiplier", CLOSURES)
 def test_closure_is_cached_hashable_and_read_only(multiplier: str):
     closure = LobattoIIIAB(4, multiplier).closure_weights

@@ -99,6 +99,17 @@ def test_order_with_constraints_is_what_runs_show(name):
     assert found.multiplier > method.multiplier_order - 0.3
 
 
+@pytest.mark.long
+def test_order_with_constraints_without_collocation_is_what_runs_show():
+    # The proof in docs/closures.md is about collocation.
+    b = [1 / 6, 2 / 3, 1 / 6]
+    a = [[0, 0, 0], [0.2, 0.4, -0.1], b]
+    method = nhjax.PartitionedRungeKutta(a, b, closure="consistent")
+    assert (method.orders.C, method.constrained_order) == (1, 2)
+    found = _tableaux.observed(*_tableaux.rolling(), method, (40, 80), 1.0)
+    np.testing.assert_allclose(found, 2, atol=0.1)
+
+
 # The others have a factor |R_A(∞)| > 1, and are refused.
 PROPAGATED = [
     "0, 1/3, 2/3, 1",
