@@ -131,8 +131,7 @@ def initial_state(
     throw = check_flag("throw", throw)
     q, v, p, t = checked_inputs(system, q, v, p, t)
     chosen = {"q": keep_q, "v": keep_v, "p": keep_p}
-    letter, given = ("p", p) if v is None else ("v", v)
-    keep = checked_keep(system, q, given, letter, chosen, project)
+    keep = checked_keep(system, q, "p" if v is None else "v", chosen, project)
     args = parameters(args)
     check_functions(system, t, q, args)
     inputs = [

@@ -62,7 +62,6 @@ def kept_numbers(tree: PyTree[Array], kept: Kept) -> Float[Array, " k"]:
 def checked_keep(
     system: AbstractMechanicalSystem,
     q: PyTree[Array],
-    u: Float[Array, " n"],
     letter: str,
     chosen: dict[str, Any],
     project: bool,
@@ -71,7 +70,7 @@ def checked_keep(
 
     **Arguments:**
 
-    - `letter`: "v" or "p", whichever was given; `u` is its value.
+    - `letter`: "v" or "p", whichever was given.
     - `chosen`: the arguments `keep_q`, `keep_v` and `keep_p` by the letters q, v and p.
     """
     other = "p" if letter == "v" else "v"
@@ -80,9 +79,10 @@ def checked_keep(
             f"`keep_{other}` chooses components of `{other}`, but `{letter}` is given: "
             f"use `keep_{letter}`, or give `{other}` in place of `{letter}`."
         )
-    of_q = _kept(system, "q", chosen["q"], _labels(q), u.shape[0])
-    labels = [f"{letter}[{i}]" for i in range(u.shape[0])]
-    of_u = _kept(system, letter, chosen[letter], labels, u.shape[0])
+    dimension = system.manifold_of(q).dim
+    of_q = _kept(system, "q", chosen["q"], _labels(q), dimension)
+    labels = [f"{letter}[{i}]" for i in range(dimension)]
+    of_u = _kept(system, letter, chosen[letter], labels, dimension)
     for kept in (of_q, of_u):
         if kept.indices and not project:
             raise ValueError(

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 from jax.scipy.linalg import block_diag
-from jaxtyping import Array, Bool, Float, PyTree
+from jaxtyping import Array, Float, PyTree
 
 from .._custom_types import BoolScalar, FloatScalar
 from .._numerics import (
@@ -154,17 +154,18 @@ def _nearest_keeping(
     # The units of single components are taken out by the metric.
     units = jnp.sqrt(jnp.abs(jnp.diagonal(metric)))
     units = jnp.where(units > 0, units, 1)
-    slopes, rows = frozen((jacobian / units, jax.jacrev(held)(x) / units))
+    by_units = jacobian / units[None], jax.jacrev(held)(x) / units[None]
+    slopes, rows = frozen(by_units)
     row_sizes, slope_sizes = _row_sizes(rows), _row_sizes(slopes)
     rows, slopes = rows / row_sizes[:, None], slopes / slope_sizes[:, None]
     along_kept = slopes @ jnp.linalg.pinv(rows, rtol=negligible)
-    kept_basis, is_kept_active = _left_basis(rows, negligible)
-    basis, is_active = _left_basis(slopes - along_kept @ rows, negligible)
+    kept_basis, kept_active = _left_basis(rows, negligible)
+    basis, active = _left_basis(slopes - along_kept @ rows, negligible)
     combined = block_diag(
-        _active(kept_basis, is_kept_active, row_sizes),
-        _active(basis, is_active, slope_sizes),
+        _active(kept_basis, kept_active, row_sizes),
+        _active(basis, active, slope_sizes),
     )
-    idle = jnp.concatenate([~is_kept_active, ~is_active]).astype(x.dtype)
+    idle = jnp.concatenate([1 - kept_active, 1 - active])
 
     def all_sizes(_):
         return size, jnp.abs(combined) @ jnp.concatenate([terms_of_held, terms])
@@ -177,7 +178,7 @@ def _nearest_keeping(
         is_redundant,
         idle,
     )
-    unchanging = basis * ~is_active
+    unchanging = basis * (1 - active)[None]
     fixed = Fixed(slope_sizes, unchanging @ unchanging.T, along_kept)
     return nearest._replace(jacobian=jacobian, fixed=frozen(fixed))
 
@@ -189,22 +190,28 @@ def _row_sizes(matrix: Float[Array, "l n"]) -> Float[Array, " l"]:
 
 def _left_basis(
     matrix: Float[Array, "l n"], negligible: float
-) -> tuple[Float[Array, "l l"], Bool[Array, " l"]]:
-    """Find orthonormal combinations of rows, and which of them do not vanish."""
+) -> tuple[Float[Array, "l l"], Float[Array, " l"]]:
+    """Find orthonormal combinations of rows, and which are active: one, or else zero.
+
+    The combinations, which are the columns of the result, are active unless they are
+    negligible.
+    """
     missing = jnp.zeros(max(matrix.shape[0] - matrix.shape[1], 0), matrix.dtype)
     left, singular, _ = jnp.linalg.svd(matrix)
-    return left, jnp.concatenate([singular, missing]) > negligible
+    sizes = jnp.concatenate([singular, missing])
+    return left, (sizes > negligible).astype(matrix.dtype)
 
 
 def _active(
-    basis: Float[Array, "l l"], is_active: Bool[Array, " l"], sizes: Float[Array, " l"]
+    basis: Float[Array, "l l"], active: Float[Array, " l"], sizes: Float[Array, " l"]
 ) -> Float[Array, "l l"]:
     """Return the matrix that makes the active combinations of rows of these sizes.
 
     Where all combinations are active the rows stay as they are.
     """
-    combinations = is_active[:, None] * basis.T / sizes
-    return jnp.where(jnp.all(is_active), jnp.eye(len(basis)), combinations)
+    combinations = active[:, None] * basis.T / sizes[None]
+    same = jnp.eye(basis.shape[0], dtype=basis.dtype)
+    return jnp.where(jnp.all(active > 0), same, combinations)
 
 
 def _nearest(
