@@ -45,14 +45,14 @@ class Fixed(NamedTuple):
 class Nearest(NamedTuple):
     """The result of a search for the nearest point on a constraint.
 
-    - `x`: the point at which the search ended.
+    - `x`: the point at which the search ended, a vector or an element of the group.
     - `found`: whether it is a solution.
     - `jacobian`: the Jacobian of the constraint where the search started.
     - `fixed`: the combinations of constraints that kept components fix; None if no
         components are kept.
     """
 
-    x: Float[Array, " n"]
+    x: PyTree[Array]
     found: BoolScalar
     jacobian: Float[Array, "m n"]
     fixed: Fixed | None = None
@@ -83,13 +83,14 @@ def project_position(system, t, q, u, args, kept: Kept, given: PyTree[Array]):
     if not kept.indices:
         nearest = _nearest(mass, gamma, zero, sizes, is_redundant)
         return nearest._replace(x=manifold.act(q, nearest.x))
-    size = max_norm(*jax.tree.leaves(q))
-    terms = jnp.full(len(kept.indices), size)
+    terms = jnp.full(len(kept.indices), max_norm(*jax.tree.leaves(q)))
     nearest = _nearest_keeping(mass, gamma, held, zero, sizes, terms, is_redundant)
     # A condition such as w = 1 on a quaternion has no derivative where it holds.
-    off = max_norm(held(frozen(nearest.x)))
+    moved = manifold.act(q, nearest.x)
+    size = max_norm(*jax.tree.leaves(frozen((q, moved))))
+    off = max_norm(frozen(held(nearest.x)))
     is_kept = off <= 1e3 * float(jnp.finfo(u.dtype).eps) * size
-    return nearest._replace(x=manifold.act(q, nearest.x), found=nearest.found & is_kept)
+    return nearest._replace(x=moved, found=nearest.found & is_kept)
 
 
 def project_fibre_coordinate(system, t, q, u, args, kept: Kept, given: Vector):
@@ -141,16 +142,16 @@ def _nearest_keeping(
 ) -> Nearest:
     """Do what `_nearest` does, and keep `held(y) = 0` as well.
 
-    Combinations of constraints whose derivatives vanish in all directions that are left
-    by `held` are left out. Either such a combination vanishes by itself, because the
-    values that are kept satisfy it, or the state that is returned violates it.
+    A combination of constraints is left out of the equations if its derivatives vanish
+    in all directions in which `held` does not change. The kept values then decide
+    whether it vanishes. The caller must judge all constraints at the result, at which
+    such a combination may be violated.
 
     `terms_of_held` has the sizes of the terms of `held`.
     """
     jacobian = jax.jacrev(constraint)(x)
     size, terms = sizes(jacobian)
-    eps = float(jnp.finfo(x.dtype).eps)
-    negligible = NEARLY_DEPENDENT if is_redundant else eps**0.75
+    small = float(jnp.finfo(x.dtype).eps) ** 0.75
     # The units of single components are taken out by the metric.
     units = jnp.sqrt(jnp.abs(jnp.diagonal(metric)))
     units = jnp.where(units > 0, units, 1)
@@ -158,9 +159,11 @@ def _nearest_keeping(
     slopes, rows = frozen(by_units)
     row_sizes, slope_sizes = _row_sizes(rows), _row_sizes(slopes)
     rows, slopes = rows / row_sizes[:, None], slopes / slope_sizes[:, None]
-    along_kept = slopes @ jnp.linalg.pinv(rows, rtol=negligible)
-    kept_basis, kept_active = _left_basis(rows, negligible)
-    basis, active = _left_basis(slopes - along_kept @ rows, negligible)
+    along_kept = slopes @ jnp.linalg.pinv(rows, rtol=small)
+    kept_basis, kept_active = _left_basis(rows, small)
+    basis, active = _left_basis(
+        slopes - along_kept @ rows, NEARLY_DEPENDENT if is_redundant else small
+    )
     combined = block_diag(
         _active(kept_basis, kept_active, row_sizes),
         _active(basis, active, slope_sizes),

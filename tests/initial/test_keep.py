@@ -212,6 +212,18 @@ def test_kept_positions_have_their_bits_and_the_others_are_nearest():
     np.testing.assert_allclose(y.v, expected, atol=1e-14)
 
 
+def test_positions_at_the_origin_are_kept():
+    slopes = np.array([1.0, 2.0, 3.0])
+    system = nhjax.LagrangianSystem(
+        lambda t, q, v, args: 0.5 * v @ v,
+        holonomic=lambda t, q, args: jnp.asarray(slopes) @ q - 1.0,
+    )
+    q, v = jnp.array([0.0, 0.0, -0.0]), jnp.zeros(3)
+    y = nhjax.initial_state(system, q, v, project=True, keep_q=[0, 2])
+    assert_kept(y.q, q, [0, 2])
+    np.testing.assert_allclose(y.q[1], 0.5, rtol=1e-15)
+
+
 def closed(t, q, args):
     """A crank, a rod and a slider; q has their angles and the place of the slider."""
     return jnp.stack(
@@ -232,7 +244,7 @@ SLIDER = np.cos(ANGLE) + 2 * np.cos(ROD)
     ("q", "kept"),
     [
         ([ANGLE, 0.0, 3.0], [0]),
-        # Both constraints depend on the slider alone, and the angles satisfy the second.
+        # Only the first constraint depends on the slider; the angles satisfy the other.
         ([ANGLE, ROD, 3.0], [0, 1]),
     ],
     ids=["crank", "crank and rod"],
@@ -246,7 +258,7 @@ def test_a_linkage_follows_the_crank_that_is_kept(q, kept):
         keep_q=kept,
         keep_v=[0],
     )
-    np.testing.assert_allclose(y.q, [ANGLE, ROD, SLIDER], rtol=1e-15)
+    np.testing.assert_allclose(y.q, [ANGLE, ROD, SLIDER], rtol=1e-14)
     assert_kept(y.q, q, kept)
     rate = -np.cos(ANGLE) * 2.0 / (2 * np.cos(ROD))
     speed = -np.sin(ANGLE) * 2.0 - 2 * np.sin(ROD) * rate
