@@ -3,6 +3,7 @@
 from typing import NamedTuple
 
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float, PyTree
 
 from .._custom_types import BoolScalar, FloatScalar
@@ -21,9 +22,12 @@ from .._system import (
     all_finite,
     dependence_error,
     dependent_names,
+    enumerated,
     Linearisation,
     State,
 )
+from ._keep import Kept
+from ._projection import Fixed
 
 
 class Found(NamedTuple):
@@ -38,6 +42,8 @@ class Found(NamedTuple):
     - `allowed`, `allowed_positions`, `allowed_off_group`: the bounds on violations.
     - `legendre_solved`: whether the Legendre transform could be inverted.
     - `projected`: whether the projection onto the constraints has converged.
+    - `fixed_positions`, `fixed_velocities`: the combinations of constraints that kept
+        components fix; None where nothing is kept.
     """
 
     state: State
@@ -54,6 +60,8 @@ class Found(NamedTuple):
     allowed_off_group: FloatScalar
     legendre_solved: BoolScalar
     projected: BoolScalar
+    fixed_positions: Fixed | None
+    fixed_velocities: Fixed | None
 
 
 class _Words(NamedTuple):
@@ -103,6 +111,7 @@ class _Case(NamedTuple):
     project: bool
     words: _Words
     group: str
+    keep: tuple[Kept, Kept]
 
     @property
     def where(self) -> str:
@@ -132,13 +141,14 @@ def judged(
     v: Float[Array, " n"] | None,
     p: Float[Array, " n"] | None,
     project: bool,
+    keep: tuple[Kept, Kept],
 ) -> list[Check]:
     """List the conditions on a state, each with the exception for where it fails."""
     state, lin = found.state, found.lin
     singular = 10 * state.v.shape[0] * jnp.finfo(state.v.dtype).eps
     name, given = ("p", p) if v is None else ("v", v)
     words, group = _WORDS[system.generator], f"{system.manifold_of(q)}"
-    case = (_Case(found, q, name, given, project, words, group),)
+    case = (_Case(found, q, name, given, project, words, group, keep),)
     return [
         Check(found.off_group <= found.allowed_off_group, _group_error, case),
         # The negated "<=" lets NaN pass, which ">" would not: a matrix that is not
@@ -169,9 +179,15 @@ def judged(
 
 
 def _group_error(case: _Case) -> ConstraintViolationError:
+    if case.keep[0].indices:
+        where, q = "`q` with its kept numbers", case.found.state.q
+        labels = enumerated(list(case.keep[0].labels))
+        advice = f"Choose fewer in `keep_q`, which keeps {labels}"
+    else:
+        where, q, advice = "`q`", case.q, "Pass `project=True`"
     return ConstraintViolationError(
-        f"`q` = {case.q} is no element of the group {case.group}: it is off by "
-        f"{float(case.found.off_group):.3g}. Pass `project=True`, or "
+        f"{where} = {q} is no element of the group {case.group}: it is off by "
+        f"{float(case.found.off_group):.3g}. {advice}, or pass "
         "`manifold.normalise(q)`."
     )
 
@@ -196,7 +212,7 @@ def _projection_error(case: _Case) -> NewtonError:
     return NewtonError(
         f"The state could not be projected onto the constraints from {case.where}: "
         f"Newton's method stopped at q = {case.found.state.q}, {case.reached} with "
-        f"{case.violations}. Start nearer to them."
+        f"{case.violations}. Start nearer to them{_or_keep_fewer(*case.keep)}."
     )
 
 
@@ -241,6 +257,14 @@ def _dependence_error(case: _Case, rank: Rank) -> DependentConstraintsError:
     )
 
 
+def _or_keep_fewer(*keep: Kept) -> str:
+    kept = [x for x in keep if x.indices]
+    if not kept:
+        return ""
+    listed = [f"{enumerated(list(x.labels))} (`{x.argument}`)" for x in kept]
+    return f", or keep less than {enumerated(listed)}"
+
+
 def _listed(
     letters: list[str], values: Float[Array, " l"], allowed: Float[Array, " l"]
 ) -> list[str]:
@@ -257,12 +281,13 @@ def _violation_error(case: _Case) -> ConstraintViolationError:
     m = violation.shape[0] - k
     letters = [f"{phi}[{a}]" for a in range(m)] + [f"dΓ[{a}]/dt" for a in range(k)]
     bad = _listed(letters, violation, found.allowed)
-    advice = (
-        "the projection did not reach them"
-        if case.project
-        else "choose a velocity on the constraints, or pass `project=True`"
-    )
     kind = "nonholonomic constraints" if k == 0 else "constraints on velocities"
+    if not case.project:
+        advice = "choose a velocity on the constraints, or pass `project=True`"
+    else:
+        advice = _unreached(
+            found.fixed_velocities, case.keep[1], letters, violation, found.allowed
+        )
     return ConstraintViolationError(
         f"{len(bad)} of {violation.shape[0]} {kind} violated at q = {found.state.q}, "
         f"{case.reached}: {'; '.join(bad)}; {advice}."
@@ -273,12 +298,56 @@ def _position_error(case: _Case) -> ConstraintViolationError:
     found = case.found
     letters = [f"Γ[{a}]" for a in range(found.positions.shape[0])]
     bad = _listed(letters, found.positions, found.allowed_positions)
-    advice = (
-        "the projection did not reach them"
-        if case.project
-        else "choose a configuration on the constraints, or pass `project=True`"
-    )
+    if not case.project:
+        advice = "choose a configuration on the constraints, or pass `project=True`"
+    else:
+        allowed = found.allowed_positions
+        advice = _unreached(
+            found.fixed_positions, case.keep[0], letters, found.positions, allowed
+        )
     return ConstraintViolationError(
         f"{len(bad)} of {len(letters)} holonomic constraints violated at q = "
         f"{found.state.q}: {'; '.join(bad)}; {advice}."
+    )
+
+
+def _unreached(
+    fixed: Fixed | None,
+    kept: Kept,
+    letters: list[str],
+    violation: Float[Array, " l"],
+    allowed: Float[Array, " l"],
+) -> str:
+    """Say why a projection has left a violation, and what to do about it."""
+    missed = "the projection did not reach them"
+    if fixed is None:
+        return missed
+    # The part of the violation that no change of the free components removes.
+    left = fixed.projector @ (violation / fixed.sizes)
+    rows = [a for a, x in enumerate(left) if abs(x) > allowed[a] / fixed.sizes[a]]
+    if not rows:
+        return f"{missed}{_or_keep_fewer(kept)}"
+    # Each column is the change of such violations if a kept component is released.
+    released = fixed.projector @ fixed.slopes
+    small = float(np.finfo(left.dtype).eps) ** 0.5
+    largest = np.max(np.abs(left))
+    involved, helpful = [], []
+    for label, column in zip(kept.labels, released.T, strict=True):
+        size = np.linalg.norm(column)
+        direction = column / size if size > small else np.zeros_like(column)
+        corrected = direction * (direction @ left)
+        involved += [label] * bool(np.max(np.abs(corrected)) > small * largest)
+        helpful += [label] * bool(np.max(np.abs(left - corrected)) <= small * largest)
+    names = enumerated([letters[a] for a in rows])
+    is_each_fixed = np.all(np.diagonal(fixed.projector)[rows] > 1 - small)
+    what = names if is_each_fixed else f"a combination of {names}"
+    if not involved:
+        return (
+            f"{what} cannot be changed there by any component: start from another state"
+        )
+    release = enumerated(helpful, "or") or f"more than one of {enumerated(involved)}"
+    return (
+        f"the components that `{kept.argument}` keeps determine {what}: leave "
+        f"{release} out of `{kept.argument}`, or keep values that satisfy the "
+        "constraints"
     )

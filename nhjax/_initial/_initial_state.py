@@ -40,6 +40,7 @@ from .._system import (
     violation_scale,
 )
 from ._checks import Found, judged
+from ._keep import checked_keep, Chosen, Kept
 from ._projection import project_fibre_coordinate, project_position
 
 
@@ -52,6 +53,9 @@ def initial_state(
     t: FloatScalarLike = 0.0,
     args: Args = None,
     project: bool = False,
+    keep_q: Chosen = None,
+    keep_v: Chosen = None,
+    keep_p: Chosen = None,
     throw: bool = True,
 ) -> State:
     """Make a consistent state (q, v, p, λ) from a configuration and a v or p.
@@ -73,6 +77,13 @@ def initial_state(
     - `project`: replace q by the nearest configuration, and then v by the nearest
         velocity, in the kinetic metric, that satisfies the constraints (one linear
         solve for constraints linear or affine in v, Newton's method for others).
+    - `keep_q`, `keep_v`, `keep_p`: the components of q, and of the v or p that was
+        given, that the projection must not change, as indices or names, one or a
+        sequence of them; known when tracing. The others are then the nearest, in the
+        same metric, of those that satisfy the constraints. Indices count the numbers of
+        `q` (of a tuple, the numbers of all its parts in order) or the components of `v`
+        or `p`. Names are those of the system's `coordinates`. A condition that only
+        kept components could satisfy, and do not, is an error by name.
     - `throw`: raise if there is no such state. Otherwise all its numbers are NaN, and
         `integrate` reports it as not finite; under `vmap` the other members of an
         ensemble are not touched. Wrong types and shapes raise all the same.
@@ -82,11 +93,14 @@ def initial_state(
     **Raises:** the following errors. Under `jit` those that depend on values come with
     the same message in an error of JAX, a `JaxRuntimeError` or a `ValueError`.
 
-    - `TypeError`: `system`, `project` or a part of `args` is of a wrong type.
+    - `TypeError`: `system`, `project`, `keep_q`, `keep_v`, `keep_p` or a part of `args`
+        is of a wrong type.
+    - `ValueError`: `v` and `p` are both given or both left out; a component to keep is
+        unknown, or chosen twice or without `project=True`.
     - `ShapeError`, `DTypeError`, `NonFiniteError`: an argument, or the value of one of
         the system's functions, is not what it should be.
     - `ConstraintViolationError`: a constraint is violated, or `q` is off the group, and
-        `project` is false.
+        `project` is false or the components that are kept do not allow to correct it.
     - `IrregularLagrangianError`: D2D2L (or D2D2H) is singular.
     - `DependentConstraintsError`: D2Φ and DΓ have not full rank (admissibility), unless
         the constraints of the system are `"redundant"`.
@@ -101,10 +115,23 @@ def initial_state(
         >>> y0 = nhjax.initial_state(system, jnp.zeros(3), jnp.ones(3), project=True)
         >>> [float(x) for x in y0.v]
         [1.0, 1.0, 0.0]
+
+    A disc that rolls at exactly 3 m/s, for which its roll rate has to be 3 rad/s:
+
+        >>> disc = nhjax.systems.VerticalRollingDisc(radius=1.0).system
+        >>> v = jnp.array([3.0, 0.0, 0.0, 0.0])
+        >>> y0 = nhjax.initial_state(disc, jnp.zeros(4), v, project=True)
+        >>> [float(x) for x in y0.v]
+        [2.0, 0.0, 2.0, 0.0]
+        >>> y0 = nhjax.initial_state(disc, jnp.zeros(4), v, project=True, keep_v=[0])
+        >>> [float(x) for x in y0.v]
+        [3.0, 0.0, 3.0, 0.0]
     """
-    check_flag("project", project)
+    project = check_flag("project", project)
     throw = check_flag("throw", throw)
     q, v, p, t = checked_inputs(system, q, v, p, t)
+    chosen = {"q": keep_q, "v": keep_v, "p": keep_p}
+    keep = checked_keep(system, q, "p" if v is None else "v", chosen, project)
     args = parameters(args)
     check_functions(system, t, q, args)
     inputs = [
@@ -114,8 +141,8 @@ def initial_state(
     ]
     if throw:
         q = require(q, *inputs)
-    found = _solve(system, t, q, v, p, args, bool(project))
-    checks = judged(system, found, q, v, p, bool(project))
+    found = _solve(system, t, q, v, p, args, project, keep)
+    checks = judged(system, found, q, v, p, project, keep)
     if throw:
         return require(found.state, *checks)
     good = jnp.all(jnp.stack([jnp.asarray(check.ok) for check in inputs + checks]))
@@ -123,13 +150,14 @@ def initial_state(
 
 
 @tracked_jit("system", "args")
-def _solve(system, t, q, v, p, args, project: bool) -> Found:
+def _solve(system, t, q, v, p, args, project: bool, keep: tuple[Kept, Kept]) -> Found:
     manifold = system.manifold_of(q)
-    given = p if v is None else v
+    given_q, given = q, p if v is None else v
+    keep_q, keep_u = keep
     is_fibre_coordinate = (v is None) == (system.fibre_coordinate_name == "p")
     legendre_solved = projected = jnp.asarray(True)
     off_group = manifold.distance_to_group(frozen(q))
-    starts = []
+    starts, fixed_q, fixed_u = [], None, None
     if project:
         normal = manifold.normalise(q)
         possible = all_finite(normal)
@@ -138,21 +166,29 @@ def _solve(system, t, q, v, p, args, project: bool) -> Found:
         if system.holonomic is not None:
             guess = given if is_fibre_coordinate else jnp.zeros_like(given)
             start = q
-            nearest = project_position(system, t, q, guess, args)
-            q, projected = manifold.act(q, nearest.x), nearest.found
+            nearest = project_position(system, t, q, guess, args, keep_q, given_q)
+            q, projected, fixed_q = nearest.x, nearest.found, nearest.fixed
             starts.append(Rank(nearest.jacobian, start, ~projected))
+        if keep_q.indices:
+            q = keep_q.restored(q, given_q)
+            off_group = manifold.distance_to_group(frozen(q))
     u = given
     if not is_fibre_coordinate:
         u, legendre_solved = _inverse_legendre(system, t, q, given, args)
     if project and (system.nonholonomic is not None or system.holonomic is not None):
-        nearest = project_fibre_coordinate(system, t, q, u, args)
+        nearest = project_fibre_coordinate(system, t, q, u, args, keep_u, given)
         starts.append(Rank(nearest.jacobian, q, projected & ~nearest.found))
         u, projected = nearest.x, projected & nearest.found
+        fixed_u = nearest.fixed
     lin, found_v, found_p = as_cpu_kernel(_motion, system, t, q, u, args)
     if not project:
         # The velocity or momentum that was given is kept to the last bit.
         found_v = found_v if v is None else v
         found_p = found_p if p is None else p
+    elif v is not None:
+        found_v = keep_u.restored(found_v, v)
+    else:
+        found_p = keep_u.restored(found_p, p)
     state = State(q, found_v, found_p, lin.multiplier)
     # The numbers by which the state is judged lead to no derivative.
     system, args, t, q, u, lin, starts = frozen((system, args, t, q, u, lin, starts))
@@ -180,6 +216,8 @@ def _solve(system, t, q, v, p, args, project: bool) -> Found:
         allowed_off_group=tolerance,
         legendre_solved=legendre_solved,
         projected=projected,
+        fixed_positions=fixed_q,
+        fixed_velocities=fixed_u,
     )
 
 

@@ -39,6 +39,8 @@ class SymPyModel(eqx.Module):
         t: FloatScalarLike = 0.0,
         args: Args = None,
         project: bool = False,
+        keep_q: Any = None,
+        keep_v: Any = None,
     ) -> State:
         """Make a consistent state, as `nhjax.initial_state` does.
 
@@ -50,6 +52,8 @@ class SymPyModel(eqx.Module):
         - `t`: the time.
         - `args`: the parameters, those of the model by default.
         - `project`: move the state to the constraints.
+        - `keep_q`, `keep_v`: the coordinates and velocities that the projection must
+            not change: indices, names or coordinates of SymPy, one or several.
 
         **Returns:** a `State`.
 
@@ -60,7 +64,16 @@ class SymPyModel(eqx.Module):
         args = self.args if args is None else args
         # Before JAX sorts the keys, which it cannot if they are symbols.
         parameter_values(self.parameters, args)
-        return initial_state(self.system, q, v, t=t, args=args, project=project)
+        return initial_state(
+            self.system,
+            q,
+            v,
+            t=t,
+            args=args,
+            project=project,
+            keep_q=_with_names(keep_q),
+            keep_v=_with_names(keep_v),
+        )
 
     def _array(self, name: str, given: Any) -> Array:
         if not isinstance(given, Mapping):
@@ -83,11 +96,23 @@ class SymPyModel(eqx.Module):
         return jnp.stack(made)
 
 
+def _with_names(chosen: Any) -> Any:
+    """Replace coordinates of SymPy, alone or in a sequence, by their names."""
+    if isinstance(chosen, (list, tuple, set, frozenset)):
+        return [_name(x) for x in chosen]
+    return _name(chosen)
+
+
+def _name(x: Any) -> Any:
+    """Return the name of a symbol or a coordinate q(t), and anything else as it is."""
+    return x if isinstance(x, str) else getattr(x, "name", x)
+
+
 def _by_name(where: str, given: Mapping[Any, Any]) -> dict[str, Any]:
     """Key a dictionary by names, where symbols and coordinates q(t) were keys."""
     values = {}
     for key, value in given.items():
-        name = key if isinstance(key, str) else str(getattr(key, "name", key))
+        name = str(_name(key))
         if name in values:
             raise ValueError(f"{where} has {name} twice.")
         values[name] = value

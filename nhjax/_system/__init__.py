@@ -20,6 +20,7 @@ from ._closure import closure_converted as closure_converted
 from ._dependence import (
     dependence_error as dependence_error,
     dependent_names as dependent_names,
+    enumerated as enumerated,
     require_independent as require_independent,
 )
 from ._framed import with_frames as with_frames

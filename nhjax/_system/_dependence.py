@@ -79,7 +79,7 @@ def dependent_names(matrix: Float[Array, "l c"], num_holonomic: int) -> str:
     """
     rows = np.asarray(matrix)
     names = _names(rows.shape[0] - num_holonomic, num_holonomic)
-    return _enumerated([names[a] for a in dependent_rows(rows)])
+    return enumerated([names[a] for a in dependent_rows(rows)])
 
 
 def require_independent(
@@ -105,5 +105,7 @@ def _rank(rows: np.ndarray) -> int:
     return int(np.linalg.matrix_rank(scaled, rtol=np.finfo(rows.dtype).eps ** 0.5))
 
 
-def _enumerated(names: list[str]) -> str:
-    return " and ".join([", ".join(names[:-1])] * bool(names[1:]) + names[-1:])
+def enumerated(names: list[str], conjunction: str = "and") -> str:
+    """Write names as a list in a sentence, such as "a, b and c"."""
+    first = [", ".join(names[:-1])] if names[1:] else []
+    return f" {conjunction} ".join(first + names[-1:])

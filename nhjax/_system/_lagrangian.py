@@ -55,7 +55,8 @@ class LagrangianSystem(AbstractMechanicalSystem):
         constraints in the metric M⁻¹, and none of a nonholonomic one that follows; it
         marks reactions as not unique. `docs/systems.md` has the details.
     - `coordinates`: a tuple of the names of the n coordinates, for
-        `Solution.to_xarray`; None by default.
+        `Solution.to_xarray` and for `keep_q`, `keep_v` and `keep_p` of `initial_state`;
+        None by default.
 
     !!! example
 

@@ -78,6 +78,18 @@ def test_a_lagranges_method_has_the_motion_of_its_own_equations():
     np.testing.assert_allclose(values, 0, atol=1e-13)
 
 
+def test_a_projection_keeps_what_is_chosen_by_name_or_symbol():
+    model = from_sympy(
+        (DX**2 + DY**2 + A.diff() ** 2) / 2, [X, Y, A], nonholonomic=DX - 2 * DY
+    )
+    v = {X: 1.0, "y": 3.0}
+    for chosen in (X, "x", [X, "a"], (0,)):
+        y = model.initial_state({}, v, project=True, keep_v=chosen, keep_q=[X, Y])
+        np.testing.assert_array_equal(y.v, [1.0, 0.5, 0.0])
+    with pytest.raises(ValueError, match=r"`keep_v` has the name 'm'.* are x, y, a\."):
+        model.initial_state({}, v, project=True, keep_v=[M])
+
+
 def skate(**options):
     """A skate for Kane's method: speeds forward, sideways and of its turn."""
     forward, aside, turn = dynamicsymbols("u1 u2 u3")

@@ -121,6 +121,21 @@ def a_projected_start():
 
 
 @feature
+def a_projected_start_with_kept_components():
+    disc = systems.RollingDisc(radius=0.5)
+    v = jnp.array([3.0, 0.1, 0.2, 0.0])
+    y = nhjax.initial_state(disc.system, disc.q0, v, project=True, keep_v=(0, 2))
+    np.testing.assert_array_equal(y.v[::2], v[::2])
+    close(y.v, jnp.array([3.0, 0.0, 0.2, 6.0]))
+    q = PARTICLE.q0 + 0.1
+    y = nhjax.initial_state(
+        PARTICLE.system, q, p=PARTICLE.v0, project=True, keep_q=1, keep_p=(0,)
+    )
+    assert abs(float(PARTICLE.constraint(0.0, y.q, y.v, None))) < 1e-14
+    np.testing.assert_array_equal(y.p[0], PARTICLE.v0[0])
+
+
+@feature
 def time_force_and_args():
     system = nhjax.LagrangianSystem(
         lambda t, q, v, args: 0.5 * v @ v,
