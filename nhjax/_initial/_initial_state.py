@@ -168,7 +168,7 @@ def _solve(system, t, q, v, p, args, project: bool) -> Found:
     return Found(
         state=state,
         lin=lin,
-        generator=getattr(system, system.generator)(t, q, u, args),
+        generator=system.call(system.generator, t, q, u, args),
         positions=positions,
         off_group=off_group,
         regularity=reciprocal_condition(system.metric(t, q, u, args)),

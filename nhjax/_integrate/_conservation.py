@@ -15,7 +15,13 @@ from .._custom_types import Args, BoolScalar, FloatScalar
 from .._errors import DTypeError, naming, ShapeError
 from .._numerics import ClosureConverted, dependence, frozen, matvec, max_norm
 from .._step import invariant_values, Invariants
-from .._system import AbstractMechanicalSystem, linearise, noise_near, State
+from .._system import (
+    AbstractMechanicalSystem,
+    check_signature,
+    linearise,
+    noise_near,
+    State,
+)
 
 
 # Rates of change are looked at in the initial state and in this many around it.
@@ -75,8 +81,9 @@ def _check_function(
     y: State,
     args: Args,
 ) -> None:
-    u = system.fibre_coordinate(y)
-    called = f"invariants(t, q, {system.fibre_coordinate_name}, args)"
+    u, coordinate = system.fibre_coordinate(y), system.fibre_coordinate_name
+    check_signature("integrate", "invariants", function, ("t", "q", coordinate, "args"))
+    called = f"invariants(t, q, {coordinate}, args)"
     with naming(called, function, args):
         out = eqx.filter_eval_shape(function, t, y.q, u, args)
     shape, most = getattr(out, "shape", None), u.shape[0]

@@ -41,4 +41,5 @@ from ._scales import (
     velocity_scale as velocity_scale,
     violation_scale as violation_scale,
 )
+from ._signatures import check_signature as check_signature
 from ._state import check_time_and_state as check_time_and_state, State as State
