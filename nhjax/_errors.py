@@ -74,11 +74,12 @@ class IntegrationError(RuntimeError):
 
 
 @contextlib.contextmanager
-def naming(called: str, function: Any, args: Any) -> Iterator[None]:
+def naming(called: str, function: Any, args: Any = ...) -> Iterator[None]:
     """Add a note to what is raised while a function of the user is traced.
 
     The note names the function as it is `called`, with its file and line, and says what
-    helps if that is known. `args` is what the user gave as such.
+    helps if that is known. `args` is what the user gave as such, if the function takes
+    it.
     """
     try:
         yield
@@ -101,7 +102,7 @@ _ADVICE = (
     (
         jax.errors.TracerIntegerConversionError,
         "make a list or an array of NumPy that is indexed by one of them an array of "
-        "JAX, `jnp.asarray(table)[i]`.",
+        "JAX, `jnp.asarray(table)[i]`; the number of a `range` must be an int.",
     ),
     (
         jax.errors.NonConcreteBooleanIndexError,

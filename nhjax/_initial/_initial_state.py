@@ -36,6 +36,7 @@ from .._system import (
     position_scale,
     real_scalar,
     require_manifold,
+    require_names,
     State,
     violation_scale,
 )
@@ -255,6 +256,11 @@ def _inverse_legendre(
 def checked_inputs(system, q, v, p, t):
     """Convert what `initial_state` is given to arrays, or raise for what is wrong."""
     check_type("system", system, (LagrangianSystem, HamiltonianSystem))
+    if isinstance(q, State):
+        raise TypeError(
+            "`q` must be a configuration, got an nhjax.State. Of a state `y` give "
+            "`y.q` and `y.v`."
+        )
     if (v is None) == (p is None):
         given = "neither" if v is None else "both"
         raise ValueError(f"Give either `v` or `p`; got {given} of them.")
@@ -268,6 +274,7 @@ def checked_inputs(system, q, v, p, t):
         )
     manifold = system.manifold_of(q)
     q = manifold.check(q)
+    require_names(system, "q", manifold)
     leaves = jax.tree.leaves(q)
     if u.shape != (manifold.dim,):
         raise ShapeError(

@@ -18,7 +18,9 @@ from .._step import invariant_values, Invariants
 from .._system import (
     AbstractMechanicalSystem,
     check_signature,
+    dtype_advice,
     linearise,
+    no_array,
     noise_near,
     State,
 )
@@ -90,14 +92,15 @@ def _check_function(
     if system.constraints == "independent":
         most -= y.multiplier.shape[0]
     if shape is None or len(shape) > 1 or not 1 <= math.prod(shape) <= most:
-        got = f"{out!r}" if shape is None else f"shape {shape}"
+        got = no_array(out) if shape is None else f"shape {shape}."
         raise ShapeError(
             "`invariants` must return an array of shape () or (k,) with 1 <= k <= "
-            f"{most}, the number of degrees of freedom, got {got}."
+            f"{most}, the number of degrees of freedom, got {got}"
         )
     if out.dtype != u.dtype:
         raise DTypeError(
-            f"`invariants` returns dtype {out.dtype}, but the state has {u.dtype}."
+            f"`invariants` returns dtype {out.dtype}, but the state has {u.dtype}: "
+            f"{dtype_advice(out.dtype)}"
         )
 
 

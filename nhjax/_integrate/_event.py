@@ -75,15 +75,19 @@ class Event(eqx.Module):
         for name, function in (("cond_fn", cond_fn), ("reset", reset)):
             if name == "cond_fn" or function is not None:
                 check_signature("Event", name, function, ("t", "y", "args"))
-        if direction is not None:
-            direction = check_flag("direction", direction)
+        if not isinstance(direction, bool | np.bool_ | None):
+            raise TypeError(
+                "Event: `direction` must be True or False, for functions that increase "
+                f"or decrease, or None for both, got {direction!r}."
+            )
         if terminate is None:
             terminate = reset is None
         if not isinstance(max_events, int | np.integer) or max_events < 1:
             raise ValueError(
                 f"Event: `max_events` must be an int >= 1, got {max_events!r}."
             )
-        self.cond_fn, self.reset, self.direction = cond_fn, reset, direction
+        self.cond_fn, self.reset = cond_fn, reset
+        self.direction = None if direction is None else bool(direction)
         self.terminate = check_flag("terminate", terminate)
         self.max_events = 1 if self.terminate else int(max_events)
 

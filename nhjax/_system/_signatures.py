@@ -52,10 +52,13 @@ def check_constraints(owner: Any) -> None:
 
 def check_manifold(owner: Any) -> None:
     """Raise a `TypeError` unless the `manifold` of `owner` is one, or None."""
-    if not isinstance(owner.manifold, AbstractLieGroup | None):
+    manifold = owner.manifold
+    if not isinstance(manifold, AbstractLieGroup | None):
+        is_class = isinstance(manifold, type)
+        got = f"the class; write {manifold.__name__}()" if is_class else repr(manifold)
         raise TypeError(
             f"{type(owner).__name__}: `manifold` must be an nhjax manifold such as "
-            f"nhjax.Euclidean(3), got {owner.manifold!r}."
+            f"nhjax.Euclidean(3), got {got}."
         )
 
 
@@ -66,8 +69,8 @@ def check_coordinates(owner: Any) -> None:
         return
     if not isinstance(names, tuple) or not all(isinstance(x, str) for x in names):
         raise TypeError(
-            f"{type(owner).__name__}: `coordinates` must be a tuple of names, got "
-            f"{names!r}."
+            f"{type(owner).__name__}: `coordinates` must be a tuple of names, such "
+            f"as ('x', 'y'), got {names!r}."
         )
     if len(set(names)) != len(names):
         raise ValueError(
