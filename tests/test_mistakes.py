@@ -185,7 +185,7 @@ SYSTEMS = [
         "gave two names to three coordinates",
         lambda: start(system_with(coordinates=("x", "y"))),
         ShapeError,
-        "`q` has 3 coordinates, but the system has 2 names of `coordinates`, ('x', 'y')",
+        "`q` has 3 coordinates, but the system has 2 names of `coordinates`",
         "give one name for each coordinate",
     ),
     row(
