@@ -74,11 +74,12 @@ class IntegrationError(RuntimeError):
 
 
 @contextlib.contextmanager
-def naming(called: str, function: Any, args: Any) -> Iterator[None]:
+def naming(called: str, function: Any, args: Any = ...) -> Iterator[None]:
     """Add a note to what is raised while a function of the user is traced.
 
     The note names the function as it is `called`, with its file and line, and says what
-    helps if that is known. `args` is what the user gave as such.
+    helps if that is known. `args` is what the user gave as such, if the function takes
+    it.
     """
     try:
         yield
@@ -86,28 +87,45 @@ def naming(called: str, function: Any, args: Any) -> Iterator[None]:
         note = f"This was raised by `{called}`{_place(function)}, called by nhjax."
         for kind, advice in _ADVICE:
             if isinstance(error, kind):
-                note += f" {advice}"
+                note += f" It is given arrays of JAX without values: {advice}"
                 break
-        if args is None and "NoneType" in str(error):
-            note += " Here `args` is None: has `args=...` been left out of the call?"
-        error.add_note(note)
+        error.add_note(note + _about_args(error, args))
         raise
 
 
-_NUMPY = (
-    "It is given arrays of JAX without values: use functions of `jax.numpy` in place "
-    "of those of `numpy` and `math`."
-)
 _ADVICE = (
     (
         jax.errors.TracerBoolConversionError,
-        "It is given arrays of JAX without values: write `jnp.where(condition, a, b)` "
-        "in place of `if`, and `jnp.maximum`, `jnp.minimum` in place of `max`, `min`.",
+        "write `jnp.where(condition, a, b)` in place of `if`, and `jnp.maximum`, "
+        "`jnp.minimum` in place of `max`, `min`.",
     ),
-    (jax.errors.TracerArrayConversionError, _NUMPY),
-    # The functions of `math` ask for a number, which raises this.
-    (jax.errors.ConcretizationTypeError, _NUMPY),
+    (
+        jax.errors.TracerIntegerConversionError,
+        "make a list or an array of NumPy that is indexed by one of them an array of "
+        "JAX, `jnp.asarray(table)[i]`; the number of a `range` must be an int.",
+    ),
+    (
+        jax.errors.NonConcreteBooleanIndexError,
+        "write `jnp.where(condition, a, 0.0)` in place of `a[condition]`.",
+    ),
+    # The functions of `math` ask for a number, which raises the second of these.
+    (
+        (jax.errors.TracerArrayConversionError, jax.errors.ConcretizationTypeError),
+        "use functions of `jax.numpy` in place of those of `numpy` and `math`, and "
+        "leave out `float` and `int`.",
+    ),
 )
+
+
+def _about_args(error: Exception, args: Any) -> str:
+    """Say what `args` is if an error looks as though it were something else."""
+    if args is None and "NoneType" in str(error):
+        return " Here `args` is None: has `args=...` been left out of the call?"
+    if isinstance(error, KeyError) and isinstance(args, dict):
+        return f" Here `args` has the keys {', '.join(map(repr, args))}."
+    if isinstance(error, TypeError | IndexError) and isinstance(args, tuple | list):
+        return f" Here `args` is a {type(args).__name__} of {len(args)}."
+    return ""
 
 
 def _place(function: Any) -> str:
@@ -321,11 +339,11 @@ def _short_traceback() -> TracebackType:
     return TracebackType(None, frame, frame.f_lasti, frame.f_lineno)
 
 
-class _OneLine(logging.Filter):
-    """A filter that shortens what JAX logs of a call-back that raised our exception.
+class _Once(logging.Filter):
+    """A filter that drops what JAX logs of a call-back that raised our exception.
 
-    JAX logs such exceptions with two tracebacks before it raises them; the filter
-    leaves one line, with the type and the message of the exception.
+    JAX logs such exceptions before it raises them. The user would read the message
+    twice.
     """
 
     def filter(self, record: logging.LogRecord) -> bool:
@@ -333,10 +351,7 @@ class _OneLine(logging.Filter):
         entry = exception.__traceback__ if exception else None
         while entry and entry.tb_next:
             entry = entry.tb_next
-        if entry and entry.tb_frame is _NOWHERE.gi_frame:
-            record.msg = f"{type(exception).__name__}: {exception}"
-            record.args, record.exc_info, record.exc_text = (), None, None
-        return True
+        return entry is None or entry.tb_frame is not _NOWHERE.gi_frame
 
 
-logging.getLogger("jax._src.callback").addFilter(_OneLine())
+logging.getLogger("jax._src.callback").addFilter(_Once())

@@ -1,9 +1,13 @@
 """The ways in which a run can end, with messages that say what to do about each."""
 
 import functools
+from typing import Any
 
 import equinox as eqx
 import jax
+import numpy as np
+
+from ._errors import lane_name
 
 
 JUMPS = (
@@ -19,8 +23,44 @@ FALLBACK = (
 EVENT_OCCURRED = "An event ended the run, as was asked for; this is no failure."
 
 
-class RESULTS(eqx.Enumeration):
-    """The ways in which a run can end; `RESULTS[sol.result]` is the message."""
+# By its metaclass an enumeration looks up the text of a result, and it prints a result
+# with this text.
+class _Named(type(eqx.Enumeration)):
+    """An enumeration whose items have texts that begin with their names."""
+
+    def __getitem__(cls, item: Any) -> str:
+        is_known = isinstance(item, cls) and eqx.is_array_like(item._value)
+        if not is_known or item.is_traced():
+            return super().__getitem__(item)
+        names = {code: name for name, code in result_codes().items()}
+        codes = np.asarray(item._value)
+        if codes.ndim:
+            return _counted(codes, names)
+        name, message = names[int(codes)], super().__getitem__(item)
+        return f"{name}: {message}" if message else name
+
+
+def _counted(codes: np.ndarray, names: dict[int, str]) -> str:
+    """Count the results of many runs by name; say which run is the first of each."""
+    parts = []
+    for code in np.unique(codes):
+        where, name = np.argwhere(codes == code), names[int(code)]
+        first = lane_name(tuple(where[0].tolist()))
+        which = "" if name == "successful" else f" (first: {first})"
+        parts.append(f"{len(where)} {name}{which}")
+    return f"{codes.size} runs: {', '.join(parts)}" if parts else "0 runs"
+
+
+class RESULTS(eqx.Enumeration, metaclass=_Named):
+    """The ways in which a run can end.
+
+    `RESULTS[sol.result]` is the name of the result, and a message that says what to do.
+    For many runs it says how many ended in which way; `sol.failures()` has the message
+    of each. `print(sol.result)` shows the same.
+    """
+
+    # So a result is printed as `nhjax.RESULTS<...>`.
+    __module__ = "nhjax"
 
     successful = ""
     nonlinear_divergence = (
@@ -127,8 +167,9 @@ def result_codes() -> dict[str, int]:
 
 @functools.cache
 def messages() -> list[str]:
-    """List the messages of `RESULTS` in the order of their codes."""
+    """List the messages of `RESULTS`, without names, in the order of their codes."""
     codes = result_codes()
     with jax.ensure_compile_time_eval():
         ordered = sorted(codes, key=lambda name: codes[name])
-        return [RESULTS[getattr(RESULTS, name)] for name in ordered]
+        texts = [RESULTS[getattr(RESULTS, name)] for name in ordered]
+    return [text.partition(": ")[2] for text in texts]

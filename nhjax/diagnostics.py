@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ._custom_types import Args
-from ._errors import is_traced, ShapeError
+from ._errors import is_traced, naming, ShapeError
 from ._integrate import Solution
 from ._system import (
     AbstractMechanicalSystem,
@@ -103,7 +103,8 @@ def momentum_map(
         )
 
     def pairing(q, p):
-        direction = jnp.asarray(generator(q))
+        with naming("generator(q)", generator):
+            direction = jnp.asarray(generator(q))
         if direction.shape != p.shape:
             raise ShapeError(
                 f"`generator(q)` has shape {direction.shape}, expected {p.shape}: one "

@@ -111,8 +111,6 @@ def test_convergence():
 
 
 def test_errors(sol):
-    with pytest.raises(ValueError, match="two or three indices into the 4"):
-        plot.trajectory(sol, (0, 4))
     with pytest.raises(ValueError, match="two or three indices"):
         plot.trajectory(sol, (0,))
     with pytest.raises(ValueError, match="`names` must hold 2"):

@@ -217,11 +217,11 @@ def _measured(system, t, q, u, args) -> dict[str, Any]:
         return jax.jacfwd(system.kinematic_constraint, argnums=2)(t, g, u, args)
 
     def on_chart(name):
-        arguments, function = system.signatures()[name], getattr(system, name)
+        arguments = system.signatures()[name]
 
         def value(t, xi, u):
             given = {"t": t, "q": manifold.act(q, xi), coordinate: u, "args": args}
-            return jnp.atleast_1d(function(*(given[x] for x in arguments)))
+            return jnp.atleast_1d(system.call(name, *(given[x] for x in arguments)))
 
         return value
 

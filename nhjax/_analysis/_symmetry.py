@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Array, Float, PyTree
 
 from .._custom_types import Args, BoolScalar, FloatScalar
-from .._errors import Check, DependentConstraintsError, ShapeError
+from .._errors import Check, DependentConstraintsError, naming, ShapeError
 from .._numerics import is_deficient, max_norm
 from .._system import AbstractMechanicalSystem, State
 from ._permitted import Permitted
@@ -29,7 +29,9 @@ def check_symmetry(symmetry: Any, y: State) -> None:
             f"{reprlib.repr(symmetry)} of type {type(symmetry).__name__}. For a "
             "symmetry of the body alone that is `lambda q: xi`."
         )
-    out, dim = eqx.filter_eval_shape(symmetry, y.q), y.p.shape[0]
+    dim = y.p.shape[0]
+    with naming("symmetry(q)", symmetry):
+        out = eqx.filter_eval_shape(symmetry, y.q)
     shape = getattr(out, "shape", None)
     fits = shape == (dim,) or (
         shape is not None and len(shape) == 2 and shape[1] == dim and shape[0] > 0

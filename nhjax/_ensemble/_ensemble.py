@@ -1,7 +1,8 @@
 import os
+import reprlib
 import sys
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
 import jax
@@ -9,6 +10,7 @@ import numpy as np
 from jaxtyping import PyTree
 
 from .._integrate import AbstractProgressMeter, NoProgressMeter, TqdmProgressMeter
+from .._system import check_flag
 from ._collected import Collected
 from ._failed import failed_rows
 from ._kept import Kept
@@ -24,6 +26,8 @@ from ._store import Stored
 # Chunks of this many members for each device keep all lanes busy, if their results are
 # not larger than so many bytes.
 _MEMBERS, _BYTES = 1024, 2**26
+# Names of files of other programs, which `out` does not make.
+_FILES = (".nc", ".nc4", ".h5", ".hdf5", ".csv", ".npy", ".npz", ".mat", ".pkl")
 # The shortest time between two updates of a progress meter.
 _SECONDS = 0.1
 
@@ -105,12 +109,16 @@ def ensemble(
     processes = Processes()
     with processes.together():
         if not callable(run):
-            raise TypeError(f"`run` must be a function of one member, got {run!r}.")
+            got = f"{reprlib.repr(run)} of type {type(run).__name__}"
+            raise TypeError(f"`run` must be a function of one member, got {got}.")
         if reduce is not None:
             check_reductions(reduce)
+        _check_folder(out)
+        resume = check_flag("resume", resume)
+        fixed_order = check_flag("fixed_order", fixed_order)
         progress_meter = _meter(progress_meter, processes)
         chosen = _devices(devices)
-        layout = Layout(chosen, bool(fixed_order) and len(chosen) > 1)
+        layout = Layout(chosen, fixed_order and len(chosen) > 1)
         source = Members(members, num_members)
         structure = value_structure(run, source.make, source.inputs(0, 1))
         size = _chunk_size(chunk_size, source.count, structure, len(layout.devices))
@@ -118,13 +126,31 @@ def ensemble(
         if reduce is None:
             sink = _for_values(work, out, units, resume)
         else:
-            sink = _for_statistics(work, reduce, out, units, resume, bool(fixed_order))
+            sink = _for_statistics(work, reduce, out, units, resume, fixed_order)
         try:
             _run_chunks(work, sink, progress_meter)
             outcome = sink.outcome()
         finally:
             sink.close()
     return outcome
+
+
+def _check_folder(out: Any) -> None:
+    """Raise for what is no name, or the name of a file of another program."""
+    if out is None:
+        return
+    if not isinstance(out, str | os.PathLike):
+        raise TypeError(
+            f"`out` must be the name of a folder, got {reprlib.repr(out)} of type "
+            f"{type(out).__name__}."
+        )
+    suffix = os.path.splitext(out)[1].lower()
+    if suffix in _FILES:
+        raise ValueError(
+            f"`out` is {os.fspath(out)!r}, but it names a folder, in which programs "
+            f"that read {suffix} find nothing: use a name without suffix or with "
+            ".zarr, which `xarray.open_zarr` opens."
+        )
 
 
 def _meter(given: Any, processes: Processes) -> AbstractProgressMeter:
@@ -218,6 +244,11 @@ def _run_chunks(
 def _devices(devices: Sequence[Any] | None) -> tuple[Any, ...]:
     if devices is None:
         return tuple(jax.local_devices())
+    if isinstance(devices, str) or not isinstance(devices, Iterable):
+        raise TypeError(
+            "`devices` must be a sequence of devices, such as `jax.local_devices()[:2]`"
+            f", got {devices!r}."
+        )
     chosen = tuple(devices)
     if not chosen or len(set(chosen)) < len(chosen):
         raise ValueError(f"`devices` must be different devices, got {chosen}.")

@@ -10,6 +10,8 @@ import numpy as np
 from jaxtyping import Array, Bool, Int, PyTree
 
 from .._compile import tracked_jit
+from .._errors import naming
+from .._system import no_array
 from ._reduction import AbstractReduction
 from ._verdict import is_good, verdict, without_results
 
@@ -144,10 +146,18 @@ def value_structure(run: Any, make: Any, inputs: Any) -> Any:
     **Raises:** `TypeError` if there is anything but arrays of numbers.
     """
     one = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), inputs)
-    structure = eqx.filter_eval_shape(lambda one: run(make(one)), one)
+
+    def value(one):
+        member = make(one)
+        with naming("run(member)", run):
+            return run(member)
+
+    structure = eqx.filter_eval_shape(value, one)
     leaves = jax.tree_util.tree_leaves_with_path(structure)
     if not leaves:
-        raise TypeError(f"`run` must return arrays for each member, got {structure!r}.")
+        raise TypeError(
+            f"`run` must return arrays for each member, got {no_array(structure)}"
+        )
     for path, leaf in leaves:
         name = f"`run(member){jax.tree_util.keystr(path)}`"
         if not isinstance(leaf, jax.ShapeDtypeStruct):

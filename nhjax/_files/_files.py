@@ -2,6 +2,7 @@ import importlib.metadata
 import os
 import shutil
 import uuid
+import zipfile
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +23,8 @@ _OTHER_FORMATS = {
     **dict.fromkeys((".nc", ".nc4", ".h5", ".hdf5", ".zarr"), _XARRAY),
     ".csv": "`sol.to_xarray().to_dataframe().to_csv(path)`",
     ".npy": "`numpy.save` for a single array",
+    ".mat": "`scipy.io.savemat` for arrays",
+    **dict.fromkeys((".pkl", ".pickle"), "`pickle` for objects of Python"),
 }
 
 
@@ -61,6 +64,7 @@ def save(path: str | os.PathLike[str], tree: Any) -> None:
         >>> int(nhjax.load(path).num_steps)
         50
     """
+    _check_path(path, "Call it as `save(path, tree)`.")
     # A link stays one, to the new file.
     path = Path(path).resolve()
     other = _OTHER_FORMATS.get(path.suffix.lower())
@@ -110,7 +114,8 @@ def load(path: str | os.PathLike[str]) -> Any:
     **Returns:** the tree that was saved, with the same bits; its arrays are those of
     JAX.
 
-    **Raises:** `FileNotFoundError` if there is no such file; `ValueError` if it is not
+    **Raises:** `FileNotFoundError` if there is no such file, `IsADirectoryError` if it
+    is a folder; `ValueError` if it is not
     one that `save` has written, is damaged, or was written by a later release in a
     format that this one does not know; `DTypeError` if it holds float64 and JAX is not
     set to it, rather than to round.
@@ -123,7 +128,13 @@ def load(path: str | os.PathLike[str]) -> Any:
         >>> nhjax.load(path)["name"]
         'disc'
     """
+    _check_path(path, "Call it as `load(path)`.")
     path = Path(path)
+    if path.is_dir():
+        raise IsADirectoryError(
+            f"{str(path)!r} is a folder: give the name of a file that `nhjax.save` has "
+            "written. `xarray.open_zarr` opens the store of an ensemble."
+        )
     if not path.is_file():
         raise FileNotFoundError(f"There is no file {str(path)!r}.")
     try:
@@ -152,6 +163,14 @@ def load(path: str | os.PathLike[str]) -> Any:
         ) from error
 
 
+def _check_path(path: object, advice: str) -> None:
+    if not isinstance(path, str | os.PathLike):
+        raise TypeError(
+            "`path` must be the name of a file, got an object of type "
+            f"{type(path).__name__}. {advice}"
+        )
+
+
 def installed_version() -> str:
     """Return the release of nhjax; `"unknown"` for sources that are not installed."""
     try:
@@ -165,9 +184,11 @@ def _read(path: Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     """Read all entries; those of a damaged file fail by their check sums."""
     # What NumPy opens itself stays open if it is damaged.
     with open(path, "rb") as opened:
-        file = np.load(opened, allow_pickle=False)
-        if not isinstance(file, np.lib.npyio.NpzFile):
+        # NumPy would take it for pickled objects, and advise to load these.
+        if not zipfile.is_zipfile(opened):
             raise ValueError("it is no .npz")
+        opened.seek(0)
+        file = np.load(opened, allow_pickle=False)
         with file:
             if _HEADER not in file:
                 raise ValueError(f"it has no entry {_HEADER!r}")

@@ -36,6 +36,7 @@ from .._system import (
     position_scale,
     real_scalar,
     require_manifold,
+    require_names,
     State,
     violation_scale,
 )
@@ -204,7 +205,7 @@ def _solve(system, t, q, v, p, args, project: bool, keep: tuple[Kept, Kept]) -> 
     return Found(
         state=state,
         lin=lin,
-        generator=getattr(system, system.generator)(t, q, u, args),
+        generator=system.call(system.generator, t, q, u, args),
         positions=positions,
         off_group=off_group,
         regularity=reciprocal_condition(system.metric(t, q, u, args)),
@@ -293,6 +294,11 @@ def _inverse_legendre(
 def checked_inputs(system, q, v, p, t):
     """Convert what `initial_state` is given to arrays, or raise for what is wrong."""
     check_type("system", system, (LagrangianSystem, HamiltonianSystem))
+    if isinstance(q, State):
+        raise TypeError(
+            "`q` must be a configuration, got an nhjax.State. Of a state `y` give "
+            "`y.q` and `y.v`."
+        )
     if (v is None) == (p is None):
         given = "neither" if v is None else "both"
         raise ValueError(f"Give either `v` or `p`; got {given} of them.")
@@ -306,6 +312,7 @@ def checked_inputs(system, q, v, p, t):
         )
     manifold = system.manifold_of(q)
     q = manifold.check(q)
+    require_names(system, "q", manifold)
     leaves = jax.tree.leaves(q)
     if u.shape != (manifold.dim,):
         raise ShapeError(

@@ -15,6 +15,7 @@ from .._step import StepState
 from .._system import (
     AbstractMechanicalSystem,
     check_state,
+    check_type,
     Linearisation,
     State,
 )
@@ -112,13 +113,21 @@ def time_of(y0: State | Checkpoint, t0: FloatScalarLike | None) -> FloatScalarLi
     return y0.t
 
 
+_ADVICE = (
+    "Make one with nhjax.initial_state; the last state of a solution is "
+    "`jax.tree.map(lambda x: x[-1], sol.ys)`, the first of a machine of the gallery "
+    "`machine.initial_state()`."
+)
+
+
 def check_start(
     system: AbstractMechanicalSystem, y0: State | Checkpoint, args: Args
 ) -> State:
     """Return the state of `y0`, a state of this system or a checkpoint of a run of it.
 
-    Raise if it belongs to another system.
+    Raise if it is neither, or belongs to another system.
     """
+    check_type("y0", y0, (State, Checkpoint), _ADVICE)
     if isinstance(y0, State):
         check_state(system, y0, args)
         return y0

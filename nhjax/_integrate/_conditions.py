@@ -1,7 +1,5 @@
 """The conditions of events as one function, and their signs where a step starts."""
 
-import reprlib
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -12,7 +10,14 @@ from .._errors import DTypeError, naming, ShapeError
 from .._method import AbstractMethod
 from .._numerics import ClosureConverted, NOISE_DEVIATIONS
 from .._step import StepState
-from .._system import AbstractMechanicalSystem, linearise, noise_near, State
+from .._system import (
+    AbstractMechanicalSystem,
+    dtype_advice,
+    linearise,
+    no_array,
+    noise_near,
+    State,
+)
 from ._event import Event
 from ._sides import Sides
 from ._stepping import Stepping
@@ -62,8 +67,7 @@ def _check(i: int, event: Event, t: FloatScalar, y: State, args: Args) -> None:
     shape, dtype = getattr(out, "shape", None), getattr(out, "dtype", None)
     if shape is None or dtype is None:
         raise ShapeError(
-            f"{name} must return an array of shape (), a scalar, got "
-            f"{reprlib.repr(out)} of type {type(out).__name__}."
+            f"{name} must return an array of shape (), a scalar, got {no_array(out)}"
         )
     if shape != ():
         raise ShapeError(
@@ -71,7 +75,7 @@ def _check(i: int, event: Event, t: FloatScalar, y: State, args: Args) -> None:
             "conditions give `event` a sequence of events."
         )
     if dtype != y.p.dtype:
-        advice = "constants of another precision inside it?"
+        advice = dtype_advice(dtype)
         if dtype == jnp.bool_:
             advice = "return a real number whose zero is the event."
         raise DTypeError(

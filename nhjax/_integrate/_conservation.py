@@ -15,7 +15,15 @@ from .._custom_types import Args, BoolScalar, FloatScalar
 from .._errors import DTypeError, naming, ShapeError
 from .._numerics import ClosureConverted, dependence, frozen, matvec, max_norm
 from .._step import invariant_values, Invariants
-from .._system import AbstractMechanicalSystem, linearise, noise_near, State
+from .._system import (
+    AbstractMechanicalSystem,
+    check_signature,
+    dtype_advice,
+    linearise,
+    no_array,
+    noise_near,
+    State,
+)
 
 
 # Rates of change are looked at in the initial state and in this many around it.
@@ -75,22 +83,24 @@ def _check_function(
     y: State,
     args: Args,
 ) -> None:
-    u = system.fibre_coordinate(y)
-    called = f"invariants(t, q, {system.fibre_coordinate_name}, args)"
+    u, coordinate = system.fibre_coordinate(y), system.fibre_coordinate_name
+    check_signature("integrate", "invariants", function, ("t", "q", coordinate, "args"))
+    called = f"invariants(t, q, {coordinate}, args)"
     with naming(called, function, args):
         out = eqx.filter_eval_shape(function, t, y.q, u, args)
     shape, most = getattr(out, "shape", None), u.shape[0]
     if system.constraints == "independent":
         most -= y.multiplier.shape[0]
     if shape is None or len(shape) > 1 or not 1 <= math.prod(shape) <= most:
-        got = f"{out!r}" if shape is None else f"shape {shape}"
+        got = no_array(out) if shape is None else f"shape {shape}."
         raise ShapeError(
             "`invariants` must return an array of shape () or (k,) with 1 <= k <= "
-            f"{most}, the number of degrees of freedom, got {got}."
+            f"{most}, the number of degrees of freedom, got {got}"
         )
     if out.dtype != u.dtype:
         raise DTypeError(
-            f"`invariants` returns dtype {out.dtype}, but the state has {u.dtype}."
+            f"`invariants` returns dtype {out.dtype}, but the state has {u.dtype}: "
+            f"{dtype_advice(out.dtype)}"
         )
 
 

@@ -6,7 +6,7 @@ from typing import Any
 import equinox as eqx
 import numpy as np
 
-from .._system import check_flag, check_type
+from .._system import check_flag, check_signature, check_type
 from ._saveat import SaveAt
 
 
@@ -41,7 +41,8 @@ class Event(eqx.Module):
         the sum counts. One more ends the run with `RESULTS.too_many_events`. With
         `terminate` it is 1.
 
-    **Raises:** `TypeError` or `ValueError` for arguments of a wrong type or value.
+    **Raises:** `TypeError` or `ValueError` for arguments of a wrong type or value, and
+    for functions that do not take (t, y, args) in this order.
 
     !!! example
 
@@ -72,20 +73,21 @@ class Event(eqx.Module):
         max_events: int = 32,
     ):
         for name, function in (("cond_fn", cond_fn), ("reset", reset)):
-            if not callable(function) and (name == "cond_fn" or function is not None):
-                raise TypeError(
-                    f"Event: `{name}` must be a function (t, y, args), got "
-                    f"{function!r}."
-                )
-        if direction is not None:
-            direction = check_flag("direction", direction)
+            if name == "cond_fn" or function is not None:
+                check_signature("Event", name, function, ("t", "y", "args"))
+        if not isinstance(direction, bool | np.bool_ | None):
+            raise TypeError(
+                "Event: `direction` must be True or False, for functions that increase "
+                f"or decrease, or None for both, got {direction!r}."
+            )
         if terminate is None:
             terminate = reset is None
         if not isinstance(max_events, int | np.integer) or max_events < 1:
             raise ValueError(
                 f"Event: `max_events` must be an int >= 1, got {max_events!r}."
             )
-        self.cond_fn, self.reset, self.direction = cond_fn, reset, direction
+        self.cond_fn, self.reset = cond_fn, reset
+        self.direction = None if direction is None else bool(direction)
         self.terminate = check_flag("terminate", terminate)
         self.max_events = 1 if self.terminate else int(max_events)
 

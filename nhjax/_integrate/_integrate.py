@@ -180,7 +180,6 @@ def integrate(
     """
     check_type("system", system, (LagrangianSystem, HamiltonianSystem))
     check_type("method", method, METHODS, "Such as nhjax.LobattoIIIAB(3).")
-    check_type("y0", y0, (State, Checkpoint), "Make one with nhjax.initial_state.")
     check_type("saveat", saveat, SaveAt, "Such as nhjax.SaveAt(t0=True, steps=True).")
     newton = "Such as nhjax.Newton()."
     check_type("stage_solver", stage_solver, AbstractStageSolver, newton)

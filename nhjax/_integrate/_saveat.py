@@ -10,7 +10,7 @@ from jaxtyping import Array, Float, PyTree
 
 from .._custom_types import FloatScalar, IntScalar
 from .._errors import Check, DTypeError, is_traced, NonFiniteError
-from .._system import State
+from .._system import check_signature, State
 from ._checks import static_length
 from ._interpolation import step_position
 
@@ -46,8 +46,9 @@ class SaveAt(eqx.Module):
 
     **Raises:** `ValueError` if nothing is saved, a flag is not a bool, `steps` is not a
     bool or an int >= 1, `ts` is not a sorted vector, or `ts` and `steps` are given
-    together; `DTypeError` if `ts` is not real. `integrate` raises a `TypeError` if
-    `fn` returns something that is not an array or a tree of arrays.
+    together; `DTypeError` if `ts` is not real; `TypeError` if `fn` is not a function of
+    (t, y, args). `integrate` raises a `TypeError` if `fn` returns something that is not
+    an array or a tree of arrays.
 
     !!! example
 
@@ -100,10 +101,7 @@ class SaveAt(eqx.Module):
                 "SaveAt: give `ts` or `steps`, not both; with `dense=True` the "
                 "solution can be evaluated anywhere afterwards."
             )
-        if not callable(fn):
-            raise ValueError(
-                f"SaveAt: `fn` must be a function (t, y, args), got {fn!r}."
-            )
+        check_signature("SaveAt", "fn", fn, ("t", "y", "args"))
         self.t0, self.t1, self.dense, self.fn = t0, t1, dense, fn
         self.checkpoint = checkpoint
         self.steps = int(steps)

@@ -62,7 +62,8 @@ def step(
         >>> y.q.shape
         (4,)
     """
-    check_type("y", y, State, "Make one with nhjax.initial_state.")
+    call = "Call it as `step(system, method, t, dt, y, args)`."
+    check_type("y", y, State, f"Make one with nhjax.initial_state. {call}")
     t = real_scalar("t", t, jnp.result_type(float))
     sol = integrate(
         system,

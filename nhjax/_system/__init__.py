@@ -6,8 +6,10 @@ from ._arguments import (
     check_flag as check_flag,
     check_type as check_type,
     configuration as configuration,
+    dtype_advice as dtype_advice,
     finite as finite,
     floating as floating,
+    no_array as no_array,
     parameters as parameters,
     real_scalar as real_scalar,
 )
@@ -15,6 +17,7 @@ from ._checks import (
     check_functions as check_functions,
     check_state as check_state,
     require_manifold as require_manifold,
+    require_names as require_names,
 )
 from ._closure import closure_converted as closure_converted
 from ._dependence import (
@@ -42,4 +45,5 @@ from ._scales import (
     velocity_scale as velocity_scale,
     violation_scale as violation_scale,
 )
+from ._signatures import check_signature as check_signature
 from ._state import check_time_and_state as check_time_and_state, State as State

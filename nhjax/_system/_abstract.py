@@ -1,5 +1,6 @@
 from abc import abstractmethod
 from collections.abc import Callable
+from functools import partial
 from typing import Any, Literal
 
 import equinox as eqx
@@ -14,6 +15,7 @@ from .._custom_types import (
     PhaseFunction,
     PositionFunction,
 )
+from .._errors import naming
 from .._manifold import AbstractLieGroup, Euclidean
 from ._signatures import (
     check_constraints,
@@ -47,8 +49,9 @@ class AbstractMechanicalSystem(eqx.Module):
 
     def __check_init__(self):
         for name, arguments in self.signatures().items():
-            if getattr(self, name) is not None or name == self.generator:
-                check_signature(self, name, arguments)
+            function = getattr(self, name)
+            if function is not None or name == self.generator:
+                check_signature(type(self).__name__, name, function, arguments)
         check_constraints(self)
         check_manifold(self)
         check_coordinates(self)
@@ -106,13 +109,23 @@ class AbstractMechanicalSystem(eqx.Module):
     def functions(
         self, t: Any, q: PyTree[Any], u: Any, args: Args
     ) -> dict[str, tuple[Callable[..., Any], tuple[Any, ...]]]:
-        """Map the name of each function that the system has to it and its arguments."""
+        """Map the name of each function of the system to its `call` and arguments."""
         values = {"t": t, "q": q, self.fibre_coordinate_name: u, "args": args}
         return {
-            name: (getattr(self, name), tuple(values[x] for x in arguments))
+            name: (partial(self.call, name), tuple(values[x] for x in arguments))
             for name, arguments in self.signatures().items()
             if getattr(self, name) is not None
         }
+
+    def call(self, name: str, *arguments: Any) -> Any:
+        """Call a function of the system; errors that it raises get a note.
+
+        The note names the function, which JAX and Python cannot know.
+        """
+        function = getattr(self, name)
+        called = f"{name}({', '.join(self.signatures()[name])})"
+        with naming(called, function, arguments[-1]):
+            return function(*arguments)
 
     def fibre_coordinate(self, y: State) -> Float[Array, " n"]:
         """Return the fibre coordinate u of a state, which is its v or its p."""
@@ -135,7 +148,7 @@ class AbstractMechanicalSystem(eqx.Module):
         """Compute the holonomic constraints Γ(t, q), of shape (k,), k = 0 if none."""
         if self.holonomic is None:
             return jnp.zeros((0,), jax.tree.leaves(q)[0].dtype)
-        return jnp.atleast_1d(self.holonomic(t, q, args))
+        return jnp.atleast_1d(self.call("holonomic", t, q, args))
 
     def kinematic_constraint(
         self,
@@ -147,7 +160,7 @@ class AbstractMechanicalSystem(eqx.Module):
         """Compute the nonholonomic constraints, of shape (m,) with m = 0 if none."""
         if self.nonholonomic is None:
             return jnp.zeros((0,), u.dtype)
-        return jnp.atleast_1d(self.nonholonomic(t, q, u, args))
+        return jnp.atleast_1d(self.call("nonholonomic", t, q, u, args))
 
     def tangency(
         self,

@@ -24,6 +24,9 @@ def check_type(name: str, x: object, kind: Kind, advice: str = "") -> None:
         got = f"the class itself; write {x.__name__}(...)"
     elif isinstance(getattr(x, "system", None), kind):
         got = f"{type(x).__name__}; pass its attribute `.system`"
+    elif isinstance(x, eqx.Module):
+        # Without its fields, which would fill the message.
+        got = type(x).__name__
     else:
         got = f"{reprlib.repr(x)} of type {type(x).__name__}"
     advice = f" {advice}" if advice else ""
@@ -40,6 +43,26 @@ def check_flag(name: str, x: object) -> bool:
             f"{reprlib.repr(x)} of type {type(x).__name__}."
         )
     return bool(x)
+
+
+def dtype_advice(dtype: Any) -> str:
+    """Say what to do about a function of the user that returns such a dtype."""
+    if dtype == jnp.bool_:
+        return "return the number that is to be zero, `a - b` in place of `a == b`."
+    if jnp.issubdtype(dtype, jnp.integer):
+        return "write 1.0 for 1."
+    if jnp.issubdtype(dtype, jnp.complexfloating):
+        return "take its real part."
+    return "constants of another precision inside it?"
+
+
+def no_array(x: Any) -> str:
+    """Say what a function of the user returned instead of an array, and what to do."""
+    if x is None:
+        return "nothing: does it lack a `return`?"
+    if isinstance(x, tuple | list):
+        return f"a {type(x).__name__} of {len(x)}: join its parts by `jnp.stack`."
+    return f"{reprlib.repr(x)} of type {type(x).__name__}."
 
 
 def floating(name: str, x: Any) -> Array:

@@ -8,9 +8,10 @@ import jax.numpy as jnp
 from jaxtyping import Array, PyTree
 
 from .._custom_types import Args
-from .._errors import DTypeError, is_traced, naming, require, ShapeError
+from .._errors import DTypeError, is_traced, require, ShapeError
+from .._manifold import AbstractLieGroup
 from ._abstract import AbstractMechanicalSystem
-from ._arguments import finite, floating
+from ._arguments import dtype_advice, finite, floating, no_array
 from ._state import State
 
 
@@ -26,6 +27,19 @@ def require_manifold(
         )
 
 
+def require_names(
+    system: AbstractMechanicalSystem, name: str, manifold: AbstractLieGroup
+) -> None:
+    """Raise a `ShapeError` unless there is one name for each coordinate, or none."""
+    names = system.coordinates
+    if names is not None and len(names) != manifold.dim:
+        raise ShapeError(
+            f"`{name}` has {manifold.dim} coordinates, but the system has {len(names)} "
+            f"names of `coordinates`, {names}: give one name for each coordinate, and "
+            "one coordinate for each name."
+        )
+
+
 def check_functions(
     system: AbstractMechanicalSystem, t: Array, q: PyTree[Array], args: Args
 ) -> None:
@@ -36,37 +50,40 @@ def check_functions(
     def few(shape):
         return shape == () or (len(shape) == 1 and 1 <= shape[0] <= n)
 
+    letter = system.fibre_coordinate_name
+    summed = f" Sum over the coordinates, as in `0.5 * {letter} @ {letter}`."
+    each = " Give one component for each coordinate."
     expected = {
-        system.generator: ("shape (), a scalar", lambda shape: shape == ()),
+        system.generator: ("shape (), a scalar", lambda shape: shape == (), summed),
         "nonholonomic": (
             f"shape () or (m,) with 1 <= m <= {n}, the number of coordinates",
             few,
+            "",
         ),
         "holonomic": (
             f"shape () or (k,) with 1 <= k <= {n}, the number of coordinates",
             few,
+            "",
         ),
-        "force": (f"shape ({n},)", lambda shape: shape == (n,)),
+        "force": (f"shape ({n},)", lambda shape: shape == (n,), each),
     }
     for name, (function, arguments) in system.functions(t, q, u, args).items():
-        wanted, fits = expected[name]
-        signature = f"({', '.join(system.signatures()[name])})"
-        with naming(f"{name}{signature}", function, args):
-            out = eqx.filter_eval_shape(function, *arguments)
+        wanted, fits, advice = expected[name]
+        called = f"`{name}({', '.join(system.signatures()[name])})`"
+        out = eqx.filter_eval_shape(function, *arguments)
         shape = getattr(out, "shape", None)
         if shape is None:
             raise ShapeError(
-                f"`{name}{signature}` must return an array of {wanted}, got "
-                f"{reprlib.repr(out)} of type {type(out).__name__}."
+                f"{called} must return an array of {wanted}, got {no_array(out)}"
             )
         if not fits(shape):
             raise ShapeError(
-                f"`{name}{signature}` must return {wanted}, got shape {shape}."
+                f"{called} must return {wanted}, got shape {shape}.{advice}"
             )
         if out.dtype != dtype:
             raise DTypeError(
-                f"`{name}{signature}` returns dtype {out.dtype}, but `q` has "
-                f"{dtype}: constants of another precision inside it?"
+                f"{called} returns dtype {out.dtype}, but `q` has {dtype}: "
+                f"{dtype_advice(out.dtype)}"
             )
 
 
@@ -112,11 +129,7 @@ def check_state(
                 f"`{called}.{name}` has shape {shape}, but `{called}.q` needs "
                 f"({manifold.dim},). Use `initial_state`."
             )
-    if system.coordinates is not None and len(system.coordinates) != manifold.dim:
-        raise ShapeError(
-            f"The system has {len(system.coordinates)} names of coordinates, "
-            f"{system.coordinates}, but `{called}.q` needs {manifold.dim}."
-        )
+    require_names(system, f"{called}.q", manifold)
     t = jnp.zeros((), y.v.dtype)
     u = system.fibre_coordinate(y)
     expected = eqx.filter_eval_shape(system.constraint, t, y.q, u, args).shape

@@ -92,7 +92,7 @@ class HamiltonianSystem(AbstractMechanicalSystem):
         args: Args = None,
     ) -> Float[Array, " n"]:
         """Compute the velocity v = D2H(t, q, u)."""
-        return jax.grad(self.hamiltonian, argnums=2)(t, q, u, args)
+        return jax.grad(self.call, argnums=3)("hamiltonian", t, q, u, args)
 
     def metric(
         self,
@@ -113,8 +113,10 @@ class HamiltonianSystem(AbstractMechanicalSystem):
     ) -> Float[Array, " n"]:
         """Compute the force without the reaction of the constraints, -L_q^* D1H + F."""
         manifold = self.manifold_of(q)
-        d1h = manifold.left_gradient(lambda g: self.hamiltonian(t, g, u, args), q)
-        return -d1h if self.force is None else self.force(t, q, u, args) - d1h
+        d1h = manifold.left_gradient(
+            lambda g: self.call("hamiltonian", t, g, u, args), q
+        )
+        return -d1h if self.force is None else self.call("force", t, q, u, args) - d1h
 
     def flat(
         self,
@@ -135,4 +137,4 @@ class HamiltonianSystem(AbstractMechanicalSystem):
         The arguments are those of `LagrangianSystem.energy`.
         """
         check_time_and_state("energy", t, y)
-        return self.hamiltonian(t, y.q, y.p, args)
+        return self.call("hamiltonian", t, y.q, y.p, args)

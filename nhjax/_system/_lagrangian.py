@@ -29,7 +29,9 @@ class LagrangianSystem(AbstractMechanicalSystem):
 
     which on R^n is the familiar d/dt D2L = D1L + F + λᵀ D2Φ + νᵀ DΓ with q̇ = v. All
     derivatives are taken by automatic differentiation. Array leaves of the functions
-    (if they are `equinox.Module`s) are parameters that gradients reach.
+    (if they are `equinox.Module`s) are parameters that gradients reach. A system holds
+    functions, so that a function that is given one as an argument is compiled by
+    `equinox.filter_jit`: `jax.jit` takes arrays alone.
 
     Values that the functions read beside their arguments (globals, variables of
     enclosing functions, attributes of objects) are compiled in. `integrate` and
@@ -89,7 +91,7 @@ class LagrangianSystem(AbstractMechanicalSystem):
         args: Args = None,
     ) -> Float[Array, " n"]:
         """Compute the momentum p = D2L(t, q, u), the Legendre transform of u."""
-        return jax.grad(self.lagrangian, argnums=2)(t, q, u, args)
+        return jax.grad(self.call, argnums=3)("lagrangian", t, q, u, args)
 
     def velocity(
         self,
@@ -120,8 +122,10 @@ class LagrangianSystem(AbstractMechanicalSystem):
     ) -> Float[Array, " n"]:
         """Compute the force without the reaction of the constraints, L_q^* D1L + F."""
         manifold = self.manifold_of(q)
-        d1l = manifold.left_gradient(lambda g: self.lagrangian(t, g, u, args), q)
-        return d1l if self.force is None else d1l + self.force(t, q, u, args)
+        d1l = manifold.left_gradient(
+            lambda g: self.call("lagrangian", t, g, u, args), q
+        )
+        return d1l if self.force is None else d1l + self.call("force", t, q, u, args)
 
     def flat(
         self,
@@ -156,4 +160,4 @@ class LagrangianSystem(AbstractMechanicalSystem):
         """
         check_time_and_state("energy", t, y)
         p = self.momentum(t, y.q, y.v, args)
-        return jnp.sum(p * y.v) - self.lagrangian(t, y.q, y.v, args)
+        return jnp.sum(p * y.v) - self.call("lagrangian", t, y.q, y.v, args)

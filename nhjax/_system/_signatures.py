@@ -1,4 +1,4 @@
-"""The checks of what a system is made of: its functions' arguments, its options."""
+"""Checks of the arguments of a user's functions, and of the options of a system."""
 
 import inspect
 from collections.abc import Callable
@@ -9,19 +9,38 @@ from .._errors import check_choice
 from .._manifold import AbstractLieGroup
 
 
-def check_signature(owner: Any, name: str, arguments: tuple[str, ...]) -> None:
-    """Raise a `TypeError` unless the function `name` of `owner` takes `arguments`."""
-    function, kind = getattr(owner, name), type(owner).__name__
+def check_signature(
+    owner: str, name: str, function: object, arguments: tuple[str, ...]
+) -> None:
+    """Raise a `TypeError` unless a function of the user takes `arguments`.
+
+    It is called by position. A function that gives a place to an argument of another
+    name is accepted, but one that takes two of the names in each other's places is not.
+
+    **Arguments:**
+
+    - `owner`, `name`: what the message calls the object or function of nhjax that is
+        given the function, and the argument by which it is given.
+    - `function`: the function.
+    - `arguments`: the names of its arguments, in their order.
+    """
     expected = f"({', '.join(arguments)})"
     if not callable(function):
         raise TypeError(
-            f"{kind}: `{name}` must be a function of {expected}, got {function!r}."
+            f"{owner}: `{name}` must be a function of {expected}, got {function!r}."
         )
     signature = _signature(function)
-    if signature is not None and not _takes(signature, arguments):
+    if signature is None:
+        return
+    called = f"`{_name(function)}{signature}`"
+    if not _takes(signature, arguments):
         raise TypeError(
-            f"{kind}: `{name}` must take {expected}, but "
-            f"`{_name(function)}{signature}` does not."
+            f"{owner}: `{name}` must take {expected}, but {called} does not."
+        )
+    if _confuses(signature, arguments):
+        raise TypeError(
+            f"{owner}: `{name}` must take {expected}, in this order, but {called} has "
+            "another order: nhjax passes arguments by position."
         )
 
 
@@ -33,10 +52,13 @@ def check_constraints(owner: Any) -> None:
 
 def check_manifold(owner: Any) -> None:
     """Raise a `TypeError` unless the `manifold` of `owner` is one, or None."""
-    if not isinstance(owner.manifold, AbstractLieGroup | None):
+    manifold = owner.manifold
+    if not isinstance(manifold, AbstractLieGroup | None):
+        is_class = isinstance(manifold, type)
+        got = f"the class; write {manifold.__name__}()" if is_class else repr(manifold)
         raise TypeError(
             f"{type(owner).__name__}: `manifold` must be an nhjax manifold such as "
-            f"nhjax.Euclidean(3), got {owner.manifold!r}."
+            f"nhjax.Euclidean(3), got {got}."
         )
 
 
@@ -47,8 +69,8 @@ def check_coordinates(owner: Any) -> None:
         return
     if not isinstance(names, tuple) or not all(isinstance(x, str) for x in names):
         raise TypeError(
-            f"{type(owner).__name__}: `coordinates` must be a tuple of names, got "
-            f"{names!r}."
+            f"{type(owner).__name__}: `coordinates` must be a tuple of names, such "
+            f"as ('x', 'y'), got {names!r}."
         )
     if len(set(names)) != len(names):
         raise ValueError(
@@ -90,6 +112,18 @@ def _takes(signature: inspect.Signature, arguments: tuple[str, ...]) -> bool:
     except TypeError:
         return False
     return True
+
+
+def _confuses(signature: inspect.Signature, arguments: tuple[str, ...]) -> bool:
+    """Return whether two or more arguments stand where others are expected."""
+    by_position = (
+        inspect.Parameter.POSITIONAL_ONLY,
+        inspect.Parameter.POSITIONAL_OR_KEYWORD,
+    )
+    given = [x.name for x in signature.parameters.values() if x.kind in by_position]
+    pairs = zip(given, arguments, strict=False)
+    moved = [name for name, there in pairs if name != there and name in arguments]
+    return len(moved) >= 2
 
 
 def _name(function: Callable[..., Any]) -> str:

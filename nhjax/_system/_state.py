@@ -1,8 +1,10 @@
 from typing import Any
 
 import equinox as eqx
+import jax.numpy as jnp
 from jaxtyping import Array, Float, PyTree
 
+from .._errors import ShapeError
 from ._arguments import check_type
 
 
@@ -27,8 +29,13 @@ class State(eqx.Module):
 
 
 def check_time_and_state(function: str, t: Any, y: Any, first: str = "") -> None:
-    """Raise a `TypeError` if `y` is not a `State`, or if `t` is one."""
+    """Raise if `y` is not one `State`, or if `t` is a `State`."""
     advice = f"Call it as `{function}({first}t, y, args)`."
     if isinstance(t, State):
         raise TypeError(f"`t` must be a time, got an nhjax.State. {advice}")
     check_type("y", y, State, advice)
+    if jnp.ndim(y.p) > 1:
+        raise ShapeError(
+            f"`y.p` has shape {y.p.shape}, but the state at one time has shape (n,). "
+            f"For a trajectory use `jax.vmap` over `t` and `y`."
+        )

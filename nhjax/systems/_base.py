@@ -31,6 +31,8 @@ def parameter(value: ArrayLike) -> Array:
     """
     if isinstance(value, (int, float, np.number)):
         return jnp.asarray(float(value))
+    if isinstance(value, str):
+        raise TypeError(f"A parameter must be a number, got {value!r} of type str.")
     return jnp.asarray(value)
 
 

@@ -208,5 +208,5 @@ def test_a_state_of_another_system_is_refused():
     system = polar_pendulum()["lagrangian"]
     with pytest.raises(nhjax.ShapeError, match=r"`y\.multiplier` has shape \(1,\)"):
         nhjax.motion(system, 0.0, pendulum)
-    with pytest.raises(nhjax.ShapeError, match=r"use `jax\.vmap` over `y`"):
+    with pytest.raises(nhjax.ShapeError, match=r"use `jax\.vmap` over `t` and `y`"):
         nhjax.linear_stability(SphericalPendulum().system, 0.0, many)

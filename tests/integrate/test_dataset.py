@@ -145,5 +145,5 @@ def test_names_that_are_no_names_of_the_coordinates_are_refused():
         falling(coordinates="xy")
     with pytest.raises(ValueError, match="has a name twice"):
         falling(coordinates=("x", "x"))
-    with pytest.raises(nhjax.ShapeError, match="3 names of coordinates"):
+    with pytest.raises(nhjax.ShapeError, match="3 names of `coordinates`"):
         run(falling(coordinates=("x", "y", "z")))

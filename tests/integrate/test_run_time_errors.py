@@ -141,6 +141,15 @@ def test_every_part_of_the_solution_waits_for_the_verdict():
         jax.block_until_ready(jax.jit(lambda v: fall(v).t1)(0.5))
 
 
+@pytest.mark.parametrize("transform", [lambda f: f, jax.jit], ids=["plain", "jit"])
+def test_a_failure_under_vmap_is_told_once(transform, caplog):
+    speeds = jnp.array([-1.0, 0.5, -0.5, 0.25])
+    with pytest.raises((RuntimeError, ValueError)) as error:
+        jax.block_until_ready(transform(jax.vmap(fall))(speeds))
+    told = "".join([str(error.value), *(x.getMessage() for x in caplog.records)])
+    assert told.count("Integration failed in lane 1") == 1
+
+
 def test_failures_need_a_computed_solution():
     with pytest.raises(RuntimeError, match=r"outside jit and vmap.*`sol.result`"):
         jax.jit(lambda v: fall(v, throw=False).failures())(0.5)
