@@ -10,7 +10,7 @@ from jaxtyping import Array, DTypeLike, Float, PyTree
 
 from .._custom_types import BoolScalar, FloatScalar
 from .._errors import ShapeError
-from ._abstract import AbstractLieGroup
+from ._group import AbstractLieGroup
 
 
 Element = tuple[PyTree[Array], ...]

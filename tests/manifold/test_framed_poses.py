@@ -16,7 +16,7 @@ from nhjax._manifold import (
     SO3,
     unframed,
 )
-from nhjax._manifold._framed_pose import FramedPose
+from nhjax._manifold._planar_groups import FramedPose
 
 
 XI = jnp.array([0.7, -0.3, 0.9])

@@ -19,7 +19,7 @@ from nhjax._manifold import (
     SO2,
     SO3,
 )
-from nhjax._manifold._series import arctan_ratio, stumpff
+from nhjax._manifold._retraction import arctan_ratio, stumpff
 from oracles.group_samples import (
     batched,
     directions,

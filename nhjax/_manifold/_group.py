@@ -1,9 +1,17 @@
+"""The interface of a configuration manifold: a Lie group with a retraction.
+
+`AbstractLieGroup` derives every tangent map by automatic differentiation from a few
+basic maps. `AbstractMotionGroup` adds the shortcuts of groups whose retraction
+satisfies τ(-ξ) = τ(ξ)⁻¹.
+"""
+
 from abc import abstractmethod
 from collections.abc import Callable
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, DTypeLike, Float, PyTree
 
 from .._custom_types import BoolScalar, FloatScalar
@@ -211,6 +219,41 @@ class AbstractLieGroup(eqx.Module):
         return transpose(lambda eta: self.ad(xi, eta), mu)(mu)
 
 
+class AbstractMotionGroup(AbstractLieGroup):
+    """A group of rotations or rigid motions, whose retraction has τ(-ξ) = τ(ξ)⁻¹."""
+
+    @abstractmethod
+    def to_end_change(self, xi: Vector, mu: Vector) -> Vector:
+        """Compute Ad_{τ(ξ)}^* μ - μ, without cancellation."""
+
+    def to_end(self, xi: Vector, mu: Vector) -> Vector:
+        """Compute Ad_{τ(ξ)}^* μ as μ plus its change."""
+        return mu + self.to_end_change(xi, mu)
+
+    def to_start(self, xi: Vector, mu: Vector) -> Vector:
+        """Compute Ad_{τ(-ξ)}^* μ, which is Ad_{τ(ξ)⁻¹}^* μ for these groups."""
+        return self.to_end(-xi, mu)
+
+    def to_start_change(self, xi: Vector, mu: Vector) -> Vector:
+        """Compute Ad_{τ(-ξ)}^* μ - μ, without cancellation."""
+        return self.to_end_change(-xi, mu)
+
+    def act_back(self, g: Element, xi: Vector) -> Element:
+        """Compute g τ(-ξ), which is g τ(ξ)⁻¹ for these groups."""
+        return self.act(g, -xi)
+
+    def advance_across(
+        self, q: Element, xi: Vector, compensation: Element
+    ) -> tuple[Element, Element]:
+        """Compute g τ(ξ) τ(ξ), which is g τ(-ξ)⁻¹ τ(ξ) for these groups."""
+        middle, compensation = self.advance(q, xi, compensation)
+        return self.advance(middle, xi, compensation)
+
+    def right_dtau_dual(self, xi: Vector, mu: Vector) -> Vector:
+        """Compute dτ_{-ξ}^* μ, which is (Ad_{τ(ξ)} dτ_ξ)^* μ for these groups."""
+        return self.dtau_dual(-xi, mu)
+
+
 def transpose(
     function: Callable[[Vector], PyTree[Array]], at: Vector
 ) -> Callable[[PyTree[Array]], Vector]:
@@ -232,6 +275,20 @@ def check_shape(q: Element, shape: tuple[int, ...], group: str, name: str) -> El
             f"{shape}. For many trajectories use `jax.vmap`."
         )
     return q
+
+
+def homogeneous(
+    corner: Float[Array, "n n"], column: Float[Array, " n"], last: float
+) -> Float[Array, "n+1 n+1"]:
+    """Assemble the matrix [[corner, column], [0, last]] in homogeneous coordinates.
+
+    With last = 1 it is that of a motion, with last = 0 that of a velocity.
+    """
+    rows = jnp.concatenate([corner, column[:, None]], axis=1)
+    n = column.shape[0]
+    row = np.zeros((1, n + 1), column.dtype)
+    row[0, n] = last
+    return jnp.concatenate([rows, row])
 
 
 def _jvp(function, at, direction):
