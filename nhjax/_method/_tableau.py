@@ -4,18 +4,42 @@ A collocation tableau on nodes c_1 < ... < c_s has
 
     a_ij = ∫_0^{c_i} ℓ_j(θ) dθ,    b_j = ∫_0^1 ℓ_j(θ) dθ,
 
-with ℓ_j the Lagrange basis on the nodes (Hairer, Lubich, Wanner, "Geometric Numerical
-Integration", II.1.2). The symplectic conjugate is â_ij = b_j (1 - a_ji / b_i)
-(ibid., VI.4.1); that of Lobatto IIIA is Lobatto IIIB.
+where ℓ_j is the Lagrange basis on the nodes (Hairer, Lubich, Wanner, "Geometric
+Numerical Integration", II.1.2). The symplectic conjugate is â_ij = b_j (1 - a_ji / b_i)
+(ibid., VI.4.1); the conjugate of Lobatto IIIA is Lobatto IIIB.
+
+For dense output, the Lagrange basis is expanded in Legendre polynomials of x = 2θ - 1,
+ℓ_j(θ) = Σ_n K_nj P_n(x). The coefficients K_nj are of order one for every s, where
+monomials would cancel. The integral of the basis is
+
+    ∫_0^θ ℓ_j = θ K_0j - 2 θ (1 - θ) Σ_{n>=1} K_nj P_n'(x) / (n (n + 1)),
+
+by Legendre's equation ((1 - x²) P_n')' = -n (n + 1) P_n. It is exactly 0 at θ = 0 and
+exactly K_0j, the weight b_j of a collocation method, at θ = 1.
 """
 
+import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache, cached_property, lru_cache
+from typing import Any, TypeAlias
 
+import jax
+import jax.numpy as jnp
+import mpmath
 import numpy as np
+from jax.typing import ArrayLike
+from jaxtyping import Array, Float
 
-from ._nodes import gauss_points, legendre, lobatto_points
-from ._precision import CONTEXT, Matrix, Number, to_float64
+
+# The library's own context: a user's `mpmath.mp.dps` neither changes nor is changed.
+# 60 digits leave 20 for the 1e-40 to which the order conditions are checked.
+CONTEXT = mpmath.MPContext()
+CONTEXT.dps = 60
+
+# Each context makes classes of its own for numbers and matrices; no type names them.
+Number: TypeAlias = Any
+Matrix: TypeAlias = Any
 
 
 BUILT_IN_TOLERANCE = CONTEXT.mpf("1e-40")
@@ -193,3 +217,191 @@ def user_tableau(a: tuple[tuple[float, ...], ...], b: tuple[float, ...]) -> Tabl
     mp_b = [CONTEXT.mpf(x) for x in b]
     mp_c = [CONTEXT.fsum(mp_a[i, j] for j in range(len(b))) for i in range(len(b))]
     return Tableau(mp_a, mp_b, mp_c, USER_TOLERANCE)
+
+
+def legendre(degree: int, x: Number) -> list[Number]:
+    """Evaluate the Legendre polynomials P_0(x), ..., P_degree(x) by their recurrence.
+
+    **Arguments:**
+
+    - `degree`: the highest degree.
+    - `x`: an mp number (any type with exact integer multiples will do).
+
+    **Returns:**
+
+    A list of `degree + 1` values.
+    """
+    values = [x * 0 + 1, x]
+    for n in range(1, degree):
+        values.append(((2 * n + 1) * x * values[n] - n * values[n - 1]) / (n + 1))
+    return values[: degree + 1]
+
+
+def lobatto_points(stages: int) -> list[Number]:
+    """Compute the Lobatto points on [-1, 1]: -1, the zeros of P'_{s-1}, and 1.
+
+    They are exactly symmetric about 0, and in increasing order.
+
+    **Arguments:**
+
+    - `stages`: s >= 2.
+
+    **Returns:**
+
+    A list of s mp numbers.
+    """
+    n = stages - 1
+
+    def derivative(x: Number) -> tuple[Number, Number]:
+        p = legendre(n, x)
+        # (1 - x²) P_n' = n (P_{n-1} - x P_n) and Legendre's equation for P_n''.
+        first = n * (p[n - 1] - x * p[n]) / (1 - x * x)
+        return first, (2 * x * first - n * (n + 1) * p[n]) / (1 - x * x)
+
+    guesses = [math.cos(math.pi * k / n) for k in range(1, stages // 2)]
+    inner = [_newton(derivative, g) for g in guesses]
+    return _mirrored([CONTEXT.mpf(1), *inner], stages)
+
+
+def gauss_points(stages: int) -> list[Number]:
+    """Compute the Gauss points on [-1, 1], the zeros of P_s.
+
+    They are exactly symmetric about 0, and in increasing order.
+
+    **Arguments:**
+
+    - `stages`: s >= 1.
+
+    **Returns:**
+
+    A list of s mp numbers.
+    """
+
+    def polynomial(x: Number) -> tuple[Number, Number]:
+        p = legendre(stages, x)
+        slope = stages * (p[stages - 1] - x * p[stages]) / (1 - x * x)
+        return p[stages], slope
+
+    guesses = [
+        math.cos(math.pi * (k - 0.25) / (stages + 0.5))
+        for k in range(1, stages // 2 + 1)
+    ]
+    return _mirrored([_newton(polynomial, g) for g in guesses], stages)
+
+
+def _newton(f: Callable[[Number], tuple[Number, Number]], guess: float) -> Number:
+    """Find the root of `f` near `guess`; `f` returns its value and derivative."""
+    x = CONTEXT.mpf(guess)
+    for _ in range(100):
+        value, slope = f(x)
+        step = value / slope
+        x = x - step
+        # Newton doubles the digits: a step this small leaves an error far below 1e-60.
+        if abs(step) < CONTEXT.mpf("1e-40"):
+            return x
+    raise RuntimeError("Newton's iteration for the nodes of a tableau did not converge")
+
+
+def _mirrored(right: list[Number], count: int) -> list[Number]:
+    """Make all points, exactly symmetric and in increasing order, from those > 0."""
+    centre = [CONTEXT.mpf(0)] if count % 2 else []
+    return [-x for x in right] + centre + right[::-1]
+
+
+def to_float64(x: Matrix | list[Number]) -> np.ndarray:
+    """Round mp numbers to the nearest float64, once, into a read-only array.
+
+    **Arguments:**
+
+    - `x`: an mp matrix, or a list of mp numbers.
+
+    **Returns:**
+
+    A float64 array of shape `(rows, cols)`, or `(len(x),)` for a list.
+    """
+    rows = x if isinstance(x, list) else x.tolist()
+    array = np.array(
+        [[float(e) for e in r] if isinstance(r, list) else float(r) for r in rows],
+        dtype=np.float64,
+    )
+    array.setflags(write=False)
+    return array
+
+
+@lru_cache(maxsize=128)
+def _coefficients(t: Tableau) -> tuple[np.ndarray, np.ndarray]:
+    """Compute K and the rows -2 K_nj / (n (n + 1)), n = 1..s-1, rounded once."""
+    s, c = t.stages, t.mp_c
+    for i in range(s):
+        for j in range(i):
+            if abs(c[i] - c[j]) <= t.tolerance:
+                raise ValueError(
+                    f"c = {t.c.tolist()} has equal entries c_{j + 1} and c_{i + 1}: "
+                    "there is no Lagrange basis on these nodes"
+                )
+    k = lagrange_in_legendre(c)
+    integrated = CONTEXT.matrix(s, s)
+    for n in range(1, s):
+        for j in range(s):
+            integrated[n, j] = -2 * k[n, j] / (n * (n + 1))
+    return to_float64(k), to_float64(integrated)[1:]
+
+
+def _floating(theta: ArrayLike) -> Array:
+    array = jnp.asarray(theta)
+    if jnp.issubdtype(array.dtype, jnp.floating):
+        return array
+    return array.astype(jnp.result_type(float))
+
+
+def _combine(polynomials: list[Array], coefficients: np.ndarray) -> Array:
+    # Full precision is requested, because the default on a GPU may be TensorFloat-32.
+    values = jnp.stack(polynomials, axis=-1)
+    return jnp.matmul(
+        values,
+        jnp.asarray(coefficients, values.dtype),
+        precision=jax.lax.Precision.HIGHEST,
+    )
+
+
+def lagrange(t: Tableau, theta: ArrayLike) -> Float[Array, "*batch s"]:
+    """Evaluate the Lagrange basis ℓ_1(θ), ..., ℓ_s(θ) on the nodes of a tableau.
+
+    **Arguments:**
+
+    - `t`: a tableau with distinct nodes.
+    - `theta`: θ, of any shape; traceable, not restricted to [0, 1].
+
+    **Returns:**
+
+    An array of shape `theta.shape + (s,)` and of the dtype of `theta`.
+
+    **Raises:**
+
+    A `ValueError` if two nodes coincide.
+    """
+    coefficients, _ = _coefficients(t)
+    x = 2 * _floating(theta) - 1
+    p = [jnp.ones_like(x), x]
+    for n in range(1, t.stages - 1):
+        p.append(((2 * n + 1) * x * p[n] - n * p[n - 1]) / (n + 1))
+    return _combine(p[: t.stages], coefficients)
+
+
+def integrated_lagrange(t: Tableau, theta: ArrayLike) -> Float[Array, "*batch s"]:
+    """Evaluate the integrals ∫_0^θ ℓ_1, ..., ∫_0^θ ℓ_s of the Lagrange basis.
+
+    Arguments, result and errors are those of `lagrange`.
+    """
+    coefficients, integrated = _coefficients(t)
+    fraction = _floating(theta)
+    x = 2 * fraction - 1
+    linear = _combine([fraction], coefficients[:1])
+    if t.stages == 1:
+        return linear
+    # P_1', P_2', ...: the Gegenbauer polynomials C^(3/2).
+    d = [jnp.ones_like(x), 3 * x]
+    for n in range(2, t.stages - 1):
+        d.append(((2 * n + 1) * x * d[n - 1] - (n + 1) * d[n - 2]) / n)
+    bubble = fraction * (1 - fraction)
+    return linear + _combine([bubble * p for p in d[: t.stages - 1]], integrated)

@@ -7,7 +7,12 @@ import pytest
 
 import nhjax
 from benchmarks import _tableaux
-from nhjax._method import _conditions, _trees
+from nhjax._method._order_conditions import (
+    _Branch,
+    _products,
+    order,
+    partitioned_order,
+)
 from oracles.long import long
 
 
@@ -24,17 +29,17 @@ def conjugate(a, b):
 
 
 def order_of(a, b, most=8):
-    return _trees.partitioned_order((a, conjugate(a, b)), b, 0, most)
+    return partitioned_order((a, conjugate(a, b)), b, 0, most)
 
 
 def test_trees_with_edges_of_two_colours_are_as_many_as_there_are():
     # Exact for every tree: all conditions of the flow itself, as φ = γ⁻¹ |τ| would be.
     branches, counts = [], []
     for size in range(1, 9):
-        trees = list(_trees._products(branches, size - 1, len(branches), np.ones(1)))
+        trees = list(_products(branches, size - 1, len(branches), np.ones(1)))
         counts.append(len(trees))
         branches += [
-            _trees._Branch(size, gamma * size, values)
+            _Branch(size, gamma * size, values)
             for gamma, values in trees
             for _ in range(2)
         ]
@@ -72,7 +77,7 @@ def test_order_in_exact_rationals_of_equal_distances_is_two():
     "method", [*map(nhjax.LobattoIIIAB, range(2, 9)), *map(nhjax.Gauss, range(1, 7))]
 )
 def test_order_of_built_in_method_is_that_of_its_tableau(method):
-    assert method.order == _conditions.order(method._tableau())
+    assert method.order == order(method._tableau())
 
 
 FREE = {name: _tableaux.collocation(c) for name, c in _tableaux.OPEN.items()}

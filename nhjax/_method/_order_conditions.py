@@ -1,24 +1,34 @@
-"""The properties of a tableau: order conditions, hypotheses, symmetry and stability.
+"""Order conditions, hypotheses, symmetry and stability of a tableau.
 
 The simplifying assumptions are those of Butcher (Hairer, Lubich, Wanner, "Geometric
-Numerical Integration", II.1) and the mixed one of L. Jay ("Symplectic partitioned
-Runge-Kutta methods for constrained Hamiltonian systems", SIAM J. Numer. Anal. 33,
-1996):
+Numerical Integration", II.1), and the mixed assumption of L. Jay ("Symplectic
+partitioned Runge-Kutta methods for constrained Hamiltonian systems", SIAM J. Numer.
+Anal. 33, 1996):
 
     B(p):  Σ_i b_i c_i^{k-1} = 1/k                               k = 1..p
     C(q):  Σ_j a_ij c_j^{k-1} = c_i^k / k                        k = 1..q
     D(r):  Σ_i b_i c_i^{k-1} a_ij = b_j (1 - c_j^k) / k          k = 1..r
     CĈ(Q): Σ_j Σ_l a_ij â_jl c_l^{k-2} = c_i^k / (k (k-1))       k = 2..Q
+
+A pair (a, â) with common weights b solves q' = f(q, p), p' = g(q, p). Its order
+conditions belong to rooted trees whose edges have two colours, because a stage computes
+q with a and p with â. Let τ_k be the subtrees at the root of a tree τ, and a^(k) the
+matrix of the colour of the edge to τ_k. With φ_i(τ) = Π_k Σ_j a^(k)_ij φ_j(τ_k), the
+pair has order p if
+
+    Σ_i b_i φ_i(τ) = 1 / γ(τ),    γ(τ) = |τ| Π_k γ(τ_k),
+
+for all trees τ with up to p vertices (ibid., III.2.2).
 """
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
 from functools import lru_cache
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
-from ._precision import CONTEXT, Matrix, Number
-from ._tableau import Tableau
-from ._trees import partitioned_order
+import numpy as np
+
+from ._tableau import CONTEXT, Matrix, Number, Tableau
 
 
 class SimplifyingAssumptions(NamedTuple):
@@ -45,22 +55,6 @@ class Hypotheses(NamedTuple):
     H1: bool
     H2: bool
     H3: bool
-
-
-def _powers(c: list[Number], exponent: int) -> list[Number]:
-    return [x**exponent if exponent else CONTEXT.mpf(1) for x in c]
-
-
-def _times(a: Matrix, x: list[Number]) -> list[Number]:
-    return [CONTEXT.fdot(zip(row, x, strict=True)) for row in a.tolist()]
-
-
-def _largest(defects: Callable[[int], list[Number]], first: int, t: Tableau) -> int:
-    """Find the largest k for which the defects of orders `first`..k are round-off."""
-    k = first
-    while k <= 2 * t.stages and all(abs(d) <= t.tolerance for d in defects(k)):
-        k += 1
-    return k - 1
 
 
 @lru_cache(maxsize=128)
@@ -207,6 +201,81 @@ def stability_at_infinity(t: Tableau) -> float:
     if top > bottom:
         return math.inf
     return float(numerator / denominator) if top == bottom else 0.0
+
+
+class _Branch(NamedTuple):
+    """A tree below an edge: its number of vertices, its γ, and Σ_j a_ij φ_j."""
+
+    size: int
+    gamma: int
+    values: np.ndarray
+
+
+def partitioned_order(
+    matrices: Sequence[np.ndarray], b: np.ndarray, tolerance: Any, most: int
+) -> int:
+    """Find the order of a partitioned pair, up to `most`.
+
+    **Arguments:**
+
+    - `matrices`: a and â, of floats, or of exact numbers in arrays of objects.
+    - `b`: the weights of both.
+    - `tolerance`: the defect of a condition that counts as round-off.
+    - `most`: the largest order that is looked for; of order 8 there are 9498 trees
+        with eight vertices.
+
+    **Returns:** the largest order up to `most` whose conditions hold, 0 if none does.
+    """
+    branches: list[_Branch] = []
+    for size in range(1, most + 1):
+        trees = list(_products(branches, size - 1, len(branches), b * 0 + 1))
+        for gamma, values in trees:
+            if abs(np.dot(b, values) * gamma * size - 1) > tolerance * gamma * size:
+                return size - 1
+        branches += [
+            _Branch(size, gamma * size, np.dot(a, values))
+            for gamma, values in trees
+            for a in matrices
+        ]
+    return most
+
+
+def _products(
+    branches: list[_Branch], size: int, end: int, values: np.ndarray
+) -> Iterator[tuple[int, np.ndarray]]:
+    """Make all roots with `size` vertices above them, of branches before `end`.
+
+    Each comes as the product of the γ of its branches, and its φ.
+    """
+    if size == 0:
+        yield 1, values
+        return
+    for index in range(end):
+        branch = branches[index]
+        if branch.size > size:
+            # They are sorted by size.
+            return
+        rest = size - branch.size
+        for gamma, product in _products(
+            branches, rest, index + 1, values * branch.values
+        ):
+            yield gamma * branch.gamma, product
+
+
+def _powers(c: list[Number], exponent: int) -> list[Number]:
+    return [x**exponent if exponent else CONTEXT.mpf(1) for x in c]
+
+
+def _times(a: Matrix, x: list[Number]) -> list[Number]:
+    return [CONTEXT.fdot(zip(row, x, strict=True)) for row in a.tolist()]
+
+
+def _largest(defects: Callable[[int], list[Number]], first: int, t: Tableau) -> int:
+    """Find the largest k for which the defects of orders `first`..k are round-off."""
+    k = first
+    while k <= 2 * t.stages and all(abs(d) <= t.tolerance for d in defects(k)):
+        k += 1
+    return k - 1
 
 
 def _leading_term(
