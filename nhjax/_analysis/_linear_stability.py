@@ -4,28 +4,36 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Complex, Float
 
-from .._custom_types import Args, BoolScalar, FloatScalarLike
+from .._custom_types import Args, BoolScalar, FloatScalar, FloatScalarLike
 from .._errors import (
     Check,
     DependentConstraintsError,
     IrregularLagrangianError,
     require,
 )
-from .._system import (
-    AbstractMechanicalSystem,
-    check_flag,
-    parameters,
-    State,
+from .._system import AbstractMechanicalSystem, check_flag, parameters, State
+from ._linearisation import (
+    Bounded,
+    check_symmetry,
+    checks_of,
+    independent_basis,
+    Indices,
+    indices,
+    judged,
+    orthonormal_basis,
+    size_of,
+    Slopes,
+    slopes_along_symmetry,
+    slopes_along_velocity,
+    Symmetry,
+    Verdict,
 )
-from ._arguments import checked_time
-from ._permitted import independent_basis, orthonormal_basis
-from ._perturbation import check_independent, Indices
-from ._slopes import size_of, Slopes, slopes_along_symmetry, slopes_along_velocity
-from ._symmetry import Bounded, check_symmetry, checks_of, judged, Symmetry, Verdict
+from ._motion import checked_time
 
 
 class LinearStability(eqx.Module):
@@ -265,3 +273,38 @@ def _reduced(
         drift=_drift(slopes, y, independent),
         verdict=verdict,
     )
+
+
+def check_independent(
+    system: AbstractMechanicalSystem,
+    t: FloatScalar,
+    y: State,
+    args: Args,
+    positions: Sequence[int] | None,
+    velocities: Sequence[int] | None,
+) -> tuple[Indices, Indices] | None:
+    """Check the choice of independent coordinates; None if none are chosen."""
+    if positions is None and velocities is None:
+        return None
+    if positions is None or velocities is None:
+        missing = "positions" if positions is None else "velocities"
+        raise ValueError(
+            f"Give `positions` and `velocities` together: `{missing}` is missing."
+        )
+    dim, count = y.p.shape[0], y.multiplier.shape[0]
+    chosen = (
+        indices("positions", positions, dim),
+        indices("velocities", velocities, dim),
+    )
+    if len(chosen[1]) != dim - count:
+        raise ValueError(
+            f"`velocities` has {len(chosen[1])} indices, but {dim} velocities with "
+            f"{count} constraints have {dim - count} independent ones."
+        )
+    tied = jax.eval_shape(lambda q: system.position_constraint(t, q, args), y.q).size
+    if len(chosen[0]) > dim - tied:
+        raise ValueError(
+            f"`positions` has {len(chosen[0])} indices, but {dim} coordinates with "
+            f"{tied} holonomic constraints have {dim - tied} independent ones."
+        )
+    return chosen

@@ -1,23 +1,30 @@
 """The accelerations and reactions of the continuous equations at one state."""
 
+from typing import Any
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from .._compile import tracked_jit
-from .._custom_types import Args, FloatScalarLike
+from .._custom_types import Args, FloatScalar, FloatScalarLike
 from .._errors import is_traced
 from .._numerics import inverse, nan_unless
 from .._system import (
     AbstractMechanicalSystem,
     all_finite,
+    check_state,
+    check_time_and_state,
+    check_type,
+    HamiltonianSystem,
+    LagrangianSystem,
     linearise,
     parameters,
+    real_scalar,
     require_independent,
     State,
 )
-from ._arguments import checked_time
 
 
 class Motion(eqx.Module):
@@ -156,3 +163,13 @@ def in_velocities(
     # The metric is D2D2H, whose inverse is ∂p/∂v.
     mass = inverse(metric)
     return mass, jacobian @ mass
+
+
+def checked_time(
+    function: str, system: Any, t: FloatScalarLike, y: Any, args: Args
+) -> FloatScalar:
+    """Return the time as an array; raise for what is no system, time or state of it."""
+    check_type("system", system, (LagrangianSystem, HamiltonianSystem))
+    check_time_and_state(function, t, y, "system, ")
+    check_state(system, y, args, "y")
+    return real_scalar("t", t, y.p.dtype)
