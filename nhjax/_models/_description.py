@@ -17,7 +17,7 @@ import numpy as np
 class Description(NamedTuple):
     """The expressions of a model, in coordinates q(t), their rates and the time.
 
-    There are as many `forces`, the generalised ones, as `coordinates`, or none.
+    `forces` has one generalised force for each coordinate, or is empty.
     """
 
     lagrangian: Any
@@ -27,7 +27,7 @@ class Description(NamedTuple):
     forces: list[Any]
 
 
-def of_lagranges_method(method: Any) -> Description:
+def read_lagranges_method(method: Any) -> Description:
     """Read a `LagrangesMethod`."""
     coordinates = check_coordinates(method.q)
     holonomic = list(method._hol_coneqs)
@@ -39,29 +39,29 @@ def of_lagranges_method(method: Any) -> Description:
         coordinates,
         nonholonomic,
         holonomic,
-        of_loads(loads, rates(coordinates), method.inertial) if loads else [],
+        forces_of_loads(loads, rates(coordinates), method.inertial) if loads else [],
     )
 
 
-def of_kanes_method(method: Any, potential: Any) -> Description:
-    """Read a `KanesMethod` whose bodies it knows."""
+def read_kanes_method(method: Any, potential: Any) -> Description:
+    """Read a `KanesMethod` that has bodies."""
     coordinates = check_coordinates(method.q)
     speeds = list(method.u)
     if len(speeds) != len(coordinates):
         raise ValueError(
             f"from_sympy: the KanesMethod has {len(speeds)} speeds "
-            f"({_listed(speeds)}) for {len(coordinates)} coordinates "
-            f"({_listed(coordinates)}). A Lagrangian needs a coordinate for each "
-            "speed, also where the motion does not depend on it, such as the angle of "
-            "a wheel and the place of its contact."
+            f"({_comma_separated(speeds)}) for {len(coordinates)} coordinates "
+            f"({_comma_separated(coordinates)}). A Lagrangian needs a coordinate for "
+            "each speed, even if the motion does not depend on it, such as the angle "
+            "of a wheel and the position of its contact point."
         )
     bodies, frame = list(method.bodies or []), method._inertial
     if not bodies:
         raise ValueError(
-            "from_sympy: the KanesMethod knows no bodies: make it with `bodies=`, or "
-            "call its `kanes_equations` before."
+            "from_sympy: the KanesMethod has no bodies: create it with `bodies=`, or "
+            "call its `kanes_equations` first."
         )
-    solved = _speeds_of_rates(method, coordinates, speeds)
+    solved = _solve_for_speeds(method, coordinates, speeds)
     for body in bodies:
         _check_velocity(body, frame, solved)
     kinetic = mechanics().kinetic_energy(frame, *bodies)
@@ -71,9 +71,9 @@ def of_kanes_method(method: Any, potential: Any) -> Description:
         if loads and potential != 0:
             raise ValueError(
                 f"from_sympy: the bodies of the KanesMethod have the potential energy "
-                f"{potential}, and there are loads. Kane's method leaves potential "
-                "energies out: give `potential=0` if the loads contain its forces, "
-                "and otherwise the energy itself as `potential`."
+                f"{potential}, and there are loads. Kane's method ignores potential "
+                "energies: pass `potential=0` if the loads contain its forces, and "
+                "otherwise pass the energy itself as `potential`."
             )
     lagrangian = (kinetic - expression("potential", potential)).subs(solved)
     holonomic = list(method._f_h)
@@ -86,11 +86,11 @@ def of_kanes_method(method: Any, potential: Any) -> Description:
     )
 
 
-def _listed(names: list[Any]) -> str:
+def _comma_separated(names: list[Any]) -> str:
     return ", ".join(map(str, names))
 
 
-def _speeds_of_rates(
+def _solve_for_speeds(
     method: Any, coordinates: list[Any], speeds: list[Any]
 ) -> dict[Any, Any]:
     """Solve the kinematical differential equations for the speeds."""
@@ -99,7 +99,7 @@ def _speeds_of_rates(
     if sympy().simplify(matrix.det()) == 0:
         raise ValueError(
             "from_sympy: the kinematical differential equations do not determine the "
-            f"speeds {_listed(speeds)} from the rates of the coordinates."
+            f"speeds {_comma_separated(speeds)} from the rates of the coordinates."
         )
     return dict(zip(speeds, matrix.LUsolve(-(of_rates + rest)), strict=True))
 
@@ -111,10 +111,10 @@ def _nonholonomic(
     solved: dict[Any, Any],
     holonomic: list[Any],
 ) -> list[Any]:
-    """Return the velocity constraints that are no rates of holonomic ones.
+    """Return the velocity constraints that are not rates of holonomic ones.
 
-    Kane's method needs the rates of its configuration constraints among its velocity
-    constraints. They are linear in the speeds.
+    Kane's method needs the rates of configuration constraints among its velocity
+    constraints. All of these are linear in the speeds.
     """
     if not method._f_nh:
         return []
@@ -127,7 +127,7 @@ def _nonholonomic(
     def row(x: Any) -> list[Any]:
         slopes = [x.diff(rate) for rate in rates(coordinates)]
         rest = x.subs(dict.fromkeys(rates(coordinates), 0))
-        return [_at_a_point(part) for part in (*slopes, rest)]
+        return [_evaluate_at_generic_point(part) for part in (*slopes, rest)]
 
     known = np.array([row(x.diff(t)) for x in holonomic])
     rank = np.linalg.matrix_rank(known)
@@ -145,25 +145,25 @@ def _forces(
     solved: dict[Any, Any],
     frame: Any,
 ) -> list[Any]:
-    """Compute the generalised forces of the coordinates, by those of the speeds.
+    """Compute the coordinates' generalised forces from those of the speeds.
 
-    With velocities v(q, u, q') the force of q is F·(∂v/∂u ∂u/∂q' + ∂v/∂q').
+    For velocities v(q, u, q') the force of q is F·(∂v/∂u ∂u/∂q' + ∂v/∂q').
     """
-    of_speeds = sympy().Matrix(of_loads(loads, speeds, frame))
-    directly = sympy().Matrix(of_loads(loads, rates(coordinates), frame))
+    of_speeds = sympy().Matrix(forces_of_loads(loads, speeds, frame))
+    directly = sympy().Matrix(forces_of_loads(loads, rates(coordinates), frame))
     slopes = sympy().Matrix([solved[u] for u in speeds]).jacobian(rates(coordinates))
     return [x.subs(solved) for x in slopes.T * of_speeds + directly]
 
 
 def _check_velocity(body: Any, frame: Any, solved: dict[Any, Any]) -> None:
-    """Raise if the velocity of a body has a constraint put into it.
+    """Raise if a constraint was substituted into the velocity of a body.
 
-    For Kane's method a point where a wheel touches the ground may be given the velocity
-    zero, although the place of contact moves. The energy is then that of motions which
-    satisfy the constraint, and Lagrange's equations of it are not those of the system.
+    In Kane's method, the point where a wheel touches the ground can have the velocity
+    zero, although the contact moves. The energy is then correct only for motions that
+    satisfy the constraint, and its Lagrange equations are wrong.
     """
     centre = body.masscenter
-    for point in _connected(centre)[1:]:
+    for point in _connected_points(centre)[1:]:
         if frame not in point._vel_dict:
             continue
         difference = centre.vel(frame) - point.vel(frame)
@@ -172,26 +172,26 @@ def _check_velocity(body: Any, frame: Any, solved: dict[Any, Any]) -> None:
             if not _vanishes(component.subs(solved)):
                 raise ValueError(
                     f"from_sympy: the velocity of {centre} relative to {point} is not "
-                    "the rate of its position: a constraint such as rolling is put "
-                    "into it already, and Lagrange's equations need the energy without "
-                    "it. Give the place of the contact coordinates, and rolling as a "
-                    "constraint."
+                    "the rate of its position: a constraint such as rolling was "
+                    "substituted, but Lagrange's equations need the energy without it. "
+                    "Describe the position of the contact by coordinates, and rolling "
+                    "by a constraint."
                 )
 
 
 def _vanishes(expression: Any) -> bool:
-    """Tell whether an expression vanishes at a generic point."""
-    return abs(_at_a_point(expression)) < 1e-9
+    """Return whether an expression vanishes at a generic point."""
+    return abs(_evaluate_at_generic_point(expression)) < 1e-9
 
 
-def _at_a_point(expression: Any) -> complex:
-    """Evaluate an expression at a generic point, in the numbers of `_value_of`.
+def _evaluate_at_generic_point(expression: Any) -> complex:
+    """Evaluate an expression with each variable replaced by its `_value_of`.
 
-    The value of a variable depends on its name alone, so that several expressions are
+    The value of a variable depends only on its name, so that all expressions are
     evaluated at the same point.
     """
     library = sympy()
-    # Derivatives first: the functions are parts of them.
+    # Replace derivatives first, because they contain functions.
     for kind in (
         library.Derivative,
         library.core.function.AppliedUndef,
@@ -203,11 +203,11 @@ def _at_a_point(expression: Any) -> complex:
 
 
 def _value_of(name: str) -> Any:
-    """Return a number between 1/2 and 3/2 that belongs to a name."""
+    """Return a pseudo-random number between 1/2 and 3/2 for a name."""
     return sympy().Rational(zlib.crc32(name.encode()) % 9973 + 4987, 9973)
 
 
-def _connected(point: Any) -> list[Any]:
+def _connected_points(point: Any) -> list[Any]:
     """List the points whose positions relative to `point` are known."""
     found = [point]
     for known in found:
@@ -216,7 +216,7 @@ def _connected(point: Any) -> list[Any]:
 
 
 def expressions(name: str, given: Any) -> list[Any]:
-    """Return one or several expressions, or equations, as a list of expressions."""
+    """Return one or several expressions or equations as a list of expressions."""
     if given is None:
         return []
     library = sympy()
@@ -224,18 +224,18 @@ def expressions(name: str, given: Any) -> list[Any]:
         given = list(given)
     if isinstance(given, Set | library.Set):
         raise TypeError(
-            f"from_sympy: `{name}` is a set, which has no order: give a list."
+            f"from_sympy: `{name}` is a set, which has no order: pass a list."
         )
     several = isinstance(given, Iterable) and not isinstance(given, str | Mapping)
     return [expression(name, x) for x in (given if several else [given])]
 
 
 def expression(name: str, x: Any) -> Any:
-    """Return an expression; an equation is the difference of its sides."""
+    """Return an expression; an equation becomes the difference of its sides."""
     library = sympy()
     if isinstance(x, library.MatrixBase) and x.shape == (1, 1):
         x = x[0, 0]
-    # Strict, so that no string is evaluated.
+    # With `strict`, SymPy does not evaluate strings.
     with contextlib.suppress(library.SympifyError):
         x = library.sympify(x, strict=True)
     if isinstance(x, library.Equality):
@@ -243,29 +243,29 @@ def expression(name: str, x: Any) -> Any:
     matrix = library.MatrixBase | library.MatrixExpr
     if not isinstance(x, library.Expr) or isinstance(x, matrix):
         raise TypeError(
-            f"from_sympy: `{name}` must be of scalar expressions of SymPy, got "
+            f"from_sympy: `{name}` must consist of scalar SymPy expressions, got "
             f"{reprlib.repr(x)} of type {type(x).__name__}."
         )
     return x
 
 
 def rates(coordinates: list[Any]) -> list[Any]:
-    """Return the derivatives of the coordinates by time."""
+    """Return the time derivatives of the coordinates."""
     t = mechanics().dynamicsymbols._t
     return [q.diff(t) for q in coordinates]
 
 
 def check_coordinates(coordinates: Any) -> list[Any]:
-    """Return the coordinates as a list; raise unless they are different q(t)."""
+    """Return the coordinates as a list; raise if they are not distinct q(t)."""
     library, t = sympy(), mechanics().dynamicsymbols._t
     found = expressions("coordinates", coordinates)
     if not found:
-        raise ValueError("from_sympy: `coordinates` is empty: give at least one q(t).")
+        raise ValueError("from_sympy: `coordinates` is empty: pass at least one q(t).")
     for q in found:
         if not isinstance(q, library.core.function.AppliedUndef) or q.args != (t,):
             raise TypeError(
-                f"from_sympy: the coordinate {q} is no function of time, of the symbol "
-                "`dynamicsymbols._t`; make it by "
+                f"from_sympy: the coordinate {q} is not a function of the time "
+                "`dynamicsymbols._t`; create it with "
                 "`sympy.physics.mechanics.dynamicsymbols`."
             )
     names = [str(q.func) for q in found]
@@ -276,37 +276,39 @@ def check_coordinates(coordinates: Any) -> list[Any]:
 
 
 def generalised_forces(forces: Any, coordinates: list[Any], frame: Any) -> list[Any]:
-    """Return the generalised force of each coordinate; an empty list for none."""
+    """Return the generalised force of each coordinate, or an empty list."""
     if forces is None:
         return []
     if isinstance(forces, Mapping):
-        return _by_coordinate(forces, coordinates)
+        return _order_by_coordinate(forces, coordinates)
     pairs = list(forces) if isinstance(forces, Iterable) else [forces]
     if pairs and all(_is_load(pair) for pair in pairs):
-        return of_loads(pairs, rates(coordinates), frame)
+        return forces_of_loads(pairs, rates(coordinates), frame)
     found = expressions("forces", forces)
     if len(found) != len(coordinates):
         raise ValueError(
             f"from_sympy: `forces` has {len(found)} entries, but there are "
-            f"{len(coordinates)} coordinates. Give one for each, a dictionary of "
+            f"{len(coordinates)} coordinates. Pass one for each, a dictionary by "
             "coordinates, or pairs of a point and a force, or a frame and a torque."
         )
     return found
 
 
-def _by_coordinate(forces: Mapping[Any, Any], coordinates: list[Any]) -> list[Any]:
-    """Put the forces of a dictionary, by coordinates or their names, in their order."""
+def _order_by_coordinate(
+    forces: Mapping[Any, Any], coordinates: list[Any]
+) -> list[Any]:
+    """Order the forces of a dictionary by coordinates or their names."""
     of_name = {str(q.func): q for q in coordinates}
     of_coordinate: dict[Any, Any] = {}
     for key, force in forces.items():
         q = of_name.get(key) if isinstance(key, str) else key
         if q not in coordinates:
             raise ValueError(
-                f"from_sympy: `forces` has {key}, not among the coordinates "
-                f"{', '.join(map(str, coordinates))}."
+                f"from_sympy: `forces` has {key}, which is not one of the "
+                f"coordinates {', '.join(map(str, coordinates))}."
             )
         if q in of_coordinate:
-            raise ValueError(f"from_sympy: `forces` has {q} twice, once by its name.")
+            raise ValueError(f"from_sympy: `forces` has {q} twice, also by its name.")
         of_coordinate[q] = force
     return [expression("forces", of_coordinate.get(q, 0)) for q in coordinates]
 
@@ -316,8 +318,8 @@ def _is_load(pair: Any) -> bool:
     return isinstance(pair, tuple) and len(pair) == 2 and isinstance(pair[1], vector)
 
 
-def of_loads(loads: list[Any], speeds: list[Any], frame: Any) -> list[Any]:
-    """Compute the generalised forces Σ F·∂v/∂u of loads, for each of the speeds u."""
+def forces_of_loads(loads: list[Any], speeds: list[Any], frame: Any) -> list[Any]:
+    """Compute the generalised force Σ F·∂v/∂u of loads for each speed u."""
     module = mechanics()
     if not isinstance(frame, module.ReferenceFrame):
         raise TypeError(
