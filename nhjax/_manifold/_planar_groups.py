@@ -1,4 +1,9 @@
-"""The groups of the plane: SO(2), SE(2), and poses that carry their sine and cosine."""
+"""The groups of the plane, SO(2) and SE(2), with angles that count turns.
+
+An angle is never wrapped to one turn when it is stored. Inside a step, a pose of SE(2)
+carries the cosine and sine of its angle (`FramedPose`), so that trigonometric functions
+are not evaluated again at every stage.
+"""
 
 import math
 from typing import Any
@@ -29,15 +34,16 @@ Twist = Float[Array, "3"]
 
 
 class SO2(AbstractLieGroup):
-    """The group SO(2) of rotations of the plane, with an angle θ for an element.
+    """The group SO(2) of rotations of the plane. An element is an angle θ.
 
-    The velocity is ω = dθ/dt. The angle is never wrapped to one turn, so that it counts
-    the turns: it is an array of shape (1,), as an element of `Euclidean(1)` is. Inside
-    of a step the functions of the system are given the angle of the first turn, whose
-    sine and cosine lose no digits after many turns: they must have the period 2π.
+    The velocity is ω = dθ/dt. The angle is an array of shape (1,), like an element of
+    `Euclidean(1)`. It is never wrapped to one turn, so that it counts the turns. Inside
+    a step, however, the functions of the system receive the equivalent angle of the
+    first turn, whose sine and cosine lose no digits after many turns. These functions
+    must therefore have the period 2π.
 
-    With `Exponential()` the group is else the same as `Euclidean(1)`; with `Cayley()`
-    the retraction turns by 2 arctan(ω/2).
+    Otherwise, the group with `Exponential()` is the same as `Euclidean(1)`. With
+    `Cayley()` the retraction rotates by 2 arctan(ω/2).
 
     **Arguments:**
 
@@ -62,11 +68,11 @@ class SO2(AbstractLieGroup):
 
     @property
     def is_flat(self) -> bool:
-        """Tell whether dτ = 1, which is so with the exponential map."""
+        """Return whether dτ = 1, which holds for the exponential map."""
         return isinstance(self.retraction, Exponential)
 
     def identity(self, dtype: DTypeLike | None = None) -> Angle:
-        """Return the identity, which is the angle 0."""
+        """Return the identity, the angle 0."""
         return jnp.zeros(1, dtype)
 
     def check(self, q: Angle, name: str = "q") -> Angle:
@@ -74,7 +80,7 @@ class SO2(AbstractLieGroup):
         return check_shape(q, (1,), "SO2", name)
 
     def in_chart(self, xi: Rate) -> BoolScalar:
-        """Tell whether the rotation stays inside of the chart, if that has an end."""
+        """Return whether the rotation is inside the chart, if the chart has an end."""
         if self.is_flat:
             return jnp.asarray(True)
         return self.retraction.in_chart(xi[0] ** 2)
@@ -84,7 +90,7 @@ class SO2(AbstractLieGroup):
         return g + h
 
     def inverse(self, g: Angle) -> Angle:
-        """Compute the inverse rotation, which has the angle -θ."""
+        """Compute -θ, the angle of the inverse rotation."""
         return -g
 
     def retract(self, xi: Rate) -> Angle:
@@ -92,11 +98,11 @@ class SO2(AbstractLieGroup):
         return self.retraction.angle(xi)
 
     def local(self, g: Angle) -> Rate:
-        """Compute the ω for which τ(ω) has the angle θ."""
+        """Compute the rate ω for which τ(ω) has the angle θ."""
         return self.retraction.rate(g)
 
     def wrapped(self, q: Angle, compensation: Angle) -> Angle:
-        """Return the angle of the first turn, between -π and π."""
+        """Return the equivalent angle between -π and π."""
         return wrapped_angle(q, compensation)
 
     def advance(self, q: Angle, xi: Rate, compensation: Angle) -> tuple[Angle, Angle]:
@@ -112,14 +118,14 @@ class SO2(AbstractLieGroup):
     def matrix(self, g: Angle) -> Float[Array, "2 2"]:
         """Return the rotation matrix of the angle."""
         basis = jnp.eye(2, dtype=g.dtype)
-        return jnp.cos(g[0]) * basis + jnp.sin(g[0]) * turn(basis)
+        return jnp.cos(g[0]) * basis + jnp.sin(g[0]) * quarter_turn(basis)
 
     def hat(self, xi: Rate) -> Float[Array, "2 2"]:
         """Return the matrix [[0, -ω], [ω, 0]] of an angular velocity ω."""
-        return xi[0] * turn(jnp.eye(2, dtype=xi.dtype))
+        return xi[0] * quarter_turn(jnp.eye(2, dtype=xi.dtype))
 
     def tangent(self, g: Angle, eta: Rate) -> Angle:
-        """Return η, which is the rate of the angle."""
+        """Return η, because the tangent of θ -> θ + θ' is the identity."""
         return eta
 
     def dtau(self, xi: Rate, eta: Rate) -> Rate:
@@ -157,9 +163,9 @@ class SO2(AbstractLieGroup):
 class SE2(AbstractMotionGroup):
     """The group SE(2) of rigid motions of the plane, with elements (x, y, θ).
 
-    The body velocity is (v1, v2, ω), with d(x, y)/dt = R(θ) (v1, v2) and dθ/dt = ω. The
-    angle is never wrapped to one turn, and the functions of a system must have the
-    period 2π in it, as on `SO2`.
+    The body velocity is (v1, v2, ω), with d(x, y)/dt = R(θ) (v1, v2) and dθ/dt = ω. As
+    on `SO2`, the angle is never wrapped to one turn, and the functions of a system must
+    have the period 2π in it.
 
     **Arguments:**
 
@@ -191,25 +197,22 @@ class SE2(AbstractMotionGroup):
         return check_shape(q, (3,), "SE2", name)
 
     def in_chart(self, xi: Twist) -> BoolScalar:
-        """Tell whether the rotation of τ(ξ) stays inside of the chart."""
+        """Return whether the rotation of τ(ξ) is inside the chart."""
         return self.retraction.in_chart(xi[2] ** 2)
 
     def compose(self, g: Pose, h: Pose) -> Pose:
         """Compute the product (x + R(θ) x', θ + θ') of (x, θ) and (x', θ')."""
-        return g + _moved(g, h)
+        return g + _rotate_move(g, h)
 
     def act(self, g: Element, xi: Twist) -> Element:
-        """Compute g τ(ξ), with its frame if g has one.
-
-        Inside of a step poses are given with their frames, the cosine and sine of θ.
-        """
+        """Compute g τ(ξ), as a `FramedPose` if g is one."""
         if not isinstance(g, FramedPose):
             return super().act(g, xi)
-        less, sin = self.retraction.plane_rotation(xi[2])
+        cos_minus_1, sin = self.retraction.plane_rotation(xi[2])
         return FramedPose(
-            g.pose + _moved(g, self.retract(xi)),
-            g.cos + (less * g.cos - sin * g.sin),
-            g.sin + (less * g.sin + sin * g.cos),
+            g.pose + _rotate_move(g, self.retract(xi)),
+            g.cos + (cos_minus_1 * g.cos - sin * g.sin),
+            g.sin + (cos_minus_1 * g.sin + sin * g.cos),
         )
 
     def inverse(self, g: Pose) -> Pose:
@@ -223,24 +226,24 @@ class SE2(AbstractMotionGroup):
     def _translation(self, xi: Twist) -> Float[Array, "2"]:
         v, omega = xi[:2], xi[2]
         alpha, beta, _ = self.retraction.dtau_coefficients(omega**2)
-        return alpha * v + beta * omega * turn(v)
+        return alpha * v + beta * omega * quarter_turn(v)
 
     def local(self, g: Pose) -> Twist:
-        """Compute the ξ with τ(ξ) = g."""
+        """Compute the vector ξ with τ(ξ) = g."""
         rate = self.retraction.rate(g[2:])
         omega = rate[0]
         alpha, _ = self.retraction.dtau_inv_coefficients(omega**2)
-        v = alpha * g[:2] - 0.5 * omega * turn(g[:2])
+        v = alpha * g[:2] - 0.5 * omega * quarter_turn(g[:2])
         return jnp.concatenate([v, rate])
 
     def wrapped(self, q: Pose, compensation: Pose) -> Pose:
-        """Return the pose with its angle reduced to one turn, between -π and π."""
+        """Return the pose with its angle reduced to between -π and π."""
         return jnp.concatenate([q[:2], wrapped_angle(q[2:], compensation[2:])])
 
     def advance(self, q: Pose, xi: Twist, compensation: Pose) -> tuple[Pose, Pose]:
         """Compute g τ(ξ) by compensated summation."""
         direction = self.wrapped(q, compensation)
-        return two_sum(q, _moved(direction, self.retract(xi)) + compensation)
+        return two_sum(q, _rotate_move(direction, self.retract(xi)) + compensation)
 
     def matrix(self, g: Pose) -> Float[Array, "3 3"]:
         """Return the matrix of the motion in homogeneous coordinates."""
@@ -252,38 +255,39 @@ class SE2(AbstractMotionGroup):
         return homogeneous(SO2(self.retraction).hat(xi[2:]), xi[:2], 0.0)
 
     def tangent(self, g: Element, eta: Twist) -> Element:
-        """Compute the tangent (R(θ) v, ω) at g = (x, θ) of η = (v, ω).
+        """Compute the tangent (R(θ) v, ω) of η = (v, ω) at g = (x, θ).
 
-        The frame, if there is one, changes by -ω sin θ and ω cos θ.
+        If g is a `FramedPose`, so is the tangent, with the derivatives -ω sin θ of the
+        cosine and ω cos θ of the sine.
         """
-        rate = _moved(g, eta)
+        rate = _rotate_move(g, eta)
         if not isinstance(g, FramedPose):
             return rate
         return FramedPose(rate, -eta[2] * g.sin, eta[2] * g.cos)
 
     def dtau(self, xi: Twist, eta: Twist) -> Twist:
-        """Compute dτ_ξ η, by the formula of `SO3` for motions of the plane."""
+        """Compute dτ_ξ η by the formula of `SO3`, restricted to planar motions."""
         v, omega = xi[:2], xi[2]
         u, sigma = eta[:2], eta[2]
         s = omega**2
         alpha, beta, gamma = self.retraction.dtau_coefficients(s)
-        bracket = omega * turn(u) - sigma * turn(v)
+        bracket = omega * quarter_turn(u) - sigma * quarter_turn(v)
         linear = alpha * u - beta * bracket + gamma * omega * sigma * v
         return jnp.concatenate([linear, (alpha + gamma * s) * eta[2:]])
 
     def dtau_inv(self, xi: Twist, eta: Twist) -> Twist:
-        """Compute dτ_ξ⁻¹ η, by the formula of `SO3` for motions of the plane."""
+        """Compute dτ_ξ⁻¹ η by the formula of `SO3`, restricted to planar motions."""
         v, omega = xi[:2], xi[2]
         u, sigma = eta[:2], eta[2]
         s = omega**2
         alpha, gamma = self.retraction.dtau_inv_coefficients(s)
-        bracket = omega * turn(u) - sigma * turn(v)
+        bracket = omega * quarter_turn(u) - sigma * quarter_turn(v)
         linear = alpha * u + 0.5 * bracket + gamma * omega * sigma * v
         return jnp.concatenate([linear, (alpha + gamma * s) * eta[2:]])
 
     def Ad(self, g: Pose, eta: Twist) -> Twist:
-        """Compute Ad_g η = (R(θ) u - σ J x, σ) of η = (u, σ)."""
-        linear = rotate(g[2], eta[:2]) - eta[2] * turn(g[:2])
+        """Compute Ad_g η = (R(θ) u - σ J x, σ) for η = (u, σ)."""
+        linear = rotate(g[2], eta[:2]) - eta[2] * quarter_turn(g[:2])
         return jnp.concatenate([linear, eta[2:]])
 
     def to_end_change(self, xi: Twist, mu: Twist) -> Twist:
@@ -291,24 +295,24 @@ class SE2(AbstractMotionGroup):
 
         It is (R(θ)ᵀ m - m, -m·J x) for μ = (m, σ) and τ(ξ) = (x, θ).
         """
-        # With Cayley's map neither the angle nor trigonometric functions are needed.
-        less, sin = self.retraction.plane_rotation(xi[2])
-        moment = jnp.sum(turn(self._translation(xi)) * mu[:2])
-        turned = less * mu[:2] - sin * turn(mu[:2])
+        # With the Cayley map this uses neither the angle nor trigonometric functions.
+        cos_minus_1, sin = self.retraction.plane_rotation(xi[2])
+        moment = jnp.sum(quarter_turn(self._translation(xi)) * mu[:2])
+        turned = cos_minus_1 * mu[:2] - sin * quarter_turn(mu[:2])
         return jnp.concatenate([turned, -moment[None]])
 
     def ad(self, xi: Twist, eta: Twist) -> Twist:
-        """Compute [ξ, η] = (ω J u - σ J v, 0) of ξ = (v, ω) and η = (u, σ)."""
-        linear = xi[2] * turn(eta[:2]) - eta[2] * turn(xi[:2])
+        """Compute [ξ, η] = (ω J u - σ J v, 0) for ξ = (v, ω) and η = (u, σ)."""
+        linear = xi[2] * quarter_turn(eta[:2]) - eta[2] * quarter_turn(xi[:2])
         return jnp.concatenate([linear, jnp.zeros_like(eta[2:])])
 
 
 class FramedPose(eqx.Module):
-    """A pose (x, y, θ) with cos θ and sin θ, which tell the frame of the body.
+    """A pose (x, y, θ) together with cos θ and sin θ, the frame of the body.
 
-    In the place of a pose it saves trigonometric functions: from the frame at one pose
-    that at another follows by products, since the retraction gives the sine and cosine
-    of the angle between them.
+    It replaces a pose inside a step to save trigonometric functions. The retraction
+    gives the cosine and sine of the angle between two poses, so that the frame of the
+    second pose follows from the frame of the first one by products.
     """
 
     pose: Float[Array, "3"]
@@ -316,17 +320,17 @@ class FramedPose(eqx.Module):
     sin: FloatScalar
 
     def rotate(self, v: Float[Array, "2"]) -> Float[Array, "2"]:
-        """Turn a vector from the frame of the body to that of the plane."""
-        return self.cos * v + self.sin * turn(v)
+        """Rotate a vector from the frame of the body to the frame of the plane."""
+        return self.cos * v + self.sin * quarter_turn(v)
 
 
 def framed(group: AbstractLieGroup, q: PyTree[Array]) -> PyTree[Array]:
-    """Return an element with the frames of those parts that are poses of the plane.
+    """Return an element with its planar poses replaced by framed poses.
 
-    The methods `act`, `act_back` and `tangent` of the group take it in the place of the
-    element. Where no part is such a pose it is the element itself.
+    The methods `act`, `act_back` and `tangent` of the group accept such an element. An
+    element without planar poses is returned unchanged.
     """
-    # A subclass may have methods of its own, which know nothing of frames.
+    # A subclass may override methods, and these do not support framed poses.
     if type(group) is SE2:
         return FramedPose(q, jnp.cos(q[2]), jnp.sin(q[2]))
     if type(group) is ProductGroup:
@@ -335,47 +339,48 @@ def framed(group: AbstractLieGroup, q: PyTree[Array]) -> PyTree[Array]:
 
 
 def is_framed(q: Any) -> bool:
-    """Tell whether this is a pose with its frame."""
+    """Return whether `q` is a `FramedPose`."""
     return isinstance(q, FramedPose)
 
 
 def unframed(q: PyTree[Array]) -> PyTree[Array]:
-    """Return an element of a group without the frames of the poses that it is made of.
+    """Return an element with its framed poses replaced by plain poses.
 
-    These are the elements that functions of a user are called with.
+    The functions of a user are called with plain elements.
     """
     return jax.tree.map(lambda x: x.pose if is_framed(x) else x, q, is_leaf=is_framed)
 
 
-def _moved(g: Pose | FramedPose, move: Pose | Twist) -> Pose:
-    """Turn the first two numbers of a move from the frame of the body g."""
+def _rotate_move(g: Pose | FramedPose, move: Pose | Twist) -> Pose:
+    """Rotate the first two entries of `move` from the frame of g to the plane."""
     v = move[:2]
     turned = g.rotate(v) if isinstance(g, FramedPose) else rotate(g[2], v)
     return jnp.concatenate([turned, move[2:]])
 
 
-# 2π is math.tau plus this, to 32 digits.
+# math.tau plus this number is 2π to 32 digits.
 _TAU_REST = 2.4492935982947064e-16
 
 
-def turn(v: Float[Array, "2 ..."]) -> Float[Array, "2 ..."]:
-    """Compute J v, a vector of the plane (or the columns of a matrix) turned by π/2."""
+def quarter_turn(v: Float[Array, "2 ..."]) -> Float[Array, "2 ..."]:
+    """Compute J v: rotate a vector, or the columns of a matrix, by π/2."""
     return jnp.concatenate([-v[1:], v[:1]])
 
 
 def rotate(angle: Float[Array, ""], v: Float[Array, "2"]) -> Float[Array, "2"]:
-    """Turn a vector v of the plane by an angle."""
-    return jnp.cos(angle) * v + jnp.sin(angle) * turn(v)
+    """Rotate a vector v of the plane by an angle."""
+    return jnp.cos(angle) * v + jnp.sin(angle) * quarter_turn(v)
 
 
 def wrapped_angle(
     angle: Float[Array, "1"], compensation: Float[Array, "1"]
 ) -> Float[Array, "1"]:
-    """Compute angle + compensation - 2πk for the whole k that brings it near zero.
+    """Compute angle + compensation - 2πk for the integer k that brings it nearest to 0.
 
-    It is accurate to the round-off of one turn for as many turns as half of the bits of
-    a number can count: 2πk is subtracted in parts so short that k times them is exact
-    (Cody and Waite, *Software Manual for the Elementary Functions*, 1980).
+    The result is accurate to the round-off of one turn if k fits into half of the bits
+    of the mantissa. The number 2πk is subtracted in parts that are short enough for
+    their products with k to be exact (Cody and Waite, *Software Manual for the
+    Elementary Functions*, 1980).
     """
     dtype = np.dtype(angle.dtype)
     bits = jnp.finfo(dtype).nmant + 1
@@ -386,7 +391,7 @@ def wrapped_angle(
 
 
 def _parts_of_a_turn(bits: int) -> tuple[float, float, float]:
-    """Split 2π into two numbers of so many bits and the rest."""
+    """Split 2π into two numbers with `bits` bits each and a remainder."""
     rest, parts = math.tau, []
     for _ in range(2):
         mantissa, exponent = math.frexp(rest)

@@ -29,7 +29,7 @@ Twist = Float[Array, "6"]
 
 
 class Euclidean(AbstractLieGroup):
-    """The vector space R^n: the abelian group whose retraction is the identity.
+    """The vector space R^n, an abelian group whose retraction is the identity.
 
     **Arguments:**
 
@@ -56,11 +56,11 @@ class Euclidean(AbstractLieGroup):
 
     @property
     def is_flat(self) -> bool:
-        """Return True, because dτ and Ad are identities here."""
+        """Return True, because dτ and Ad are identities."""
         return True
 
     def identity(self, dtype: DTypeLike | None = None) -> Point:
-        """Return the zero vector, which is the identity of the group."""
+        """Return the zero vector, the identity of the group."""
         return jnp.zeros(self.n, dtype)
 
     def check(self, q: Point, name: str = "q") -> Point:
@@ -68,7 +68,7 @@ class Euclidean(AbstractLieGroup):
         return check_shape(q, (self.n,), f"Euclidean({self.n})", name)
 
     def compose(self, g: Point, h: Point) -> Point:
-        """Compute the sum g + h, which is the product of the group."""
+        """Compute the sum g + h, the product of the group."""
         return g + h
 
     def inverse(self, g: Point) -> Point:
@@ -98,7 +98,7 @@ class Euclidean(AbstractLieGroup):
         return homogeneous(jnp.eye(self.n, dtype=g.dtype), g, 1.0)
 
     def hat(self, xi: Vector) -> Float[Array, "n+1 n+1"]:
-        """Return the matrix of ξ, which has ξ as its last column."""
+        """Return the matrix whose last column is ξ."""
         return homogeneous(jnp.zeros((self.n, self.n), xi.dtype), xi, 0.0)
 
     def tangent(self, g: Point, eta: Vector) -> Point:
@@ -151,11 +151,12 @@ class Euclidean(AbstractLieGroup):
 
 
 class SO3(AbstractMotionGroup):
-    """The group SO(3) of rotations of space, with a unit quaternion for an element.
+    """The group SO(3) of rotations of space. An element is a unit quaternion.
 
-    The velocity is the body angular velocity ω, with dq/dt = q ∘ (0, ω/2); `matrix(q)`
-    takes body to space coordinates. The quaternion is the paper's g = (w, x, y, z). The
-    quaternions q and -q are the same rotation: `local` of either is the shorter vector.
+    The quaternion is the paper's g = (w, x, y, z). The velocity is the body angular
+    velocity ω, with dq/dt = q ∘ (0, ω/2). The matrix `matrix(q)` takes body coordinates
+    to space coordinates. The quaternions q and -q are the same rotation, and `local`
+    returns the same vector for both, the shorter one.
 
     **Arguments:**
 
@@ -187,7 +188,7 @@ class SO3(AbstractMotionGroup):
         return check_shape(q, (4,), "SO3", name)
 
     def in_chart(self, xi: Vector3) -> BoolScalar:
-        """Tell whether the rotation τ(ω) stays inside of the chart."""
+        """Return whether the rotation τ(ω) is inside the chart."""
         return self.retraction.in_chart(dot(xi, xi))
 
     def distance_to_group(self, q: Quaternion) -> FloatScalar:
@@ -203,7 +204,7 @@ class SO3(AbstractMotionGroup):
         return multiply(g, h)
 
     def inverse(self, g: Quaternion) -> Quaternion:
-        """Compute the conjugate quaternion, which is the inverse."""
+        """Compute the conjugate quaternion, the inverse of a unit quaternion."""
         return conjugate(g)
 
     def retract(self, xi: Vector3) -> Quaternion:
@@ -227,9 +228,9 @@ class SO3(AbstractMotionGroup):
         The result has norm 1 up to rounding.
         """
         total, error = two_sum(q, multiply(q, self._increment(xi)) + compensation)
-        # This is one Newton step for the norm, applied to sum and error together: what
-        # rounding adds to the norm in one step is removed in the next, and the rotation
-        # is not changed.
+        # One Newton step for the norm, applied to the sum and its error together. It
+        # removes the rounding error of the norm from the previous step, and does not
+        # change the rotation.
         correction = 0.5 * (1 - dot(total, total)) - dot(total, error)
         return total, error + correction * total
 
@@ -256,11 +257,11 @@ class SO3(AbstractMotionGroup):
         return alpha * eta + 0.5 * cross(xi, eta) + gamma * dot(xi, eta) * xi
 
     def dtau_dual(self, xi: Vector3, mu: Vector3) -> Vector3:
-        """Compute dτ_ω^* μ, by dτ_ω^* = dτ_{-ω}."""
+        """Compute dτ_ω^* μ as dτ_{-ω} μ."""
         return self.dtau(-xi, mu)
 
     def dtau_inv_dual(self, xi: Vector3, mu: Vector3) -> Vector3:
-        """Compute (dτ_ω⁻¹)^* μ, by (dτ_ω⁻¹)^* = dτ_{-ω}⁻¹."""
+        """Compute (dτ_ω⁻¹)^* μ as dτ_{-ω}⁻¹ μ."""
         return self.dtau_inv(-xi, mu)
 
     def Ad(self, g: Quaternion, eta: Vector3) -> Vector3:
@@ -287,8 +288,8 @@ class SO3(AbstractMotionGroup):
 class SE3(AbstractMotionGroup):
     """The group SE(3) of rigid motions of space.
 
-    An element is a unit quaternion q followed by a translation x, in one array of shape
-    (7,). The body velocity is (v, ω), with dx/dt = R(q) v and dq/dt = q ∘ (0, ω/2).
+    An element is an array of shape (7,), a unit quaternion q followed by a translation
+    x. The body velocity is (v, ω), with dx/dt = R(q) v and dq/dt = q ∘ (0, ω/2).
 
     **Arguments:**
 
@@ -324,7 +325,7 @@ class SE3(AbstractMotionGroup):
         return check_shape(q, (7,), "SE3", name)
 
     def in_chart(self, xi: Twist) -> BoolScalar:
-        """Tell whether the rotation of τ(ξ) stays inside of the chart."""
+        """Return whether the rotation of τ(ξ) is inside the chart."""
         return self._rotations.in_chart(xi[3:])
 
     def distance_to_group(self, q: Pose) -> FloatScalar:
@@ -354,15 +355,15 @@ class SE3(AbstractMotionGroup):
         v, omega = xi[:3], xi[3:]
         if isinstance(self.retraction, Exponential):
             return self._rotations.dtau(-omega, v)
-        return self._solve(-omega, v)
+        return self._cayley_factor(-omega, v)
 
-    def _solve(self, omega, v):
-        """Compute (I + ω^/2)⁻¹ v, of which Cayley's map is made."""
+    def _cayley_factor(self, omega, v):
+        """Compute (I + ω^/2)⁻¹ v, a factor of the Cayley map."""
         alpha, _, _ = self.retraction.dtau_coefficients(dot(omega, omega))
         return alpha * self._rotations.dtau_inv(-omega, v)
 
     def local(self, g: Pose) -> Twist:
-        """Compute the ξ with τ(ξ) = g that has the shorter rotation vector."""
+        """Compute the vector ξ with τ(ξ) = g and the shortest rotation vector."""
         omega, x = self._rotations.local(g[:4]), g[4:]
         if isinstance(self.retraction, Exponential):
             v = self._rotations.dtau_inv(-omega, x)
@@ -373,7 +374,7 @@ class SE3(AbstractMotionGroup):
     def advance(self, q: Pose, xi: Twist, compensation: Pose) -> tuple[Pose, Pose]:
         """Compute g τ(ξ) by compensated summation.
 
-        The quaternion has norm 1 up to rounding.
+        The quaternion of the result has norm 1 up to rounding.
         """
         step = rotate(q[:4], self._translation(xi))
         x, x_error = two_sum(q[4:], step + compensation[4:])
@@ -389,28 +390,28 @@ class SE3(AbstractMotionGroup):
         return homogeneous(self._rotations.hat(xi[3:]), xi[:3], 0.0)
 
     def tangent(self, g: Pose, eta: Twist) -> Pose:
-        """Compute the tangent (q ∘ (0, ω/2), R(q) v) at g of η = (v, ω)."""
+        """Compute the tangent (q ∘ (0, ω/2), R(q) v) of η = (v, ω) at g = (q, x)."""
         rotation = self._rotations.tangent(g[:4], eta[3:])
         return jnp.concatenate([rotation, rotate(g[:4], eta[:3])])
 
     def dtau(self, xi: Twist, eta: Twist) -> Twist:
         """Compute dτ_ξ η, the left-trivialised tangent of τ."""
         if isinstance(self.retraction, Exponential):
-            return _dual_part(self._rotations.dtau, xi, eta)
+            return _extend_by_dual_numbers(self._rotations.dtau, xi, eta)
         sigma = self._rotations.dtau(xi[3:], eta[3:])
-        u = self._solve(xi[3:], eta[:3]) + 0.5 * cross(sigma, xi[:3])
+        u = self._cayley_factor(xi[3:], eta[:3]) + 0.5 * cross(sigma, xi[:3])
         return jnp.concatenate([u, sigma])
 
     def dtau_inv(self, xi: Twist, eta: Twist) -> Twist:
         """Compute dτ_ξ⁻¹ η, the inverse of the left-trivialised tangent."""
         if isinstance(self.retraction, Exponential):
-            return _dual_part(self._rotations.dtau_inv, xi, eta)
+            return _extend_by_dual_numbers(self._rotations.dtau_inv, xi, eta)
         y = eta[:3] - 0.5 * cross(eta[3:], xi[:3])
         sigma = self._rotations.dtau_inv(xi[3:], eta[3:])
         return jnp.concatenate([y + 0.5 * cross(xi[3:], y), sigma])
 
     def Ad(self, g: Pose, eta: Twist) -> Twist:
-        """Compute Ad_g η = (R u + x × R σ, R σ) of η = (u, σ)."""
+        """Compute Ad_g η = (R u + x × R σ, R σ) for η = (u, σ)."""
         sigma = rotate(g[:4], eta[3:])
         u = rotate(g[:4], eta[:3]) + cross(g[4:], sigma)
         return jnp.concatenate([u, sigma])
@@ -427,15 +428,16 @@ class SE3(AbstractMotionGroup):
         return jnp.concatenate([rotation_change(back, m), turned + moment])
 
     def ad(self, xi: Twist, eta: Twist) -> Twist:
-        """Compute [ξ, η] = (ω × u + v × σ, ω × σ) of ξ = (v, ω), η = (u, σ)."""
-        return _dual_part(self._rotations.ad, xi, eta)
+        """Compute [ξ, η] = (ω × u + v × σ, ω × σ) for ξ = (v, ω), η = (u, σ)."""
+        return _extend_by_dual_numbers(self._rotations.ad, xi, eta)
 
 
-def _dual_part(function, xi: Twist, eta: Twist) -> Twist:
+def _extend_by_dual_numbers(function, xi: Twist, eta: Twist) -> Twist:
     """Extend a map of so(3) that is built from brackets to a map of se(3).
 
-    A vector ξ = (v, ω) is the dual number ω + ε v with ε² = 0, so that a map built from
-    brackets alone extends by its derivative: f(ω + ε v, σ + ε u) = f + ε Df (v, u).
+    A vector ξ = (v, ω) is the dual number ω + ε v with ε² = 0. A map built from
+    brackets alone therefore extends by its derivative:
+    f(ω + ε v, σ + ε u) = f(ω, σ) + ε Df(ω, σ) (v, u).
     """
     value: Vector3
     slope: Vector3
@@ -445,7 +447,7 @@ def _dual_part(function, xi: Twist, eta: Twist) -> Twist:
 
 def dot(a: Float[Array, " n"], b: Float[Array, " n"]) -> Float[Array, ""]:
     """Compute the scalar product a·b of two vectors."""
-    # A matrix product would not be fused with the operations around it.
+    # XLA fuses a sum with the operations around it, but not a matrix product.
     return jnp.sum(a * b)
 
 
@@ -454,7 +456,7 @@ _CROSS = np.cross(np.eye(3)[:, None], np.eye(3)[None]).transpose(2, 0, 1)
 
 
 def _product_tensor() -> np.ndarray:
-    """Make the coefficients (1_j ∘ 1_k)_i of the product of quaternions 1, i, j, k."""
+    """Build the coefficients (1_j ∘ 1_k)_i of the products of 1, i, j and k."""
     tensor = np.zeros((4, 4, 4))
     tensor[0] = np.diag([1.0, -1.0, -1.0, -1.0])
     tensor[1:, 0, 1:] = tensor[1:, 1:, 0] = np.eye(3)
@@ -484,7 +486,7 @@ def multiply_vector(q: Quaternion, v: Vector3) -> Quaternion:
 
 
 def conjugate(q: Quaternion) -> Quaternion:
-    """Compute the conjugate of a unit quaternion, which is its inverse."""
+    """Compute the conjugate of a quaternion, the inverse of a unit quaternion."""
     return jnp.array([1.0, -1.0, -1.0, -1.0], q.dtype) * q
 
 
@@ -500,7 +502,7 @@ def rotation_change(q: Quaternion, v: Vector3) -> Vector3:
 
 def cross_matrix(v: Vector3) -> Float[Array, "3 3"]:
     """Return the matrix of the linear map x -> v × x."""
-    return matrix_of(_CROSS, v)
+    return bilinear_matrix(_CROSS, v)
 
 
 def rotation_matrix(q: Quaternion) -> Float[Array, "3 3"]:
@@ -512,9 +514,9 @@ def bilinear(
     tensor: np.ndarray, a: Float[Array, " n"], b: Float[Array, " k"]
 ) -> Float[Array, " m"]:
     """Compute the vector Σ T_ijk a_j b_k of a bilinear map T."""
-    return small_einsum("ik,k->i", matrix_of(tensor, a), b)
+    return small_einsum("ik,k->i", bilinear_matrix(tensor, a), b)
 
 
-def matrix_of(tensor: np.ndarray, a: Float[Array, " n"]) -> Float[Array, "m k"]:
+def bilinear_matrix(tensor: np.ndarray, a: Float[Array, " n"]) -> Float[Array, "m k"]:
     """Compute Σ T_ijk a_j, the matrix of the linear map b -> Σ T_ijk a_j b_k."""
     return small_einsum("ijk,j->ik", jnp.asarray(tensor, a.dtype), a)
