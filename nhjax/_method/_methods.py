@@ -45,31 +45,32 @@ _STATEMENTS = {
     "H3": "H3 (a_sj = b_j, last stage at t_{k+1})",
 }
 
-# R_A(∞) of a user's tableau is a ratio of sums of products of float64 coefficients. At
-# s = 12 the rounding of those of Lobatto IIIA moves it by less than 1e-10.
+# R_A(∞) of a user's tableau is a ratio of sums of products of float64 coefficients. For
+# Lobatto IIIA with s = 12, rounding the coefficients changes it by less than 1e-10.
 _UNIT_TOLERANCE = 1e-9
 
-# At s = 32 the 60 digits still show every order condition, the rounded coefficients
-# satisfy those of a stage to 2e-16, and runs end at round-off; but the defect of the
-# multiplier, which at s = 16 is round-off, has grown sixfold, and the checks of a
-# tableau, whose cost grows as s^4 and more, take 5 s (s = 20: 0.8 s; s = 100: minutes).
-MOST_STAGES = 32
+# At s = 32, 60 digits still resolve every order condition, the rounded coefficients
+# satisfy the stage conditions to 2e-16, and runs converge to round-off. Two things get
+# worse: the defect of the multiplier, which is round-off at s = 16, is six times as
+# large, and the checks of a tableau, whose cost grows at least as s^4, take 5 s
+# (s = 20: 0.8 s; s = 100: minutes).
+MAX_STAGES = 32
 
 
 @dataclass(frozen=True, eq=False)
 class ClosureWeights:
-    """The weights of a closure, by which a step's multipliers follow from its unknowns.
+    """The weights that map a closure's unknowns to the multipliers of a step.
 
-    They are read-only float64 arrays; instances are compared by identity.
+    All are read-only float64 arrays. Instances compare by identity.
 
     **Fields:**
 
     - `E`: shape (s, s-1), the weights of the unknowns y.
     - `start`: shape (s,), the weights of the multiplier λ_k at t_k.
     - `end`: shape (s,), the weights of the continuous multiplier λ_c(q_{k+1}, p_{k+1}).
-    - `response`: shape (s-1,), the change of y which, with a change of λ_{k+1} by one,
-        leaves Σ_j a_ij Λ^j, i >= 2, as they are.
-    - `stage_response`: shape (s,), by how much Σ_j â_ij Λ^j change then.
+    - `response`: shape (s-1,), the change of y that compensates a change of λ_{k+1} by
+        one, so that Σ_j a_ij Λ^j, i >= 2, do not change.
+    - `stage_response`: shape (s,), the change of Σ_j â_ij Λ^j under both changes.
     """
 
     E: np.ndarray
@@ -82,10 +83,10 @@ class ClosureWeights:
 class AbstractMethod(eqx.Module):
     """A symplectic partitioned Runge-Kutta method: (a, b) for q, its conjugate for p.
 
-    All data of a method is static: it is hashable, has no array leaves, can be a static
-    argument of `jax.jit`, and equals any other method with the same data. Coefficients
-    are computed in 60 digits and rounded once. A subclass defines `stages`, `closure`,
-    `chart` and `_tableau`, and has no subclasses of its own.
+    All data of a method is static: the method is hashable, has no array leaves, can be
+    a static argument of `jax.jit`, and equals any other method with the same data.
+    Coefficients are computed in 60 digits and rounded once. A subclass is final and
+    defines `stages`, `closure`, `chart` and `_tableau`.
     """
 
     stages: eqx.AbstractVar[int]
@@ -94,7 +95,7 @@ class AbstractMethod(eqx.Module):
 
     @abc.abstractmethod
     def _tableau(self) -> Tableau:
-        """Return the tableau of the method, the same object for all equal methods."""
+        """Return the tableau; equal methods return the same object."""
 
     @property
     def a(self) -> np.ndarray:
@@ -128,8 +129,8 @@ class AbstractMethod(eqx.Module):
     def order(self) -> int:
         """Return the order of q and p in systems without constraints.
 
-        It is found from the order conditions of the pair (a, â) up to order 8, and is
-        min(p, 2r + 2) of B(p) and D(r) beyond that, as measured.
+        Up to order 8 it follows from the order conditions of the pair (a, â). Beyond
+        that it is min(p, 2r + 2) of B(p) and D(r), which agrees with measurements.
         """
         return _order_conditions.order(self._tableau())
 
@@ -138,21 +139,22 @@ class AbstractMethod(eqx.Module):
         """Return the order of q and p in systems with constraints.
 
         It is min(p, 2r + 2) of B(p) and D(r), or the order without constraints if that
-        is less. This is what runs of many tableaux show; proved it is for Lobatto's.
+        is less. This is proved for Lobatto methods, and agrees with runs of many other
+        tableaux.
 
-        **Raises:** a `ValueError` as `require_constraint_hypotheses` does.
+        **Raises:** `ValueError`, as `require_constraint_hypotheses` does.
         """
         self.require_constraint_hypotheses()
         return min(self.order, self.orders.B, 2 * self.orders.D + 2)
 
     @property
     def hypotheses(self) -> Hypotheses:
-        """Find which of H1, H2, H3 hold, which systems with constraints need."""
+        """Find which of H1, H2 and H3 hold, which systems with constraints need."""
         return _order_conditions.hypotheses(self._tableau())
 
     @property
     def is_symmetric(self) -> bool:
-        """Tell if a_{s+1-i,s+1-j} + a_ij = b_j: a step of -h then undoes one of h."""
+        """Return whether a_{s+1-i,s+1-j} + a_ij = b_j: a step -h undoes a step h."""
         return _order_conditions.is_symmetric(self._tableau())
 
     @property
@@ -164,13 +166,13 @@ class AbstractMethod(eqx.Module):
     def multiplier_order(self) -> int:
         """Return the order of convergence of the multiplier that a solution reports.
 
-        With `closure="propagated"` it is Q of CĈ(Q), less one if R_A(∞) = 1, and the
-        next even number if the method is symmetric, as runs of many tableaux show. (The
-        paper's theorem on global convergence has q of C(q) for Q, which is the same for
-        Lobatto's nodes alone.) With the other closures the multiplier is the continuous
-        one, and has the order of the state.
+        With `closure="propagated"` it is Q of CĈ(Q), less one if R_A(∞) = 1, then
+        rounded up to an even number if the method is symmetric. Runs of many tableaux
+        show this. (The paper's theorem on global convergence has q of C(q) in place of
+        Q; the two are equal for Lobatto nodes only.) With the other closures the
+        multiplier is the continuous multiplier, which has the order of the state.
 
-        **Raises:** a `ValueError` as `require_constraint_hypotheses` does.
+        **Raises:** `ValueError`, as `require_constraint_hypotheses` does.
         """
         self.require_constraint_hypotheses()
         if self.closure != "propagated":
@@ -183,12 +185,12 @@ class AbstractMethod(eqx.Module):
 
     @property
     def embedded_difference(self) -> np.ndarray | None:
-        """Return b less the weights of a quadrature that leaves out the last node.
+        """Return b minus the weights of a quadrature without the last node.
 
-        These weights are a multiple of the divided difference over all nodes. A
-        quadrature with them is zero for polynomials of a degree less than s - 1, so
-        that it shows how well the nodes resolve a function. Where nodes coincide, only
-        the first of them has a weight. None if there is but one node.
+        The difference is a multiple of the divided difference over all nodes. As a
+        quadrature it vanishes for polynomials of degree less than s - 1, so that it
+        measures how well the nodes resolve a function. Of several coinciding nodes only
+        the first has a weight. Returns None if there is only one distinct node.
         """
         nodes, first = np.unique(self.c, return_index=True)
         if len(nodes) == 1:
@@ -202,20 +204,20 @@ class AbstractMethod(eqx.Module):
 
     @property
     def closure_weights(self) -> ClosureWeights:
-        """Return the weights that give a step's multipliers, as in `ClosureWeights`.
+        """Return the `ClosureWeights`, which give a step's multipliers.
 
-        **Raises:** a `ValueError` as `require_constraint_hypotheses` does.
+        **Raises:** `ValueError`, as `require_constraint_hypotheses` does.
         """
         self.require_constraint_hypotheses()
-        return make_closure_weights(self._tableau(), self.closure == "symmetric")
+        return multiplier_closure_weights(self._tableau(), self.closure == "symmetric")
 
     def basis(self, theta: ArrayLike) -> Float[Array, "*batch s"]:
         """Evaluate the Lagrange basis ℓ_1(θ), ..., ℓ_s(θ) on the nodes c.
 
         **Arguments:**
 
-        - `theta`: θ = (t - t_k) / h, of any shape, traceable; beyond [0, 1] it
-            extrapolates.
+        - `theta`: θ = (t - t_k) / h, of any shape. It may be traced. Values outside
+            [0, 1] extrapolate.
 
         **Returns:**
 
@@ -223,30 +225,30 @@ class AbstractMethod(eqx.Module):
 
         **Raises:**
 
-        A `ValueError` if two nodes coincide.
+        `ValueError` if two nodes coincide.
         """
         return lagrange(self._tableau(), theta)
 
     def integrated_basis(self, theta: ArrayLike) -> Float[Array, "*batch s"]:
         """Compute ∫_0^θ ℓ_j, the weights of a collocation polynomial at t_k + θ h.
 
-        At θ = 0 they are exactly 0, and at θ = 1 exactly `b` for a collocation method,
+        They are exactly 0 at θ = 0, and for a collocation method exactly `b` at θ = 1,
         so that dense output agrees with the states at both ends of a step. Arguments,
-        result and errors are those of `basis`.
+        result and errors are the same as for `basis`.
         """
         return integrated_lagrange(self._tableau(), theta)
 
     def require_constraint_hypotheses(self) -> None:
         """Check that the method can integrate systems with constraints.
 
-        H1, H2 and H3 (the paper's section on holonomic constraints) make the first and
-        last stages the states at t_k and t_{k+1} and the multipliers solvable. Carried
-        multipliers stay bounded if |R_A(∞)| <= 1; the symmetric closure needs a
-        symmetric tableau and |R_A(∞)| = 1.
+        By H1, H2 and H3 (the paper's section on holonomic constraints), the first and
+        last stages are the states at t_k and t_{k+1}, and the multipliers are
+        determined. Propagated multipliers stay bounded if |R_A(∞)| <= 1. The symmetric
+        closure needs a symmetric tableau and |R_A(∞)| = 1.
 
         **Raises:**
 
-        A `ValueError` naming the first condition that fails.
+        `ValueError` with the first condition that fails.
         """
         for name, holds in self.hypotheses._asdict().items():
             if not holds:
@@ -254,8 +256,8 @@ class AbstractMethod(eqx.Module):
         size = abs(self.stability_at_infinity)
         if self.closure == "propagated" and size > 1 + _UNIT_TOLERANCE:
             self._reject(
-                "closure='propagated' needs |R_A(∞)| <= 1, the factor that a step "
-                f"applies to an error in the multiplier, and it is {size:.6g}; "
+                "closure='propagated' multiplies an error in the multiplier by R_A(∞) "
+                f"in each step and needs |R_A(∞)| <= 1, but it is {size:.6g}; "
                 "use closure='consistent'"
             )
         if self.closure != "symmetric":
@@ -263,7 +265,7 @@ class AbstractMethod(eqx.Module):
         alternatives = "use closure='propagated' or 'consistent'"
         if not math.isclose(size, 1, rel_tol=_UNIT_TOLERANCE):
             self._reject(
-                f"closure='symmetric' needs |R_A(∞)| = 1, and it is {size:.6g}; "
+                f"closure='symmetric' needs |R_A(∞)| = 1, but it is {size:.6g}; "
                 + alternatives
             )
         if not self.is_symmetric:
@@ -280,11 +282,12 @@ class AbstractMethod(eqx.Module):
 
 
 class LobattoIIIAB(AbstractMethod):
-    """The Lobatto IIIA-IIIB pair of order 2s - 2, symmetric and fit for any system.
+    """The symmetric Lobatto IIIA-IIIB pair of order 2s - 2, for every system.
 
-    It integrates q by Lobatto IIIA (a, b) and p by the symplectic conjugate, Lobatto
-    IIIB (â, b). These are the paper's methods. For s = 2 it is the trapezoidal rule
-    with its conjugate, which for a separable Lagrangian is the Störmer-Verlet method.
+    It integrates q by Lobatto IIIA (a, b) and p by its symplectic conjugate Lobatto
+    IIIB (â, b). These are the paper's methods. For s = 2 the pair is the trapezoidal
+    rule with its conjugate, which is the Störmer-Verlet method for a separable
+    Lagrangian.
 
     !!! example
 
@@ -301,28 +304,30 @@ class LobattoIIIAB(AbstractMethod):
         """
         **Arguments:**
 
-        - `stages`: s from 2 to 32, beyond which coefficients take minutes to find
-            and nothing is gained in float64.
-        - `closure`: how the first of the s multipliers of a step is determined, for
-            which there is no equation. `"propagated"`, the choice of the paper, carries
-            Λ^s to the next step as its Λ^1. `"consistent"` takes for Λ^1 the continuous
-            multiplier of the state. `"symmetric"` uses the continuous multipliers of
-            the states at both ends of the step, with one unknown added that makes the
-            step symmetric; a step then depends on nothing but its state.
-        - `chart`: where, on a Lie group, the chart of a step has its origin. With
-            `"middle"` a step leads from -ξ/2 to ξ/2 in its chart, and is symmetric;
-            without constraints it is symplectic. With `"start"`, the choice of the
-            paper, it leads from 0 to ξ, and is not symmetric. On a vector space the two
-            are the same.
+        - `stages`: s from 2 to 32. More stages gain no accuracy in float64, and their
+            coefficients take minutes to compute.
+        - `closure`: how a step determines the first of its s multipliers, for which
+            there is no equation. `"propagated"`, the choice of the paper, uses Λ^s of
+            the previous step as Λ^1. `"consistent"` uses the continuous multiplier of
+            the state as Λ^1. `"symmetric"` uses the continuous multipliers of the
+            states at both ends of the step, with one more unknown that makes the step
+            symmetric; a step then depends on its initial state only.
+        - `chart`: the origin of the chart of a step on a Lie group. With `"middle"` a
+            step leads from -ξ/2 to ξ/2 in its chart; it is symmetric, and symplectic
+            if there are no constraints. With `"start"`, the choice of the paper, a step
+            leads from 0 to ξ, and is not symmetric. On a vector space both are the
+            same.
 
         **Raises:**
 
-        A `TypeError` if `stages` is no integer; a `ValueError` if it is out of range,
+        `TypeError` if `stages` is not an integer; `ValueError` if it is out of range,
         or if `closure` or `chart` is not one of the choices.
         """
         self.stages = check_stages(stages, 2, "LobattoIIIAB")
-        self.closure = check_closure(closure)
-        self.chart = check_chart(chart)
+        check_choice("closure", closure, CLOSURES)
+        self.closure = closure
+        check_choice("chart", chart, CHARTS)
+        self.chart = chart
 
     @property
     def order(self) -> int:
@@ -334,11 +339,11 @@ class LobattoIIIAB(AbstractMethod):
 
 
 class Gauss(AbstractMethod):
-    """The Gauss method of order 2s, symplectic and symmetric, without constraints.
+    """The symplectic, symmetric Gauss method of order 2s, without constraints.
 
     Its tableau (a, b) is its own symplectic conjugate. The stages do not include the
-    ends of the step (hypotheses H1 and H3 fail), so that `integrate` refuses it for
-    systems with constraints.
+    ends of the step (hypotheses H1 and H3 fail), so that `integrate` raises an error
+    for systems with constraints.
 
     !!! example
 
@@ -354,21 +359,22 @@ class Gauss(AbstractMethod):
         """
         **Arguments:**
 
-        - `stages`: s from 1 to 32, beyond which coefficients take minutes to find
-            and nothing is gained in float64.
+        - `stages`: s from 1 to 32. More stages gain no accuracy in float64, and their
+            coefficients take minutes to compute.
         - `chart`: as for `LobattoIIIAB`.
 
         **Raises:**
 
-        A `TypeError` if `stages` is no integer; a `ValueError` if it is out of range,
-        or if `chart` is not one of the two.
+        `TypeError` if `stages` is not an integer; `ValueError` if it is out of range,
+        or if `chart` is not one of the two choices.
         """
         self.stages = check_stages(stages, 1, "Gauss")
-        self.chart = check_chart(chart)
+        check_choice("chart", chart, CHARTS)
+        self.chart = chart
 
     @property
     def closure(self) -> None:
-        """Return None: the method takes no constraints, and so needs no closure."""
+        """Return None, because a method without constraints needs no closure."""
         return None
 
     @property
@@ -381,12 +387,12 @@ class Gauss(AbstractMethod):
 
 
 class PartitionedRungeKutta(AbstractMethod):
-    """A method from any Runge-Kutta tableau (a, b) for q, with its conjugate for p.
+    """A Runge-Kutta tableau (a, b) for q with its symplectic conjugate for p.
 
     The nodes c_i = Σ_j a_ij and the symplectic conjugate â_ij = b_j (1 - a_ji / b_i)
-    follow from the tableau. The float64 coefficients are taken as exact, and the
-    conditions on them are checked to 1e-13. (At s = 12 the defect of the first order
-    that a tableau lacks may itself be that small, and `orders` is then too high.) For
+    follow from the tableau. The float64 coefficients are taken as exact, and conditions
+    on them are checked to 1e-13. (With 12 or more stages the defect of the first order
+    condition that fails can be as small as that, and `orders` is then too high.) For
     systems with constraints the tableau must satisfy H1, H2 and H3.
 
     !!! example
@@ -412,14 +418,14 @@ class PartitionedRungeKutta(AbstractMethod):
         """
         **Arguments:**
 
-        - `a`: the coefficients a_ij, shape (s, s), not traced.
-        - `b`: the weights b_j, shape (s,), none of them zero and of sum 1.
+        - `a`: the coefficients a_ij, shape (s, s); they cannot be traced.
+        - `b`: the weights b_j, shape (s,), which are not zero and sum to 1.
         - `closure`, `chart`: as for `LobattoIIIAB`.
 
         **Raises:**
 
-        A `ValueError` if a shape is wrong, an entry is not finite, a weight is zero,
-        the weights do not sum to 1, or `closure` or `chart` is not one of the choices.
+        `ValueError` if a shape is wrong, an entry is not finite, a weight is zero, the
+        weights do not sum to 1, or `closure` or `chart` is not one of the choices.
         """
         a = np.asarray(a, dtype=np.float64)
         b = np.asarray(b, dtype=np.float64)
@@ -434,14 +440,16 @@ class PartitionedRungeKutta(AbstractMethod):
                 raise ValueError(f"{name} must be finite, got {array.tolist()}")
         if (b == 0).any():
             raise ValueError(
-                f"b must have no zero weight, got {b.tolist()}: the symplectic "
+                f"every weight in b must be nonzero, got {b.tolist()}: the symplectic "
                 "conjugate b_j (1 - a_ji / b_i) would not exist"
             )
         if abs(b.sum() - 1) > 1e-13:
             raise ValueError(f"b must sum to 1, got {float(b.sum())!r}")
         self.stages = b.size
-        self.closure = check_closure(closure)
-        self.chart = check_chart(chart)
+        check_choice("closure", closure, CLOSURES)
+        self.closure = closure
+        check_choice("chart", chart, CHARTS)
+        self.chart = chart
         self._coefficients = tuple(tuple(row) for row in a.tolist())
         self._weights = tuple(b.tolist())
 
@@ -450,29 +458,28 @@ class PartitionedRungeKutta(AbstractMethod):
 
 
 @lru_cache(maxsize=128)
-def make_closure_weights(t: Tableau, symmetric: bool) -> ClosureWeights:
-    """Make the weights of the closure of a tableau that satisfies H1, H2 and H3.
+def multiplier_closure_weights(t: Tableau, symmetric: bool) -> ClosureWeights:
+    """Compute the closure weights of a tableau that satisfies H1, H2 and H3.
 
-    If the closure is not symmetric, Λ^1 = λ_k and y = (Λ^2, ..., Λ^s), as in the
-    equations of the paper. The symmetric closure has y = (ν, Λ^2, ..., Λ^{s-1}),
-    Λ^1 = λ_k + ν and Λ^s = λ_{k+1} + σ ν. A step back exchanges the two ends and maps
-    ν to σ ν, so that it retraces the step if σ = ±1. Of these two σ = -R_A(∞) is the
-    one for which A_{2:,:} E is invertible, because the solutions of
-    Σ_j a_ij Λ^j = 0, i >= 2, have Λ^s = R_A(∞) Λ^1.
+    The other closures have Λ^1 = λ_k and y = (Λ^2, ..., Λ^s), as in the equations of
+    the paper. The symmetric closure has y = (ν, Λ^2, ..., Λ^{s-1}), Λ^1 = λ_k + ν and
+    Λ^s = λ_{k+1} + σ ν. A step back exchanges the two ends and maps ν to σ ν, so that
+    it retraces the step if σ = ±1. Only σ = -R_A(∞) makes A_{2:,:} E invertible,
+    because the solutions of Σ_j a_ij Λ^j = 0, i >= 2, have Λ^s = R_A(∞) Λ^1.
 
     **Arguments:**
 
     - `t`: the tableau.
-    - `symmetric`: whether to make the symmetric closure; needs R_A(∞) = ±1.
+    - `symmetric`: whether to use the symmetric closure, which needs R_A(∞) = ±1.
 
     **Returns:**
 
-    A `ClosureWeights`, the same object at every call.
+    A `ClosureWeights`; equal calls return the same object.
 
     !!! example
 
         >>> from nhjax._method._tableau import lobatto_tableau
-        >>> make_closure_weights(lobatto_tableau(3), symmetric=True).E.tolist()
+        >>> multiplier_closure_weights(lobatto_tableau(3), symmetric=True).E.tolist()
         [[1.0, 0.0], [0.0, 1.0], [-1.0, 0.0]]
     """
     s = t.stages
@@ -487,7 +494,7 @@ def make_closure_weights(t: Tableau, symmetric: bool) -> ClosureWeights:
     else:
         for i in range(1, s):
             e[i, i - 1] = CONTEXT.one
-    # These two are part of a Jacobian, for which float64 is enough.
+    # Both responses are used in an approximate Jacobian only: float64 suffices.
     weights, last = to_float64(e), to_float64(end)
     response = -np.linalg.solve(t.a[1:] @ weights, t.a[1:] @ last)
     return ClosureWeights(
@@ -500,18 +507,18 @@ def make_closure_weights(t: Tableau, symmetric: bool) -> ClosureWeights:
 
 
 def check_stages(stages: int, minimum: int, method: str) -> int:
-    """Return a number of stages as an int, or raise an error if it is not in range.
+    """Return a number of stages as an int, or raise an error if it is out of range.
 
     **Arguments:**
 
     - `stages`: the number of stages s.
-    - `minimum`: the fewest that the method can have.
-    - `method`: its name, for the error.
+    - `minimum`: the smallest number of stages of the method.
+    - `method`: the name of the method, for the error message.
 
     **Raises:**
 
-    A `TypeError` if it is no integer, a `ValueError` if it is less than `minimum` or
-    more than `MOST_STAGES`.
+    `TypeError` if `stages` is not an integer; `ValueError` if it is less than `minimum`
+    or more than `MAX_STAGES`.
     """
     try:
         if isinstance(stages, bool):
@@ -524,32 +531,10 @@ def check_stages(stages: int, minimum: int, method: str) -> int:
         ) from None
     if count < minimum:
         raise ValueError(f"stages of {method} must be >= {minimum}, got {count}")
-    if count > MOST_STAGES:
+    if count > MAX_STAGES:
         raise ValueError(
-            f"stages of {method} must be <= {MOST_STAGES}, got {count}: more gain no "
-            "digit in float64, and their coefficients take minutes to find and to "
-            "check. Take smaller steps"
+            f"stages of {method} must be <= {MAX_STAGES}, got {count}: more stages "
+            "gain no accuracy in float64, and their coefficients take minutes to "
+            "compute. Take smaller steps"
         )
     return count
-
-
-def check_closure(closure: str) -> str:
-    """Return `closure` if it is one of `CLOSURES`.
-
-    **Raises:**
-
-    A `ValueError` that lists the choices.
-    """
-    check_choice("closure", closure, CLOSURES)
-    return closure
-
-
-def check_chart(chart: str) -> str:
-    """Return `chart` if it is one of `CHARTS`.
-
-    **Raises:**
-
-    A `ValueError` that lists the choices.
-    """
-    check_choice("chart", chart, CHARTS)
-    return chart

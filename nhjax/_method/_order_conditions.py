@@ -34,8 +34,8 @@ from ._tableau import CONTEXT, Matrix, Number, Tableau
 class SimplifyingAssumptions(NamedTuple):
     """The largest p, q, r and Q for which B(p), C(q), D(r) and CĈ(Q) hold.
 
-    `mixed` is Q; it is 1, the empty assumption, when even k = 2 fails. No quadrature of
-    s stages has an order above 2s, and none of the four is searched beyond it.
+    `mixed` is Q. It is 1, an empty assumption, if the condition fails for k = 2. The
+    search ends at 2s, the largest order of a quadrature with s nodes.
     """
 
     B: int
@@ -45,7 +45,7 @@ class SimplifyingAssumptions(NamedTuple):
 
 
 class Hypotheses(NamedTuple):
-    """Which hypotheses on (a, b) hold for systems with constraints.
+    """Which of the hypotheses of systems with constraints hold for (a, b).
 
     - `H1`: a_1j = 0, the first stage is the state at t_k.
     - `H2`: the submatrix (a_ij), i, j >= 2, is invertible.
@@ -61,7 +61,7 @@ class Hypotheses(NamedTuple):
 def simplifying_assumptions(t: Tableau) -> SimplifyingAssumptions:
     """Find the largest p, q, r and Q for which B(p), C(q), D(r) and CĈ(Q) hold.
 
-    The first three are conditions on (a, b, c), the last one on the pair (a, â).
+    The first three are conditions on (a, b, c), the last is one on the pair (a, â).
 
     **Arguments:**
 
@@ -80,44 +80,44 @@ def simplifying_assumptions(t: Tableau) -> SimplifyingAssumptions:
     a, a_hat, b, c = t.mp_a, t.mp_a_hat, t.mp_b, t.mp_c
 
     def quadrature(k: int) -> list[Number]:
-        return [CONTEXT.fdot(zip(b, _powers(c, k - 1), strict=True)) - CONTEXT.one / k]
+        return [CONTEXT.fdot(zip(b, _power(c, k - 1), strict=True)) - CONTEXT.one / k]
 
     def stage(k: int) -> list[Number]:
-        sums = _times(a, _powers(c, k - 1))
-        return [left - x / k for left, x in zip(sums, _powers(c, k), strict=True)]
+        sums = _matvec(a, _power(c, k - 1))
+        return [left - x / k for left, x in zip(sums, _power(c, k), strict=True)]
 
     def transposed(k: int) -> list[Number]:
-        bc = [w * x for w, x in zip(b, _powers(c, k - 1), strict=True)]
-        ends = zip(_times(a.T, bc), b, _powers(c, k), strict=True)
+        bc = [w * x for w, x in zip(b, _power(c, k - 1), strict=True)]
+        ends = zip(_matvec(a.T, bc), b, _power(c, k), strict=True)
         return [left - w * (1 - x) / k for left, w, x in ends]
 
     def mixed(k: int) -> list[Number]:
-        sums = _times(a, _times(a_hat, _powers(c, k - 2)))
-        ends = zip(sums, _powers(c, k), strict=True)
+        sums = _matvec(a, _matvec(a_hat, _power(c, k - 2)))
+        ends = zip(sums, _power(c, k), strict=True)
         return [left - x / (k * (k - 1)) for left, x in ends]
 
     return SimplifyingAssumptions(
-        B=_largest(quadrature, 1, t),
-        C=_largest(stage, 1, t),
-        D=_largest(transposed, 1, t),
-        mixed=_largest(mixed, 2, t),
+        B=_largest_order(quadrature, 1, t),
+        C=_largest_order(stage, 1, t),
+        D=_largest_order(transposed, 1, t),
+        mixed=_largest_order(mixed, 2, t),
     )
 
 
-# The largest order that is looked for tree by tree.
-_MOST_BY_TREES = 8
+# The largest order that is determined from trees.
+_MAX_TREE_ORDER = 8
 
 
 @lru_cache(maxsize=128)
 def order(t: Tableau) -> int:
     """Find the order of the pair (a, â) in systems without constraints.
 
-    Conditions of trees are checked in float64, to 1e-12. Where all up to order 8 hold,
-    the order is min(p, 2r + 2) of B(p) and D(r), which fits Gauss, Lobatto and what was
-    measured of other tableaux.
+    The conditions of trees are checked in float64 to 1e-12. If all conditions up to
+    order 8 hold, the order is min(p, 2r + 2) of B(p) and D(r). This is the order of
+    Gauss and Lobatto methods, and agrees with measurements for other tableaux.
     """
-    found = partitioned_order((t.a, t.a_hat), t.b, 1e-12, _MOST_BY_TREES)
-    if found < _MOST_BY_TREES:
+    found = partitioned_order((t.a, t.a_hat), t.b, 1e-12, _MAX_TREE_ORDER)
+    if found < _MAX_TREE_ORDER:
         return found
     assumptions = simplifying_assumptions(t)
     return max(found, min(assumptions.B, 2 * assumptions.D + 2))
@@ -125,7 +125,7 @@ def order(t: Tableau) -> int:
 
 @lru_cache(maxsize=128)
 def hypotheses(t: Tableau) -> Hypotheses:
-    """Find which of H1, H2, H3 hold, the hypotheses for systems with constraints.
+    """Find which of H1, H2 and H3 hold, the hypotheses of constrained systems.
 
     **Arguments:**
 
@@ -150,7 +150,7 @@ def hypotheses(t: Tableau) -> Hypotheses:
 
 @lru_cache(maxsize=128)
 def is_symmetric(t: Tableau) -> bool:
-    """Tell whether a_{s+1-i,s+1-j} + a_ij = b_j, so that the method is its own adjoint.
+    """Return whether a_{s+1-i,s+1-j} + a_ij = b_j: the method is its own adjoint.
 
     See Hairer, Lubich, Wanner, V.2.1. The conjugate â is then symmetric too. Applying
     the identity twice gives b_{s+1-j} = b_j.
@@ -185,7 +185,7 @@ def stability_at_infinity(t: Tableau) -> float:
 
     **Returns:**
 
-    A float; `inf` when the numerator has the higher degree (R is unbounded), 0 when the
+    A float: `inf` if the numerator has the higher degree (R is unbounded), 0 if the
     denominator has.
 
     !!! example
@@ -204,7 +204,7 @@ def stability_at_infinity(t: Tableau) -> float:
 
 
 class _Branch(NamedTuple):
-    """A tree below an edge: its number of vertices, its γ, and Σ_j a_ij φ_j."""
+    """A tree with the edge to its root: its size |τ|, its γ, and Σ_j a_ij φ_j."""
 
     size: int
     gamma: int
@@ -212,22 +212,21 @@ class _Branch(NamedTuple):
 
 
 def partitioned_order(
-    matrices: Sequence[np.ndarray], b: np.ndarray, tolerance: Any, most: int
+    matrices: Sequence[np.ndarray], b: np.ndarray, tolerance: Any, max_order: int
 ) -> int:
-    """Find the order of a partitioned pair, up to `most`.
+    """Find the order of a partitioned pair, up to `max_order`.
 
     **Arguments:**
 
-    - `matrices`: a and â, of floats, or of exact numbers in arrays of objects.
-    - `b`: the weights of both.
-    - `tolerance`: the defect of a condition that counts as round-off.
-    - `most`: the largest order that is looked for; of order 8 there are 9498 trees
-        with eight vertices.
+    - `matrices`: a and â, as arrays of floats, or of objects for exact numbers.
+    - `b`: the common weights.
+    - `tolerance`: the defect up to which a condition counts as satisfied.
+    - `max_order`: the largest order to test. There are 9498 trees with 8 vertices.
 
-    **Returns:** the largest order up to `most` whose conditions hold, 0 if none does.
+    **Returns:** the largest order up to `max_order` whose conditions hold, or 0.
     """
     branches: list[_Branch] = []
-    for size in range(1, most + 1):
+    for size in range(1, max_order + 1):
         trees = list(_products(branches, size - 1, len(branches), b * 0 + 1))
         for gamma, values in trees:
             if abs(np.dot(b, values) * gamma * size - 1) > tolerance * gamma * size:
@@ -237,15 +236,16 @@ def partitioned_order(
             for gamma, values in trees
             for a in matrices
         ]
-    return most
+    return max_order
 
 
 def _products(
     branches: list[_Branch], size: int, end: int, values: np.ndarray
 ) -> Iterator[tuple[int, np.ndarray]]:
-    """Make all roots with `size` vertices above them, of branches before `end`.
+    """Generate all trees with `size` vertices besides the root.
 
-    Each comes as the product of the γ of its branches, and its φ.
+    The branches at the root are taken from `branches[:end]`. Each tree is returned as
+    the product of its branches' γ and the product of `values` and its φ.
     """
     if size == 0:
         yield 1, values
@@ -253,7 +253,7 @@ def _products(
     for index in range(end):
         branch = branches[index]
         if branch.size > size:
-            # They are sorted by size.
+            # The branches are sorted by size.
             return
         rest = size - branch.size
         for gamma, product in _products(
@@ -262,16 +262,18 @@ def _products(
             yield gamma * branch.gamma, product
 
 
-def _powers(c: list[Number], exponent: int) -> list[Number]:
+def _power(c: list[Number], exponent: int) -> list[Number]:
     return [x**exponent if exponent else CONTEXT.mpf(1) for x in c]
 
 
-def _times(a: Matrix, x: list[Number]) -> list[Number]:
+def _matvec(a: Matrix, x: list[Number]) -> list[Number]:
     return [CONTEXT.fdot(zip(row, x, strict=True)) for row in a.tolist()]
 
 
-def _largest(defects: Callable[[int], list[Number]], first: int, t: Tableau) -> int:
-    """Find the largest k for which the defects of orders `first`..k are round-off."""
+def _largest_order(
+    defects: Callable[[int], list[Number]], first: int, t: Tableau
+) -> int:
+    """Find the largest k for which the conditions `first`..k hold to round-off."""
     k = first
     while k <= 2 * t.stages and all(abs(d) <= t.tolerance for d in defects(k)):
         k += 1
@@ -298,8 +300,8 @@ def _leading_term(
     for k in range(1, n + 1):
         product = m * auxiliary
         f = -CONTEXT.fsum(product[i, i] for i in range(n)) / k
-        # f_k scales like the k-th power of M and falls like 1/(2n)!: zero is judged
-        # against the last coefficient that is not zero, never on an absolute scale.
+        # f_k scales like the k-th power of M and decreases like 1/(2n)!. It counts as
+        # zero relative to the last nonzero coefficient, not on an absolute scale.
         if abs(f) > tolerance * abs(leading) * norm ** (k - degree):
             degree, leading = k, f
         auxiliary = product + f * CONTEXT.eye(n)

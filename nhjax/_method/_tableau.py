@@ -32,12 +32,12 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
 
-# The library's own context: a user's `mpmath.mp.dps` neither changes nor is changed.
-# 60 digits leave 20 for the 1e-40 to which the order conditions are checked.
+# A context of its own, independent of a user's `mpmath.mp.dps`. With 60 digits, order
+# conditions can be checked to 1e-40 with 20 digits to spare.
 CONTEXT = mpmath.MPContext()
 CONTEXT.dps = 60
 
-# Each context makes classes of its own for numbers and matrices; no type names them.
+# mpmath creates the classes of numbers and matrices for each context.
 Number: TypeAlias = Any
 Matrix: TypeAlias = Any
 
@@ -50,10 +50,11 @@ USER_TOLERANCE = CONTEXT.mpf("1e-13")
 class Tableau:
     """A Runge-Kutta tableau (a, b, c) with its symplectic conjugate â.
 
-    The fields hold mp numbers (`mp_a` an s x s matrix, `mp_b` and `mp_c` lists);
-    `tolerance` is the defect below which an identity between them counts as satisfied:
-    round-off of the 60 digits for built-in tableaux, of float64 for a user's.
-    Instances compare and hash by identity; the functions that make them are cached.
+    The fields hold mpmath numbers: `mp_a` is an s x s matrix, `mp_b` and `mp_c` are
+    lists. An identity between them counts as satisfied if its defect is at most
+    `tolerance`, the round-off of 60 digits for built-in tableaux and of float64 for a
+    user's tableau. Instances compare and hash by identity; the functions that create
+    them are cached.
     """
 
     mp_a: Matrix
@@ -68,12 +69,12 @@ class Tableau:
 
     @cached_property
     def mp_a_hat(self) -> Matrix:
-        """Compute the symplectic conjugate â_ij = b_j (1 - a_ji / b_i) as mp matrix."""
+        """Compute the symplectic conjugate â_ij = b_j (1 - a_ji / b_i)."""
         a, b, s = self.mp_a, self.mp_b, self.stages
         a_hat = CONTEXT.matrix(s, s)
         for i in range(s):
             for j in range(s):
-                # Where a_ji = b_i the entry is a true zero (hypothesis H1'), which
+                # If a_ji = b_i (hypothesis H1') the entry is exactly zero, which
                 # b_j - b_j a_ji / b_i would miss by one unit of the last digit.
                 if a[j, i] != b[i]:
                     a_hat[i, j] = b[j] * (1 - a[j, i] / b[i])
@@ -103,16 +104,16 @@ class Tableau:
 def lagrange_in_legendre(nodes: list[Number]) -> Matrix:
     """Expand the Lagrange basis in the shifted Legendre polynomials on [0, 1].
 
-    The coefficients K_nj are those in ℓ_j(θ) = Σ_n K_nj P_n(2θ - 1), which means that
-    K = V^{-1} with V_in = P_n(2 c_i - 1).
+    The coefficients K_nj satisfy ℓ_j(θ) = Σ_n K_nj P_n(2θ - 1), so that K = V^{-1} with
+    V_in = P_n(2 c_i - 1).
 
     **Arguments:**
 
-    - `nodes`: the distinct nodes c_1..c_s in [0, 1], mp numbers.
+    - `nodes`: the distinct nodes c_1..c_s in [0, 1], mpmath numbers.
 
     **Returns:**
 
-    The s x s mp matrix K.
+    The s x s mpmath matrix K.
     """
     s = len(nodes)
     vandermonde = CONTEXT.matrix([legendre(s - 1, 2 * c - 1) for c in nodes])
@@ -129,21 +130,22 @@ def _integrated_legendre(degree: int, x: Number) -> list[Number]:
 
 
 def _collocation(points: list[Number]) -> Tableau:
-    """Make the collocation tableau with nodes (1 + x) / 2, x in symmetric `points`."""
+    """Build the collocation tableau with nodes (1 + x) / 2, x in symmetric `points`."""
     s = len(points)
     nodes = [(1 + x) / 2 for x in points]
     k = lagrange_in_legendre(nodes)
     integrals = CONTEXT.matrix([_integrated_legendre(s - 1, x) for x in points])
-    # P_0 alone has a non-zero integral over [0, 1].
+    # Only P_0 has a nonzero integral over [0, 1].
     b = [(k[0, j] + k[0, s - 1 - j]) / 2 for j in range(s)]
     raw = integrals * k
     a = CONTEXT.matrix(s, s)
     for i in range(s):
         for j in range(s):
-            # Reflection maps a_ij to b_j - a_{s+1-i,s+1-j}; the average is invariant.
+            # Average a_ij with its reflection b_j - a_{s+1-i,s+1-j}, which equals it in
+            # exact arithmetic, so that the result is exactly symmetric.
             a[i, j] = (raw[i, j] + b[j] - raw[s - 1 - i, s - 1 - j]) / 2
     if points[0] == -1:
-        # The integrals to c_1 = 0 and c_s = 1, without the last-digit error of a sum.
+        # The integrals to c_1 = 0 and c_s = 1 are known exactly.
         for j in range(s):
             a[0, j], a[s - 1, j] = CONTEXT.mpf(0), b[j]
     return Tableau(a, b, nodes, BUILT_IN_TOLERANCE)
@@ -151,7 +153,7 @@ def _collocation(points: list[Number]) -> Tableau:
 
 @cache
 def lobatto_tableau(stages: int) -> Tableau:
-    """Make the tableau of the Lobatto IIIA method with s stages.
+    """Build the tableau of the Lobatto IIIA method with s stages.
 
     It is collocation at 0, 1 and the s - 2 zeros of P'_{s-1}(2c - 1) (Hairer, Lubich,
     Wanner, II.1.4). Its symplectic conjugate is Lobatto IIIB.
@@ -162,7 +164,7 @@ def lobatto_tableau(stages: int) -> Tableau:
 
     **Returns:**
 
-    A `Tableau`, the same object at every call. Row 1 of `a` is zero and row s is `b`.
+    A `Tableau`; equal calls return the same object. Row 1 of `a` is 0, row s is `b`.
 
     !!! example
 
@@ -174,7 +176,7 @@ def lobatto_tableau(stages: int) -> Tableau:
 
 @cache
 def gauss_tableau(stages: int) -> Tableau:
-    """Make the tableau of the Gauss method with s stages.
+    """Build the tableau of the Gauss method with s stages.
 
     It is collocation at the s zeros of P_s(2c - 1) (Hairer, Lubich, Wanner, II.1.3),
     and its own symplectic conjugate.
@@ -185,7 +187,7 @@ def gauss_tableau(stages: int) -> Tableau:
 
     **Returns:**
 
-    A `Tableau`, the same object at every call.
+    A `Tableau`; equal calls return the same object.
 
     !!! example
 
@@ -197,12 +199,12 @@ def gauss_tableau(stages: int) -> Tableau:
 
 @lru_cache(maxsize=128)
 def user_tableau(a: tuple[tuple[float, ...], ...], b: tuple[float, ...]) -> Tableau:
-    """Make a tableau with c_i = Σ_j a_ij from float64 coefficients, taken as exact.
+    """Build a tableau with c_i = Σ_j a_ij from float64 coefficients, taken as exact.
 
     **Arguments:**
 
     - `a`: the rows of the coefficients.
-    - `b`: the weights, none of them zero.
+    - `b`: the weights, which must not be zero.
 
     **Returns:**
 
@@ -225,7 +227,7 @@ def legendre(degree: int, x: Number) -> list[Number]:
     **Arguments:**
 
     - `degree`: the highest degree.
-    - `x`: an mp number (any type with exact integer multiples will do).
+    - `x`: an mpmath number, or any number with exact integer multiples.
 
     **Returns:**
 
@@ -240,7 +242,7 @@ def legendre(degree: int, x: Number) -> list[Number]:
 def lobatto_points(stages: int) -> list[Number]:
     """Compute the Lobatto points on [-1, 1]: -1, the zeros of P'_{s-1}, and 1.
 
-    They are exactly symmetric about 0, and in increasing order.
+    They are exactly symmetric about 0 and in increasing order.
 
     **Arguments:**
 
@@ -248,7 +250,7 @@ def lobatto_points(stages: int) -> list[Number]:
 
     **Returns:**
 
-    A list of s mp numbers.
+    A list of s mpmath numbers.
     """
     n = stages - 1
 
@@ -266,7 +268,7 @@ def lobatto_points(stages: int) -> list[Number]:
 def gauss_points(stages: int) -> list[Number]:
     """Compute the Gauss points on [-1, 1], the zeros of P_s.
 
-    They are exactly symmetric about 0, and in increasing order.
+    They are exactly symmetric about 0 and in increasing order.
 
     **Arguments:**
 
@@ -274,7 +276,7 @@ def gauss_points(stages: int) -> list[Number]:
 
     **Returns:**
 
-    A list of s mp numbers.
+    A list of s mpmath numbers.
     """
 
     def polynomial(x: Number) -> tuple[Number, Number]:
@@ -296,24 +298,25 @@ def _newton(f: Callable[[Number], tuple[Number, Number]], guess: float) -> Numbe
         value, slope = f(x)
         step = value / slope
         x = x - step
-        # Newton doubles the digits: a step this small leaves an error far below 1e-60.
+        # Newton's method converges quadratically: the error after this step is far
+        # below 1e-60.
         if abs(step) < CONTEXT.mpf("1e-40"):
             return x
     raise RuntimeError("Newton's iteration for the nodes of a tableau did not converge")
 
 
 def _mirrored(right: list[Number], count: int) -> list[Number]:
-    """Make all points, exactly symmetric and in increasing order, from those > 0."""
+    """Build all points, exactly symmetric and increasing, from the positive ones."""
     centre = [CONTEXT.mpf(0)] if count % 2 else []
     return [-x for x in right] + centre + right[::-1]
 
 
 def to_float64(x: Matrix | list[Number]) -> np.ndarray:
-    """Round mp numbers to the nearest float64, once, into a read-only array.
+    """Round mpmath numbers to the nearest float64, as a read-only array.
 
     **Arguments:**
 
-    - `x`: an mp matrix, or a list of mp numbers.
+    - `x`: an mpmath matrix, or a list of mpmath numbers.
 
     **Returns:**
 
@@ -329,7 +332,7 @@ def to_float64(x: Matrix | list[Number]) -> np.ndarray:
 
 
 @lru_cache(maxsize=128)
-def _coefficients(t: Tableau) -> tuple[np.ndarray, np.ndarray]:
+def _basis_coefficients(t: Tableau) -> tuple[np.ndarray, np.ndarray]:
     """Compute K and the rows -2 K_nj / (n (n + 1)), n = 1..s-1, rounded once."""
     s, c = t.stages, t.mp_c
     for i in range(s):
@@ -337,7 +340,7 @@ def _coefficients(t: Tableau) -> tuple[np.ndarray, np.ndarray]:
             if abs(c[i] - c[j]) <= t.tolerance:
                 raise ValueError(
                     f"c = {t.c.tolist()} has equal entries c_{j + 1} and c_{i + 1}: "
-                    "there is no Lagrange basis on these nodes"
+                    "the Lagrange basis needs distinct nodes"
                 )
     k = lagrange_in_legendre(c)
     integrated = CONTEXT.matrix(s, s)
@@ -347,7 +350,7 @@ def _coefficients(t: Tableau) -> tuple[np.ndarray, np.ndarray]:
     return to_float64(k), to_float64(integrated)[1:]
 
 
-def _floating(theta: ArrayLike) -> Array:
+def _as_floating(theta: ArrayLike) -> Array:
     array = jnp.asarray(theta)
     if jnp.issubdtype(array.dtype, jnp.floating):
         return array
@@ -355,7 +358,7 @@ def _floating(theta: ArrayLike) -> Array:
 
 
 def _combine(polynomials: list[Array], coefficients: np.ndarray) -> Array:
-    # Full precision is requested, because the default on a GPU may be TensorFloat-32.
+    # The default precision on a GPU may be TensorFloat-32.
     values = jnp.stack(polynomials, axis=-1)
     return jnp.matmul(
         values,
@@ -370,7 +373,7 @@ def lagrange(t: Tableau, theta: ArrayLike) -> Float[Array, "*batch s"]:
     **Arguments:**
 
     - `t`: a tableau with distinct nodes.
-    - `theta`: θ, of any shape; traceable, not restricted to [0, 1].
+    - `theta`: θ, of any shape. It may be traced, and may lie outside [0, 1].
 
     **Returns:**
 
@@ -378,10 +381,10 @@ def lagrange(t: Tableau, theta: ArrayLike) -> Float[Array, "*batch s"]:
 
     **Raises:**
 
-    A `ValueError` if two nodes coincide.
+    `ValueError` if two nodes coincide.
     """
-    coefficients, _ = _coefficients(t)
-    x = 2 * _floating(theta) - 1
+    coefficients, _ = _basis_coefficients(t)
+    x = 2 * _as_floating(theta) - 1
     p = [jnp.ones_like(x), x]
     for n in range(1, t.stages - 1):
         p.append(((2 * n + 1) * x * p[n] - n * p[n - 1]) / (n + 1))
@@ -391,15 +394,15 @@ def lagrange(t: Tableau, theta: ArrayLike) -> Float[Array, "*batch s"]:
 def integrated_lagrange(t: Tableau, theta: ArrayLike) -> Float[Array, "*batch s"]:
     """Evaluate the integrals ∫_0^θ ℓ_1, ..., ∫_0^θ ℓ_s of the Lagrange basis.
 
-    Arguments, result and errors are those of `lagrange`.
+    Arguments, result and errors are the same as for `lagrange`.
     """
-    coefficients, integrated = _coefficients(t)
-    fraction = _floating(theta)
+    coefficients, integrated = _basis_coefficients(t)
+    fraction = _as_floating(theta)
     x = 2 * fraction - 1
     linear = _combine([fraction], coefficients[:1])
     if t.stages == 1:
         return linear
-    # P_1', P_2', ...: the Gegenbauer polynomials C^(3/2).
+    # P_1', P_2', ... are the Gegenbauer polynomials C^(3/2).
     d = [jnp.ones_like(x), 3 * x]
     for n in range(2, t.stages - 1):
         d.append(((2 * n + 1) * x * d[n - 1] - (n + 1) * d[n - 2]) / n)
