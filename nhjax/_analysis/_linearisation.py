@@ -1,9 +1,9 @@
 """The equations of motion and the constraints, linearised at one state.
 
-A perturbation x = (ξ, w) leads from the state (q, u) to (q τ(ξ), u + w). This file has
-the derivatives with respect to x in a frame that moves with the velocity or along
-symmetries, bases of the perturbations that the constraints permit, and the checks that
-given generators are symmetries of the system and of the motion.
+A perturbation x = (ξ, w) changes the state (q, u) to (q τ(ξ), u + w). This file
+differentiates the equations with respect to x, in a frame that moves with the velocity
+or along symmetries. It also computes bases of the perturbations that the constraints
+permit, and checks that given generators are symmetries of the system and the motion.
 """
 
 import operator
@@ -25,30 +25,30 @@ from .._system import AbstractMechanicalSystem, linearise, State
 
 
 Indices = tuple[int, ...]
-# The function of a configuration that returns generators, of shape (n,) or (k, n).
+# A function of the configuration that returns generators, of shape (n,) or (k, n).
 Symmetry = Callable[[Any], Array]
 
 
 class Orbit(NamedTuple):
-    """The directions in which generators move a state, and how they act around it.
+    """The generators of symmetries and the equations of motion near a state.
 
-    - `directions`: the generators, lifted to states.
-    - `slopes`: their derivatives with respect to perturbations x = (ξ, w).
-    - `motion`, `motion_slopes`: the same for the equations of motion.
+    - `directions`: the generators at the state, as vectors of perturbations.
+    - `jacobians`: their derivatives with respect to perturbations x = (ξ, w).
+    - `motion`, `motion_jacobian`: the same for the equations of motion.
     - `nearby`: the derivatives of the equations of motion and of the generators, in
-        this order, at the state moved by + and - the `steps` along each generator.
+        this order, at the state displaced by ± `steps` along each generator.
     """
 
     directions: Float[Array, "k x"]
-    slopes: Float[Array, "k x x"]
+    jacobians: Float[Array, "k x x"]
     motion: Float[Array, " x"]
-    motion_slopes: Float[Array, "x x"]
+    motion_jacobian: Float[Array, "x x"]
     nearby: Float[Array, "m c x"]
     steps: Float[Array, " k"]
 
     @property
     def coefficients(self) -> Float[Array, " k"]:
-        """Return the c with which the motion goes along Σ c_k (generator k)."""
+        """Return the c for which the motion is Σ c_k (generator k)."""
         return jnp.linalg.solve(
             self.directions @ self.directions.T, self.directions @ self.motion
         )
@@ -56,58 +56,62 @@ class Orbit(NamedTuple):
     @property
     def rates(self) -> Float[Array, "x x"]:
         """Return the derivative of the motion relative to the moving frame."""
-        frame = jnp.einsum("k,kxy->xy", self.coefficients, self.slopes)
-        return self.motion_slopes - frame
+        frame = jnp.einsum("k,kxy->xy", self.coefficients, self.jacobians)
+        return self.motion_jacobian - frame
 
 
-class Slopes(NamedTuple):
+class LinearisedEquations(NamedTuple):
     """The derivatives of the equations with respect to perturbations x = (ξ, w).
 
-    - `rates`: those of the rates of x in the frame that moves along.
+    - `rates`: the derivatives of the rates of x in the moving frame.
     - `velocity`: the rates (v, u̇) of the state itself.
-    - `on_velocities`, `on_positions`: those of the constraints.
-    - `orbit`: what is known of the symmetries along which the frame moves, if any are
-        named. Otherwise it moves with the velocity v, as a left translation does.
+    - `constraint_jacobian`: the derivatives of the velocity constraints, including the
+        rates of the holonomic constraints.
+    - `position_jacobian`: the derivatives of the holonomic constraints.
+    - `orbit`: the symmetries along which the frame moves. If it is None, the frame
+        moves with the velocity v, by left translation.
     """
 
     rates: Float[Array, "x x"]
     velocity: Float[Array, " x"]
-    on_velocities: Float[Array, "l x"]
-    on_positions: Float[Array, "k n"]
+    constraint_jacobian: Float[Array, "l x"]
+    position_jacobian: Float[Array, "k n"]
     orbit: Orbit | None
 
     @property
-    def rows(self) -> Float[Array, "r x"]:
+    def all_constraints(self) -> Float[Array, "r x"]:
         """Return the derivatives of all constraints."""
-        dim = self.on_positions.shape[1]
-        on_positions = jnp.pad(self.on_positions, ((0, 0), (0, dim)))
-        return jnp.concatenate([self.on_velocities, on_positions])
+        dim = self.position_jacobian.shape[1]
+        position_jacobian = jnp.pad(self.position_jacobian, ((0, 0), (0, dim)))
+        return jnp.concatenate([self.constraint_jacobian, position_jacobian])
 
 
-def size_of(y: State) -> Array:
-    """Return the size of the numbers in a state, in which its errors are measured."""
+def state_size(y: State) -> Array:
+    """Return the largest absolute value in a state, the scale of its errors."""
     return unit(max_norm(*jax.tree.leaves(y.q), y.v, y.p))
 
 
 @tracked_jit("system", "args")
-def slopes_along_velocity(system, t, y, args) -> Slopes:
-    """Differentiate the equations in the frame that moves with the velocity."""
+def linearise_along_velocity(system, t, y, args) -> LinearisedEquations:
+    """Differentiate the equations in a frame that moves with the velocity."""
     dim, count = y.p.shape[0], y.multiplier.shape[0]
 
     def equations(x):
         rates = rates_of_change(system, t, y, args)(x)
         return jnp.concatenate([rates, _constraints(system, t, y, args, x)])
 
-    slopes, value, _ = jacobian_and_value(
+    jacobians, value, _ = jacobian_and_value(
         lambda x: (as_cpu_kernel(equations, x), None), jnp.zeros(2 * dim, y.p.dtype)
     )
     velocity = jnp.concatenate([y.v, value[dim : 2 * dim]])
-    rates, on_velocities, rest = jnp.split(slopes, [2 * dim, 2 * dim + count])
-    return Slopes(rates, velocity, on_velocities, rest[:, :dim], None)
+    rates, constraint_jacobian, rest = jnp.split(jacobians, [2 * dim, 2 * dim + count])
+    return LinearisedEquations(
+        rates, velocity, constraint_jacobian, rest[:, :dim], None
+    )
 
 
 @tracked_jit("system", "args", "symmetry")
-def slopes_along_symmetry(system, t, y, args, symmetry) -> Slopes:
+def linearise_along_symmetry(system, t, y, args, symmetry) -> LinearisedEquations:
     """Differentiate the equations and the generators of symmetries.
 
     Both are vector fields on states, in the chart x -> (q τ(ξ), u + w).
@@ -116,8 +120,8 @@ def slopes_along_symmetry(system, t, y, args, symmetry) -> Slopes:
     manifold = system.manifold_of(y.q)
 
     def fields(x):
-        q, u = perturbed(system, y, x)
-        xi, change = lifted(system, symmetry, t, q, u, args)
+        q, u = perturb(system, y, x)
+        xi, change = lift_generators(system, symmetry, t, q, u, args)
         velocity = system.velocity(t, q, u, args)
         in_chart = jax.vmap(lambda v: manifold.dtau_inv(x[:dim], v))(
             jnp.concatenate([velocity[None], xi])
@@ -133,31 +137,35 @@ def slopes_along_symmetry(system, t, y, args, symmetry) -> Slopes:
 
     zero = jnp.zeros(2 * dim, y.p.dtype)
     u = system.fibre_coordinate(y)
-    ways = jnp.concatenate(lifted(system, symmetry, t, y.q, u, args), axis=1)
-    steps = steps_along(ways, size_of(y))
-    moved = jnp.stack([steps, -steps], axis=1)[:, :, None] * ways[:, None, :]
-    places = jnp.concatenate([zero[None], moved.reshape(-1, 2 * dim)])
-    # One program serves all places: most of the time goes into compiling it.
-    samples, values = jax.lax.map(at, places)
-    number = 2 * dim * (1 + len(ways))
-    slopes = samples[0, :number].reshape(-1, 2 * dim, 2 * dim)
+    directions = jnp.concatenate(
+        lift_generators(system, symmetry, t, y.q, u, args), axis=1
+    )
+    steps = difference_steps(directions, state_size(y))
+    moved = jnp.stack([steps, -steps], axis=1)[:, :, None] * directions[:, None, :]
+    points = jnp.concatenate([zero[None], moved.reshape(-1, 2 * dim)])
+    # `map` compiles one program for all points: most of the time is compilation.
+    samples, values = jax.lax.map(at, points)
+    number = 2 * dim * (1 + len(directions))
+    jacobians = samples[0, :number].reshape(-1, 2 * dim, 2 * dim)
     found = values[0, :number].reshape(-1, 2 * dim)
-    on_velocities, rest = jnp.split(samples[0, number:], [count])
+    constraint_jacobian, rest = jnp.split(samples[0, number:], [count])
     nearby = samples[1:, :number]
-    orbit = Orbit(found[1:], slopes[1:], found[0], slopes[0], nearby, steps)
-    return Slopes(orbit.rates, found[0], on_velocities, rest[:, :dim], orbit)
+    orbit = Orbit(found[1:], jacobians[1:], found[0], jacobians[0], nearby, steps)
+    return LinearisedEquations(
+        orbit.rates, found[0], constraint_jacobian, rest[:, :dim], orbit
+    )
 
 
 def _constraints(system, t, y, args, x):
-    q, u = perturbed(system, y, x)
-    on_positions = system.position_constraint(t, q, args)
-    return jnp.concatenate([system.constraint(t, q, u, args), on_positions])
+    q, u = perturb(system, y, x)
+    positions = system.position_constraint(t, q, args)
+    return jnp.concatenate([system.constraint(t, q, u, args), positions])
 
 
-def perturbed(
+def perturb(
     system: AbstractMechanicalSystem, y: State, x: Float[Array, " x"]
 ) -> tuple[PyTree[Array], Float[Array, " n"]]:
-    """Perturb (q, u) of a state by x = (ξ, w), to (q τ(ξ), u + w)."""
+    """Return (q τ(ξ), u + w), the state perturb by x = (ξ, w)."""
     xi, w = jnp.split(x, 2)
     return system.manifold_of(y.q).act(y.q, xi), system.fibre_coordinate(y) + w
 
@@ -165,16 +173,16 @@ def perturbed(
 def rates_of_change(
     system: AbstractMechanicalSystem, t: FloatScalar, y: State, args: Args
 ) -> Callable[[Float[Array, " x"]], Float[Array, " x"]]:
-    """Make the function x -> (v - v_0 - ad_v₀ ξ, u̇) of perturbations x = (ξ, w).
+    """Return the function x -> (v - v_0 - ad_v₀ ξ, u̇) of perturbations x = (ξ, w).
 
-    Its derivative at zero is that of the equations of motion: in the frame of a body
+    Its derivative at zero is the linearised equations of motion: in the frame of a body
     that moves with v_0, a perturbation of the configuration changes at the rate
     ξ̇ = δv - ad_v₀ ξ.
     """
     manifold = system.manifold_of(y.q)
     v0 = system.velocity(t, y.q, system.fibre_coordinate(y), args)
 
-    def turning(xi):
+    def ad_v0(xi):
         if manifold.is_flat:
             return jnp.zeros_like(xi)
         # ad_v is the transpose of ad*_v.
@@ -182,15 +190,15 @@ def rates_of_change(
         return transposed(xi)[0]
 
     def rates(x):
-        q, u = perturbed(system, y, x)
+        q, u = perturb(system, y, x)
         xi = x[: x.shape[0] // 2]
-        change = system.velocity(t, q, u, args) - v0 - turning(xi)
+        change = system.velocity(t, q, u, args) - v0 - ad_v0(xi)
         return jnp.concatenate([change, linearise(system, t, q, u, args).acceleration])
 
     return rates
 
 
-def lifted(
+def lift_generators(
     system: AbstractMechanicalSystem,
     symmetry: Symmetry,
     t: FloatScalar,
@@ -198,15 +206,15 @@ def lifted(
     u: Float[Array, " n"],
     args: Args,
 ) -> tuple[Float[Array, "k n"], Float[Array, "k n"]]:
-    """Compute the generators ξ at q, and the changes of u that they make.
+    """Compute the generators ξ at q, and the rates δu of u under their flows.
 
-    The flow of a vector field q ξ(q) carries velocities along by its derivative, and
-    momenta by the inverse transpose of that,
+    The flow of a vector field q ξ(q) transports velocities by its derivative, and
+    momenta by the inverse transpose of its derivative,
 
     δv = Dξ v + ad_v ξ,    δp = ad*_ξ p - Dξᵀ p,
 
-    with Dξ the derivative of χ -> ξ(q τ(χ)) at zero. A left translation changes
-    neither, and a right one by a constant ξ changes v by [v, ξ].
+    where Dξ is the derivative of χ -> ξ(q τ(χ)) at zero. A left translation changes
+    neither. A right translation, with constant ξ, changes v by [v, ξ].
     """
     manifold = system.manifold_of(q)
 
@@ -218,21 +226,24 @@ def lifted(
     if system.fibre_coordinate_name == "v":
         xi, along = jax.jvp(generators, (zero,), (u,))
         return xi, along + jax.vmap(lambda xi: manifold.ad(u, xi))(xi)
-    xi, slopes = generators(zero), jax.jacfwd(generators)(zero)
+    xi, jacobians = generators(zero), jax.jacfwd(generators)(zero)
     turned = jax.vmap(lambda xi: manifold.ad_dual(xi, u))(xi)
-    return xi, turned - jnp.einsum("kij,i->kj", slopes, u)
+    return xi, turned - jnp.einsum("kij,i->kj", jacobians, u)
 
 
-def steps_along(orbit: Float[Array, "k x"], size: FloatScalar) -> Float[Array, " k"]:
-    """Return steps along generators that suit central differences."""
+def difference_steps(
+    orbit: Float[Array, "k x"], size: FloatScalar
+) -> Float[Array, " k"]:
+    """Return steps along generators for central differences."""
     step = float(jnp.finfo(orbit.dtype).eps) ** (1 / 3) * size
     return step / jax.vmap(lambda way: jnp.maximum(max_norm(way), step))(orbit)
 
 
-class Permitted(NamedTuple):
-    """A basis Z of the perturbations that are permitted, and a W with W Z = 1.
+class PermittedPerturbations(NamedTuple):
+    """A basis Z of the permitted perturbations, and a left inverse W with W Z = 1.
 
-    `determined` tells whether the constraints determine all others.
+    `determined` is true if the basis is well defined: the equations that define it are
+    independent.
     """
 
     basis: Float[Array, "x d"]
@@ -240,153 +251,165 @@ class Permitted(NamedTuple):
     determined: BoolScalar
 
 
-def orthonormal_basis(rows: Array, orbit: Array) -> Permitted:
-    """Compute an orthonormal basis of the kernel of `rows`, at right angles to `orbit`.
+def orthonormal_basis(rows: Array, orbit: Array) -> PermittedPerturbations:
+    """Compute an orthonormal basis of the kernel of `rows`, orthogonal to `orbit`.
 
-    What is picked from perturbations does not depend on how far they go along the
-    vectors of `orbit`, which lie in the kernel themselves.
+    The vectors of `orbit` lie in the kernel themselves. The left inverse ignores the
+    components of a perturbation along them.
 
-    The basis is defined up to a rotation, which no derivative of a singular value
-    decomposition settles: the one that is found is held, and its derivative is that by
-    which it stays in the kernel.
+    The basis is unique only up to a rotation, and the derivative of a singular value
+    decomposition does not exist for equal singular values. Therefore the computed basis
+    is held fixed, and its derivative is the correction that keeps it in the kernel.
     """
     rows = jnp.concatenate([rows, orbit])
     count = rows.shape[0]
     _, _, right = jnp.linalg.svd(jax.lax.stop_gradient(rows), full_matrices=True)
     kernel = right[count:].T
-    basis = kernel - _along(rows, kernel)
-    beside = (kernel - _along(orbit, kernel)).T
+    basis = kernel - _project_onto(rows, kernel)
+    beside = (kernel - _project_onto(orbit, kernel)).T
     left = jnp.linalg.solve(beside @ basis, beside)
-    return Permitted(basis, left, ~is_deficient(rows))
+    return PermittedPerturbations(basis, left, ~is_deficient(rows))
 
 
-def _along(rows: Array, vectors: Array) -> Array:
-    """Compute the parts of vectors, as columns, in the span of `rows`."""
+def _project_onto(rows: Array, vectors: Array) -> Array:
+    """Project vectors, given as columns, onto the span of `rows`."""
     return rows.T @ jnp.linalg.solve(rows @ rows.T, rows @ vectors)
 
 
 def independent_basis(
-    on_velocities: Array,
-    on_positions: Array,
+    constraint_jacobian: Array,
+    position_jacobian: Array,
     positions: tuple[int, ...],
     velocities: tuple[int, ...],
-) -> Permitted:
-    """Compute a basis of the permitted perturbations, one for each chosen coordinate.
+) -> PermittedPerturbations:
+    """Compute the basis of the permitted perturbations for chosen coordinates.
 
-    Each changes its own coordinate by one and no other chosen one; `left` takes the
-    chosen coordinates from a perturbation.
+    Each basis vector changes one chosen coordinate by one, and no other chosen one. The
+    left inverse extracts the chosen coordinates of a perturbation.
     """
-    dim, dtype = on_positions.shape[1], on_positions.dtype
+    dim, dtype = position_jacobian.shape[1], position_jacobian.dtype
     count, others = len(positions), len(velocities)
     unit = jnp.eye(dim, dtype=dtype)
     q_rows, u_rows = (
         unit[jnp.asarray(positions, int)],
         unit[jnp.asarray(velocities, int)],
     )
-    # The smallest change of positions: those that no constraint ties stay as they are.
+    # The least-norm change of positions: unconstrained positions do not change.
     wanted = jnp.concatenate(
-        [jnp.eye(count, dtype=dtype), jnp.zeros((on_positions.shape[0], count), dtype)]
+        [
+            jnp.eye(count, dtype=dtype),
+            jnp.zeros((position_jacobian.shape[0], count), dtype),
+        ]
     )
-    moved = jnp.concatenate([q_rows, on_positions])
+    moved = jnp.concatenate([q_rows, position_jacobian])
     xi = moved.T @ jnp.linalg.solve(moved @ moved.T, wanted)
     xi = jnp.concatenate([xi, jnp.zeros((dim, others), dtype)], axis=1)
     kept = jnp.eye(count + others, dtype=dtype)[count:]
-    right = jnp.concatenate([kept, -on_velocities[:, :dim] @ xi])
-    following = jnp.concatenate([u_rows, on_velocities[:, dim:]])
+    right = jnp.concatenate([kept, -constraint_jacobian[:, :dim] @ xi])
+    following = jnp.concatenate([u_rows, constraint_jacobian[:, dim:]])
     w = jnp.linalg.solve(following, right)
     zero = jnp.zeros_like
     left = jnp.block([[q_rows, zero(q_rows)], [zero(u_rows), u_rows]])
     regular = ~(is_deficient(moved) | is_deficient(following))
-    return Permitted(jnp.concatenate([xi, w]), left, regular)
+    return PermittedPerturbations(jnp.concatenate([xi, w]), left, regular)
 
 
-class Bounded(NamedTuple):
-    """Numbers that must vanish, and the sizes up to which they count as zero."""
+class BoundedResidual(NamedTuple):
+    """Values that must vanish, and the bounds up to which they count as zero."""
 
     value: Array
     allowed: Array
 
     @property
     def holds(self) -> BoolScalar:
-        """Tell whether all numbers vanish; NaN does not."""
+        """Return whether all values are within their bounds; NaN is not."""
         return jnp.all(self.value <= self.allowed)
 
 
-class Verdict(NamedTuple):
-    """How well a motion and the generators of symmetries fit together.
+class SymmetryConditions(NamedTuple):
+    """The conditions for a motion to be an orbit of symmetries of the system.
 
-    The arrays have a row for each generator, but `drift` has one entry for each
-    component of the motion. Where the constraints are dependent, `determined` is false
-    and the other fields mean nothing.
+    - `determined`: whether the constraints are independent. Otherwise the other fields
+        are not defined.
+    - `independent`: whether the generators are independent.
+    - `on_constraints`: the rates at which generators violate the constraints.
+    - `drift`: the motion minus the combination of generators, an entry a component.
+    - `bracket`: the brackets of the motion and the generators.
+    - `closed`: the rates at which generators leave their span in the moving frame.
+
+    Except for `drift`, the arrays have one row for each generator.
     """
 
     determined: BoolScalar
     independent: BoolScalar
-    on_constraints: Bounded
-    drift: Bounded
-    bracket: Bounded
-    closed: Bounded
+    on_constraints: BoundedResidual
+    drift: BoundedResidual
+    bracket: BoundedResidual
+    closed: BoundedResidual
 
 
-def judged(
+def check_relative_equilibrium(
     orbit: Orbit,
     rows: Float[Array, "l x"],
-    permitted: Permitted,
+    permitted: PermittedPerturbations,
     scale: FloatScalar,
-) -> Verdict:
-    """Measure what must vanish if the motion goes along with symmetries.
+) -> SymmetryConditions:
+    """Compute the residuals that vanish if the motion is an orbit of symmetries.
 
-    The bounds are for states that were computed or printed with some digits.
+    The bounds allow for states that are accurate to a few digits only.
 
     **Arguments:**
 
     - `orbit`: the generators around the state.
     - `rows`: the derivatives of the constraints.
-    - `permitted`: the perturbations beside the orbit.
-    - `scale`: the size of the numbers in the state.
+    - `permitted`: the permitted perturbations that are not along the orbit.
+    - `scale`: the largest absolute value in the state.
     """
-    ways, slopes = orbit.directions, orbit.slopes
+    directions, jacobians = orbit.directions, orbit.jacobians
     basis, left = permitted.basis, permitted.left
-    small = float(jnp.finfo(ways.dtype).eps) ** 0.25
+    small = float(jnp.finfo(directions.dtype).eps) ** 0.25
     size = jnp.abs
 
     def bounded(value, terms):
-        return Bounded(size(value), small * (1 + terms))
+        return BoundedResidual(size(value), small * (1 + terms))
 
     rates = orbit.rates
-    bends, bend_terms = _bracket_slopes(orbit)
-    flat = (len(ways), -1)
+    bends, bend_terms = _bracket_derivatives(orbit)
+    flat = (len(directions), -1)
     brackets = [
-        slopes @ orbit.motion - ways @ orbit.motion_slopes.T,
+        jacobians @ orbit.motion - directions @ orbit.motion_jacobian.T,
         (bends @ basis).reshape(flat),
     ]
     terms = [
-        size(slopes) @ size(orbit.motion) + size(ways) @ size(orbit.motion_slopes.T),
+        size(jacobians) @ size(orbit.motion)
+        + size(directions) @ size(orbit.motion_jacobian.T),
         (bend_terms @ size(basis)).reshape(flat),
     ]
-    return Verdict(
+    return SymmetryConditions(
         determined=~is_deficient(rows),
-        independent=~is_deficient(ways),
-        on_constraints=bounded(ways @ rows.T, size(ways) @ size(rows.T)),
+        independent=~is_deficient(directions),
+        on_constraints=bounded(directions @ rows.T, size(directions) @ size(rows.T)),
         drift=bounded(
-            orbit.motion - orbit.coefficients @ ways, jnp.sum(size(rates), 1) * scale
+            orbit.motion - orbit.coefficients @ directions,
+            jnp.sum(size(rates), 1) * scale,
         ),
         bracket=bounded(*(jnp.concatenate(x, axis=1) for x in (brackets, terms))),
         closed=bounded(
-            ways @ (left @ rates).T, size(ways) @ (size(left) @ size(rates)).T
+            directions @ (left @ rates).T,
+            size(directions) @ (size(left) @ size(rates)).T,
         ),
     )
 
 
-def _bracket_slopes(
+def _bracket_derivatives(
     orbit: Orbit,
 ) -> tuple[Float[Array, "k x x"], Float[Array, "k x x"]]:
     """Differentiate the brackets of the motion with each generator.
 
-    Second derivatives are central differences: they serve for a check alone, and
-    another derivative of the equations would take three times as long to compile.
+    Second derivatives are central differences, which are accurate enough for a check.
+    Another automatic derivative would make the compile time three times as long.
 
-    **Returns:** the derivatives, and the sum of the sizes of their terms.
+    **Returns:** the derivatives, and the sums of the absolute values of their terms.
     """
     count, dim = orbit.directions.shape
     up, down = orbit.nearby.reshape(count, 2, -1, dim).swapaxes(0, 1)
@@ -397,19 +420,19 @@ def _bracket_slopes(
         orbit.coefficients,
         of_generators.reshape(count, count, dim, dim),
     )
-    pulled = orbit.slopes @ orbit.motion_slopes
-    pushed = orbit.motion_slopes @ orbit.slopes
+    pulled = orbit.jacobians @ orbit.motion_jacobian
+    pushed = orbit.motion_jacobian @ orbit.jacobians
     parts = jnp.stack([along, pulled, -of_motion, -pushed])
     return jnp.sum(parts, axis=0), jnp.sum(jnp.abs(parts), axis=0)
 
 
 def check_symmetry(symmetry: Any, y: State) -> None:
-    """Raise unless `symmetry(q)` is a vector field, or several, at the state `y`."""
+    """Raise if `symmetry(q)` does not return one or several generators at `y`."""
     if not callable(symmetry):
         raise TypeError(
             "`symmetry` must be a function of q that returns generators, got "
             f"{reprlib.repr(symmetry)} of type {type(symmetry).__name__}. For a "
-            "symmetry of the body alone that is `lambda q: xi`."
+            "symmetry of the body, pass `lambda q: xi`."
         )
     out, dim = eqx.filter_eval_shape(symmetry, y.q), y.p.shape[0]
     shape = getattr(out, "shape", None)
@@ -443,17 +466,17 @@ def indices(name: str, values: Sequence[int], dim: int) -> Indices:
     return found
 
 
-def checks_of(verdict: Verdict) -> list[Check]:
-    """List the conditions for a motion to go along with symmetries, with errors."""
+def symmetry_checks(verdict: SymmetryConditions) -> list[Check]:
+    """Return the conditions as checks, each with its error."""
     measures = {
         _off_constraints: verdict.on_constraints,
-        _not_along: verdict.drift,
-        _no_symmetry: verdict.bracket,
+        _not_steady: verdict.drift,
+        _not_a_symmetry: verdict.bracket,
         _not_closed: verdict.closed,
     }
     checks = [Check(x.holds, error, tuple(x)) for error, x in measures.items()]
     constraints = Check(verdict.determined, _dependent_constraints)
-    return [constraints, Check(verdict.independent, _dependent), *checks]
+    return [constraints, Check(verdict.independent, _dependent_generators), *checks]
 
 
 def _worst(values: np.ndarray, allowed: np.ndarray) -> tuple[int, str]:
@@ -465,21 +488,22 @@ def _worst(values: np.ndarray, allowed: np.ndarray) -> tuple[int, str]:
 
 def _dependent_constraints() -> DependentConstraintsError:
     return DependentConstraintsError(
-        "The constraints are dependent at `y`, so that nothing tells whether the "
-        "generators of `symmetry` are any. Remove redundant constraints."
+        "The constraints are dependent at `y`, so that the generators of `symmetry` "
+        "cannot be checked. Remove redundant constraints."
     )
 
 
-def _dependent() -> ValueError:
+def _dependent_generators() -> ValueError:
     return ValueError(
         "The generators of `symmetry` are dependent at `y`: several combinations move "
-        "the state alike, as a turn of an upright top in space and one on its axis do, "
-        "and nothing says with which the frame moves. Leave generators out."
+        "the state in the same way, like rotations of an upright top about the "
+        "vertical and about its axis, so that the moving frame is not determined. "
+        "Omit generators."
     )
 
 
 _TRIVIALISED = (
-    "On a group generators are left-trivialised like velocities; that of "
+    "On a group, generators are left-trivialised like velocities; the generator of "
     "g -> exp(εξ) g is `manifold.Ad(manifold.inverse(q), xi)`."
 )
 
@@ -487,35 +511,34 @@ _TRIVIALISED = (
 def _off_constraints(values: np.ndarray, allowed: np.ndarray) -> ValueError:
     worst, numbers = _worst(values, allowed)
     return ValueError(
-        f"Generator {worst} of `symmetry` is no symmetry of the constraints: it moves "
-        f"`y` off them at the rate {numbers}. {_TRIVIALISED}"
+        f"Generator {worst} of `symmetry` is not a symmetry of the constraints: it "
+        f"violates them at the rate {numbers}. {_TRIVIALISED}"
     )
 
 
-def _no_symmetry(values: np.ndarray, allowed: np.ndarray) -> ValueError:
+def _not_a_symmetry(values: np.ndarray, allowed: np.ndarray) -> ValueError:
     worst, numbers = _worst(values, allowed)
     return ValueError(
-        f"Generator {worst} of `symmetry` is no symmetry of the system: along it the "
-        "equations of motion, or their derivatives at `y`, change at the rate "
+        f"Generator {worst} of `symmetry` is not a symmetry of the system: along it, "
+        "the equations of motion or their derivatives at `y` change at the rate "
         f"{numbers}. {_TRIVIALISED}"
     )
 
 
-def _not_along(values: np.ndarray, allowed: np.ndarray) -> ValueError:
+def _not_steady(values: np.ndarray, allowed: np.ndarray) -> ValueError:
     _, numbers = _worst(values, allowed)
     return ValueError(
         "The motion is not steady: no combination of the generators of `symmetry` "
-        f"moves the state as it moves, {numbers} is left of a velocity or of its rate. "
-        "Find a steady motion with `nhjax.steady_motion`, or add the generators that "
-        "are missing."
+        f"equals the motion; the largest difference is {numbers}. Find a steady motion "
+        "with `nhjax.steady_motion`, or add the missing generators."
     )
 
 
 def _not_closed(values: np.ndarray, allowed: np.ndarray) -> ValueError:
     worst, numbers = _worst(values, allowed)
     return ValueError(
-        "The generators of `symmetry` are not closed: in the frame of the motion "
-        f"generator {worst} moves out of their span, at the rate {numbers}. Add the "
-        "generators that are missing, as translations in all directions in which a "
-        "rotation takes one."
+        "The generators of `symmetry` are not closed: in the moving frame, "
+        f"generator {worst} leaves their span at the rate {numbers}. Add the missing "
+        "generators, such as translations in all directions into which a rotation "
+        "turns a translation."
     )

@@ -26,19 +26,19 @@ from .._numerics import (
 )
 from .._system import AbstractMechanicalSystem, linearise, parameters, State
 from ._linearisation import (
+    check_relative_equilibrium,
     check_symmetry,
-    checks_of,
     Indices,
     indices,
-    judged,
-    lifted,
+    lift_generators,
+    linearise_along_symmetry,
+    LinearisedEquations,
     orthonormal_basis,
-    perturbed,
-    size_of,
-    Slopes,
-    slopes_along_symmetry,
+    perturb,
+    state_size,
     Symmetry,
-    Verdict,
+    symmetry_checks,
+    SymmetryConditions,
 )
 from ._motion import checked_time
 
@@ -85,29 +85,31 @@ def steady_motion(
     held_velocities: Sequence[int] = (),
     max_iterations: int = 50,
 ) -> State | tuple[State, Float[Array, " k"]]:
-    """Find the steady motion, or relative equilibrium, that is near to a given state.
+    """Find a steady motion, or relative equilibrium, near a given state.
 
-    There are two ways to say what is steady. With `positions` and `velocities` it is a
-    consistent state at which the chosen positions do not change, and the rates of
-    change of the chosen velocities vanish,
+    There are two ways to define steady. With `positions` and `velocities`, the result
+    is a consistent state at which the rates of the chosen positions and of the chosen
+    velocities vanish,
 
     v_j = 0 for j in `positions`,   u̇_i = 0 for i in `velocities`,
 
-    u being the velocity or for a Hamiltonian system the momentum. The other coordinates
-    may change, as the place of a bicycle that runs in a circle does.
+    where u is the velocity, or the momentum of a Hamiltonian system. The other
+    coordinates may change, such as the position of a bicycle on a circle.
 
-    With `symmetry` it is a consistent state that moves as symmetries of the system move
-    it: with x = (q, u), the equations of motion ẋ = f(x) and the generators X_k,
+    With `symmetry`, the result is a consistent state whose motion is an orbit of
+    symmetries of the system: with x = (q, u), the equations of motion ẋ = f(x) and the
+    generators X_k,
 
     f(x) = Σ c_k X_k(x).
 
-    The state and the rates c are found together. So a wheel rolls on a circle, or a top
-    precesses, though no coordinates of their attitude are constant.
+    The state and the rates c are computed together. Examples are a wheel that rolls on
+    a circle and a precessing top, for which no coordinates of the attitude are
+    constant.
 
-    Where these equations leave a family of steady motions, the result is the one that
-    Newton's method with the smallest increments leads to; `held_...` picks another one,
-    such as that of a given speed or lean. What symmetries do to a state is left
-    undone, as far as what is held allows it.
+    If these equations have a family of solutions, the result is the one to which
+    Newton's method with least-norm increments converges. The `held_...` arguments
+    select another one, for instance one with a given speed or lean. The increments have
+    no component along the symmetries, except where held coordinates require it.
 
     **Arguments:**
 
@@ -126,26 +128,26 @@ def steady_motion(
         the configuration of `y`.
     - `max_iterations`: the largest number of iterations.
 
-    **Returns:** a consistent `State`, and with `symmetry` a pair of it and the rates c
-    of the generators, shape (k,), in units of the velocity over those of a generator.
-    `linear_stability` with the same `symmetry` takes the state. Both are twice
-    differentiable with respect to `y` and `args` by the implicit function theorem,
-    where the steady motion is the only one with the held values, or one of a family
-    that differs in what nothing depends on. In other families the derivative is that of
-    one more increment of Newton's method.
+    **Returns:** a consistent `State`. With `symmetry`, a pair of the state and the
+    rates c of the generators, shape (k,), whose unit is the unit of the velocity
+    divided by that of the generator. Pass the state to `linear_stability` with the same
+    `symmetry`. Both results are twice differentiable with respect to `y` and `args` by
+    the implicit function theorem, if the steady motion is unique for the held values,
+    or unique up to ignorable coordinates. In other families the derivative is that of
+    one more Newton increment.
 
-    **Raises:** `NewtonError` if there is none near to `y`; `ValueError` or `TypeError`
-    if an index is wrong; `ValueError` if neither or both of the two ways are chosen,
-    or if generators are dependent, not closed, or no symmetries, which is checked as
-    `linear_stability` does it; `DependentConstraintsError` if constraints are dependent
-    and there is a `symmetry`; `TypeError` if `system` is no system, `y` no `State` or
-    `symmetry` no function; `ShapeError` if `y` is no state of this system, or many, or
-    generators no velocities. Under `jit` what depends on values comes as an error of
-    JAX with the same message.
+    **Raises:** `NewtonError` if no steady motion is found near `y`. `ValueError` or
+    `TypeError` if an index is wrong. `ValueError` if neither or both of the two ways
+    are chosen, or if generators are dependent, not closed, or not symmetries, as in
+    `linear_stability`. `DependentConstraintsError` if constraints are dependent and
+    `symmetry` is given. `TypeError` if `system` is not a system, `y` is not a `State`,
+    or `symmetry` is not a function. `ShapeError` if `y` is not a single state of this
+    system, or a generator does not have the shape of a velocity. Under `jit`, errors
+    that depend on values are raised as JAX errors with the same message.
 
     !!! example
 
-        A pendulum of length 1 m under unit gravity goes round on a cone at the rate
+        A pendulum of length 1 m under unit gravity moves on a cone at the rate
         (g / l cos θ)^½:
 
         >>> import jax.numpy as jnp, nhjax
@@ -168,49 +170,55 @@ def steady_motion(
         *(dim + i for i in indices("held_velocities", held_velocities, dim)),
     )
     if symmetry is None:
-        steady = _chosen(positions, velocities, dim)
-        outcome = steady_in_indices(system, t, y, args, steady, held, max_iterations)
+        steady = _checked_coordinates(positions, velocities, dim)
+        outcome = solve_in_coordinates(system, t, y, args, steady, held, max_iterations)
         return require(outcome.state, *outcome.checks)
     if positions is not None or velocities is not None:
         raise ValueError(
-            "Give either `symmetry`, along which the state is to move, or `positions` "
-            "and `velocities`, not both."
+            "Pass either `symmetry` or `positions` and `velocities`, not both: both "
+            "define which motion is steady."
         )
     check_symmetry(symmetry, y)
-    outcome = steady_along(system, t, y, args, symmetry, held, max_iterations)
-    # What tells symmetries is the program of `linear_stability`, which mostly follows.
+    outcome = solve_along_symmetry(system, t, y, args, symmetry, held, max_iterations)
+    # The check uses the compiled program of `linear_stability`, which users call next.
     given = frozen((system, t, outcome.state, args))
-    verdict = _verdict(slopes_along_symmetry(*given, symmetry), given[2])
+    conditions = _symmetry_conditions(
+        linearise_along_symmetry(*given, symmetry), given[2]
+    )
     return require(
         (outcome.state, outcome.rates),
         *outcome.checks,
-        *checks_of(frozen(verdict)),
+        *symmetry_checks(frozen(conditions)),
     )
 
 
-def _chosen(
+def _checked_coordinates(
     positions: Sequence[int] | None, velocities: Sequence[int] | None, dim: int
 ) -> tuple[Indices, Indices]:
     if positions is None or velocities is None:
         missing = "positions" if positions is None else "velocities"
         raise ValueError(
-            f"`{missing}` is missing: give `positions` and `velocities` together, the "
-            "indices of what is to be steady, or a `symmetry`."
+            f"`{missing}` is missing: pass `positions` and `velocities` together, the "
+            "indices of steady coordinates, or pass `symmetry`."
         )
     return indices("positions", positions, dim), indices("velocities", velocities, dim)
 
 
 @eqx.filter_jit
-def _verdict(slopes: Slopes, y: State) -> Verdict:
-    """Judge the generators at a state."""
-    orbit = slopes.orbit
+def _symmetry_conditions(
+    linearised: LinearisedEquations, y: State
+) -> SymmetryConditions:
+    """Compute the conditions on the generators at a state."""
+    orbit = linearised.orbit
     assert orbit is not None
-    permitted = orthonormal_basis(slopes.rows, orbit.directions)
-    return judged(orbit, slopes.rows, permitted, size_of(y))
+    permitted = orthonormal_basis(linearised.all_constraints, orbit.directions)
+    return check_relative_equilibrium(
+        orbit, linearised.all_constraints, permitted, state_size(y)
+    )
 
 
-class Outcome(NamedTuple):
-    """The state, the rates of generators, and how Newton's method ended."""
+class SteadyMotionResult(NamedTuple):
+    """The state, the rates of the generators, and the outcome of Newton's method."""
 
     state: State
     rates: Float[Array, " k"]
@@ -220,7 +228,7 @@ class Outcome(NamedTuple):
 
     @property
     def checks(self) -> tuple[Check, ...]:
-        """Return the condition that a steady motion was found."""
+        """Return the check that a steady motion was found."""
         values = (self.num_iterations, self.residual, self.state)
         return (Check(self.converged, _not_found, values),)
 
@@ -229,18 +237,20 @@ def _not_found(count: np.ndarray, residual: np.ndarray, y: State) -> NewtonError
     return NewtonError(
         f"No steady motion was found from `y` in {int(count)} iterations: Newton's "
         f"method stopped at q = {y.q}, v = {y.v} with the residual "
-        f"{float(residual):.3g}. Start nearer to one, hold fewer indices, or leave out "
-        "one whose rate follows from others."
+        f"{float(residual):.3g}. Start nearer to a steady motion, hold fewer indices, "
+        "or omit an index whose rate follows from others."
     )
 
 
 @tracked_jit("system", "args")
-def steady_in_indices(system, t, y, args, steady, held, max_iterations) -> Outcome:
+def solve_in_coordinates(
+    system, t, y, args, steady, held, max_iterations
+) -> SteadyMotionResult:
     """Solve for a state whose chosen positions and velocities do not change."""
     positions, velocities = (jnp.asarray(x, int) for x in steady)
 
     def residual(x):
-        q, u = perturbed(system, y, x)
+        q, u = perturb(system, y, x)
         rate = linearise(system, t, q, u, args).acceleration
         return jnp.concatenate(
             [
@@ -252,55 +262,60 @@ def steady_in_indices(system, t, y, args, steady, held, max_iterations) -> Outco
         )
 
     none = jnp.zeros(0, y.p.dtype)
-    return _outcome(system, t, y, args, held, max_iterations, residual, none)
+    return _solve(system, t, y, args, held, max_iterations, residual, none)
 
 
 @tracked_jit("system", "args", "symmetry")
-def steady_along(system, t, y, args, symmetry, held, max_iterations) -> Outcome:
+def solve_along_symmetry(
+    system, t, y, args, symmetry, held, max_iterations
+) -> SteadyMotionResult:
     """Solve for a state that moves along generators of symmetries, and their rates."""
     dim = y.p.shape[0]
 
     def fields(x):
-        q, u = perturbed(system, y, x)
+        q, u = perturb(system, y, x)
         rate = linearise(system, t, q, u, args).acceleration
         motion = jnp.concatenate([system.velocity(t, q, u, args), rate])
-        lifts = lifted(system, symmetry, t, q, u, args)
+        lifts = lift_generators(system, symmetry, t, q, u, args)
         constraints = [
             system.position_constraint(t, q, args),
             system.constraint(t, q, u, args),
         ]
         return motion, jnp.concatenate(lifts, axis=1), constraints
 
-    # The rates with which the generators move the configuration as nearly as it moves.
-    here = frozen(lifted(system, symmetry, t, y.q, system.fibre_coordinate(y), args))
+    # The rates for which the generators are closest to the velocity.
+    here = frozen(
+        lift_generators(system, symmetry, t, y.q, system.fibre_coordinate(y), args)
+    )
     guess = jnp.linalg.pinv(here[0].T) @ frozen(y.v)
-    phases = _phases(jnp.concatenate(here, axis=1), held)
+    phase_conditions = _phase_conditions(jnp.concatenate(here, axis=1), held)
 
     def residual(z):
-        motion, ways, constraints = fields(z[: 2 * dim])
-        left = motion - (guess + z[2 * dim :]) @ ways
-        return jnp.concatenate([*constraints, left, phases @ z[: 2 * dim]])
+        motion, directions, constraints = fields(z[: 2 * dim])
+        left = motion - (guess + z[2 * dim :]) @ directions
+        return jnp.concatenate([*constraints, left, phase_conditions @ z[: 2 * dim]])
 
-    return _outcome(system, t, y, args, held, max_iterations, residual, guess)
+    return _solve(system, t, y, args, held, max_iterations, residual, guess)
 
 
-def _phases(ways: Float[Array, "k x"], held: Indices) -> Float[Array, "k x"]:
-    """Compute phase conditions, which keep perturbations from going along symmetries.
+def _phase_conditions(
+    directions: Float[Array, "k x"], held: Indices
+) -> Float[Array, "k x"]:
+    """Compute phase conditions, which exclude perturbations along symmetries.
 
-    Steady motions come in families that differ by symmetries, and nothing else tells
-    Newton's method which one of a family to find. Each row is a direction in which a
-    perturbation must have no part. Combinations of generators that change what is held
-    are left out, since holding it excludes them already.
+    Steady motions that differ by symmetries form a family, and phase conditions select
+    one member of it. A perturbation must be orthogonal to each row. Combinations of
+    generators that change held coordinates are omitted: they are excluded already.
     """
-    moved = ways[:, jnp.asarray(held, int)]
-    unit = jnp.eye(ways.shape[0], dtype=ways.dtype)
-    return (unit - moved @ jnp.linalg.pinv(moved)) @ ways
+    moved = directions[:, jnp.asarray(held, int)]
+    unit = jnp.eye(directions.shape[0], dtype=directions.dtype)
+    return (unit - moved @ jnp.linalg.pinv(moved)) @ directions
 
 
-def _outcome(
+def _solve(
     system, t, y, args, held, max_iterations, residual, guess: Float[Array, " k"]
-) -> Outcome:
-    """Solve for the perturbation of the state `y` and that of the rates `guess`."""
+) -> SteadyMotionResult:
+    """Solve for the increments to the state `y` and to the rates `guess`."""
     dim, count = y.p.shape[0], guess.shape[0]
 
     def in_one_program(z):
@@ -310,10 +325,10 @@ def _outcome(
     is_flat = system.manifold_of(y.q).is_flat
     positions_here = ravel_pytree(y.q)[0] if is_flat else jnp.ones_like(y.p)
     start = jnp.concatenate([positions_here, system.fibre_coordinate(y), guess])
-    z, left, solved = nearest_root(
+    z, left, solved = least_norm_root(
         in_one_program, free, start, (dim, dim, count), max_iterations
     )
-    q, u = perturbed(system, y, z[: 2 * dim])
+    q, u = perturb(system, y, z[: 2 * dim])
 
     def multiplier(q, u):
         return linearise(system, t, q, u, args).multiplier
@@ -324,7 +339,7 @@ def _outcome(
         p=system.momentum(t, q, u, args),
         multiplier=as_cpu_kernel(multiplier, q, u),
     )
-    return Outcome(
+    return SteadyMotionResult(
         found,
         guess + z[2 * dim :],
         max_norm(left),
@@ -333,64 +348,64 @@ def _outcome(
     )
 
 
-def nearest_root(
+def least_norm_root(
     residual: Callable[[Array], Array],
     free: Float[Array, " k"],
     start: Float[Array, " k"],
     groups: Sequence[int],
     max_iterations: int,
 ) -> tuple[Float[Array, " k"], Array, Solved[Array, Any]]:
-    """Find a root by Newton's method from zero, with the smallest increments.
+    """Find a root by Newton's method from zero, with least-norm increments.
 
-    There may be fewer equations than unknowns, and equations may depend on each other
-    at the root.
+    The equations may be fewer than the unknowns, and may be dependent at the root.
 
     **Arguments:**
 
-    - `residual`: the function that is to vanish.
-    - `free`: one for each component that may be changed, and zero for the others.
-    - `start`: the numbers to which the unknowns are increments.
-    - `groups`: how many unknowns of each kind there are, one kind after the other.
-        Those of one kind are rounded by the size of the largest of them.
+    - `residual`: the function whose root is computed.
+    - `free`: 1 for each unknown that may change, and 0 for the others.
+    - `start`: the values to which the unknowns are increments.
+    - `groups`: the numbers of unknowns of each kind, in order. Unknowns of one kind
+        have the round-off of the largest of them.
     - `max_iterations`: the largest number of iterations.
 
-    **Returns:** the root, the residual there, and how the method ended.
+    **Returns:** the root, the residual at the root, and the result of the iteration.
     """
     residual = ClosureConverted(residual, start)
-    # Derivatives come from the two steps after the iteration. Without this they would
-    # also be traced through its loop, which jax 0.10.1 cannot do twice.
+    # Derivatives come from the two steps after the iteration. Without `frozen`, JAX
+    # would also differentiate the loop, which jax 0.10.1 cannot do twice.
     fixed_residual, start = frozen((residual, start))
 
-    def sweep(x):
-        slopes, value, _ = jacobian_and_value(lambda x: (fixed_residual(x), None), x)
-        # Where the equations are dependent, the pseudo-inverse leaves them out.
-        inverse = free[:, None] * jnp.linalg.pinv(slopes * free[None, :])
+    def newton_step(x):
+        jacobian, value, _ = jacobian_and_value(lambda x: (fixed_residual(x), None), x)
+        # The pseudo-inverse ignores dependent equations.
+        inverse = free[:, None] * jnp.linalg.pinv(jacobian * free[None, :])
         increment = inverse @ value
-        return x - increment, Sizes(max_norm(increment)), (inverse, slopes)
+        return x - increment, Sizes(max_norm(increment)), (inverse, jacobian)
 
     solved = iterate(
-        sweep,
+        newton_step,
         jnp.zeros_like(free),
         unit(max_norm(start)),
         max_iterations=max_iterations,
     )
-    x, (inverse, slopes) = frozen((solved.x, solved.aux))
+    x, (inverse, jacobian) = frozen((solved.x, solved.aux))
 
-    # With the slopes frozen, each step more makes one more order of derivatives right.
+    # With a fixed Jacobian, each further step corrects one more order of derivatives.
     def refined(x, _):
         left = residual(x)
         return x - inverse @ left, left
 
     x, left = jax.lax.scan(refined, x, length=2)
-    # An increment also vanishes where the unknowns that may change have no influence:
-    # the residual is checked too. It is compared with the sum of the derivatives, each
-    # times the size of its unknown; an unknown without influence has size zero.
+    # An increment also vanishes if the free unknowns have no influence, so that the
+    # residual must be checked too. It is compared with the sum of the absolute
+    # derivatives, each times the size of its unknown. An unknown without influence has
+    # size zero.
     sizes = jnp.where(
-        jnp.any(slopes != 0, axis=0), jnp.abs(start) + jnp.abs(frozen(x)), 0
+        jnp.any(jacobian != 0, axis=0), jnp.abs(start) + jnp.abs(frozen(x)), 0
     )
     eps = float(jnp.finfo(x.dtype).eps)
-    # Unknowns of one kind share the largest of their sizes. Where all are zero, as at
-    # rest or at the origin, a small part of a unit stands for them.
+    # All unknowns of one kind get the largest of their sizes. If all are zero, as at
+    # rest or at the origin, a small positive size replaces it.
     ends = np.cumsum(groups)
     kinds = jnp.split(sizes, ends[:-1])
     sizes = jnp.concatenate(
@@ -399,7 +414,7 @@ def nearest_root(
             for kind in kinds
         ]
     )
-    is_root = jnp.all(jnp.abs(left[0]) <= eps**0.5 * (jnp.abs(slopes) @ sizes))
+    is_root = jnp.all(jnp.abs(left[0]) <= eps**0.5 * (jnp.abs(jacobian) @ sizes))
     return x, left[0], solved._replace(converged=solved.converged & is_root)
 
 

@@ -1,4 +1,4 @@
-"""Models written in SymPy: equations of motion, parameters, and what is refused."""
+"""Models imported from SymPy: equations of motion, parameters and errors."""
 
 import builtins
 from typing import Any
@@ -34,7 +34,7 @@ def numbers(expression, model, y, acceleration):
             for q, x in zip(symbols, given, strict=True)
         }
     values |= {sympy.Symbol(name): float(x) for name, x in model.args.items()}
-    # Derivatives first: the coordinates are parts of them.
+    # Replace derivatives first, because they contain coordinates.
     for part in (2, 1, 0):
         some = {
             key: value
@@ -67,7 +67,7 @@ def test_lagranges_method_imported_agrees_with_its_own_equations():
     found = nhjax.motion(model.system, 0.7, y, model.args)
     equations: Any = method.form_lagranges_equations()
     names: Any = method.lam_vec
-    # There the holonomic ones come first, and multipliers have the other sign.
+    # In SymPy holonomic constraints come first, and multipliers have the other sign.
     signed = [-found.multiplier[1], -found.multiplier[0]]
     multipliers = dict(zip(names, map(float, signed), strict=True))
     residual = numbers(equations.subs(multipliers), model, y, found.acceleration)
@@ -79,7 +79,7 @@ def test_lagranges_method_imported_agrees_with_its_own_equations():
 
 
 def skate(**options):
-    """A skate for Kane's method: speeds forward, sideways and of its turn."""
+    """A skate for Kane's method, with forward, sideways and turning speeds."""
     forward, aside, turn = dynamicsymbols("u1 u2 u3")
     frame = mechanics.ReferenceFrame("N")
     body = frame.orientnew("B", "Axis", [A, frame.z])

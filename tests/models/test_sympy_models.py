@@ -1,4 +1,4 @@
-"""Imported models against what SymPy and PyDy print, and against the gallery."""
+"""Imported models compared with results of SymPy and PyDy, and with the gallery."""
 
 import jax
 import jax.numpy as jnp
@@ -30,7 +30,7 @@ def stone():
 
 
 def printed_by_sympy(v):
-    """The slopes of (lean, steer) and of their rates at the speed v.
+    """The matrix of the linear equations for (lean, steer) and their rates at speed v.
 
     SymPy 1.14, sympy/physics/mechanics/tests/test_kane3.py, `Res`.
     """
@@ -64,7 +64,7 @@ def test_sympy_bicycle_when_upright_has_published_coefficients(bicycle, speed):
         bicycle.system, 0.0, y, bicycle.args, positions=place[:2], velocities=place
     )
     expected = printed_by_sympy(speed)
-    # The test there allows 1e-12.
+    # SymPy's own test has the tolerance 1e-12.
     np.testing.assert_allclose(found.matrix[:4, :4], expected, rtol=0, atol=1e-12)
     np.testing.assert_allclose(found.matrix[4], 0, atol=1e-12)
     for value in np.linalg.eigvals(expected):
@@ -103,7 +103,7 @@ def test_sympy_disc_at_pydys_steady_turn_has_no_acceleration(disc, lean, turn):
     from_turn = g * m * r * sin + (axial - across + m * r**2) * sin * cos * turn**2
     spin = -from_turn / ((axial + m * r**2) * cos * turn)
     y = rolling_state(disc, {"q1": lean}, {"q0": turn, "q2": spin})
-    # The place of the contact goes round in a circle, and angles change steadily.
+    # The contact point moves on a circle, and angles change at constant rates.
     found = accelerations_of(disc)(y).acceleration
     np.testing.assert_allclose(found[2:], 0, atol=1e-12)
     np.testing.assert_allclose(
@@ -113,7 +113,7 @@ def test_sympy_disc_at_pydys_steady_turn_has_no_acceleration(disc, lean, turn):
 
 @pytest.mark.long
 def test_sympy_disc_integrated_agrees_with_gallery(disc):
-    """The gallery's has SE(3), z upward and the axle as its third axis."""
+    """The gallery's disc uses SE(3), z upward, and the axle as third body axis."""
     q, v = {"q1": 0.4, "q0": 0.0, "q2": 0.0}, {"q0": 1.2, "q1": -0.3, "q2": 5.0}
     y0 = rolling_state(disc, q, v)
     attitude = Rotation.from_euler("x", 0.4).as_matrix()
