@@ -26,20 +26,20 @@ def energy_error(
 ) -> Float[Array, "... k"]:
     """Compute the energy error E(t) - E(t0) along a saved trajectory.
 
-    It works under `vmap`, and on a solution that comes out of `vmap` as long as all
+    It works under `vmap`. It also works on a solution returned by `vmap`, if all
     members share `system` and `args`.
 
     **Arguments:**
 
     - `system`: the system that was integrated.
-    - `sol`: a `Solution` that holds states, the initial one first: save with
-        `SaveAt(t0=True, steps=True)`.
-    - `args`: those of the integration.
+    - `sol`: a `Solution` with states, starting with the initial one, for instance saved
+        by `SaveAt(t0=True, steps=True)`.
+    - `args`: the `args` of the integration.
 
     **Returns:** an array of the shape of `sol.ts`.
 
-    **Raises:** `ValueError` if `sol` holds no states, or not the initial one;
-    `TypeError` if an argument is no system or no solution.
+    **Raises:** `ValueError` if `sol` has no states, or lacks the initial one;
+    `TypeError` if `system` is not a system or `sol` is not a solution.
 
     !!! example
 
@@ -51,13 +51,13 @@ def energy_error(
         >>> nhjax.energy_error(disc.system, sol).shape
         (11,)
     """
-    check_system(system)
+    check_is_system(system)
     ts, ys = saved_states(sol)
     first = ts[..., 0]
     if not is_traced(first, sol.t0) and np.any(np.asarray(first != sol.t0)):
         raise ValueError(
-            "The initial state was not saved, so that there is no energy to compare "
-            "with: pass `saveat=nhjax.SaveAt(t0=True, ...)` to `integrate`."
+            "The initial state was not saved, so that its energy is not known: "
+            "pass `saveat=nhjax.SaveAt(t0=True, ...)` to `integrate`."
         )
     energy = map_over_axes(ts.ndim, lambda t, y: system.energy(t, y, args))(ts, ys)
     return energy - energy[..., :1]
@@ -68,22 +68,22 @@ def momentum_map(
 ) -> Float[Array, "..."]:
     """Compute the momentum p · ξ_Q(q) along an infinitesimal symmetry ξ_Q.
 
-    It is conserved when ξ_Q is a symmetry of the Lagrangian that the constraints allow
-    as a virtual displacement, D2Φ · ξ_Q = 0; otherwise it obeys the nonholonomic
+    It is conserved if ξ_Q is a symmetry of the Lagrangian and a virtual displacement
+    that the constraints permit, D2Φ · ξ_Q = 0. Otherwise it satisfies the nonholonomic
     momentum equation.
 
     **Arguments:**
 
-    - `y`: a state, or a trajectory of them such as `sol.ys`.
+    - `y`: a state, or a trajectory of states such as `sol.ys`.
     - `generator`: the vector field ξ_Q, called as `generator(q)` with one
         configuration, of shape (n,). On a group it is left-trivialised like the
-        velocity: for the symmetry g -> exp(εξ) g that is
+        velocity: for the symmetry g -> exp(εξ) g, return
         `manifold.Ad(manifold.inverse(q), xi)`.
 
     **Returns:** one number for each state.
 
-    **Raises:** `ShapeError` if `generator` returns something of another shape,
-    `TypeError` if `y` is no state or `generator` no function.
+    **Raises:** `ShapeError` if `generator` returns an array of another shape;
+    `TypeError` if `y` is not a state or `generator` is not a function.
 
     !!! example
 
@@ -95,7 +95,7 @@ def momentum_map(
         >>> round(float(nhjax.momentum_map(y0, turn)), 6)
         0.175
     """
-    check_type("y", y, State, "Such as `sol.ys` or an entry of it.")
+    check_type("y", y, State, "Pass for instance `sol.ys` or an entry of it.")
     if not callable(generator):
         raise TypeError(
             f"`generator` must be a function of q, got {reprlib.repr(generator)} of "
@@ -123,13 +123,13 @@ def convergence_order(
 
     **Arguments:**
 
-    - `step_sizes`: at least two different ones, shape (k,).
-    - `errors`: the error for each of them, shape (k, ...).
+    - `step_sizes`: at least two different step sizes, shape (k,).
+    - `errors`: the error for each step size, shape (k, ...).
 
     **Returns:** a NumPy array of shape (k - 1, ...).
 
-    **Raises:** `ValueError` for sizes or errors that have no slope between them,
-    `TypeError` if they are not numbers.
+    **Raises:** `ValueError` if step sizes are equal, zero or not finite, or if errors
+    are not positive and finite; `TypeError` if they are not numbers.
 
     !!! example
 
@@ -137,8 +137,8 @@ def convergence_order(
         >>> nhjax.convergence_order([0.2, 0.1, 0.05], [1.6e-3, 1e-4, 6.25e-6])
         array([4., 4.])
     """
-    h = np.abs(numbers("step_sizes", step_sizes))
-    e = numbers("errors", errors)
+    h = np.abs(real_array("step_sizes", step_sizes))
+    e = real_array("errors", errors)
     if h.ndim != 1 or h.shape[0] < 2:
         raise ValueError(
             f"`step_sizes` must be a vector of at least two, got shape {h.shape}."
@@ -158,14 +158,14 @@ def convergence_order(
     if np.any(bad):
         where = tuple(int(i) for i in np.argwhere(bad)[0])
         raise ValueError(
-            f"`errors` must be positive and finite to have a slope, but errors{where} "
-            f"= {e[where]}. Leave it out."
+            f"`errors` must be positive and finite, but errors{where} = {e[where]}. "
+            "Omit this entry."
         )
     widths = np.diff(np.log(h)).reshape(-1, *([1] * (e.ndim - 1)))
     return np.diff(np.log(e), axis=0) / widths
 
 
-def numbers(name: str, x: Any) -> np.ndarray:
+def real_array(name: str, x: Any) -> np.ndarray:
     """Convert `x` to a float64 array on the host, or raise a `TypeError`."""
     try:
         return np.asarray(x, dtype=np.float64)
@@ -176,18 +176,18 @@ def numbers(name: str, x: Any) -> np.ndarray:
         ) from None
 
 
-def check_system(system: Any) -> None:
-    """Raise a `TypeError` unless `system` is a mechanical system of nhjax."""
+def check_is_system(system: Any) -> None:
+    """Raise a `TypeError` if `system` is not a mechanical system of nhjax."""
     check_type("system", system, (LagrangianSystem, HamiltonianSystem))
 
 
 def saved_states(sol: Solution) -> tuple[Float[Array, "... k"], State]:
-    """Return the times and states of `sol`, or raise an error on how to save them."""
-    check_type("sol", sol, Solution, "It is what `nhjax.integrate` returns.")
+    """Return the times and states of `sol`, or raise if states were not saved."""
+    check_type("sol", sol, Solution, "`nhjax.integrate` returns one.")
     if sol.ts is None or not isinstance(sol.ys, State):
-        held = "nothing" if sol.ts is None else f"values of type {type(sol.ys)}"
+        held = "no values" if sol.ts is None else f"values of type {type(sol.ys)}"
         raise ValueError(
-            f"The solution holds {held} where states are needed: pass "
+            f"The solution has {held} where states are needed: pass "
             "`saveat=nhjax.SaveAt(t0=True, steps=True)`, without `fn`, to `integrate`."
         )
     return sol.ts, sol.ys

@@ -32,7 +32,7 @@ def _particles():
     return particle, batch
 
 
-def test_energy_error_is_that_of_the_states():
+def test_energy_error_of_a_solution_agrees_with_its_states():
     particle = nhjax.systems.NonholonomicParticle()
     sol = _run(particle)
     assert isinstance(sol.ys, nhjax.State)
@@ -44,7 +44,7 @@ def test_energy_error_is_that_of_the_states():
     assert 0 < np.max(np.abs(error)) < 1e-4
 
 
-def test_energy_error_of_a_batch_and_under_vmap():
+def test_energy_error_of_a_batch_agrees_with_vmap():
     particle, y0 = _particles()
     sol = jax.jit(jax.vmap(lambda y: _run(particle, y)))(y0)
     whole = energy_error(particle.system, sol)
@@ -56,7 +56,7 @@ def test_energy_error_of_a_batch_and_under_vmap():
     np.testing.assert_allclose(whole[1], alone, atol=1e-14)
 
 
-def test_energy_error_passes_args_on():
+def test_energy_error_with_args_passes_them_to_the_system():
     def lagrangian(t, q, v, args):
         return 0.5 * args["mass"] * (v @ v) - 0.5 * (q @ q)
 
@@ -75,17 +75,17 @@ def test_energy_error_passes_args_on():
     [
         (nhjax.SaveAt(steps=True), "initial state was not saved"),
         (nhjax.SaveAt(t1=True, fn=lambda t, y, args: y.q), "where states are needed"),
-        (nhjax.SaveAt(dense=True), "holds nothing where states are needed"),
+        (nhjax.SaveAt(dense=True), "has no values where states are needed"),
     ],
 )
-def test_energy_error_needs_the_saved_states(saveat, message):
+def test_energy_error_without_saved_states_raises(saveat, message):
     particle = nhjax.systems.NonholonomicParticle()
     sol = _run(particle, saveat=saveat)
     with pytest.raises(ValueError, match=message):
         energy_error(particle.system, sol)
 
 
-def test_momentum_map_of_a_state_and_of_a_trajectory():
+def test_momentum_map_of_a_trajectory_agrees_with_single_states():
     disc = nhjax.systems.VerticalRollingDisc()
     sol = _run(disc)
 
@@ -101,7 +101,7 @@ def test_momentum_map_of_a_state_and_of_a_trajectory():
     np.testing.assert_allclose(momentum_map(one, roll), along[0], atol=1e-15)
 
 
-def test_convergence_order_of_a_power():
+def test_convergence_order_of_a_power_law_is_its_exponent():
     h = np.array([0.3, 0.1, 0.05])
     np.testing.assert_allclose(convergence_order(h, 7 * h**4), [4, 4], rtol=1e-13)
     columns = np.stack([h**2, 3 * h**6], axis=1)
@@ -118,6 +118,6 @@ def test_convergence_order_of_a_power():
         ([0.1, 0.2], [np.nan, 1.0], r"errors\(0,\) = nan"),
     ],
 )
-def test_convergence_order_refuses(step_sizes, errors, message):
+def test_convergence_order_with_invalid_errors_raises(step_sizes, errors, message):
     with pytest.raises(ValueError, match=message):
         convergence_order(step_sizes, errors)

@@ -1,4 +1,4 @@
-"""What holds at one state: accelerations, reactions, stability; steady motions."""
+"""Analysis at one state: accelerations, reactions, steady motions and stability."""
 
 from ._check_system import check_system as check_system, SystemReport as SystemReport
 from ._linear_stability import (

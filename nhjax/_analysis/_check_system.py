@@ -1,4 +1,4 @@
-"""A report on a system: its dimensions, how well it is posed, what does not change."""
+"""A report on a system: dimensions, conditioning, dependences and invariances."""
 
 from typing import Any
 
@@ -22,34 +22,35 @@ from .._numerics import (
     reciprocal_condition_of_range,
 )
 from .._system import AbstractMechanicalSystem, check_functions, finite, parameters
-from ._motion import in_velocities
+from ._motion import convert_to_velocities
 
 
-# Derivatives that vanish at this many states near the given one vanish near it.
-_SAMPLES = 3
+# A derivative counts as zero if it vanishes at this many states near the given one.
+_NUM_SAMPLES = 3
 _SPREAD = 0.3
 
 _MASS, _JACOBIAN = "mass matrix", "Jacobian of the nonholonomic constraints"
 
 
 class SystemReport(eqx.Module):
-    """What `check_system` found out about a system; its `str` is a table.
+    """The report of `check_system`; its `str` is a table.
 
     - `dimension`: the number n of coordinates.
     - `num_nonholonomic`, `num_holonomic`: the numbers m and k of constraints.
     - `mass_condition`, `compatibility_condition`: the condition numbers of M = ∂p/∂v
-        and of C = B M⁻¹ Bᵀ, after their rows and columns are scaled to size one.
-        Infinite ones tell that the system has no motion there.
-    - `violations`: the constraint functions by name, "Φ[0]" for nonholonomic ones and
-        "Γ[0]", "dΓ[0]/dt" for holonomic ones.
-    - `dependent`: the names of constraints that depend on each other, if any do.
-    - `num_redundant`: of a system whose constraints are redundant, how many follow from
-        others. The reactions of those in `dependent` are not unique then.
+        and of C = B M⁻¹ Bᵀ, after their rows and columns are scaled to size one. If
+        one is infinite, the accelerations at the state are not determined.
+    - `violations`: the values of the constraint functions by name, "Φ[0]" for
+        nonholonomic ones and "Γ[0]", "dΓ[0]/dt" for holonomic ones.
+    - `dependent`: the names of constraints that depend on each other, if any.
+    - `num_redundant`: the number of constraints that follow from others, for a system
+        that declares its constraints redundant. The reactions of the constraints in
+        `dependent` are then not unique.
     - `depends_on_time`: the names of the functions that depend on t.
     - `ignorable`: the indices of coordinates that no function depends on near the given
-        state; one that drops out by terms that cancel is not found.
-    - `constant`: those of the mass matrix and the Jacobian of the nonholonomic
-        constraints that depend on nothing.
+        state. A coordinate whose terms cancel only up to rounding is not found.
+    - `constant`: which of the mass matrix and the Jacobian of the nonholonomic
+        constraints are constant.
     """
 
     dimension: int
@@ -66,15 +67,15 @@ class SystemReport(eqx.Module):
 
     @property
     def degrees_of_freedom(self) -> int:
-        """Return the dimension n - m - k of the velocities that are permitted.
+        """Return the dimension n - m - k of the permitted velocities.
 
-        Constraints that are redundant do not count.
+        Redundant constraints do not count.
         """
         count = self.num_nonholonomic + self.num_holonomic - self.num_redundant
         return self.dimension - count
 
     def _size(self, name: str) -> float:
-        # What is no number is worse than any.
+        # NaN counts as the largest violation.
         size = abs(self.violations[name])
         return size if size == size else float("inf")
 
@@ -90,18 +91,18 @@ class SystemReport(eqx.Module):
             "largest violation": f"{worst} = {self.violations[worst]:.3g}"
             if worst
             else "none",
-            "dependent constraints": _listed(self.dependent),
-            "depend on time": _listed(self.depends_on_time),
-            "ignorable coordinates": _listed(self.ignorable),
-            "constant": _listed(self.constant),
+            "dependent constraints": _comma_separated(self.dependent),
+            "depend on time": _comma_separated(self.depends_on_time),
+            "ignorable coordinates": _comma_separated(self.ignorable),
+            "constant": _comma_separated(self.constant),
         }
         if self.num_redundant:
             rows["redundant constraints"] = self.num_redundant
-            rows["reactions not unique"] = _listed(self.dependent)
+            rows["reactions not unique"] = _comma_separated(self.dependent)
         return "\n".join(f"{name:30} {value}" for name, value in rows.items())
 
 
-def _listed(names: tuple[Any, ...]) -> str:
+def _comma_separated(names: tuple[Any, ...]) -> str:
     return ", ".join(map(str, names)) or "none"
 
 
@@ -116,9 +117,9 @@ def check_system(
 ) -> SystemReport:
     """Report on a system at a configuration and a velocity or momentum.
 
-    It is for a model that one has just written: `print(nhjax.check_system(...))`. The
-    state need not be consistent, and nothing is raised for a system without motion,
-    such as one of dependent constraints: the report says so.
+    Use it for a new model: `print(nhjax.check_system(...))`. The state need not be
+    consistent. If the accelerations are not determined, for instance because
+    constraints are dependent, the report says so and no exception is raised.
 
     **Arguments:**
 
@@ -128,12 +129,12 @@ def check_system(
         one, shape (n,).
     - `t`, `args`: passed on to the functions of the system.
 
-    **Returns:** a `SystemReport`. What a function depends on is found from derivatives
-    at three states around the given one.
+    **Returns:** a `SystemReport`. The arguments on which functions depend are found
+    from derivatives at three states near the given one.
 
-    **Raises:** as `initial_state` does for wrong types and shapes, also of what the
-    functions return; `ValueError` if a Lagrangian system is given `p`, or a Hamiltonian
-    one `v`; `TypeError` under `jit`, `vmap` or `grad`.
+    **Raises:** as `initial_state` does for wrong types and shapes, also of values that
+    the system's functions return; `ValueError` if a Lagrangian system is given `p`, or
+    a Hamiltonian one `v`; `TypeError` under `jit`, `vmap` or `grad`.
 
     !!! example
 
@@ -148,27 +149,27 @@ def check_system(
     u = {"v": v, "p": p}[coordinate]
     if u is None:
         raise ValueError(
-            f"Give `{coordinate}`, the fibre coordinate of a {type(system).__name__}."
+            f"Pass `{coordinate}`, the fibre coordinate of a {type(system).__name__}."
         )
     args = parameters(args)
     if is_traced(*jax.tree.leaves((q, u, t, args))):
         raise TypeError(
-            "`check_system` looks at numbers and makes text of them: call it outside "
-            "of `jax.jit`, `jax.vmap` and `jax.grad`."
+            "`check_system` needs concrete values: call it outside `jax.jit`, "
+            "`jax.vmap` and `jax.grad`."
         )
     for name, x in (("q", q), (coordinate, u), ("t", t)):
         require(x, finite(name, x))
     check_functions(system, t, q, args)
-    found = jax.tree.map(np.asarray, _measured(system, t, q, u, args))
-    count, k = found["constraints"].size, found["positions"].size
+    found = jax.tree.map(np.asarray, _measurements(system, t, q, u, args))
+    count, k = found["constraints"].size, found["position_constraints"].size
     m = count - k
     letters = [f"Φ[{i}]" for i in range(m)] + [f"Γ[{i}]" for i in range(k)]
     rates = letters[:m] + [f"d{name}/dt" for name in letters[m:]]
-    values = [*found["constraints"], *found["positions"]]
+    values = [*found["constraints"], *found["position_constraints"]]
     changes = {key: _changes(found[key]) for key in (_MASS, _JACOBIAN)}
-    # Rows that are not finite show in the condition number of C.
+    # If a row is not finite, the condition number of C reports it.
     rows = dependent_rows(found["jacobian"]) if found["deficient"] else []
-    moving = np.any(_changes(found["of positions"]), axis=0)
+    moving = np.any(_changes(found["by_position"]), axis=0)
     return SystemReport(
         dimension=u.size,
         num_nonholonomic=m,
@@ -181,7 +182,7 @@ def check_system(
         depends_on_time=tuple(
             name
             for name in system.functions(t, q, u, args)
-            if np.any(_changes(found["of time"][name]))
+            if np.any(_changes(found["by_time"][name]))
         ),
         ignorable=tuple(int(i) for i in np.flatnonzero(~moving)),
         constant=tuple(
@@ -193,9 +194,9 @@ def check_system(
 
 
 def _changes(derivatives: np.ndarray) -> np.ndarray:
-    """Tell what changes, from derivatives at several states along the first axis.
+    """Return which values change, from derivatives at several states (first axis).
 
-    A number that is not finite counts as a change.
+    A derivative that is not finite counts as a change.
     """
     return np.asarray(np.any(~(derivatives == 0), axis=0))
 
@@ -206,13 +207,13 @@ def _condition(reciprocal: np.ndarray) -> float:
 
 
 @tracked_jit("system", "args")
-def _measured(system, t, q, u, args) -> dict[str, Any]:
+def _measurements(system, t, q, u, args) -> dict[str, Any]:
     manifold, coordinate = system.manifold_of(q), system.fibre_coordinate_name
 
-    def metric(t, xi, u):
+    def hessian(t, xi, u):
         return system.metric(t, manifold.act(q, xi), u, args)
 
-    def slopes(t, xi, u):
+    def constraint_jacobian(t, xi, u):
         g = manifold.act(q, xi)
         return jax.jacfwd(system.kinematic_constraint, argnums=2)(t, g, u, args)
 
@@ -237,17 +238,17 @@ def _measured(system, t, q, u, args) -> dict[str, Any]:
         ]
         second = {
             key: max_norm(*jax.tree.leaves(jax.jacfwd(x, argnums=(0, 1, 2))(*point)))
-            for key, x in ((_MASS, metric), (_JACOBIAN, slopes))
+            for key, x in ((_MASS, hessian), (_JACOBIAN, constraint_jacobian))
         }
         return by_time, jnp.concatenate(by_position), second
 
     size = 1 + jnp.abs(u)
     keys = jax.random.split(jax.random.key(0), 2)
-    shape = (_SAMPLES, u.shape[0])
+    shape = (_NUM_SAMPLES, u.shape[0])
     xi, w = (_SPREAD * jax.random.normal(key, shape, u.dtype) for key in keys)
     by_time, by_position, second = jax.vmap(sample)(xi, w * size[None])
     rows = jax.jacfwd(system.constraint, argnums=2)(t, q, u, args)
-    mass, rows = in_velocities(system, metric(t, jnp.zeros_like(u), u), rows)
+    mass, rows = convert_to_velocities(system, hessian(t, jnp.zeros_like(u), u), rows)
     compatibility = rows @ inverse(mass) @ rows.T
     redundant, condition = jnp.zeros((), int), reciprocal_condition
     if system.constraints == "redundant":
@@ -255,13 +256,13 @@ def _measured(system, t, q, u, args) -> dict[str, Any]:
         condition = reciprocal_condition_of_range
     return {
         "constraints": system.constraint(t, q, u, args),
-        "positions": system.position_constraint(t, q, args),
+        "position_constraints": system.position_constraint(t, q, args),
         "regularity": reciprocal_condition(mass),
         "compatibility": condition(compatibility),
         "redundant": redundant,
         "jacobian": rows,
         "deficient": is_deficient(rows),
-        "of time": by_time,
-        "of positions": by_position,
+        "by_time": by_time,
+        "by_position": by_position,
         **second,
     }

@@ -1,44 +1,51 @@
 """The accelerations and reactions of the continuous equations at one state."""
 
+from typing import Any
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from .._compile import tracked_jit
-from .._custom_types import Args, FloatScalarLike
+from .._custom_types import Args, FloatScalar, FloatScalarLike
 from .._errors import is_traced
 from .._numerics import inverse, nan_unless
 from .._system import (
     AbstractMechanicalSystem,
     all_finite,
+    check_state,
+    check_time_and_state,
+    check_type,
+    HamiltonianSystem,
+    LagrangianSystem,
     linearise,
     parameters,
+    real_scalar,
     require_independent,
     State,
 )
-from ._arguments import checked_time
 
 
 class Motion(eqx.Module):
     """The continuous motion of a system at one state: its accelerations and reactions.
 
-    - `acceleration`: the rate v̇ of the velocity, shape (n,); on a group that of the
-        body velocity.
+    - `acceleration`: the rate v̇ of the velocity, shape (n,). On a group it is the rate
+        of the body velocity.
     - `momentum_rate`: the rate ṗ of the momentum, shape (n,).
     - `multiplier`: the multiplier λ_c, shape (l,) with l = m + k: m nonholonomic
         constraints, then k holonomic ones.
     - `reaction`: the generalised force λᵀB of all constraints, shape (n,).
     - `mass_matrix`: M = ∂p/∂v, shape (n, n).
-    - `constraint_jacobian`: B = ∂Φ/∂v, shape (l, n), with the rates of the holonomic
-        constraints as its last rows.
-    - `is_unique`: which multipliers the equations determine, shape (l,). Of redundant
-        constraints it is false for all that depend on others, whose reactions are one
-        choice of many: that of the least norm. Their sum `reaction` is unique.
+    - `constraint_jacobian`: B = ∂Φ/∂v, shape (l, n). Its last rows belong to the rates
+        of the holonomic constraints.
+    - `is_unique`: whether the equations determine each multiplier, shape (l,). It is
+        false for redundant constraints, whose multipliers are the solution with the
+        least norm. The sum `reaction` is always unique.
 
-    A generalised force has the unit that makes its product with a coordinate a work: N
-    for a coordinate in m, N m for an angle. A multiplier is a force in N if its
-    constraint is a velocity in m/s or a distance in m.
+    The product of a generalised force and its coordinate is a work, so that the unit of
+    the force is N for a coordinate in m, and N m for an angle. A multiplier is a force
+    in N if its constraint is a velocity in m/s or a distance in m.
     """
 
     acceleration: Float[Array, " n"]
@@ -51,7 +58,7 @@ class Motion(eqx.Module):
 
     @property
     def reaction_of_each(self) -> Float[Array, "l n"]:
-        """Return the generalised force λ_a B_a of each constraint, one a row."""
+        """Return the generalised force λ_a B_a of each constraint, as rows."""
         return self.multiplier[:, None] * self.constraint_jacobian
 
     @property
@@ -73,29 +80,30 @@ def motion(
 ) -> Motion:
     """Compute accelerations, multipliers and reaction forces at a state.
 
-    They solve the continuous equations of motion (the paper's section 3) together with
-    the hidden constraints,
+    The function solves the continuous equations of motion (the paper's section 3)
+    together with the hidden constraints,
 
     M v̇ - Bᵀ λ = ad*_v p + D1L + F - (∂t + D1 v) p,    B v̇ = -(∂t + D1 v) Φ,
 
-    and those of a Hamiltonian system likewise. Along a trajectory, reactions are saved
-    by `SaveAt(fn=lambda t, y, args: nhjax.motion(system, t, y, args).reaction)`.
+    or the corresponding equations of a Hamiltonian system. To save reactions along a
+    trajectory, use
+    `SaveAt(fn=lambda t, y, args: nhjax.motion(system, t, y, args).reaction)`.
 
     **Arguments:**
 
     - `system`: the mechanical system.
     - `t`: the time of the state.
-    - `y`: a state, from `initial_state` or from `Solution.ys`. Where it violates the
-        constraints, the accelerations are those that keep the violation constant.
+    - `y`: a state, from `initial_state` or `Solution.ys`. If it violates the
+        constraints, the accelerations keep the violation constant.
     - `args`: passed on to the functions of the system.
 
-    **Returns:** a `Motion`. Its numbers are not finite where the mass matrix or the
+    **Returns:** a `Motion`. Its values are not finite if the mass matrix or the
     compatibility matrix is singular.
 
-    **Raises:** `DependentConstraintsError` if constraints are dependent, and the system
-    does not say that they are redundant; under `jit` and `vmap` accelerations and
-    reactions are NaN then. `TypeError` if `system` is no system or `y` no `State`;
-    `ShapeError` if `y` is no state of this system, or many.
+    **Raises:** `DependentConstraintsError` if constraints are dependent, unless the
+    system declares them redundant; under `jit` and `vmap`, accelerations and reactions
+    are NaN instead. `TypeError` if `system` is not a system or `y` is not a `State`;
+    `ShapeError` if `y` is not a state of this system, or is a batch of states.
 
     !!! example
 
@@ -128,8 +136,8 @@ def _motion(system, t, y, args) -> Motion:
         (t, jnp.zeros_like(u), u),
         (jnp.ones_like(t), velocity, lin.acceleration),
     )
-    metric = system.metric(t, y.q, u, args)
-    mass, jacobian = in_velocities(system, metric, lin.dense[0])
+    hessian = system.metric(t, y.q, u, args)
+    mass, jacobian = convert_to_velocities(system, hessian, lin.dense[0])
     rates = acceleration, momentum_rate, lin.multiplier
     if lin.multiplier.shape[0] > 0:
         rates = nan_unless(lin.determines_multipliers, rates)
@@ -145,14 +153,24 @@ def _motion(system, t, y, args) -> Motion:
     )
 
 
-def in_velocities(
+def convert_to_velocities(
     system: AbstractMechanicalSystem,
-    metric: Float[Array, "n n"],
+    hessian: Float[Array, "n n"],
     jacobian: Float[Array, "l n"],
 ) -> tuple[Float[Array, "n n"], Float[Array, "l n"]]:
-    """Return ∂p/∂v and ∂Φ/∂v, given the metric K and ∂Φ/∂u of the system."""
+    """Return ∂p/∂v and ∂Φ/∂v, given ∂Φ/∂u and the Hessian D2D2L or D2D2H."""
     if system.fibre_coordinate_name == "v":
-        return metric, jacobian
-    # The metric is D2D2H, whose inverse is ∂p/∂v.
-    mass = inverse(metric)
+        return hessian, jacobian
+    # The Hessian is D2D2H = ∂v/∂p.
+    mass = inverse(hessian)
     return mass, jacobian @ mass
+
+
+def checked_time(
+    function: str, system: Any, t: FloatScalarLike, y: Any, args: Args
+) -> FloatScalar:
+    """Return the time as an array; raise for an invalid system, time or state."""
+    check_type("system", system, (LagrangianSystem, HamiltonianSystem))
+    check_time_and_state(function, t, y, "system, ")
+    check_state(system, y, args, "y")
+    return real_scalar("t", t, y.p.dtype)

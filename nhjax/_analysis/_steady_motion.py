@@ -1,25 +1,46 @@
 """Steady motions: equilibria, and motions that are steady up to symmetries."""
 
-from collections.abc import Sequence
-from typing import overload
+import operator
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple, overload
 
 import equinox as eqx
-from jaxtyping import Array, Float
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.flatten_util import ravel_pytree
+from jaxtyping import Array, Float, Int
 
-from .._custom_types import Args, FloatScalarLike
-from .._errors import require
-from .._numerics import frozen
-from .._system import (
-    AbstractMechanicalSystem,
-    parameters,
-    State,
+from .._compile import as_cpu_kernel, tracked_jit
+from .._custom_types import Args, BoolScalar, FloatScalar, FloatScalarLike
+from .._errors import Check, NewtonError, require
+from .._numerics import (
+    ClosureConverted,
+    frozen,
+    iterate,
+    jacobian_and_value,
+    max_norm,
+    Sizes,
+    Solved,
+    unit,
 )
-from ._arguments import checked_count, checked_time
-from ._permitted import orthonormal_basis
-from ._perturbation import Indices, indices
-from ._slopes import size_of, Slopes, slopes_along_symmetry
-from ._steady_equations import steady_along, steady_in_indices
-from ._symmetry import check_symmetry, checks_of, judged, Symmetry, Verdict
+from .._system import AbstractMechanicalSystem, linearise, parameters, State
+from ._linearisation import (
+    check_relative_equilibrium,
+    check_symmetry,
+    Indices,
+    indices,
+    lift_generators,
+    linearise_along_symmetry,
+    LinearisedEquations,
+    orthonormal_basis,
+    perturb,
+    state_size,
+    Symmetry,
+    symmetry_checks,
+    SymmetryConditions,
+)
+from ._motion import checked_time
 
 
 @overload
@@ -64,29 +85,31 @@ def steady_motion(
     held_velocities: Sequence[int] = (),
     max_iterations: int = 50,
 ) -> State | tuple[State, Float[Array, " k"]]:
-    """Find the steady motion, or relative equilibrium, that is near to a given state.
+    """Find a steady motion, or relative equilibrium, near a given state.
 
-    There are two ways to say what is steady. With `positions` and `velocities` it is a
-    consistent state at which the chosen positions do not change, and the rates of
-    change of the chosen velocities vanish,
+    There are two ways to define steady. With `positions` and `velocities`, the result
+    is a consistent state at which the rates of the chosen positions and of the chosen
+    velocities vanish,
 
     v_j = 0 for j in `positions`,   u̇_i = 0 for i in `velocities`,
 
-    u being the velocity or for a Hamiltonian system the momentum. The other coordinates
-    may change, as the place of a bicycle that runs in a circle does.
+    where u is the velocity, or the momentum of a Hamiltonian system. The other
+    coordinates may change, such as the position of a bicycle on a circle.
 
-    With `symmetry` it is a consistent state that moves as symmetries of the system move
-    it: with x = (q, u), the equations of motion ẋ = f(x) and the generators X_k,
+    With `symmetry`, the result is a consistent state whose motion is an orbit of
+    symmetries of the system: with x = (q, u), the equations of motion ẋ = f(x) and the
+    generators X_k,
 
     f(x) = Σ c_k X_k(x).
 
-    The state and the rates c are found together. So a wheel rolls on a circle, or a top
-    precesses, though no coordinates of their attitude are constant.
+    The state and the rates c are computed together. Examples are a wheel that rolls on
+    a circle and a precessing top, for which no coordinates of the attitude are
+    constant.
 
-    Where these equations leave a family of steady motions, the result is the one that
-    Newton's method with the smallest increments leads to; `held_...` picks another one,
-    such as that of a given speed or lean. What symmetries do to a state is left
-    undone, as far as what is held allows it.
+    If these equations have a family of solutions, the result is the one to which
+    Newton's method with least-norm increments converges. The `held_...` arguments
+    select another one, for instance one with a given speed or lean. The increments have
+    no component along the symmetries, except where held coordinates require it.
 
     **Arguments:**
 
@@ -105,26 +128,26 @@ def steady_motion(
         the configuration of `y`.
     - `max_iterations`: the largest number of iterations.
 
-    **Returns:** a consistent `State`, and with `symmetry` a pair of it and the rates c
-    of the generators, shape (k,), in units of the velocity over those of a generator.
-    `linear_stability` with the same `symmetry` takes the state. Both are twice
-    differentiable with respect to `y` and `args` by the implicit function theorem,
-    where the steady motion is the only one with the held values, or one of a family
-    that differs in what nothing depends on. In other families the derivative is that of
-    one more increment of Newton's method.
+    **Returns:** a consistent `State`. With `symmetry`, a pair of the state and the
+    rates c of the generators, shape (k,), whose unit is the unit of the velocity
+    divided by that of the generator. Pass the state to `linear_stability` with the same
+    `symmetry`. Both results are twice differentiable with respect to `y` and `args` by
+    the implicit function theorem, if the steady motion is unique for the held values,
+    or unique up to ignorable coordinates. In other families the derivative is that of
+    one more Newton increment.
 
-    **Raises:** `NewtonError` if there is none near to `y`; `ValueError` or `TypeError`
-    if an index is wrong; `ValueError` if neither or both of the two ways are chosen,
-    or if generators are dependent, not closed, or no symmetries, which is checked as
-    `linear_stability` does it; `DependentConstraintsError` if constraints are dependent
-    and there is a `symmetry`; `TypeError` if `system` is no system, `y` no `State` or
-    `symmetry` no function; `ShapeError` if `y` is no state of this system, or many, or
-    generators no velocities. Under `jit` what depends on values comes as an error of
-    JAX with the same message.
+    **Raises:** `NewtonError` if no steady motion is found near `y`. `ValueError` or
+    `TypeError` if an index is wrong. `ValueError` if neither or both of the two ways
+    are chosen, or if generators are dependent, not closed, or not symmetries, as in
+    `linear_stability`. `DependentConstraintsError` if constraints are dependent and
+    `symmetry` is given. `TypeError` if `system` is not a system, `y` is not a `State`,
+    or `symmetry` is not a function. `ShapeError` if `y` is not a single state of this
+    system, or a generator does not have the shape of a velocity. Under `jit`, errors
+    that depend on values are raised as JAX errors with the same message.
 
     !!! example
 
-        A pendulum of length 1 m under unit gravity goes round on a cone at the rate
+        A pendulum of length 1 m under unit gravity moves on a cone at the rate
         (g / l cos θ)^½:
 
         >>> import jax.numpy as jnp, nhjax
@@ -147,42 +170,260 @@ def steady_motion(
         *(dim + i for i in indices("held_velocities", held_velocities, dim)),
     )
     if symmetry is None:
-        steady = _chosen(positions, velocities, dim)
-        outcome = steady_in_indices(system, t, y, args, steady, held, max_iterations)
+        steady = _checked_coordinates(positions, velocities, dim)
+        outcome = solve_in_coordinates(system, t, y, args, steady, held, max_iterations)
         return require(outcome.state, *outcome.checks)
     if positions is not None or velocities is not None:
         raise ValueError(
-            "Give either `symmetry`, along which the state is to move, or `positions` "
-            "and `velocities`, not both."
+            "Pass either `symmetry` or `positions` and `velocities`, not both: both "
+            "define which motion is steady."
         )
     check_symmetry(symmetry, y)
-    outcome = steady_along(system, t, y, args, symmetry, held, max_iterations)
-    # What tells symmetries is the program of `linear_stability`, which mostly follows.
+    outcome = solve_along_symmetry(system, t, y, args, symmetry, held, max_iterations)
+    # The check uses the compiled program of `linear_stability`, which users call next.
     given = frozen((system, t, outcome.state, args))
-    verdict = _verdict(slopes_along_symmetry(*given, symmetry), given[2])
+    conditions = _symmetry_conditions(
+        linearise_along_symmetry(*given, symmetry), given[2]
+    )
     return require(
         (outcome.state, outcome.rates),
         *outcome.checks,
-        *checks_of(frozen(verdict)),
+        *symmetry_checks(frozen(conditions)),
     )
 
 
-def _chosen(
+def _checked_coordinates(
     positions: Sequence[int] | None, velocities: Sequence[int] | None, dim: int
 ) -> tuple[Indices, Indices]:
     if positions is None or velocities is None:
         missing = "positions" if positions is None else "velocities"
         raise ValueError(
-            f"`{missing}` is missing: give `positions` and `velocities` together, the "
-            "indices of what is to be steady, or a `symmetry`."
+            f"`{missing}` is missing: pass `positions` and `velocities` together, the "
+            "indices of steady coordinates, or pass `symmetry`."
         )
     return indices("positions", positions, dim), indices("velocities", velocities, dim)
 
 
 @eqx.filter_jit
-def _verdict(slopes: Slopes, y: State) -> Verdict:
-    """Judge the generators at a state."""
-    orbit = slopes.orbit
+def _symmetry_conditions(
+    linearised: LinearisedEquations, y: State
+) -> SymmetryConditions:
+    """Compute the conditions on the generators at a state."""
+    orbit = linearised.orbit
     assert orbit is not None
-    permitted = orthonormal_basis(slopes.rows, orbit.directions)
-    return judged(orbit, slopes.rows, permitted, size_of(y))
+    permitted = orthonormal_basis(linearised.all_constraints, orbit.directions)
+    return check_relative_equilibrium(
+        orbit, linearised.all_constraints, permitted, state_size(y)
+    )
+
+
+class SteadyMotionResult(NamedTuple):
+    """The state, the rates of the generators, and the outcome of Newton's method."""
+
+    state: State
+    rates: Float[Array, " k"]
+    residual: FloatScalar
+    converged: BoolScalar
+    num_iterations: Int[Array, ""]
+
+    @property
+    def checks(self) -> tuple[Check, ...]:
+        """Return the check that a steady motion was found."""
+        values = (self.num_iterations, self.residual, self.state)
+        return (Check(self.converged, _not_found, values),)
+
+
+def _not_found(count: np.ndarray, residual: np.ndarray, y: State) -> NewtonError:
+    return NewtonError(
+        f"No steady motion was found from `y` in {int(count)} iterations: Newton's "
+        f"method stopped at q = {y.q}, v = {y.v} with the residual "
+        f"{float(residual):.3g}. Start nearer to a steady motion, hold fewer indices, "
+        "or omit an index whose rate follows from others."
+    )
+
+
+@tracked_jit("system", "args")
+def solve_in_coordinates(
+    system, t, y, args, steady, held, max_iterations
+) -> SteadyMotionResult:
+    """Solve for a state whose chosen positions and velocities do not change."""
+    positions, velocities = (jnp.asarray(x, int) for x in steady)
+
+    def residual(x):
+        q, u = perturb(system, y, x)
+        rate = linearise(system, t, q, u, args).acceleration
+        return jnp.concatenate(
+            [
+                system.position_constraint(t, q, args),
+                system.constraint(t, q, u, args),
+                system.velocity(t, q, u, args)[positions],
+                rate[velocities],
+            ]
+        )
+
+    none = jnp.zeros(0, y.p.dtype)
+    return _solve(system, t, y, args, held, max_iterations, residual, none)
+
+
+@tracked_jit("system", "args", "symmetry")
+def solve_along_symmetry(
+    system, t, y, args, symmetry, held, max_iterations
+) -> SteadyMotionResult:
+    """Solve for a state that moves along generators of symmetries, and their rates."""
+    dim = y.p.shape[0]
+
+    def fields(x):
+        q, u = perturb(system, y, x)
+        rate = linearise(system, t, q, u, args).acceleration
+        motion = jnp.concatenate([system.velocity(t, q, u, args), rate])
+        lifts = lift_generators(system, symmetry, t, q, u, args)
+        constraints = [
+            system.position_constraint(t, q, args),
+            system.constraint(t, q, u, args),
+        ]
+        return motion, jnp.concatenate(lifts, axis=1), constraints
+
+    # The rates for which the generators are closest to the velocity.
+    here = frozen(
+        lift_generators(system, symmetry, t, y.q, system.fibre_coordinate(y), args)
+    )
+    guess = jnp.linalg.pinv(here[0].T) @ frozen(y.v)
+    phase_conditions = _phase_conditions(jnp.concatenate(here, axis=1), held)
+
+    def residual(z):
+        motion, directions, constraints = fields(z[: 2 * dim])
+        left = motion - (guess + z[2 * dim :]) @ directions
+        return jnp.concatenate([*constraints, left, phase_conditions @ z[: 2 * dim]])
+
+    return _solve(system, t, y, args, held, max_iterations, residual, guess)
+
+
+def _phase_conditions(
+    directions: Float[Array, "k x"], held: Indices
+) -> Float[Array, "k x"]:
+    """Compute phase conditions, which exclude perturbations along symmetries.
+
+    Steady motions that differ by symmetries form a family, and phase conditions select
+    one member of it. A perturbation must be orthogonal to each row. Combinations of
+    generators that change held coordinates are omitted: they are excluded already.
+    """
+    moved = directions[:, jnp.asarray(held, int)]
+    unit = jnp.eye(directions.shape[0], dtype=directions.dtype)
+    return (unit - moved @ jnp.linalg.pinv(moved)) @ directions
+
+
+def _solve(
+    system, t, y, args, held, max_iterations, residual, guess: Float[Array, " k"]
+) -> SteadyMotionResult:
+    """Solve for the increments to the state `y` and to the rates `guess`."""
+    dim, count = y.p.shape[0], guess.shape[0]
+
+    def in_one_program(z):
+        return as_cpu_kernel(residual, z)
+
+    free = jnp.ones(2 * dim + count, y.p.dtype).at[jnp.asarray(held, int)].set(0)
+    is_flat = system.manifold_of(y.q).is_flat
+    positions_here = ravel_pytree(y.q)[0] if is_flat else jnp.ones_like(y.p)
+    start = jnp.concatenate([positions_here, system.fibre_coordinate(y), guess])
+    z, left, solved = least_norm_root(
+        in_one_program, free, start, (dim, dim, count), max_iterations
+    )
+    q, u = perturb(system, y, z[: 2 * dim])
+
+    def multiplier(q, u):
+        return linearise(system, t, q, u, args).multiplier
+
+    found = State(
+        q=q,
+        v=system.velocity(t, q, u, args),
+        p=system.momentum(t, q, u, args),
+        multiplier=as_cpu_kernel(multiplier, q, u),
+    )
+    return SteadyMotionResult(
+        found,
+        guess + z[2 * dim :],
+        max_norm(left),
+        solved.converged,
+        solved.num_iterations,
+    )
+
+
+def least_norm_root(
+    residual: Callable[[Array], Array],
+    free: Float[Array, " k"],
+    start: Float[Array, " k"],
+    groups: Sequence[int],
+    max_iterations: int,
+) -> tuple[Float[Array, " k"], Array, Solved[Array, Any]]:
+    """Find a root by Newton's method from zero, with least-norm increments.
+
+    The equations may be fewer than the unknowns, and may be dependent at the root.
+
+    **Arguments:**
+
+    - `residual`: the function whose root is computed.
+    - `free`: 1 for each unknown that may change, and 0 for the others.
+    - `start`: the values to which the unknowns are increments.
+    - `groups`: the numbers of unknowns of each kind, in order. Unknowns of one kind
+        have the round-off of the largest of them.
+    - `max_iterations`: the largest number of iterations.
+
+    **Returns:** the root, the residual at the root, and the result of the iteration.
+    """
+    residual = ClosureConverted(residual, start)
+    # Derivatives come from the two steps after the iteration. Without `frozen`, JAX
+    # would also differentiate the loop, which jax 0.10.1 cannot do twice.
+    fixed_residual, start = frozen((residual, start))
+
+    def newton_step(x):
+        jacobian, value, _ = jacobian_and_value(lambda x: (fixed_residual(x), None), x)
+        # The pseudo-inverse ignores dependent equations.
+        inverse = free[:, None] * jnp.linalg.pinv(jacobian * free[None, :])
+        increment = inverse @ value
+        return x - increment, Sizes(max_norm(increment)), (inverse, jacobian)
+
+    solved = iterate(
+        newton_step,
+        jnp.zeros_like(free),
+        unit(max_norm(start)),
+        max_iterations=max_iterations,
+    )
+    x, (inverse, jacobian) = frozen((solved.x, solved.aux))
+
+    # With a fixed Jacobian, each further step corrects one more order of derivatives.
+    def refined(x, _):
+        left = residual(x)
+        return x - inverse @ left, left
+
+    x, left = jax.lax.scan(refined, x, length=2)
+    # An increment also vanishes if the free unknowns have no influence, so that the
+    # residual must be checked too. It is compared with the sum of the absolute
+    # derivatives, each times the size of its unknown. An unknown without influence has
+    # size zero.
+    sizes = jnp.where(
+        jnp.any(jacobian != 0, axis=0), jnp.abs(start) + jnp.abs(frozen(x)), 0
+    )
+    eps = float(jnp.finfo(x.dtype).eps)
+    # All unknowns of one kind get the largest of their sizes. If all are zero, as at
+    # rest or at the origin, a small positive size replaces it.
+    ends = np.cumsum(groups)
+    kinds = jnp.split(sizes, ends[:-1])
+    sizes = jnp.concatenate(
+        [
+            jnp.full_like(kind, jnp.maximum(jnp.max(kind, initial=0), eps**0.5))
+            for kind in kinds
+        ]
+    )
+    is_root = jnp.all(jnp.abs(left[0]) <= eps**0.5 * (jnp.abs(jacobian) @ sizes))
+    return x, left[0], solved._replace(converged=solved.converged & is_root)
+
+
+def checked_count(name: str, value: Any) -> int:
+    """Return a number of iterations, or raise a `ValueError`."""
+    try:
+        count = operator.index(value)
+    except TypeError:
+        count = 0
+    if count < 1 or isinstance(value, bool):
+        raise ValueError(f"`{name}` must be an int >= 1, got {value!r}.")
+    return count

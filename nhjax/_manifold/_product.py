@@ -10,7 +10,7 @@ from jaxtyping import Array, DTypeLike, Float, PyTree
 
 from .._custom_types import BoolScalar, FloatScalar
 from .._errors import ShapeError
-from ._abstract import AbstractLieGroup
+from ._group import AbstractLieGroup
 
 
 Element = tuple[PyTree[Array], ...]
@@ -18,11 +18,11 @@ Vector = Float[Array, " n"]
 
 
 class ProductGroup(AbstractLieGroup):
-    """The direct product of Lie groups, which are its factors.
+    """The direct product of Lie groups, its factors.
 
-    An element is a tuple of elements, one for each factor. Vectors of the Lie algebra
-    and of its dual are those of the factors, concatenated. Factors may themselves be
-    products.
+    An element is a tuple of elements, one for each factor. A vector of the Lie algebra
+    or of its dual is the concatenation of the factors' vectors. A factor can itself be
+    a product.
 
     **Arguments:**
 
@@ -47,12 +47,12 @@ class ProductGroup(AbstractLieGroup):
 
     @property
     def dim(self) -> int:
-        """Return the dimension of the product, the sum of those of the factors."""
+        """Return the dimension of the product, the sum of the factors' dimensions."""
         return sum(group.dim for group in self.factors)
 
     @property
     def is_flat(self) -> bool:
-        """Tell whether all factors are flat."""
+        """Return whether all factors are flat."""
         return all(group.is_flat for group in self.factors)
 
     def identity(self, dtype: DTypeLike | None = None) -> Element:
@@ -60,7 +60,7 @@ class ProductGroup(AbstractLieGroup):
         return tuple(group.identity(dtype) for group in self.factors)
 
     def check(self, q: Element, name: str = "q") -> Element:
-        """Return `q`, or raise a `ShapeError` unless it is a tuple of elements."""
+        """Return `q`, or raise a `ShapeError` if it is not a tuple of elements."""
         if not isinstance(q, tuple) or len(q) != len(self.factors):
             kinds = ", ".join(type(group).__name__ for group in self.factors)
             raise ShapeError(
@@ -72,18 +72,18 @@ class ProductGroup(AbstractLieGroup):
         return q
 
     def in_chart(self, xi: Vector) -> BoolScalar:
-        """Tell whether the vector of every factor lies in that factor's chart."""
-        inside = self._each(lambda group, x: group.in_chart(x), xi)
+        """Return whether every factor's vector lies in that factor's chart."""
+        inside = self._map(lambda group, x: group.in_chart(x), xi)
         return reduce(jnp.logical_and, inside)
 
     def distance_to_group(self, q: Element) -> FloatScalar:
-        """Compute the largest distance of a part of `q` to its factor."""
+        """Compute the largest distance of a part of `q` from its factor."""
         return reduce(
-            jnp.maximum, self._each(lambda group, g: group.distance_to_group(g), q)
+            jnp.maximum, self._map(lambda group, g: group.distance_to_group(g), q)
         )
 
     def normalise(self, q: Element) -> Element:
-        """Normalise the part of every factor."""
+        """Normalise every factor's part of `q`."""
         return self._tuple(lambda group, g: group.normalise(g), q)
 
     def compose(self, g: Element, h: Element) -> Element:
@@ -134,82 +134,82 @@ class ProductGroup(AbstractLieGroup):
 
     def matrix(self, g: Element) -> Float[Array, "k k"]:
         """Return the block-diagonal matrix of the factors' matrices of g."""
-        return block_diag(*self._each(lambda group, g: group.matrix(g), g))
+        return block_diag(*self._map(lambda group, g: group.matrix(g), g))
 
     def hat(self, xi: Vector) -> Float[Array, "k k"]:
         """Return the block-diagonal matrix of the factors' matrices ξ^."""
-        return block_diag(*self._each(lambda group, x: group.hat(x), xi))
+        return block_diag(*self._map(lambda group, x: group.hat(x), xi))
 
     def tangent(self, g: Element, eta: Vector) -> Element:
         """Compute the tuple of the factors' tangents T L_g η."""
         return self._tuple(lambda group, g, y: group.tangent(g, y), g, eta)
 
     def dtau(self, xi: Vector, eta: Vector) -> Vector:
-        """Apply the dτ of every factor, to its parts of the vectors."""
+        """Apply every factor's dτ to its parts of the vectors."""
         return self._vector(lambda group, x, y: group.dtau(x, y), xi, eta)
 
     def dtau_inv(self, xi: Vector, eta: Vector) -> Vector:
-        """Apply the dτ⁻¹ of every factor, to its parts of the vectors."""
+        """Apply every factor's dτ⁻¹ to its parts of the vectors."""
         return self._vector(lambda group, x, y: group.dtau_inv(x, y), xi, eta)
 
     def dtau_dual(self, xi: Vector, mu: Vector) -> Vector:
-        """Apply the dτ^* of every factor, to its parts of the vectors."""
+        """Apply every factor's dτ^* to its parts of the vectors."""
         return self._vector(lambda group, x, m: group.dtau_dual(x, m), xi, mu)
 
     def right_dtau_dual(self, xi: Vector, mu: Vector) -> Vector:
-        """Apply the (Ad_{τ(ξ)} dτ_ξ)^* of every factor, to its parts of the vectors."""
+        """Apply every factor's (Ad_{τ(ξ)} dτ_ξ)^* to its parts of the vectors."""
         return self._vector(lambda group, x, m: group.right_dtau_dual(x, m), xi, mu)
 
     def dtau_inv_dual(self, xi: Vector, mu: Vector) -> Vector:
-        """Apply the (dτ⁻¹)^* of every factor, to its parts of the vectors."""
+        """Apply every factor's (dτ⁻¹)^* to its parts of the vectors."""
         return self._vector(lambda group, x, m: group.dtau_inv_dual(x, m), xi, mu)
 
     def Ad(self, g: Element, eta: Vector) -> Vector:
-        """Apply the Ad_g of every factor, to its part of the vector."""
+        """Apply every factor's Ad_g to its part of the vector."""
         return self._vector(lambda group, g, y: group.Ad(g, y), g, eta)
 
     def Ad_dual(self, g: Element, mu: Vector) -> Vector:
-        """Apply the Ad_g^* of every factor, to its part of the covector."""
+        """Apply every factor's Ad_g^* to its part of the covector."""
         return self._vector(lambda group, g, m: group.Ad_dual(g, m), g, mu)
 
     def to_end(self, xi: Vector, mu: Vector) -> Vector:
-        """Apply the Ad_{τ(ξ)}^* of every factor, to its part of the covector."""
+        """Apply every factor's Ad_{τ(ξ)}^* to its part of the covector."""
         return self._vector(lambda group, x, m: group.to_end(x, m), xi, mu)
 
     def to_end_change(self, xi: Vector, mu: Vector) -> Vector:
-        """Compute the Ad_{τ(ξ)}^* μ - μ of every factor, concatenated."""
+        """Concatenate the factors' changes Ad_{τ(ξ)}^* μ - μ."""
         return self._vector(lambda group, x, m: group.to_end_change(x, m), xi, mu)
 
     def to_start(self, xi: Vector, mu: Vector) -> Vector:
-        """Apply the Ad_{τ(ξ)⁻¹}^* of every factor, to its part of the covector."""
+        """Apply every factor's Ad_{τ(ξ)⁻¹}^* to its part of the covector."""
         return self._vector(lambda group, x, m: group.to_start(x, m), xi, mu)
 
     def to_start_change(self, xi: Vector, mu: Vector) -> Vector:
-        """Compute the Ad_{τ(ξ)⁻¹}^* μ - μ of every factor, concatenated."""
+        """Concatenate the factors' changes Ad_{τ(ξ)⁻¹}^* μ - μ."""
         return self._vector(lambda group, x, m: group.to_start_change(x, m), xi, mu)
 
     def ad(self, xi: Vector, eta: Vector) -> Vector:
-        """Apply the ad_ξ of every factor, to its parts of the vectors."""
+        """Apply every factor's ad_ξ to its parts of the vectors."""
         return self._vector(lambda group, x, y: group.ad(x, y), xi, eta)
 
     def ad_dual(self, xi: Vector, mu: Vector) -> Vector:
-        """Apply the ad_ξ^* of every factor, to its parts of the vectors."""
+        """Apply every factor's ad_ξ^* to its parts of the vectors."""
         return self._vector(lambda group, x, m: group.ad_dual(x, m), xi, mu)
 
-    def _each(self, function: Callable[..., Any], *arguments: Any) -> list[Any]:
-        """Call a function with every factor and its parts of elements and vectors."""
+    def _map(self, function: Callable[..., Any], *arguments: Any) -> list[Any]:
+        """Call a function with each factor and its parts of the arguments."""
         parts = [a if isinstance(a, tuple) else self._split(a) for a in arguments]
         return [function(*part) for part in zip(self.factors, *parts, strict=True)]
 
     def _pair(self, function, *arguments) -> tuple[Element, Element]:
-        pairs = self._each(function, *arguments)
+        pairs = self._map(function, *arguments)
         return tuple(g for g, _ in pairs), tuple(c for _, c in pairs)
 
     def _tuple(self, function, *arguments) -> Element:
-        return tuple(self._each(function, *arguments))
+        return tuple(self._map(function, *arguments))
 
     def _vector(self, function, *arguments) -> Vector:
-        return jnp.concatenate(self._each(function, *arguments))
+        return jnp.concatenate(self._map(function, *arguments))
 
     def _split(self, vector: Vector) -> list[Array]:
         ends = accumulate(group.dim for group in self.factors)
@@ -218,7 +218,7 @@ class ProductGroup(AbstractLieGroup):
 
 def _check_factors(factors: tuple[object, ...]) -> None:
     if not factors:
-        raise ValueError("ProductGroup: give at least one factor.")
+        raise ValueError("ProductGroup: pass at least one factor.")
     for k, factor in enumerate(factors):
         if not isinstance(factor, AbstractLieGroup):
             raise TypeError(

@@ -1,29 +1,36 @@
+"""The retractions of groups of rotations and rigid motions, and their scalar functions.
+
+All scalar functions are smooth at the angle zero. They are functions of a square, so
+that no square root is differentiated at zero.
+"""
+
 from abc import abstractmethod
-from math import pi, tan
+from functools import partial
+from math import factorial, pi, tan
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from .._custom_types import BoolScalar, FloatScalar
-from ._series import arctan_ratio, stumpff
 
 
-# How far, in radians of rotation, the chart stays away from where τ is singular.
+# The chart ends at this distance from the singularity of τ, in radians of rotation.
 _MARGIN = 0.05
 
 
 class AbstractRetraction(eqx.Module):
     """A retraction τ: 𝔤 -> G with τ(0) = e and dτ_0 = I, for groups of motions.
 
-    A retraction is given by scalar functions of the rotation vector ω or of s = |ω|².
-    The formulas of all groups are made of these functions, so that the groups of the
-    plane use the same ones as those of space.
+    A retraction consists of scalar functions of the rotation vector ω or of s = |ω|².
+    The planar and the spatial groups build all their formulas from these functions.
 
     - `angle`, `rate`, `plane_rotation`, `half_rotation` and `rotation_vector` describe
       the rotation τ(ω);
-    - `dtau_coefficients` are those of dτ_ω η = α η - β ω × η + γ (ω·η) ω;
-    - `dtau_inv_coefficients` are those of dτ_ω⁻¹ η = α η + ½ ω × η + γ (ω·η) ω.
+    - `dtau_coefficients` returns α, β, γ in dτ_ω η = α η - β ω × η + γ (ω·η) ω;
+    - `dtau_inv_coefficients` returns α, γ in dτ_ω⁻¹ η = α η + ½ ω × η + γ (ω·η) ω.
     """
 
     @abstractmethod
@@ -32,7 +39,7 @@ class AbstractRetraction(eqx.Module):
 
     @abstractmethod
     def rate(self, angle: Array) -> Array:
-        """Compute the ω whose plane rotation τ(ω) has this angle."""
+        """Compute the rate ω for which the plane rotation τ(ω) has this angle."""
 
     @abstractmethod
     def plane_rotation(self, omega: FloatScalar) -> tuple[FloatScalar, FloatScalar]:
@@ -49,7 +56,7 @@ class AbstractRetraction(eqx.Module):
     def rotation_vector(
         self, w: FloatScalar, v: Float[Array, "3"]
     ) -> Float[Array, "3"]:
-        """Compute the shortest ω that gives the rotation of the quaternion (w, v)."""
+        """Compute the shortest ω for which τ(ω) is the rotation of the quaternion."""
 
     @abstractmethod
     def dtau_coefficients(
@@ -65,14 +72,14 @@ class AbstractRetraction(eqx.Module):
 
     @abstractmethod
     def in_chart(self, s: FloatScalar) -> BoolScalar:
-        """Tell whether the rotation is well inside the domain where τ is invertible."""
+        """Return whether τ is invertible at the rotation, with a margin."""
 
 
 class Cayley(AbstractRetraction):
     """The Cayley map τ(ξ) = (I - ξ^/2)⁻¹ (I + ξ^/2) of the group's matrices.
 
-    It needs no transcendental function, and its derivatives are rational. A rotation
-    by |ω| becomes one by 2 arctan(|ω|/2), so that the chart ends at the angle π.
+    It uses only rational functions and square roots. The vector ω gives a rotation by
+    the angle 2 arctan(|ω|/2), so that the chart ends at the angle π.
 
     !!! example
 
@@ -87,7 +94,7 @@ class Cayley(AbstractRetraction):
         return 2 * jnp.arctan(0.5 * omega)
 
     def rate(self, angle: Array) -> Array:
-        """Compute the ω = 2 tan(θ/2) of an angle θ."""
+        """Compute the rate ω = 2 tan(θ/2) of an angle θ."""
         return 2 * jnp.tan(0.5 * angle)
 
     def plane_rotation(self, omega: FloatScalar) -> tuple[FloatScalar, FloatScalar]:
@@ -103,7 +110,7 @@ class Cayley(AbstractRetraction):
     def rotation_vector(
         self, w: FloatScalar, v: Float[Array, "3"]
     ) -> Float[Array, "3"]:
-        """Compute the ω = 2v/w of the quaternion (w, v)."""
+        """Compute ω = 2v/w for the quaternion (w, v)."""
         return 2 * v / w
 
     def dtau_coefficients(
@@ -120,14 +127,14 @@ class Cayley(AbstractRetraction):
         return 1.0, 0.25
 
     def in_chart(self, s: FloatScalar) -> BoolScalar:
-        """Tell whether the angle 2 arctan(√s/2) is less than π by a margin."""
+        """Return whether the angle 2 arctan(√s/2) is less than π by a margin."""
         return s < (2 * tan((pi - _MARGIN) / 2)) ** 2
 
 
 class Exponential(AbstractRetraction):
     """The exponential map τ(ξ) = exp(ξ^).
 
-    The chart ends where dτ becomes singular, at rotations by 2π.
+    The chart ends at rotations by 2π, where dτ becomes singular.
 
     !!! example
 
@@ -138,11 +145,11 @@ class Exponential(AbstractRetraction):
     """
 
     def angle(self, omega: Array) -> Array:
-        """Return ω, which is the angle itself."""
+        """Return ω, because the angle is ω."""
         return omega
 
     def rate(self, angle: Array) -> Array:
-        """Return the angle θ, which is ω itself."""
+        """Return the angle θ, because ω = θ."""
         return angle
 
     def plane_rotation(self, omega: FloatScalar) -> tuple[FloatScalar, FloatScalar]:
@@ -158,9 +165,8 @@ class Exponential(AbstractRetraction):
     def rotation_vector(
         self, w: FloatScalar, v: Float[Array, "3"]
     ) -> Float[Array, "3"]:
-        """Compute ω = 2 arctan(|v|/w) v/|v|, by the tangent of half the angle."""
-        # The quaternions q and -q are the same rotation; this takes the one with the
-        # shorter ω.
+        """Compute ω = 2 arctan(|v|/w) v/|v| from the tangent of half of the angle."""
+        # The quaternions q and -q are the same rotation: use the one with shorter ω.
         sign = jnp.where(w < 0, -1.0, 1.0).astype(w.dtype)
         v, w = sign * v, 1 + sign * w
         return 4 * arctan_ratio(jnp.sum(v**2) / w**2) / w * v
@@ -168,7 +174,7 @@ class Exponential(AbstractRetraction):
     def dtau_coefficients(
         self, s: FloatScalar
     ) -> tuple[FloatScalar, FloatScalar, FloatScalar | float]:
-        """Compute the coefficients of dτ, Stumpff's functions c_1, c_2 and c_3."""
+        """Compute the coefficients of dτ, the Stumpff functions c_1, c_2 and c_3."""
         c = stumpff(s, 4)
         return c[1], c[2], c[3]
 
@@ -177,27 +183,94 @@ class Exponential(AbstractRetraction):
     ) -> tuple[FloatScalar | float, FloatScalar | float]:
         """Compute α = (θ/2) cot(θ/2) and γ = (1 - α)/θ² of dτ⁻¹, with θ² = s."""
         c = stumpff(0.25 * s, 4)
-        # This avoids cancellation in 1 - α by c_1 - c_0 = θ²/4 (c_2 - c_3) at θ²/4.
+        # By c_1 - c_0 = θ²/4 (c_2 - c_3) at θ²/4, 1 - α is free of cancellation.
         return c[0] / c[1], 0.25 * (c[2] - c[3]) / c[1]
 
     def in_chart(self, s: FloatScalar) -> BoolScalar:
-        """Tell whether the angle √s is less than 2π by a margin."""
+        """Return whether the angle √s is less than 2π by a margin."""
         return s < (2 * pi - _MARGIN) ** 2
 
 
 def check_retraction(group: str, retraction: object) -> None:
-    """Raise unless `retraction` is one of those for which the groups have formulas."""
+    """Raise if the groups have no formulas for `retraction`."""
     if type(retraction) in (Cayley, Exponential):
         return
     allowed = "Cayley() and Exponential()"
     if isinstance(retraction, AbstractRetraction):
         raise ValueError(
             f"{group}: `retraction` is {retraction!r}, but {group} has formulas for "
-            f"{allowed} only. For another retraction subclass `AbstractLieGroup`."
+            f"{allowed} only. For another retraction, subclass `AbstractLieGroup`."
         )
     hint = ""
     if isinstance(retraction, type) and issubclass(retraction, AbstractRetraction):
-        hint = " It is the class; call it to make an instance."
+        hint = " It is a class; call it to create an instance."
     raise TypeError(
         f"{group}: `retraction` must be one of {allowed}, got {retraction!r}.{hint}"
     )
+
+
+# The series is used for s below this value. Above it the recursion is equally accurate,
+# because it divides its rounding errors by s.
+_SWITCH = 2.0
+
+# The first omitted term of the series is at most 2e-18, for c_0 at the switch.
+_NUM_TERMS = 11
+
+
+@partial(jax.custom_jvp, nondiff_argnums=(1,))
+def stumpff(s: FloatScalar, n: int) -> Float[Array, " n"]:
+    """Compute the Stumpff functions c_k(s) = Σ_j (-s)^j / (2j + k)! for k < n.
+
+    For s = θ² >= 0 these functions are c_0 = cos θ, c_1 = sin θ / θ,
+    c_2 = (1 - cos θ)/θ² and c_3 = (θ - sin θ)/θ³. Their derivatives
+    2 c_k' = k c_{k+2} - c_{k+1} belong to the same family. The custom derivative rule
+    uses this identity, so that derivatives are as accurate as values.
+    """
+    small = s < _SWITCH
+    series = _horner(_coefficients(n, s.dtype), jnp.where(small, s, 0.0))
+    return jnp.where(small, series, _recursion(jnp.where(small, _SWITCH, s), n))
+
+
+@stumpff.defjvp
+def _(n, primals, tangents):
+    (s,), (ds,) = primals, tangents
+    c = stumpff(s, n + 2)
+    slope = 0.5 * (np.arange(n, dtype=s.dtype) * c[2:] - c[1:-1])
+    return c[:n], slope * ds
+
+
+def _coefficients(n, dtype):
+    return [
+        np.array([(-1) ** j / factorial(2 * j + k) for k in range(n)], dtype)
+        for j in range(_NUM_TERMS)
+    ]
+
+
+def _recursion(s, n):
+    """Compute c_0 by cos, c_1 by sin, the others by s c_k = 1/(k-2)! - c_{k-2}."""
+    theta = jnp.sqrt(s)
+    c = [jnp.cos(theta), jnp.sin(theta) / theta]
+    for k in range(2, n):
+        c.append((1 / factorial(k - 2) - c[k - 2]) / s)
+    return jnp.stack(c[:n])
+
+
+def _horner(coefficients, x):
+    *lower, total = coefficients
+    for c in reversed(lower):
+        total = c + x * total
+    return total
+
+
+def arctan_ratio(x: FloatScalar) -> FloatScalar:
+    """Compute arctan(√x)/√x for 0 <= x <= 1.
+
+    Halving the angle twice reduces √x to at most tan(π/16), where one short series is
+    accurate. There is no branch, so that derivatives of all orders exist.
+    """
+    scale = 1.0
+    for _ in range(2):
+        half = 1 + jnp.sqrt(1 + x)
+        scale = scale * 2 / half
+        x = x / half**2
+    return scale * _horner([(-1) ** j / (2 * j + 1) for j in range(15)], x)

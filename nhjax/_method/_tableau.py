@@ -4,18 +4,42 @@ A collocation tableau on nodes c_1 < ... < c_s has
 
     a_ij = ∫_0^{c_i} ℓ_j(θ) dθ,    b_j = ∫_0^1 ℓ_j(θ) dθ,
 
-with ℓ_j the Lagrange basis on the nodes (Hairer, Lubich, Wanner, "Geometric Numerical
-Integration", II.1.2). The symplectic conjugate is â_ij = b_j (1 - a_ji / b_i)
-(ibid., VI.4.1); that of Lobatto IIIA is Lobatto IIIB.
+where ℓ_j is the Lagrange basis on the nodes (Hairer, Lubich, Wanner, "Geometric
+Numerical Integration", II.1.2). The symplectic conjugate is â_ij = b_j (1 - a_ji / b_i)
+(ibid., VI.4.1); the conjugate of Lobatto IIIA is Lobatto IIIB.
+
+For dense output, the Lagrange basis is expanded in Legendre polynomials of x = 2θ - 1,
+ℓ_j(θ) = Σ_n K_nj P_n(x). The coefficients K_nj are of order one for every s, where
+monomials would cancel. The integral of the basis is
+
+    ∫_0^θ ℓ_j = θ K_0j - 2 θ (1 - θ) Σ_{n>=1} K_nj P_n'(x) / (n (n + 1)),
+
+by Legendre's equation ((1 - x²) P_n')' = -n (n + 1) P_n. It is exactly 0 at θ = 0 and
+exactly K_0j, the weight b_j of a collocation method, at θ = 1.
 """
 
+import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache, cached_property, lru_cache
+from typing import Any, TypeAlias
 
+import jax
+import jax.numpy as jnp
+import mpmath
 import numpy as np
+from jax.typing import ArrayLike
+from jaxtyping import Array, Float
 
-from ._nodes import gauss_points, legendre, lobatto_points
-from ._precision import CONTEXT, Matrix, Number, to_float64
+
+# A context of its own, independent of a user's `mpmath.mp.dps`. With 60 digits, order
+# conditions can be checked to 1e-40 with 20 digits to spare.
+CONTEXT = mpmath.MPContext()
+CONTEXT.dps = 60
+
+# mpmath creates the classes of numbers and matrices for each context.
+Number: TypeAlias = Any
+Matrix: TypeAlias = Any
 
 
 BUILT_IN_TOLERANCE = CONTEXT.mpf("1e-40")
@@ -26,10 +50,11 @@ USER_TOLERANCE = CONTEXT.mpf("1e-13")
 class Tableau:
     """A Runge-Kutta tableau (a, b, c) with its symplectic conjugate â.
 
-    The fields hold mp numbers (`mp_a` an s x s matrix, `mp_b` and `mp_c` lists);
-    `tolerance` is the defect below which an identity between them counts as satisfied:
-    round-off of the 60 digits for built-in tableaux, of float64 for a user's.
-    Instances compare and hash by identity; the functions that make them are cached.
+    The fields hold mpmath numbers: `mp_a` is an s x s matrix, `mp_b` and `mp_c` are
+    lists. An identity between them counts as satisfied if its defect is at most
+    `tolerance`, the round-off of 60 digits for built-in tableaux and of float64 for a
+    user's tableau. Instances compare and hash by identity; the functions that create
+    them are cached.
     """
 
     mp_a: Matrix
@@ -44,12 +69,12 @@ class Tableau:
 
     @cached_property
     def mp_a_hat(self) -> Matrix:
-        """Compute the symplectic conjugate â_ij = b_j (1 - a_ji / b_i) as mp matrix."""
+        """Compute the symplectic conjugate â_ij = b_j (1 - a_ji / b_i)."""
         a, b, s = self.mp_a, self.mp_b, self.stages
         a_hat = CONTEXT.matrix(s, s)
         for i in range(s):
             for j in range(s):
-                # Where a_ji = b_i the entry is a true zero (hypothesis H1'), which
+                # If a_ji = b_i (hypothesis H1') the entry is exactly zero, which
                 # b_j - b_j a_ji / b_i would miss by one unit of the last digit.
                 if a[j, i] != b[i]:
                     a_hat[i, j] = b[j] * (1 - a[j, i] / b[i])
@@ -79,16 +104,16 @@ class Tableau:
 def lagrange_in_legendre(nodes: list[Number]) -> Matrix:
     """Expand the Lagrange basis in the shifted Legendre polynomials on [0, 1].
 
-    The coefficients K_nj are those in ℓ_j(θ) = Σ_n K_nj P_n(2θ - 1), which means that
-    K = V^{-1} with V_in = P_n(2 c_i - 1).
+    The coefficients K_nj satisfy ℓ_j(θ) = Σ_n K_nj P_n(2θ - 1), so that K = V^{-1} with
+    V_in = P_n(2 c_i - 1).
 
     **Arguments:**
 
-    - `nodes`: the distinct nodes c_1..c_s in [0, 1], mp numbers.
+    - `nodes`: the distinct nodes c_1..c_s in [0, 1], mpmath numbers.
 
     **Returns:**
 
-    The s x s mp matrix K.
+    The s x s mpmath matrix K.
     """
     s = len(nodes)
     vandermonde = CONTEXT.matrix([legendre(s - 1, 2 * c - 1) for c in nodes])
@@ -105,21 +130,22 @@ def _integrated_legendre(degree: int, x: Number) -> list[Number]:
 
 
 def _collocation(points: list[Number]) -> Tableau:
-    """Make the collocation tableau with nodes (1 + x) / 2, x in symmetric `points`."""
+    """Build the collocation tableau with nodes (1 + x) / 2, x in symmetric `points`."""
     s = len(points)
     nodes = [(1 + x) / 2 for x in points]
     k = lagrange_in_legendre(nodes)
     integrals = CONTEXT.matrix([_integrated_legendre(s - 1, x) for x in points])
-    # P_0 alone has a non-zero integral over [0, 1].
+    # Only P_0 has a nonzero integral over [0, 1].
     b = [(k[0, j] + k[0, s - 1 - j]) / 2 for j in range(s)]
     raw = integrals * k
     a = CONTEXT.matrix(s, s)
     for i in range(s):
         for j in range(s):
-            # Reflection maps a_ij to b_j - a_{s+1-i,s+1-j}; the average is invariant.
+            # Average a_ij with its reflection b_j - a_{s+1-i,s+1-j}, which equals it in
+            # exact arithmetic, so that the result is exactly symmetric.
             a[i, j] = (raw[i, j] + b[j] - raw[s - 1 - i, s - 1 - j]) / 2
     if points[0] == -1:
-        # The integrals to c_1 = 0 and c_s = 1, without the last-digit error of a sum.
+        # The integrals to c_1 = 0 and c_s = 1 are known exactly.
         for j in range(s):
             a[0, j], a[s - 1, j] = CONTEXT.mpf(0), b[j]
     return Tableau(a, b, nodes, BUILT_IN_TOLERANCE)
@@ -127,7 +153,7 @@ def _collocation(points: list[Number]) -> Tableau:
 
 @cache
 def lobatto_tableau(stages: int) -> Tableau:
-    """Make the tableau of the Lobatto IIIA method with s stages.
+    """Build the tableau of the Lobatto IIIA method with s stages.
 
     It is collocation at 0, 1 and the s - 2 zeros of P'_{s-1}(2c - 1) (Hairer, Lubich,
     Wanner, II.1.4). Its symplectic conjugate is Lobatto IIIB.
@@ -138,7 +164,7 @@ def lobatto_tableau(stages: int) -> Tableau:
 
     **Returns:**
 
-    A `Tableau`, the same object at every call. Row 1 of `a` is zero and row s is `b`.
+    A `Tableau`; equal calls return the same object. Row 1 of `a` is 0, row s is `b`.
 
     !!! example
 
@@ -150,7 +176,7 @@ def lobatto_tableau(stages: int) -> Tableau:
 
 @cache
 def gauss_tableau(stages: int) -> Tableau:
-    """Make the tableau of the Gauss method with s stages.
+    """Build the tableau of the Gauss method with s stages.
 
     It is collocation at the s zeros of P_s(2c - 1) (Hairer, Lubich, Wanner, II.1.3),
     and its own symplectic conjugate.
@@ -161,7 +187,7 @@ def gauss_tableau(stages: int) -> Tableau:
 
     **Returns:**
 
-    A `Tableau`, the same object at every call.
+    A `Tableau`; equal calls return the same object.
 
     !!! example
 
@@ -173,12 +199,12 @@ def gauss_tableau(stages: int) -> Tableau:
 
 @lru_cache(maxsize=128)
 def user_tableau(a: tuple[tuple[float, ...], ...], b: tuple[float, ...]) -> Tableau:
-    """Make a tableau with c_i = Σ_j a_ij from float64 coefficients, taken as exact.
+    """Build a tableau with c_i = Σ_j a_ij from float64 coefficients, taken as exact.
 
     **Arguments:**
 
     - `a`: the rows of the coefficients.
-    - `b`: the weights, none of them zero.
+    - `b`: the weights, which must not be zero.
 
     **Returns:**
 
@@ -193,3 +219,192 @@ def user_tableau(a: tuple[tuple[float, ...], ...], b: tuple[float, ...]) -> Tabl
     mp_b = [CONTEXT.mpf(x) for x in b]
     mp_c = [CONTEXT.fsum(mp_a[i, j] for j in range(len(b))) for i in range(len(b))]
     return Tableau(mp_a, mp_b, mp_c, USER_TOLERANCE)
+
+
+def legendre(degree: int, x: Number) -> list[Number]:
+    """Evaluate the Legendre polynomials P_0(x), ..., P_degree(x) by their recurrence.
+
+    **Arguments:**
+
+    - `degree`: the highest degree.
+    - `x`: an mpmath number, or any number with exact integer multiples.
+
+    **Returns:**
+
+    A list of `degree + 1` values.
+    """
+    values = [x * 0 + 1, x]
+    for n in range(1, degree):
+        values.append(((2 * n + 1) * x * values[n] - n * values[n - 1]) / (n + 1))
+    return values[: degree + 1]
+
+
+def lobatto_points(stages: int) -> list[Number]:
+    """Compute the Lobatto points on [-1, 1]: -1, the zeros of P'_{s-1}, and 1.
+
+    They are exactly symmetric about 0 and in increasing order.
+
+    **Arguments:**
+
+    - `stages`: s >= 2.
+
+    **Returns:**
+
+    A list of s mpmath numbers.
+    """
+    n = stages - 1
+
+    def derivative(x: Number) -> tuple[Number, Number]:
+        p = legendre(n, x)
+        # (1 - x²) P_n' = n (P_{n-1} - x P_n) and Legendre's equation for P_n''.
+        first = n * (p[n - 1] - x * p[n]) / (1 - x * x)
+        return first, (2 * x * first - n * (n + 1) * p[n]) / (1 - x * x)
+
+    guesses = [math.cos(math.pi * k / n) for k in range(1, stages // 2)]
+    inner = [_newton(derivative, g) for g in guesses]
+    return _mirrored([CONTEXT.mpf(1), *inner], stages)
+
+
+def gauss_points(stages: int) -> list[Number]:
+    """Compute the Gauss points on [-1, 1], the zeros of P_s.
+
+    They are exactly symmetric about 0 and in increasing order.
+
+    **Arguments:**
+
+    - `stages`: s >= 1.
+
+    **Returns:**
+
+    A list of s mpmath numbers.
+    """
+
+    def polynomial(x: Number) -> tuple[Number, Number]:
+        p = legendre(stages, x)
+        slope = stages * (p[stages - 1] - x * p[stages]) / (1 - x * x)
+        return p[stages], slope
+
+    guesses = [
+        math.cos(math.pi * (k - 0.25) / (stages + 0.5))
+        for k in range(1, stages // 2 + 1)
+    ]
+    return _mirrored([_newton(polynomial, g) for g in guesses], stages)
+
+
+def _newton(f: Callable[[Number], tuple[Number, Number]], guess: float) -> Number:
+    """Find the root of `f` near `guess`; `f` returns its value and derivative."""
+    x = CONTEXT.mpf(guess)
+    for _ in range(100):
+        value, slope = f(x)
+        step = value / slope
+        x = x - step
+        # Newton's method converges quadratically: the error after this step is far
+        # below 1e-60.
+        if abs(step) < CONTEXT.mpf("1e-40"):
+            return x
+    raise RuntimeError("Newton's iteration for the nodes of a tableau did not converge")
+
+
+def _mirrored(right: list[Number], count: int) -> list[Number]:
+    """Build all points, exactly symmetric and increasing, from the positive ones."""
+    centre = [CONTEXT.mpf(0)] if count % 2 else []
+    return [-x for x in right] + centre + right[::-1]
+
+
+def to_float64(x: Matrix | list[Number]) -> np.ndarray:
+    """Round mpmath numbers to the nearest float64, as a read-only array.
+
+    **Arguments:**
+
+    - `x`: an mpmath matrix, or a list of mpmath numbers.
+
+    **Returns:**
+
+    A float64 array of shape `(rows, cols)`, or `(len(x),)` for a list.
+    """
+    rows = x if isinstance(x, list) else x.tolist()
+    array = np.array(
+        [[float(e) for e in r] if isinstance(r, list) else float(r) for r in rows],
+        dtype=np.float64,
+    )
+    array.setflags(write=False)
+    return array
+
+
+@lru_cache(maxsize=128)
+def _basis_coefficients(t: Tableau) -> tuple[np.ndarray, np.ndarray]:
+    """Compute K and the rows -2 K_nj / (n (n + 1)), n = 1..s-1, rounded once."""
+    s, c = t.stages, t.mp_c
+    for i in range(s):
+        for j in range(i):
+            if abs(c[i] - c[j]) <= t.tolerance:
+                raise ValueError(
+                    f"c = {t.c.tolist()} has equal entries c_{j + 1} and c_{i + 1}: "
+                    "the Lagrange basis needs distinct nodes"
+                )
+    k = lagrange_in_legendre(c)
+    integrated = CONTEXT.matrix(s, s)
+    for n in range(1, s):
+        for j in range(s):
+            integrated[n, j] = -2 * k[n, j] / (n * (n + 1))
+    return to_float64(k), to_float64(integrated)[1:]
+
+
+def _as_floating(theta: ArrayLike) -> Array:
+    array = jnp.asarray(theta)
+    if jnp.issubdtype(array.dtype, jnp.floating):
+        return array
+    return array.astype(jnp.result_type(float))
+
+
+def _combine(polynomials: list[Array], coefficients: np.ndarray) -> Array:
+    # The default precision on a GPU may be TensorFloat-32.
+    values = jnp.stack(polynomials, axis=-1)
+    return jnp.matmul(
+        values,
+        jnp.asarray(coefficients, values.dtype),
+        precision=jax.lax.Precision.HIGHEST,
+    )
+
+
+def lagrange(t: Tableau, theta: ArrayLike) -> Float[Array, "*batch s"]:
+    """Evaluate the Lagrange basis ℓ_1(θ), ..., ℓ_s(θ) on the nodes of a tableau.
+
+    **Arguments:**
+
+    - `t`: a tableau with distinct nodes.
+    - `theta`: θ, of any shape. It may be traced, and may lie outside [0, 1].
+
+    **Returns:**
+
+    An array of shape `theta.shape + (s,)` and of the dtype of `theta`.
+
+    **Raises:**
+
+    `ValueError` if two nodes coincide.
+    """
+    coefficients, _ = _basis_coefficients(t)
+    x = 2 * _as_floating(theta) - 1
+    p = [jnp.ones_like(x), x]
+    for n in range(1, t.stages - 1):
+        p.append(((2 * n + 1) * x * p[n] - n * p[n - 1]) / (n + 1))
+    return _combine(p[: t.stages], coefficients)
+
+
+def integrated_lagrange(t: Tableau, theta: ArrayLike) -> Float[Array, "*batch s"]:
+    """Evaluate the integrals ∫_0^θ ℓ_1, ..., ∫_0^θ ℓ_s of the Lagrange basis.
+
+    Arguments, result and errors are the same as for `lagrange`.
+    """
+    coefficients, integrated = _basis_coefficients(t)
+    fraction = _as_floating(theta)
+    x = 2 * fraction - 1
+    linear = _combine([fraction], coefficients[:1])
+    if t.stages == 1:
+        return linear
+    # P_1', P_2', ... are the Gegenbauer polynomials C^(3/2).
+    d = [jnp.ones_like(x), 3 * x]
+    for n in range(2, t.stages - 1):
+        d.append(((2 * n + 1) * x * d[n - 1] - (n + 1) * d[n - 2]) / n)
+    bubble = fraction * (1 - fraction)
+    return linear + _combine([bubble * p for p in d[: t.stages - 1]], integrated)

@@ -1,4 +1,3 @@
-"""Models that other libraries describe, as systems: those of SymPy."""
+"""Mechanical systems imported from models of other libraries, so far of SymPy."""
 
-from ._from_sympy import from_sympy as from_sympy
-from ._model import SymPyModel as SymPyModel
+from ._from_sympy import from_sympy as from_sympy, SymPyModel as SymPyModel

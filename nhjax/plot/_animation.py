@@ -6,7 +6,7 @@ from typing import Any, TYPE_CHECKING
 import numpy as np
 from jaxtyping import Float
 
-from ..diagnostics import numbers
+from ..diagnostics import real_array
 from ._axes import new_axes
 
 
@@ -118,7 +118,7 @@ def animate(
 
 
 def _times(ts: Any) -> np.ndarray:
-    times = numbers("ts", ts)
+    times = real_array("ts", ts)
     if times.ndim != 1 or times.size < 2:
         raise ValueError(
             "`ts` must hold two or more times of one trajectory, got shape "

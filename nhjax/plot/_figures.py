@@ -11,10 +11,10 @@ from .._custom_types import Args
 from .._integrate import Solution
 from .._system import AbstractMechanicalSystem
 from ..diagnostics import (
-    check_system,
+    check_is_system,
     energy_error,
     map_over_axes,
-    numbers,
+    real_array,
     saved_states,
 )
 from ._axes import new_axes
@@ -163,7 +163,7 @@ def constraint(
 
     **Raises:** `ValueError` if `sol` holds no states.
     """
-    check_system(system)
+    check_is_system(system)
     ts, ys = saved_states(sol)
 
     violation = map_over_axes(
@@ -207,7 +207,7 @@ def convergence(
         >>> import nhjax
         >>> ax = nhjax.plot.convergence([0.2, 0.1], [1.6e-3, 1e-4], order=4)
     """
-    h, e = np.abs(numbers("step_sizes", step_sizes)), numbers("errors", errors)
+    h, e = np.abs(real_array("step_sizes", step_sizes)), real_array("errors", errors)
     if h.ndim != 1 or h.shape != e.shape:
         raise ValueError(
             "`step_sizes` and `errors` must be vectors of one length, got shapes "

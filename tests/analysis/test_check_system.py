@@ -1,4 +1,4 @@
-"""The report on a system, for systems whose properties are known."""
+"""The report of `check_system` for systems with known properties."""
 
 import jax
 import jax.numpy as jnp
@@ -14,22 +14,22 @@ def report_of(example):
     return nhjax.check_system(example.system, example.q0, example.v0)
 
 
-def test_a_disc_in_coordinates_and_on_its_group():
+def test_check_system_of_a_disc_reports_its_invariances():
     report = report_of(VerticalRollingDisc())
     assert report.dimension == 4
     assert (report.num_nonholonomic, report.num_holonomic) == (2, 0)
     assert report.degrees_of_freedom == 2
-    # Its place and its roll angle; the heading turns the constraints.
+    # Position and roll angle are ignorable; the constraints depend on the heading.
     assert report.ignorable == (0, 1, 2)
     assert report.constant == ("mass matrix",)
     assert report.depends_on_time == report.dependent == ()
-    # On the group nothing depends on the configuration at all.
+    # On the group no function depends on the configuration.
     report = report_of(RollingDisc())
     assert report.ignorable == (0, 1, 2, 3)
     assert len(report.constant) == 2
 
 
-def test_a_pendulum_on_its_sphere():
+def test_check_system_of_a_spherical_pendulum_reports_its_constraint():
     pendulum = SphericalPendulum(2.0, q0=(0.0, 0.6, -0.8), v0=(1.0, 0.0, 0.0))
     report = report_of(pendulum)
     assert (report.num_nonholonomic, report.num_holonomic) == (0, 1)
@@ -42,17 +42,17 @@ def test_a_pendulum_on_its_sphere():
     assert "largest violation              Γ[0] = -0.15" in str(report)
 
 
-def test_what_depends_on_time():
+def test_check_system_reports_functions_that_depend_on_time():
     report = nhjax.check_system(
         DRIVEN.system, jnp.ones(3), jnp.ones(3), t=0.3, args=ARGS
     )
     assert report.depends_on_time == ("lagrangian", "nonholonomic")
-    # The mass grows, the constraint turns.
+    # The mass grows and the constraint rotates.
     assert report.constant == ()
     assert report.ignorable == ()
 
 
-def test_conditioning_of_the_masses():
+def test_check_system_reports_the_condition_of_the_mass_matrix():
     body = HeavyTop()
     assert report_of(body).mass_condition == pytest.approx(1.0)
 
@@ -65,7 +65,7 @@ def test_conditioning_of_the_masses():
     assert report.compatibility_condition == 1.0
 
 
-def test_a_singular_mass_matrix_and_dependent_constraints_are_reported():
+def test_check_system_reports_singular_mass_and_dependent_constraints():
     def lagrangian(t, q, v, args):
         return 0.5 * v[0] ** 2 - q @ q
 
@@ -79,7 +79,7 @@ def test_a_singular_mass_matrix_and_dependent_constraints_are_reported():
     assert "dependent constraints          Φ[0], Φ[2]" in str(report)
 
 
-def test_a_hamiltonian_system_is_like_its_lagrangian():
+def test_check_system_of_a_hamiltonian_agrees_with_its_lagrangian():
     start = in_space("nonholonomic", in_time=True)
     y = start.y0
     one = nhjax.check_system(start.forms["lagrangian"], y.q, y.v, t=0.3)
@@ -93,9 +93,9 @@ def test_a_hamiltonian_system_is_like_its_lagrangian():
         assert getattr(one, name) == pytest.approx(getattr(other, name), rel=1e-9)
 
 
-def test_wrong_arguments_are_named():
+def test_check_system_with_wrong_arguments_raises_naming_them():
     disc = VerticalRollingDisc()
-    with pytest.raises(ValueError, match="Give `v`, the fibre coordinate"):
+    with pytest.raises(ValueError, match="Pass `v`, the fibre coordinate"):
         nhjax.check_system(disc.system, disc.q0, p=disc.v0)
     with pytest.raises(nhjax.ShapeError, match="`v` has shape"):
         nhjax.check_system(disc.system, disc.q0, jnp.ones(3))
@@ -103,7 +103,7 @@ def test_wrong_arguments_are_named():
         nhjax.check_system(disc, disc.q0, disc.v0)  # pyright: ignore[reportArgumentType]
 
 
-def test_what_is_not_finite_and_wrong_shapes_are_told():
+def test_check_system_with_nonfinite_or_misshaped_values_raises():
     def hidden(t, q, v, args):
         return jnp.stack([v[0] - 1, v[1] + 0 * jnp.sqrt(q[0] - 5)])
 
@@ -117,5 +117,5 @@ def test_what_is_not_finite_and_wrong_shapes_are_told():
     vector = nhjax.LagrangianSystem(lambda t, q, v, args: v)
     with pytest.raises(nhjax.ShapeError, match="must return shape"):
         nhjax.check_system(vector, jnp.zeros(2), jnp.zeros(2))
-    with pytest.raises(TypeError, match=r"outside of `jax\.jit`"):
+    with pytest.raises(TypeError, match=r"outside `jax\.jit`"):
         jax.jit(lambda q: nhjax.check_system(system, q, q).dimension)(jnp.zeros(2))

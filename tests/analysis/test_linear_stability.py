@@ -1,4 +1,4 @@
-"""Eigenvalues of linearised motions against closed forms and one-step maps."""
+"""Eigenvalues of linearised motions compared with closed forms and one-step maps."""
 
 import jax
 import jax.numpy as jnp
@@ -22,7 +22,7 @@ def conical(system, angle):
 
 
 @pytest.mark.parametrize("form", ["lagrangian", "hamiltonian"])
-def test_frequency_of_a_conical_pendulum(form):
+def test_linear_stability_of_a_conical_pendulum_has_the_exact_frequency(form):
     system, angle = polar_pendulum()[form], jnp.asarray(0.7)
 
     def frequency(angle):
@@ -42,7 +42,7 @@ def test_frequency_of_a_conical_pendulum(form):
     np.testing.assert_allclose(slope, jax.grad(expected)(angle), rtol=1e-12)
 
 
-def test_holonomic_constraints_leave_two_of_three_coordinates():
+def test_linear_stability_with_holonomic_constraint_is_reduced():
     pendulum = SphericalPendulum(
         2.0, 0.5, GRAVITY, q0=(0.0, 0.0, -0.5), v0=(0.0, 0.0, 0.0)
     )
@@ -63,13 +63,13 @@ def test_holonomic_constraints_leave_two_of_three_coordinates():
     )
 
 
-def test_rotation_about_the_middle_axis_is_unstable():
+def test_linear_stability_of_rotation_about_the_middle_axis_is_unstable():
     moments = i1, i2, i3 = np.array([3.0, 2.0, 1.0])
     body = FreeRigidBody(moments, v0=(0.0, 1.3, 0.0))
     stability = nhjax.linear_stability(body.system, 0.0, body.initial_state())
     growth = 1.3 * np.sqrt((i1 - i2) * (i2 - i3) / (i1 * i3))
     found = np.asarray(stability.eigenvalues)
-    # Attitudes turn with the body, at its own rate; three more are neutral.
+    # Attitude perturbations rotate with the body at its rate; three more are neutral.
     expected = [-growth, growth, 0, 0, -1.3j, 1.3j]
     distance = np.abs(found[:, None] - np.asarray(expected))
     assert np.max(np.min(distance, axis=0)) < 1e-7
@@ -81,10 +81,10 @@ def test_rotation_about_the_middle_axis_is_unstable():
     np.testing.assert_allclose(mode, [1, 0, ratio], rtol=0, atol=1e-13)
 
 
-def test_eigenvalues_are_those_of_a_step():
+def test_linear_stability_eigenvalues_agree_with_those_of_a_step():
     sleigh = ChaplyginSleigh(q0=(0.0, 0.0, 0.0), v0=(1.2, 0.0, 0.0))
     system, y = sleigh.system, sleigh.initial_state()
-    # Straight ahead, only the rate of turning changes by itself.
+    # In straight motion, only the turning rate has a nonzero eigenvalue.
     stability = nhjax.linear_stability(system, 0.0, y, positions=(), velocities=(0, 2))
 
     def turned(rate):
@@ -99,7 +99,7 @@ def test_eigenvalues_are_those_of_a_step():
     np.testing.assert_allclose(found, [rate, 0.0], rtol=0, atol=1e-11)
 
 
-def test_derivative_in_an_orthonormal_basis():
+def test_linear_stability_derivative_agrees_with_differences():
     def fastest(gravity):
         pendulum = SphericalPendulum(
             gravity=gravity, q0=(0.0, 0.0, -1.0), v0=(0.0, 0.0, 0.0)
@@ -125,13 +125,13 @@ def test_derivative_in_an_orthonormal_basis():
         ({"positions": (0, 1), "velocities": (0, 2)}, "do not determine"),
     ],
 )
-def test_a_wrong_choice_of_coordinates_is_named(chosen, message):
+def test_linear_stability_with_wrong_coordinates_raises_naming_them(chosen, message):
     pendulum = SphericalPendulum(q0=(0.0, 0.0, -1.0), v0=(0.0, 0.0, 0.0))
     with pytest.raises(ValueError, match=message):
         nhjax.linear_stability(pendulum.system, 0.0, pendulum.initial_state(), **chosen)
 
 
-def test_indices_are_integers():
+def test_linear_stability_with_noninteger_indices_raises():
     pendulum = SphericalPendulum(q0=(0.0, 0.0, -1.0), v0=(0.0, 0.0, 0.0))
     with pytest.raises(TypeError, match="`positions` must be a sequence of integers"):
         nhjax.linear_stability(
@@ -143,20 +143,20 @@ def test_indices_are_integers():
         )
 
 
-def test_a_motion_that_is_not_steady_is_refused():
+def test_linear_stability_of_an_unsteady_motion_raises():
     pendulum = SphericalPendulum()
     y = pendulum.initial_state()
     with pytest.raises(ValueError, match=r"not steady: .* changes at the rate"):
         nhjax.linear_stability(pendulum.system, 0.0, y)
     instant = nhjax.linear_stability(pendulum.system, 0.0, y, must_be_steady=False)
     assert np.all(np.isfinite(instant.matrix))
-    # Its body axes turn against the motion, which is steady in space.
+    # The body axes rotate relative to the motion, which is steady in space.
     torus = RollingTorus.steady(1.0, 2.0, tube_radius=0.1)
     with pytest.raises(ValueError, match="not steady"):
         nhjax.linear_stability(torus.system, 0.0, torus.initial_state())
 
 
-def test_a_system_without_motion_is_refused():
+def test_linear_stability_with_singular_mass_matrix_raises():
     def half(t, q, v, args):
         return 0.5 * v[0] ** 2 - q @ q
 
@@ -166,7 +166,7 @@ def test_a_system_without_motion_is_refused():
         nhjax.linear_stability(system, 0.0, y)
 
 
-def test_stability_in_single_precision_and_of_many_states():
+def test_linear_stability_in_single_precision_and_under_vmap_works():
     def frequencies(gravity):
         pendulum = SphericalPendulum(
             gravity=gravity, q0=(0.0, 0.0, -1.0), v0=(0.0, 0.0, 0.0)

@@ -1,4 +1,4 @@
-"""Accelerations and reactions at a state, against equations written another way."""
+"""Accelerations and reactions, compared with independently written equations."""
 
 import jax
 import jax.numpy as jnp
@@ -22,7 +22,7 @@ STARTS = {
 
 
 @pytest.mark.parametrize("name", EXAMPLES)
-def test_accelerations_solve_the_equations_of_motion(name):
+def test_motion_accelerations_solve_the_equations_of_motion(name):
     example = SOLVED[name]
     y = example.initial_state()
     motion = nhjax.motion(example.system, 0.0, y)
@@ -38,9 +38,9 @@ def test_accelerations_solve_the_equations_of_motion(name):
 
 
 @pytest.mark.parametrize("start", STARTS.values(), ids=STARTS.keys())
-def test_motion_is_the_same_in_both_forms(start):
+def test_motion_in_lagrangian_and_hamiltonian_form_is_equal(start):
     y = start.y0
-    # At another time another velocity belongs to the momentum.
+    # The velocity for a given momentum depends on time.
     lagrangian = start.forms["lagrangian"]
     p = lagrangian.momentum(jnp.asarray(0.3), y.q, y.v, None)
     y = type(y)(y.q, y.v, p, y.multiplier)
@@ -50,7 +50,7 @@ def test_motion_is_the_same_in_both_forms(start):
 
 
 @pytest.mark.parametrize("start", STARTS.values(), ids=STARTS.keys())
-def test_momentum_changes_by_forces_and_reactions(start):
+def test_motion_momentum_rate_is_the_sum_of_forces_and_reactions(start):
     system, y = start.forms["lagrangian"], start.y0
     motion = nhjax.motion(system, 0.0, y)
     t = jnp.asarray(0.0)
@@ -61,7 +61,7 @@ def test_momentum_changes_by_forces_and_reactions(start):
     np.testing.assert_allclose(motion.momentum_rate, expected, rtol=0, atol=1e-13)
 
 
-def test_accelerations_are_rates_along_a_trajectory():
+def test_motion_accelerations_agree_with_rates_along_a_trajectory():
     y = nhjax.initial_state(
         DRIVEN.system, jnp.ones(3), jnp.ones(3), t=0.2, args=ARGS, project=True
     )
@@ -81,7 +81,7 @@ def test_accelerations_are_rates_along_a_trajectory():
         np.testing.assert_allclose(rate, weights @ differences / h, rtol=0, atol=1e-10)
 
 
-def test_reaction_of_a_pendulum_is_the_pull_of_its_rod():
+def test_motion_reaction_of_a_pendulum_is_the_force_in_its_rod():
     pendulum = nhjax.systems.SphericalPendulum(
         2.0, 0.5, 9.81, q0=(0.0, 0.0, -0.5), v0=(0.3, 0.0, 0.0)
     )
@@ -98,7 +98,7 @@ def test_reaction_of_a_pendulum_is_the_pull_of_its_rod():
     np.testing.assert_allclose(motion.compatibility_matrix, [[0.5]], rtol=1e-14)
 
 
-def test_reactions_of_all_constraints_add_up():
+def test_motion_reactions_of_single_constraints_add_up():
     disc = nhjax.systems.VerticalRollingDisc()
     motion = nhjax.motion(disc.system, 0.0, disc.initial_state())
     each = motion.reaction_of_each
@@ -106,7 +106,7 @@ def test_reactions_of_all_constraints_add_up():
     np.testing.assert_allclose(jnp.sum(each, axis=0), motion.reaction, atol=1e-15)
 
 
-def test_reactions_are_saved_along_an_ensemble():
+def test_motion_reactions_saved_under_vmap_agree_at_equal_times():
     disc = nhjax.systems.VerticalRollingDisc()
     y0 = disc.initial_state()
 
@@ -122,12 +122,12 @@ def test_reactions_are_saved_along_an_ensemble():
 
     saved = jax.jit(jax.vmap(run))(jnp.asarray([0.1, 0.2]))
     assert saved.shape == (2, 3, 4)
-    # Two steps of the first run take as long as one of the second.
+    # Two steps of the first run end at the same time as one step of the second.
     np.testing.assert_allclose(saved[0, 1], saved[1, 0], rtol=0, atol=1e-3)
     assert np.ptp(np.asarray(saved[..., 0])) > 1e-2
 
 
-def test_motion_works_in_single_precision():
+def test_motion_in_single_precision_keeps_dtype():
     disc = nhjax.systems.VerticalRollingDisc()
     motion = nhjax.motion(disc.system, 0.0, disc.initial_state(jnp.float32))
     assert motion.is_unique.dtype == bool
@@ -135,7 +135,7 @@ def test_motion_works_in_single_precision():
     assert set(numbers) == {jnp.dtype("float32")}
 
 
-def test_motion_wants_a_state():
+def test_motion_without_a_state_raises():
     disc = nhjax.systems.VerticalRollingDisc()
     with pytest.raises(TypeError, match=r"`y` must be an nhjax\.State"):
         nhjax.motion(disc.system, 0.0, disc.q0)  # pyright: ignore[reportArgumentType]

@@ -1,4 +1,4 @@
-"""The page about this room: its blocks run as printed, and are right."""
+"""The analysis page: its code blocks run and print the results shown."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -6,11 +6,11 @@ import numpy as np
 from oracles.pages import blocks, page, run_page
 
 
-def test_the_page_runs_as_printed():
+def test_analysis_page_when_run_prints_as_shown():
     namespace = run_page("analysis")
     (printed,) = blocks(page("analysis"), "text")
     assert str(namespace["report"]) == printed.removesuffix("\n")
-    # The pull on the disc turns with its heading, and keeps its size.
+    # The force on the disc rotates with its heading and keeps its magnitude.
     pull = jnp.linalg.norm(namespace["sol"].ys[:, :2], axis=1)
     np.testing.assert_allclose(pull, pull[0], rtol=1e-12)
     assert float(pull[0]) > 0.5

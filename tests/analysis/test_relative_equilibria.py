@@ -1,4 +1,4 @@
-"""Motions that are steady up to a symmetry, found from states near them."""
+"""Relative equilibria, found from states near them."""
 
 from typing import Any
 
@@ -19,7 +19,7 @@ UPRIGHT = jnp.asarray([np.cos(ANGLE / 2), np.sin(ANGLE / 2), 0.0, 0.0])
 
 
 def about_both(q):
-    """The generators of turns about the vertical, and about the axis of the top."""
+    """The generators of rotations about the vertical and about the axis of the top."""
     return jnp.stack([SPACE.Ad(SPACE.inverse(q), AXIS), AXIS])
 
 
@@ -38,7 +38,7 @@ def precession(gravity, spin, guess):
     return rates[0], (y, rates)
 
 
-def test_slow_and_fast_precession_of_a_top_and_their_derivatives():
+def test_steady_motion_of_a_top_has_slow_and_fast_precession():
     gravity, spin = 9.81, 30.0
     lean = FIRST * np.cos(ANGLE)
     slope = jax.value_and_grad(precession, argnums=(0, 1), has_aux=True)
@@ -63,7 +63,7 @@ def turn(q):
 
 
 @pytest.mark.parametrize("form", ["lagrangian", "hamiltonian"])
-def test_the_cone_of_a_pendulum_of_given_height(form):
+def test_steady_motion_along_symmetry_at_given_height_is_the_cone(form):
     system = both_forms(
         lambda t, q: jnp.eye(3, dtype=q.dtype),
         lambda t, q: 9.81 * q[2],
@@ -96,21 +96,21 @@ ALONG = {"symmetry": lambda q: jnp.eye(2)[0]}
 @pytest.mark.parametrize(
     ("chosen", "error", "message"),
     [
-        (ALONG | INDICES, ValueError, "Give either `symmetry`"),
-        (ALONG | {"velocities": (0,)}, ValueError, "Give either `symmetry`"),
+        (ALONG | INDICES, ValueError, "Pass either `symmetry`"),
+        (ALONG | {"velocities": (0,)}, ValueError, "Pass either `symmetry`"),
         ({"velocities": (0,)}, ValueError, "`positions` is missing"),
-        ({}, ValueError, "`positions` is missing: .* or a `symmetry`"),
+        ({}, ValueError, "`positions` is missing: .* or pass `symmetry`"),
         ({"symmetry": jnp.ones(2)}, TypeError, "must be a function of q"),
         ({"symmetry": lambda q: jnp.ones(3)}, nhjax.ShapeError, r"got shape \(3,\)"),
         (ALONG | {"held_velocities": (1,)}, nhjax.NewtonError, "residual 0.5"),
         (
             {"symmetry": lambda q: jnp.stack([1 + (q[1] - 0.5) * q[0], 0 * q[0]])},
             ValueError,
-            "Generator 0 .* no symmetry of the system",
+            "Generator 0 .* not a symmetry of the system",
         ),
     ],
 )
-def test_what_is_wrong_is_named(chosen: Any, error, message):
+def test_steady_motion_along_invalid_symmetry_raises(chosen: Any, error, message):
     v = jnp.asarray([1.0, 0.5])
     y = nhjax.State(jnp.asarray([0.0, 0.5]), v, v, AXIS[:0])
     with pytest.raises(error, match=message):
@@ -118,8 +118,8 @@ def test_what_is_wrong_is_named(chosen: Any, error, message):
 
 
 @pytest.mark.parametrize("function", [nhjax.steady_motion, nhjax.linear_stability])
-def test_redundant_constraints_are_refused_with_a_symmetry(function):
+def test_symmetry_with_redundant_constraints_raises(function):
     v = jnp.asarray([1.0, 0.0])
     y = nhjax.State(jnp.asarray([0.0, 0.5]), v, v, AXIS[:2])
-    with pytest.raises(nhjax.DependentConstraintsError, match="whether the generators"):
+    with pytest.raises(nhjax.DependentConstraintsError, match="cannot be checked"):
         function(TWICE, 0.0, y, **ALONG)

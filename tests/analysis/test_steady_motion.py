@@ -1,4 +1,4 @@
-"""Steady motions against closed forms."""
+"""Steady motions compared with closed forms."""
 
 import jax
 import jax.numpy as jnp
@@ -10,7 +10,7 @@ from nhjax.systems import SphericalPendulum
 from oracles.polar_pendulum import GRAVITY, polar_pendulum
 
 
-def test_cone_of_a_pendulum_of_given_rate():
+def test_steady_motion_of_a_pendulum_with_given_rate_is_its_cone():
     system = polar_pendulum()["lagrangian"]
 
     def angle(rate):
@@ -33,7 +33,7 @@ def test_cone_of_a_pendulum_of_given_rate():
     np.testing.assert_allclose(y.q[1], 0.2, rtol=1e-15)
 
 
-def test_cone_of_given_angle_and_of_given_momentum():
+def test_steady_motion_with_given_angle_or_momentum_is_the_cone():
     forms = polar_pendulum()
     q = jnp.asarray([0.7, 0.0])
     rate = np.sqrt(GRAVITY / np.cos(0.7))
@@ -62,7 +62,7 @@ def test_cone_of_given_angle_and_of_given_momentum():
     np.testing.assert_allclose(found.q, [0.7, 0], rtol=0, atol=1e-14)
 
 
-def test_steady_motion_is_steady():
+def test_steady_motion_integrated_stays_steady():
     system = polar_pendulum()["lagrangian"]
     y = nhjax.initial_state(system, jnp.asarray([0.5, 0.2]), jnp.asarray([0.1, 4.0]))
     y = nhjax.steady_motion(system, 0.0, y, positions=(0,), velocities=(0, 1))
@@ -71,7 +71,7 @@ def test_steady_motion_is_steady():
     np.testing.assert_allclose(run.ys.v[0], y.v, rtol=0, atol=1e-12)
 
 
-def test_equilibrium_on_a_constraint_and_on_a_group():
+def test_steady_motion_at_rest_on_a_constraint_or_group_is_found():
     pendulum = SphericalPendulum.swinging(0.4)
     y = nhjax.steady_motion(
         pendulum.system,
@@ -96,7 +96,7 @@ def test_equilibrium_on_a_constraint_and_on_a_group():
     np.testing.assert_allclose(vertical.v, [0, 0, 2.0], rtol=0, atol=1e-13)
 
 
-def test_equilibrium_on_a_product_of_vector_spaces():
+def test_steady_motion_at_rest_on_a_product_group_is_found():
     def lagrangian(t, q, v, args):
         return 0.5 * v @ v - jnp.sum(jnp.cosh(q[0] - 3.0)) - (q[1][0] + 2.0) ** 2
 
@@ -109,8 +109,8 @@ def test_equilibrium_on_a_product_of_vector_spaces():
     np.testing.assert_allclose(y.v, 0, rtol=0, atol=1e-13)
 
 
-def test_a_search_that_fails_says_where_it_stopped():
-    # A pendulum that turns slowly has no cone.
+def test_steady_motion_not_found_raises_with_the_last_state():
+    # A pendulum that rotates slowly has no conical motion.
     system = polar_pendulum()["lagrangian"]
     y = nhjax.initial_state(system, jnp.asarray([0.5, 0.0]), jnp.asarray([0.0, 1.0]))
     with pytest.raises(nhjax.NewtonError, match=r"residual 4\.28"):
@@ -125,7 +125,7 @@ def test_a_search_that_fails_says_where_it_stopped():
         )
 
 
-def test_wrong_arguments_are_named():
+def test_steady_motion_with_wrong_arguments_raises_naming_them():
     system = polar_pendulum()["lagrangian"]
     y = nhjax.initial_state(system, jnp.asarray([0.5, 0.0]), jnp.asarray([0.0, 1.0]))
     with pytest.raises(ValueError, match="`held_velocities` has the index 2"):
@@ -145,7 +145,7 @@ FORCED = nhjax.LagrangianSystem(
 )
 
 
-def test_derivatives_of_second_order():
+def test_steady_motion_second_derivatives_are_exact():
     def root(x):
         y = nhjax.initial_state(FORCED, jnp.ones(2), jnp.zeros(2), args=x)
         found = nhjax.steady_motion(
@@ -163,7 +163,7 @@ def test_derivatives_of_second_order():
     np.testing.assert_allclose(many, [1.0, np.cbrt(2.0), 2.0], rtol=1e-13)
 
 
-def test_a_search_may_start_at_rest_at_the_origin():
+def test_steady_motion_started_at_rest_at_the_origin_is_found():
     def lagrangian(t, q, v, args):
         return 0.5 * (v @ v) - 1.5 * (q @ q) - 9.81 * q[0] - 0.1 * q[0] ** 4
 
@@ -177,8 +177,8 @@ def test_a_search_may_start_at_rest_at_the_origin():
         np.testing.assert_allclose(force, 0, rtol=0, atol=10 * tolerance)
 
 
-def test_forces_that_contradict_each_other_have_no_equilibrium():
-    # A place on which nothing depends says nothing of how small a force must be.
+def test_steady_motion_without_equilibrium_raises():
+    # The value of an ignorable coordinate must not affect the tolerance of a force.
     system = nhjax.LagrangianSystem(
         lambda t, q, v, args: 0.5 * (v @ v),
         force=lambda t, q, v, args: jnp.stack([1.0 - q[0], 1.05 - q[0], 0 * q[0]]),
@@ -193,7 +193,7 @@ def test_forces_that_contradict_each_other_have_no_equilibrium():
 
 
 @pytest.mark.parametrize("count", [0, 2.7, "x", True])
-def test_the_number_of_iterations_is_checked(count):
+def test_steady_motion_with_invalid_max_iterations_raises(count):
     system = polar_pendulum()["lagrangian"]
     y = nhjax.initial_state(system, jnp.asarray([0.5, 0.0]), jnp.asarray([0.0, 1.0]))
     with pytest.raises(ValueError, match="`max_iterations` must be an int >= 1"):
@@ -202,7 +202,7 @@ def test_the_number_of_iterations_is_checked(count):
         )
 
 
-def test_a_state_of_another_system_is_refused():
+def test_steady_motion_with_a_state_of_another_system_raises():
     pendulum = SphericalPendulum().initial_state()
     many = jax.tree.map(lambda x: x[None], pendulum)
     system = polar_pendulum()["lagrangian"]

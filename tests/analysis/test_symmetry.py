@@ -1,4 +1,4 @@
-"""Stability of motions that are steady up to a symmetry, against closed forms."""
+"""Stability of relative equilibria, compared with closed forms."""
 
 import jax
 import jax.numpy as jnp
@@ -13,7 +13,7 @@ from oracles.rolling_bodies import matrix_of, RollingBody, torus
 
 
 AXIS = jnp.asarray([0.0, 0.0, 1.0])
-# A disc of no thickness, and a tyre. Both are leaves of one program.
+# A flat disc and a tyre. Their parameters are arguments of one compiled program.
 DISC = RollingTorus(1.3, 0.4, 0.0, 0.05, 0.11)
 TYRE = RollingTorus(1.7, 0.4, 0.06, 0.15, 0.28)
 
@@ -47,7 +47,7 @@ def numbers(body):
 
 
 @pytest.mark.parametrize("ratio", [0.9, 1.1])
-def test_critical_speed_of_a_disc_that_rolls_straight(ratio):
+def test_linear_stability_of_a_rolling_disc_has_the_critical_speed(ratio):
     # λ² (I + m a²) = m g a - J (J + m a²) ω² / I: Neimark and Fufaev.
     m, a, diametral, axial, g = numbers(DISC)
     contact = axial + m * a**2
@@ -56,17 +56,17 @@ def test_critical_speed_of_a_disc_that_rolls_straight(ratio):
     root = np.sqrt(complex(square))
     half = np.sqrt(0.5)
     stability = rolling(DISC, (half, half, 0.0, 0.0), (0.0, 0.0, omega))
-    # The two zeros are the speed and the rate of turning of other steady motions.
+    # The two zero eigenvalues change the speed and the turning rate.
     assert_eigenvalues(stability, [root, -root, 0, 0])
 
 
 @pytest.mark.parametrize("ratio", [0.9, 1.1])
-def test_critical_rate_of_a_disc_that_spins_on_the_spot(ratio):
+def test_linear_stability_of_a_spinning_disc_has_the_critical_rate(ratio):
     # λ² = m g a / (I + m a²) - Ω²
     m, a, diametral, _, g = numbers(DISC)
     square = m * g * a / (diametral + m * a**2)
     root = np.sqrt(complex(square * (1 - ratio**2)))
-    # The axle points anywhere in the plane, and the wheel has turned.
+    # The direction of the axle in the plane and the angle of the wheel are arbitrary.
     attitude = np.array([0.5, 0.5, 0.5, 0.5])
     up = matrix_of(attitude)[2]
     stability = rolling(DISC, attitude, ratio * np.sqrt(square) * up)
@@ -88,7 +88,7 @@ def rates_in_angles(oracle, state):
 
 
 @pytest.mark.parametrize("body", [DISC, TYRE], ids=["disc", "tyre"])
-def test_circling_wheels_have_the_eigenvalues_of_newton_and_euler(body):
+def test_linear_stability_of_circling_wheels_agrees_with_newton_euler(body):
     steady = type(body).steady(
         1.2,
         2.5,
@@ -112,7 +112,7 @@ def test_circling_wheels_have_the_eigenvalues_of_newton_and_euler(body):
         at = {k: rates_in_angles(oracle, state + k * e) for k in (-3, -2, -1, 1, 2, 3)}
         odd = [at[k] - at[-k] for k in (1, 2, 3)]
         columns.append((45 * odd[0] - 9 * odd[1] + odd[2]) / (60 * h))
-    # The wheel has rolled on, and its circle lies anywhere.
+    # The wheel has an arbitrary angle and its circle an arbitrary position.
     turned = nhjax.SO3().compose(steady.q0[:4], jnp.asarray([0.6, 0.0, 0.0, 0.8]))
     back = matrix_of([0.6, 0.0, 0.0, 0.8]).T
     moved = steady.rolling(turned, back @ np.asarray(steady.v0[3:]), (0.3, -0.7))
@@ -127,14 +127,14 @@ def test_circling_wheels_have_the_eigenvalues_of_newton_and_euler(body):
 
 
 @pytest.mark.long
-def test_a_wheel_finds_the_circle_on_which_it_rolls():
+def test_steady_motion_of_a_wheel_along_symmetry_is_a_circle():
     wheel = RollingTorus.circling(1.2, 0.6, tube_radius=0.04)
     moved = wheel.manifold.act(wheel.q0, 0.05 * jnp.asarray([2, -1, 1, 3, 0, 0.0]))
     start = nhjax.initial_state(wheel.system, moved, wheel.v0, project=True)
     y, rates = nhjax.steady_motion(
         wheel.system, 0.0, start, symmetry=wheel.symmetry, held_velocities=(5,)
     )
-    # In closed form the balance of moments tells ω₃ from the tilt and the turning.
+    # The balance of moments gives ω₃ in closed form from the tilt and turning rate.
     up, turn = matrix_of(np.asarray(y.q[:4]))[2], rates[2]
     tilt = np.arccos(up[2])
     assert abs(tilt - 1.2) > 0.01
@@ -146,7 +146,7 @@ def test_a_wheel_finds_the_circle_on_which_it_rolls():
     rolling = spin - turn * up[2]
     np.testing.assert_allclose(y.v[3:], turn * up + rolling * AXIS, atol=1e-12)
     np.testing.assert_allclose(rates[3], rolling, rtol=1e-12)
-    # The turn is about the middle of the circle of its centre.
+    # The rotation is about the centre of the circle.
     middle = np.array([-rates[1], rates[0]]) / turn
     distance = np.linalg.norm(np.asarray(y.q[4:6]) - middle)
     path = -(spin / turn) * (0.5 + 0.04 * np.sin(tilt))
@@ -175,7 +175,7 @@ FIRST, THIRD, ARM = 0.55, 0.4, 0.5
 
 
 @pytest.mark.parametrize("form", ["lagrangian", "hamiltonian"])
-def test_precession_and_nutation_of_a_sleeping_top(form):
+def test_linear_stability_of_a_sleeping_top_has_exact_frequencies(form):
     # J₁ ν² - J₃ ω ν + m g l = 0 in space; it sleeps where (J₃ ω)² > 4 J₁ m g l.
     for ratio in (0.9, 1.1):
         rate = ratio * np.sqrt(4 * FIRST * ARM * 9.81) / THIRD
@@ -184,13 +184,13 @@ def test_precession_and_nutation_of_a_sleeping_top(form):
         nu = np.roots([FIRST, -THIRD * rate, ARM * 9.81])
         expected = 1j * np.array([*nu, *-np.conj(nu), 0])
         assert_eigenvalues(found, expected)
-        # In the frame of the body it turns backwards: ν - ω, and the same growth.
+        # In the frame of the body the frequency is ν - ω, with the same growth rate.
         found = nhjax.linear_stability(system, 0.0, y, symmetry=about_vertical)
         turned = 1j * np.array([*(nu - rate), *-np.conj(nu - rate), 0])
         assert_eigenvalues(found, turned)
 
 
-def test_derivative_with_respect_to_the_rate_and_gravity():
+def test_linear_stability_derivative_along_symmetry_is_exact():
     def squares(rate, gravity):
         system, y = sleeping(rate, gravity)
         matrix = nhjax.linear_stability(system, 0.0, y, symmetry=on_axis).matrix
@@ -205,7 +205,7 @@ def test_derivative_with_respect_to_the_rate_and_gravity():
         np.testing.assert_allclose(x, -2 * y, rtol=1e-12)
 
 
-def test_left_translations_leave_the_equations_of_euler():
+def test_linear_stability_under_left_translations_gives_euler_equations():
     def everywhere(q):
         return jax.vmap(lambda xi: nhjax.SO3().Ad(nhjax.SO3().inverse(q), xi))(
             jnp.eye(3)
@@ -224,7 +224,7 @@ def turn(q):
 
 
 @pytest.mark.parametrize("form", ["lagrangian", "hamiltonian"])
-def test_cone_of_a_pendulum_in_space(form):
+def test_linear_stability_of_a_pendulum_cone_in_space_is_exact(form):
     g, angle = 9.81, 0.7
     rate = np.sqrt(g / np.cos(angle))
     system = both_forms(
@@ -243,7 +243,7 @@ def test_cone_of_a_pendulum_in_space(form):
         nhjax.linear_stability(system, 0.0, y)
 
 
-def test_many_and_in_single_precision():
+def test_linear_stability_along_symmetry_under_vmap_and_single_precision():
     @jax.jit
     @jax.vmap
     def squares(cosine):

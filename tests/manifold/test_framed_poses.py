@@ -1,4 +1,4 @@
-"""Poses of the plane that carry the sine and cosine of their angle along."""
+"""Framed poses: planar poses with the sine and cosine of their angle."""
 
 import jax
 import jax.numpy as jnp
@@ -16,7 +16,7 @@ from nhjax._manifold import (
     SO3,
     unframed,
 )
-from nhjax._manifold._framed_pose import FramedPose
+from nhjax._manifold._planar_groups import FramedPose
 
 
 XI = jnp.array([0.7, -0.3, 0.9])
@@ -34,7 +34,7 @@ def assert_frame_belongs_to_angle(g):
 
 @with_retractions
 @pytest.mark.parametrize("size", [1e-9, 0.1, 1.0, 2.5])
-def test_frame_is_carried_along_with_the_pose(group, size):
+def test_framed_pose_after_act_has_the_frame_of_its_angle(group, size):
     moved = group.act(framed(group, POSE), size * XI)
     np.testing.assert_allclose(moved.pose, group.act(POSE, size * XI), atol=1e-15)
     assert_frame_belongs_to_angle(moved)
@@ -44,7 +44,7 @@ def test_frame_is_carried_along_with_the_pose(group, size):
 
 
 @with_retractions
-def test_tangent_is_the_derivative_of_pose_and_frame(group):
+def test_framed_pose_tangent_is_its_derivative(group):
     place, eta = framed(group, POSE), jnp.array([0.2, 0.5, -1.1])
     tangent = group.tangent(place, eta)
     np.testing.assert_allclose(tangent.pose, group.tangent(POSE, eta), atol=1e-15)
@@ -54,7 +54,7 @@ def test_tangent_is_the_derivative_of_pose_and_frame(group):
 
 
 @with_retractions
-def test_left_gradient_is_the_same_with_a_frame(group):
+def test_framed_pose_left_gradient_equals_that_of_the_pose(group):
     def function(q):
         x, y, angle = unframed(q)
         return x**2 * jnp.sin(angle) + y * jnp.cos(2 * angle)
@@ -64,7 +64,7 @@ def test_left_gradient_is_the_same_with_a_frame(group):
     np.testing.assert_allclose(found, plain, rtol=0, atol=2e-15)
 
 
-def test_frames_of_a_product_are_those_of_its_poses():
+def test_framed_pose_in_a_product_group_replaces_each_pose():
     group = ProductGroup(SO3(), ProductGroup(SE2(), Euclidean(2)))
     xi = jnp.linspace(-0.4, 0.5, group.dim)
     q = (jnp.array([0.6, 0.0, 0.8, 0.0]), (POSE, jnp.array([0.1, 0.2])))
@@ -77,7 +77,7 @@ def test_frames_of_a_product_are_those_of_its_poses():
             np.testing.assert_allclose(ours, theirs, rtol=0, atol=1e-15)
 
 
-def test_a_group_without_frames_leaves_elements_as_they_are():
+def test_framed_element_without_planar_poses_is_unchanged():
     q = jnp.array([0.6, 0.0, 0.8, 0.0])
     assert framed(SO3(), q) is q
     assert unframed(q) is q

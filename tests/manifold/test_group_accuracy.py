@@ -1,4 +1,4 @@
-"""Lie groups to the last digits: derivatives of tangents, long products, precision."""
+"""Accuracy of the Lie groups: derivatives, long products, single precision."""
 
 from math import pi
 
@@ -19,7 +19,7 @@ from nhjax._manifold import (
     SO2,
     SO3,
 )
-from nhjax._manifold._series import arctan_ratio, stumpff
+from nhjax._manifold._retraction import arctan_ratio, stumpff
 from oracles.group_samples import (
     batched,
     directions,
@@ -58,7 +58,7 @@ def exact_dtau(group, X, Y):
 
 
 @over([g for g in SIMPLE if not isinstance(g, SO2)])
-def test_dtau_and_its_derivatives_are_right_to_the_last_digits(group):
+def test_group_dtau_and_its_derivatives_are_accurate_to_round_off(group):
     xi = vectors(group, [0.0, *INSIDE[1:4], *INSIDE[6:], 5.0], 14)
     eta, delta = directions(group, xi, 15), directions(group, xi, 16)
 
@@ -81,7 +81,7 @@ def test_dtau_and_its_derivatives_are_right_to_the_last_digits(group):
 
 
 @pytest.mark.parametrize("s", [0.0, 1e-300, 1e-16, 0.5, 1.999999, 2.0, 9.0, 39.0])
-def test_stumpff_functions_and_their_derivatives(s):
+def test_stumpff_functions_and_derivatives_are_accurate_to_round_off(s):
     n = 4
 
     def value(s):
@@ -91,7 +91,7 @@ def test_stumpff_functions_and_their_derivatives(s):
         return jax.jacfwd(jax.jacrev(jax.jacfwd(value)))(s)
 
     def exact(k, order):
-        # j (j - 1) ... (j - order + 1) s^(j - order), written to hold at s = 0.
+        # j (j - 1) ... (j - order + 1) s^(j - order), in a form that is valid at s = 0.
         return mp.nsum(
             lambda j: (
                 (-1) ** (int(j) + order)
@@ -109,7 +109,7 @@ def test_stumpff_functions_and_their_derivatives(s):
 
 
 @pytest.mark.parametrize("x", [0.0, 1e-300, 1e-8, 0.3, 1.0])
-def test_arctan_ratio_and_its_second_derivative(x):
+def test_arctan_ratio_and_second_derivative_are_accurate(x):
     def exact(x):
         root = mp.sqrt(x)
         return mp.mpf(1) if x == 0 else mp.atan(root) / root
@@ -123,7 +123,7 @@ def test_arctan_ratio_and_its_second_derivative(x):
 
 
 @over([g for g in SIMPLE if not isinstance(g, SO2)])
-def test_second_derivatives_at_the_identity(group):
+def test_group_second_derivatives_at_the_identity_are_exact(group):
     eta, delta = directions(group, range(2), 17)
     zero = jnp.zeros(group.dim)
     D, Y = (np.asarray(group.hat(v)) for v in (delta, eta))
@@ -135,14 +135,14 @@ def test_second_derivatives_at_the_identity(group):
         expected = bracket(D, bracket(D, Y)) / 3
     else:
         expected = (bracket(D, bracket(D, Y)) + D @ Y @ D) / 2
-    # In reverse mode; forward mode is that of the test above.
+    # This test uses reverse mode; the test above uses forward mode.
     hessian = jax.jacrev(jax.jacrev(lambda x: group.dtau(x, eta)))
     actual = group.hat(batched(hessian)(zero[None])[0] @ delta @ delta)
     assert distance(actual, expected) < 1e-14
 
 
 @over([SO3(Cayley()), SE2(Exponential()), SE3(Exponential())])
-def test_gradients_of_every_map_are_finite_at_the_identity(group):
+def test_group_gradients_at_the_identity_are_finite(group):
     zero, ones = jnp.zeros(group.dim), jnp.ones(group.dim)
 
     def everything(x):
@@ -165,7 +165,7 @@ def test_gradients_of_every_map_are_finite_at_the_identity(group):
 
 
 @over([SO3(Exponential()), SE3(Cayley())])
-def test_a_million_steps_stay_on_the_group(group):
+def test_group_advance_after_a_million_steps_stays_on_the_group(group):
     direction = jnp.asarray(directions(group, [0], 18)[0])
 
     def step(k, carry):
@@ -184,8 +184,8 @@ def test_a_million_steps_stay_on_the_group(group):
 
 
 @pytest.mark.parametrize("retraction", RETRACTIONS, ids=repr)
-def test_compensated_steps_add_up_to_the_exact_motion(retraction):
-    # Many equal screw motions, of which the sum is known.
+def test_group_advance_with_compensation_agrees_with_exact_motion(retraction):
+    # The product of many equal screw motions has a closed form.
     group, num_steps = SE3(retraction), 10**5
     xi = jnp.array([0.001, -0.002, 0.003, 0.001, 0.002, -0.001])
 
@@ -204,11 +204,11 @@ def test_compensated_steps_add_up_to_the_exact_motion(retraction):
         else:
             one = mp.expm(X)
         expected = np.array((one**num_steps).tolist(), dtype=float)
-    # The increments are rounded relative to themselves: the same way each time.
+    # Each equal increment has the same rounding error.
     assert distance(matrix, expected) < 1e-13
 
 
-def test_advance_is_the_action():
+def test_group_advance_agrees_with_act():
     for group in GROUPS:
         q = jax.tree.map(lambda x: x[3], elements(group, 7))
         xi = vectors(group, [0.7])[0]
@@ -220,7 +220,7 @@ def test_advance_is_the_action():
 @pytest.mark.parametrize(
     ("dtype", "most_turns"), [(jnp.float64, 2**24), (jnp.float32, 2**12)]
 )
-def test_an_angle_of_many_turns_is_wrapped_without_loss(dtype, most_turns):
+def test_group_wrapped_angle_of_many_turns_is_accurate(dtype, most_turns):
     turns = np.random.default_rng(0).uniform(-most_turns, most_turns, 200)
     angles = jnp.asarray(2 * np.pi * turns, dtype)[:, None]
     compensations = jnp.asarray(np.linspace(-1e-9, 1e-9, 200), dtype)[:, None]
@@ -247,7 +247,7 @@ def test_an_angle_of_many_turns_is_wrapped_without_loss(dtype, most_turns):
 
 
 @over(GROUPS)
-def test_single_precision_is_kept(group):
+def test_group_maps_in_single_precision_keep_dtype(group):
     xi = jnp.asarray(vectors(group, [0.0, 1e-3, 1.0, 1.5, 3.0]), jnp.float32)
 
     def everything(x):
@@ -278,7 +278,7 @@ def test_single_precision_is_kept(group):
     assert distance(single.astype(float), double) < 1e-6
 
 
-def test_flat_groups_are_those_without_curvature():
+def test_group_is_flat_only_without_curvature():
     assert Euclidean(2).is_flat
     assert SO2(Exponential()).is_flat
     assert ProductGroup(Euclidean(2), SO2(Exponential())).is_flat
@@ -286,7 +286,7 @@ def test_flat_groups_are_those_without_curvature():
         assert not group.is_flat
 
 
-def test_factors_without_curvature_cost_nothing():
+def test_product_group_of_flat_factors_compiles_without_tangent_maps():
     group = ProductGroup(Euclidean(2), SO2(Exponential()), Euclidean(3))
     x = jnp.ones(6)
     for function in (group.dtau, group.dtau_inv, group.dtau_dual):
@@ -295,7 +295,7 @@ def test_factors_without_curvature_cost_nothing():
 
 
 @over(SIMPLE)
-def test_maps_compile_to_arithmetic_only(group):
+def test_group_maps_compiled_contain_arithmetic_only(group):
     x = jnp.ones(group.dim)
     g = group.retract(x)
     twice = ((group.dtau, x), (group.to_end, x), (group.to_start, x), (group.act, g))
@@ -306,7 +306,7 @@ def test_maps_compile_to_arithmetic_only(group):
             assert operation not in text
 
 
-def test_products_act_factor_by_factor():
+def test_product_group_maps_act_on_each_factor():
     group = ProductGroup(SO3(), Euclidean(2))
     assert group.dim == 5
     xi = jnp.arange(5.0) / 5
@@ -316,7 +316,7 @@ def test_products_act_factor_by_factor():
     assert group.matrix((q, x)).shape == (6, 6)
 
 
-def test_the_chart_ends_where_the_tangent_is_singular():
+def test_group_chart_ends_where_dtau_is_singular():
     def inside(group, angle):
         return bool(group.in_chart(jnp.asarray(vectors(group, [angle])[0])))
 
@@ -334,7 +334,7 @@ def test_the_chart_ends_where_the_tangent_is_singular():
     assert MIXED.in_chart(jnp.ones(MIXED.dim))
 
 
-def test_defect_is_the_error_of_the_norm_and_normalise_removes_it():
+def test_group_normalise_removes_the_distance_to_the_group():
     q = 1.25 * SO3().retract(jnp.array([0.1, 0.2, 0.3]))
     pose = jnp.concatenate([q, jnp.ones(3)])
     group = ProductGroup(SO3(), Euclidean(1), SE3())
@@ -344,7 +344,7 @@ def test_defect_is_the_error_of_the_norm_and_normalise_removes_it():
     assert distance(group.normalise(element)[2][4:], np.ones(3)) == 0
 
 
-def test_equal_groups_are_equal_and_without_leaves():
+def test_equal_groups_compare_equal_and_have_no_leaves():
     assert SO3() == SO3(retraction=Cayley())
     assert SO3() != SO3(Exponential())
     assert SO3() != SE3()

@@ -37,7 +37,7 @@ from oracles.group_samples import (
 
 @over(GROUPS)
 @seeded
-def test_axioms(group, seed):
+def test_group_composition_satisfies_the_axioms(group, seed):
     g, h, k = (elements(group, seed + i) for i in range(3))
     left, right, neutral, nothing = _axioms(group)(g, h, k)
     assert distance(left, right) < 1e-14
@@ -58,7 +58,7 @@ def _axioms(group):
 
 
 @over(GROUPS)
-def test_matrix_is_a_homomorphism(group):
+def test_group_matrix_of_a_product_is_the_product_of_matrices(group):
     g, h = elements(group, 1), elements(group, 2)
     product = batched(lambda g, h: group.matrix(group.compose(g, h)))(g, h)
     matrix = batched(group.matrix)
@@ -67,8 +67,8 @@ def test_matrix_is_a_homomorphism(group):
 
 @over(GROUPS)
 @seeded
-def test_local_inverts_the_retraction(group, seed):
-    # Exponential: the shorter of two rotation vectors, hence less than π.
+def test_group_local_inverts_the_retraction(group, seed):
+    # `local` returns the shorter rotation vector, whose angle is less than π.
     xi = vectors(group, [*INSIDE, 3.1], seed)
     assert distance(_round_trip(group)(xi), xi) < 1e-14
 
@@ -79,14 +79,14 @@ def _round_trip(group):
 
 
 @pytest.mark.parametrize("retraction", RETRACTIONS, ids=repr)
-def test_local_of_opposite_quaternions_is_the_same(retraction):
+def test_group_local_of_opposite_quaternions_is_equal(retraction):
     group = SO3(retraction)
     q = group.retract(jnp.array([0.3, -0.5, 1.0]))
     assert distance(group.local(-q), group.local(q)) < 1e-15
 
 
 @over(SIMPLE)
-def test_retraction_is_the_matrix_function(group):
+def test_retraction_agrees_with_the_matrix_function(group):
     xi = chart(group)
     matrix = batched(lambda x: group.matrix(group.retract(x)))(xi)
     hat = np.asarray(batched(group.hat)(xi))
@@ -95,7 +95,7 @@ def test_retraction_is_the_matrix_function(group):
 
 
 @over(SIMPLE)
-def test_retraction_keeps_relative_accuracy_of_tiny_vectors(group):
+def test_retraction_of_tiny_vectors_keeps_relative_accuracy(group):
     xi = 1e-200 * directions(group, range(4), 5)
     back = batched(lambda x: group.local(group.retract(x)))(xi)
     np.testing.assert_allclose(back, xi, rtol=1e-14)
@@ -106,7 +106,7 @@ def test_retraction_keeps_relative_accuracy_of_tiny_vectors(group):
 
 @over(SIMPLE)
 @seeded
-def test_dtau_is_the_left_trivialised_derivative_of_the_matrix(group, seed):
+def test_group_dtau_agrees_with_the_derivative_of_the_matrix(group, seed):
     xi = chart(group, seed)
     eta = directions(group, xi, seed + 1)
     hat = _hat(group)
@@ -126,18 +126,18 @@ def _hat(group):
 
 @over(GROUPS)
 @seeded
-def test_dtau_inv_inverts_dtau(group, seed):
+def test_group_dtau_inv_inverts_dtau(group, seed):
     xi = chart(group, seed)
     eta = directions(group, xi, seed + 2)
     back = compiled(group, "dtau", "dtau_inv")(xi, eta)
-    # Near the edge dτ⁻¹ is large.
+    # dτ⁻¹ is large near the boundary of the chart.
     assert distance(back[: len(INSIDE)], eta[: len(INSIDE)]) < 1e-14
     assert distance(back, eta) < 1e-11
 
 
 @over(GROUPS)
 @seeded
-def test_dtau_at_minus_xi_is_the_right_trivialised_one(group, seed):
+def test_group_dtau_at_minus_xi_is_right_trivialised(group, seed):
     xi = chart(group, seed)
     eta = directions(group, xi, seed + 3)
     left, right = compiled(group, "dtau")(xi, eta), _right_trivialised(group)(xi, eta)
@@ -151,7 +151,7 @@ def _right_trivialised(group):
 
 @over(GROUPS)
 @seeded
-def test_ddtau_is_the_second_tangent(group, seed):
+def test_group_ddtau_agrees_with_the_derivative_of_dtau(group, seed):
     xi = vectors(group, INSIDE, seed)
     eta, delta = directions(group, xi, seed + 5), directions(group, xi, seed + 6)
     actual, expected = _second_tangents(group)(xi, eta, delta)
@@ -168,7 +168,7 @@ def _second_tangents(group):
 
 
 @over(GROUPS)
-def test_tangent_is_the_velocity_of_the_retraction(group):
+def test_group_tangent_agrees_with_the_derivative_of_act(group):
     g = elements(group, 3)
     eta = directions(group, range(16), 7)
     expected = batched(lambda g, y: AbstractLieGroup.tangent(group, g, y))(g, eta)
@@ -176,7 +176,7 @@ def test_tangent_is_the_velocity_of_the_retraction(group):
 
 
 @over(GROUPS)
-def test_left_gradient_is_the_derivative_along_the_retraction(group):
+def test_group_left_gradient_agrees_with_the_derivative_along_act(group):
     g = elements(group, 4)
 
     def function(g):
@@ -191,7 +191,7 @@ def test_left_gradient_is_the_derivative_along_the_retraction(group):
 
 @over([g for g in GROUPS if not isinstance(g, Euclidean)])
 @seeded
-def test_adjoint_maps_are_those_of_matrices(group, seed):
+def test_group_adjoint_maps_agree_with_matrices(group, seed):
     g = elements(group, seed)
     xi, eta = (directions(group, range(16), seed + k) for k in (8, 9))
     hat = _hat(group)
@@ -207,7 +207,7 @@ def _matrix(group):
 
 
 @over(GROUPS)
-def test_covectors_are_carried_along_the_retraction(group):
+def test_group_covector_transport_agrees_with_the_adjoint_map(group):
     xi = chart(group, 3)
     mu = directions(group, range(len(xi)), 4)
     g = batched(group.retract)(xi)
@@ -219,7 +219,7 @@ def test_covectors_are_carried_along_the_retraction(group):
 
 @pytest.mark.parametrize("retraction", RETRACTIONS, ids=repr)
 @pytest.mark.parametrize("kind", [SO3, SE2, SE3])
-def test_change_of_a_covector_keeps_relative_accuracy_of_tiny_motions(kind, retraction):
+def test_group_covector_change_of_tiny_motions_keeps_accuracy(kind, retraction):
     group = kind(retraction)
     xi = 1e-9 * np.eye(group.dim)
     mu = directions(group, range(group.dim), 5)
@@ -231,7 +231,7 @@ def test_change_of_a_covector_keeps_relative_accuracy_of_tiny_motions(kind, retr
 
 @over(GROUPS)
 @seeded
-def test_duals_are_the_transposed_maps(group, seed):
+def test_group_dual_maps_are_transposes(group, seed):
     g = elements(group, seed)
     xi = vectors(group, np.linspace(0, 3, 16), seed + 10)
     eta, delta, mu = (directions(group, range(16), seed + 11 + i) for i in range(3))

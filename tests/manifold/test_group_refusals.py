@@ -1,4 +1,4 @@
-"""What is no group, no retraction, and no element of a group."""
+"""Errors for invalid groups, retractions and elements."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -26,17 +26,17 @@ from oracles.group_samples import (
 
 @pytest.mark.parametrize("group", [SO2, SO3, SE2, SE3])
 @pytest.mark.parametrize("retraction", [Cayley, "cayley", None, np.ones(3)])
-def test_retraction_must_be_an_instance(group, retraction):
+def test_group_with_invalid_retraction_raises(group, retraction):
     with pytest.raises(TypeError, match=r"`retraction` must be one of Cayley\(\)"):
         group(retraction=retraction)
 
 
-def test_a_class_as_retraction_is_named_as_such():
-    with pytest.raises(TypeError, match="It is the class; call it"):
+def test_group_with_a_class_as_retraction_raises_saying_so():
+    with pytest.raises(TypeError, match="It is a class; call it"):
         SO3(retraction=Exponential)  # pyright: ignore[reportArgumentType]
 
 
-def test_unknown_retraction_is_refused_with_advice():
+def test_group_with_unknown_retraction_raises_with_advice():
     class Mine(AbstractRetraction):
         angle = rate = plane_rotation = half_rotation = None  # pyright: ignore
         rotation_vector = None  # pyright: ignore
@@ -63,12 +63,12 @@ def test_unknown_retraction_is_refused_with_advice():
         ),
     ],
 )  # fmt: skip
-def test_wrong_elements_are_named(group, q, message):
+def test_group_check_of_a_wrong_element_raises_naming_it(group, q, message):
     with pytest.raises(ShapeError, match=message):
         group.check(q)
 
 
-def test_right_elements_pass():
+def test_group_check_of_a_valid_element_returns_it():
     for group in GROUPS:
         q = group.identity()
         assert group.check(q) is q
@@ -82,6 +82,6 @@ def test_right_elements_pass():
         ((SO3,), TypeError, "factor 0 must be a Lie group"),
     ],
 )
-def test_products_are_of_groups(factors, error, message):
+def test_product_group_with_invalid_factors_raises(factors, error, message):
     with pytest.raises(error, match=message):
         ProductGroup(*factors)

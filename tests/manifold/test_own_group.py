@@ -1,4 +1,4 @@
-"""A user's own group: seven methods, and everything else by differentiation."""
+"""A user's own group: seven methods; all others follow by differentiation."""
 
 import jax
 import jax.numpy as jnp
@@ -22,7 +22,7 @@ def close(a, b):
     np.testing.assert_allclose(a, b, rtol=1e-13, atol=1e-14)
 
 
-def test_heisenberg_bracket_and_tangents_are_the_closed_forms():
+def test_own_group_heisenberg_maps_agree_with_closed_forms():
     group = Heisenberg()
     bracket = jnp.array([0.0, 0.0, XI[0] * ETA[1] - XI[1] * ETA[0]])
     close(group.ad(XI, ETA), bracket)
@@ -34,7 +34,7 @@ def test_heisenberg_bracket_and_tangents_are_the_closed_forms():
     close(group.tangent(XI, ETA), ETA + 0.5 * bracket)
 
 
-def test_sl2_tangents_are_those_of_matrices():
+def test_own_group_sl2_tangents_agree_with_matrices():
     group = SL2()
     X, Y, one = group.hat(XI), group.hat(ETA), jnp.eye(2)
     g = group.act(group.retract(DELTA), XI)
@@ -52,7 +52,7 @@ def test_sl2_tangents_are_those_of_matrices():
 @pytest.mark.parametrize(
     "group", [Heisenberg(), long(SL2())], ids=["Heisenberg", "SL2"]
 )
-def test_second_tangents_duals_and_gradients_follow(group):
+def test_own_group_derived_maps_are_consistent(group):
     g = group.retract(DELTA)
     slope = jax.jvp(lambda x: group.dtau(x, ETA), (XI,), (DELTA,))[1]
     second = group.ddtau(XI, ETA, DELTA)
@@ -74,7 +74,7 @@ def test_second_tangents_duals_and_gradients_follow(group):
     close(group.left_gradient(function, g), along)
 
 
-def test_a_group_of_ones_own_advances_without_compensation():
+def test_own_group_advance_returns_compensation_unchanged():
     group = SL2()
     q, compensation = group.advance(
         group.identity(), XI, group.no_compensation(jnp.eye(2))
@@ -87,21 +87,21 @@ def test_a_group_of_ones_own_advances_without_compensation():
     close(group.normalise(q), q)
 
 
-def test_a_group_of_ones_own_is_a_factor():
+def test_own_group_in_a_product_group_works_as_factor():
     group = ProductGroup(SO3(), SL2())
     xi = jnp.concatenate([XI, ETA])
     close(group.local(group.retract(xi)), xi)
     close(group.dtau(xi, group.dtau_inv(xi, xi[::-1])), xi[::-1])
 
 
-def test_missing_matrix_says_what_to_define():
+def test_own_group_without_matrix_raises_saying_what_to_define():
     with pytest.raises(NotImplementedError, match=r"define `Heisenberg\.matrix`"):
         Heisenberg().matrix(XI)
     with pytest.raises(NotImplementedError, match=r"define `Heisenberg\.hat`"):
         Heisenberg().hat(XI)
 
 
-def test_missing_methods_are_named():
+def test_own_group_with_missing_methods_raises_naming_them():
     class Unfinished(AbstractLieGroup):
         pass
 

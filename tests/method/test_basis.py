@@ -1,4 +1,4 @@
-"""The basis of dense output, and methods as values."""
+"""The Lagrange basis of dense output, and methods as hashable values."""
 
 import jax
 import jax.numpy as jnp
@@ -18,10 +18,10 @@ from oracles.tableaux import (
 
 @pytest.mark.parametrize("s", STAGES)
 @pytest.mark.parametrize("kind", [LobattoIIIAB, Gauss])
-def test_basis_reproduces_the_coefficients_at_the_nodes(s: int, kind: type):
+def test_basis_integrated_to_the_nodes_equals_the_coefficients(s: int, kind: type):
     method = kind(s)
-    # Rounding the node alone moves ℓ_j by up to ℓ_j' 2^-53: over 1e-15 at the outer
-    # nodes of Gauss, where ℓ_j is steep.
+    # Rounding a node changes ℓ_j by up to ℓ_j' 2^-53, which exceeds 1e-15 at the outer
+    # Gauss nodes, where ℓ_j is steep.
     slopes = jax.vmap(jax.jacfwd(method.basis))(jnp.asarray(method.c))
     bound = 1e-15 + 2.0**-53 * np.abs(slopes)
     assert (np.abs(method.basis(method.c) - np.eye(s)) <= bound).all()
@@ -41,7 +41,7 @@ def test_integrated_basis_is_exact_at_both_ends(s: int, kind: type):
 @pytest.mark.parametrize(
     "method", [LobattoIIIAB(2), LobattoIIIAB(5), Gauss(1), RADAU_IIA]
 )
-def test_basis_is_the_derivative_of_the_integrated_basis(method: AbstractMethod):
+def test_integrated_basis_differentiated_equals_the_basis(method: AbstractMethod):
     theta = jnp.linspace(-0.25, 1.5, 8)
     slopes = jax.vmap(jax.jacfwd(method.integrated_basis))(theta)
     np.testing.assert_allclose(slopes, method.basis(theta), rtol=1e-12, atol=1e-13)
@@ -83,7 +83,7 @@ def test_basis_of_an_integer_is_floating():
     assert LobattoIIIAB(2).integrated_basis(jnp.array(1)).tolist() == [0.5, 0.5]
 
 
-def test_basis_needs_distinct_nodes():
+def test_basis_with_coinciding_nodes_raises():
     message = r"c = \[0\.0, 0\.5, 0\.5, 1\.0\] has equal entries c_2 and c_3"
     with pytest.raises(ValueError, match=message):
         RK4.basis(0.5)
@@ -104,11 +104,11 @@ def test_methods_compare_and_hash_by_value():
 
 
 @pytest.mark.parametrize("method", [LobattoIIIAB(3), Gauss(2), RK4])
-def test_methods_have_no_leaves(method: AbstractMethod):
+def test_methods_as_pytrees_have_no_leaves(method: AbstractMethod):
     assert jax.tree.leaves(method) == []
 
 
-def test_equal_methods_share_one_compilation():
+def test_equal_methods_under_jit_share_one_compilation():
     traces = []
 
     def weights(method: AbstractMethod, x: jax.Array) -> jax.Array:

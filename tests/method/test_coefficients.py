@@ -1,4 +1,4 @@
-"""The coefficients of methods are right to the last bit, and orders are recognised.
+"""The coefficients of methods to the last bit, and the orders found from them.
 
 Identities are checked in exact rational arithmetic on the float64 coefficients, so that
 the only error in them is the rounding of the coefficients themselves.
@@ -105,7 +105,7 @@ def legendre_and_slope(n: int, x: Fraction) -> tuple[Fraction, Fraction]:
 
 
 @pytest.mark.parametrize("s", range(2, 13))
-def test_nodes_are_the_zeros_rounded_to_nearest(s: int):
+def test_method_nodes_are_the_zeros_rounded_to_nearest(s: int):
     # The polynomial changes sign between the midpoints to the neighbouring floats.
     def changes_sign(node: float, degree: int, derivative: bool) -> bool:
         ends = [
@@ -125,7 +125,7 @@ def test_nodes_are_the_zeros_rounded_to_nearest(s: int):
 
 
 @pytest.mark.parametrize("s", range(2, 13))
-def test_lobatto_ends_are_exact(s: int):
+def test_lobatto_coefficients_at_the_ends_are_exact(s: int):
     method = LobattoIIIAB(s)
     assert not method.a[0].any()
     assert method.a[-1].tolist() == method.b.tolist()
@@ -135,7 +135,7 @@ def test_lobatto_ends_are_exact(s: int):
 
 
 @pytest.mark.parametrize("method", [LobattoIIIAB(5), Gauss(4), RK4])
-def test_coefficients_are_read_only_float64(method: AbstractMethod):
+def test_method_coefficients_are_read_only_float64(method: AbstractMethod):
     s = method.stages
     shapes = [(s, s), (s,), (s,), (s, s)]
     arrays = [method.a, method.b, method.c, method.a_hat]
@@ -144,7 +144,7 @@ def test_coefficients_are_read_only_float64(method: AbstractMethod):
         assert not array.flags.writeable
 
 
-def test_precision_does_not_depend_on_the_users_context():
+def test_method_coefficients_do_not_depend_on_the_users_mpmath_context():
     lobatto_tableau.cache_clear()
     with mpmath.workdps(5):
         coarse = LobattoIIIAB(6).a.tolist()
@@ -182,7 +182,7 @@ def test_lobatto_pair_satisfies_the_mixed_assumption_to_two_ulp(s: int):
 
 @pytest.mark.parametrize("s", STAGES)
 @pytest.mark.parametrize("kind", [LobattoIIIAB, Gauss])
-def test_the_pair_is_symplectic_to_two_ulp(s: int, kind: type):
+def test_method_pair_is_symplectic_to_two_ulp(s: int, kind: type):
     method = kind(s)
     a, a_hat, b = exact(method.a), exact(method.a_hat), exact(method.b)
     for i in range(s):
@@ -193,7 +193,7 @@ def test_the_pair_is_symplectic_to_two_ulp(s: int, kind: type):
 
 @pytest.mark.parametrize("s", STAGES)
 @pytest.mark.parametrize("kind", [LobattoIIIAB, Gauss])
-def test_the_tableau_is_symmetric_to_two_ulp(s: int, kind: type):
+def test_method_tableau_is_symmetric_to_two_ulp(s: int, kind: type):
     method = kind(s)
     a, b = exact(method.a), exact(method.b)
     for i in range(s):
@@ -202,7 +202,7 @@ def test_the_tableau_is_symmetric_to_two_ulp(s: int, kind: type):
     assert method.is_symmetric
 
 
-def test_symplecticity_of_a_pair_is_recognised():
+def test_symplecticity_check_of_other_pairs_detects_defects():
     gauss, lobatto = gauss_tableau(3), lobatto_tableau(3)
     assert is_symplectic_pair(gauss, gauss.mp_a)
     assert is_symplectic_pair(lobatto, lobatto.mp_a_hat)
@@ -225,7 +225,7 @@ def test_gauss_reports_its_orders(s: int):
 
 
 @pytest.mark.parametrize("s", range(2, 11))
-def test_a_tableau_rounded_to_float64_keeps_its_properties(s: int):
+def test_tableau_rounded_to_float64_keeps_its_properties(s: int):
     built_in = LobattoIIIAB(s)
     method = PartitionedRungeKutta(built_in.a, built_in.b)
     assert method.orders == built_in.orders
@@ -238,7 +238,7 @@ def test_a_tableau_rounded_to_float64_keeps_its_properties(s: int):
     np.testing.assert_array_equal(method.closure_weights.E, built_in.closure_weights.E)
 
 
-def test_orders_of_classical_tableaux():
+def test_tableau_of_classical_methods_has_known_orders():
     assert RK4.orders == (4, 1, 1, 1)
     assert RK4.order == 4
     assert RADAU_IIA.orders[:3] == (3, 2, 1)

@@ -1,4 +1,4 @@
-"""The orders that methods report, by the conditions of trees and by runs."""
+"""The orders of methods, from the conditions of trees and from runs."""
 
 from fractions import Fraction
 
@@ -7,7 +7,12 @@ import pytest
 
 import nhjax
 from benchmarks import _tableaux
-from nhjax._method import _conditions, _trees
+from nhjax._method._order_conditions import (
+    _Branch,
+    _products,
+    order,
+    partitioned_order,
+)
 from oracles.long import long
 
 
@@ -23,18 +28,18 @@ def conjugate(a, b):
     )
 
 
-def order_of(a, b, most=8):
-    return _trees.partitioned_order((a, conjugate(a, b)), b, 0, most)
+def order_of(a, b, max_order=8):
+    return partitioned_order((a, conjugate(a, b)), b, 0, max_order)
 
 
-def test_trees_with_edges_of_two_colours_are_as_many_as_there_are():
+def test_order_trees_with_two_colours_have_the_known_counts():
     # Exact for every tree: all conditions of the flow itself, as φ = γ⁻¹ |τ| would be.
     branches, counts = [], []
     for size in range(1, 9):
-        trees = list(_trees._products(branches, size - 1, len(branches), np.ones(1)))
+        trees = list(_products(branches, size - 1, len(branches), np.ones(1)))
         counts.append(len(trees))
         branches += [
-            _trees._Branch(size, gamma * size, values)
+            _Branch(size, gamma * size, values)
             for gamma, values in trees
             for _ in range(2)
         ]
@@ -71,8 +76,8 @@ def test_order_in_exact_rationals_of_equal_distances_is_two():
 @pytest.mark.parametrize(
     "method", [*map(nhjax.LobattoIIIAB, range(2, 9)), *map(nhjax.Gauss, range(1, 7))]
 )
-def test_order_of_built_in_method_is_that_of_its_tableau(method):
-    assert method.order == _conditions.order(method._tableau())
+def test_order_of_built_in_method_agrees_with_its_tableau(method):
+    assert method.order == order(method._tableau())
 
 
 FREE = {name: _tableaux.collocation(c) for name, c in _tableaux.OPEN.items()}
@@ -81,7 +86,7 @@ FREE |= {"RK4": _tableaux.RK4}
 
 
 @pytest.mark.parametrize("name", FREE)
-def test_order_without_constraints_is_what_runs_show(name):
+def test_order_without_constraints_agrees_with_runs(name):
     method = FREE[name]
     counts = (40, 80) if method.order < 4 else (20, 40)
     found = _tableaux.observed(*_tableaux.pendulum(), method, counts, 2.0)
@@ -90,7 +95,7 @@ def test_order_without_constraints_is_what_runs_show(name):
 
 
 @pytest.mark.parametrize("name", _tableaux.CLOSED)
-def test_order_with_constraints_is_what_runs_show(name):
+def test_order_with_constraints_agrees_with_runs(name):
     method = _tableaux.collocation(_tableaux.CLOSED[name])
     counts = (40, 80) if method.constrained_order < 4 else (24, 48)
     found = _tableaux.observed(*_tableaux.rolling(), method, counts, 1.0)
@@ -110,7 +115,7 @@ def test_order_with_constraints_without_collocation_is_what_runs_show():
     np.testing.assert_allclose(found, 2, atol=0.1)
 
 
-# The others have a factor |R_A(∞)| > 1, and are refused.
+# The other tableaux have |R_A(∞)| > 1 and raise an error.
 PROPAGATED = [
     "0, 1/3, 2/3, 1",
     "0, .25, .5, .75, 1",
@@ -121,7 +126,7 @@ PROPAGATED = [
 
 
 @pytest.mark.parametrize("name", PROPAGATED)
-def test_order_of_propagated_multiplier_is_what_runs_show(name):
+def test_order_of_propagated_multiplier_agrees_with_runs(name):
     method = _tableaux.collocation(_tableaux.CLOSED[name], "propagated")
     found = _tableaux.observed(*_tableaux.rolling(), method, (80, 160), 1.0)
     assert abs(found.multiplier - method.multiplier_order) < 0.1

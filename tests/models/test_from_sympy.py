@@ -1,4 +1,4 @@
-"""Models written in SymPy: equations of motion, parameters, and what is refused."""
+"""Models imported from SymPy: equations of motion, parameters and errors."""
 
 import builtins
 from typing import Any
@@ -34,7 +34,7 @@ def numbers(expression, model, y, acceleration):
             for q, x in zip(symbols, given, strict=True)
         }
     values |= {sympy.Symbol(name): float(x) for name, x in model.args.items()}
-    # Derivatives first: the coordinates are parts of them.
+    # Replace derivatives first, because they contain coordinates.
     for part in (2, 1, 0):
         some = {
             key: value
@@ -45,7 +45,7 @@ def numbers(expression, model, y, acceleration):
     return np.array(expression.subs(T, 0.7).evalf(), float).reshape(-1)
 
 
-def test_a_lagranges_method_has_the_motion_of_its_own_equations():
+def test_lagranges_method_imported_agrees_with_its_own_equations():
     """With both kinds of constraints, loads, an explicit time and a factor 1/2."""
     z: Any = dynamicsymbols("z")
     frame, point = mechanics.ReferenceFrame("N"), mechanics.Point("P")
@@ -67,7 +67,7 @@ def test_a_lagranges_method_has_the_motion_of_its_own_equations():
     found = nhjax.motion(model.system, 0.7, y, model.args)
     equations: Any = method.form_lagranges_equations()
     names: Any = method.lam_vec
-    # There the holonomic ones come first, and multipliers have the other sign.
+    # In SymPy holonomic constraints come first, and multipliers have the other sign.
     signed = [-found.multiplier[1], -found.multiplier[0]]
     multipliers = dict(zip(names, map(float, signed), strict=True))
     residual = numbers(equations.subs(multipliers), model, y, found.acceleration)
@@ -91,7 +91,7 @@ def test_a_projection_keeps_what_is_chosen_by_name_or_symbol():
 
 
 def skate(**options):
-    """A skate for Kane's method: speeds forward, sideways and of its turn."""
+    """A skate for Kane's method, with forward, sideways and turning speeds."""
     forward, aside, turn = dynamicsymbols("u1 u2 u3")
     frame = mechanics.ReferenceFrame("N")
     body = frame.orientnew("B", "Axis", [A, frame.z])
@@ -124,7 +124,7 @@ def skate(**options):
     return method, (forward, turn, aside)
 
 
-def test_a_kanes_method_has_the_motion_of_its_own_equations():
+def test_kanes_method_imported_agrees_with_its_own_equations():
     method, speeds = skate()
     model = from_sympy(method, parameters={M: 1.3, K: 0.2})
     y = model.initial_state(
@@ -174,7 +174,7 @@ def slider(loads=(), energy=0, pushed=False):
 
 
 @pytest.mark.parametrize(("pushed", "expected"), [(False, [-1.5]), (True, [-0.75] * 2)])
-def test_a_kanes_method_may_have_holonomic_constraints_or_none(pushed, expected):
+def test_kanes_method_with_or_without_holonomic_constraints_imports(pushed, expected):
     model = from_sympy(slider([-K * X], pushed=pushed), parameters={M: 2.0, K: 3.0})
     assert (model.system.nonholonomic, model.system.holonomic is None) == (
         None,
@@ -185,9 +185,9 @@ def test_a_kanes_method_may_have_holonomic_constraints_or_none(pushed, expected)
     np.testing.assert_allclose(found, expected, rtol=1e-14)
 
 
-def test_a_potential_energy_beside_loads_is_not_counted_twice():
+def test_kanes_method_with_potential_and_loads_requires_potential_argument():
     method = slider([-K * X], energy=K * X**2 / 2)
-    with pytest.raises(ValueError, match=r"and there are loads.* give `potential=0`"):
+    with pytest.raises(ValueError, match=r"and there are loads.* pass `potential=0`"):
         from_sympy(method)
     model = from_sympy(method, potential=0, parameters={M: 2.0, K: 3.0})
     y = model.initial_state({X: 1.0}, {})
@@ -195,7 +195,7 @@ def test_a_potential_energy_beside_loads_is_not_counted_twice():
     np.testing.assert_allclose(found, [-1.5], rtol=1e-14)
 
 
-def test_numbers_keep_all_their_digits():
+def test_sympy_numbers_imported_keep_all_digits():
     for number in (np.pi, 5.972e24, 10**25):
         system = from_sympy(sympy.sympify(number) * X + DX**2, [X]).system
         one, zero = jnp.ones(1), jnp.zeros(1)
@@ -207,7 +207,7 @@ def particle():
     return sympy_models.particle()
 
 
-def test_an_imported_particle_moves_as_that_of_the_gallery(particle):
+def test_sympy_particle_integrated_agrees_with_gallery(particle):
     example = systems.NonholonomicParticle()
     options = {"dt": 0.1, "num_steps": 20}
     ours = nhjax.integrate(
@@ -226,7 +226,7 @@ def test_an_imported_particle_moves_as_that_of_the_gallery(particle):
     assert ours.coordinates == ("x", "y", "z")
 
 
-def test_gradients_reach_the_parameters(particle):
+def test_sympy_parameters_differentiated_give_gradients(particle):
     y0 = particle.initial_state({"x": 1.0, "y": 0.5}, {"y": 1.0})
 
     def end(k):
@@ -240,20 +240,20 @@ def test_gradients_reach_the_parameters(particle):
     np.testing.assert_allclose(slope(1.0)[1], difference, rtol=1e-8)
 
 
-def test_a_model_serves_both_precisions(particle):
+def test_sympy_model_in_single_precision_keeps_dtype(particle):
     q, v = jnp.ones(3, jnp.float32), jnp.zeros(3, jnp.float32)
     y = particle.initial_state(q, v)
     assert y.p.dtype == jnp.float32
     assert nhjax.motion(particle.system, 0.0, y, particle.args).multiplier.shape == (1,)
 
 
-def test_values_at_run_time_are_refused_by_name(particle):
+def test_sympy_parameters_wrong_at_run_time_raise_naming_them(particle):
     for args, message in (
-        (None, "with the parameters of the model by name, as strings, k, such as"),
-        ({}, "`args` lacks k of the parameters"),
-        ({"k": 1.0, "g": 2.0}, "`args` has g, which is none of the parameters"),
+        (None, r"of the model's parameters by name, as strings \(k\), such as"),
+        ({}, "`args` lacks the parameters k"),
+        ({"k": 1.0, "g": 2.0}, "`args` has the unknown parameters g"),
         ({"k": "1"}, r"`args\['k'\]` must be a real number, got '1'"),
-        ({sympy.Symbol("k"): 1.0}, "by name, as strings, k"),
+        ({sympy.Symbol("k"): 1.0}, "by name, as strings \\(k\\)"),
         ({"k": jnp.ones(2)}, r"`args\['k'\]` has shape \(2,\)"),
     ):
         with pytest.raises((ValueError, TypeError), match=message):
@@ -270,7 +270,7 @@ def test_values_at_run_time_are_refused_by_name(particle):
         )
 
 
-def test_forces_may_be_given_in_four_forms():
+def test_sympy_forces_in_four_forms_give_equal_systems():
     frame, point = mechanics.ReferenceFrame("N"), mechanics.Point("P")
     point.set_vel(frame, DX * frame.x + DY * frame.y)
     forms = (
@@ -288,7 +288,7 @@ def test_forces_may_be_given_in_four_forms():
         np.testing.assert_allclose(found, [-0.75, 0.0], rtol=1e-15)
 
 
-def test_an_equation_and_a_derivative_of_a_product_are_read():
+def test_sympy_equations_and_product_derivatives_are_imported():
     model = from_sympy(
         FREE, [X, Y], nonholonomic=sympy.Eq((X * Y).diff(T, evaluate=False), 0)
     )
@@ -301,19 +301,19 @@ def test_an_equation_and_a_derivative_of_a_product_are_read():
 
 OTHER = sympy.Function("f")
 WRONG = {
-    "`lagrangian` contains f\\(t\\), which is not among the coordinates": (
+    "`lagrangian` contains f\\(t\\), which is not one of the coordinates": (
         {"lagrangian": FREE + OTHER(T)}
     ),
-    "contains Derivative\\(x\\(t\\), \\(t, 2\\)\\); .* not on accelerations": (
+    "contains Derivative\\(x\\(t\\), \\(t, 2\\)\\), .* not on accelerations": (
         {"lagrangian": FREE + X.diff(T, 2)}
     ),
-    "contains Derivative\\(a\\(t\\), t\\), the derivative of what is no coordinate": (
+    "contains Derivative\\(a\\(t\\), t\\), but a\\(t\\) is not a coordinate": (
         {"lagrangian": FREE + DA**2}
     ),
-    "contains Integral\\(.*\\) \\(Integral\\), which SymPy's printer": (
+    "contains Integral\\(.*\\) \\(Integral\\), which JAX or SymPy's printer": (
         {"lagrangian": FREE + sympy.Integral(sin(K**2 * Y), (K, 0, 1))}
     ),
-    "contains besselj\\(1, x\\(t\\)\\) \\(besselj\\), which SymPy's printer": (
+    "contains besselj\\(1, x\\(t\\)\\) \\(besselj\\), which JAX or SymPy's printer": (
         {"lagrangian": FREE + sympy.besselj(1, X)}
     ),
     "`lagrangian` contains f\\(x\\(t\\)\\), which": {"lagrangian": FREE + OTHER(X)},
@@ -328,13 +328,13 @@ WRONG = {
     "`parameters` has m \\+ 1, but": {"parameters": {M + 1: 1.0}},
     "`lagrangian` contains the imaginary unit": {"lagrangian": FREE + sympy.I * X},
     "the coordinate x is given twice": {"coordinates": [X, X]},
-    "the coordinate k is no function of time": {"coordinates": [X, K]},
+    "the coordinate k is not a function of the time": {"coordinates": [X, K]},
     "`holonomic\\[1\\]`, k - 1, contains no coordinate": {"holonomic": [X, K - 1]},
-    "contains velocities: give it as `nonholonomic`": {"holonomic": DX},
-    "contains no velocity: give it as `holonomic`": {"nonholonomic": X},
+    "contains velocities: pass it as `nonholonomic`": {"holonomic": DX},
+    "contains no velocity: pass it as `holonomic`": {"nonholonomic": X},
     "`forces` has 1 entries, but there are 2 coordinates": {"forces": [X]},
-    "`forces` has a\\(t\\), not among the coordinates": {"forces": {A: X}},
-    "`forces` has z, not among the coordinates": {"forces": {"z": X}},
+    "`forces` has a\\(t\\), which is not one of the coordinates": {"forces": {A: X}},
+    "`forces` has z, which is not one of the coordinates": {"forces": {"z": X}},
     "`forces` has x\\(t\\) twice": {"forces": {X: 1, "x": 2}},
     "`parameters` has q, but the symbols of the model are m": {"parameters": {"q": 1}},
     "`parameters` has m twice": {"parameters": {"m": 1, M: 2}},
@@ -344,8 +344,8 @@ WRONG = {
     "two symbols of the name m": (
         {"lagrangian": FREE + sympy.Symbol("m", positive=True) * X}
     ),
-    "must be of scalar expressions of SymPy, got 'x' of type str": {"lagrangian": "x"},
-    "`potential` belongs to a KanesMethod": {"potential": X},
+    "must consist of scalar SymPy expressions, got 'x' of": {"lagrangian": "x"},
+    "`potential` is for a KanesMethod only": {"potential": X},
     "need `frame`, the inertial ReferenceFrame": (
         {"forces": [(mechanics.Point("P"), mechanics.ReferenceFrame("N").x)]}
     ),
@@ -353,13 +353,13 @@ WRONG = {
 
 
 @pytest.mark.parametrize("message", WRONG)
-def test_what_cannot_be_imported_is_named(message):
+def test_from_sympy_with_unsupported_input_raises_naming_it(message):
     given = {"lagrangian": FREE, "coordinates": [X, Y]} | WRONG[message]
     with pytest.raises((ValueError, TypeError), match=message):
         from_sympy(**given)
 
 
-def test_a_method_with_more_is_refused():
+def test_from_sympy_method_with_extra_arguments_raises():
     with pytest.raises(ValueError, match="`coordinates` is given together with a Kan"):
         from_sympy(skate()[0], [X])
 
@@ -383,7 +383,7 @@ def rolling_for_kane(speeds):
     )
 
 
-def test_energies_that_roll_already_are_refused():
+def test_kanes_method_with_substituted_rolling_raises():
     u, w = dynamicsymbols("u w")
     with pytest.raises(ValueError, match="centre relative to contact is not the rate"):
         from_sympy(rolling_for_kane([u]))
@@ -391,7 +391,7 @@ def test_energies_that_roll_already_are_refused():
         from_sympy(rolling_for_kane([u, w]))
 
 
-def test_without_sympy_the_extra_is_named(monkeypatch):
+def test_from_sympy_without_sympy_raises_naming_the_extra(monkeypatch):
     imported = builtins.__import__
 
     def without(name, *args, **kwargs):

@@ -1,4 +1,4 @@
-"""Imported models against what SymPy and PyDy print, and against the gallery."""
+"""Imported models compared with results of SymPy and PyDy, and with the gallery."""
 
 import jax
 import jax.numpy as jnp
@@ -30,7 +30,7 @@ def stone():
 
 
 def printed_by_sympy(v):
-    """The slopes of (lean, steer) and of their rates at the speed v.
+    """The matrix of the linear equations for (lean, steer) and their rates at speed v.
 
     SymPy 1.14, sympy/physics/mechanics/tests/test_kane3.py, `Res`.
     """
@@ -56,7 +56,7 @@ def printed_by_sympy(v):
 
 @pytest.mark.long
 @pytest.mark.parametrize("speed", range(6))
-def test_the_bicycle_of_sympys_tests_has_the_slopes_printed_there(bicycle, speed):
+def test_sympy_bicycle_when_upright_has_published_coefficients(bicycle, speed):
     rolling = {"x": speed, "q3": speed / 0.3, "q6": speed / 0.35}
     y = bicycle.initial_state(q={}, v=rolling)
     place = [bicycle.coordinates.index(name) for name in ("q2", "q5", "q3")]
@@ -64,14 +64,14 @@ def test_the_bicycle_of_sympys_tests_has_the_slopes_printed_there(bicycle, speed
         bicycle.system, 0.0, y, bicycle.args, positions=place[:2], velocities=place
     )
     expected = printed_by_sympy(speed)
-    # The test there allows 1e-12.
+    # SymPy's own test has the tolerance 1e-12.
     np.testing.assert_allclose(found.matrix[:4, :4], expected, rtol=0, atol=1e-12)
     np.testing.assert_allclose(found.matrix[4], 0, atol=1e-12)
     for value in np.linalg.eigvals(expected):
         assert np.min(np.abs(np.asarray(found.eigenvalues) - value)) < 1e-10
 
 
-def test_the_benchmark_compares_the_same_systems():
+def test_sympy_benchmark_models_have_equal_accelerations():
     pair = particles()
     both = [system.energy(0.0, y) for system, y in (pair.by_hand, pair.imported)]
     np.testing.assert_allclose(both[0], both[1], rtol=1e-14)
@@ -96,14 +96,14 @@ def rolling_state(model, q, v, free=("x", "y")):
 
 
 @pytest.mark.parametrize(("lean", "turn"), [(0.3, 1.7), (-0.8, 0.6), (1.1, -2.5)])
-def test_the_disc_turns_steadily_where_pydys_equation_says(disc, lean, turn):
+def test_sympy_disc_at_pydys_steady_turn_has_no_acceleration(disc, lean, turn):
     """PyDy, examples/rollingdisc/rollingdisc.py: Fr[0] + Fr_star_steady[0] = 0."""
     r, m, g, across, axial = (float(disc.args[x]) for x in ("r", "m", "g", "I", "J"))
     sin, cos = np.sin(lean), np.cos(lean)
     from_turn = g * m * r * sin + (axial - across + m * r**2) * sin * cos * turn**2
     spin = -from_turn / ((axial + m * r**2) * cos * turn)
     y = rolling_state(disc, {"q1": lean}, {"q0": turn, "q2": spin})
-    # The place of the contact goes round in a circle, and angles change steadily.
+    # The contact point moves on a circle, and angles change at constant rates.
     found = accelerations_of(disc)(y).acceleration
     np.testing.assert_allclose(found[2:], 0, atol=1e-12)
     np.testing.assert_allclose(
@@ -112,8 +112,8 @@ def test_the_disc_turns_steadily_where_pydys_equation_says(disc, lean, turn):
 
 
 @pytest.mark.long
-def test_the_disc_moves_as_that_of_the_gallery(disc):
-    """The gallery's has SE(3), z upward and the axle as its third axis."""
+def test_sympy_disc_integrated_agrees_with_gallery(disc):
+    """The gallery's disc uses SE(3), z upward, and the axle as third body axis."""
     q, v = {"q1": 0.4, "q0": 0.0, "q2": 0.0}, {"q0": 1.2, "q1": -0.3, "q2": 5.0}
     y0 = rolling_state(disc, q, v)
     attitude = Rotation.from_euler("x", 0.4).as_matrix()
@@ -190,7 +190,7 @@ def stone_at(stone, lean, pitch, omega):
 
 
 @pytest.mark.parametrize("printed", PYDY)
-def test_the_rattleback_has_the_accelerations_and_forces_of_pydys(stone, printed):
+def test_sympy_rattleback_agrees_with_pydy_accelerations_and_forces(stone, printed):
     (lean, pitch, *omega), rates, force, kinetic = printed
     y = stone_at(stone, lean, pitch, omega)
     found = accelerations_of(stone)(y)
@@ -200,7 +200,7 @@ def test_the_rattleback_has_the_accelerations_and_forces_of_pydys(stone, printed
     np.testing.assert_allclose(0.5 * y.p @ y.v, kinetic, rtol=1e-13)
 
 
-def test_the_rattleback_moves_as_kane_and_levinson_say(stone):
+def test_sympy_rattleback_integrated_reverses_as_published(stone):
     angle = np.deg2rad(0.5)
     y0 = stone_at(stone, angle, angle, (0.0, 0.0, -5.0))
     options = {"dt": 0.001, "num_steps": 400, "args": stone.args}

@@ -1,9 +1,17 @@
+"""The interface of a configuration manifold: a Lie group with a retraction.
+
+`AbstractLieGroup` derives every tangent map by automatic differentiation from a few
+basic maps. `AbstractMotionGroup` adds the shortcuts of groups whose retraction
+satisfies τ(-ξ) = τ(ξ)⁻¹.
+"""
+
 from abc import abstractmethod
 from collections.abc import Callable
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, DTypeLike, Float, PyTree
 
 from .._custom_types import BoolScalar, FloatScalar
@@ -18,13 +26,13 @@ class AbstractLieGroup(eqx.Module):
     """A configuration manifold: a Lie group G with a retraction τ: 𝔤 -> G.
 
     The stage equations are written on the chart Ξ -> g_k τ(Ξ) around the current
-    configuration (paper, section 5). Velocities and momenta are left-trivialised, that
-    is, vectors of 𝔤 and 𝔤*.
+    configuration (paper, section 5). Velocities and momenta are left-trivialised: they
+    are vectors of 𝔤 and 𝔤*.
 
     To define a group of your own, write a subclass with `dim`, `identity`, `check`,
-    `compose`, `inverse`, `retract` and `local`. Everything else follows from these by
-    automatic differentiation, and may be overridden with closed forms. An element is a
-    pytree of arrays; the retraction must satisfy τ(0) = e and dτ_0 = I.
+    `compose`, `inverse`, `retract` and `local`. All other methods follow from these by
+    automatic differentiation, and can be overridden with closed forms. An element is a
+    pytree of arrays. The retraction must satisfy τ(0) = e and dτ_0 = I.
     """
 
     @property
@@ -40,7 +48,7 @@ class AbstractLieGroup(eqx.Module):
     def check(self, q: Element, name: str = "q") -> Element:
         """Return `q`, or raise a `ShapeError` if it cannot be an element.
 
-        The message of the error calls it `name`.
+        The error message refers to it by `name`.
         """
 
     @abstractmethod
@@ -61,26 +69,26 @@ class AbstractLieGroup(eqx.Module):
 
     @property
     def is_flat(self) -> bool:
-        """Tell whether dτ = I and Ad = I everywhere, as on a vector space.
+        """Return whether dτ = I and Ad = I everywhere, as on a vector space.
 
-        The equations of a step then leave them out.
+        The step equations then omit both maps.
         """
         return False
 
     def in_chart(self, xi: Vector) -> BoolScalar:
-        """Tell whether τ is invertible around ξ, with a margin."""
+        """Return whether τ is invertible around ξ, with a margin."""
         return jnp.asarray(True)
 
     def distance_to_group(self, q: Element) -> FloatScalar:
-        """Compute the distance of the numbers in `q` to the group."""
+        """Compute the distance of the values in `q` from the group."""
         return jnp.zeros((), _dtype(q))
 
     def normalise(self, q: Element) -> Element:
-        """Return the element of the group that is nearest to `q`."""
+        """Return the element of the group nearest to `q`."""
         return q
 
-    # Nothing in the library needs the two methods below, and the maps of a group do not
-    # determine them: a user's own group need not have them.
+    # A user's group may omit the two methods below. The library does not call them, and
+    # they do not follow from the other methods.
 
     def matrix(self, g: Element) -> Float[Array, "k k"]:
         """Return the matrix that represents the element g."""
@@ -91,40 +99,40 @@ class AbstractLieGroup(eqx.Module):
         raise NotImplementedError(_no_matrix(self, "hat"))
 
     def act(self, g: Element, xi: Vector) -> Element:
-        """Compute g τ(ξ), the element that ξ leads to from g."""
+        """Compute g τ(ξ), the end of the motion ξ that starts at g."""
         return self.compose(g, self.retract(xi))
 
     def act_back(self, g: Element, xi: Vector) -> Element:
-        """Compute g τ(ξ)⁻¹, the element from which ξ leads to g."""
+        """Compute g τ(ξ)⁻¹, the start of the motion ξ that ends at g."""
         return self.compose(g, self.inverse(self.retract(xi)))
 
     def no_compensation(self, q: Element) -> Element:
-        """Return the compensation to start `advance` from, which is zero."""
+        """Return the initial compensation of `advance`, which is zero."""
         return jax.tree.map(jnp.zeros_like, q)
 
     def wrapped(self, q: Element, compensation: Element) -> Element:
-        """Return `q` with its angles reduced to one turn, as functions are given it.
+        """Return `q` with its angles reduced to one turn.
 
-        An angle that has grown over many turns is replaced by the one of the first turn
-        that means the same, which holds more of its digits; to these the compensation
-        adds what `advance` could not.
+        The functions of a system are called with this element. An angle that has grown
+        over many turns is replaced by the equivalent angle of the first turn, plus the
+        compensation: the smaller number has a smaller rounding error.
         """
         return q
 
     def advance(
         self, q: Element, xi: Vector, compensation: Element
     ) -> tuple[Element, Element]:
-        """Compute g τ(ξ) and its compensation, the rounding error of the sum so far.
+        """Compute g τ(ξ) and the compensation, the accumulated rounding error.
 
-        The compensation is added in the next call, so that rounding errors do not add
-        up over many steps. A group without such a sum returns it unchanged.
+        The next call adds the compensation, so that rounding errors do not grow over
+        many steps. A group without compensated summation returns it unchanged.
         """
         return self.act(q, xi), compensation
 
     def advance_across(
         self, q: Element, xi: Vector, compensation: Element
     ) -> tuple[Element, Element]:
-        """Compute g τ(-ξ)⁻¹ τ(ξ) as `advance` does: in the chart, from -ξ to ξ."""
+        """Compute g τ(-ξ)⁻¹ τ(ξ), from -ξ to ξ in the chart, as `advance` does."""
         return self.advance(self.act_back(q, -xi), xi, compensation)
 
     def tangent(self, g: Element, eta: Vector) -> Element:
@@ -151,8 +159,8 @@ class AbstractLieGroup(eqx.Module):
 
         It is defined by ∂_ξ(dτ_ξ η) δ = dτ_ξ ddτ_ξ(η, δ).
         """
-        # This differentiates dτ_ξ⁻¹ y = η at y = dτ_ξ η. The inverse is simpler than
-        # dτ: for Cayley's map it is a polynomial.
+        # Differentiate dτ_ξ⁻¹ y = η at y = dτ_ξ η. The inverse is simpler than dτ: for
+        # the Cayley map it is a polynomial.
         y = self.dtau(xi, eta)
         return -_jvp(lambda z: self.dtau_inv(z, y), xi, delta)
 
@@ -161,7 +169,7 @@ class AbstractLieGroup(eqx.Module):
         return transpose(lambda eta: self.dtau(xi, eta), mu)(mu)
 
     def right_dtau_dual(self, xi: Vector, mu: Vector) -> Vector:
-        """Compute (Ad_{τ(ξ)} dτ_ξ)^* μ, by the right-trivialised tangent of τ."""
+        """Compute (Ad_{τ(ξ)} dτ_ξ)^* μ, the dual of the right-trivialised tangent."""
         return self.dtau_dual(xi, self.to_end(xi, mu))
 
     def dtau_inv_dual(self, xi: Vector, mu: Vector) -> Vector:
@@ -191,19 +199,19 @@ class AbstractLieGroup(eqx.Module):
         return transpose(lambda eta: self.Ad(g, eta), mu)(mu)
 
     def to_end(self, xi: Vector, mu: Vector) -> Vector:
-        """Compute Ad_{τ(ξ)}^* μ: carry a covector from g to g τ(ξ)."""
+        """Compute Ad_{τ(ξ)}^* μ, the covector μ at g transported to g τ(ξ)."""
         return self.Ad_dual(self.retract(xi), mu)
 
     def to_end_change(self, xi: Vector, mu: Vector) -> Vector:
-        """Compute Ad_{τ(ξ)}^* μ - μ; subclasses may do so without cancellation."""
+        """Compute Ad_{τ(ξ)}^* μ - μ; subclasses may avoid cancellation."""
         return self.to_end(xi, mu) - mu
 
     def to_start(self, xi: Vector, mu: Vector) -> Vector:
-        """Compute Ad_{τ(ξ)⁻¹}^* μ: carry a covector from g τ(ξ) to g."""
+        """Compute Ad_{τ(ξ)⁻¹}^* μ, the covector μ at g τ(ξ) transported to g."""
         return self.Ad_dual(self.inverse(self.retract(xi)), mu)
 
     def to_start_change(self, xi: Vector, mu: Vector) -> Vector:
-        """Compute Ad_{τ(ξ)⁻¹}^* μ - μ; subclasses may do so without cancellation."""
+        """Compute Ad_{τ(ξ)⁻¹}^* μ - μ; subclasses may avoid cancellation."""
         return self.to_start(xi, mu) - mu
 
     def ad_dual(self, xi: Vector, mu: Vector) -> Vector:
@@ -211,16 +219,51 @@ class AbstractLieGroup(eqx.Module):
         return transpose(lambda eta: self.ad(xi, eta), mu)(mu)
 
 
+class AbstractMotionGroup(AbstractLieGroup):
+    """A group of rotations or rigid motions, with τ(-ξ) = τ(ξ)⁻¹."""
+
+    @abstractmethod
+    def to_end_change(self, xi: Vector, mu: Vector) -> Vector:
+        """Compute Ad_{τ(ξ)}^* μ - μ, without cancellation."""
+
+    def to_end(self, xi: Vector, mu: Vector) -> Vector:
+        """Compute Ad_{τ(ξ)}^* μ as the sum of μ and its change."""
+        return mu + self.to_end_change(xi, mu)
+
+    def to_start(self, xi: Vector, mu: Vector) -> Vector:
+        """Compute Ad_{τ(-ξ)}^* μ, which equals Ad_{τ(ξ)⁻¹}^* μ."""
+        return self.to_end(-xi, mu)
+
+    def to_start_change(self, xi: Vector, mu: Vector) -> Vector:
+        """Compute Ad_{τ(-ξ)}^* μ - μ, without cancellation."""
+        return self.to_end_change(-xi, mu)
+
+    def act_back(self, g: Element, xi: Vector) -> Element:
+        """Compute g τ(-ξ), which equals g τ(ξ)⁻¹."""
+        return self.act(g, -xi)
+
+    def advance_across(
+        self, q: Element, xi: Vector, compensation: Element
+    ) -> tuple[Element, Element]:
+        """Compute g τ(ξ) τ(ξ), which equals g τ(-ξ)⁻¹ τ(ξ)."""
+        middle, compensation = self.advance(q, xi, compensation)
+        return self.advance(middle, xi, compensation)
+
+    def right_dtau_dual(self, xi: Vector, mu: Vector) -> Vector:
+        """Compute dτ_{-ξ}^* μ, which equals (Ad_{τ(ξ)} dτ_ξ)^* μ."""
+        return self.dtau_dual(-xi, mu)
+
+
 def transpose(
     function: Callable[[Vector], PyTree[Array]], at: Vector
 ) -> Callable[[PyTree[Array]], Vector]:
-    """Return the transpose of the derivative of a function at a vector."""
+    """Return the transpose of the derivative of a function at the point `at`."""
     _, pullback = jax.vjp(function, at)
     return lambda covector: pullback(covector)[0]
 
 
 def check_shape(q: Element, shape: tuple[int, ...], group: str, name: str) -> Element:
-    """Return `q`, or raise a `ShapeError` unless it is one array of this shape."""
+    """Return `q`, or raise a `ShapeError` if it is not one array of this shape."""
     if isinstance(q, (tuple, list, dict)):
         raise ShapeError(
             f"`{name}` is {eqx.tree_pformat(q)}, but the manifold {group} needs an "
@@ -232,6 +275,20 @@ def check_shape(q: Element, shape: tuple[int, ...], group: str, name: str) -> El
             f"{shape}. For many trajectories use `jax.vmap`."
         )
     return q
+
+
+def homogeneous(
+    corner: Float[Array, "n n"], column: Float[Array, " n"], last: float
+) -> Float[Array, "n+1 n+1"]:
+    """Assemble the matrix [[corner, column], [0, last]] in homogeneous coordinates.
+
+    It represents a motion if last = 1, and a velocity if last = 0.
+    """
+    rows = jnp.concatenate([corner, column[:, None]], axis=1)
+    n = column.shape[0]
+    row = np.zeros((1, n + 1), column.dtype)
+    row[0, n] = last
+    return jnp.concatenate([rows, row])
 
 
 def _jvp(function, at, direction):
@@ -246,5 +303,5 @@ def _no_matrix(group, method):
     name = type(group).__name__
     return (
         f"{name} has no matrix representation. The integrators do not need one; to "
-        f"have it, define `{name}.{method}`."
+        f"add one, define `{name}.{method}`."
     )
