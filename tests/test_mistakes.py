@@ -728,7 +728,7 @@ STATES = [
         lambda: start(TURNING, q=2 * QUATERNION),
         ConstraintViolationError,
         "is no element of the group SO3",
-        "Pass `project=True`, or `manifold.normalise(q)`",
+        "or pass `manifold.normalise(q)`",
     ),
     row(
         "gave one array to a product of groups",
@@ -757,7 +757,7 @@ METHODS = [
         "asked for a hundred stages",
         lambda: nhjax.Gauss(100),
         ValueError,
-        "must be <= 32, got 100: more gain no digit",
+        "must be <= 32, got 100: more stages gain no accuracy",
     ),
     row(
         "misspelled a closure",
@@ -783,7 +783,7 @@ METHODS = [
         lambda: NHJAX.SO3(retraction=nhjax.Exponential),
         TypeError,
         "`retraction` must be one of Cayley()",
-        "It is the class; call it",
+        "It is a class; call it",
     ),
     row(
         "gave a negative tolerance",
@@ -1535,7 +1535,7 @@ RESULTS_OF_RUNS = [
         lambda: NHJAX.momentum_map(trajectory(), lambda q: q),
         TypeError,
         "`y` must be an nhjax.State, got Solution",
-        "Such as `sol.ys`",
+        "Pass for instance `sol.ys`",
     ),
     row(
         "gave a vector in place of a generator",
@@ -1559,7 +1559,7 @@ RESULTS_OF_RUNS = [
         "gave an error of zero to find an order",
         lambda: nhjax.convergence_order([0.1, 0.2], [1.0, 0.0]),
         ValueError,
-        "errors(1,) = 0.0. Leave it out",
+        "errors(1,) = 0.0. Omit this entry",
     ),
     row(
         "gave the position in place of the state",
@@ -1578,7 +1578,7 @@ RESULTS_OF_RUNS = [
         "asked for a steady motion without saying of what",
         lambda: NHJAX.steady_motion(SYSTEM, 0.0, Y0),
         ValueError,
-        "`positions` is missing: give `positions` and `velocities` together",
+        "`positions` is missing: pass `positions` and `velocities` together",
     ),
     row(
         "named coordinates where indices belong",
@@ -1597,7 +1597,7 @@ RESULTS_OF_RUNS = [
         lambda: ANY_PLOT.trajectory(trajectory().ys),
         TypeError,
         "`sol` must be an nhjax.Solution",
-        "It is what `nhjax.integrate` returns",
+        "`nhjax.integrate` returns one",
     ),
     row(
         "exchanged system and solution in a figure",
