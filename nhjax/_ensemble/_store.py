@@ -535,6 +535,7 @@ class _ZarrEncoder:
     ):
         try:
             import zarr
+            import zarr.storage
         except ImportError as error:
             raise ImportError(
                 "`nhjax.ensemble(out=...)` needs zarr 3, an optional dependency: "
