@@ -32,7 +32,7 @@ FLOORS = (
     ("_models",),
     ("_step",),
     ("_integrate",),
-    ("_files",),
+    ("_io",),
     ("_ensemble",),
     ("systems", "diagnostics", "plot", "studies", "__main__"),
 )
@@ -238,7 +238,7 @@ _COLUMNS = {
     "_models": 1.3,
     "_step": 2.4,
     "_integrate": 3.0,
-    "_files": 4.1,
+    "_io": 4.1,
     "_ensemble": 3.5,
     "systems": 0.0,
     "diagnostics": 1.8,

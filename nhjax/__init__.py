@@ -33,7 +33,6 @@ from ._errors import (
     NonFiniteError as NonFiniteError,
     ShapeError as ShapeError,
 )
-from ._files import load as load, save as save
 from ._initial import initial_state as initial_state
 from ._integrate import (
     AbstractAdjoint as AbstractAdjoint,
@@ -53,6 +52,7 @@ from ._integrate import (
     TextProgressMeter as TextProgressMeter,
     TqdmProgressMeter as TqdmProgressMeter,
 )
+from ._io import load as load, save as save
 from ._manifold import (
     AbstractLieGroup as AbstractLieGroup,
     Cayley as Cayley,

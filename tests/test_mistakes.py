@@ -1379,7 +1379,7 @@ ENSEMBLES = [
         lambda: nhjax.ensemble(lambda x: x, 1.0),
         ShapeError,
         "is a single number",
-        "`run` can close over what they share",
+        "`run` can close over shared values",
     ),
     row(
         "gave no members",
@@ -1391,7 +1391,7 @@ ENSEMBLES = [
         "gave a word as member",
         lambda: nhjax.ensemble(lambda x: x, ["x"]),
         TypeError,
-        "`members[0]` is 'x', but `members` holds arrays",
+        "`members[0]` is 'x', but `members` must hold arrays",
     ),
     row(
         "gave a number of members that is not theirs",
@@ -1403,7 +1403,7 @@ ENSEMBLES = [
         "gave a function of the index without the number of members",
         lambda: nhjax.ensemble(lambda x: x, lambda i: i),
         ValueError,
-        "`num_members` is needed where `members` is a function",
+        "`num_members` is needed if `members` is a function",
     ),
     row(
         "asked for no member",
@@ -1491,7 +1491,7 @@ ENSEMBLES = [
         "gave a number of bins in place of their edges",
         lambda: NHJAX.Histogram(10),
         ValueError,
-        "`edges` must be two numbers or more, got shape ()",
+        "`edges` must be a sequence of two or more numbers, got shape ()",
     ),
 ]
 
@@ -1645,7 +1645,7 @@ RESULTS_OF_RUNS = [
         "named coordinates of a data set that are not there",
         lambda: trajectory().to_xarray(coordinates=("x",)),
         ValueError,
-        "`coordinates` has the names ('x',), but 3 different ones are needed",
+        "`coordinates` has the names ('x',), but 3 different names are needed",
     ),
     row(
         "imported a model without coordinates",
@@ -1660,7 +1660,7 @@ FILES = [
         "saved under the name of a file of NetCDF",
         lambda folder: nhjax.save(folder / "x.nc", Y0),
         ValueError,
-        "'x.nc' would be a file of NumPy's (.npz) under the name of another format",
+        "'x.nc' has the suffix of another format",
         "use `sol.to_xarray()`",
         "or a name that ends in .npz",
     ),
@@ -1668,7 +1668,7 @@ FILES = [
         "saved under the name of a pickle",
         lambda folder: nhjax.save(folder / "x.pkl", Y0),
         ValueError,
-        "under the name of another format",
+        "has the suffix of another format",
     ),
     row(
         "exchanged the name and what is saved",
@@ -1694,14 +1694,13 @@ FILES = [
         "saved into a folder that is not there",
         lambda folder: nhjax.save(folder / "nowhere" / "x.npz", Y0),
         FileNotFoundError,
-        "There is no folder",
-        "make it first",
+        "does not exist: create it first",
     ),
     row(
         "loaded a file that is not there",
         lambda folder: nhjax.load(folder / "x.npz"),
         FileNotFoundError,
-        "There is no file",
+        "does not exist.",
     ),
     row(
         "loaded a folder",
@@ -1714,7 +1713,7 @@ FILES = [
         "loaded a text",
         lambda folder: nhjax.load(written(folder / "notes.txt")),
         ValueError,
-        "is no file of `nhjax.save`, or is damaged: it is no .npz",
+        "is not a file of `nhjax.save`, or is damaged: it is not an .npz",
     ),
     row(
         "gave an ensemble the name of a file of NetCDF",

@@ -1,4 +1,4 @@
-"""Every picture has labelled axes and shows its data."""
+"""Every figure has labelled axes and shows its data."""
 
 import subprocess
 import sys
@@ -44,7 +44,7 @@ def batch(disc):
     return jax.vmap(lambda y: _run(disc, y))(y0)
 
 
-def test_trajectory(sol):
+def test_plot_trajectory_draws_coordinates_with_labels(sol):
     ax = plot.trajectory(sol, (0, -1), names=("east", "heading"), color="k")
     assert (ax.get_xlabel(), ax.get_ylabel()) == ("east", "heading")
     (line,) = ax.lines
@@ -52,14 +52,14 @@ def test_trajectory(sol):
     assert line.get_color() == "k"
 
 
-def test_trajectory_in_space(sol):
+def test_plot_trajectory_of_three_coordinates_draws_in_space(sol):
     ax = plot.trajectory(sol, (0, 1, 2))
     assert ax.get_zlabel() == "$q_3$"  # pyright: ignore[reportAttributeAccessIssue]
     ax.figure.canvas.draw()
 
 
 @pytest.mark.parametrize("kind", ["trajectory", "energy", "multiplier", "constraint"])
-def test_a_batch_has_a_line_for_each_member(kind, disc, batch):
+def test_plot_of_a_batch_draws_a_line_for_each_member(kind, disc, batch):
     given = Figure().add_subplot()
     if kind in ("energy", "constraint"):
         ax = getattr(plot, kind)(disc.system, batch, ax=given)
@@ -72,14 +72,14 @@ def test_a_batch_has_a_line_for_each_member(kind, disc, batch):
     assert ax.get_ylabel()
 
 
-def test_energy(disc, sol):
+def test_plot_energy_draws_the_energy_error(disc, sol):
     ax = plot.energy(disc.system, sol)
     assert ax.get_xlabel() == "time $t$"
     assert ax.get_ylabel() == "$E(t) - E(t_0)$"
     np.testing.assert_array_equal(ax.lines[0].get_xdata(), sol.ts)
 
 
-def test_multiplier(sol):
+def test_plot_multiplier_draws_its_values(sol):
     ax = plot.multiplier(sol)
     assert ax.get_ylabel() == "multiplier"
     legend = ax.get_legend()
@@ -90,14 +90,14 @@ def test_multiplier(sol):
     ]
 
 
-def test_multiplier_needs_constraints():
+def test_plot_multiplier_without_constraints_raises():
     oscillator = nhjax.systems.HarmonicOscillator()
     free = _run(oscillator, oscillator.initial_state())
     with pytest.raises(ValueError, match="no constraints"):
         plot.multiplier(free)
 
 
-def test_convergence():
+def test_plot_convergence_draws_errors_and_reference_slope():
     h = np.array([0.4, 0.2, 0.1])
     errors = np.array([1e-2, 6e-4, 0.0])
     ax = plot.convergence(h, errors, order=4, label="s = 3")
@@ -110,18 +110,18 @@ def test_convergence():
     assert ax.get_ylabel()
 
 
-def test_errors(sol):
+def test_plot_with_invalid_argument_raises(sol):
     with pytest.raises(ValueError, match="two or three indices"):
         plot.trajectory(sol, (0,))
-    with pytest.raises(ValueError, match="`names` must hold 2"):
+    with pytest.raises(ValueError, match="`names` must have 2"):
         plot.trajectory(sol, names=("x",))
-    with pytest.raises(ValueError, match="vectors of one length"):
+    with pytest.raises(ValueError, match="vectors of the same length"):
         plot.convergence([0.1, 0.2], [1.0])
     with pytest.raises(ValueError, match="positive number"):
         plot.convergence([0.1], [0.0])
 
 
-def test_importing_the_library_does_not_import_matplotlib():
+def test_plot_import_does_not_import_matplotlib():
     code = "import sys, nhjax, nhjax.plot; sys.exit('matplotlib' in sys.modules)"
     subprocess.run([sys.executable, "-c", code], check=True)
 
@@ -141,7 +141,7 @@ def in_space(points):
 
 
 @pytest.mark.parametrize("spatial", [False, True])
-def test_an_animation_keeps_the_pace_of_the_motion(tmp_path, spatial):
+def test_plot_animation_has_constant_frame_rate(tmp_path, spatial):
     wheel = np.array([[-1.0, 0.0], [0.0, 1.0], [1.0, 0.0]])
     points = SLIDER | {"wheel": SLIDER["hub"][:, None] + wheel}
     points = in_space(points) if spatial else points
@@ -150,7 +150,7 @@ def test_an_animation_keeps_the_pace_of_the_motion(tmp_path, spatial):
     )
     animation.save(tmp_path / "motion.gif", dpi=20)
     with Image.open(tmp_path / "motion.gif") as picture:
-        # Two seconds at half the speed, with the first and the last moment.
+        # Two seconds at half the speed, including the first and the last frame.
         assert picture.info["duration"] == 200
         assert len(list(ImageSequence.Iterator(picture))) == 21
     (ax,) = animation._fig.axes  # pyright: ignore[reportAttributeAccessIssue]
@@ -160,7 +160,7 @@ def test_an_animation_keeps_the_pace_of_the_motion(tmp_path, spatial):
     )
     np.testing.assert_allclose(body, points["wheel"][-1])
     np.testing.assert_allclose(rod, [points["hub"][-1], points["end"][-1]])
-    # Straight between the times that were saved.
+    # Positions are interpolated linearly between the saved times.
     assert path.shape == (21, 3 if spatial else 2)
     np.testing.assert_allclose(path[:, 0], np.linspace(0, 2, 21), atol=1e-15)
     np.testing.assert_allclose(path[:, 1], np.linspace(1, 3, 21), atol=1e-15)
@@ -169,7 +169,7 @@ def test_an_animation_keeps_the_pace_of_the_motion(tmp_path, spatial):
     assert high >= 3
 
 
-def test_an_animation_backwards_in_time_moves_along_with_a_point(tmp_path):
+def test_plot_animation_backwards_in_time_follows_a_point(tmp_path):
     points = {name: x[::-1] for name, x in SLIDER.items()}
     ax = Figure().subplots()
     animation = plot.animate(
@@ -178,7 +178,7 @@ def test_an_animation_backwards_in_time_moves_along_with_a_point(tmp_path):
     animation.save(tmp_path / "motion.gif", dpi=20)
     x, y = map(np.asarray, ax.lines[0].get_data())
     np.testing.assert_allclose((x, y), [[0, 0], [0, 1]])
-    # The end is up to three away, and the hub stays in the middle.
+    # The end is up to three away, and the hub stays in the centre.
     np.testing.assert_allclose(ax.get_xlim(), (-3.15, 3.15))
     np.testing.assert_allclose(ax.get_ylim(), (-3.15, 3.15))
 
@@ -201,6 +201,6 @@ def test_an_animation_backwards_in_time_moves_along_with_a_point(tmp_path):
         ({"frame_rate": -1}, ValueError, "`speed` and `frame_rate` must be positive"),
     ],
 )
-def test_what_cannot_be_animated_is_refused(changes, error, message):
+def test_plot_animation_with_invalid_argument_raises(changes, error, message):
     with pytest.raises(error, match=message):
         plot.animate(**({"ts": TIMES, "points": SLIDER} | changes))

@@ -1,8 +1,13 @@
-"""Ensembles that outgrow one call: chunks of members, and statistics on the way."""
+"""Ensembles: runs of many members in chunks, with statistics and resumable stores."""
 
 from ._ensemble import ensemble as ensemble
-from ._extremes import Maximum as Maximum, Minimum as Minimum
-from ._histogram import Histogram as Histogram, HistogramCounts as HistogramCounts
-from ._moments import Mean as Mean, Variance as Variance
-from ._outcome import EnsembleOutcome as EnsembleOutcome
-from ._reduction import AbstractReduction as AbstractReduction
+from ._reductions import (
+    AbstractReduction as AbstractReduction,
+    Histogram as Histogram,
+    HistogramCounts as HistogramCounts,
+    Maximum as Maximum,
+    Mean as Mean,
+    Minimum as Minimum,
+    Variance as Variance,
+)
+from ._sinks import EnsembleOutcome as EnsembleOutcome

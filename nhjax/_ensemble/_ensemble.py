@@ -11,20 +11,20 @@ from jaxtyping import PyTree
 
 from .._integrate import AbstractProgressMeter, NoProgressMeter, TqdmProgressMeter
 from .._system import check_flag
-from ._collected import Collected
-from ._failed import failed_rows
-from ._kept import Kept
-from ._members import Members
-from ._outcome import EnsembleOutcome
-from ._processes import Pace, Processes
-from ._program import Layout, value_structure
-from ._reduced import check_reductions, Reduced
-from ._sinks import AbstractSink, Work
-from ._store import Stored
+from ._processes import PeriodicExchange, Processes
+from ._program import is_reduction, Job, Layout, Members, value_structure
+from ._sinks import (
+    AbstractSink,
+    EnsembleOutcome,
+    failures_in_chunk,
+    MemorySink,
+    ReductionSink,
+)
+from ._store import CheckpointedReductionSink, ZarrSink
 
 
-# Chunks of this many members for each device keep all lanes busy, if their results are
-# not larger than so many bytes.
+# A chunk of this many members for each device keeps all cores busy. It is smaller if
+# the values of the members would take more than this many bytes.
 _MEMBERS, _BYTES = 1024, 2**26
 # Names of files of other programs, which `out` does not make.
 _FILES = (".nc", ".nc4", ".h5", ".hdf5", ".csv", ".npy", ".npz", ".mat", ".pkl")
@@ -46,58 +46,58 @@ def ensemble(
     resume: bool = True,
     units: Mapping[str, str] | None = None,
 ) -> EnsembleOutcome:
-    """Run a function for every member of an ensemble, chunk after chunk.
+    """Run a function for every member of an ensemble, in chunks of members.
 
     It computes `jax.vmap(run)(members)` for more members than fit into one array. One
-    program is compiled for all chunks, with the members of a chunk spread over all
-    devices; the last chunk is filled up with members that do not count.
+    compiled program runs all chunks and spreads the members of a chunk over all
+    devices. The last chunk is padded with members that are ignored.
 
-    Where `run` returns an `nhjax.Solution` or `nhjax.RESULTS`, alone or as a part of a
-    tree, members whose runs failed are listed in the outcome and left out of
-    statistics. For that `nhjax.integrate` must be called with `throw=False`; otherwise
-    the first failure ends the whole ensemble.
+    If `run` returns an `nhjax.Solution` or `nhjax.RESULTS`, alone or as part of a tree,
+    the outcome lists the members whose runs failed, and statistics leave them out. For
+    this, call `nhjax.integrate` with `throw=False`; otherwise the first failure ends
+    the whole ensemble.
 
-    After `jax.distributed.initialize` all processes make the same call: each runs its
-    share of the chunks on its own devices, and every one returns the whole outcome.
+    After `jax.distributed.initialize`, all processes must make the same call. Each runs
+    its share of the chunks on its own devices, and each returns the whole outcome.
 
     **Arguments:**
 
     - `run`: a function of one member that returns a tree of arrays.
-    - `members`: a tree of arrays with the members as leading axis, or a function that
-        JAX can trace from the index of a member to the member, which takes no memory.
-    - `num_members`: how many members there are, if `members` is a function.
-    - `out`: a folder for a store of Zarr that the values are written to, chunk after
-        chunk, and `xarray.open_zarr` opens. The same call goes on with a store that an
-        interrupted one has left. With `reduce` the states of the reductions are kept
-        there instead. `docs/ensembles.md` says more.
+    - `members`: a tree of arrays with the members as leading axis, or a function from
+        the index of a member to the member, which takes no memory. JAX traces it.
+    - `num_members`: the number of members, if `members` is a function.
+    - `out`: a folder for a Zarr store. The values of each chunk are written to it, and
+        `xarray.open_zarr` opens it. The same call resumes a store that an interrupted
+        run has left. With `reduce`, the folder holds the states of the reductions
+        instead of values. See `docs/ensembles.md`.
     - `reduce`: an `nhjax.Mean`, `nhjax.Variance`, `nhjax.Minimum`, `nhjax.Maximum`,
-        `nhjax.Histogram`, an `nhjax.AbstractReduction` of one's own, or a tree of them
-        such as a dictionary. Then values are not kept, and memory does not grow with
-        the number of members.
-    - `chunk_size`: how many members run at a time, rounded up to a multiple of the
-        number of devices; by default 1024 for each device, or fewer if they return
-        much.
-    - `devices`: those of JAX to run on, `jax.local_devices()` by default.
-    - `fixed_order`: collect statistics in an order that does not depend on the number
-        of devices and processes, so that they are the same to the last bit if the
-        members are. Each device then looks at all members of a chunk, and processes
-        meet after each.
-    - `progress_meter`: told of members that are done; by default a bar on the standard
-        error stream if that is a terminal.
-    - `resume`: whether to go on with a store that exists, rather than to refuse it.
-    - `units`: units of arrays in the store, by their names there.
+        `nhjax.Histogram`, your own `nhjax.AbstractReduction`, or a tree of these such
+        as a dictionary. Then values are not kept, and memory does not grow with the
+        number of members.
+    - `chunk_size`: the number of members that run at a time, rounded up to a multiple
+        of the number of devices; by default 1024 for each device, or fewer if the
+        values of a member are large.
+    - `devices`: the JAX devices to use, `jax.local_devices()` by default.
+    - `fixed_order`: compute statistics in an order that does not depend on the number
+        of devices and processes. If the values of the members are then equal bit for
+        bit, so are the statistics. Each device reduces all members of a chunk, and
+        processes wait for each other after each chunk.
+    - `progress_meter`: shows the number of finished members; by default a bar on the
+        standard error stream if that is a terminal.
+    - `resume`: whether to resume an existing store; otherwise it is refused.
+    - `units`: units of the arrays in the store, by their names there.
 
     **Returns:** an `nhjax.EnsembleOutcome` with `values` or `statistics`, or with
     neither if values were written to `out`.
 
     **Raises:** `nhjax.ShapeError` for arrays that differ in their leading axis;
-    `TypeError` if `run` returns anything but arrays; `ValueError` for numbers that make
-    no sense, for a store that is damaged or that of other arguments, and for processes
-    that call with different ones; `RuntimeError` for a store that another run is
-    writing, and if another process has failed or is gone; `OSError` if the store cannot
-    be written; `ImportError` with `out` and without zarr
-    (`pip install "nhjax[ensemble]"`); `nhjax.IntegrationError` if all members failed
-    and there is something to reduce.
+    `TypeError` if `run` returns anything except arrays; `ValueError` for invalid
+    numbers, for a store that is damaged or belongs to other arguments, and for
+    processes that call with different arguments; `RuntimeError` for a store that
+    another run is writing, and if another process has failed or has ended; `OSError` if
+    the store cannot be written; `ImportError` with `out` if zarr is missing
+    (`pip install "nhjax[ensemble]"`); `nhjax.IntegrationError` with `reduce` if all
+    members failed.
 
     !!! example
 
@@ -107,36 +107,113 @@ def ensemble(
         [0.0, 1.0, 4.0, 9.0, 16.0]
     """
     processes = Processes()
-    with processes.together():
+    with processes.sharing_errors():
         if not callable(run):
             got = f"{reprlib.repr(run)} of type {type(run).__name__}"
             raise TypeError(f"`run` must be a function of one member, got {got}.")
         if reduce is not None:
-            check_reductions(reduce)
+            _check_reductions(reduce)
         _check_folder(out)
         resume = check_flag("resume", resume)
         fixed_order = check_flag("fixed_order", fixed_order)
-        progress_meter = _meter(progress_meter, processes)
-        chosen = _devices(devices)
+        progress_meter = _check_progress_meter(progress_meter, processes)
+        chosen = _check_devices(devices)
         layout = Layout(chosen, fixed_order and len(chosen) > 1)
         source = Members(members, num_members)
         structure = value_structure(run, source.make, source.inputs(0, 1))
         size = _chunk_size(chunk_size, source.count, structure, len(layout.devices))
-        work = Work(run, source, size, layout, structure, processes)
-        if reduce is None:
-            sink = _for_values(work, out, units, resume)
-        else:
-            sink = _for_statistics(work, reduce, out, units, resume, fixed_order)
+        job = Job(run, source, size, layout, structure, processes)
+        sink = _sink(job, reduce, out, units, resume, fixed_order)
         try:
-            _run_chunks(work, sink, progress_meter)
+            _run_chunks(job, sink, progress_meter)
             outcome = sink.outcome()
         finally:
             sink.close()
     return outcome
 
 
+def _sink(
+    job: Job,
+    reductions: Any,
+    out: str | os.PathLike[str] | None,
+    units: Mapping[str, str] | None,
+    resume: bool,
+    fixed_order: bool,
+) -> AbstractSink:
+    if reductions is None:
+        if out is not None:
+            return ZarrSink(job, out, {} if units is None else units, resume)
+        if units is not None:
+            raise ValueError("`units` are for a store: name its folder by `out`.")
+        return MemorySink(job)
+    if units is not None:
+        raise ValueError(
+            "`units` are for the values in a store, but with `reduce` no values are "
+            "kept: leave `units` out."
+        )
+    if out is not None:
+        return CheckpointedReductionSink(job, reductions, out, resume)
+    sink = ReductionSink(job, reductions, in_rounds=fixed_order)
+    sink.check_same_call()
+    return sink
+
+
+def _run_chunks(
+    job: Job, sink: AbstractSink, progress_meter: AbstractProgressMeter
+) -> None:
+    todo, total = list(sink.remaining_chunks()), job.members.count
+    if job.processes.count > 1:
+        total = sum(map(job.num_members, todo))
+    done = total - sum(map(job.num_members, todo))
+    shown = time.monotonic()
+    exchange = PeriodicExchange(job.processes, len(todo), not sink.in_rounds)
+    if todo and done:
+        progress_meter.update(done, total)
+
+    def finish(chunk, result):
+        nonlocal done, shown
+        sink.collect(chunk, result.content, failures_in_chunk(job, chunk, result))
+        done += job.num_members(chunk)
+        if done == total or time.monotonic() - shown > _SECONDS:
+            shown = time.monotonic()
+            progress_meter.update(done, total)
+        exchange.chunk_done()
+
+    running = None
+    try:
+        for chunk in todo:
+            # The next chunk runs while the results of the previous one are collected.
+            following = chunk, sink.start(chunk)
+            if running is not None:
+                finish(*running)
+            running = following
+        if running is not None:
+            finish(*running)
+        exchange.finish()
+    except jax.errors.JaxRuntimeError as error:
+        if "throw=False" in str(error):
+            error.add_note(
+                "In `nhjax.ensemble`, a run with `throw=False` that returns its "
+                "solution fails alone: it is listed, and the other members go on."
+            )
+        raise
+    finally:
+        progress_meter.close()
+
+
+def _check_reductions(reductions: Any) -> None:
+    leaves = jax.tree.leaves(reductions, is_leaf=is_reduction)
+    for leaf in leaves:
+        if not is_reduction(leaf):
+            raise TypeError(
+                f"`reduce` holds {leaf!r}, but it must be a reduction, such as "
+                "`nhjax.Mean()`, or several in a tuple, a dictionary or another tree."
+            )
+    if not leaves:
+        raise TypeError(f"`reduce` holds no reduction: {reductions!r}.")
+
+
 def _check_folder(out: Any) -> None:
-    """Raise for what is no name, or the name of a file of another program."""
     if out is None:
         return
     if not isinstance(out, str | os.PathLike):
@@ -153,7 +230,7 @@ def _check_folder(out: Any) -> None:
         )
 
 
-def _meter(given: Any, processes: Processes) -> AbstractProgressMeter:
+def _check_progress_meter(given: Any, processes: Processes) -> AbstractProgressMeter:
     if given is None:
         is_shown = processes.index == 0 and sys.stderr.isatty()
         return TqdmProgressMeter(unit="member") if is_shown else NoProgressMeter()
@@ -165,83 +242,7 @@ def _meter(given: Any, processes: Processes) -> AbstractProgressMeter:
     return given
 
 
-def _for_values(
-    work: Work,
-    out: str | os.PathLike[str] | None,
-    units: Mapping[str, str] | None,
-    resume: bool,
-) -> AbstractSink:
-    if out is not None:
-        return Stored(work, out, {} if units is None else units, resume)
-    if units is not None:
-        raise ValueError("`units` are those of a store: give its folder as `out`.")
-    return Collected(work)
-
-
-def _for_statistics(
-    work: Work,
-    reductions: Any,
-    out: str | os.PathLike[str] | None,
-    units: Mapping[str, str] | None,
-    resume: bool,
-    fixed_order: bool,
-) -> AbstractSink:
-    if units is not None:
-        raise ValueError("`units` are those of values, which `reduce` does not keep.")
-    if out is not None:
-        return Kept(work, reductions, out, resume)
-    sink = Reduced(work, reductions, in_rounds=fixed_order)
-    sink.agree()
-    return sink
-
-
-def _run_chunks(
-    work: Work, sink: AbstractSink, progress_meter: AbstractProgressMeter
-) -> None:
-    todo, total = list(sink.todo()), work.members.count
-    if work.processes.count > 1:
-        total = sum(map(work.filled, todo))
-    done = total - sum(map(work.filled, todo))
-    shown = time.monotonic()
-    pace = Pace(work.processes, len(todo), is_needed=not sink.in_rounds)
-    if todo and done:
-        progress_meter.update(done, total)
-
-    def finish(chunk, result):
-        nonlocal done, shown
-        codes, steps = np.asarray(result.codes), np.asarray(result.steps)
-        count = work.filled(chunk)
-        failed = failed_rows(work.start(chunk), codes[:count], steps[:count])
-        sink.take(chunk, result.content, failed)
-        done += count
-        if done == total or time.monotonic() - shown > _SECONDS:
-            shown = time.monotonic()
-            progress_meter.update(done, total)
-        pace.chunk_done()
-
-    running = None
-    try:
-        for chunk in todo:
-            # The next chunk runs while the one before it is put away.
-            following = chunk, sink.start(chunk)
-            if running is not None:
-                finish(*running)
-            running = following
-        if running is not None:
-            finish(*running)
-        pace.finish()
-    except jax.errors.JaxRuntimeError as error:
-        if "throw=False" in str(error):
-            error.add_note(
-                "In `nhjax.ensemble` a run with `throw=False` that returns its "
-                "solution fails alone: it is listed, and the others go on."
-            )
-        raise
-    finally:
-        progress_meter.close()
-
-
-def _devices(devices: Sequence[Any] | None) -> tuple[Any, ...]:
+def _check_devices(devices: Sequence[Any] | None) -> tuple[Any, ...]:
     if devices is None:
         return tuple(jax.local_devices())
     if isinstance(devices, str) or not isinstance(devices, Iterable):
@@ -251,14 +252,16 @@ def _devices(devices: Sequence[Any] | None) -> tuple[Any, ...]:
         )
     chosen = tuple(devices)
     if not chosen or len(set(chosen)) < len(chosen):
-        raise ValueError(f"`devices` must be different devices, got {chosen}.")
+        raise ValueError(
+            f"`devices` must be one or more different devices, got {chosen}."
+        )
     known = jax.local_devices()
     for device in chosen:
         if device not in known and device not in jax.local_devices(
             backend=getattr(device, "platform", None)
         ):
             raise ValueError(
-                f"`devices` has {device!r}, which is no device of this process."
+                f"`devices` has {device!r}, which is not a device of this process."
             )
     return chosen
 

@@ -1,5 +1,13 @@
-"""The program that runs a chunk of members, compiled once for all chunks."""
+"""The job of an ensemble: its members, the programs that run them, and its manifest.
 
+A job is split into chunks of members. One compiled program runs every chunk, spread
+over the devices, and reports which members failed. The manifest and the text of the
+program identify a job: processes compare them before they run it together, and a store
+keeps them to refuse another job.
+"""
+
+import hashlib
+import re
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -10,140 +18,227 @@ import numpy as np
 from jaxtyping import Array, Bool, Int, PyTree
 
 from .._compile import tracked_jit
-from .._errors import naming
+from .._errors import is_traced, naming, ShapeError
+from .._integrate import Solution
+from .._io import installed_version
+from .._results import result_codes, RESULTS
 from .._system import no_array
-from ._reduction import AbstractReduction
-from ._verdict import is_good, verdict, without_results
+from ._processes import Processes
+from ._reductions import AbstractReduction
 
 
+# The step of a failure whose step is not known.
+UNKNOWN_STEP = -1
+# The name of the mesh axis along which members are spread over devices.
 AXIS = "members"
+FORMAT = 1
 
 
 class Layout(NamedTuple):
-    """The devices on which chunks run, and the order in which statistics are formed.
+    """The devices that run the chunks, and the order in which statistics are computed.
 
-    `is_fixed` is true if this order must not depend on the number of devices.
+    If `is_fixed`, this order does not depend on the number of devices.
     """
 
     devices: tuple[Any, ...]
     is_fixed: bool
 
 
-class Chunk(NamedTuple):
-    """What came of a chunk: codes of `RESULTS`, steps of failures, and values."""
+class ChunkResult(NamedTuple):
+    """The result of a chunk: codes of `RESULTS`, failed steps, and its content.
+
+    The content is the values of all members, or the states of reductions.
+    """
 
     codes: Int[Array, " c"]
     steps: Int[Array, " c"]
     content: PyTree[Array]
 
 
-def is_reduction(x: Any) -> bool:
-    """Tell whether `x` is a reduction, which is itself a tree."""
-    return isinstance(x, AbstractReduction)
+class Job:
+    """A function, its members, their split into chunks, and where they run."""
 
+    def __init__(
+        self,
+        run: Callable[[Any], Any],
+        members: "Members",
+        chunk_size: int,
+        layout: Layout,
+        structure: Any,
+        processes: Processes,
+    ):
+        self.run, self.members, self.chunk_size = run, members, chunk_size
+        self.layout, self.structure, self.processes = layout, structure, processes
 
-def each_reduction(function: Callable[..., Any], reductions: Any, *trees: Any) -> Any:
-    """Map a function over a tree of reductions and the like parts of other trees."""
-    return jax.tree.map(function, reductions, *trees, is_leaf=is_reduction)
+    @property
+    def num_chunks(self) -> int:
+        """Return the number of chunks; the last one may not be full."""
+        return -(-self.members.count // self.chunk_size)
 
+    def first_member(self, chunk: int) -> int:
+        """Return the index of the first member of a chunk."""
+        return chunk * self.chunk_size
 
-def _members_of(run: Any, make: Any, inputs: Any, layout: Layout) -> Any:
-    def member(one):
-        value = run(make(one))
-        return value, *verdict(value)
+    def num_members(self, chunk: int) -> int:
+        """Return the number of members of a chunk, without padding."""
+        return min(self.chunk_size, self.members.count - self.first_member(chunk))
 
-    every = jax.vmap(member)
-    if len(layout.devices) > 1:
-        # Members have nothing to do with each other; JAX's check of what varies
-        # between devices does not know the operations of an ensemble.
-        every = _on_each(layout, every, jax.P(AXIS), jax.P(AXIS))
-    return every(inputs)
+    def share(self, index: int) -> range:
+        """Return the chunks of a process; each process has consecutive chunks."""
+        count = self.processes.count
+        ends = [self.num_chunks * i // count for i in (index, index + 1)]
+        return range(*ends)
 
+    def values(self, chunk: int) -> ChunkResult:
+        """Start a chunk that returns the values of its members; do not wait for it."""
+        inputs = self._on_devices(self._inputs(chunk))
+        return _values_of_chunk(self.run, self.members.make, inputs, self.layout)
 
-def spread(layout: Layout, axes: Any) -> jax.sharding.Sharding:
-    """Make the sharding of arrays along the given axes of the devices."""
-    if len(layout.devices) == 1:
-        return jax.sharding.SingleDeviceSharding(layout.devices[0])
-    return jax.sharding.NamedSharding(_mesh(layout), axes)
-
-
-def _mesh(layout: Layout) -> jax.sharding.Mesh:
-    return jax.sharding.Mesh(np.array(layout.devices), (AXIS,))
-
-
-def _on_each(layout: Layout, function: Any, inside: Any, outside: Any) -> Any:
-    mesh = _mesh(layout)
-    return jax.shard_map(
-        function, mesh=mesh, in_specs=inside, out_specs=outside, check_vma=False
-    )
-
-
-@tracked_jit("run", "make")
-def values_of_chunk(run: Any, make: Any, inputs: Any, layout: Layout) -> Chunk:
-    """Run the members of a chunk."""
-    value, codes, steps = _members_of(run, make, inputs, layout)
-    return Chunk(codes, steps, value)
-
-
-@tracked_jit("run", "make", "reductions")
-def reduced_chunk(
-    run: Any,
-    make: Any,
-    reductions: Any,
-    inputs: Any,
-    is_there: Bool[Array, " c"],
-    layout: Layout,
-) -> Chunk:
-    """Run the members of a chunk, and make of them the states of reductions."""
-    value, codes, steps = _members_of(run, make, inputs, layout)
-    values = without_results(value)
-    counts = is_there & is_good(codes)
-    structure = jax.tree.map(
-        lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), values
-    )
-
-    def of_all(values, counts):
-        return each_reduction(
-            lambda each: each.update(each.init(structure), values, counts), reductions
+    def states(self, chunk: int, reductions: Any) -> ChunkResult:
+        """Start a chunk that returns states of reductions; do not wait for it."""
+        is_member = np.arange(self.chunk_size) < self.num_members(chunk)
+        inputs, is_member = self._on_devices((self._inputs(chunk), is_member))
+        return _states_of_chunk(
+            self.run, self.members.make, reductions, inputs, is_member, self.layout
         )
 
-    if len(layout.devices) == 1:
-        return Chunk(codes, steps, of_all(values, counts))
-    if layout.is_fixed:
-        # Every device has all members, so that the order is that of one device.
-        everywhere = _on_each(layout, of_all, jax.P(), jax.P())
-        return Chunk(codes, steps, everywhere(values, counts))
+    def _inputs(self, chunk: int) -> Any:
+        return self.members.inputs(self.first_member(chunk), self.chunk_size)
 
-    def of_some(values, counts):
-        return jax.tree.map(lambda x: x[None], of_all(values, counts))
-
-    stacked = _on_each(layout, of_some, jax.P(AXIS), jax.P(AXIS))(values, counts)
-    state, *others = [
-        jax.tree.map(lambda x, i=i: x[i], stacked) for i in range(len(layout.devices))
-    ]
-    for other in others:
-        state = each_reduction(_merged, reductions, state, other)
-    return Chunk(codes, steps, state)
+    def _on_devices(self, rows: Any) -> Any:
+        devices = self.layout.devices
+        if len(devices) == 1:
+            sharding = jax.sharding.SingleDeviceSharding(devices[0])
+        else:
+            sharding = jax.sharding.NamedSharding(_mesh(self.layout), jax.P(AXIS))
+        return jax.device_put(rows, sharding)
 
 
-@tracked_jit("reductions")
-def merged_states(reductions: Any, one: Any, other: Any) -> Any:
-    """Merge the states of reductions of two sets of members.
+class Members:
+    """The members of an ensemble, given by arrays or by a function of their index.
 
-    It is a program of its own, so that it rounds in the same way wherever the states
-    come from.
+    - `count`: the number of members.
+    - `make`: a traceable function that converts one row of `inputs` to a member.
     """
-    return each_reduction(_merged, reductions, one, other)
+
+    count: int
+    make: Callable[[Any], Any]
+
+    def __init__(self, members: Any, num_members: int | None):
+        if callable(members):
+            if num_members is None:
+                raise ValueError(
+                    "`num_members` is needed if `members` is a function of the index "
+                    "of a member."
+                )
+            self._leaves = None
+            self.make, self.count = members, _check_num_members(num_members)
+            return
+        leaves, treedef = jax.tree.flatten(members)
+        if is_traced(*leaves):
+            raise RuntimeError(
+                "`nhjax.ensemble` runs its chunks from the host: call it outside of "
+                "jit, vmap and grad."
+            )
+        self.count = _leading_size(members)
+        if num_members is not None and num_members != self.count:
+            raise ValueError(
+                f"`num_members` is {num_members}, but the arrays of `members` have "
+                f"{self.count} rows: leave it out."
+            )
+        keys = [jax.random.key_impl(x) if _is_key(x) else None for x in leaves]
+        # For NumPy arrays these are views, so that memory-mapped files are not read.
+        self._leaves = [
+            np.asarray(jax.random.key_data(x) if impl else _canonical(x))
+            for x, impl in zip(leaves, keys, strict=True)
+        ]
+        self.make = _MemberFromArrays(treedef, tuple(keys))
+
+    def inputs(self, start: int, size: int) -> Any:
+        """Return the inputs of `size` members; the last member pads the last chunk."""
+        indices = np.minimum(np.arange(start, start + size), self.count - 1)
+        if self._leaves is None:
+            return indices.astype(jnp.result_type(int))
+        if start + size <= self.count:
+            return [_canonical(x[start : start + size]) for x in self._leaves]
+        return [_canonical(x[indices]) for x in self._leaves]
+
+    def digest(self) -> str:
+        """Compute a digest of the arrays; a function is part of the program instead."""
+        if self._leaves is None:
+            return "a function"
+        made = hashlib.sha256()
+        for x in self._leaves:
+            made.update(f"{x.dtype.str}{x.shape}".encode())
+            # In blocks, because a copy of a whole memory-mapped array may not fit.
+            for start in range(0, len(x), 65536):
+                made.update(np.ascontiguousarray(x[start : start + 65536]).tobytes())
+        return made.hexdigest()
 
 
-def _merged(each: AbstractReduction, one: Any, other: Any) -> Any:
-    return each.merge(one, other)
+class _MemberFromArrays(eqx.Module):
+    """Create a member from its leaves, with random keys from their integers."""
+
+    treedef: Any = eqx.field(static=True)
+    keys: tuple[Any, ...] = eqx.field(static=True)
+
+    def __call__(self, leaves: list[Any]) -> Any:
+        """Create the member."""
+        made = [
+            x if impl is None else jax.random.wrap_key_data(x, impl=impl)
+            for x, impl in zip(leaves, self.keys, strict=True)
+        ]
+        return jax.tree.unflatten(self.treedef, made)
+
+
+def _canonical(x: Any) -> Any:
+    """Convert as JAX does: float64 to float32, unless float64 is enabled."""
+    if isinstance(x, jax.Array):
+        return x
+    return np.asarray(x, jax.dtypes.canonicalize_dtype(np.asarray(x).dtype))
+
+
+def _is_key(x: Any) -> bool:
+    return isinstance(x, jax.Array) and jnp.issubdtype(x.dtype, jax.dtypes.prng_key)
+
+
+def _check_num_members(number: Any) -> int:
+    if isinstance(number, bool) or not isinstance(number, int | np.integer):
+        raise TypeError(f"`num_members` must be an int, got {number!r}.")
+    if number < 1:
+        raise ValueError(f"`num_members` must be at least 1, got {number}.")
+    return int(number)
+
+
+def _leading_size(members: Any) -> int:
+    sizes: dict[int, str] = {}
+    for path, leaf in jax.tree_util.tree_leaves_with_path(members):
+        name = f"`members{jax.tree_util.keystr(path)}`"
+        if not eqx.is_array_like(leaf):
+            raise TypeError(
+                f"{name} is {leaf!r}, but `members` must hold arrays with a row for "
+                "each member; `run` can close over everything else."
+            )
+        if np.ndim(leaf) == 0:
+            raise ShapeError(
+                f"{name} is a single number, but the leading axis of each array in "
+                "`members` must be the members; `run` can close over shared values."
+            )
+        sizes.setdefault(np.shape(leaf)[0], name)
+    if len(sizes) > 1:
+        listed = ", ".join(f"{name} has {size}" for size, name in sizes.items())
+        raise ShapeError(
+            f"The arrays of `members` differ in the number of members: {listed}."
+        )
+    if not sizes or 0 in sizes:
+        raise ShapeError("`members` has no members: it needs arrays with rows.")
+    return next(iter(sizes))
 
 
 def value_structure(run: Any, make: Any, inputs: Any) -> Any:
-    """Find what `run` returns for one member: shapes and dtypes.
+    """Compute the shapes and dtypes of what `run` returns for one member.
 
-    **Raises:** `TypeError` if there is anything but arrays of numbers.
+    **Raises:** `TypeError` if `run` returns anything except arrays of numbers.
     """
     one = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), inputs)
 
@@ -162,12 +257,236 @@ def value_structure(run: Any, make: Any, inputs: Any) -> Any:
         name = f"`run(member){jax.tree_util.keystr(path)}`"
         if not isinstance(leaf, jax.ShapeDtypeStruct):
             raise TypeError(
-                f"{name} is {leaf!r}, but `run` must return arrays, in tuples, "
-                "dictionaries and other trees, for each member."
+                f"{name} is {leaf!r}, but `run` must return arrays for each member, "
+                "alone or in tuples, dictionaries and other trees."
             )
         if jnp.issubdtype(leaf.dtype, jax.dtypes.extended):
             raise TypeError(
-                f"{name} has dtype {leaf.dtype}: of a random key return "
-                "`jax.random.key_data`."
+                f"{name} has dtype {leaf.dtype}: return `jax.random.key_data` of a "
+                "random key."
             )
     return structure
+
+
+@tracked_jit("run", "make")
+def _values_of_chunk(run: Any, make: Any, inputs: Any, layout: Layout) -> ChunkResult:
+    value, codes, steps = _run_members(run, make, inputs, layout)
+    return ChunkResult(codes, steps, value)
+
+
+@tracked_jit("run", "make", "reductions")
+def _states_of_chunk(
+    run: Any,
+    make: Any,
+    reductions: Any,
+    inputs: Any,
+    is_member: Bool[Array, " c"],
+    layout: Layout,
+) -> ChunkResult:
+    value, codes, steps = _run_members(run, make, inputs, layout)
+    values = without_results(value)
+    counts = is_member & is_success(codes)
+    structure = jax.tree.map(
+        lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), values
+    )
+
+    def reduce(values, counts):
+        return each_reduction(
+            lambda each: each.update(each.init(structure), values, counts), reductions
+        )
+
+    if len(layout.devices) == 1:
+        return ChunkResult(codes, steps, reduce(values, counts))
+    if layout.is_fixed:
+        # Every device reduces all members, so that the order is that of one device.
+        everywhere = _on_each_device(layout, reduce, jax.P(), jax.P())
+        return ChunkResult(codes, steps, everywhere(values, counts))
+
+    def reduce_share(values, counts):
+        return jax.tree.map(lambda x: x[None], reduce(values, counts))
+
+    each_share = _on_each_device(layout, reduce_share, jax.P(AXIS), jax.P(AXIS))
+    stacked = each_share(values, counts)
+    state, *others = [
+        jax.tree.map(lambda x, i=i: x[i], stacked) for i in range(len(layout.devices))
+    ]
+    for other in others:
+        state = each_reduction(_merge, reductions, state, other)
+    return ChunkResult(codes, steps, state)
+
+
+@tracked_jit("reductions")
+def merged_states(reductions: Any, one: Any, other: Any) -> Any:
+    """Merge the states of reductions of two sets of members.
+
+    A program of its own rounds in the same way, wherever the states come from.
+    """
+    return each_reduction(_merge, reductions, one, other)
+
+
+def _merge(each: AbstractReduction, one: Any, other: Any) -> Any:
+    return each.merge(one, other)
+
+
+def _run_members(run: Any, make: Any, inputs: Any, layout: Layout) -> Any:
+    def member(one):
+        value = run(make(one))
+        return value, *first_failure(value)
+
+    every = jax.vmap(member)
+    if len(layout.devices) > 1:
+        # Members are independent. JAX's check of what varies between devices
+        # (`check_vma`) does not know the primitives that nhjax adds.
+        every = _on_each_device(layout, every, jax.P(AXIS), jax.P(AXIS))
+    return every(inputs)
+
+
+def _mesh(layout: Layout) -> jax.sharding.Mesh:
+    return jax.sharding.Mesh(np.array(layout.devices), (AXIS,))
+
+
+def _on_each_device(layout: Layout, function: Any, inside: Any, outside: Any) -> Any:
+    return jax.shard_map(
+        function,
+        mesh=_mesh(layout),
+        in_specs=inside,
+        out_specs=outside,
+        check_vma=False,
+    )
+
+
+def each_reduction(function: Callable[..., Any], reductions: Any, *trees: Any) -> Any:
+    """Map a function over a tree of reductions and the matching parts of `trees`."""
+    return jax.tree.map(function, reductions, *trees, is_leaf=is_reduction)
+
+
+def is_reduction(x: Any) -> bool:
+    """Return whether `x` is a reduction, which is itself a tree."""
+    return isinstance(x, AbstractReduction)
+
+
+def is_success(codes: Any) -> Any:
+    """Return which codes of `RESULTS` are not failures."""
+    known = result_codes()
+    return (codes == known["successful"]) | (codes == known["event_occurred"])
+
+
+def first_failure(value: Any) -> tuple[Int[Array, ""], Int[Array, ""]]:
+    """Return the code of the first failure in a value, and its step.
+
+    It searches every `nhjax.Solution` and `nhjax.RESULTS` in the value. Without a
+    failure the code is that of success. The step is -1 if it is not known.
+    """
+    codes, steps = [], []
+    nodes = jax.tree.leaves(
+        value, is_leaf=lambda x: isinstance(x, Solution) or _is_result(x)
+    )
+    for node in nodes:
+        if isinstance(node, Solution):
+            codes.append(node.result._value)
+            steps.append(node.stats["failed_step"])
+        elif _is_result(node):
+            codes.append(node._value)
+            steps.append(jnp.full(jnp.shape(node._value), UNKNOWN_STEP))
+    codes.append(jnp.asarray(result_codes()["successful"]))
+    steps.append(jnp.asarray(UNKNOWN_STEP))
+    flat = [
+        jnp.concatenate([jnp.ravel(x).astype(jnp.int32) for x in parts])
+        for parts in (codes, steps)
+    ]
+    # The success appended above is found if there is no failure before it.
+    bad = ~is_success(flat[0]).at[-1].set(False)
+    first = jnp.argmax(bad)
+    return flat[0][first], flat[1][first]
+
+
+def results_as_codes(value: Any) -> Any:
+    """Replace `RESULTS` by their codes, except the one of a solution."""
+    if isinstance(value, Solution):
+        return value
+    return jax.tree.map(
+        lambda x: x._value if _is_result(x) else x, value, is_leaf=_is_result
+    )
+
+
+def without_results(value: Any) -> Any:
+    """Replace `RESULTS`, which have no statistics, by None."""
+    return jax.tree.map(
+        lambda x: None if _is_result(x) else x, value, is_leaf=_is_result
+    )
+
+
+def _is_result(x: Any) -> bool:
+    return isinstance(x, type(RESULTS.successful)) and x._enumeration is RESULTS
+
+
+def manifest(job: Job, **others: Any) -> dict[str, Any]:
+    """Describe the parameters of a job as JSON; `others` depend on what is kept."""
+    return {
+        "format": FORMAT,
+        "nhjax": installed_version(),
+        "jax": jax.__version__,
+        "num_members": job.members.count,
+        "chunk_size": job.chunk_size,
+        "members": job.members.digest(),
+    } | others
+
+
+def without_addresses(text: str) -> str:
+    """Remove memory addresses of functions from a text."""
+    return re.sub(r"0x[0-9a-f]+", "0x", text)
+
+
+def call_description(
+    made: dict[str, Any], text: str, out: bool = False, **others: Any
+) -> dict[str, Any]:
+    """Describe what all processes that run a job together must have in common.
+
+    This is a manifest, a digest of the text of the program, whether there is an `out`,
+    and `others`.
+    """
+    run = hashlib.sha256(text.encode()).hexdigest()
+    return {"out": out, "reduce": None} | made | {"run": run} | others
+
+
+def program_text(job: Job, reductions: Any = ()) -> str:
+    """Write the jaxpr of one member and of the reductions.
+
+    Digests of the arrays in the jaxprs follow them. Addresses of functions, which
+    differ between processes, are removed.
+    """
+
+    def run(one):
+        return job.run(job.members.make(one))
+
+    def reduce(value):
+        value, counts = without_results(value), jnp.ones(1, bool)
+        chunk = jax.tree.map(lambda x: x[None], value)
+        structure = without_results(job.structure)
+        return each_reduction(
+            lambda each: each.update(each.init(structure), chunk, counts), reductions
+        )
+
+    one = jax.tree.map(lambda x: x[0], job.members.inputs(0, 1))
+    parts = [jax.make_jaxpr(run)(one), jax.make_jaxpr(reduce)(job.structure)]
+    lines = []
+    for closed in parts:
+        lines += without_addresses(str(closed)).splitlines()
+        lines += [f"array {x}" for x in _constants(closed)]
+    return "\n".join(line.rstrip() for line in lines) + "\n"
+
+
+def _constants(closed: Any) -> list[str]:
+    found = [
+        f"{np.shape(x)} {hashlib.sha256(np.asarray(x).tobytes()).hexdigest()}"
+        for x in closed.consts
+        if not jnp.issubdtype(x.dtype, jax.dtypes.extended)
+    ]
+    for equation in closed.jaxpr.eqns:
+        leaves = jax.tree.leaves(
+            list(equation.params.values()), is_leaf=lambda x: hasattr(x, "consts")
+        )
+        for part in leaves:
+            if hasattr(part, "consts") and hasattr(part, "jaxpr"):
+                found += _constants(part)
+    return found

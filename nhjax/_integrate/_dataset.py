@@ -14,7 +14,7 @@ from .._system import State
 def to_dataset(
     sol: Any, coordinates: Sequence[str] | None, units: Mapping[str, str]
 ) -> Any:
-    """Make the data set; the method `Solution.to_xarray` says what is in it."""
+    """Create the data set that `Solution.to_xarray` documents."""
     xarray = _xarray()
     if not isinstance(units, Mapping):
         raise TypeError(
@@ -26,8 +26,8 @@ def to_dataset(
         )
     if sol.ts is None:
         raise ValueError(
-            "Nothing was saved that has times: ask for some with `nhjax.SaveAt`, such "
-            "as `steps=True`."
+            "The solution has no saved times: request them with `nhjax.SaveAt`, for "
+            "example `steps=True`."
         )
     batch = _batch_dims(np.ndim(sol.t1))
     variables = _saved(sol.ys, (*batch, "time"))
@@ -40,8 +40,8 @@ def to_dataset(
     for name in variables:
         if name in {*outcome, *labels, *batch, "time", "coordinate", "event"}:
             raise ValueError(
-                f"What `SaveAt(fn=...)` returned has the name {name!r}, which "
-                "something else in the data set has already: take another one."
+                f"`SaveAt(fn=...)` returned an array named {name!r}, which is the name "
+                "of another array of the data set: choose another name."
             )
     variables |= outcome
     names = _coordinate_names(sol, coordinates, variables)
@@ -55,7 +55,7 @@ def to_dataset(
         elif names is None or name not in names:
             known = [*made.variables, *(names or ())]
             raise ValueError(
-                f"`units` has the name {name!r}, but the names here are: "
+                f"`units` has the name {name!r}, but the known names are: "
                 f"{', '.join(map(str, known))}."
             )
     return made
@@ -64,11 +64,11 @@ def to_dataset(
 def units_of_coordinates(
     names: Sequence[str], units: Mapping[str, str]
 ) -> dict[str, Any]:
-    """Label coordinates by their units, and by those of their velocities.
+    """Return labels of coordinates: their units and the units of their velocities.
 
-    The units of momenta are left out: they do not follow from those of coordinates.
+    Momenta have no labels, because their units do not follow from those of coordinates.
 
-    **Returns:** by name pairs of the dimension and the units along it.
+    **Returns:** a dictionary from names to pairs of a dimension and the units along it.
     """
     of_q, of_t = [units.get(name, "") for name in names], units.get("time", "")
     made = {"coordinate_unit": ("coordinate", of_q)} if any(of_q) else {}
@@ -84,15 +84,16 @@ def _events(sol: Any) -> tuple[tuple[str, Any], ...]:
 
 
 def named_arrays(value: Any, batch: tuple[str, ...]) -> dict[str, Any]:
-    """Name the arrays of what a function of a run returns, and their axes.
+    """Name the arrays of a solution or of another tree, and their axes.
 
-    Those of a solution have the names that `Solution.to_xarray` gives them, with the
-    times in `t` and the codes of its result in `result`; those of another tree are
-    named by the paths in it.
+    The arrays of a solution have the names of `Solution.to_xarray`, with the times in
+    `t` and the codes of the result in `result`. Arrays of another tree are named by
+    their paths.
 
-    **Returns:** by name pairs of the dimensions, those of `batch` first, and the array.
+    **Returns:** a dictionary from names to pairs of the dimensions, starting with
+    `batch`, and the array.
     """
-    # A solution, which this module cannot import.
+    # This module cannot import `Solution`, which has `stats`.
     if not hasattr(value, "stats"):
         return _named(value, batch, "value", None)
     made = {} if value.ts is None else _saved(value.ys, (*batch, "time"))
@@ -109,8 +110,8 @@ def named_arrays(value: Any, batch: tuple[str, ...]) -> dict[str, Any]:
     for name in made:
         if name in others:
             raise ValueError(
-                f"What `SaveAt(fn=...)` returned has the name {name!r}, which "
-                "something else in the data set has already: take another one."
+                f"`SaveAt(fn=...)` returned an array named {name!r}, which is the name "
+                "of another array of the data set: choose another name."
             )
     return made | others
 
@@ -133,7 +134,7 @@ def _batch_dims(number: int) -> tuple[str, ...]:
 
 
 def _time(ts: np.ndarray, batch: tuple[str, ...]) -> dict[str, Any]:
-    """Label times by their values, if all trajectories have the same."""
+    """Label the time axis if all trajectories have the same times."""
     flat = ts.reshape(-1, ts.shape[-1])
     if flat.shape[0] and np.all(flat == flat[:1]):
         return {"time": ("time", flat[0])}
@@ -147,7 +148,7 @@ def _result_names(result: Any) -> np.ndarray:
 
 
 def _saved(ys: Any, dims: tuple[str, ...]) -> dict[str, Any]:
-    """Name the arrays of what was saved, and their axes after those of `dims`."""
+    """Name the saved arrays, and their axes after those of `dims`."""
     if not isinstance(ys, State):
         return _named(ys, dims, "value", None)
     of = ys.v.shape[-1:]
@@ -160,10 +161,9 @@ def _saved(ys: Any, dims: tuple[str, ...]) -> dict[str, Any]:
 def _named(
     tree: Any, dims: tuple[str, ...], root: str, coordinates: tuple[int, ...] | None
 ) -> dict[str, Any]:
-    """Name the leaves of a tree by their paths, q0 and q1 for the parts of a tuple q.
+    """Name the leaves of a tree by their paths, such as q0 and q1 for a tuple q.
 
-    The axis of an array that has as many components as there are `coordinates` is
-    called so.
+    An array of shape `coordinates`, not counting `dims`, has the axis "coordinate".
     """
     made = {}
     for path, leaf in jax.tree_util.tree_leaves_with_path(tree):
@@ -175,8 +175,8 @@ def _named(
             name = f"{root}{name}"
         if name in made:
             raise ValueError(
-                f"Two parts of what `SaveAt(fn=...)` returned have the name {name!r} "
-                "in the data set, the keys on their paths joined by _: rename one."
+                f"Two parts of the value of `SaveAt(fn=...)` have the name {name!r} in "
+                "the data set, which joins the keys on a path by _: rename one."
             )
         x = np.asarray(leaf)
         shape = x.shape[len(dims) :]
@@ -188,7 +188,7 @@ def _named(
 
 
 def _part(key: Any) -> str:
-    """Write one step of a path into a tree: a key, a name or an index."""
+    """Format one element of a path in a tree: a key, a name or an index."""
     for attribute in ("key", "name", "idx"):
         if hasattr(key, attribute):
             return str(getattr(key, attribute))
@@ -208,7 +208,7 @@ def _coordinate_names(
         return None
     if len(names) != sizes[0] or len(set(names)) != len(names):
         raise ValueError(
-            f"`coordinates` has the names {names}, but {sizes[0]} different ones are "
+            f"`coordinates` has the names {names}, but {sizes[0]} different names are "
             "needed."
         )
     return names

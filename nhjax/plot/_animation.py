@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ..diagnostics import real_array
-from ._axes import new_axes
+from ._figures import new_axes
 
 
 if TYPE_CHECKING:
@@ -26,11 +26,11 @@ def animate(
     frame_rate: float = 25.0,
     ax: "Axes | None" = None,
 ) -> "FuncAnimation":
-    """Animate a machine, in the plane or in space, at the pace of its motion.
+    """Animate a machine in the plane or in space, at the speed of its motion.
 
-    Between the saved times points move on straight lines, so that frames come at a
-    steady rate whatever the steps were. Matplotlib's own writers make the file:
-    `animation.save("motion.gif")`, or `"motion.mp4"` where there is FFmpeg.
+    Positions are interpolated linearly between the saved times, so that the frame rate
+    is constant for any step sizes. Save the animation with
+    `animation.save("motion.gif")`, or with `"motion.mp4"` if FFmpeg is installed.
 
     **Arguments:**
 
@@ -38,22 +38,22 @@ def animate(
     - `points`: the saved positions by name: points of shape (times, 2) or (times, 3),
         outlines of bodies of shape (times, corners, 2) or (times, corners, 3). The
         machines of `nhjax.systems` have a method `points`, which
-        `SaveAt(fn=lambda t, y, args: machine.points(t, y.q))` saves; of a run that has
-        saved its states they are `jax.vmap(machine.points)(sol.ts, sol.ys.q)`.
+        `SaveAt(fn=lambda t, y, args: machine.points(t, y.q))` saves. For a run that has
+        saved states, use `jax.vmap(machine.points)(sol.ts, sol.ys.q)`.
     - `rods`: chains of names of points that are connected by lines, such as
         `[("hub", "end")]`.
-    - `traced`: the names of points whose paths so far are drawn.
-    - `follow`: the name of a point that the picture moves along with.
-    - `speed`: the seconds of the motion that one second of the animation shows.
-    - `frame_rate`: the frames of a second.
-    - `ax`: the axes to draw into; for points in space, with a 3d projection.
+    - `traced`: the names of points whose past paths are drawn.
+    - `follow`: the name of a point that stays in the centre of the picture.
+    - `speed`: the number of seconds of the motion in one second of the animation.
+    - `frame_rate`: the number of frames per second.
+    - `ax`: the axes to draw into; points in space need a 3d projection.
 
     **Returns:** an animation of matplotlib. Keep it in a variable until it is saved or
-    shown: it stops where nothing refers to it.
+    shown, because matplotlib stops an animation that is garbage-collected.
 
-    **Raises:** `ValueError` if shapes do not fit together, a name is not one of
-    `points`, positions are not finite, `ts` does not go one way, or `speed` or
-    `frame_rate` is not positive.
+    **Raises:** `ValueError` if shapes do not match, a name is not in `points`,
+    positions are not finite, `ts` is not monotonic, or `speed` or `frame_rate` is not
+    positive.
 
     !!! example
 
@@ -91,9 +91,9 @@ def animate(
     centres, reach = _window(frames, follow)
     bodies = [name for name, x in frames.items() if x.ndim == 3]
     lines: list[Any] = [
-        *(ax.plot(*_nothing(spatial), color="0.25", linewidth=1.5)[0] for _ in bodies),
-        *(ax.plot(*_nothing(spatial), "o-", color="0.1", ms=3)[0] for _ in rods),
-        *(ax.plot(*_nothing(spatial), color="tab:blue", lw=1)[0] for _ in traced),
+        *(ax.plot(*_no_data(spatial), color="0.25", linewidth=1.5)[0] for _ in bodies),
+        *(ax.plot(*_no_data(spatial), "o-", color="0.1", ms=3)[0] for _ in rods),
+        *(ax.plot(*_no_data(spatial), color="tab:blue", lw=1)[0] for _ in traced),
     ]
 
     def show(frame: int) -> list[Any]:
@@ -104,7 +104,7 @@ def animate(
             line.set_data(*path.T[:2])
             if spatial:
                 line.set_3d_properties(path.T[2])
-        _look_at(ax, centres[frame], reach)
+        _set_limits(ax, centres[frame], reach)
         return lines
 
     if spatial:
@@ -121,11 +121,11 @@ def _times(ts: Any) -> np.ndarray:
     times = real_array("ts", ts)
     if times.ndim != 1 or times.size < 2:
         raise ValueError(
-            "`ts` must hold two or more times of one trajectory, got shape "
-            f"{times.shape}. Of a batch, animate one member."
+            "`ts` must be two or more times of one trajectory, got shape "
+            f"{times.shape}. For a batch, select one member."
         )
     if not (np.all(np.diff(times) > 0) or np.all(np.diff(times) < 0)):
-        raise ValueError("`ts` must increase from each time to the next, or decrease.")
+        raise ValueError("`ts` must increase or decrease monotonically.")
     return times
 
 
@@ -142,14 +142,14 @@ def _positions(points: Any, count: int) -> dict[str, np.ndarray]:
     ):
         raise ValueError(
             f"`points` must be arrays of shape ({count}, 2), ({count}, corners, 2), or "
-            "with 3 in place of 2, all of the plane or all of space, got shapes "
+            "all with 3 in place of 2 for points in space, got shapes "
             f"{ {name: x.shape for name, x in moving.items()} }."
         )
     for name, x in moving.items():
         if not np.all(np.isfinite(x)):
             raise ValueError(
-                f"`points[{name!r}]` holds numbers that are not finite. Where a run "
-                "has failed, animate the part before."
+                f"`points[{name!r}]` has numbers that are not finite. If the run has "
+                "failed, animate the part before the failure."
             )
     return moving
 
@@ -158,22 +158,22 @@ def _check_point(argument: str, name: Any, moving: dict[str, np.ndarray]) -> Non
     names = [name for name, x in moving.items() if x.ndim == 2]
     if name not in names:
         raise ValueError(
-            f"`{argument}` must name points, of which there are {', '.join(names)}, "
+            f"`{argument}` must name points, which are {', '.join(names)}, "
             f"got {name!r}."
             + (" It is a list of chains: [('a', 'b')]." if argument == "rods" else "")
         )
 
 
 def _frame_times(times: np.ndarray, spacing: float) -> np.ndarray:
-    """Times as far apart as frames are, from the first saved one on."""
+    """Return the times of the frames, with constant spacing from the first time on."""
     duration = abs(times[-1] - times[0])
-    # What is shown last is at most half a frame from the last saved time.
+    # The last frame is at most half a frame from the last saved time.
     shown = spacing * np.arange(round(duration / spacing) + 1)
     return times[0] + np.sign(times[-1] - times[0]) * np.minimum(shown, duration)
 
 
 def _at(shown: np.ndarray, times: np.ndarray, positions: np.ndarray) -> np.ndarray:
-    # NumPy interpolates where abscissas increase.
+    # `numpy.interp` needs increasing abscissas.
     forwards = 1 if times[-1] > times[0] else -1
     columns = positions.reshape(len(times), -1).T
     values = [np.interp(forwards * shown, forwards * times, x) for x in columns]
@@ -183,7 +183,7 @@ def _at(shown: np.ndarray, times: np.ndarray, positions: np.ndarray) -> np.ndarr
 def _window(
     frames: dict[str, np.ndarray], follow: str | None
 ) -> tuple[np.ndarray, float]:
-    """Compute the centre of the picture in each frame, and half of its width."""
+    """Compute the centre of the picture in each frame, and half its width."""
     everything = np.concatenate(
         [x.reshape(len(x), -1, x.shape[-1]) for x in frames.values()], axis=1
     )
@@ -193,14 +193,14 @@ def _window(
     else:
         centres = frames[follow]
     reach = np.max(np.abs(everything - centres[:, None]))
-    # A machine that is a single point at rest has no size.
+    # A single point at rest has size zero.
     return centres, 1.05 * float(reach) or 1.0
 
 
-def _look_at(ax: "Axes", centre: np.ndarray, reach: float) -> None:
+def _set_limits(ax: "Axes", centre: np.ndarray, reach: float) -> None:
     for axis, middle in zip("xyz", centre, strict=False):
         getattr(ax, f"set_{axis}lim")(middle - reach, middle + reach)
 
 
-def _nothing(spatial: bool) -> list[list[float]]:
+def _no_data(spatial: bool) -> list[list[float]]:
     return [[]] * (3 if spatial else 2)

@@ -1,5 +1,6 @@
 """Figures of trajectories, of errors against time, and of convergence."""
 
+import reprlib
 from collections.abc import Sequence
 from typing import Any, TYPE_CHECKING
 
@@ -17,7 +18,6 @@ from ..diagnostics import (
     real_array,
     saved_states,
 )
-from ._axes import new_axes
 
 
 if TYPE_CHECKING:
@@ -32,22 +32,22 @@ def trajectory(
     ax: "Axes | None" = None,
     **style: Any,
 ) -> "Axes":
-    """Draw the path of two or three coordinates of a trajectory, in plane or space.
+    """Draw the path of two or three coordinates of a trajectory.
 
     **Arguments:**
 
-    - `sol`: a `Solution` that holds states; of a batch the path of each member is
-        drawn.
-    - `coordinates`: the indices of two or three entries of q. On a group they count the
-        numbers of an element, on a product those of one factor after the other.
-    - `names`: the names of the coordinates for the labels of the axes.
-    - `ax`: the axes to draw into; for three coordinates, with a 3d projection.
+    - `sol`: a `Solution` with saved states; for a batch, one path is drawn for each
+        member.
+    - `coordinates`: the indices of two or three entries of q. On a group, they index
+        the flattened numbers of an element; on a product, those of all factors in turn.
+    - `names`: the names of the coordinates, for the labels of the axes.
+    - `ax`: the axes to draw into; three coordinates need a 3d projection.
     - `style`: passed on to `Axes.plot`.
 
     **Returns:** the axes.
 
-    **Raises:** `ValueError` if `sol` holds no states, or a single one, or `coordinates`
-    do not fit it.
+    **Raises:** `ValueError` if `sol` has fewer than two states, or if `coordinates` are
+    out of range.
 
     !!! example
 
@@ -62,7 +62,7 @@ def trajectory(
     lead = np.asarray(ys.p).shape[:-1]
     if lead[-1] < 2:
         raise ValueError(
-            "The solution holds a single state of each trajectory, which is no path: "
+            "The solution has only one state of each trajectory, but a path needs two: "
             "pass `saveat=nhjax.SaveAt(t0=True, steps=True)` to `integrate`."
         )
     parts = [np.asarray(leaf).reshape(*lead, -1) for leaf in jax.tree.leaves(ys.q)]
@@ -109,7 +109,7 @@ def energy(
 
     **Returns:** the axes.
 
-    **Raises:** what `nhjax.energy_error` raises.
+    **Raises:** the errors of `nhjax.energy_error`.
     """
     errors = energy_error(system, sol, args)
     ax = _against_time(sol.ts, errors, ax, style)
@@ -118,17 +118,17 @@ def energy(
 
 
 def multiplier(sol: Solution, *, ax: "Axes | None" = None, **style: Any) -> "Axes":
-    """Draw the multipliers λ_a against time, one line for each constraint.
+    """Draw the multipliers λ_a against time, with a line for each constraint.
 
     **Arguments:**
 
-    - `sol`: a `Solution` that holds states.
+    - `sol`: a `Solution` with saved states.
     - `ax`: the axes to draw into.
     - `style`: passed on to `Axes.plot`.
 
     **Returns:** the axes.
 
-    **Raises:** `ValueError` if `sol` holds no states.
+    **Raises:** `ValueError` if `sol` has no states.
     """
     ts, ys = saved_states(sol)
     values = np.asarray(ys.multiplier)
@@ -148,20 +148,20 @@ def constraint(
 ) -> "Axes":
     """Draw the values of the constraint functions at the saved states against time.
 
-    They are Φ_a for each nonholonomic constraint, dΓ_a/dt and Γ_a for each holonomic
-    one.
+    The figure shows Φ_a for each nonholonomic constraint, and dΓ_a/dt and Γ_a for each
+    holonomic constraint.
 
     **Arguments:**
 
     - `system`: the system that was integrated.
-    - `sol`: a `Solution` that holds states.
-    - `args`: those of the integration.
+    - `sol`: a `Solution` with saved states.
+    - `args`: the `args` of the integration.
     - `ax`: the axes to draw into.
     - `style`: passed on to `Axes.plot`.
 
     **Returns:** the axes.
 
-    **Raises:** `ValueError` if `sol` holds no states.
+    **Raises:** `ValueError` if `sol` has no states.
     """
     check_is_system(system)
     ts, ys = saved_states(sol)
@@ -192,15 +192,16 @@ def convergence(
 
     **Arguments:**
 
-    - `step_sizes`, `errors`: vectors of one length; errors that are not positive are
-        left out.
-    - `order`: draw a dashed line of this slope through the error in the middle.
+    - `step_sizes`, `errors`: vectors of the same length; errors that are not positive
+        are ignored.
+    - `order`: the slope of a dashed reference line, which is drawn through the error
+        at the median step size.
     - `ax`: the axes to draw into.
     - `style`: passed on to `Axes.plot`.
 
     **Returns:** the axes.
 
-    **Raises:** `ValueError` if the lengths differ, or no error is positive.
+    **Raises:** `ValueError` if the lengths differ, or if no error is positive.
 
     !!! example
 
@@ -210,19 +211,20 @@ def convergence(
     h, e = np.abs(real_array("step_sizes", step_sizes)), real_array("errors", errors)
     if h.ndim != 1 or h.shape != e.shape:
         raise ValueError(
-            "`step_sizes` and `errors` must be vectors of one length, got shapes "
+            "`step_sizes` and `errors` must be vectors of the same length, got shapes "
             f"{h.shape} and {e.shape}."
         )
     shown = np.isfinite(e) & (e > 0)
     if not np.any(shown):
-        raise ValueError(f"`errors` must hold a positive number, got {errors}.")
+        raise ValueError(f"`errors` must contain a positive number, got {errors}.")
     h, e = h[shown], e[shown]
     ax = new_axes(ax)
     (line,) = ax.plot(h, e, **{"marker": "o", "markersize": 4, **style})
     if order is not None and not isinstance(order, int | float | np.number):
         raise TypeError(f"`order` must be a number or None, got {order!r}.")
     if order is not None:
-        # The largest step need not be asymptotic yet, the smallest may be round-off.
+        # The largest step may not be in the asymptotic regime, and the error of the
+        # smallest may be round-off.
         middle = np.argsort(h)[len(h) // 2]
         reference = e[middle] * (h / h[middle]) ** order
         ax.plot(h, reference, linestyle="--", linewidth=0.8, color=line.get_color())
@@ -236,7 +238,7 @@ def convergence(
 def _against_time(ts: Any, values: Any, ax: "Axes | None", style: Any) -> "Axes":
     ax = new_axes(ax)
     times, values = np.asarray(ts), np.asarray(values)
-    # A batch becomes columns, so that each member is a line.
+    # The members of a batch become columns, because matplotlib draws a line for each.
     ax.plot(_columns(times), _columns(values), **style)
     ax.set_xlabel("time $t$")
     return ax
@@ -265,5 +267,23 @@ def _names(names: Sequence[str] | None, default: list[str]) -> Sequence[str]:
     if names is None:
         return default
     if len(names) != len(default):
-        raise ValueError(f"`names` must hold {len(default)} names, got {len(names)}.")
+        raise ValueError(f"`names` must have {len(default)} names, got {len(names)}.")
     return names
+
+
+def new_axes(ax: "Axes | None", projection: str | None = None) -> "Axes":
+    """Return the axes given by the user, or those of a new figure."""
+    if ax is not None:
+        if not hasattr(ax, "plot"):
+            raise TypeError(
+                "`ax` must be axes of matplotlib, such as those of "
+                f"`matplotlib.pyplot.subplots()`, got {reprlib.repr(ax)} of type "
+                f"{type(ax).__name__}."
+            )
+        return ax
+    # Imported only here, because drawing into given axes must not choose a backend of
+    # matplotlib.
+    from matplotlib import pyplot as plt
+
+    keywords = {} if projection is None else {"projection": projection}
+    return plt.figure(layout="constrained").add_subplot(**keywords)

@@ -1,11 +1,20 @@
 """The mean squared energy error of an ensemble of chaotic motions."""
 
 import dataclasses
-from collections.abc import Sequence
-from typing import Any, ClassVar, TYPE_CHECKING
+import math
+import time
+from collections.abc import Callable, Sequence
+from typing import Any, ClassVar, NamedTuple, TYPE_CHECKING
 
+import jax
+import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array
 
+from .._ensemble import ensemble, EnsembleOutcome, Maximum, Mean, Variance
+from .._errors import IntegrationError
+from .._initial import initial_state
+from .._integrate import integrate, SaveAt
 from .._method import LobattoIIIAB
 from ..systems import ChaoticSystem
 from ._arguments import (
@@ -17,22 +26,50 @@ from ._arguments import (
     check_step_sizes,
     whole_steps,
 )
-from ._chaotic_figure import chaotic_figure
-from ._chaotic_run import Case, chaotic_run, ChaoticRun, WINDOW
-from ._result import AbstractStudyResult
-from ._table import format_slope, format_table, slopes
+from ._report import format_slope, format_table, slopes
+from ._result import AbstractStudyResult, meter, Timing
 
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 
 TIMES = (10.0, 50.0, 100.0, 200.0)
+# μ(E, k) is averaged over an interval of this length on each side of a time, because
+# its value at one step fluctuates with the fast motion of the system.
+WINDOW = 5.0
+# The largest number of members that run at a time, and the largest number of bytes of
+# their saved energies, so that memory does not grow with the number of members.
+CHUNK, CHUNK_BYTES = 1000, 2**26
+# The powers of h by which the figure of the paper divides μ.
+PAPER_POWERS = {2: 4, 3: 10}
+
+
+@dataclasses.dataclass(frozen=True)
+class ChaoticRun:
+    """The run of the ensemble with one method and one step size.
+
+    - `mu`, `mu_error`: the mean squared energy error μ(E, k) at the saved times, and
+        its standard error σ/√N over the N members.
+    - `windows`, `windows_error`: the same of averages over windows in time.
+    """
+
+    stages: int
+    dt: float
+    times: np.ndarray
+    mu: np.ndarray
+    mu_error: np.ndarray
+    windows: np.ndarray
+    windows_error: np.ndarray
+    mean_iterations: float
+    max_constraint_violation: float
+    timing: Timing
 
 
 @dataclasses.dataclass(frozen=True)
 class ChaoticEnergy(AbstractStudyResult):
-    """The runs of a chaotic-energy study, h falling for each s."""
+    """The runs of a chaotic-energy study, with decreasing h for each s."""
 
     name: ClassVar[str] = "chaotic-energy"
 
@@ -46,13 +83,13 @@ class ChaoticEnergy(AbstractStudyResult):
     runs: list[ChaoticRun]
 
     def of_stages(self, s: int) -> list[ChaoticRun]:
-        """Return the runs with `s` stages, with falling step size h."""
+        """Return the runs with `s` stages, with decreasing step size h."""
         return [run for run in self.runs if run.stages == s]
 
     def slopes(self, s: int) -> np.ndarray:
         """Return log-log slopes of the window means, of shape (step sizes, times).
 
-        The first row is NaN: there is no larger step to compare with.
+        The first row is NaN, because it has no larger step to compare with.
         """
         means = np.stack([run.windows for run in self.of_stages(s)])
         return slopes(self.dt, means)
@@ -83,7 +120,7 @@ class ChaoticEnergy(AbstractStudyResult):
         }
 
     def summary(self) -> dict[str, Any]:
-        """Return the results in short, with timings."""
+        """Return a summary of the results, with timings."""
         entries = []
         for s in self.stages:
             for run, slope in zip(self.of_stages(s), self.slopes(s), strict=True):
@@ -119,7 +156,7 @@ class ChaoticEnergy(AbstractStudyResult):
         return data
 
     def table(self) -> str:
-        """Write a table of μ/h^{4(s-1)} and the slopes of μ at the times."""
+        """Format a table of μ/h^{4(s-1)} and of the slopes of μ at the times."""
         header = ["s", "h", "4(s-1)"]
         header += [f"μ/h^4(s-1) t={t:g} ± error" for t in self.times]
         header += [f"slope t={t:g}" for t in self.times]
@@ -142,23 +179,20 @@ class ChaoticEnergy(AbstractStudyResult):
         return format_table(header, rows)
 
     def verdict(self) -> str:
-        """Say with which power of h the mean squared error goes."""
+        """State with which power of h the mean squared error scales."""
         powers = {s: self.slopes(s)[-1] for s in self.stages}
         if not all(np.all(np.isfinite(x)) for x in powers.values()):
-            return "no power of h can be seen: it takes two step sizes"
+            return "no power of h can be observed: it takes two step sizes"
         found = ", ".join(
             f"h^{np.mean(x):.1f} for s = {s} (4(s - 1) = {4 * (s - 1)})"
             for s, x in powers.items()
         )
-        return f"μ goes as {found}, averaged over the times"
+        return f"μ scales as {found}, averaged over the times"
 
     def figures(self) -> "dict[str, Figure]":
-        """Draw μ against time in both normalisations, ours and the paper's."""
-        curves = [
-            (run.stages, run.dt, run.times, run.mu, run.mu_error) for run in self.runs
-        ]
+        """Draw μ against time, normalised by the measured power and as in the paper."""
         title = f"J = {self.members}, {self.closure} closure"
-        return {self.name: chaotic_figure(curves, title)}
+        return {self.name: _figure(self.runs, title)}
 
 
 def chaotic_energy(
@@ -174,29 +208,31 @@ def chaotic_energy(
 ) -> ChaoticEnergy:
     """Compute the mean squared energy error of an ensemble of the chaotic system.
 
-    The paper's third experiment, J + 1 motions of a system with 7 degrees of freedom on
-    one energy surface. μ(E, k), the mean of (E_jk - E_0)² over the ensemble at step k,
-    is found to go as h^{4(s-1)}. Every motion is chaotic: only such statistics can be
-    compared. Members run in chunks and statistics are collected on the way, so that
-    memory does not grow with J; μ has an error bar, its standard error.
+    This is the third experiment of the paper: J + 1 motions of a system with 7 degrees
+    of freedom on one energy surface. μ(E, k), the mean of (E_jk - E_0)² over the
+    ensemble at step k, scales as h^{4(s-1)}. Every motion is chaotic, so that only such
+    statistics can be compared. Members run in chunks and statistics are updated after
+    each chunk, so that memory does not grow with J. The error bar of μ is its standard
+    error.
 
     **Arguments:**
 
     - `stages`: the numbers of stages s.
     - `dt`: the step sizes h, each of which must divide `final_time`.
     - `final_time`: the length of each run.
-    - `members`: the paper's J.
-    - `closure`: of the multipliers, as for `nhjax.LobattoIIIAB`; the paper's by
-        default.
-    - `times`: when to report μ, as means over a window of ±5; 10, 50, 100 and 200 as
-        far as the run goes (its end if it is shorter) by default.
-    - `save_every`: save energies after every this many steps.
-    - `progress`: show a bar for each run on the standard error stream.
+    - `members`: J of the paper; the ensemble has J + 1 members.
+    - `closure`: the closure of the multipliers, as for `nhjax.LobattoIIIAB`; by default
+        that of the paper.
+    - `times`: the times at which to report μ, averaged over a window of ±5; by default
+        those of 10, 50, 100 and 200 within the run, or its end if there are none.
+    - `save_every`: the number of steps between saved energies.
+    - `progress`: whether to show a progress bar for each run on the standard error
+        stream.
 
     **Returns:** a `ChaoticEnergy`.
 
-    **Raises:** `ArgumentError` for arguments that cannot be right, and
-    `nhjax.IntegrationError` if a step cannot be solved.
+    **Raises:** `ArgumentError` for invalid arguments, and `nhjax.IntegrationError` if a
+    step cannot be solved.
     """
     check_stages(stages)
     check_step_sizes(dt)
@@ -218,9 +254,9 @@ def chaotic_energy(
                 name, f"must leave samples in a window of ±{WINDOW:g}, got {value:g}"
             )
     runs = [
-        chaotic_run(case, members, times, progress)
+        _run(case, members, times, progress)
         for case in (
-            Case(LobattoIIIAB(s, closure), h, n, save_every)
+            _Case(LobattoIIIAB(s, closure), h, n, save_every)
             for s in stages
             for h, n in num_steps.items()
         )
@@ -235,3 +271,162 @@ def chaotic_energy(
         save_every=save_every,
         runs=runs,
     )
+
+
+class _Case(NamedTuple):
+    """The method, step size, length and output of one run of the ensemble."""
+
+    method: LobattoIIIAB
+    h: float
+    num_steps: int
+    save_every: int
+
+
+def _program(
+    case: _Case, members: int, every: int, weights: np.ndarray
+) -> tuple[Callable[[Any], Any], Callable[[Any], Any]]:
+    """Create the run of a member, and the function from an index to the member."""
+    chaotic = ChaoticSystem()
+
+    def member(j: Array) -> tuple[Array, Array]:
+        angle = j.astype(float) * (0.5 * math.pi / members)
+        return (
+            chaotic.q0.at[0].set(jnp.cos(angle)),
+            chaotic.v0.at[1].set(jnp.sin(angle)),
+        )
+
+    def run(start: tuple[Array, Array]) -> dict[str, Any]:
+        sol = integrate(
+            chaotic.system,
+            case.method,
+            initial_state(chaotic.system, *start),
+            dt=case.h,
+            num_steps=case.num_steps,
+            saveat=SaveAt(t0=True, steps=every, fn=chaotic.system.energy),
+            throw=False,
+        )
+        squares = (sol.ys - sol.ys[0]) ** 2
+        windows = jnp.asarray(weights) @ squares
+        return {"sol": sol, "μ": {"each": squares, "windows": windows}}
+
+    return run, member
+
+
+def _run(
+    case: _Case, members: int, times: Sequence[float], progress: bool
+) -> ChaoticRun:
+    """Run the ensemble, and average over a window around each of `times`."""
+    every = min(case.save_every, case.num_steps)
+    # `integrate` computes times as products, too.
+    ts = case.h * np.arange(0, case.num_steps + 1, every)
+    weights = np.abs(ts - np.asarray(times)[:, None]) <= WINDOW + 1e-9
+    weights = weights / np.sum(weights, axis=1, keepdims=True)
+    run, member = _program(case, members, every, weights)
+    size = max(1, min(members + 1, CHUNK, CHUNK_BYTES // ts.nbytes))
+    name = f"s = {case.method.stages}, h = {case.h:.4g}"
+
+    def outcome(count: int, shown: bool) -> EnsembleOutcome:
+        return ensemble(
+            run,
+            member,
+            num_members=count,
+            chunk_size=size,
+            reduce=_REDUCTIONS,
+            progress_meter=meter(shown, name, "member"),
+        )
+
+    start = time.perf_counter()
+    # This compiles, and runs one chunk.
+    outcome(size, False)
+    compiled = time.perf_counter()
+    whole = outcome(members + 1, progress)
+    timing = Timing(compiled - start, time.perf_counter() - compiled)
+    failures = whole.failures()
+    if failures:
+        j, k, reason = failures[0]
+        raise IntegrationError(
+            f"Integration failed in {len(failures)} of {members + 1} members, first in "
+            f"member {j}, step {k}: {reason}"
+        )
+    found = jax.tree.map(np.asarray, whole.statistics)
+    errors = jax.tree.map(lambda x: np.sqrt(x / (members + 1)), found["variance"])
+    return ChaoticRun(
+        stages=case.method.stages,
+        dt=case.h,
+        times=ts,
+        mu=found["mean"]["each"],
+        mu_error=errors["each"],
+        windows=found["mean"]["windows"],
+        windows_error=errors["windows"],
+        mean_iterations=float(found["iterations"]) / case.num_steps,
+        max_constraint_violation=float(found["violation"]),
+        timing=timing,
+    )
+
+
+_REDUCTIONS = {
+    "mean": Mean(of=lambda value: value["μ"]),
+    "variance": Variance(of=lambda value: value["μ"]),
+    "iterations": Mean(of=lambda value: value["sol"].stats["num_iterations"]),
+    "violation": Maximum(
+        of=lambda value: value["sol"].stats["max_constraint_violation"]
+    ),
+}
+
+
+def _figure(runs: list[ChaoticRun], title: str) -> "Figure":
+    """Draw μ against time with standard errors, in a column for each s.
+
+    The upper row is normalised by the measured power of h, the lower as in the paper.
+    """
+    from matplotlib.figure import Figure
+
+    stages = list(dict.fromkeys(run.stages for run in runs))
+    figure = Figure(figsize=(1 + 4 * len(stages), 7), layout="constrained")
+    axes = figure.subplots(2, len(stages), sharex=True, squeeze=False)
+    for (ours, paper), s in zip(axes.T, stages, strict=True):
+        chosen = [run for run in runs if run.stages == s]
+        _panel(ours, chosen, 4 * (s - 1))
+        ours.set_title(f"s = {s}")
+        if s in PAPER_POWERS:
+            _panel(paper, chosen, PAPER_POWERS[s])
+        else:
+            paper.set_axis_off()
+            paper.text(
+                0.5, 0.5, "not in the paper", ha="center", transform=paper.transAxes
+            )
+    axes[0, 0].legend(loc="lower right")
+    figure.suptitle(
+        f"Mean squared energy error of the chaotic ensemble, {title}\n"
+        "above: divided by $h^{4(s-1)}$, the measured power; below: divided by the "
+        "power of the paper's figure"
+    )
+    return figure
+
+
+def _panel(ax: "Axes", runs: list[ChaoticRun], power: int) -> None:
+    # The first steps start from zero. Including them would compress the other curves.
+    levels = []
+    for i, run in enumerate(runs):
+        h, times = run.dt, run.times
+        scaled, spread = run.mu / h**power, _smoothed(run.mu_error) / h**power
+        levels += [np.min(scaled[len(scaled) // 10 :]), np.max(scaled[1:])]
+        ax.plot(times, scaled, linewidth=0.4, alpha=0.35, color=f"C{i}")
+        mean = _smoothed(scaled)
+        ax.plot(times, mean, color=f"C{i}", linewidth=1.5, label=f"$h$ = {h:g}")
+        # Errors at neighbouring times are correlated, so that they do not average out.
+        ax.fill_between(
+            times, mean - spread, mean + spread, color=f"C{i}", alpha=0.2, linewidth=0
+        )
+    ax.set_yscale("log")
+    ax.set_ylim(min(levels) / 1.5, max(levels) * 1.5)
+    ax.set_xlabel("time $t$")
+    ax.set_ylabel(f"$\\mu(E, k) / h^{{{power}}}$")
+    ax.tick_params(labelbottom=True)
+
+
+def _smoothed(x: np.ndarray) -> np.ndarray:
+    """Compute running means over a fortieth of the run."""
+    width = max(1, len(x) // 40)
+    kernel = np.ones(width)
+    return np.convolve(x, kernel, "same") / np.convolve(np.ones(len(x)), kernel, "same")

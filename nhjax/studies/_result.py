@@ -1,4 +1,4 @@
-"""The interface of the results that studies return, and the files made of them."""
+"""The results of studies: their interface, their timing, and the files they write."""
 
 import abc
 import dataclasses
@@ -7,7 +7,8 @@ import json
 import math
 import os
 import platform
-from collections.abc import Mapping
+import time
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, ClassVar, TYPE_CHECKING
 
@@ -15,7 +16,8 @@ import equinox as eqx
 import jax
 import numpy as np
 
-from ._style import colour_blind_safe
+from .._integrate import AbstractProgressMeter, NoProgressMeter, TqdmProgressMeter
+from ._report import colour_blind_safe
 
 
 if TYPE_CHECKING:
@@ -24,7 +26,7 @@ if TYPE_CHECKING:
 
 @dataclasses.dataclass(frozen=True)
 class Timing:
-    """The wall-clock seconds that it took to compile and to run one program."""
+    """The wall-clock seconds to compile and to run one program."""
 
     compile_seconds: float
     run_seconds: float
@@ -41,7 +43,7 @@ class AbstractStudyResult(abc.ABC):
 
     @abc.abstractmethod
     def summary(self) -> dict[str, Any]:
-        """Return the results in short, with timings."""
+        """Return a summary of the results, with timings."""
 
     @abc.abstractmethod
     def arrays(self) -> dict[str, np.ndarray]:
@@ -49,24 +51,24 @@ class AbstractStudyResult(abc.ABC):
 
     @abc.abstractmethod
     def table(self) -> str:
-        """Write the results in short as a table of text."""
+        """Format the main results as a table of text."""
 
     @abc.abstractmethod
     def verdict(self) -> str:
-        """Say in one line what came out."""
+        """State the main result in one line."""
 
     @abc.abstractmethod
     def figures(self) -> "dict[str, Figure]":
-        """Draw the figures; return them by file name, without suffix."""
+        """Draw the figures; return them by file name without suffix."""
 
 
 def write(result: AbstractStudyResult, directory: str | Path) -> dict[str, Any]:
-    """Write figures (PNG), data (NPZ) and a record (JSON) of a study.
+    """Write the figures (PNG), the data (NPZ) and the record (JSON) of a study.
 
     **Arguments:**
 
-    - `result`: what a study returned.
-    - `directory`: where to; it is made if need be.
+    - `result`: the result of a study.
+    - `directory`: the folder; it is created if it does not exist.
 
     **Returns:** the record, as in the JSON file.
     """
@@ -93,8 +95,26 @@ def write(result: AbstractStudyResult, directory: str | Path) -> dict[str, Any]:
     return record
 
 
+def compile_and_run(function: Callable[..., Any], *args: Any) -> tuple[Any, Timing]:
+    """Compile and run `function(*args)` as one program; return its value and timing."""
+    start = time.perf_counter()
+    program = jax.jit(function).lower(*args).compile()
+    compiled = time.perf_counter()
+    value = jax.block_until_ready(program(*args))
+    # The callbacks of progress meters may end after the program.
+    jax.effects_barrier()
+    return value, Timing(compiled - start, time.perf_counter() - compiled)
+
+
+def meter(
+    progress: bool, description: str, unit: str = "step"
+) -> AbstractProgressMeter:
+    """Create a progress bar on the standard error stream, or none."""
+    return TqdmProgressMeter(description, unit) if progress else NoProgressMeter()
+
+
 def system_parameters(example: Any) -> dict[str, Any]:
-    """Return the parameters of an example of the gallery, without the initial data."""
+    """Return the parameters of an example of the gallery without the initial data."""
     values = {
         field.name: getattr(example, field.name)
         for field in dataclasses.fields(example)
@@ -116,7 +136,7 @@ def initial_data(example: Any) -> dict[str, Any]:
 
 
 def environment() -> dict[str, Any]:
-    """Return the versions, the precision and the device that the numbers depend on."""
+    """Return the versions, the precision and the device that affect the numbers."""
     device = jax.devices()[0]
     packages = ("nhjax", "jax", "jaxlib", "equinox", "numpy", "matplotlib")
     return {
@@ -129,7 +149,7 @@ def environment() -> dict[str, Any]:
 
 
 def _plain(x: Any) -> Any:
-    """Convert `x` to values of JSON, with null for numbers that are not finite."""
+    """Convert `x` to JSON values, with null for numbers that are not finite."""
     if isinstance(x, Mapping):
         return {str(key): _plain(value) for key, value in x.items()}
     if isinstance(x, list | tuple | np.ndarray):

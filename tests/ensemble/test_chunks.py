@@ -1,4 +1,4 @@
-"""Ensembles in chunks: the same as `vmap`, with failures noted and errors by name."""
+"""Ensembles in chunks return the values of `vmap` and list the members that failed."""
 
 import io
 import os
@@ -21,19 +21,19 @@ def outcome():
     return nhjax.ensemble(start, starts(), chunk_size=4)
 
 
-def test_values_are_those_of_vmap(outcome):
+def test_ensemble_values_in_chunks_equal_those_of_vmap(outcome):
     expected = jax.jit(jax.vmap(start))(starts())
     assert isinstance(outcome.values, nhjax.Solution)
     assert jax.tree.structure(outcome.values) == jax.tree.structure(expected)
 
-    # XLA rounds a little differently in vectors of other lengths.
+    # XLA rounds slightly differently in vectors of another length.
     def close(x, y):
         np.testing.assert_allclose(x, y, rtol=1e-14, atol=1e-14)
 
     jax.tree.map(close, outcome.values, expected)
 
 
-def test_failures_are_listed_and_others_go_on(outcome):
+def test_ensemble_with_failing_members_lists_them_and_runs_the_others(outcome):
     assert outcome.failed.tolist() == list(BAD)
     assert outcome.failed_step.tolist() == [0, 0]
     whole = [(index, step, reason) for index, step, reason in outcome.values.failures()]
@@ -41,7 +41,7 @@ def test_failures_are_listed_and_others_go_on(outcome):
     assert outcome.num_members == 10
 
 
-def test_members_that_failed_are_left_out_of_statistics_and_rerun_alone(outcome):
+def test_ensemble_statistics_with_failing_members_leave_them_out(outcome):
     got = nhjax.ensemble(start, starts(), chunk_size=4, reduce=nhjax.Mean())
     assert got.failures() == outcome.failures()
     good = np.delete(outcome.values.ys, BAD, axis=0)
@@ -51,7 +51,7 @@ def test_members_that_failed_are_left_out_of_statistics_and_rerun_alone(outcome)
     assert again.failures() == []
 
 
-def test_a_bare_result_is_looked_at():
+def test_ensemble_of_bare_results_lists_failed_members():
     def bare(x):
         good, bad = nhjax.RESULTS.successful, nhjax.RESULTS.nonfinite_state
         return x, nhjax.RESULTS.where(x < 2.0, good, bad)
@@ -62,12 +62,12 @@ def test_a_bare_result_is_looked_at():
     assert float(got.statistics[0]) == 1.0
 
 
-def test_if_all_fail_the_first_reason_is_told():
+def test_ensemble_statistics_if_all_members_fail_raise_the_first_reason():
     with pytest.raises(nhjax.IntegrationError, match=r"all 2 members, .* step 0: The"):
         nhjax.ensemble(start, starts()[list(BAD)], reduce=nhjax.Mean(), chunk_size=4)
 
 
-def test_one_program_for_all_chunks():
+def test_ensemble_of_several_chunks_compiles_one_program():
     traced = []
 
     def count(x):
@@ -75,11 +75,11 @@ def test_one_program_for_all_chunks():
         return 2 * x
 
     nhjax.ensemble(count, lambda i: i, num_members=10, chunk_size=4)
-    # Once for the shapes of what it returns, and once for the program.
+    # Once for the shapes of its values, and once for the program.
     assert len(traced) == 2
 
 
-def test_trees_random_keys_and_functions_as_members():
+def test_ensemble_members_as_trees_keys_and_functions_equal_vmap():
     keys = jax.random.split(jax.random.key(1), 5)
 
     def draw(member):
@@ -100,17 +100,21 @@ def test_trees_random_keys_and_functions_as_members():
         ({"members": {}}, nhjax.ShapeError, "no members"),
         ({"run": lambda x: jax.random.key(0)}, TypeError, "key_data"),
         ({"reduce": {}}, TypeError, "holds no reduction"),
-        ({"devices": []}, ValueError, "`devices` must be different devices"),
+        (
+            {"devices": []},
+            ValueError,
+            "`devices` must be one or more different devices",
+        ),
         ({"devices": "cpu"}, TypeError, "`devices` must be a sequence of devices"),
     ],
 )
-def test_wrong_arguments_are_refused_by_name(arguments, error, message):
+def test_ensemble_with_invalid_argument_raises_with_its_name(arguments, error, message):
     whole = {"run": lambda x: x, "members": np.ones(3)} | arguments
     with pytest.raises(error, match=message):
         nhjax.ensemble(whole.pop("run"), whole.pop("members"), **whole)
 
 
-def test_a_bar_counts_members_and_is_silent_unless_on_a_terminal(monkeypatch):
+def test_ensemble_progress_bar_counts_members_and_needs_a_terminal(monkeypatch):
     shown = io.StringIO()
     monkeypatch.setattr(sys, "stderr", shown)
     nhjax.ensemble(lambda x: x, np.ones(5))
@@ -147,7 +151,7 @@ print("the same")
 
 
 @pytest.mark.long
-def test_members_and_statistics_on_several_devices_are_those_of_one():
+def test_ensemble_on_several_devices_equals_one_device():
     flags = f"{os.environ['XLA_FLAGS']} --xla_force_host_platform_device_count=3"
     root = Path(__file__).parents[2]
     places = os.pathsep.join([str(root), str(root / "tests")])
@@ -163,7 +167,7 @@ def test_members_and_statistics_on_several_devices_are_those_of_one():
     assert done.stdout == "the same\n", done.stderr
 
 
-def test_the_benchmark_in_a_small_form():
+def test_ensemble_benchmark_with_few_members_computes_their_mean_energy():
     row = ensembles.measure(members=2500, num_steps=2, rounds=1)
     assert row["failed"] == 0
     # The energy of all members.

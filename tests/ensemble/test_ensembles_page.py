@@ -1,9 +1,9 @@
-"""The page about ensembles keeps its word: its code runs as printed."""
+"""The code of the page about ensembles runs as printed."""
 
 from oracles.pages import run_page
 
 
-def test_the_code_of_the_page_runs(tmp_path, monkeypatch):
+def test_ensembles_page_code_runs(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     namespace = run_page("ensembles")
     assert namespace["again"].values.ys.q.shape == (1, 1, 7)

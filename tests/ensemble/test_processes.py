@@ -1,4 +1,4 @@
-"""Two processes of JAX run an ensemble together, as one does."""
+"""Two JAX processes that run an ensemble together return the result of one."""
 
 import ast
 import json
@@ -22,7 +22,7 @@ from nhjax._ensemble import _processes
 from oracles import processes
 
 
-# Nothing may touch the devices before JAX knows of the other process.
+# JAX must know of the other process before anything uses the devices.
 SCRIPT = """
 import sys
 from pathlib import Path
@@ -38,8 +38,8 @@ getattr(processes, task)(int(index), Path(folder))
 ROOT = Path(__file__).parents[2]
 
 
-def pair(folder: Path, task: str) -> list[subprocess.Popen]:
-    """Start two processes that know of one another."""
+def start_two(folder: Path, task: str) -> list[subprocess.Popen]:
+    """Start two processes that are connected by JAX."""
     with socket.socket() as found:
         found.bind(("localhost", 0))
         port = found.getsockname()[1]
@@ -56,8 +56,8 @@ def pair(folder: Path, task: str) -> list[subprocess.Popen]:
     ]
 
 
-def ended(both: list[subprocess.Popen]) -> list[tuple[str, str]]:
-    """Wait for processes, and return what they have printed."""
+def wait_for(both: list[subprocess.Popen]) -> list[tuple[str, str]]:
+    """Wait for processes, and return their output and errors."""
     try:
         return [process.communicate(timeout=300) for process in both]
     finally:
@@ -65,13 +65,13 @@ def ended(both: list[subprocess.Popen]) -> list[tuple[str, str]]:
             process.kill()
 
 
-def spoken(output: str) -> list[str]:
-    """The lines that are not by what connects the processes."""
+def without_gloo(output: str) -> list[str]:
+    """Return the lines of an output without the messages of Gloo."""
     return [line for line in output.splitlines() if not line.startswith("[Gloo]")]
 
 
 def content(folder: Path) -> dict[str, bytes]:
-    """All files of a store, by name."""
+    """Return all files of a store, by name."""
     return {
         str(path.relative_to(folder)): path.read_bytes()
         for path in sorted(folder.rglob("*"))
@@ -80,7 +80,7 @@ def content(folder: Path) -> dict[str, bytes]:
 
 
 def lines(folder: Path, index: int) -> int:
-    """How many chunks a process has finished since it was started."""
+    """Return how many chunks a process has finished since its start."""
     name = f"chunks-{index}.jsonl" if index else "chunks.jsonl"
     journal = folder / "manifest" / name
     return journal.read_bytes().count(b"\n") if journal.exists() else 0
@@ -92,47 +92,49 @@ def folder(tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def said(folder):
-    """What two processes have said; the second is killed in a store's midst."""
-    both = pair(folder, "together")
+def outputs(folder):
+    """Return the outputs of two processes; the second is killed while it writes."""
+    both = start_two(folder, "together")
     while both[1].poll() is None:
         if lines(folder / "killed", 1) > 20:
             both[1].send_signal(signal.SIGKILL)
             break
         time.sleep(0.001)
-    found = ended(both)
+    found = wait_for(both)
     codes = [process.returncode for process in both]
     assert codes == [3, -signal.SIGKILL], found
-    return [spoken(out) for out, _ in found]
+    return [without_gloo(out) for out, _ in found]
 
 
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory):
-    """The files of a store that one process has written."""
+    """Return the files of a store that one process has written."""
     path = tmp_path_factory.mktemp("one") / "store"
     processes.stored(path)
     return content(path)
 
 
-def test_statistics_and_values_are_those_of_one_process(said, tmp_path):
-    assert said[0][:2] == said[1][:2]
+def test_processes_statistics_and_values_equal_those_of_one_process(outputs, tmp_path):
+    assert outputs[0][:2] == outputs[1][:2]
     alone = processes.summary(tmp_path)
-    assert ast.literal_eval(said[0][0]) == alone
+    assert ast.literal_eval(outputs[0][0]) == alone
     assert alone["digits"] == alone["rounds"] == 1234567
     assert len(alone["failures"]) == 2
-    # Of shares that are merged in the end.
+    # Without a fixed order, shares are merged at the end.
     expected = jax.tree.leaves(processes.statistics().statistics)
-    for x, y in zip(ast.literal_eval(said[0][1]), expected, strict=True):
+    for x, y in zip(ast.literal_eval(outputs[0][1]), expected, strict=True):
         np.testing.assert_allclose(x, y, rtol=1e-14, atol=1e-30)
 
 
-def test_one_that_is_killed_ends_the_other_with_an_error(said):
-    assert said[0][2].startswith("Another of the 2 processes has ended or cannot be")
-    assert len(said[1]) == 2
+def test_processes_if_one_is_killed_raise_in_the_other(outputs):
+    assert outputs[0][2].startswith("Another of the 2 processes has ended or cannot be")
+    assert len(outputs[1]) == 2
 
 
 @pytest.mark.long
-def test_both_and_one_alone_go_on_to_the_same_bytes(said, folder, whole, monkeypatch):
+def test_processes_resume_of_killed_stores_writes_the_same_bytes(
+    outputs, folder, whole, monkeypatch
+):
     monkeypatch.setattr(nhjax._ensemble._ensemble, "_SECONDS", 0.0)
     with pytest.raises(OSError, match="No space"):
         processes.statistics(folder / "begun", progress_meter=processes.Failing())
@@ -143,12 +145,12 @@ def test_both_and_one_alone_go_on_to_the_same_bytes(said, folder, whole, monkeyp
     shutil.copytree(folder / "killed", folder / "alone")
     processes.stored(folder / "alone")
     assert content(folder / "alone") == whole
-    both = pair(folder, "again")
-    found = ended(both)
+    both = start_two(folder, "again")
+    found = wait_for(both)
     assert [process.returncode for process in both] == [0, 0], found
     for name in ("killed", "bad"):
         assert content(folder / name) == whole
-    one, other = [spoken(out) for out, _ in found]
+    one, other = [without_gloo(out) for out, _ in found]
     assert one[:3] == other[:3]
     assert "process 0 and process 1 differ in `chunk_size`: 4 and 5" in one[0]
     assert "differ in `fixed_order`: False and True" in one[1]
@@ -162,49 +164,49 @@ def test_both_and_one_alone_go_on_to_the_same_bytes(said, folder, whole, monkeyp
     assert not left.exists()
 
 
-def test_what_only_one_process_is_given_is_refused_in_all():
+def test_processes_with_different_calls_raise_in_all():
     calls = {"out": False}, {"out": False, "reduce": "Mean()"}
 
-    class Told(_processes.Processes):
-        def exchange(self, data=b""):
+    class Scripted(_processes.Processes):
+        def allgather(self, data=b""):
             return [json.dumps(call).encode() for call in calls]
 
     for call in calls:
         with pytest.raises(ValueError, match=r"differ in `reduce`: None and Mean\(\)"):
-            Told().agree(call)
+            Scripted().check_same_call(call)
 
 
-def test_processes_with_other_numbers_of_devices_are_named():
-    _processes.check_devices([0, 1, 1, 0])
+def test_processes_with_different_numbers_of_devices_are_named():
+    _processes.check_equal_devices([0, 1, 1, 0])
     with pytest.raises(ValueError, match="process 0 has 2, process 1 has 1"):
-        _processes.check_devices([0, 0, 1])
+        _processes.check_equal_devices([0, 0, 1])
 
 
-def test_processes_of_unequal_shares_meet_as_often(monkeypatch):
-    """Threads stand for processes; one that waited for nobody would wait for ever."""
+def test_processes_with_unequal_shares_exchange_equally_often(monkeypatch):
+    """Threads replace processes; an unmatched exchange would wait forever."""
     monkeypatch.setattr(_processes, "_SECONDS", 0.004)
-    barrier, told, meetings = threading.Barrier(3), {}, [0, 0, 0]
+    barrier, sent, exchanges = threading.Barrier(3), {}, [0, 0, 0]
 
     class Others(_processes.Processes):
         def __init__(self, index):
             self.index, self.count = index, 3
 
-        def exchange(self, data=b""):
-            meetings[self.index] += 1
-            told[self.index] = data
+        def allgather(self, data=b""):
+            exchanges[self.index] += 1
+            sent[self.index] = data
             barrier.wait(timeout=60)
-            found = [told[index] for index in range(3)]
+            found = [sent[index] for index in range(3)]
             barrier.wait(timeout=60)
             return found
 
     def run(index, chunks):
-        pace = _processes.Pace(Others(index), chunks, is_needed=True)
+        exchange = _processes.PeriodicExchange(Others(index), chunks, is_needed=True)
         for _ in range(chunks):
             time.sleep(0.001)
-            pace.chunk_done()
-        pace.finish()
+            exchange.chunk_done()
+        exchange.finish()
 
     with ThreadPoolExecutor(3) as pool:
         for ended in [pool.submit(run, *x) for x in enumerate((40, 0, 7))]:
             ended.result()
-    assert meetings[0] == meetings[1] == meetings[2] > 5
+    assert exchanges[0] == exchanges[1] == exchanges[2] > 5

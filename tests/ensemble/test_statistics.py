@@ -1,4 +1,4 @@
-"""Statistics of ensembles against exact fractions, whatever the chunks."""
+"""Statistics of ensembles equal those of exact fractions for every chunk size."""
 
 from fractions import Fraction
 
@@ -22,7 +22,7 @@ ALL = {
 
 @pytest.fixture(scope="module")
 def data():
-    """Small numbers, and the same with a mean that is 1e8 times their deviation."""
+    """Return small numbers, and the same with a mean of 1e8 standard deviations."""
     small = np.random.default_rng(0).standard_normal((MEMBERS, 2))
     return {"small": small, "large": small + 1e8}
 
@@ -34,7 +34,7 @@ def statistics(request, data):
 
 
 def exact(x):
-    """Mean and variance by fractions, of a column."""
+    """Compute the mean and the variance of a column with fractions."""
     numbers = [Fraction(float(y)) for y in x]
     mean = sum(numbers) / len(numbers)
     squares = sum((y - mean) ** 2 for y in numbers)
@@ -42,22 +42,22 @@ def exact(x):
 
 
 @pytest.mark.parametrize("name", ["small", "large"])
-def test_moments_are_those_of_fractions(name, statistics, data):
+def test_mean_and_variance_in_chunks_equal_those_of_fractions(name, statistics, data):
     for column in range(2):
         mean, variance = exact(data[name][:, column])
         got = [statistics[x][name][column] for x in ("mean", "variance")]
-        # The mean of the small numbers is itself the rest of a cancellation.
+        # The mean of the small numbers is itself the result of a cancellation.
         np.testing.assert_allclose(got[0], mean, rtol=1e-15, atol=1e-17)
         np.testing.assert_allclose(got[1], variance, rtol=1e-15)
 
 
-def test_extremes_are_those_of_numpy(statistics, data):
+def test_minimum_and_maximum_in_chunks_equal_those_of_numpy(statistics, data):
     for name, x in data.items():
         assert np.array_equal(statistics["least"][name], x.min(axis=0))
         assert np.array_equal(statistics["largest"][name], x.max(axis=0))
 
 
-def test_histograms_and_quantiles_are_those_of_numpy(statistics, data):
+def test_histogram_and_quantiles_in_chunks_equal_those_of_numpy(statistics, data):
     found, x = statistics["histogram"], data["small"]
     for column in range(2):
         counts = np.histogram(x[:, column], found.edges)[0]
@@ -68,11 +68,11 @@ def test_histograms_and_quantiles_are_those_of_numpy(statistics, data):
     assert np.array_equal(inside + below + found.above, [MEMBERS] * 2)
     for fraction in (0.1, 0.5, 0.9):
         expected = np.quantile(x, fraction, axis=0)
-        # To within the width of a bin, and the distance of two members there.
+        # The error is at most the width of a bin plus the distance of two members.
         np.testing.assert_allclose(found.quantile(fraction), expected, atol=0.02)
 
 
-def test_quantiles_outside_of_the_edges_are_refused():
+def test_quantile_outside_of_the_edges_raises():
     found = nhjax.ensemble(
         lambda x: x, jnp.array([0.0, 1.0, 5.0]), reduce=nhjax.Histogram([0.5, 2.0])
     ).statistics
@@ -81,7 +81,7 @@ def test_quantiles_outside_of_the_edges_are_refused():
         found.quantile(0.01)
 
 
-def test_infinities_and_nan_are_handed_on():
+def test_statistics_of_infinity_and_nan_propagate_them():
     x = np.ones((5, 3))
     x[1, 0], x[2, 1], x[3, 1], x[4, 2] = np.inf, np.inf, -np.inf, np.nan
     got = nhjax.ensemble(
@@ -96,7 +96,7 @@ def test_infinities_and_nan_are_handed_on():
     assert got[2].above.tolist() == [1, 1, 0]
 
 
-def test_integers_and_booleans_have_statistics():
+def test_statistics_of_integers_and_booleans_are_computed():
     got = nhjax.ensemble(
         lambda i: (i, i > 1),
         lambda i: i,
@@ -108,38 +108,38 @@ def test_integers_and_booleans_have_statistics():
 
 
 class Product(nhjax.AbstractReduction):
-    """A reduction of a user's own."""
+    """A reduction that a user has defined."""
 
     def init(self, value):
-        """One."""
+        """Create a product without factors."""
         return jnp.ones(value.shape, value.dtype)
 
     def update(self, state, values, counts):
-        """Multiply."""
+        """Multiply with the members of a chunk."""
         return state * jnp.prod(jnp.where(counts, values, 1.0))
 
     def merge(self, one, other):
-        """Multiply."""
+        """Multiply two products."""
         return one * other
 
     def finish(self, state):
-        """Return a number of Python."""
+        """Convert to a Python float."""
         return float(state)
 
 
-def test_a_reduction_of_ones_own():
+def test_reduction_of_a_user_is_applied_in_chunks():
     got = nhjax.ensemble(
         lambda x: x, jnp.arange(1.0, 6.0), reduce=Product(), chunk_size=2
     )
     assert got.statistics == 120.0
 
 
-def test_a_variance_of_one_member_is_refused():
+def test_variance_of_one_member_raises():
     with pytest.raises(ValueError, match="more than 1 members"):
         nhjax.ensemble(lambda x: x, jnp.ones(1), reduce=nhjax.Variance())
 
 
 @pytest.mark.parametrize("edges", [[1.0], [0.0, 0.0], [0.0, np.nan], [[0.0, 1.0]]])
-def test_edges_that_cannot_be_are_refused(edges):
+def test_histogram_with_invalid_edges_raises(edges):
     with pytest.raises(ValueError, match="`edges` must"):
         nhjax.Histogram(edges)

@@ -1,4 +1,4 @@
-"""Stores of ensembles: opened by xarray, resumed bit for bit, faults told."""
+"""Stores of ensembles: xarray opens them, runs resume bit for bit, faults raise."""
 
 import errno
 import json
@@ -25,12 +25,12 @@ COUNT, CHUNK = 50, 4
 
 
 def run(x):
-    """Something quick, with an axis of its own."""
+    """Return powers quickly, along an axis of their own."""
     return {"powers": x ** jnp.arange(3.0), "is_large": x > 1.0}
 
 
 def failing(x):
-    """Something quick that fails for some members."""
+    """Return powers quickly; fail for some members."""
     codes = nhjax.RESULTS.nonfinite_state, nhjax.RESULTS.successful
     return {
         "powers": x ** jnp.arange(3.0),
@@ -45,12 +45,12 @@ def call(out, function=run, count=COUNT, **options):
 
 
 def power(table):
-    """A run with an array that is not written in its program."""
+    """Return a run with an array whose numbers are not in the text of its jaxpr."""
     return lambda x: x**table
 
 
 def content(folder: Path) -> dict[str, bytes]:
-    """All files of a store, by name."""
+    """Return all files of a store, by name."""
     return {
         str(path.relative_to(folder)): path.read_bytes()
         for path in sorted(folder.rglob("*"))
@@ -60,7 +60,7 @@ def content(folder: Path) -> dict[str, bytes]:
 
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory):
-    """The files of a run that nothing has disturbed."""
+    """Return the files of a run that was not interrupted."""
     folder = tmp_path_factory.mktemp("whole") / "store"
     call(folder)
     return content(folder)
@@ -68,7 +68,7 @@ def whole(tmp_path_factory):
 
 @pytest.fixture
 def store(tmp_path, whole):
-    """A finished store, to be damaged."""
+    """Create a finished store that a test may damage."""
     for name, data in whole.items():
         path = tmp_path / "store" / name
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -76,7 +76,7 @@ def store(tmp_path, whole):
     return tmp_path / "store"
 
 
-def test_xarray_opens_the_store_of_solutions(tmp_path):
+def test_store_of_solutions_opens_in_xarray_with_labels(tmp_path):
     options = {"out": tmp_path / "s", "units": {"time": "s", "value": "J"}}
     outcome = nhjax.ensemble(start, starts(), chunk_size=4, **options)
     expected = nhjax.ensemble(start, starts(), chunk_size=4)
@@ -97,7 +97,7 @@ def test_xarray_opens_the_store_of_solutions(tmp_path):
         np.testing.assert_array_equal(data.stats_num_steps, steps)
 
 
-def test_units_by_coordinate_are_those_of_solutions(tmp_path):
+def test_store_with_units_by_coordinate_labels_as_to_xarray(tmp_path):
     system = nhjax.LagrangianSystem(
         lambda t, q, v, args: 0.5 * v @ v - q[1], coordinates=("x", "angle")
     )
@@ -120,7 +120,7 @@ def test_units_by_coordinate_are_those_of_solutions(tmp_path):
         assert data.p.units == single.p.units == "N s"
 
 
-def test_xarray_opens_the_store_of_a_tree(store):
+def test_store_of_a_tree_opens_in_xarray(store):
     with xarray.open_zarr(store) as data:
         x = np.linspace(0.5, 1.5, COUNT)
         np.testing.assert_allclose(data.powers, np.stack([x**0, x, x**2], axis=1))
@@ -129,11 +129,11 @@ def test_xarray_opens_the_store_of_a_tree(store):
 
 
 class Killed(BaseException):
-    """What stands for the end of the process."""
+    """Simulates the end of the process."""
 
 
-def test_wherever_it_is_interrupted_the_same_call_goes_on(tmp_path, whole, monkeypatch):
-    """Each run ends at another operation on files, short of the last bytes."""
+def test_store_interrupted_at_any_operation_resumes(tmp_path, whole, monkeypatch):
+    """Each run ends at another file operation, without the last bytes."""
     fsync, replace, folder = os.fsync, os.replace, tmp_path / "store"
     left, ran = [0], []
 
@@ -148,7 +148,7 @@ def test_wherever_it_is_interrupted_the_same_call_goes_on(tmp_path, whole, monke
 
         return operation
 
-    # Folders cannot be cut in half.
+    # The simulated end truncates a file, which is not possible for folders.
     monkeypatch.setattr(_durable, "sync_folder", lambda folder: None)
     monkeypatch.setattr(_durable.os, "fsync", counted(fsync))
     monkeypatch.setattr(_durable.os, "replace", counted(replace))
@@ -161,7 +161,7 @@ def test_wherever_it_is_interrupted_the_same_call_goes_on(tmp_path, whole, monke
     call(folder)
     assert content(folder) == whole
     assert "manifest/chunks.jsonl" not in ran[0]
-    # No chunk is run twice that was done.
+    # Finished chunks do not run again.
     journals = [x.get("manifest/chunks.jsonl", b"").count(b"\n") for x in ran]
     assert journals == sorted(journals)
     assert 0 < journals[-1] < 13
@@ -176,7 +176,7 @@ test_store.call(sys.argv[1], count=800)
 """
 
 
-def test_a_run_that_is_killed_goes_on_to_the_same_bytes(tmp_path):
+def test_store_of_a_killed_run_resumes_to_the_same_bytes(tmp_path):
     root = Path(__file__).parents[2]
     places = os.pathsep.join([str(root), str(root / "tests")])
     command = [sys.executable, "-c", SCRIPT, str(tmp_path / "killed")]
@@ -195,7 +195,7 @@ def test_a_run_that_is_killed_goes_on_to_the_same_bytes(tmp_path):
     assert content(tmp_path / "killed") == content(tmp_path / "whole")
 
 
-def test_a_finished_store_runs_nothing(store, whole, capsys):
+def test_store_that_is_finished_runs_no_chunk(store, whole, capsys):
     call(store, progress_meter=nhjax.TextProgressMeter())
     assert capsys.readouterr().out == ""
     assert content(store) == whole
@@ -216,26 +216,28 @@ def test_a_finished_store_runs_nothing(store, whole, capsys):
                     "is_large": x > 1.0,
                 }
             },
-            r"computes, or the numbers in it.*add.*0\.25",
+            r"computation in `run`, or the numbers in it.*add.*0\.25",
         ),
     ],
 )
-def test_other_parameters_are_refused_by_what_differs(options, message, store, whole):
-    with pytest.raises(ValueError, match=f"another run. What differs: .*{message}"):
+def test_store_resumed_with_other_parameters_raises_with_the_difference(
+    options, message, store, whole
+):
+    with pytest.raises(ValueError, match=f"another run. Differences: .*{message}"):
         call(store, **options)
     assert content(store) == whole
 
 
-def test_other_members_and_other_arrays_of_run_are_refused(store):
+def test_store_resumed_with_other_arrays_raises(store):
     with pytest.raises(ValueError, match="the arrays of `members`"):
         nhjax.ensemble(run, np.ones(COUNT), out=store, chunk_size=CHUNK)
     own = store.with_name("own")
     call(own, power(jnp.arange(3.0)))
-    with pytest.raises(ValueError, match="what `run` computes"):
+    with pytest.raises(ValueError, match="the computation in `run`"):
         call(own, power(jnp.array([0.0, 1.0, 2.5])))
 
 
-def test_a_damaged_chunk_is_named_and_run_again_once_deleted(store, whole):
+def test_store_with_damaged_chunk_raises_and_reruns_it_once_deleted(store, whole):
     path = store / "powers" / "c" / "3" / "0"
     path.write_bytes(path.read_bytes()[:-1] + b"x")
     with pytest.raises(ValueError, match=r"powers/c/3/0.*members 12 to 15"):
@@ -246,19 +248,19 @@ def test_a_damaged_chunk_is_named_and_run_again_once_deleted(store, whole):
 
 
 @pytest.mark.parametrize("name", ["zarr.json", "program.txt", "chunks.jsonl"])
-def test_a_missing_manifest_is_told(name, store):
+def test_store_with_missing_file_raises(name, store):
     (store / "manifest" / name).unlink()
     with pytest.raises(ValueError, match=f"has no 'manifest/{name}'"):
         call(store)
 
 
-def test_a_damaged_manifest_is_told(store):
+def test_store_with_damaged_manifest_raises(store):
     (store / "manifest" / "zarr.json").write_text("{")
     with pytest.raises(ValueError, match=r"a damaged 'manifest/zarr\.json'"):
         call(store)
 
 
-def test_a_damaged_journal_is_told(store):
+def test_store_with_damaged_journal_raises_with_the_line(store):
     journal = store / "manifest" / "chunks.jsonl"
     lines = journal.read_text().splitlines()
     journal.write_text("\n".join([lines[0][:-5], *lines[1:], ""]))
@@ -266,7 +268,9 @@ def test_a_damaged_journal_is_told(store):
         call(store)
 
 
-def test_a_full_disk_is_told_and_what_is_done_is_kept(tmp_path, whole, monkeypatch):
+def test_store_on_full_disk_raises_and_keeps_finished_chunks(
+    tmp_path, whole, monkeypatch
+):
     left = [30]
 
     def fsync(file):
@@ -284,7 +288,7 @@ def test_a_full_disk_is_told_and_what_is_done_is_kept(tmp_path, whole, monkeypat
     assert content(tmp_path / "store") == whole
 
 
-def test_folders_that_cannot_be_used_are_told(tmp_path, monkeypatch):
+def test_store_in_unusable_folder_raises(tmp_path, monkeypatch):
     (tmp_path / "file").write_text("")
     with pytest.raises(FileExistsError, match="is a file: `out` names a folder"):
         call(tmp_path / "file")
@@ -304,8 +308,8 @@ def test_folders_that_cannot_be_used_are_told(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("name", ["lock", "chunks-1.jsonl"])
-def test_two_runs_do_not_write_to_one_store(name, store, whole):
-    """Nor does one to that of which a process still runs."""
+def test_store_locked_by_another_process_raises(name, store, whole):
+    """The lock is that of the store, or that of a process which still runs."""
     fcntl = pytest.importorskip("fcntl")
     with open(store / "manifest" / name, "w") as locked:
         fcntl.flock(locked, fcntl.LOCK_EX)
@@ -315,7 +319,7 @@ def test_two_runs_do_not_write_to_one_store(name, store, whole):
     assert content(store) == whole
 
 
-def test_store_without_locks_of_the_system_is_refused(tmp_path, monkeypatch):
+def test_store_on_system_without_fcntl_raises(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "fcntl", None)
     with pytest.raises(RuntimeError, match="has no module `fcntl`"):
         call(tmp_path / "store")
@@ -332,7 +336,7 @@ def test_store_on_a_file_system_without_locks_warns(tmp_path, monkeypatch):
         call(tmp_path / "store")
 
 
-def test_ctrl_c_leaves_a_store_that_goes_on(tmp_path, whole):
+def test_store_interrupted_by_ctrl_c_resumes(tmp_path, whole):
     class Interrupting(nhjax.AbstractProgressMeter):
         def update(self, done, total):
             raise KeyboardInterrupt
@@ -348,7 +352,7 @@ def test_ctrl_c_leaves_a_store_that_goes_on(tmp_path, whole):
     assert content(folder) == whole
 
 
-def test_without_zarr_the_extra_is_named(tmp_path, monkeypatch):
+def test_store_without_zarr_raises_with_the_extra(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "zarr", None)
     with pytest.raises(ImportError, match=r'pip install "nhjax\[ensemble\]"'):
         call(tmp_path / "store")
@@ -357,7 +361,11 @@ def test_without_zarr_the_extra_is_named(tmp_path, monkeypatch):
 @pytest.mark.parametrize(
     ("options", "error", "message"),
     [
-        ({"reduce": nhjax.Mean(), "units": {}}, ValueError, "`units` are those of"),
+        (
+            {"reduce": nhjax.Mean(), "units": {}},
+            ValueError,
+            "`units` are for the values in a store",
+        ),
         ({"units": {"mass": "kg"}}, ValueError, "`units` has the name 'mass'"),
         ({"function": lambda x: {"time": x}}, ValueError, "an array called 'time'"),
         (
@@ -367,18 +375,22 @@ def test_without_zarr_the_extra_is_named(tmp_path, monkeypatch):
         ),
     ],
 )
-def test_what_a_store_does_not_hold_is_refused(options, error, message, tmp_path):
+def test_store_with_unsupported_values_or_units_raises(
+    options, error, message, tmp_path
+):
     with pytest.raises(error, match=message):
         call(tmp_path / "store", **options)
     assert not (tmp_path / "store").exists()
 
 
-def test_units_without_a_store_are_refused():
-    with pytest.raises(ValueError, match="give its folder as `out`"):
+def test_ensemble_with_units_but_no_store_raises():
+    with pytest.raises(ValueError, match="name its folder by `out`"):
         call(None, units={"time": "s"})
 
 
-def test_statistics_go_on_where_they_were_interrupted(tmp_path, monkeypatch):
+def test_statistics_in_a_folder_resume_where_they_were_interrupted(
+    tmp_path, monkeypatch
+):
     reduce = {"mean": nhjax.Mean(), "variance": nhjax.Variance()}
     members = np.linspace(0.5, 1.5, 10)
     options: dict[str, Any] = {"members": members, "chunk_size": 2, "reduce": reduce}
@@ -392,12 +404,13 @@ def test_statistics_go_on_where_they_were_interrupted(tmp_path, monkeypatch):
         replace(*args)
 
     monkeypatch.setattr(os, "replace", interrupted)
-    # Before the program, the manifest and the states are there; then between chunks.
+    # The first three runs end before the program, the manifest and the first state
+    # exist; the others end between chunks.
     for operations in (1, 2, 3, 2, 2):
         left[0] = operations
         with pytest.raises(Killed):
             nhjax.ensemble(failing, out=folder, **options)
-    # The rest is run, and then nothing is.
+    # The first call runs the remaining chunks, and the second call runs none.
     for _ in range(2):
         again = nhjax.ensemble(failing, out=folder, **options)
         assert again.failures() == whole.failures() != []
@@ -428,5 +441,5 @@ def test_statistics_go_on_where_they_were_interrupted(tmp_path, monkeypatch):
 
 
 def content_of(tree):
-    """The bytes of the arrays of a tree."""
+    """Return the bytes of the arrays of a tree."""
     return [np.asarray(x).tobytes() for x in jax.tree.leaves(tree)]

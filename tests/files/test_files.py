@@ -1,4 +1,4 @@
-"""Files of states, solutions and checkpoints: what is read is what was written."""
+"""Files of states, solutions and checkpoints are read bit for bit as written."""
 
 import dataclasses
 import json
@@ -19,7 +19,7 @@ BALL = systems.TurntableBall()
 
 @pytest.fixture(scope="module")
 def sol():
-    """A run on a product of groups, whose q is a tuple."""
+    """Return a run on a product of groups, so that q is a tuple."""
     saveat = SaveAt(steps=True, checkpoint=True, dense=True)
     options = {"dt": 0.05, "num_steps": 4, "saveat": saveat}
     run = nhjax.integrate(BALL.system, LobattoIIIAB(2), BALL.initial_state(), **options)
@@ -39,7 +39,7 @@ def assert_same(got, expected):
         assert np.asarray(x).tobytes() == np.asarray(y).tobytes()
 
 
-def test_a_tree_is_read_as_it_was_written(saved, tmp_path):
+def test_save_of_a_tree_loads_bit_for_bit(saved, tmp_path):
     tree = {
         "run": saved,
         "start": (saved.checkpoint.state, [1, 2.5, True, None, "ω", float("-inf")]),
@@ -51,11 +51,11 @@ def test_a_tree_is_read_as_it_was_written(saved, tmp_path):
     assert_same(got, tree)
     assert got["start"][1] == tree["start"][1]
     assert got["run"].result == nhjax.RESULTS.successful
-    # Nothing else is left in the folder.
+    # No temporary file is left in the folder.
     assert [path.name for path in tmp_path.iterdir()] == ["all"]
 
 
-def test_numpy_reads_the_arrays_under_their_names(saved, tmp_path):
+def test_save_writes_arrays_that_numpy_reads_by_path(saved, tmp_path):
     nhjax.save(tmp_path / "run.npz", saved)
     with np.load(tmp_path / "run.npz", allow_pickle=False) as file:
         np.testing.assert_array_equal(file["ys.q[1]"], saved.ys.q[1])
@@ -64,14 +64,14 @@ def test_numpy_reads_the_arrays_under_their_names(saved, tmp_path):
     assert header["tree"]["kind"] == "Solution"
 
 
-def test_results_of_a_batch_go_by_their_names(saved, tmp_path):
+def test_load_of_results_numbered_differently_uses_their_names(saved, tmp_path):
     path = tmp_path / "run.npz"
     failed = nhjax.RESULTS.nonfinite_state
     batch = jax.tree.map(lambda *x: jnp.stack(x), saved.result, failed)
     nhjax.save(path, batch)
     entries = dict(np.load(path))
     header = json.loads(entries["nhjax"].tobytes())
-    # As if another release had counted them differently.
+    # Simulate a release that numbers the results differently.
     names = header["tree"]["names"]
     order = sorted(names, reverse=True)
     codes = {code: name for name, code in names.items()}
@@ -87,7 +87,7 @@ def _write(path, header, entries):
     np.savez(path, **(entries | {"nhjax": text}))
 
 
-def test_single_precision_reads_no_float64(saved, tmp_path):
+def test_load_of_float64_in_single_precision_raises(saved, tmp_path):
     nhjax.save(tmp_path / "run.npz", saved.checkpoint)
     program = f"import nhjax; nhjax.load({str(tmp_path / 'run.npz')!r})"
     done = subprocess.run(
@@ -100,26 +100,26 @@ def test_single_precision_reads_no_float64(saved, tmp_path):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (lambda file: file.write_bytes(b"nothing"), "is no file of `nhjax.save`"),
+        (lambda file: file.write_bytes(b"nothing"), "is not a file of `nhjax.save`"),
         (lambda file: np.savez(file, q=np.ones(2)), "it has no entry 'nhjax'"),
         (
             lambda file: file.write_bytes(file.read_bytes()[:-100]),
-            "is no file of `nhjax.save`, or is damaged",
+            "is not a file of `nhjax.save`, or is damaged",
         ),
         (lambda file: _changed(file, format="new"), "its header lacks format"),
-        (lambda file: _as_array(file), "it is no .npz"),
+        (lambda file: _as_array(file), "it is not an .npz"),
         (lambda file: _changed(file, format=2), "in format 2, .* formats up to 1"),
         (
             lambda file: _changed(file, tree={"kind": "Robot", "parts": {}}),
-            "names the kind 'Robot'",
+            "contains the type 'Robot'",
         ),
         (
             lambda file: _changed(file, tree={"kind": "State", "parts": {"w": _ONE}}),
-            "State has the parts w",
+            "State has the fields w",
         ),
     ],
 )
-def test_what_is_no_file_of_ours_is_refused(change, message, saved, tmp_path):
+def test_load_of_a_foreign_or_damaged_file_raises(change, message, saved, tmp_path):
     path = tmp_path / "run.npz"
     nhjax.save(path, saved.checkpoint.state)
     change(path)
@@ -141,7 +141,7 @@ def _changed(path, **parts):
     _write(path, header, entries)
 
 
-def test_a_flipped_bit_is_found(saved, tmp_path):
+def test_load_of_a_file_with_a_flipped_bit_raises(saved, tmp_path):
     path = tmp_path / "run.npz"
     nhjax.save(path, saved.checkpoint.state)
     data, q = bytearray(path.read_bytes()), np.asarray(saved.checkpoint.state.p)
@@ -152,17 +152,19 @@ def test_a_flipped_bit_is_found(saved, tmp_path):
 
 
 @pytest.mark.parametrize("name", ["run.H5", "run.csv", "run.MAT", "run.pickle"])
-def test_name_of_another_format_is_refused(name, tmp_path):
-    with pytest.raises(ValueError, match=r"the name of another format: use .*npz"):
+def test_save_with_suffix_of_another_format_raises(name, tmp_path):
+    with pytest.raises(
+        ValueError, match=r"the suffix of another format, .*: use .*npz"
+    ):
         nhjax.save(tmp_path / name, {"x": jnp.zeros(2)})
     assert not list(tmp_path.iterdir())
 
 
-def test_what_cannot_be_saved_is_named(sol, tmp_path):
+def test_save_of_an_unsupported_part_raises_with_its_path(sol, tmp_path):
     path = tmp_path / "run.npz"
     wrong = {
         "`interpolation` is the dense output of a run": sol,
-        r"`\[0\]` is a key of random numbers": (jax.random.key(0),),
+        r"`\[0\]` is a random key": (jax.random.key(0),),
         "has the key 1.5 of type float": {1.5: 1},
         "has dtype bfloat16": jnp.ones(2, jnp.bfloat16),
     }
@@ -172,7 +174,7 @@ def test_what_cannot_be_saved_is_named(sol, tmp_path):
     assert not path.exists()
 
 
-def test_a_file_has_the_rights_of_others_and_a_link_stays(tmp_path):
+def test_save_over_a_file_keeps_its_permissions_and_links(tmp_path):
     path, link = tmp_path / "run.npz", tmp_path / "link"
     (tmp_path / "plain").touch()
     nhjax.save(path, 1)
@@ -187,7 +189,7 @@ def test_a_file_has_the_rights_of_others_and_a_link_stays(tmp_path):
         nhjax.save(tmp_path, 1)
 
 
-def test_a_save_that_fails_leaves_the_old_file_whole(tmp_path, monkeypatch):
+def test_save_that_fails_keeps_the_old_file(tmp_path, monkeypatch):
     path = tmp_path / "run.npz"
     nhjax.save(path, 1)
 

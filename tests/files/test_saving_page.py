@@ -1,9 +1,9 @@
-"""The page about results keeps its word: its code runs as printed."""
+"""The code of the page about results runs as printed."""
 
 from oracles.pages import run_page
 
 
-def test_the_code_of_the_page_runs(tmp_path, monkeypatch):
+def test_saving_page_code_runs(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     namespace = run_page("saving")
     assert namespace["whole"].ys.q.shape == (100, 4)

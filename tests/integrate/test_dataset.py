@@ -105,8 +105,8 @@ def test_saved_functions_are_named_by_their_paths():
 @pytest.mark.parametrize(
     ("fn", "message"),
     [
-        (lambda t, y, args: {"result": t}, "has the name 'result', which something"),
-        (lambda t, y, args: {"time": t}, "has the name 'time', which something"),
+        (lambda t, y, args: {"result": t}, "an array named 'result', which"),
+        (lambda t, y, args: {"time": t}, "an array named 'time', which"),
         (lambda t, y, args: {"a_b": t, "a": {"b": t}}, "have the name 'a_b'"),
     ],
 )
@@ -116,9 +116,9 @@ def test_names_of_functions_replace_nothing(fn, message):
 
 
 def test_what_has_no_labels_is_refused(sol, monkeypatch):
-    with pytest.raises(ValueError, match="Nothing was saved that has times"):
+    with pytest.raises(ValueError, match="no saved times"):
         dataclasses.replace(sol, ts=None, ys=None).to_xarray()
-    with pytest.raises(ValueError, match="2 different ones are needed"):
+    with pytest.raises(ValueError, match="2 different names are needed"):
         sol.to_xarray(coordinates=("x",))
     with pytest.raises(ValueError, match=r"has the name 'z', but .* x, y"):
         sol.to_xarray(units={"z": "m"})

@@ -1,6 +1,6 @@
-"""What two processes of JAX do together, and one of them alone.
+"""The tasks of two JAX processes that run ensembles together.
 
-What processes say of it goes to standard output.
+The processes print their results to standard output.
 """
 
 import errno
@@ -16,21 +16,21 @@ import jax.numpy as jnp
 import numpy as np
 
 import nhjax
-from nhjax._ensemble import _collected
+from nhjax._ensemble import _sinks
 
 
 CHUNKS, CHUNK = 200, 4
 
 
 class Digits(nhjax.AbstractReduction):
-    """Members as the digits of a number, for which their order counts."""
+    """Reads the members as the digits of a number, so that their order matters."""
 
     def init(self, value):
-        """No digits, and the weight of one more."""
+        """Create no digits, and the weight of the next digit."""
         return jnp.zeros((), int), jnp.ones((), int)
 
     def update(self, state, values, counts):
-        """Append those of a chunk."""
+        """Append the digits of a chunk."""
 
         def add(state, x):
             digit, counts = x
@@ -51,10 +51,10 @@ class Digits(nhjax.AbstractReduction):
 
 
 class Total(nhjax.AbstractReduction):
-    """A sum whose dtype is only known from the first members."""
+    """A sum whose dtype changes when the first members are added."""
 
     def init(self, value):
-        """Nothing, as an integer that is short."""
+        """Create an integer of 8 bits."""
         return jnp.zeros((), jnp.int8)
 
     def update(self, state, values, counts):
@@ -78,7 +78,7 @@ REDUCTIONS = {
 
 
 def judged(x):
-    """Something quick that fails for a number that is none."""
+    """Return powers quickly; fail for NaN."""
     good, bad = nhjax.RESULTS.successful, nhjax.RESULTS.nonfinite_state
     return jnp.exp(x * jnp.arange(3.0)), nhjax.RESULTS.where(jnp.isnan(x), bad, good)
 
@@ -88,14 +88,14 @@ MEMBERS[[3, 8]] = np.nan
 
 
 def statistics(folder: Path | None = None, **options: Any) -> nhjax.EnsembleOutcome:
-    """Statistics of runs of which some fail, in five chunks."""
+    """Compute statistics of members, some of which fail, in five chunks."""
     return nhjax.ensemble(
         judged, MEMBERS, chunk_size=2, reduce=REDUCTIONS, out=folder, **options
     )
 
 
 def digits(**options: Any) -> int:
-    """The number 1234567."""
+    """Compute the number 1234567."""
     return nhjax.ensemble(
         lambda i: i + 1,
         lambda i: i,
@@ -107,27 +107,27 @@ def digits(**options: Any) -> int:
 
 
 def power(x):
-    """Something quick, with an axis of its own."""
+    """Return powers quickly, along an axis of their own."""
     return {"powers": x ** jnp.arange(3.0), "is_large": x > 1.0}
 
 
 def stored(folder: Path, **options: Any) -> nhjax.EnsembleOutcome:
-    """Many chunks to disk."""
+    """Write many chunks to a store."""
     members = np.linspace(0.5, 1.5, CHUNKS * CHUNK - 1)
     chosen: dict[str, Any] = {"chunk_size": CHUNK, "out": folder} | options
     return nhjax.ensemble(power, members, **chosen)
 
 
 def bits(tree: Any) -> str:
-    """The bytes of the arrays of a tree."""
+    """Return the bytes of the arrays of a tree as text."""
     return "".join(np.asarray(x).tobytes().hex() for x in jax.tree.leaves(tree))
 
 
 def summary(folder: Path) -> dict[str, Any]:
-    """What must be the same in both processes, and in one that is alone."""
+    """Return the results that do not depend on the number of processes."""
     kept = statistics(folder / "kept")
-    # In blocks that do not end with those of a process.
-    with mock.patch.object(_collected, "_BLOCK", 80):
+    # The blocks of the exchange do not end where the share of a process ends.
+    with mock.patch.object(_sinks, "_BLOCK", 80):
         values = nhjax.ensemble(judged, MEMBERS, chunk_size=2).values
     assert kept.failures() == statistics().failures()
     return {
@@ -142,7 +142,7 @@ def summary(folder: Path) -> dict[str, Any]:
 
 
 def together(index: int, folder: Path) -> None:
-    """Statistics, and then a store in whose midst the process may be killed."""
+    """Compute statistics, then write a store, during which a process is killed."""
     print(repr(summary(folder)))
     print([np.asarray(x).tolist() for x in jax.tree.leaves(statistics().statistics)])
     sys.stdout.flush()
@@ -150,12 +150,12 @@ def together(index: int, folder: Path) -> None:
         stored(folder / "killed")
     except RuntimeError as error:
         print(str(error).splitlines()[0], flush=True)
-        # Without JAX's wait for the process that is gone.
+        # JAX would wait for the killed process at a normal exit.
         os._exit(3)
 
 
 def again(index: int, folder: Path) -> None:
-    """Calls that are not alike, an error of one process, and the rest of stores."""
+    """Make different calls, fail in one process, and resume stores."""
 
     def refused(*args, call=stored, **options):
         try:
@@ -175,7 +175,7 @@ def again(index: int, folder: Path) -> None:
 
 
 class Failing(nhjax.AbstractProgressMeter):
-    """Ends a run as a full disk does."""
+    """Raises the error of a full disk."""
 
     def update(self, done: int, total: int) -> None:
         """Raise."""

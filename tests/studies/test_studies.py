@@ -1,4 +1,4 @@
-"""The studies with tiny arguments, from Python and from the command line."""
+"""The studies run with tiny arguments, from Python and from the command line."""
 
 import functools
 import json
@@ -13,7 +13,7 @@ import pytest
 import nhjax
 from nhjax import studies
 from nhjax.__main__ import main
-from nhjax.studies import _chaotic_run
+from nhjax.studies import _chaotic_energy
 from nhjax.systems import ChaoticSystem, NonholonomicParticle
 from oracles.long import long_but
 
@@ -46,7 +46,7 @@ def ball():
     return studies.ball_invariants(stages=(2, 3), dt=(0.1, 0.2), num_steps=50)
 
 
-def test_list(capsys):
+def test_studies_list_prints_all_names(capsys):
     assert main(["list"]) == 0
     lines = capsys.readouterr().out.splitlines()
     assert [line.split()[0] for line in lines] == list(studies.STUDIES)
@@ -56,7 +56,7 @@ def test_list(capsys):
     "study",
     long_but(["particle-order", "cvt-energy", "chaotic-energy"], studies.STUDIES),
 )
-def test_run_writes_figures_data_and_record(study, tmp_path, capsys, monkeypatch):
+def test_study_run_writes_figures_data_and_record(study, tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
     assert main(["run", study, *TINY[study].split(), "--json", "--progress"]) == 0
     shown = capsys.readouterr()
@@ -92,7 +92,7 @@ def test_run_writes_figures_data_and_record(study, tmp_path, capsys, monkeypatch
         assert len(data.files) > 0
 
 
-def test_run_prints_a_table(tmp_path, capsys):
+def test_study_run_without_json_prints_plan_table_and_verdict(tmp_path, capsys):
     out = tmp_path / "deep" / "er"
     arguments = "--regimes high --stages 3 --dt 0.1 --num-steps 20 --epsilon 0.25"
     arguments += " --closure symmetric --short-time 1"
@@ -119,7 +119,7 @@ def test_run_prints_a_table(tmp_path, capsys):
 
 
 @pytest.mark.parametrize("study", studies.STUDIES)
-def test_quick_is_smaller_and_gives_way_to_options(
+def test_study_run_quick_is_smaller_and_options_override_it(
     study, monkeypatch, tmp_path, capsys
 ):
     asked = []
@@ -186,7 +186,7 @@ def test_quick_is_smaller_and_gives_way_to_options(
         ),
     ],
 )
-def test_bad_arguments_name_the_argument(arguments, message, tmp_path, capsys):
+def test_study_run_with_invalid_argument_names_it(arguments, message, tmp_path, capsys):
     command = arguments.split()
     if len(command) > 2:
         command += ["--out", str(tmp_path)]
@@ -196,14 +196,14 @@ def test_bad_arguments_name_the_argument(arguments, message, tmp_path, capsys):
     assert message in capsys.readouterr().err
 
 
-def test_unknown_study_lists_the_known(capsys):
+def test_study_run_of_unknown_name_lists_the_studies(capsys):
     with pytest.raises(SystemExit):
         main(["run", "nonsense"])
     message = capsys.readouterr().err
     assert all(name in message for name in studies.STUDIES)
 
 
-def test_an_output_directory_that_cannot_be_made(tmp_path, capsys):
+def test_study_run_with_unusable_folder_names_the_option(tmp_path, capsys):
     (tmp_path / "file").write_text("")
     command = ["run", "chaotic-energy", "--out", str(tmp_path / "file" / "x")]
     with pytest.raises(SystemExit) as ended:
@@ -212,25 +212,25 @@ def test_an_output_directory_that_cannot_be_made(tmp_path, capsys):
     assert "argument --out:" in capsys.readouterr().err
 
 
-def test_an_unsolvable_step_is_reported(tmp_path, capsys):
+def test_study_run_with_unsolvable_step_exits_with_its_message(tmp_path, capsys):
     command = "run chaotic-energy --stages 4 --dt 4 --final-time 40 --members 1"
     assert main([*command.split(), "--out", str(tmp_path)]) == 1
     assert "Integration failed in all 2 members" in capsys.readouterr().err
 
 
-def test_errors_in_python_name_the_parameter():
+def test_study_function_with_invalid_argument_raises_with_its_name():
     with pytest.raises(studies.ArgumentError, match="`members` must be at least 1"):
         studies.chaotic_energy(members=0)
 
 
-def test_particle_order_finds_the_orders(particle):
+def test_particle_order_observes_the_theoretical_orders(particle):
     assert particle.dt == (0.25, 0.1875, 0.125)
     assert particle.errors.shape == (2, 3, 4)
     np.testing.assert_allclose(
         particle.orders(), [[4, 4, 2, 4], [6, 6, 4, 6]], atol=0.15
     )
     assert np.all(np.isnan(particle.slopes()[:, 0]))
-    assert "q, p, λ, λ_c are those of the theory" in particle.verdict()
+    assert "q, p, λ, λ_c agree with theory" in particle.verdict()
     assert (
         particle.table().splitlines()[-1].split()
         == (
@@ -240,7 +240,7 @@ def test_particle_order_finds_the_orders(particle):
     )
 
 
-def test_particle_order_leaves_round_off_out():
+def test_particle_order_of_round_off_errors_is_undefined():
     errors = np.full((1, 3, 4), 1e-16)
     errors[0, 0] = 1.0
     result = studies.ParticleOrder(
@@ -253,13 +253,13 @@ def test_particle_order_leaves_round_off_out():
         timings=[],
     )
     assert np.all(np.isnan(result.orders()))
-    assert result.verdict().startswith("no order can be seen")
+    assert result.verdict().startswith("no order can be observed")
     assert "-" in result.table().splitlines()[-1]
 
 
 @pytest.mark.long
 @pytest.mark.parametrize("retraction", ["cayley", "exponential"])
-def test_unicycle_order_finds_the_orders(retraction):
+def test_unicycle_order_observes_the_theoretical_orders(retraction):
     result = studies.unicycle_order(
         stages=(2, 3), dt=(0.125, 0.0625), retraction=retraction
     )
@@ -276,28 +276,28 @@ def test_unicycle_order_finds_the_orders(retraction):
 
 
 @pytest.mark.long
-def test_ball_invariants_are_kept(ball):
+def test_ball_invariants_of_all_runs_are_conserved(ball):
     for run in ball.runs:
         assert run.integrals.shape == (51, 4)
         np.testing.assert_array_less(run.largest_linear_errors(), 3e-15)
         assert run.max_constraint_violation < 1e-14
         assert len(run.energy_by_fifths()) == 5
-    assert re.search(r"kept to \de-1[56]; the moving energy", ball.verdict())
+    assert re.search(r"conserved to \de-1[56]; the moving energy", ball.verdict())
 
 
 @pytest.mark.long
-def test_ball_invariants_finds_the_orders(ball):
+def test_ball_invariants_observes_the_theoretical_orders(ball):
     assert ball.dt == (0.2, 0.1)
     assert ball.final_time == 5.0
     for s, order in ((2, 2), (3, 4)):
         assert np.isnan(ball.circle_slopes(s)[0])
         assert float(ball.circle_slopes(s)[1]) == pytest.approx(order, abs=0.15)
-        # For even s the moving energy of a homogeneous ball is better than 2s - 2.
+        # For even s, the moving energy of a homogeneous ball has an order above 2s - 2.
         assert float(ball.energy_slopes(s)[1]) == pytest.approx(4, abs=0.15)
 
 
 @pytest.mark.long
-def test_ball_invariants_record_and_figures(ball):
+def test_ball_invariants_writes_record_and_figures(ball):
     parameters = ball.parameters()
     assert parameters["last_times"] == [10.0, 5.0]
     assert parameters["system_parameters"]["frame"] == "space"
@@ -311,7 +311,7 @@ def test_ball_invariants_record_and_figures(ball):
     assert "|z-z_exact| t=5" in header
 
 
-def test_chaotic_energy_shapes_and_slopes(chaotic):
+def test_chaotic_energy_observes_the_theoretical_slopes(chaotic):
     assert chaotic.times == (4.0,)
     data = chaotic.arrays()
     assert data["s2_h0.2_mu_error"].shape == (11,)
@@ -323,8 +323,8 @@ def test_chaotic_energy_shapes_and_slopes(chaotic):
         assert run.max_constraint_violation < 1e-13
 
 
-def test_chaotic_energy_in_chunks_is_that_of_all_energies_at_once(monkeypatch):
-    monkeypatch.setattr(_chaotic_run, "CHUNK", 3)
+def test_chaotic_energy_in_chunks_equals_statistics_of_all_energies(monkeypatch):
+    monkeypatch.setattr(_chaotic_energy, "CHUNK", 3)
     options = {"stages": (2,), "dt": (0.2,), "final_time": 4.0, "times": (2.0, 4.0)}
     (run,) = studies.chaotic_energy(members=7, **options).runs
     chaotic = ChaoticSystem()
@@ -348,20 +348,20 @@ def test_chaotic_energy_in_chunks_is_that_of_all_energies_at_once(monkeypatch):
     np.testing.assert_allclose(run.mu, squares.mean(axis=0), rtol=1e-8, atol=1e-17)
     error = squares.std(axis=0, ddof=1) / np.sqrt(8)
     np.testing.assert_allclose(run.mu_error, error, rtol=1e-8, atol=1e-17)
-    # Both windows hold all times.
+    # Both windows contain all times.
     windows = squares.mean(axis=1)
     np.testing.assert_allclose(run.windows, [windows.mean()] * 2, rtol=1e-8)
     error = windows.std(ddof=1) / np.sqrt(8)
     np.testing.assert_allclose(run.windows_error, [error] * 2, rtol=1e-8)
 
 
-def test_chaotic_energy_draws_both_normalisations(chaotic):
+def test_chaotic_energy_figure_shows_both_normalisations(chaotic):
     (figure,) = chaotic.figures().values()
     shown = [ax.get_ylabel() for ax in figure.axes]
     assert shown == [rf"$\mu(E, k) / h^{{{power}}}$" for power in (4, 8, 4, 10)]
 
 
-def test_cvt_energy_of_a_short_run():
+def test_cvt_energy_of_a_short_run_measures_parts_and_growth():
     result = studies.cvt_energy(dt=(0.1,), final_time=10.0, short_time=5.0)
     low, high = result.runs
     assert low.energies.shape == (101, 3)
@@ -377,14 +377,14 @@ def test_cvt_energy_of_a_short_run():
     assert greatest == pytest.approx(1.26e-2, rel=0.02)
 
 
-def test_number_of_steps_follows_from_the_nearest_whole_one():
+def test_cvt_energy_with_fractional_number_of_steps_rounds_it():
     result = studies.cvt_energy(
         regimes=("low",), dt=(math.pi / 10,), final_time=4.0, short_time=1.0
     )
     assert len(result.runs[0].times) == 1 + round(40 / math.pi)
 
 
-def test_an_envelope_holds_every_value_and_no_more():
+def test_envelope_of_oscillation_with_nan_bounds_every_finite_value():
     times = np.linspace(0.0, 1.0, 1003)
     values = np.sin(300.0 * times)
     values[500] = np.nan
