@@ -111,7 +111,7 @@ def linear_stability(
         motion does not depend, such as the position of a wheel. By default, z are
         coordinates in an orthonormal basis of all perturbations that the constraints
         permit.
-    - `symmetry`: generators of symmetries, as vector fields like those of
+    - `symmetry`: generators of symmetries, as vector fields like the generator of
         `momentum_map`: called as `symmetry(q)`, of shape (n,) or (k, n), in the
         components of the velocity. On a group, the generator of g -> g exp(εξ), a
         symmetry of the body, is the constant ξ. The generator of g -> exp(εξ) g, a

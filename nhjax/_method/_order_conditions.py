@@ -1,7 +1,7 @@
 """Order conditions, hypotheses, symmetry and stability of a tableau.
 
-The simplifying assumptions are those of Butcher (Hairer, Lubich, Wanner, "Geometric
-Numerical Integration", II.1), and the mixed assumption of L. Jay ("Symplectic
+The simplifying assumptions are due to Butcher (Hairer, Lubich, Wanner, "Geometric
+Numerical Integration", II.1), and, for the mixed one, to L. Jay ("Symplectic
 partitioned Runge-Kutta methods for constrained Hamiltonian systems", SIAM J. Numer.
 Anal. 33, 1996):
 
