@@ -1,6 +1,7 @@
 """Functions that a run keeps at their values, and the impulses that keep them."""
 
 from collections.abc import Callable
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -16,7 +17,12 @@ from .._numerics import (
     small_einsum,
     unit,
 )
-from .._system import AbstractMechanicalSystem, Linearisation, State
+from .._system import (
+    AbstractMechanicalSystem,
+    constraint_matrices,
+    Linearisation,
+    State,
+)
 
 
 # Impulses change the part of an invariant that belongs to the motion by no more than
@@ -56,14 +62,64 @@ class Invariants(eqx.Module):
         q: PyTree[Array],
         u: Float[Array, " n"],
         args: Args,
-    ) -> tuple[Float[Array, "k n"], Float[Array, "k n"]]:
-        """Compute ∂I/∂u, and the covectors ω = ∂I/∂v of the impulses of a step."""
-        slopes = jax.jacrev(
+    ) -> Float[Array, "k n"]:
+        """Compute the derivatives ∂I/∂u."""
+        return jax.jacrev(
             lambda u: invariant_values(self.function, system, t, q, u, args)
         )(u)
-        if system.fibre_coordinate_name == "v":
-            return slopes, slopes
-        return slopes, jax.vmap(lambda x: system.flat(t, q, u, x, args))(slopes)
+
+    def directions(
+        self,
+        system: AbstractMechanicalSystem,
+        t: FloatScalar,
+        q: PyTree[Array],
+        u: Float[Array, " n"],
+        args: Args,
+        slopes: Float[Array, "k n"] | None = None,
+    ) -> "Directions":
+        """Compute the directions of the impulses at a state, from ∂I/∂u if it is known.
+
+        The ∂I/∂v of a function that is conserved on the constraint set alone has a part
+        Bᵀ μ along reactions. An impulse along it would violate the constraints, and the
+        reactions that make up for this would take back what it adds to I. Without that
+        part, B M⁻¹ ω = 0. The ω of the energy, M v, is free of it: where a system
+        conserves its energy, B v = 0.
+        """
+        if slopes is None:
+            slopes = self.slopes(system, t, q, u, args)
+        multipliers = None
+        if self.function is not None and _is_constrained(system):
+            num_constraints = jax.eval_shape(
+                lambda: system.constraint(t, q, u, args)
+            ).shape[0]
+            given = system, t, q, u, args, num_constraints
+            matrices = constraint_matrices(*given, may_be_sparse=True)
+            slopes, multipliers = jax.vmap(matrices.tangent_part)(slopes)
+        covectors = slopes
+        if system.fibre_coordinate_name == "p":
+            covectors = jax.vmap(lambda x: system.flat(t, q, u, x, args))(slopes)
+        return Directions(slopes, covectors, multipliers)
+
+    def tangent_error(
+        self,
+        system: AbstractMechanicalSystem,
+        t: FloatScalar,
+        q: PyTree[Array],
+        u: Float[Array, " n"],
+        args: Args,
+    ) -> Float[Array, " k"]:
+        """Compute by how much I - μ·Φ differs from the values of I.
+
+        It is I where the constraints hold, and its derivative there is that of
+        `directions`: to leading order, what the constraints still change does not
+        change it.
+        """
+        error = self.error(system, t, q, u, args)
+        multipliers = self.directions(system, t, q, u, args).multipliers
+        if multipliers is None:
+            return error
+        violation = system.constraint(t, q, u, args)
+        return error - small_einsum("kl,l->k", multipliers, violation)
 
     def sizes(
         self,
@@ -105,6 +161,23 @@ def invariant_values(
     return system.energy(t, State(q, u, u, nothing), args)[None]
 
 
+def _is_constrained(system: AbstractMechanicalSystem) -> bool:
+    return system.nonholonomic is not None or system.holonomic is not None
+
+
+class Directions(NamedTuple):
+    """The directions of the impulses that keep invariants, at one state.
+
+    - `slopes`: ∂I/∂u - Bᵀ μ, the part of ∂I/∂u that reactions do not change.
+    - `covectors`: ω, the same as covectors: impulses are along them.
+    - `multipliers`: μ = C⁻¹ B M⁻¹ ∂I/∂v; None where μ = 0 is known.
+    """
+
+    slopes: Float[Array, "k n"]
+    covectors: Float[Array, "k n"]
+    multipliers: Float[Array, "k l"] | None
+
+
 class StartImpulses(eqx.Module):
     """The invariants of a step, with what is known of them at its start.
 
@@ -138,9 +211,12 @@ class StartImpulses(eqx.Module):
     ) -> "StartImpulses":
         """Make the start impulses at the state y, whose linearisation is `lin`."""
         u = system.fibre_coordinate(y)
-        slopes, covectors = invariants.slopes(system, t, y.q, u, args)
+        all_slopes = invariants.slopes(system, t, y.q, u, args)
+        sizes = invariants.sizes(system, t, y.q, u, args, all_slopes)
+        slopes, covectors, _ = invariants.directions(
+            system, t, y.q, u, args, all_slopes
+        )
         given = slopes, covectors, lin.momentum_inverse, moving_part(slopes, u)
-        sizes = invariants.sizes(system, t, y.q, u, args, slopes)
         return cls(invariants, *given, sizes, position)
 
 
