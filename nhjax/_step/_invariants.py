@@ -28,6 +28,9 @@ from .._system import (
 # Impulses change the part of an invariant that belongs to the motion by no more than
 # this: where hardly any is left, no impulse might make up for the error.
 _LARGEST_PART = 0.1
+# With an indefinite mass matrix ω·M⁻¹ω can vanish where ω does not. Where it is a
+# smaller part than this of what it is for a definite one, there is no impulse.
+LEAST_PART = 0.03
 
 
 class Invariants(eqx.Module):
@@ -38,11 +41,13 @@ class Invariants(eqx.Module):
     - `value`: the k values.
     - `least_sizes`: the measured round-off of the functions at the start of the run, in
         units of the unit round-off; it includes constants that cancel.
+    - `least_part`: zero if the mass matrix is definite, otherwise `LEAST_PART`.
     """
 
     function: Callable[..., Array] | None
     value: Float[Array, " k"]
     least_sizes: Float[Array, " k"]
+    least_part: FloatScalar
 
     def error(
         self,
@@ -183,6 +188,7 @@ class StartImpulses(eqx.Module):
 
     - `slopes`, `covectors`: ∂I/∂u and ω = ∂I/∂v there.
     - `momentum_inverse`: N⁻¹, which turns momenta into fibre coordinates.
+    - `row_sums`: Σ_j |K⁻¹_ij|, a diagonal matrix that bounds K⁻¹ from above.
     - `moving`: Σ |u ∂I/∂u| there, of the energy twice the kinetic one as a rule.
     - `sizes`: the sizes of the terms of the invariants, whose round-off is theirs.
     - `position`: q_k before it was wrapped and the rounding error that it has
@@ -194,6 +200,7 @@ class StartImpulses(eqx.Module):
     slopes: Float[Array, "k n"]
     covectors: Float[Array, "k n"]
     momentum_inverse: Matrix
+    row_sums: Float[Array, " n"]
     moving: Float[Array, " k"]
     sizes: Float[Array, " k"]
     position: tuple[PyTree[Array], PyTree[Array]]
@@ -216,8 +223,11 @@ class StartImpulses(eqx.Module):
         slopes, covectors, _ = invariants.directions(
             system, t, y.q, u, args, all_slopes
         )
-        given = slopes, covectors, lin.momentum_inverse, moving_part(slopes, u)
-        return cls(invariants, *given, sizes, position)
+        row_sums = jnp.abs(lin.metric_inverse)
+        if row_sums.ndim == 2:
+            row_sums = jnp.sum(row_sums, axis=1)
+        given = slopes, covectors, lin.momentum_inverse, row_sums
+        return cls(invariants, *given, moving_part(slopes, u), sizes, position)
 
 
 def moving_part(slopes: Float[Array, "k n"], u: Float[Array, " n"]) -> Array:
@@ -277,13 +287,21 @@ class ImpulseWeights(eqx.Module):
         denominator = unit(g**2 + eps * given.sizes**2)
         errors, a = g / denominator, g**2 / denominator
         matrix = errors[:, None] * gram + (1 - a)[:, None] * one
+        # Functions of which some follow from others have a singular matrix.
+        solved = inverse(matrix + eps**0.5 * one)
+        # How far ε changes u for errors r, in units of r over the size of u: at least one
+        # by the row sums, and not much more unless the mass matrix is indefinite.
+        squares = given.covectors**2 + covectors**2
+        roots = jnp.sqrt(jnp.sum(given.row_sums[None] * squares, axis=1))
+        gain = roots[:, None] * solved * (errors * roots)[None]
+        acts = ~(given.invariants.least_part * max_norm(gain) > 1)
         pushes = jnp.abs(jnp.concatenate([start, end], axis=1))
+        terms = jnp.abs(given.slopes * start) + jnp.abs(slopes * end)
         return cls(
-            errors=errors,
-            rest=1 - a,
-            # Functions of which some follow from others have a singular matrix.
-            inverse=inverse(matrix + eps**0.5 * one),
-            limits=_LARGEST_PART * (given.moving + moving) / unit(g),
+            errors=jnp.where(acts, errors, 0),
+            rest=jnp.where(acts, 1 - a, 1),
+            inverse=jnp.where(acts, solved, one),
+            limits=_LARGEST_PART * (given.moving + moving) / unit(jnp.sum(terms, 1)),
             start=start,
             end=end,
             velocity=given.slopes if hamiltonian else start,
