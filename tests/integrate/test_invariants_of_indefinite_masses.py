@@ -1,0 +1,190 @@
+"""Runs that keep the energy where the mass matrix is negative or indefinite."""
+
+from functools import cache
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+import nhjax
+from nhjax import LobattoIIIAB, SaveAt, systems
+from oracles.long import long, long_but
+from oracles.orders import rms
+
+
+PARTICLE = systems.NonholonomicParticle()
+DURATION = 5.0
+
+
+def lagrangian(t, q, v, args):
+    return 0.5 * (v[0] ** 2 + v[1] ** 2 - v[2] ** 2) - 0.5 * q @ q
+
+
+def constraint(t, q, v, args):
+    return v[0] - 0.5 * q[1] * v[1]
+
+
+SADDLE = nhjax.LagrangianSystem(lagrangian, nonholonomic=constraint)
+
+
+def saddle_rates(t, z):
+    """In plain NumPy: M a = -q + λ B with B a = v_2² / 2."""
+    q, v = z[:3], z[3:]
+    mass, slope = np.array([1.0, 1.0, -1.0]), np.array([1.0, -0.5 * q[1], 0.0])
+    free = -q / mass
+    multiplier = (0.5 * v[1] ** 2 - slope @ free) / (slope @ (slope / mass))
+    return np.concatenate([v, free + multiplier * slope / mass])
+
+
+def null_coordinates(t, q, v, args):
+    """Two oscillators whose energies have opposite signs, in q_1 ± q_2."""
+    x, y = q[0] + q[1], q[0] - q[1]
+    return v[0] * v[1] - q[0] * q[1] + 0.1 * jnp.sin(x) * jnp.cos(y)
+
+
+NULL = nhjax.LagrangianSystem(null_coordinates)
+
+
+def null_rates(t, z):
+    x, y = z[0] + z[1], z[0] - z[1]
+    # The derivatives of sin(x) cos(y) by q_1 and q_2.
+    first = np.cos(x) * np.cos(y) - np.sin(x) * np.sin(y)
+    second = np.cos(x) * np.cos(y) + np.sin(x) * np.sin(y)
+    return np.array([z[2], z[3], -z[0] + 0.1 * second, -z[1] + 0.1 * first])
+
+
+def starts(name):
+    """Many states, from some of which v·Mv vanishes near a node of the run."""
+    numbers = np.random.default_rng(0).normal(size=(2, 300, 3))
+    if name == "null coordinates":
+        return NULL, np.concatenate([*numbers[:, :, :2]], axis=1), null_rates
+    q, v = numbers
+    v[:, 2], v[:, 0] = 0.9, 0.5 * q[:, 1] * v[:, 1]
+    return SADDLE, np.concatenate([q, v], axis=1), saddle_rates
+
+
+@cache
+def exact(name):
+    _, z, rates = starts(name)
+    options = {"method": "DOP853", "rtol": 1e-11, "atol": 1e-12}
+    return np.array([solve_ivp(rates, (0, DURATION), x, **options).y[:, -1] for x in z])
+
+
+@cache
+def errors_at_the_end(name, stages, num_steps, invariants):
+    """The relative error of each member, and the largest error of its energy."""
+    system, z, _ = starts(name)
+    n = z.shape[1] // 2
+
+    @jax.jit
+    @jax.vmap
+    def run(z):
+        y0 = nhjax.initial_state(system, z[:n], v=z[n:])
+        given = system, LobattoIIIAB(stages), y0
+        options = {"dt": DURATION / num_steps, "num_steps": num_steps}
+        options["saveat"] = SaveAt(t0=True, steps=True)
+        sol = nhjax.integrate(*given, **options, invariants=invariants, throw=False)
+        energies = jax.vmap(system.energy)(sol.ts, sol.ys)
+        off = jnp.max(jnp.abs(energies - energies[0]))
+        return sol.ys.q[-1], sol.result == nhjax.RESULTS.successful, off
+
+    q, successful, off = run(jnp.asarray(z))
+    assert np.all(np.asarray(successful))
+    wanted = exact(name)[:, :n]
+    misses = np.max(np.abs(np.asarray(q) - wanted), axis=1)
+    return misses / np.max(np.abs(wanted), axis=1), np.asarray(off)
+
+
+@pytest.mark.parametrize("name", ["a saddle", long("null coordinates")])
+def test_no_member_is_spoilt_where_the_energy_of_motion_changes_its_sign(name):
+    """With impulses at all nodes some members would be off by 10 to 100 per cent."""
+    plain, walk = errors_at_the_end(name, 3, 50, None)
+    kept, off = errors_at_the_end(name, 3, 50, "energy")
+    # Ten times: members without such nodes lose as much by the impulses.
+    assert np.max(kept) < 10 * np.max(plain)
+    # Where there is no impulse for a few steps, the energy goes as it does without.
+    assert 1e-9 < np.max(off) < np.max(walk)
+    assert np.mean(off < 1e-12) > 0.3
+
+
+@pytest.mark.parametrize("stages", long_but((3,), (2, 3)))
+def test_the_order_stays_where_the_energy_of_motion_changes_its_sign(stages):
+    counts = {2: (200, 400), 3: (50, 100)}[stages]
+    found = [errors_at_the_end("a saddle", stages, n, "energy")[0] for n in counts]
+    slope = np.log2(rms(found[0][:, None]) / rms(found[1][:, None]))
+    assert abs(slope - (2 * stages - 2)) < 0.4
+
+
+@pytest.mark.long
+def test_two_functions_are_no_worse_than_the_energy_alone():
+    """The one of q_3 is conserved by itself; the other may vanish as the energy does."""
+
+    def both(t, q, v, args):
+        return jnp.stack(
+            [
+                0.5 * (v[0] ** 2 + v[1] ** 2 - v[2] ** 2) + 0.5 * q @ q,
+                -0.5 * v[2] ** 2 + 0.5 * q[2] ** 2,
+            ]
+        )
+
+    plain, _ = errors_at_the_end("a saddle", 3, 50, None)
+    kept, _ = errors_at_the_end("a saddle", 3, 50, both)
+    assert np.max(kept) < 20 * np.max(plain)
+
+
+def test_the_norm_of_a_timelike_geodesic_is_kept_around_a_black_hole():
+    """The mass matrix is indefinite, but v·Mv = -1 all along."""
+
+    def schwarzschild(t, q, v, args):
+        f = 1 - 2 / q[1]
+        return 0.5 * (-f * v[0] ** 2 + v[1] ** 2 / f + (q[1] * v[2]) ** 2)
+
+    system, r, turn = nhjax.LagrangianSystem(schwarzschild), 8.0, 0.06
+    rate = np.sqrt((1 + (r * turn) ** 2) / (1 - 2 / r))
+    q, v = jnp.array([0.0, r, 0.0]), jnp.array([rate, 0.0, turn])
+    y0 = nhjax.initial_state(system, q, v=v)
+    given = system, LobattoIIIAB(2), y0
+    options = {"dt": 1.0, "num_steps": 1000, "saveat": SaveAt(steps=True)}
+    sol = nhjax.integrate(*given, **options, invariants="energy")
+    norms = 2 * jax.vmap(lambda y: schwarzschild(0.0, y.q, y.v, None))(sol.ys)
+    assert float(jnp.ptp(sol.ys.q[:, 1])) > 1
+    np.testing.assert_allclose(norms, -1.0, rtol=0, atol=3e-15)
+
+
+def test_a_negative_mass_matrix_takes_the_steps_of_the_positive_one():
+    system, y0 = PARTICLE.system, PARTICLE.initial_state()
+    negative = nhjax.LagrangianSystem(
+        lambda *given: -system.lagrangian(*given), nonholonomic=system.nonholonomic
+    )
+    z0 = nhjax.initial_state(negative, y0.q, v=y0.v)
+
+    def run(system, y0, dt):
+        given = system, LobattoIIIAB(2), y0
+        options = {"dt": dt, "num_steps": 100, "invariants": "energy"}
+        return nhjax.integrate(*given, **options, saveat=SaveAt(steps=True))
+
+    for dt in (0.1, -0.1):
+        plain, found = run(system, y0, dt), run(negative, z0, dt)
+        np.testing.assert_allclose(found.ys.q, plain.ys.q, rtol=0, atol=1e-13)
+        assert float(found.stats["max_invariant_error"]) < 1e-15
+
+
+def test_an_ill_conditioned_mass_matrix_that_is_definite_keeps_its_energy():
+    """The terms of v·Mv cancel to a part of 1e-4, which is no sign of a saddle."""
+    mass = np.array([[1e4, 1e4], [1e4, 1e4 + 1]])
+
+    def stiff(t, q, v, args):
+        total = q[0] + q[1]
+        return 0.5 * v @ mass @ v - 5e3 * total**2 + jnp.cos(q[1])
+
+    system = nhjax.LagrangianSystem(stiff)
+    q, v = jnp.array([0.3, -0.3]), jnp.array([-0.99, 1.0])
+    y0 = nhjax.initial_state(system, q, v=v)
+    given = system, LobattoIIIAB(3), y0
+    options = {"dt": 0.05, "num_steps": 400, "saveat": SaveAt(t0=True, steps=True)}
+    sol = nhjax.integrate(*given, **options, invariants="energy")
+    energies = jax.vmap(lambda y: system.energy(0.0, y))(sol.ys)
+    assert float(sol.stats["max_invariant_error"]) < 1e-14
+    np.testing.assert_allclose(energies, energies[0], rtol=0, atol=1e-10)
