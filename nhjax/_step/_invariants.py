@@ -28,8 +28,10 @@ from .._system import (
 # Impulses change the part of an invariant that belongs to the motion by no more than
 # this: where hardly any is left, no impulse might make up for the error.
 _LARGEST_PART = 0.1
-# With an indefinite mass matrix ω·M⁻¹ω can vanish where ω does not. Where it is a
-# smaller part than this of what it is for a definite one, there is no impulse.
+# With an indefinite mass matrix, ω·M⁻¹ω can vanish where ω does not. A step has no
+# impulse where ω·M⁻¹ω is less than this part of its bound Σ_ij |M⁻¹_ij| ω_i². An impulse
+# is then at most 1 / 0.03 times as large as with a definite matrix of this size. With
+# parts from 0.01 to 0.3 the largest errors of trajectories were the same (measured).
 LEAST_PART = 0.03
 
 
@@ -188,7 +190,7 @@ class StartImpulses(eqx.Module):
 
     - `slopes`, `covectors`: ∂I/∂u and ω = ∂I/∂v there.
     - `momentum_inverse`: N⁻¹, which turns momenta into fibre coordinates.
-    - `row_sums`: Σ_j |K⁻¹_ij|, a diagonal matrix that bounds K⁻¹ from above.
+    - `row_sums`: Σ_j |K⁻¹_ij|, the diagonal matrix D with |ω·K⁻¹ω| <= ω·Dω.
     - `moving`: Σ |u ∂I/∂u| there, of the energy twice the kinetic one as a rule.
     - `sizes`: the sizes of the terms of the invariants, whose round-off is theirs.
     - `position`: q_k before it was wrapped and the rounding error that it has
@@ -248,10 +250,13 @@ class ImpulseWeights(eqx.Module):
     with ϵ the unit round-off and S the size of the terms of I. Where g is not small, a
     is 1 up to round-off; at rest g vanishes, so that no impulse could keep I.
 
+    With an indefinite mass matrix G can be singular away from rest too. There, a = 0
+    for all functions; see `LEAST_PART`.
+
     - `errors`: a / g, by which errors are multiplied.
     - `rest`: 1 - a.
     - `inverse`: the inverse of the derivative of the equations by ε.
-    - `limits`: the largest |ε|.
+    - `limits`: the largest |ε|. The sum of |terms| of g is not small where these cancel.
     - `start`, `end`: N⁻¹ ω at both ends, by which u changes with ε.
     - `velocity`: M⁻¹ ω at the start, by which velocities do.
     - `noise`: the round-off of u for that of the invariants.
@@ -289,8 +294,8 @@ class ImpulseWeights(eqx.Module):
         matrix = errors[:, None] * gram + (1 - a)[:, None] * one
         # Functions of which some follow from others have a singular matrix.
         solved = inverse(matrix + eps**0.5 * one)
-        # How far ε changes u for errors r, in units of r over the size of u: at least one
-        # by the row sums, and not much more unless the mass matrix is indefinite.
+        # The impulses for given errors, relative to those of the definite matrix of the
+        # row sums: of one function, Σ (row sum) ω² over |g|.
         squares = given.covectors**2 + covectors**2
         roots = jnp.sqrt(jnp.sum(given.row_sums[None] * squares, axis=1))
         gain = roots[:, None] * solved * (errors * roots)[None]

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 import nhjax
+from benchmarks.invariants_on_constraints import particle_at, substituted_energy
 from nhjax import LobattoIIIAB, SaveAt, systems
 from oracles.helpers import central_difference, scalar
 from oracles.long import long, long_but
@@ -15,16 +16,6 @@ from oracles.long import long, long_but
 
 PARTICLE = systems.NonholonomicParticle()
 EVERY = SaveAt(t0=True, steps=True)
-
-
-def substituted(t, q, v, args):
-    """The energy of the particle, with y v_x in the place of v_z."""
-    kinetic = v[0] ** 2 + v[1] ** 2 + (q[1] * v[0]) ** 2
-    return 0.5 * kinetic + 0.5 * (q[0] ** 2 + q[1] ** 2)
-
-
-def particle_at(y):
-    return systems.NonholonomicParticle(q0=(1.0, y, 0.2), v0=(0.4, 0.7, 0.4 * y))
 
 
 @jax.jit
@@ -36,7 +27,7 @@ def particles(y0, dt):
         options = {"num_steps": 200, "saveat": EVERY, "invariants": invariants}
         return nhjax.integrate(system, method, y0, dt=dt, throw=False, **options)
 
-    return run("energy"), run(substituted)
+    return run("energy"), run(substituted_energy)
 
 
 @pytest.mark.parametrize("y", [0.0, 0.3, 1.0, 2.0, 3.0, 5.0, 8.0])
@@ -212,7 +203,7 @@ def test_impulses_leave_out_what_reactions_undo():
 def test_steps_there_and_back_return_to_the_start(closure, stages):
     @jax.jit
     def run(y0, dt):
-        options = {"num_steps": 40, "invariants": substituted}
+        options = {"num_steps": 40, "invariants": substituted_energy}
         method = LobattoIIIAB(stages, closure)
         return nhjax.integrate(PARTICLE.system, method, y0, dt=dt, **options).ys
 
@@ -258,7 +249,7 @@ def test_gradients_are_those_of_differences(name):
         v = x[1] * y0.v
         v = jnp.stack([v[0], v[1], q[1] * v[0]])
         start = nhjax.initial_state(PARTICLE.system, q, v)
-        options = {"adjoint": ADJOINTS[name], "invariants": substituted}
+        options = {"adjoint": ADJOINTS[name], "invariants": substituted_energy}
         method = LobattoIIIAB(2)
         sol = nhjax.integrate(
             PARTICLE.system, method, start, dt=x[0], num_steps=5, **options
@@ -288,7 +279,7 @@ def test_badly_scaled_masses_and_constraints_change_neither_sweeps_nor_accuracy(
         return nhjax.integrate(
             *(system, LobattoIIIAB(2), y0),
             **{"dt": 0.1, **options},
-            invariants=lambda *given: mass * substituted(*given),
+            invariants=lambda *given: mass * substituted_energy(*given),
         )
 
     plain, scaled = run(1.0, 1.0), run(scale, 1 / scale)
@@ -302,7 +293,7 @@ def test_members_of_an_ensemble_take_the_steps_of_single_runs():
     y0 = jax.tree.map(lambda *x: jnp.stack(x), *starts)
 
     def run(y):
-        options = {"num_steps": 50, "invariants": substituted}
+        options = {"num_steps": 50, "invariants": substituted_energy}
         return nhjax.integrate(PARTICLE.system, LobattoIIIAB(2), y, dt=0.1, **options)
 
     found = jax.jit(jax.vmap(run))(y0)
