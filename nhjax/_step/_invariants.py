@@ -29,9 +29,9 @@ from .._system import (
 # this: where hardly any is left, no impulse might make up for the error.
 _LARGEST_PART = 0.1
 # With an indefinite mass matrix, ω·M⁻¹ω can vanish where ω does not. A step has no
-# impulse where ω·M⁻¹ω is less than this part of its bound Σ_ij |M⁻¹_ij| ω_i². An impulse
-# is then at most 1 / 0.03 times as large as with a definite matrix of this size. With
-# parts from 0.01 to 0.3 the largest errors of trajectories were the same (measured).
+# impulse where ω·M⁻¹ω is less than this part of its bound Σ_ij |M⁻¹_ij| ω_i². Other
+# impulses are at most 1 / 0.03 times as large as with a definite matrix of this size.
+# With parts from 0.01 to 0.3 the largest errors of motions were the same (measured).
 LEAST_PART = 0.03
 
 
@@ -256,7 +256,7 @@ class ImpulseWeights(eqx.Module):
     - `errors`: a / g, by which errors are multiplied.
     - `rest`: 1 - a.
     - `inverse`: the inverse of the derivative of the equations by ε.
-    - `limits`: the largest |ε|. The sum of |terms| of g is not small where these cancel.
+    - `limits`: the largest |ε|, by the sum of the |terms| of g, which do not cancel.
     - `start`, `end`: N⁻¹ ω at both ends, by which u changes with ε.
     - `velocity`: M⁻¹ ω at the start, by which velocities do.
     - `noise`: the round-off of u for that of the invariants.
