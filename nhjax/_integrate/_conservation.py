@@ -13,8 +13,16 @@ from jaxtyping import Array, Float, PyTree
 from .._compile import as_cpu_kernel
 from .._custom_types import Args, BoolScalar, FloatScalar
 from .._errors import DTypeError, naming, ShapeError
-from .._numerics import ClosureConverted, dependence, frozen, matvec, max_norm
-from .._step import invariant_values, Invariants
+from .._numerics import (
+    ClosureConverted,
+    dependence,
+    frozen,
+    is_definite,
+    jacobian,
+    matvec,
+    max_norm,
+)
+from .._step import invariant_values, Invariants, LEAST_PART
 from .._system import (
     AbstractMechanicalSystem,
     check_signature,
@@ -63,17 +71,25 @@ def kept_invariants(
         )
     value = invariant_values(function, system, t, y.q, u, args)
     given = function, system, t, y.q, u, args, value
-    noise = as_cpu_kernel(_noise, *given, is_brief=True)
-    return Invariants(function, value, noise / float(jnp.finfo(value.dtype).eps))
+    noise, least_part = as_cpu_kernel(_noise_and_least_part, *given, is_brief=True)
+    sizes = noise / float(jnp.finfo(value.dtype).eps)
+    return Invariants(function, value, sizes, least_part)
 
 
-def _noise(function, system, t, q, u, args, value) -> Float[Array, " k"]:
+def _noise_and_least_part(
+    function, system, t, q, u, args, value
+) -> tuple[Float[Array, " k"], FloatScalar]:
     function, system, args = frozen((function, system, args))
-    return noise_near(
+    noise = noise_near(
         lambda t, q, u: invariant_values(function, system, t, q, u, args),
         system.manifold_of(q),
         *(t, q, u, value),
     )
+    # A mass matrix that is indefinite at one state is so at all states of a motion: an
+    # eigenvalue that changes its sign makes it singular, and a singular one ends a run.
+    t, q, u = frozen((t, q, u))
+    metric = jacobian(lambda u: system.fibre_derivative(t, q, u, args), u)
+    return noise, jnp.where(is_definite(metric), 0, LEAST_PART).astype(value.dtype)
 
 
 def _check_function(

@@ -59,6 +59,7 @@ from ._noise import (
 from ._rank import (
     dependent_rows as dependent_rows,
     is_deficient as is_deficient,
+    is_definite as is_definite,
     is_nearly_singular as is_nearly_singular,
     is_without_entries as is_without_entries,
     Rank as Rank,

@@ -11,6 +11,7 @@ from ._error_estimate import estimated_error as estimated_error
 from ._invariants import (
     invariant_values as invariant_values,
     Invariants as Invariants,
+    LEAST_PART as LEAST_PART,
 )
 from ._newton import (
     AbstractStageSolver as AbstractStageSolver,

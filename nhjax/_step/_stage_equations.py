@@ -188,15 +188,16 @@ def end_impulse(stages: StageSystem, x: Stages) -> Float[Array, " n"]:
 def end_slopes(
     stages: StageSystem, x: Stages
 ) -> tuple[Float[Array, "k n"], Float[Array, "k n"]]:
-    """Compute ∂I/∂u and ω = ∂I/∂v of the invariants at the end of a step."""
+    """Compute ∂I/∂u and ω of the invariants at the end of a step; see `Directions`."""
     assert stages.kept is not None
-    return stages.kept.invariants.slopes(*_end_point(stages, x))
+    found = stages.kept.invariants.directions(*_end_point(stages, x))
+    return found.slopes, found.covectors
 
 
 def invariant_errors(stages: StageSystem, x: Stages) -> Float[Array, " k"]:
     """Compute the errors of the invariants at the end of a step."""
     assert stages.kept is not None
-    return stages.kept.invariants.error(*_end_point(stages, x))
+    return stages.kept.invariants.tangent_error(*_end_point(stages, x))
 
 
 def impulse_weights(stages: StageSystem, x: Stages) -> ImpulseWeights:

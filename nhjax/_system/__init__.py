@@ -30,6 +30,7 @@ from ._framed import with_frames as with_frames
 from ._hamiltonian import HamiltonianSystem as HamiltonianSystem
 from ._lagrangian import LagrangianSystem as LagrangianSystem
 from ._linearisation import (
+    constraint_matrices as constraint_matrices,
     continuous_multiplier as continuous_multiplier,
     Linearisation as Linearisation,
     linearise as linearise,

@@ -1,6 +1,6 @@
 from collections.abc import Callable
 from functools import reduce
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import equinox as eqx
 import jax
@@ -196,6 +196,66 @@ def motion_residual(
     return p_dot - (w + _inertial_force(system, q, p, v)), phi_dot
 
 
+class ConstraintMatrices(NamedTuple):
+    """The matrices of `Linearisation` that need no solution of the equations."""
+
+    metric_inverse: Matrix  # K⁻¹
+    jacobian: Float[Array, "l n"] | SparseMatrix  # B
+    reaction: Float[Array, "n l"] | WeightedTranspose  # K⁻¹ Bᵀ
+    compliance_inverse: Float[Array, "l l"] | BlockTridiagonalInverse  # C⁻¹
+
+    def tangent_part(
+        self, slope: Float[Array, " n"]
+    ) -> tuple[Float[Array, " n"], Float[Array, " l"]]:
+        """Split a derivative s = ∂I/∂u by u: s - Bᵀ μ with B K⁻¹ (s - Bᵀ μ) = 0.
+
+        Return s - Bᵀ μ and the multipliers μ = C⁻¹ B K⁻¹ s.
+        """
+        pushed = matvec(self.jacobian, matvec(self.metric_inverse, slope))
+        multiplier = matvec(self.compliance_inverse, pushed)
+        if isinstance(self.jacobian, SparseMatrix):
+            return slope - self.jacobian.rmatvec(multiplier), multiplier
+        return slope - small_einsum("ln,l->n", self.jacobian, multiplier), multiplier
+
+
+def constraint_matrices(
+    system: AbstractMechanicalSystem,
+    t: FloatScalar,
+    q: PyTree[Array],
+    u: Float[Array, " n"],
+    args: Args,
+    num_constraints: int,
+    *,
+    may_be_sparse: bool = False,
+) -> ConstraintMatrices:
+    """Compute the metric and the derivatives of the constraints at (t, q, u).
+
+    With `may_be_sparse` the matrices of many constraints are sparse where that pays.
+    """
+    metric = jacobian(lambda u: system.fibre_derivative(t, q, u, args), u)
+    metric_inverse = inverse(metric)
+    pattern = None
+    if may_be_sparse and num_constraints >= FEWEST_SPARSE and metric.ndim == 1:
+        pattern = constraint_pattern(system, t, q, u, args)
+    if pattern is None:
+        slopes = jax.jacrev(system.constraint, argnums=2)(t, q, u, args)
+        reaction = matvec(metric_inverse, slopes).T
+        compliance = small_einsum("kn,nl->kl", slopes, reaction)
+        if system.constraints == "redundant":
+            k = jax.eval_shape(lambda: system.position_constraint(t, q, args)).size
+            m = slopes.shape[0] - k
+            compliance_inverse = least_norm_inverse_by_blocks(compliance, m)
+        else:
+            compliance_inverse = inverse(compliance)
+    else:
+        slopes = sparse_jacobian(lambda u: system.constraint(t, q, u, args), u, pattern)
+        reaction = WeightedTranspose(metric_inverse, slopes)
+        rows = SparseMatrix(slopes.values[None], pattern)
+        products = couplings(rows, rows, metric_inverse)
+        compliance_inverse = block_tridiagonal_inverse(products, pattern)
+    return ConstraintMatrices(metric_inverse, slopes, reaction, compliance_inverse)
+
+
 def linearise(
     system: AbstractMechanicalSystem,
     t: FloatScalar,
@@ -215,33 +275,10 @@ def linearise(
         (t, zero, u),
         (jnp.ones_like(t), v, zero),
     )
-    metric = jacobian(lambda u: system.fibre_derivative(t, q, u, args), u)
-    metric_inverse = inverse(metric)
-    pattern = None
-    is_large = violation.shape[0] >= FEWEST_SPARSE
-    if may_be_sparse and is_large and metric.ndim == 1:
-        pattern = constraint_pattern(system, t, q, u, args)
-    if pattern is None:
-        slopes = jax.jacrev(system.constraint, argnums=2)(t, q, u, args)
-        reaction = matvec(metric_inverse, slopes).T
-        compliance = small_einsum("kn,nl->kl", slopes, reaction)
-        if system.constraints == "redundant":
-            k = jax.eval_shape(lambda: system.position_constraint(t, q, args)).size
-            m = slopes.shape[0] - k
-            compliance_inverse = least_norm_inverse_by_blocks(compliance, m)
-        else:
-            compliance_inverse = inverse(compliance)
-    else:
-        slopes = sparse_jacobian(lambda u: system.constraint(t, q, u, args), u, pattern)
-        reaction = WeightedTranspose(metric_inverse, slopes)
-        rows = SparseMatrix(slopes.values[None], pattern)
-        products = couplings(rows, rows, metric_inverse)
-        compliance_inverse = block_tridiagonal_inverse(products, pattern)
+    given = system, t, q, u, args, violation.shape[0]
+    matrices = constraint_matrices(*given, may_be_sparse=may_be_sparse)
     lin = Linearisation(
-        metric_inverse=metric_inverse,
-        jacobian=slopes,
-        reaction=reaction,
-        compliance_inverse=compliance_inverse,
+        *matrices,
         acceleration=zero,
         multiplier=jnp.zeros_like(violation),
         violation=violation,

@@ -445,6 +445,84 @@ def test_next_to_a_saddle_the_error_stays_below_the_root_of_round_off():
     assert abs(0.5 * v**2 - jnp.cos(q) - 1.0) < 1e-8
 
 
+# A charge in a magnetic field, on the constraint of the particle. Its Lagrangian is not
+# even in the velocities.
+_FIELD, _SLOPE, _CUBIC = 1.5, 0.3, 0.3
+
+
+def charge():
+    def lagrangian(t, q, v, args):
+        magnetic = 0.5 * _FIELD * (q[0] * v[1] - q[1] * v[0]) + _SLOPE * q[2] * v[1]
+        return 0.5 * v @ v + magnetic - 0.5 * q @ q - _CUBIC / 3 * q[0] ** 3
+
+    system = nhjax.LagrangianSystem(
+        lagrangian, nonholonomic=PARTICLE.system.nonholonomic
+    )
+    q = jnp.array([0.7, -0.5, 0.4])
+    return system, nhjax.initial_state(system, q, v=jnp.zeros(3))
+
+
+def charge_rates(t, z):
+    """In plain NumPy: a = f + λ B with B a = v_x v_y."""
+    q, v = z[:3], z[3:]
+    force = -q - np.array([_CUBIC * q[0] ** 2, 0.0, 0.0])
+    force += [_FIELD * v[1], -_FIELD * v[0] - _SLOPE * v[2], _SLOPE * v[1]]
+    slope = np.array([-q[1], 0.0, 1.0])
+    multiplier = (v[0] * v[1] - slope @ force) / (slope @ slope)
+    return np.concatenate([v, force + multiplier * slope])
+
+
+@pytest.mark.parametrize(
+    ("stages", "counts"), [(2, (128, 256, 512)), long(3, (32, 64, 128))]
+)
+def test_a_charge_from_rest_loses_a_logarithm_of_the_step(stages, counts):
+    """The error is h^(2s-2) (a + b log(1/h)): equal growth each time h is halved."""
+    system, y0 = charge()
+    start = np.concatenate([y0.q, y0.v])
+    options = {"method": "DOP853", "rtol": 1e-13, "atol": 1e-15}
+    exact = solve_ivp(charge_rates, (0, 2), start, **options).y[:, -1]
+
+    def scaled_errors(invariants):
+        found = []
+        for count in counts:
+            given = system, LobattoIIIAB(stages), y0
+            steps = {"dt": 2 / count, "num_steps": count}
+            y = nhjax.integrate(*given, **steps, invariants=invariants).ys
+            error = np.concatenate([y.q[0], y.v[0]]) - exact
+            found.append(error * (count / 2) ** (2 * stages - 2))
+        return np.max(np.abs(np.diff(found, axis=0)), axis=1), np.max(np.abs(found))
+
+    growth, size = scaled_errors("energy")
+    assert growth[0] > 0.05 * size
+    np.testing.assert_allclose(growth[1], growth[0], rtol=0.05)
+    growth, size = scaled_errors(None)
+    assert np.max(growth) < 0.01 * size
+
+
+@pytest.mark.parametrize(("dt", "limited"), [(0.9, False), (1.19, True)])
+def test_a_run_with_a_limited_impulse_does_not_lead_back(dt, limited):
+    @jax.jit
+    def run(y0, dt):
+        given = pendulum(0.0, 0.0)[0], LobattoIIIAB(2), y0
+        return nhjax.integrate(*given, dt=dt, num_steps=3, invariants="energy")
+
+    y0 = pendulum(0.9, 0.0)[1]
+    sol = run(y0, dt)
+    there = jax.tree.map(lambda x: x[0], sol.ys)
+    back = jax.tree.map(lambda x: x[0], run(there, -dt).ys)
+    off = float(jnp.max(jnp.abs(back.q - y0.q)))
+    error = float(sol.stats["max_invariant_error"])
+    if limited:
+        assert error > 0.01
+        assert off > 0.01
+        # The last step made up for the error.
+        energies = [0.5 * y.v**2 - jnp.cos(y.q) for y in (y0, there)]
+        np.testing.assert_allclose(*energies, rtol=1e-14)
+    else:
+        assert error < 1e-15
+        assert off < 1e-14
+
+
 def test_the_page_runs_as_printed():
     found = run_page("invariants")["sol"].ys
     np.testing.assert_allclose(found, found[0], rtol=0, atol=1e-15)

@@ -1,0 +1,150 @@
+"""Runs that keep the energy where the mass matrix is negative or indefinite."""
+
+from functools import cache
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import nhjax
+from benchmarks.invariants_on_constraints import (
+    ends_by_scipy,
+    errors_of_members,
+    MEMBERS,
+    saddle,
+    saddle_rates,
+    saddle_starts,
+)
+from nhjax import LobattoIIIAB, SaveAt, systems
+from oracles.long import long, long_but
+from oracles.orders import rms
+
+
+PARTICLE = systems.NonholonomicParticle()
+
+
+def null_coordinates(t, q, v, args):
+    """Two oscillators whose energies have opposite signs, in q_1 ± q_2."""
+    x, y = q[0] + q[1], q[0] - q[1]
+    return v[0] * v[1] - q[0] * q[1] + 0.1 * jnp.sin(x) * jnp.cos(y)
+
+
+NULL = nhjax.LagrangianSystem(null_coordinates)
+
+
+def null_rates(t, z):
+    x, y = z[0] + z[1], z[0] - z[1]
+    # The derivatives of sin(x) cos(y) by q_1 and q_2.
+    first = np.cos(x) * np.cos(y) - np.sin(x) * np.sin(y)
+    second = np.cos(x) * np.cos(y) + np.sin(x) * np.sin(y)
+    return np.array([z[2], z[3], -z[0] + 0.1 * second, -z[1] + 0.1 * first])
+
+
+@cache
+def motions(name):
+    """Many motions; for some of them v·Mv vanishes near a node of the run."""
+    if name == "null coordinates":
+        system, rates = NULL, null_rates
+        starts = np.random.default_rng(0).normal(size=(MEMBERS, 4))
+    else:
+        system, rates, starts = saddle(), saddle_rates, saddle_starts()
+    return system, starts, ends_by_scipy(rates, starts)
+
+
+@cache
+def errors_at_the_end(name, stages, num_steps, invariants):
+    return errors_of_members(*motions(name), stages, num_steps, invariants)
+
+
+@pytest.mark.parametrize("name", ["a saddle", long("null coordinates")])
+def test_no_member_is_spoilt_where_the_energy_of_motion_changes_its_sign(name):
+    """Large impulses where v·Mv nearly vanishes would spoil some members."""
+    plain, walk = errors_at_the_end(name, 3, 50, None)
+    kept, off = errors_at_the_end(name, 3, 50, "energy")
+    # Ten times: members without such nodes lose as much by the impulses.
+    assert np.max(kept) < 10 * np.max(plain)
+    # Where there is no impulse for a few steps, the energy goes as it does without.
+    assert 1e-9 < np.max(off) < np.max(walk)
+    assert np.mean(off < 1e-12) > 0.3
+
+
+@pytest.mark.parametrize("stages", long_but((3,), (2, 3)))
+def test_the_order_stays_where_the_energy_of_motion_changes_its_sign(stages):
+    counts = {2: (200, 400), 3: (50, 100)}[stages]
+    found = [errors_at_the_end("a saddle", stages, n, "energy")[0] for n in counts]
+    slope = np.log2(rms(found[0][:, None]) / rms(found[1][:, None]))
+    assert abs(slope - (2 * stages - 2)) < 0.4
+
+
+@pytest.mark.long
+def test_two_functions_are_no_worse_than_the_energy_alone():
+    """The energy of q_3 is conserved separately."""
+
+    def both(t, q, v, args):
+        return jnp.stack(
+            [
+                0.5 * (v[0] ** 2 + v[1] ** 2 - v[2] ** 2) + 0.5 * q @ q,
+                -0.5 * v[2] ** 2 + 0.5 * q[2] ** 2,
+            ]
+        )
+
+    plain, _ = errors_at_the_end("a saddle", 3, 50, None)
+    kept, _ = errors_at_the_end("a saddle", 3, 50, both)
+    assert np.max(kept) < 20 * np.max(plain)
+
+
+def test_the_norm_of_a_timelike_geodesic_is_kept_around_a_black_hole():
+    """The mass matrix is indefinite, but v·Mv = -1 all along."""
+
+    def schwarzschild(t, q, v, args):
+        f = 1 - 2 / q[1]
+        return 0.5 * (-f * v[0] ** 2 + v[1] ** 2 / f + (q[1] * v[2]) ** 2)
+
+    system, r, turn = nhjax.LagrangianSystem(schwarzschild), 8.0, 0.06
+    rate = np.sqrt((1 + (r * turn) ** 2) / (1 - 2 / r))
+    q, v = jnp.array([0.0, r, 0.0]), jnp.array([rate, 0.0, turn])
+    y0 = nhjax.initial_state(system, q, v=v)
+    given = system, LobattoIIIAB(2), y0
+    options = {"dt": 1.0, "num_steps": 1000, "saveat": SaveAt(steps=True)}
+    sol = nhjax.integrate(*given, **options, invariants="energy")
+    norms = 2 * jax.vmap(lambda y: schwarzschild(0.0, y.q, y.v, None))(sol.ys)
+    assert float(jnp.ptp(sol.ys.q[:, 1])) > 1
+    np.testing.assert_allclose(norms, -1.0, rtol=0, atol=3e-15)
+
+
+def test_a_negative_mass_matrix_takes_the_steps_of_the_positive_one():
+    system, y0 = PARTICLE.system, PARTICLE.initial_state()
+    negative = nhjax.LagrangianSystem(
+        lambda *given: -system.lagrangian(*given), nonholonomic=system.nonholonomic
+    )
+    z0 = nhjax.initial_state(negative, y0.q, v=y0.v)
+
+    def run(system, y0, dt):
+        given = system, LobattoIIIAB(2), y0
+        options = {"dt": dt, "num_steps": 100, "invariants": "energy"}
+        return nhjax.integrate(*given, **options, saveat=SaveAt(steps=True))
+
+    for dt in (0.1, -0.1):
+        plain, found = run(system, y0, dt), run(negative, z0, dt)
+        np.testing.assert_allclose(found.ys.q, plain.ys.q, rtol=0, atol=1e-13)
+        assert float(found.stats["max_invariant_error"]) < 1e-15
+
+
+def test_an_ill_conditioned_mass_matrix_that_is_definite_keeps_its_energy():
+    """The terms of v·Mv cancel to a part of 1e-4, which is no sign of a saddle."""
+    mass = np.array([[1e4, 1e4], [1e4, 1e4 + 1]])
+
+    def stiff(t, q, v, args):
+        total = q[0] + q[1]
+        return 0.5 * v @ mass @ v - 5e3 * total**2 + jnp.cos(q[1])
+
+    system = nhjax.LagrangianSystem(stiff)
+    q, v = jnp.array([0.3, -0.3]), jnp.array([-0.99, 1.0])
+    y0 = nhjax.initial_state(system, q, v=v)
+    given = system, LobattoIIIAB(3), y0
+    options = {"dt": 0.05, "num_steps": 400, "saveat": SaveAt(t0=True, steps=True)}
+    sol = nhjax.integrate(*given, **options, invariants="energy")
+    energies = jax.vmap(lambda y: system.energy(0.0, y))(sol.ys)
+    assert float(sol.stats["max_invariant_error"]) < 1e-14
+    np.testing.assert_allclose(energies, energies[0], rtol=0, atol=1e-10)
