@@ -13,18 +13,16 @@ import jax.extend
 import jax.numpy as jnp
 from jax.interpreters import ad, batching, mlir
 
-from .._lanes import target, Unsupported
-from ._collection import rare_collections
-from ._engine import note
-from ._kernel import kernel, never_high
-from ._kernel_derivatives import differentiated, transposed
+from ..lanes import compile_batched, Unsupported
+from ._garbage_collection import rare_collections
+from ._kernel import differentiated, kernel, merged, never_high, split, transposed
 from ._lowering import (
     is_exported,
     is_within_kernel,
+    note,
     reason_against_kernel,
     reason_against_lanes,
 )
-from ._marks import merged, split
 
 
 ensemble = jax.extend.core.Primitive("ensemble")
@@ -185,7 +183,7 @@ def _lowered(ctx, *operands, program, is_batched, is_brief):
     reason = reason_against_lanes()
     if reason is None:
         try:
-            name = target(program, is_batched, is_brief)
+            name = compile_batched(program, is_batched, is_brief)
         except Unsupported as error:
             reason = str(error)
         else:

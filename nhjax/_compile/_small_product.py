@@ -17,7 +17,7 @@ import jax.numpy as jnp
 from jax.interpreters import ad, batching, mlir
 from jaxtyping import Array
 
-from ._elementary import SMALL_PRODUCT
+from ._jaxprs import SMALL_PRODUCT
 from ._kernel import never_high
 
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import nhjax
-from nhjax._compile._captured import captured, MOST_ENTRIES
+from nhjax._compile._tracked_jit import captured, MOST_ENTRIES
 from oracles.falling import (
     end,
     falling,

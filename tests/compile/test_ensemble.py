@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import nhjax
-from nhjax import _lanes
+from nhjax import lanes
 from nhjax._compile import as_cpu_kernel
 from oracles.lane_kernels import kernel_ir, TRIPLE, WIDTH
 
@@ -156,9 +156,9 @@ def test_kernels_are_optimised_little_where_jax_is():
     try:
         for is_little in (False, True):
             jax.config.update("jax_disable_most_optimizations", is_little)
-            before = _lanes.held().bytes
-            names.append(_lanes.registered(text, 1, 1, WIDTH, True))
-            sizes.append(_lanes.held().bytes - before)
+            before = lanes.compiled_code().bytes
+            names.append(lanes.register_kernel(text, 1, 1, WIDTH, True))
+            sizes.append(lanes.compiled_code().bytes - before)
     finally:
         jax.config.update("jax_disable_most_optimizations", True)
     assert sizes[1] > 1.2 * sizes[0] > 0

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from jax import lax
 
-from nhjax import _lanes
+from nhjax import lanes
 from oracles import lane_processes
 from oracles.lane_kernels import kernel_ir, SHARED, TRIPLE, WIDTH
 
@@ -40,7 +40,7 @@ def printed(*command, **environment):
 
 @pytest.fixture(scope="module")
 def triple():
-    return _lanes.registered(kernel_ir(TRIPLE), 1, 1, WIDTH, True)
+    return lanes.register_kernel(kernel_ir(TRIPLE), 1, 1, WIDTH, True)
 
 
 @pytest.mark.parametrize("members", [0, 1, WIDTH - 1, WIDTH, WIDTH + 1, 100_000])
@@ -62,15 +62,15 @@ def test_a_kernel_without_memory_to_work_in_is_an_error_of_jax():
         return lax.fori_loop(0, 20, lambda k, y: y.at[100 * k].add(x[k]), places)[:1000]
 
     x = jnp.arange(20.0 * WIDTH).reshape(WIDTH, 20)
-    text = _lanes.member_ir(jax.make_jaxpr(sums)(x[0]), (True,), WIDTH)
+    text = lanes.llvm_ir(jax.make_jaxpr(sums)(x[0]), (True,), WIDTH)
     declared = "declare ptr @malloc(i64)"
     assert declared in text
-    name = _lanes.registered(text, 1, 1, WIDTH, True)
+    name = lanes.register_kernel(text, 1, 1, WIDTH, True)
     found = call(name, x, shape=(WIDTH, 1000))
     np.testing.assert_array_equal(found, jax.vmap(sums)(x))
     lacking = "define internal ptr @malloc(i64 %size) { ret ptr null }"
     text = text.replace(declared, lacking)
-    name = _lanes.registered(text, 1, 1, WIDTH, True)
+    name = lanes.register_kernel(text, 1, 1, WIDTH, True)
     message = "RESOURCE_EXHAUSTED: no memory for the arrays that a program works with"
     with pytest.raises(jax.errors.JaxRuntimeError, match=message):
         jax.block_until_ready(call(name, x, shape=(WIDTH, 1000)))
@@ -78,7 +78,7 @@ def test_a_kernel_without_memory_to_work_in_is_an_error_of_jax():
 
 @pytest.mark.parametrize("members", [1, WIDTH + 1, 1000])
 def test_an_operand_that_all_members_share(members):
-    name = _lanes.registered(kernel_ir(SHARED), 2, 1, WIDTH, True)
+    name = lanes.register_kernel(kernel_ir(SHARED), 2, 1, WIDTH, True)
     x = jnp.arange(members, dtype=jnp.float64)
     shared = jnp.full(1, 5.0)
     np.testing.assert_array_equal(call(name, x, shared), np.arange(members) + 5)
@@ -88,13 +88,13 @@ def test_an_operand_that_all_members_share(members):
 def test_arrays_without_elements(members):
     """A kernel that does not touch its arrays, which have no elements."""
     kernel = kernel_ir("")
-    name = _lanes.registered(kernel, 1, 1, WIDTH, True)
+    name = lanes.register_kernel(kernel, 1, 1, WIDTH, True)
     x = jnp.zeros((members, 0))
     assert call(name, x).shape == (members, 0)
 
 
 def test_one_member_without_a_batch():
-    name = _lanes.registered(kernel_ir(TRIPLE, width=1), 1, 1, 1, False)
+    name = lanes.register_kernel(kernel_ir(TRIPLE, width=1), 1, 1, 1, False)
     np.testing.assert_array_equal(call(name, jnp.full(1, 2.0)), [6.0])
 
 
@@ -105,20 +105,20 @@ def test_wrong_numbers_of_arrays_are_an_error_of_jax(triple):
 
 
 def test_equal_programs_are_compiled_once(triple):
-    before = _lanes.held()
-    assert _lanes.registered(kernel_ir(TRIPLE), 1, 1, WIDTH, True) == triple
-    assert _lanes.held() == before
+    before = lanes.compiled_code()
+    assert lanes.register_kernel(kernel_ir(TRIPLE), 1, 1, WIDTH, True) == triple
+    assert lanes.compiled_code() == before
     assert before.bytes > 0
     others = [(1, 1, WIDTH, False), (1, 1, WIDTH + 1, True), (2, 1, WIDTH, True)]
-    names = {_lanes.registered(kernel_ir(TRIPLE), *other) for other in others}
+    names = {lanes.register_kernel(kernel_ir(TRIPLE), *other) for other in others}
     assert len(names | {triple}) == 4
 
 
 def test_what_is_held_grows_by_each_program():
-    before = _lanes.held()
+    before = lanes.compiled_code()
     unused = "@grows = global i32 0\n"
-    _lanes.registered(kernel_ir(TRIPLE, before=unused), 1, 1, WIDTH, True)
-    after = _lanes.held()
+    lanes.register_kernel(kernel_ir(TRIPLE, before=unused), 1, 1, WIDTH, True)
+    after = lanes.compiled_code()
     assert after.programs == before.programs + 1
     assert after.bytes > before.bytes
 
@@ -126,24 +126,24 @@ def test_what_is_held_grows_by_each_program():
 def test_a_module_of_a_million_characters():
     """Its code is generated at another level than that of shorter modules."""
     comment = f"; {'.' * 1_000_000}\n"
-    name = _lanes.registered(kernel_ir(TRIPLE, before=comment), 1, 1, WIDTH, True)
+    name = lanes.register_kernel(kernel_ir(TRIPLE, before=comment), 1, 1, WIDTH, True)
     x = np.arange(1001.0)
     np.testing.assert_array_equal(call(name, x), 3 * x)
 
 
 def test_text_that_is_not_a_kernel_is_refused():
     with pytest.raises(RuntimeError, match="parsing"):
-        _lanes.registered("this is not LLVM IR", 1, 1, WIDTH, True)
+        lanes.register_kernel("this is not LLVM IR", 1, 1, WIDTH, True)
 
 
 def test_threads_that_want_the_same_program_at_once():
     kernel = kernel_ir(TRIPLE, before="@at_once = global i32 0\n")
-    before = _lanes.held().programs
+    before = lanes.compiled_code().programs
     start, names = threading.Barrier(8), []
 
     def want():
         start.wait()
-        name = _lanes.registered(kernel, 1, 1, WIDTH, True)
+        name = lanes.register_kernel(kernel, 1, 1, WIDTH, True)
         x = np.arange(1000.0)
         np.testing.assert_array_equal(call(name, x), 3 * x)
         names.append(name)
@@ -155,7 +155,7 @@ def test_threads_that_want_the_same_program_at_once():
         thread.join()
     assert len(names) == 8
     assert len(set(names)) == 1
-    assert _lanes.held().programs == before + 1
+    assert lanes.compiled_code().programs == before + 1
 
 
 def test_calls_from_more_threads_than_the_pool_has():

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from nhjax._lanes import member_ir
+from nhjax.lanes import llvm_ir
 from oracles import lanes_run
 from oracles.lanes_samples import (
     assert_as_jax,
@@ -94,7 +94,7 @@ def test_a_branch_equal_in_all_lanes_is_a_real_one():
 
     shapes = (jax.ShapeDtypeStruct((), bool), jax.ShapeDtypeStruct((), np.float64))
     program = jax.make_jaxpr(function)(*shapes)
-    shared = member_ir(program, (False, True), 8)
+    shared = llvm_ir(program, (False, True), 8)
     member = shared[shared.index("@member") : shared.index("@kernel")]
     assert "phi <8 x double>" in member
     assert "select <8 x i1>" not in member

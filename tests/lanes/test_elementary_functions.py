@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import scipy.special
 
-from nhjax._lanes import _coefficients, definition, library, SUPPORTED, symbol
+from nhjax.lanes import _coefficients, definition, library, SUPPORTED, symbol
 from oracles import approximations, ulps
 from oracles.native_lanes import Native
 

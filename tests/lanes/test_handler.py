@@ -7,7 +7,7 @@ import threading
 import numpy as np
 import pytest
 
-from nhjax._lanes import _ffi_structs, _handler, _native, _pool
+from nhjax.lanes import _ffi, _handler, _native
 from oracles import ffi_runtime
 from oracles.ffi_runtime import Runtime
 from oracles.lane_kernels import kernel_ir, TRIPLE, WIDTH
@@ -69,7 +69,7 @@ WORKERS = ctypes.c_int64(0)
 def loaded(texts, symbol):
     """The address of a function of modules that are compiled for this machine."""
     code = _native.object_code(texts, symbol, _native.host())
-    imports = {_pool.WORKERS: ctypes.addressof(WORKERS)}
+    imports = {_handler.WORKERS: ctypes.addressof(WORKERS)}
     return _native.load(code, f"test_{next(NUMBERS)}", symbol, imports)
 
 
@@ -130,18 +130,18 @@ def in_header(struct):
     return structs[struct if struct in structs else RENAMED[struct]]
 
 
-@pytest.mark.parametrize("struct", _ffi_structs.STRUCTS)
+@pytest.mark.parametrize("struct", _ffi.STRUCTS)
 def test_fields_lie_where_the_header_puts_them(struct):
-    fields = _ffi_structs.STRUCTS[struct]
+    fields = _ffi.STRUCTS[struct]
     stores = "\n".join(
         f"""
-        %p{k} = {_ffi_structs.field("null", struct, name)}
+        %p{k} = {_ffi.field("null", struct, name)}
         %i{k} = ptrtoint ptr %p{k} to i64
         %o{k} = getelementptr i64, ptr %offsets, i64 {k}
         store i64 %i{k}, ptr %o{k}"""
         for k, name in enumerate(fields)
     )
-    text = _ffi_structs.type_definitions(_ffi_structs.STRUCTS)
+    text = _ffi.type_definitions(_ffi.STRUCTS)
     text += f"define void @offsets(ptr %offsets) {{ {stores}\n ret void }}"
     offsets = (ctypes.c_int64 * len(fields))()
     ctypes.CFUNCTYPE(None, ctypes.c_void_p)(loaded([text], "offsets"))(offsets)
@@ -154,11 +154,11 @@ def test_fields_lie_where_the_header_puts_them(struct):
 
 
 def test_what_is_asked_of_the_runtime_has_the_size_of_the_header():
-    for struct in _ffi_structs.STRUCTS:
+    for struct in _ffi.STRUCTS:
         if not struct.endswith("_Args") or struct == "XLA_FFI_Args":
             continue
-        text = _ffi_structs.type_definitions(_ffi_structs.STRUCTS)
-        text += f"define i64 @size() {{ ret i64 {_ffi_structs.size_of(struct)} }}"
+        text = _ffi.type_definitions(_ffi.STRUCTS)
+        text += f"define i64 @size() {{ ret i64 {_ffi.size_of(struct)} }}"
         size = ctypes.CFUNCTYPE(ctypes.c_int64)(loaded([text], "size"))()
         assert size == ctypes.sizeof(in_header(struct))
 

@@ -7,8 +7,8 @@ import sys
 import jax.numpy as jnp
 import pytest
 
-from nhjax import _lanes
-from nhjax._lanes import _handler, _native
+from nhjax import lanes
+from nhjax.lanes import _handler, _native
 from oracles import lane_processes
 from oracles.lane_kernels import VECTORS
 
@@ -55,9 +55,9 @@ def test_products_and_sums_are_contracted_where_the_machine_can():
 
 
 def test_the_width_is_that_of_the_hosts_vectors():
-    width = _lanes.host_width(jnp.float64)
+    width = lanes.host_width(jnp.float64)
     assert width in (2, 4, 8)
-    assert _lanes.host_width(jnp.float32) == 2 * width
+    assert lanes.host_width(jnp.float32) == 2 * width
     text = VECTORS.replace("<8 x double>", f"<{width} x double>")
     made = _native.assembly([text], "kernel", _native.host())
     # One product of this width is one instruction.
@@ -69,7 +69,7 @@ def run(*command):
 
 
 def test_lanes_are_available_here():
-    assert _lanes.is_available()
+    assert lanes.is_available()
 
 
 @pytest.mark.parametrize(

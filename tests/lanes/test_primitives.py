@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 from jax import lax
 
-from nhjax._compile import _elementary
-from nhjax._lanes import _trace, Unsupported
+from nhjax._compile import _jaxprs
 from nhjax._numerics import small_einsum
+from nhjax.lanes import _program, Unsupported
 from oracles import lanes_run
 from oracles.random_steps import Kind, numbers
 
@@ -236,12 +236,12 @@ _INEXACT = """
 
 def test_every_primitive_of_a_kernel_has_a_case():
     names = [
-        *_elementary.ELEMENTWISE,
-        *_elementary._REDUCING,
-        *_elementary._SHAPING,
-        *_elementary._MOVING,
-        *_elementary._CONTAINING,
-        _elementary.SMALL_PRODUCT,
+        *_jaxprs.ELEMENTWISE,
+        *_jaxprs._REDUCING,
+        *_jaxprs._SHAPING,
+        *_jaxprs._MOVING,
+        *_jaxprs._CONTAINING,
+        _jaxprs.SMALL_PRODUCT,
     ]
     assert set(names) <= set(_CASES)
 
@@ -287,7 +287,7 @@ def test_what_is_not_supported_says_so(function, reason):
 
 
 def test_programs_that_take_long_to_compile_are_refused(monkeypatch):
-    monkeypatch.setattr(_trace, "MOST_NODES", 100)
+    monkeypatch.setattr(_program, "MOST_NODES", 100)
     lanes_run.run_batched(lambda x: jnp.sin(x), 4, np.ones((2, 10)))
     with pytest.raises(Unsupported, match="more than 120 operations"):
         lanes_run.run_batched(lambda x: jnp.outer(x, x), 4, np.ones((2, 20)))
@@ -300,7 +300,7 @@ def test_parameters_of_another_release_are_refused_by_name():
     equation = equation.replace(params=params)
     jaxpr = program.jaxpr.replace(eqns=[equation])
     with pytest.raises(Unsupported, match="rev without its dimensions"):
-        _trace.trace(program.replace(jaxpr=jaxpr))
+        _program.trace(program.replace(jaxpr=jaxpr))
 
 
 def test_effects_are_refused():

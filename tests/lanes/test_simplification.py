@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from nhjax._lanes import member_ir
+from nhjax.lanes import llvm_ir
 from oracles import lanes_run
 from oracles.lanes_samples import (
     repeated,
@@ -29,7 +29,7 @@ def test_a_structural_zero_leaves_nothing_to_compute():
         return jnp.pad(x, (1, 1)) * jnp.concatenate([x, x])[:5] + jnp.zeros(5)
 
     program = jax.make_jaxpr(function)(jax.ShapeDtypeStruct((3,), np.float64))
-    text = member_ir(program, (True,), 8)
+    text = llvm_ir(program, (True,), 8)
     assert text.count("fmul") == 3
     assert text.count("fadd") == 0
 
@@ -40,7 +40,7 @@ def test_what_is_not_used_is_not_computed():
         return x * 2, (unused, x)[1]
 
     program = jax.make_jaxpr(function)(jax.ShapeDtypeStruct((3,), np.float64))
-    text = member_ir(program, (True,), 8)
+    text = llvm_ir(program, (True,), 8)
     assert "phi" not in text
     assert "nhjax.sin" not in text
 
@@ -50,7 +50,7 @@ def test_what_does_not_change_is_computed_before_a_loop():
         return repeated(5, lambda k, y: y + jnp.sin(x), x)
 
     program = jax.make_jaxpr(function)(jax.ShapeDtypeStruct((), np.float64))
-    lines = member_ir(program, (True,), 8).splitlines()
+    lines = llvm_ir(program, (True,), 8).splitlines()
     call = next(i for i, line in enumerate(lines) if "call" in line and "sin" in line)
     loop = next(i for i, line in enumerate(lines) if "phi" in line)
     assert call < loop
@@ -67,7 +67,7 @@ def test_the_time_to_make_nested_loops_does_not_multiply():
         return repeated(9, lambda k, y: nested(level - 1, y), x)
 
     program = jax.make_jaxpr(lambda x: nested(depth, jnp.zeros(())) + x)(1.0)
-    text = member_ir(program, (True,), 4)
+    text = llvm_ir(program, (True,), 4)
     assert text.count("phi double") == depth
     # Numbers that are made and dropped leave gaps.
     assert int(text.split("%v")[-1].split()[0].strip(",")) < 400

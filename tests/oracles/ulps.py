@@ -12,7 +12,7 @@ import mpmath
 import numpy as np
 from mpmath import mp, mpf
 
-from nhjax._lanes import library, SUPPORTED, symbol
+from nhjax.lanes import library, SUPPORTED, symbol
 from oracles.native_lanes import Native
 
 

@@ -8,9 +8,8 @@ from typing import Protocol
 
 import numpy as np
 
-from ._elementary_functions import symbol
 from ._graph import is_float, Node
-from ._types import bits, is_signed, literal, scalar_type, suffix, vector
+from ._writer import bits, is_signed, literal, scalar_type, suffix, symbol, vector
 
 
 class Writer(Protocol):
