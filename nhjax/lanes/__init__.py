@@ -1,10 +1,5 @@
 """A compiler of small JAX programs that run for many members, by SIMD and threads."""
 
-from ._elementary_functions import (
-    definition as definition,
-    library as library,
-    SUPPORTED as SUPPORTED,
-)
 from ._graph import Unsupported as Unsupported
 from ._native import host_width as host_width, is_available as is_available
 from ._program import (
@@ -15,4 +10,3 @@ from ._program import (
     llvm_ir as llvm_ir,
     register_kernel as register_kernel,
 )
-from ._writer import symbol as symbol

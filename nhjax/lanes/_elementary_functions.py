@@ -1,11 +1,11 @@
-"""The remainder of a division that is rounded towards zero, for vectors of float64.
+"""The elementary functions, defined in LLVM IR that calls no library.
 
-Elementary functions of vectors, as text of LLVM IR that calls no library.
-
-Errors are below 2 ulp everywhere, and the values at infinities, zeros and NaN are those
-of C. All formulas are for float64, which float32 is converted to: its results are then
-the nearest float32 but for few. Arguments that are infinite or NaN take no longer than
-others, so that a failed member does not delay those in the other lanes.
+A kernel calls a function such as `@nhjax.exp.f64x8`, and `definitions` returns the text
+of all functions that a kernel calls. Errors are below 2 ulp everywhere, and the values
+at infinities, zeros and NaN are those of C. All formulas are for float64; float32 is
+converted to float64 and back, so that nearly all results are the nearest float32.
+Infinite and NaN arguments take no longer than others, so that a failed member does not
+slow down the other members of its vector.
 """
 
 import math
@@ -32,14 +32,76 @@ from ._exponentials import (
 from ._trigonometry import acos, asin, atan, atan2, sine_and_cosine, tan
 from ._writer import (
     absolute,
-    Body,
     nearest,
+    result_type,
+    scalar_type,
     symbol,
     two_product,
     Value,
     where,
     with_sign,
+    Writer,
 )
+
+
+def definitions(wanted: Iterable[tuple[str, str, int]]) -> str:
+    """Return the definitions of functions and of all that they call, each once.
+
+    A function is given by the name of JAX's primitive, the dtype and the width.
+    """
+    texts: dict[str, str] = {}
+    for function in wanted:
+        texts |= _texts(*function)
+    return "\n".join(texts.values())
+
+
+@cache
+def _texts(op: str, dtype: str, width: int) -> dict[str, str]:
+    """Return definitions by name: of a function, and of the functions that it calls."""
+    writer = Writer(width)
+    scalar = scalar_type(dtype)
+    names = ["%x", "%y"] if op in _BINARY else ["%x"]
+    results = _write(op, [Value(writer, scalar, name) for name in names])
+    writer.result(*results)
+    kind = writer.type(scalar)
+    result = result_type([kind] * len(results))
+    # A function that only calls another one is inlined. `sin` and `cos` call one common
+    # function, which is not inlined, so that LLVM merges its calls.
+    is_call = dtype == "float32" or op in _RESULT_OF_BOTH
+    inlining = "noinline" if op == _SIN_AND_COS else "alwaysinline" if is_call else ""
+    name, parameters = symbol(op, dtype, width), ", ".join(f"{kind} {x}" for x in names)
+    # With these attributes LLVM merges calls with equal arguments, and removes calls
+    # whose results are not used.
+    attributes = "nounwind willreturn memory(none)"
+    head = f"define internal {result} @{name}({parameters}) {inlining} {attributes}"
+    texts: dict[str, str] = {}
+    for function in writer.wanted:
+        texts |= _texts(*function)
+    return {**texts, **writer.helpers, name: f"{writer.definition(head)}\n"}
+
+
+def _write(op: str, arguments: list[Value]) -> tuple[Value, ...]:
+    """Write the formulas of a function, and return its results."""
+    if arguments[0].kind == "float":
+        (result,) = _call(op, 1, *[x.cast("fpext", "double") for x in arguments])
+        return (result.cast("fptrunc", "float"),)
+    if op == _SIN_AND_COS:
+        return sine_and_cosine(*arguments)
+    if op in _RESULT_OF_BOTH:
+        return (_call(_SIN_AND_COS, 2, *arguments)[_RESULT_OF_BOTH[op]],)
+    function = _BINARY[op] if op in _BINARY else _UNARY[op]
+    return (function(*arguments),)
+
+
+def _call(op: str, results: int, *arguments: Value) -> tuple[Value, ...]:
+    """Call another function of the library, for float64."""
+    writer = arguments[0].writer
+    writer.wanted[op, "float64", writer.width] = None
+    name = symbol(op, "float64", writer.width)
+    return writer.call(f"@{name}", ("double",) * results, *arguments)
+
+
+# The remainder of a division that is rounded towards zero
 
 
 _LARGEST_QUOTIENT = 2.0**50
@@ -106,7 +168,7 @@ def rem(x: Value, y: Value) -> Value:
     ratio = a / b
     whole, _ = nearest(ratio)
     high, low = two_product(whole, b)
-    with x.body.exact():
+    with x.writer.exact():
         rest = (a - high) - low
         rest = where(rest < 0.0, rest + b, rest)
     rest = where(a < b, a, rest)
@@ -116,12 +178,14 @@ def rem(x: Value, y: Value) -> Value:
     is_long = is_long & (a < math.inf) & (b > 0.0) & (a >= b)
 
     def otherwise() -> tuple[Value, ...]:
-        x.body.needed[_LONG_REMAINDER] = _LONG_REMAINDER_DEFINITION
-        return x.body.lane_by_lane(f"@{_LONG_REMAINDER}", ("double",), a, b)
+        x.writer.helpers[_LONG_REMAINDER] = _LONG_REMAINDER_DEFINITION
+        return x.writer.call_for_each_member(f"@{_LONG_REMAINDER}", ("double",), a, b)
 
-    (rest,) = x.body.with_rare_case(is_long, (rest,), otherwise)
+    (rest,) = x.writer.with_rare_case(is_long, (rest,), otherwise)
     return with_sign(rest, x)
 
+
+# The table of functions
 
 _UNARY: dict[str, Callable[[Value], Value]] = {
     "acos": acos,
@@ -144,65 +208,8 @@ _UNARY: dict[str, Callable[[Value], Value]] = {
     "tanh": tanh,
 }
 _BINARY = {"atan2": atan2, "pow": pow, "rem": rem}
-# Sine and cosine are the results of one function.
-_BOTH = "sin_and_cos"
-_OF_BOTH = {"sin": 0, "cos": 1}
+# Sine and cosine are two results of one function.
+_SIN_AND_COS = "sin_and_cos"
+_RESULT_OF_BOTH = {"sin": 0, "cos": 1}
 
-SUPPORTED = frozenset([*_UNARY, *_BINARY, *_OF_BOTH])
-
-# So LLVM may merge calls with the same arguments, and drop what is not used.
-_ATTRIBUTES = "nounwind willreturn memory(none)"
-
-
-def definition(op: str, dtype: str, width: int) -> str:
-    """Return the definition of a function, with all that it needs."""
-    return library([(op, dtype, width)])
-
-
-def library(wanted: Iterable[tuple[str, str, int]]) -> str:
-    """Return the definitions of functions, with what they need, each once."""
-    texts: dict[str, str] = {}
-    for op, dtype, width in wanted:
-        texts |= _texts(op, dtype, width)
-    return "\n".join(texts.values())
-
-
-@cache
-def _texts(op: str, dtype: str, width: int) -> dict[str, str]:
-    """Return definitions by name: of a function, and of those that it calls."""
-    body = Body(width)
-    kind = "double" if dtype == "float64" else "float"
-    names = ["%x", "%y"] if op in _BINARY else ["%x"]
-    results = _write(op, [Value(body, kind, name) for name in names])
-    types = [body.type(kind)] * len(results)
-    result = types[0] if len(types) == 1 else f"{{ {', '.join(types)} }}"
-    body.result(*results)
-    # What only calls another function is put in place. That of sine and cosine is not,
-    # so that its calls can be merged.
-    is_call = dtype == "float32" or op in _OF_BOTH
-    kept = "noinline" if op == _BOTH else "alwaysinline" if is_call else ""
-    name, given = symbol(op, dtype, width), ", ".join(f"{types[0]} {x}" for x in names)
-    head = f"define internal {result} @{name}({given}) {kept} {_ATTRIBUTES}"
-    return {**body.needed, name: body.text(head)}
-
-
-def _write(op: str, arguments: list[Value]) -> tuple[Value, ...]:
-    """Write the formulas of a function, and return its results."""
-    if arguments[0].kind == "float":
-        long = [x.cast("fpext", "double") for x in arguments]
-        (result,) = _call(op, 1, *long)
-        return (result.cast("fptrunc", "float"),)
-    if op == _BOTH:
-        return sine_and_cosine(*arguments)
-    if op in _OF_BOTH:
-        return (_call(_BOTH, 2, *arguments)[_OF_BOTH[op]],)
-    function = _BINARY[op] if op in _BINARY else _UNARY[op]
-    return (function(*arguments),)
-
-
-def _call(op: str, results: int, *arguments: Value) -> tuple[Value, ...]:
-    """Call another of the functions for float64."""
-    body = arguments[0].body
-    body.needed |= _texts(op, "float64", body.width)
-    name = symbol(op, "float64", body.width)
-    return body.call(f"@{name}", ("double",) * results, *arguments)
+SUPPORTED = frozenset([*_UNARY, *_BINARY, *_RESULT_OF_BOTH])

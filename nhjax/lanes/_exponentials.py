@@ -17,12 +17,12 @@ import math
 from ._coefficients import CBRT, COSH, ERF, ERFC, EXP, LOG, LOG_LONG, SINH
 from ._writer import (
     absolute,
+    DoubleDouble,
     fast_two_sum,
     halves,
     leading_bits,
     nearest,
     ONE_BITS,
-    Pair,
     polynomial,
     power_of_two,
     product,
@@ -52,10 +52,10 @@ def clamped(x: Value, lower: float, upper: float) -> Value:
     return where(x < lower, lower, where(x > upper, upper, x))
 
 
-def reduced(x: Value, low: Value | float = 0.0) -> tuple[Value, Pair]:
+def reduced(x: Value, low: Value | float = 0.0) -> tuple[Value, DoubleDouble]:
     """Return n, in the lowest bits of an integer, and r with x + low = n log(2) + r."""
     n, exponent = nearest(x * _PER_LN2)
-    with x.body.exact():
+    with x.writer.exact():
         high, small = x - n * LN2_HIGH, n * LN2_LOW
         if isinstance(low, Value):
             small = small - low
@@ -73,7 +73,7 @@ def exp(x: Value) -> Value:
     """Return the exponential function of x."""
     x = clamped(x, LOWEST, HIGHEST)
     n, exponent = nearest(x * _PER_LN2)
-    with x.body.exact():
+    with x.writer.exact():
         r = (x - n * LN2_HIGH) - n * LN2_LOW
     return times_power_of_two(1.0 + (r + r * r * polynomial(r, EXP)), exponent)
 
@@ -86,7 +86,7 @@ def exp2(x: Value) -> Value:
     return times_power_of_two(1.0 + (r + r * r * polynomial(r, EXP)), exponent)
 
 
-def _expm1_parts(x: Value) -> tuple[Value, Pair, Value]:
+def _expm1_parts(x: Value) -> tuple[Value, DoubleDouble, Value]:
     """Return n, a pair m with exp(x) - 1 = 2^n m, and 2^-n, for x from -50."""
     exponent, (r, rest) = reduced(x)
     # 2^-n would be subnormal for the largest x, where it does not count.
@@ -190,8 +190,8 @@ def log(x: Value) -> Value:
 
 def _log1p(x: Value, low: Value | float = 0.0, doublings: Value | float = 0.0) -> Value:
     """Return log(1 + x + low) + doublings log(2), for finite x + low > -1."""
-    with x.body.exact():
-        high, rest = two_sum(x.body.constant("double", 1.0), x)
+    with x.writer.exact():
+        high, rest = two_sum(x.writer.constant("double", 1.0), x)
         rest = rest + low
     k, m = parts(high)
     is_near = k.equals(0.0)
@@ -213,9 +213,9 @@ def asinh(x: Value) -> Value:
     size = absolute(x)
     is_large = size > 2.0**100
     square, error = two_product(size, size)
-    more, lost = two_sum(x.body.constant("double", 1.0), square)
+    more, lost = two_sum(x.writer.constant("double", 1.0), square)
     length, rest = root(fast_two_sum(more, lost + error))
-    length, error = two_sum(length, x.body.constant("double", -1.0))
+    length, error = two_sum(length, x.writer.constant("double", -1.0))
     total, lost = two_sum(size, length)
     result = _log1p(
         where(is_large, size, total),
@@ -228,8 +228,8 @@ def asinh(x: Value) -> Value:
 def acosh(x: Value) -> Value:
     """Return the inverse hyperbolic cosine, log(1 + (x - 1 + sqrt(x^2 - 1)))."""
     is_large = x > 2.0**100
-    less = two_sum(x, x.body.constant("double", -1.0))
-    more = two_sum(x, x.body.constant("double", 1.0))
+    less = two_sum(x, x.writer.constant("double", -1.0))
+    more = two_sum(x, x.writer.constant("double", 1.0))
     length, rest = root(product(less, more))
     total, lost = two_sum(less[0], length)
     result = _log1p(
@@ -244,7 +244,7 @@ def acosh(x: Value) -> Value:
 def atanh(x: Value) -> Value:
     """Return the inverse hyperbolic tangent, log(1 + 2x / (1 - x)) / 2 for x > 0."""
     size = absolute(x)
-    below = two_sum(x.body.constant("double", 1.0), -size)
+    below = two_sum(x.writer.constant("double", 1.0), -size)
     ratio, low = quotient((size * 2.0, size * 0.0), below)
     result = 0.5 * _log1p(ratio, low)
     result = where(size < 1.0, result, where(size.equals(1.0), math.inf, math.nan))
@@ -255,7 +255,7 @@ _THIRD = 1.0 / 3.0
 _SIGN_BIT = -(2**63)
 
 
-def _long_log(x: Value) -> Pair:
+def _long_log(x: Value) -> DoubleDouble:
     """Return the logarithm of a positive x, to some 66 bits.
 
     The first part has 26 bits or less, and the second is what it leaves.
@@ -264,7 +264,7 @@ def _long_log(x: Value) -> Pair:
     f = m - 1.0
     d = 2.0 + f
     ratio = f / d
-    with x.body.exact():
+    with x.writer.exact():
         # s = f / d is a + rest / d, where the products of the short a are exact.
         a, (f1, f2) = leading_bits(ratio, 24), halves(f)
         rest = ((f - 2.0 * a) - a * f1) - a * f2
@@ -278,14 +278,14 @@ def _long_log(x: Value) -> Pair:
     more = low + (more + rest / (d - d * (a * ratio)))
     total, lost = fast_two_sum(k * LN2_HIGH, high * 2.0)
     low = lost + (k * LN2_LOW + more * 2.0)
-    with x.body.exact():
+    with x.writer.exact():
         first = leading_bits(total + low, 26)
         return first, (total - first) + low
 
 
 def _is_integer(x: Value) -> Value:
     """Tell which x >= 0 are integers; infinity counts as one."""
-    with x.body.exact():
+    with x.writer.exact():
         return (((x + 2.0**52) - 2.0**52).equals(x)) | (x >= 2.0**52)
 
 

@@ -84,14 +84,14 @@ class Node:
         "args",
         "attr",
         "dtype",
-        "is_wide",
-        "live",
+        "is_broadcast",
+        "is_divergent",
+        "is_live",
         "name",
         "number",
         "op",
         "region",
-        "varies",
-        "wide",
+        "vector_name",
     )
 
     def __init__(
@@ -105,8 +105,8 @@ class Node:
     ):
         self.op, self.args, self.dtype = op, args, dtype
         self.region, self.number, self.attr = region, number, attr
-        self.live = self.varies = self.is_wide = False
-        self.name = self.wide = ""
+        self.is_live = self.is_divergent = self.is_broadcast = False
+        self.name = self.vector_name = ""
 
     @property
     def is_constant(self) -> bool:
@@ -281,14 +281,14 @@ class Buffer:
     __slots__ = (
         "dtype",
         "holders",
+        "is_divergent",
         "is_fixed",
+        "is_live",
         "kind",
-        "live",
         "place",
         "region",
         "size",
         "stores",
-        "varies",
         "version",
     )
 
@@ -300,7 +300,7 @@ class Buffer:
         self.stores: list[Node] = []
         self.holders = self.version = 0
         self.is_fixed = kind in ("operand", "constant")
-        self.varies = self.live = False
+        self.is_divergent = self.is_live = False
 
 
 def _quotient(a: Any, b: Any) -> Any:

@@ -4,30 +4,21 @@ Intrinsics of LLVM need no declaration.
 """
 
 from collections.abc import Callable
-from typing import Protocol
 
 import numpy as np
 
 from ._graph import is_float, Node
-from ._writer import bits, is_signed, literal, scalar_type, suffix, symbol, vector
-
-
-class Writer(Protocol):
-    """A text of LLVM's language in the making, to which instructions are written."""
-
-    contract: str
-
-    def value(self, text: str) -> str:
-        """Write an instruction, and return the name of its result."""
-        ...
-
-    def want(self, op: str, dtype: str, width: int) -> None:
-        """Ask for an elementary function."""
-        ...
-
-    def splat(self, text: str, dtype: str, width: int) -> str:
-        """Write a constant of any width."""
-        ...
+from ._writer import (
+    bits,
+    is_signed,
+    literal,
+    scalar_type,
+    splat,
+    suffix,
+    symbol,
+    vector,
+    Writer,
+)
 
 
 # A node, the width of its result, and its arguments as text.
@@ -70,8 +61,8 @@ def _intrinsic(
 def _arithmetic(name: str) -> _Rule:
     def rule(writer: Writer, node: Node, width: int, args: list[str]) -> str:
         kind = vector(scalar_type(node.dtype), width)
-        op = f"f{name} {writer.contract}" if is_float(node.dtype) else name
-        return writer.value(f"{op} {kind} {args[0]}, {args[1]}")
+        op = f"f{name} {writer.contract}" if is_float(node.dtype) else f"{name} "
+        return writer.value(f"{op}{kind} {args[0]}, {args[1]}")
 
     return rule
 
@@ -99,8 +90,8 @@ def _integer_division(writer: Writer, node: Node, width: int, args: list[str]) -
         and not (signed and divisor.attr == -1)
     ):
         return writer.value(f"{op} {kind} {a}, {b}")
-    zero, one = (writer.splat(text, node.dtype, width) for text in "01")
-    ones = writer.splat("-1", node.dtype, width)
+    zero, one = (splat(text, scalar_type(node.dtype), width) for text in "01")
+    ones = splat("-1", scalar_type(node.dtype), width)
     is_zero = writer.value(f"icmp eq {kind} {b}, {zero}")
     is_odd, is_minus = is_zero, ""
     if signed:
@@ -121,13 +112,15 @@ def _neg(writer: Writer, node: Node, width: int, args: list[str]) -> str:
     kind = vector(scalar_type(node.dtype), width)
     if is_float(node.dtype):
         return writer.value(f"fneg {kind} {args[0]}")
-    zero = writer.splat("0", node.dtype, width)
+    zero = splat("0", scalar_type(node.dtype), width)
     return writer.value(f"sub {kind} {zero}, {args[0]}")
 
 
 def _not(writer: Writer, node: Node, width: int, args: list[str]) -> str:
     kind = vector(scalar_type(node.dtype), width)
-    ones = writer.splat("true" if node.dtype == "bool" else "-1", node.dtype, width)
+    ones = splat(
+        "true" if node.dtype == "bool" else "-1", scalar_type(node.dtype), width
+    )
     return writer.value(f"xor {kind} {args[0]}, {ones}")
 
 
@@ -163,12 +156,12 @@ def _sign(writer: Writer, node: Node, width: int, args: list[str]) -> str:
     (x,), dtype = args, node.dtype
     kind, flag = vector(scalar_type(dtype), width), vector("i1", width)
     if is_float(dtype):
-        zero = writer.splat(literal(np.float64(0), dtype), dtype, width)
-        one = writer.splat(literal(np.float64(1), dtype), dtype, width)
+        zero = splat(literal(np.float64(0), dtype), scalar_type(dtype), width)
+        one = splat(literal(np.float64(1), dtype), scalar_type(dtype), width)
         signed = _intrinsic(writer, "copysign", dtype, width, [one, x])
         moves = writer.value(f"fcmp one {kind} {x}, {zero}")
         return writer.value(f"select {flag} {moves}, {kind} {signed}, {kind} {x}")
-    zero = writer.splat("0", dtype, width)
+    zero = splat("0", scalar_type(dtype), width)
     order = "sgt" if is_signed(dtype) else "ugt"
     positive = writer.value(f"icmp {order} {kind} {x}, {zero}")
     out = writer.value(f"zext {flag} {positive} to {kind}")
@@ -183,7 +176,7 @@ def _is_finite(writer: Writer, node: Node, width: int, args: list[str]) -> str:
     dtype = node.args[0].dtype
     kind = vector(scalar_type(dtype), width)
     size = _intrinsic(writer, "fabs", dtype, width, args)
-    infinity = writer.splat(literal(np.float64(np.inf), dtype), dtype, width)
+    infinity = splat(literal(np.float64(np.inf), dtype), scalar_type(dtype), width)
     return writer.value(f"fcmp olt {kind} {size}, {infinity}")
 
 
@@ -202,7 +195,7 @@ def _compare(writer: Writer, node: Node, width: int, args: list[str]) -> str:
 def _select(writer: Writer, node: Node, width: int, args: list[str]) -> str:
     kind = vector(scalar_type(node.dtype), width)
     # One predicate for all lanes may choose between vectors.
-    flag = vector("i1", width if node.args[0].varies else 1)
+    flag = vector("i1", width if node.args[0].is_divergent else 1)
     return writer.value(f"select {flag} {args[0]}, {kind} {args[1]}, {kind} {args[2]}")
 
 
@@ -247,9 +240,9 @@ def _shift(writer: Writer, node: Node, width: int, args: list[str]) -> str:
     """
     kind, flag = vector(scalar_type(node.dtype), width), vector("i1", width)
     size, op = bits(node.dtype), _SHIFTS[node.op]
-    limit = writer.splat(str(size), node.dtype, width)
-    most = writer.splat(str(size - 1), node.dtype, width)
-    zero = writer.splat("0", node.dtype, width)
+    limit = splat(str(size), scalar_type(node.dtype), width)
+    most = splat(str(size - 1), scalar_type(node.dtype), width)
+    zero = splat("0", scalar_type(node.dtype), width)
     fits = writer.value(f"icmp ult {kind} {args[1]}, {limit}")
     by = writer.value(f"select {flag} {fits}, {kind} {args[1]}, {kind} {most}")
     out = writer.value(f"{op} {kind} {args[0]}, {by}")
@@ -260,7 +253,7 @@ def _shift(writer: Writer, node: Node, width: int, args: list[str]) -> str:
 
 def _function(writer: Writer, node: Node, width: int, args: list[str]) -> str:
     kind = vector(scalar_type(node.dtype), width)
-    writer.want(node.attr, node.dtype, width)
+    writer.wanted[node.attr, node.dtype, width] = None
     arguments = ", ".join(f"{kind} {arg}" for arg in args)
     name = symbol(node.attr, node.dtype, width)
     return writer.value(f"call {kind} @{name}({arguments})")

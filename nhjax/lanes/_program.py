@@ -31,7 +31,7 @@ import jax.ffi
 from ._arrays import GATHERS, INDEXING, REDUCTIONS, SHAPING
 from ._builder import Builder, InMemory, LARGE, Operation, places, Value
 from ._control_flow import BRANCHES, SCANS
-from ._elementary_functions import library
+from ._elementary_functions import definitions
 from ._elementwise import ELEMENTWISE
 from ._emission import emit
 from ._graph import Buffer, dtype_name, Region
@@ -118,7 +118,7 @@ def llvm_ir(
     """
     traced = trace(program)
     kernel, wanted = emit(traced.root, traced.results, is_batched, width, contract)
-    return f"{kernel}{library(wanted)}\n"
+    return f"{kernel}{definitions(wanted)}\n"
 
 
 # A scan of at most so many rounds is unrolled.

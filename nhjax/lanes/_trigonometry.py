@@ -19,10 +19,9 @@ from typing import NamedTuple
 from ._coefficients import ASIN, ATAN, COS, SIN
 from ._writer import (
     absolute,
-    Body,
+    DoubleDouble,
     fast_two_sum,
     nearest,
-    Pair,
     polynomial,
     rounded_quotient,
     square_root,
@@ -30,6 +29,7 @@ from ._writer import (
     Value,
     where,
     with_sign,
+    Writer,
 )
 
 
@@ -50,7 +50,7 @@ _REDUCED_LARGE = "nhjax.reduced_large"
 
 def _window(exponent: Value) -> list[Value]:
     """Load the 192 digits of 2 / pi that matter, for x with this biased exponent."""
-    body = exponent.body
+    writer = exponent.writer
     # With e = exponent - 1075, those of weight 2^(e - i) >= 4 are left out.
     skipped = where(exponent < 1013, 0, exponent - 1013)
     word, shift = skipped >> 6, skipped & 63
@@ -58,12 +58,12 @@ def _window(exponent: Value) -> list[Value]:
     for k in range(4):
         index = (word + k).name
         array = f"[{len(_WORDS)} x i64]"
-        address = body.value(
+        address = writer.compute(
             "ptr", f"getelementptr {array}, ptr @{_DIGITS}, i64 0, i64 {index}"
         )
-        words.append(body.value("i64", f"load i64, ptr {address.name}"))
+        words.append(writer.compute("i64", f"load i64, ptr {address.name}"))
     return [
-        body.call("@llvm.fshl.i64", ("i64",), words[k], words[k + 1], shift)[0]
+        writer.call("@llvm.fshl.i64", ("i64",), words[k], words[k + 1], shift)[0]
         for k in range(3)
     ]
 
@@ -73,8 +73,8 @@ def _function() -> str:
 
     They are as for small arguments: x is n pi / 2 + r up to multiples of 2 pi.
     """
-    body = Body(1)
-    bits = Value(body, "double", "%x").bits()
+    writer = Writer(1)
+    bits = Value(writer, "double", "%x").bits()
     mantissa = (bits & ((1 << 52) - 1)) | (1 << 52)
     digits = _window((bits >> 52) & 0x7FF)
     long = mantissa.cast("zext", "i128")
@@ -87,7 +87,7 @@ def _function() -> str:
     is_negative = rest < 0
     size = where(is_negative, -rest, rest)
     text = f"call i128 @llvm.ctlz.i128(i128 {size.name}, i1 false)"
-    zeros = body.value("i128", text).cast("trunc", "i64")
+    zeros = writer.compute("i128", text).cast("trunc", "i64")
     # The first 64 bits of the fraction, times pi / 2, in units of 2^-(125 + zeros).
     leading = (size << zeros.cast("zext", "i128")) >> 64
     angle = leading * _HALF_PI_BITS
@@ -100,7 +100,7 @@ def _function() -> str:
     is_left = bits < 0
     sign = where(is_negative, -(2**63), 0) ^ (bits & -(2**63))
     quadrant = n.cast("trunc", "i64")
-    body.result(
+    writer.result(
         where(is_left, -quadrant, quadrant),
         (high.bits() ^ sign).number(),
         (low.bits() ^ sign).number(),
@@ -111,7 +111,7 @@ def _function() -> str:
         f"define internal {{ i64, double, double }} @{_REDUCED_LARGE}(double %x) "
         "cold noinline nounwind willreturn memory(none)"
     )
-    return table + body.text(head)
+    return f"{table}{writer.definition(head)}\n"
 
 
 _REDUCED_LARGE_DEFINITION = _function()
@@ -124,10 +124,10 @@ _PARTS = (1.5707963267923333, 2.5633441515839558e-12, 1.0562999066987428e-23)
 _MOST = 51471.0
 
 
-def _reduced(x: Value) -> tuple[Value, Pair]:
+def _reduced(x: Value) -> tuple[Value, DoubleDouble]:
     """Return n, in the lowest bits of an integer, and r as a pair."""
     n, bits = nearest(x * _PER_HALF_PI)
-    with x.body.exact():
+    with x.writer.exact():
         first, second = x - n * _PARTS[0], n * _PARTS[1]
         difference, error = two_sum(first, -second)
         small = n * _PARTS[2] - error
@@ -138,14 +138,16 @@ def _reduced(x: Value) -> tuple[Value, Pair]:
     is_large = (size > _MOST) & (size < math.inf)
 
     def otherwise() -> tuple[Value, ...]:
-        x.body.needed[_REDUCED_LARGE] = _REDUCED_LARGE_DEFINITION
-        return x.body.lane_by_lane(f"@{_REDUCED_LARGE}", ("i64", "double", "double"), x)
+        x.writer.helpers[_REDUCED_LARGE] = _REDUCED_LARGE_DEFINITION
+        return x.writer.call_for_each_member(
+            f"@{_REDUCED_LARGE}", ("i64", "double", "double"), x
+        )
 
-    n, high, low = x.body.with_rare_case(is_large, (bits, high, low), otherwise)
+    n, high, low = x.writer.with_rare_case(is_large, (bits, high, low), otherwise)
     return n, (high, low)
 
 
-def _sine_and_cosine(r: Pair) -> tuple[Pair, Pair]:
+def _sine_and_cosine(r: DoubleDouble) -> tuple[DoubleDouble, DoubleDouble]:
     """Return sin(r) and cos(r) for |r| <= pi / 4, each as a large part and the rest."""
     high, low = r
     z = high * high
@@ -226,7 +228,7 @@ def _angle(a: Value, b: Value) -> _Angle:
 
 def atan(x: Value) -> Value:
     """Return the inverse tangent of x."""
-    angle = _angle(absolute(x), x.body.constant("double", 1.0))
+    angle = _angle(absolute(x), x.writer.constant("double", 1.0))
     return with_sign(angle.after(0, 1, 2, 1.0), x)
 
 

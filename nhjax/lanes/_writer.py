@@ -1,19 +1,14 @@
-"""The types and literals of LLVM, as text.
+"""The writer of LLVM IR: text, values with operators, and arithmetic on them.
 
-The text of a function of LLVM while it is written.
+Kernels and elementary functions are written by one class, `Writer`, which collects the
+instructions of one function. Its method `value` appends an instruction that is given as
+text and returns the name of the result; the code that writes kernels works on this
+level, since it writes 10^4 instructions and more.
 
-The body of a function in LLVM IR, written by formulas of Python.
-
-A `Value` is a vector, or a number where the width is 1. Its operators append an
-instruction to the body that it belongs to, so that a formula on values reads as usual.
-
-The functions of vectors of float64 that are instructions of every processor.
-
-Formulas that the elementary functions share: polynomials, and pairs of numbers.
-
-A pair is a number of about 106 bits, given as a sum of two of which the second is at
-most of the size of the first's round-off. What computes a round-off is `exact` in the
-sense of `Body.exact`: it relies on the rounding of each operation by itself.
+Formulas are written with `Value`, a name with its type. Its operators append
+instructions, so that Python's `(x - n * a) * b` writes what it says. The functions
+below `Value` are the arithmetic that the elementary functions share: polynomials, and
+double-double numbers.
 """
 
 import struct
@@ -23,312 +18,270 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
-from ._graph import Node
 
+# Types and literals
 
 _TYPES = {"bool": "i1", "float32": "float", "float64": "double"}
 
 
 def scalar_type(dtype: str) -> str:
-    """Return the type of a number."""
+    """Return the LLVM type of one number of a dtype."""
     return _TYPES.get(dtype) or f"i{8 * np.dtype(dtype).itemsize}"
 
 
 def memory_type(dtype: str) -> str:
-    """Return the type of a number in memory, where booleans are bytes."""
+    """Return the LLVM type of one number in memory, where booleans are bytes."""
     return "i8" if dtype == "bool" else scalar_type(dtype)
 
 
 def vector(scalar: str, width: int) -> str:
-    """Return the type of a vector; of width one, that of a number."""
+    """Return the type of a vector; a vector of width 1 is a scalar."""
     return scalar if width == 1 else f"<{width} x {scalar}>"
 
 
 def suffix(dtype: str, width: int, is_memory: bool = False) -> str:
-    """Return how names of intrinsics end for a type."""
+    """Return the suffix that the name of an overloaded intrinsic has for a type."""
     scalar = memory_type(dtype) if is_memory else scalar_type(dtype)
     scalar = {"float": "f32", "double": "f64"}.get(scalar, scalar)
     return scalar if width == 1 else f"v{width}{scalar}"
 
 
 def symbol(op: str, dtype: str, width: int) -> str:
-    """Name the function of `width` lanes that computes a primitive of JAX."""
-    lanes = "" if width == 1 else f"x{width}"
-    return f"nhjax.{op}.{suffix(dtype, 1)}{lanes}"
+    """Return the name of the function that computes a primitive of JAX on vectors."""
+    return f"nhjax.{op}.{suffix(dtype, 1)}{'' if width == 1 else f'x{width}'}"
 
 
 def literal(value: Any, dtype: str) -> str:
-    """Write a constant as LLVM reads it."""
+    """Return a number in the notation of LLVM IR."""
     if dtype.startswith("float"):
-        # LLVM writes numbers of all precisions with 64 bits.
+        # LLVM IR writes the bits of a float64 for float32 too.
         return f"0x{struct.unpack('<Q', struct.pack('<d', float(value)))[0]:016X}"
     if dtype == "bool":
         return "true" if value else "false"
     return str(int(value.astype(f"i{value.dtype.itemsize}")))
 
 
+def splat(text: str, scalar: str, width: int) -> str:
+    """Return a vector constant with the same number in all elements."""
+    return text if width == 1 else f"splat ({scalar} {text})"
+
+
 def is_signed(dtype: str) -> bool:
-    """Tell whether a dtype is of signed integers."""
+    """Return whether a dtype is a signed integer."""
     return dtype.startswith("int")
 
 
 def bits(dtype: str) -> int:
-    """Return the number of bits of a number in memory."""
+    """Return the number of bits of one number in memory."""
     return 8 * np.dtype(dtype).itemsize
 
 
-class Text:
-    """Lines of instructions in blocks, with what they need outside of the function.
+def result_type(types: Sequence[str]) -> str:
+    """Return the type of a function with one result, or with several in a struct."""
+    return types[0] if len(types) == 1 else f"{{ {', '.join(types)} }}"
 
-    `contract` is the flag with which products and sums may be fused, or empty.
+
+# The writer
+
+
+class Writer:
+    """The instructions of one function, and the definitions that they refer to.
+
+    - `width`: the number of members, which is the length of the vectors.
+    - `contract`: the fast-math flag that allows a product and a sum to be fused, with a
+        space after it, or empty.
+    - `block`: the label of the basic block that is being written.
+    - `constants`, `declarations`: text that stands outside of the function.
+    - `wanted`: the elementary functions that are called, as (primitive, dtype, width).
+    - `helpers`: definitions of other functions and tables, by name.
     """
 
-    def __init__(self, width: int, contract: str):
-        self.width, self.contract = width, contract
+    def __init__(self, width: int, contract: bool = True):
+        self.width = width
+        self.contract = "contract " if contract else ""
         self.lines: list[str] = []
         self.block = "entry"
         self.count = 0
-        self.declared: dict[str, str] = {}
+        self.constants: list[str] = []
+        self.declarations: dict[str, str] = {}
         self.wanted: dict[tuple[str, str, int], None] = {}
-        self.globals: list[str] = []
+        self.helpers: dict[str, str] = {}
 
-    def fresh(self) -> str:
+    def new_name(self) -> str:
         """Return a name that is not in use."""
         self.count += 1
         return f"%v{self.count}"
 
-    def add(self, line: str) -> None:
-        """Write an instruction without a result."""
-        self.lines.append("  " + line)
+    def add(self, instruction: str) -> None:
+        """Append an instruction without a result."""
+        self.lines.append("  " + instruction)
 
-    def value(self, text: str) -> str:
-        """Write an instruction, and return the name of its result."""
+    def value(self, instruction: str) -> str:
+        """Append an instruction, and return the name of its result."""
         self.count += 1
         name = f"%v{self.count}"
-        self.lines.append(f"  {name} = {text}")
+        self.lines.append(f"  {name} = {instruction}")
         return name
 
-    def later(self) -> int:
-        """Leave a line open, for a node that is complete only later."""
+    def placeholder(self) -> int:
+        """Append an empty line, to be filled in later, and return its index."""
         self.lines.append("")
         return len(self.lines) - 1
 
     def label(self, name: str) -> None:
-        """Start a block of LLVM with its label."""
+        """Start a basic block."""
         self.lines.append(f"{name}:")
         self.block = name
 
-    def declare(self, name: str, declaration: str) -> None:
-        """Declare a function to LLVM, unless it is declared already."""
-        self.declared[name] = declaration
+    def definition(self, head: str) -> str:
+        """Return the text of the function, which begins with `head`."""
+        return "\n".join([f"{head} {{", "entry:", *self.lines, "}"])
 
-    def want(self, op: str, dtype: str, width: int) -> None:
-        """Ask for an elementary function."""
-        self.wanted[op, dtype, width] = None
-
-    def splat(self, text: str, dtype: str, width: int) -> str:
-        """Write a constant of any width."""
-        return text if width == 1 else f"splat ({scalar_type(dtype)} {text})"
-
-    def spread(self, name: str, scalar: str) -> str:
-        """Write the same number into all lanes."""
+    def broadcast(self, name: str, scalar: str) -> str:
+        """Copy a scalar into all elements of a vector."""
         kind = vector(scalar, self.width)
         one = self.value(f"insertelement {kind} poison, {scalar} {name}, i64 0")
-        lanes = f"<{self.width} x i32> zeroinitializer"
-        return self.value(f"shufflevector {kind} {one}, {kind} poison, {lanes}")
+        zeros = f"<{self.width} x i32> zeroinitializer"
+        return self.value(f"shufflevector {kind} {one}, {kind} poison, {zeros}")
 
     def any_of(self, mask: str) -> str:
-        """Tell whether any lane of a mask is set."""
+        """Compute whether a mask is true for any member."""
+        if self.width == 1:
+            return mask
         whole = f"i{self.width}"
         number = self.value(f"bitcast <{self.width} x i1> {mask} to {whole}")
         return self.value(f"icmp ne {whole} {number}, 0")
 
-    # Nodes
-
-    def ref(self, node: Node, is_wide: bool) -> str:
-        """Return a node as an operand, as a vector if asked for."""
-        if node.is_constant:
-            text = literal(node.attr, node.dtype)
-            return self.splat(text, node.dtype, self.width if is_wide else 1)
-        if is_wide and not node.varies and self.width > 1:
-            return node.wide
-        return node.name
-
-    def kind(self, node: Node, is_wide: bool) -> str:
-        """Return the type of a node."""
-        return vector(scalar_type(node.dtype), self.width if is_wide else 1)
-
-    def define(self, node: Node, name: str) -> None:
-        """Give a node its name, and a vector of it where one is needed."""
-        node.name = name
-        if node.is_wide and not node.varies:
-            node.wide = self.spread(name, scalar_type(node.dtype))
-
-
-class Body:
-    """The instructions of a function, with the definitions of what it calls."""
-
-    def __init__(self, width: int):
-        self.width = width
-        self.lines: list[str] = []
-        # The texts of other functions and of tables, by name.
-        self.needed: dict[str, str] = {}
-        self._flags = "contract "
-        self._count = 0
-        self._block = "entry"
-
-    def type(self, kind: str) -> str:
-        """Name the type of the values of a kind, such as `double` and `i64`."""
-        return kind if self.width == 1 else f"<{self.width} x {kind}>"
-
-    def value(self, kind: str, instruction: str) -> "Value":
-        """Append an instruction, and return its value."""
-        self._count += 1
-        name = f"%v{self._count}"
-        self.lines.append(f"  {name} = {instruction}")
-        return Value(self, kind, name)
-
-    def constant(self, kind: str, number: float | int) -> "Value":
-        """Return a constant, the same in all lanes."""
-        if kind == "double":
-            (bits,) = struct.unpack("<Q", struct.pack("<d", number))
-            text = f"0x{bits:016X}"
-        else:
-            text = str(int(number))
-        return Value(self, kind, text if self.width == 1 else f"splat ({kind} {text})")
-
-    def flags(self, kind: str) -> str:
-        """Return the fast-math flags of the operations on values of a kind."""
-        return self._flags if kind == "double" else ""
-
     @contextmanager
     def exact(self) -> Iterator[None]:
-        """Forbid fused products and sums, so that each operation rounds by itself.
-
-        Elsewhere a product and a sum may become one operation, which rounds once.
-        """
-        before, self._flags = self._flags, ""
+        """Forbid fused products and sums, so that each operation rounds by itself."""
+        before, self.contract = self.contract, ""
         yield
-        self._flags = before
+        self.contract = before
+
+    # What formulas need
+
+    def type(self, scalar: str) -> str:
+        """Return the type of the vectors of a scalar type."""
+        return vector(scalar, self.width)
+
+    def compute(self, kind: str, instruction: str) -> "Value":
+        """Append an instruction, and return its result as a `Value`."""
+        return Value(self, kind, self.value(instruction))
+
+    def constant(self, kind: str, number: float | int) -> "Value":
+        """Return a constant that is the same for all members."""
+        is_float = kind == "double"
+        text = literal(number, "float64") if is_float else str(int(number))
+        return Value(self, kind, splat(text, kind, self.width))
 
     def call(
         self, function: str, kinds: tuple[str, ...], *arguments: "Value"
     ) -> tuple["Value", ...]:
-        """Call a function with one result or several, of the given kinds."""
-        result = _struct([self.type(kind) for kind in kinds])
+        """Call a function of vectors; `kinds` are the scalar types of its results."""
+        result = result_type([self.type(kind) for kind in kinds])
         given = ", ".join(x.typed() for x in arguments)
-        found = self.value(kinds[0], f"call {result} {function}({given})")
-        return self._members(found, result, kinds)
+        found = self.value(f"call {result} {function}({given})")
+        return self._unpack(found, result, kinds)
 
-    def _members(
-        self, found: "Value", result: str, kinds: tuple[str, ...]
+    def _unpack(
+        self, found: str, result: str, kinds: tuple[str, ...]
     ) -> tuple["Value", ...]:
         if len(kinds) == 1:
-            return (found,)
+            return (Value(self, kinds[0], found),)
         return tuple(
-            self.value(kind, f"extractvalue {result} {found.name}, {index}")
+            self.compute(kind, f"extractvalue {result} {found}, {index}")
             for index, kind in enumerate(kinds)
         )
 
-    def lane_by_lane(
+    def call_for_each_member(
         self, function: str, kinds: tuple[str, ...], *arguments: "Value"
     ) -> tuple["Value", ...]:
-        """Call a function of numbers for each lane."""
+        """Call a function of scalars once for each member."""
         if self.width == 1:
             return self.call(function, kinds, *arguments)
-        wholes, result = [f"{self.type(kind)} poison" for kind in kinds], _struct(kinds)
-        for lane in range(self.width):
+        wholes = [Value(self, kind, "poison") for kind in kinds]
+        result = result_type(kinds)
+        for member in range(self.width):
             given = ", ".join(
-                f"{x.kind} "
-                + self.value("", f"extractelement {x.typed()}, i64 {lane}").name
+                f"{x.kind} {self.value(f'extractelement {x.typed()}, i64 {member}')}"
                 for x in arguments
             )
-            found = self.value("", f"call {result} {function}({given})")
-            for index, part in enumerate(self._members(found, result, kinds)):
-                operands = f"{wholes[index]}, {kinds[index]} {part.name}, i64 {lane}"
-                whole = self.value(kinds[index], f"insertelement {operands}")
-                wholes[index] = whole.typed()
-        names = [whole.rpartition(" ")[2] for whole in wholes]
-        return tuple(
-            Value(self, kind, name) for kind, name in zip(kinds, names, strict=True)
-        )
+            found = self.value(f"call {result} {function}({given})")
+            for index, part in enumerate(self._unpack(found, result, kinds)):
+                operands = f"{wholes[index].typed()}, {part.kind} {part.name}"
+                wholes[index] = self.compute(
+                    part.kind, f"insertelement {operands}, i64 {member}"
+                )
+        return tuple(wholes)
 
     def with_rare_case(
         self,
-        unusual: "Value",
+        is_rare: "Value",
         usual: tuple["Value", ...],
-        otherwise: Callable[[], tuple["Value", ...]],
+        rare: Callable[[], tuple["Value", ...]],
     ) -> tuple["Value", ...]:
-        """Return `usual`, but what `otherwise` computes in the lanes of `unusual`.
+        """Return `usual`, but the results of `rare()` for the members of `is_rare`.
 
-        The function `otherwise` is computed only if there is such a lane.
+        The instructions of `rare` are skipped at run time if there is no such member.
         """
-        any_lane = unusual
-        if self.width > 1:
-            word = self.value("", f"bitcast {unusual.typed()} to i{self.width}")
-            any_lane = self.value("", f"icmp ne i{self.width} {word.name}, 0")
-        self._count += 1
-        before, rare, after = self._block, f"rare{self._count}", f"after{self._count}"
-        self.lines.append(f"  br i1 {any_lane.name}, label %{rare}, label %{after}")
-        self._start(rare)
-        pairs = list(zip(otherwise(), usual, strict=True))
-        found = [(where(unusual, x, y), y) for x, y in pairs]
-        last = self._block
-        self.lines.append(f"  br label %{after}")
-        self._start(after)
+        is_any = self.any_of(is_rare.name)
+        self.count += 1
+        before, there, after = self.block, f"rare{self.count}", f"after{self.count}"
+        self.add(f"br i1 {is_any}, label %{there}, label %{after}")
+        self.label(there)
+        pairs = list(zip(rare(), usual, strict=True))
+        found = [(where(is_rare, x, y), y) for x, y in pairs]
+        last = self.block
+        self.add(f"br label %{after}")
+        self.label(after)
         ways = [f"[ {x.name}, %{last} ], [ {y.name}, %{before} ]" for x, y in found]
         return tuple(
-            self.value(y.kind, f"phi {self.type(y.kind)} {way}")
+            self.compute(y.kind, f"phi {self.type(y.kind)} {way}")
             for way, y in zip(ways, usual, strict=True)
         )
 
-    def _start(self, block: str) -> None:
-        self.lines.append(f"{block}:")
-        self._block = block
-
     def result(self, *values: "Value") -> None:
         """Return one value or several from the function."""
-        result, whole = _struct([self.type(x.kind) for x in values]), values[0].name
+        result, whole = result_type([self.type(x.kind) for x in values]), values[0].name
         if len(values) > 1:
             whole = "poison"
             for index, x in enumerate(values):
                 insertion = f"insertvalue {result} {whole}, {x.typed()}, {index}"
-                whole = self.value("", insertion).name
-        self.lines.append(f"  ret {result} {whole}")
-
-    def text(self, head: str) -> str:
-        """Return the function's definition, which begins with `head`."""
-        return "\n".join([f"{head} {{", "entry:", *self.lines, "}"]) + "\n"
+                whole = self.value(insertion)
+        self.add(f"ret {result} {whole}")
 
 
-def _struct(types: Sequence[str]) -> str:
-    """Name the type of a function's result, or results."""
-    return types[0] if len(types) == 1 else f"{{ {', '.join(types)} }}"
+# Values with operators
 
 
 class Value:
-    """The value of an instruction, or a constant."""
+    """A vector, or a scalar where the width is 1, to be used in formulas.
 
-    def __init__(self, body: Body, kind: str, name: str):
-        self.body = body
+    - `kind`: the LLVM type of its elements, such as `double` or `i64`.
+    - `name`: the name of the instruction that computed it, or a constant.
+    """
+
+    def __init__(self, writer: Writer, kind: str, name: str):
+        self.writer = writer
         self.kind = kind
         self.name = name
 
     def typed(self) -> str:
-        """Return the value's type and name, as an operand of an instruction."""
-        return f"{self.body.type(self.kind)} {self.name}"
+        """Return type and name, as an instruction takes its first operand."""
+        return f"{self.writer.type(self.kind)} {self.name}"
 
-    def _constant(self, other: "Operand") -> "Value":
+    def _other(self, other: "Operand") -> "Value":
         if isinstance(other, Value):
             return other
-        return self.body.constant(self.kind, other)
+        return self.writer.constant(self.kind, other)
 
     def _instruction(
         self, name: str, other: "Operand", result: str | None = None
     ) -> "Value":
-        flags, operands = self.body.flags(self.kind), self._constant(other).name
-        text = f"{name} {flags}{self.typed()}, {operands}"
-        return self.body.value(result or self.kind, text)
+        flags = self.writer.contract if self.kind == "double" else ""
+        text = f"{name} {flags}{self.typed()}, {self._other(other).name}"
+        return self.writer.compute(result or self.kind, text)
 
     def _arithmetic(self, name: str, other: "Operand") -> "Value":
         prefix = "f" if self.kind == "double" else ""
@@ -344,7 +297,7 @@ class Value:
         return self._arithmetic("sub", other)
 
     def __rsub__(self, other: "Operand") -> "Value":
-        return self._constant(other) - self
+        return self._other(other) - self
 
     def __mul__(self, other: "Operand") -> "Value":
         return self._arithmetic("mul", other)
@@ -356,11 +309,11 @@ class Value:
         return self._arithmetic("div", other)
 
     def __rtruediv__(self, other: "Operand") -> "Value":
-        return self._constant(other) / self
+        return self._other(other) / self
 
     def __neg__(self) -> "Value":
         if self.kind == "double":
-            return self.body.value("double", f"fneg {self.typed()}")
+            return self.writer.compute("double", f"fneg {self.typed()}")
         return 0 - self
 
     def __and__(self, other: "Operand") -> "Value":
@@ -384,7 +337,7 @@ class Value:
     def _compare(self, floats: str, integers: str, other: "Operand") -> "Value":
         is_float = self.kind == "double"
         name = f"fcmp {floats}" if is_float else f"icmp {integers}"
-        with self.body.exact():
+        with self.writer.exact():
             return self._instruction(name, other, "i1")
 
     def __lt__(self, other: "Operand") -> "Value":
@@ -405,8 +358,8 @@ class Value:
 
     def cast(self, instruction: str, kind: str) -> "Value":
         """Convert by one of the instructions `zext`, `trunc`, `bitcast`, `uitofp`."""
-        types = f"{self.typed()} to {self.body.type(kind)}"
-        return self.body.value(kind, f"{instruction} {types}")
+        types = f"{self.typed()} to {self.writer.type(kind)}"
+        return self.writer.compute(kind, f"{instruction} {types}")
 
     def bits(self) -> "Value":
         """Return the bits of floating-point numbers as integers."""
@@ -422,14 +375,17 @@ Operand: TypeAlias = Value | float | int
 
 def where(condition: Value, chosen: Operand, other: Operand) -> Value:
     """Return `chosen` in the lanes where the condition holds, else `other`."""
-    body = condition.body
+    writer = condition.writer
     kinds = [x.kind for x in (chosen, other) if isinstance(x, Value)]
     kind = kinds[0] if kinds else "i64" if isinstance(chosen, int) else "double"
     first, second = (
-        x if isinstance(x, Value) else body.constant(kind, x) for x in (chosen, other)
+        x if isinstance(x, Value) else writer.constant(kind, x) for x in (chosen, other)
     )
     operands = f"{condition.typed()}, {first.typed()}, {second.typed()}"
-    return body.value(kind, f"select {operands}")
+    return writer.compute(kind, f"select {operands}")
+
+
+# Arithmetic of float64
 
 
 def absolute(x: Value) -> Value:
@@ -448,12 +404,14 @@ def square_root(x: Value) -> Value:
 
 
 def _intrinsic(name: str, *arguments: Value) -> Value:
-    body = arguments[0].body
-    lanes = "" if body.width == 1 else f"v{body.width}"
-    return body.call(f"@llvm.{name}.{lanes}f64", ("double",), *arguments)[0]
+    writer = arguments[0].writer
+    full = f"llvm.{name}.{suffix('float64', writer.width)}"
+    return writer.call(f"@{full}", ("double",), *arguments)[0]
 
 
-Pair = tuple[Value, Value]
+# A number of about 106 bits: the sum of two float64, the second of which is at most the
+# round-off of the first.
+DoubleDouble: TypeAlias = tuple[Value, Value]
 
 # Adding this rounds to an integer, which is then in the lowest bits.
 _TO_INTEGER = 1.5 * 2.0**52
@@ -489,7 +447,7 @@ def nearest(x: Value) -> tuple[Value, Value]:
 
     For |x| < 2^51, with 51 bits for the integer and its sign.
     """
-    with x.body.exact():
+    with x.writer.exact():
         shifted = x + _TO_INTEGER
         return shifted - _TO_INTEGER, shifted.bits()
 
@@ -511,16 +469,16 @@ def power_of_two(exponent: Value) -> Value:
     return ((exponent << 52) + ONE_BITS).number()
 
 
-def fast_two_sum(a: Value | float, b: Value) -> Pair:
+def fast_two_sum(a: Value | float, b: Value) -> DoubleDouble:
     """Return a + b without error, where a is 0 or |a| is at least |b|."""
-    with b.body.exact():
+    with b.writer.exact():
         high = a + b
         return high, b - (high - a)
 
 
-def two_sum(a: Value, b: Value) -> Pair:
+def two_sum(a: Value, b: Value) -> DoubleDouble:
     """Return a + b without error."""
-    with a.body.exact():
+    with a.writer.exact():
         high = a + b
         other = high - a
         return high, (a - (high - other)) + (b - other)
@@ -531,37 +489,37 @@ def leading_bits(x: Value, count: int) -> Value:
     return (x.bits() & -(1 << (53 - count))).number()
 
 
-def halves(x: Value) -> Pair:
+def halves(x: Value) -> DoubleDouble:
     """Split x into two numbers of 26 bits, such that products of these are exact."""
-    with x.body.exact():
+    with x.writer.exact():
         upper = leading_bits((x.bits() + _HALF_UNIT).number(), 26)
         return upper, x - upper
 
 
-def two_product(a: Value, b: Value) -> Pair:
+def two_product(a: Value, b: Value) -> DoubleDouble:
     """Return a b without error, if there is no underflow."""
-    with a.body.exact():
+    with a.writer.exact():
         high = a * b
         (a1, a2), (b1, b2) = halves(a), halves(b)
         return high, (((a1 * b1 - high) + a1 * b2) + a2 * b1) + a2 * b2
 
 
-def product(a: Pair, b: Pair) -> Pair:
+def product(a: DoubleDouble, b: DoubleDouble) -> DoubleDouble:
     """Return the product of two pairs."""
     high, low = two_product(a[0], b[0])
     return fast_two_sum(high, low + (a[0] * b[1] + a[1] * b[0]))
 
 
-def quotient(a: Pair, b: Pair) -> Pair:
+def quotient(a: DoubleDouble, b: DoubleDouble) -> DoubleDouble:
     """Return the quotient of two pairs."""
     high = a[0] / b[0]
     back, error = two_product(high, b[0])
-    with high.body.exact():
+    with high.writer.exact():
         rest = (a[0] - back) - error
     return fast_two_sum(high, (rest + (a[1] - high * b[1])) / b[0])
 
 
-def rounded_quotient(a: Pair, b: Pair) -> Value:
+def rounded_quotient(a: DoubleDouble, b: DoubleDouble) -> Value:
     """Return the quotient of two pairs to little more than half an ulp.
 
     The quotient of the first numbers is rounded, and only the effect of the second
@@ -571,10 +529,10 @@ def rounded_quotient(a: Pair, b: Pair) -> Value:
     return first + (a[1] - first * b[1]) / b[0]
 
 
-def root(a: Pair) -> Pair:
+def root(a: DoubleDouble) -> DoubleDouble:
     """Return the square root of a pair that is positive."""
     high = square_root(a[0])
     back, error = two_product(high, high)
-    with high.body.exact():
+    with high.writer.exact():
         rest = ((a[0] - back) - error) + a[1]
     return fast_two_sum(high, rest / (high + high))

@@ -8,7 +8,9 @@ import numpy as np
 import pytest
 import scipy.special
 
-from nhjax.lanes import _coefficients, definition, library, SUPPORTED, symbol
+from nhjax.lanes import _coefficients
+from nhjax.lanes._elementary_functions import definitions, SUPPORTED
+from nhjax.lanes._writer import symbol
 from oracles import approximations, ulps
 from oracles.native_lanes import Native
 
@@ -21,14 +23,14 @@ EVERYTHING = [(op, dtype, width) for op in OPS for dtype in DTYPES for width in 
 
 @pytest.fixture(scope="module")
 def native():
-    return Native(library(EVERYTHING), [symbol(*key) for key in EVERYTHING])
+    return Native(definitions(EVERYTHING), [symbol(*key) for key in EVERYTHING])
 
 
 @pytest.fixture(scope="module")
 def rounded():
     """The same functions where each product is rounded before it is added."""
     keys = [(op, "float64", 4) for op in OPS]
-    text = library(keys).replace("contract ", "")
+    text = definitions(keys).replace("contract ", "")
     return Native(text, [symbol(*key) for key in keys])
 
 
@@ -144,7 +146,9 @@ def test_coefficients_are_those_that_are_computed():
 
 
 def test_a_library_defines_each_function_once():
-    names = re.findall(r"^(?:define|declare).*?@([\w.]+)", library(EVERYTHING), re.M)
+    names = re.findall(
+        r"^(?:define|declare).*?@([\w.]+)", definitions(EVERYTHING), re.M
+    )
     assert len(names) == len(set(names))
     assert all(name.startswith("nhjax.") for name in names)
     assert {symbol(*key) for key in EVERYTHING} <= set(names)
@@ -154,7 +158,7 @@ def test_sine_and_cosine_of_one_argument_are_one_call():
     """LLVM merges the calls: the two cost what one does."""
     both = "\n".join(
         [
-            library([("sin", "float64", 4), ("cos", "float64", 4)]),
+            definitions([("sin", "float64", 4), ("cos", "float64", 4)]),
             "define <4 x double> @sum(<4 x double> %x) {",
             f"  %s = call <4 x double> @{symbol('sin', 'float64', 4)}(<4 x double> %x)",
             f"  %c = call <4 x double> @{symbol('cos', 'float64', 4)}(<4 x double> %x)",
@@ -183,7 +187,7 @@ TRIPLES = [
 def test_no_library_is_called_on_any_platform(triple, width):
     """Nor is one needed by a processor without special instructions."""
     keys = [(op, dtype, width) for op in OPS for dtype in DTYPES]
-    text = library(keys).replace("define internal", "define")
+    text = definitions(keys).replace("define internal", "define")
     assert _called_outside(text, triple) == set()
 
 
@@ -221,10 +225,10 @@ def _parsed(text, triple):
 
 def test_one_definition_is_complete():
     for op in OPS:
-        Native(definition(op, "float64", 2), [symbol(op, "float64", 2)])
+        Native(definitions([(op, "float64", 2)]), [symbol(op, "float64", 2)])
 
 
 def test_other_primitives_are_not_supported():
     assert "sqrt" not in SUPPORTED
     with pytest.raises(KeyError):
-        definition("lgamma", "float64", 4)
+        definitions([("lgamma", "float64", 4)])
