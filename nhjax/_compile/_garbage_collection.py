@@ -1,4 +1,4 @@
-"""Rarer collections of garbage while programs are traced and compiled."""
+"""Less frequent garbage collection while programs are traced and compiled."""
 
 import gc
 import threading
@@ -7,8 +7,9 @@ from contextlib import contextmanager
 
 
 # A large program consists of millions of objects, nearly all of which live as long as
-# it does. Python looks for cycles each time that 700 objects have been made: that took
-# a third of the time to trace a bicycle's gradient, and finds next to none.
+# the program. By default Python looks for cycles each time that 700 objects have been
+# created. This took a third of the time to trace a bicycle's gradient, and found almost
+# nothing.
 _OBJECTS = 100_000
 
 _lock = threading.Lock()
@@ -18,11 +19,11 @@ _outside: tuple[int, int, int] = gc.get_threshold()
 
 @contextmanager
 def rare_collections() -> Iterator[None]:
-    """Let Python look for cyclic garbage rarely, until the block is left.
+    """Make Python look for cyclic garbage less often inside the block.
 
     The thresholds are those of the whole process: the first thread that enters such a
-    block sets them, and the last one that leaves puts them back as they were. Where the
-    collector is switched off, or rarer already, nothing changes.
+    block sets them, and the last thread that leaves restores them. Where the collector
+    is switched off, or runs even less often, nothing changes.
     """
     global _inside, _outside
     with _lock:

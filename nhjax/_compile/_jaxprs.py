@@ -1,10 +1,11 @@
-"""Programs without operations that nothing uses, or that repeat an earlier one.
+"""Jaxprs: which operations they contain, and the removal of superfluous operations.
 
-Derivatives compute the function on the way, and so do those of the next order, so that
-much of a traced program is in it several times. What transforms and compiles programs
-would work at each copy.
-
-The kinds of operations, which decide if a program can be one kernel of the CPU.
+`fits_one_kernel` decides by the kinds and sizes of operations whether XLA can compile a
+program to a single kernel of the CPU. `cse_dce` removes repeated operations
+(common-subexpression elimination) and unused operations (dead-code elimination). This
+pays because derivatives compute the function on the way, so that a traced program
+contains much of it several times, and all that transforms and compiles programs would
+work on each copy.
 """
 
 import itertools
@@ -18,9 +19,9 @@ import numpy as np
 from jaxtyping import PyTree
 
 
-# The lists below name, as JAX does, the operations that XLA can put into such kernels.
-# Calls into libraries (products of matrices, factorisations, transforms), sorting,
-# scattering and callbacks are not among them.
+# The lists below contain, by JAX's names, the operations that XLA can put into one
+# kernel. Calls into libraries (products of matrices, factorisations, transforms),
+# sorting, scattering and callbacks are not in the lists.
 #
 # These operations act element by element, which `_index_sets` relies on: no other may
 # be listed here.
@@ -47,28 +48,28 @@ _MOVING = """
 """.split()  # noqa: SIM905
 ARITHMETIC_AND_SHAPES = (*ELEMENTWISE, *_REDUCING, *_SHAPING, *_MOVING)
 _ARITHMETIC = {"add", "add_any", "div", "mul", "neg", "sub"}
-# nhjax's own operation, which is written out in arithmetic and shapes.
+# nhjax's own operation, which is lowered to arithmetic and shapes.
 SMALL_PRODUCT = "small_product"
-# These operations contain programs, whose operations are examined in turn.
+# These operations contain programs, whose operations are checked in turn.
 CALLING = """
     checkpoint closed_call custom_jvp_call custom_vjp_call jit remat2
 """.split()  # noqa: SIM905
 _CONTAINING = [*CALLING, "cond", "custom_linear_solve", "cpu_kernel", "scan", "while"]
-# Numbers of elements: reductions of more are left to a library, and work on arrays of
-# more to several threads, which a kernel cannot start.
+# Numbers of elements. XLA leaves larger reductions to a library, and shares work on
+# larger arrays among threads, which a kernel cannot start.
 LARGEST_REDUCTION = 1024
 LARGEST_ARRAY = 4096
 
 
-def is_elementary(program: Any) -> bool:
-    """Tell whether all operations of a program can go into one kernel."""
-    return all(map(_is_elementary, program.eqns))
+def fits_one_kernel(program: Any) -> bool:
+    """Return whether all operations of a jaxpr can go into one kernel of the CPU."""
+    return all(map(_fits_one_kernel, program.eqns))
 
 
-def _is_elementary(equation: Any) -> bool:
+def _fits_one_kernel(equation: Any) -> bool:
     name = equation.primitive.name
     if name in _CONTAINING:
-        return all(map(is_elementary, _programs(equation.params)))
+        return all(map(fits_one_kernel, _programs(equation.params)))
     if name in _MOVING:
         return True
     if name == SMALL_PRODUCT and not equation.params["by_terms"]:
@@ -96,8 +97,8 @@ def _programs(params: PyTree[Any]) -> Iterator[Any]:
             yield leaf
 
 
-def array_size(program: Any) -> float:
-    """Compute the root of the mean square of the sizes of arrays in arithmetic."""
+def rms_array_size(program: Any) -> float:
+    """Return the root mean square of the sizes of arrays in arithmetic."""
     sizes = [size * size for size in _arithmetic_sizes(program)]
     return math.sqrt(sum(sizes) / len(sizes)) if sizes else 0.0
 
@@ -113,7 +114,7 @@ def _arithmetic_sizes(program: Any) -> Iterator[int]:
 
 
 def _sizes_of_product(product: Any) -> Iterator[int]:
-    """List the sizes of arrays in the arithmetic of a small product, written out."""
+    """List the sizes of arrays in the arithmetic that a small product is lowered to."""
     size, terms = _size(product.outvars[0]), _terms(product)
     if product.params["by_terms"]:
         yield from itertools.repeat(size, 2 * terms - 1)
@@ -121,13 +122,13 @@ def _sizes_of_product(product: Any) -> Iterator[int]:
         yield size * terms
 
 
-# Only these are left out where they are repeated: they have no state, as random numbers
-# may have, and no parameters that a user chooses.
+# Only these operations are removed when repeated: they have no state, unlike random
+# numbers, and no parameters that a user chooses.
 _REPEATABLE = frozenset(
     (*ARITHMETIC_AND_SHAPES, "dot_general", "gather", SMALL_PRODUCT)
 )
-# Operations whose programs are those of the parameters listed here. Other operations
-# with programs have rules that rely on them, and stay as they are.
+# The operations whose inner programs are simplified, and the parameters that hold these
+# programs. Other operations with inner programs have rules that rely on them.
 _INNER = {
     "checkpoint": ("jaxpr",),
     "cond": ("branches",),
@@ -140,19 +141,22 @@ _INNER = {
 }
 
 
-def shortened(program: Any) -> Any:
-    """Leave out what is not used or repeated, in a jaxpr and in its loops.
+def cse_dce(program: Any) -> Any:
+    """Remove unused and repeated operations from a jaxpr and from its inner programs.
 
-    The results are the same to the last bit, since what stays is not changed.
+    The operations that stay are not changed, so that results are the same to the last
+    bit.
     """
-    return _Shortening()(program)
+    return _Simplifier()(program)
 
 
-class _Shortening:
-    """Shortens programs, those that stand at several places once."""
+class _Simplifier:
+    """The removal of operations; a program that occurs several times is simplified
+    once.
+    """
 
     def __init__(self):
-        # A program is kept beside what it has become, so that its identity is its own.
+        # The original program is kept too, so that its identity is not reused.
         self._known: dict[int, tuple[Any, Any]] = {}
 
     def __call__(self, program: Any) -> Any:
@@ -188,7 +192,7 @@ class _Shortening:
         return jaxpr.replace(eqns=equations, outvars=[same(v) for v in jaxpr.outvars])
 
     def _params(self, equation: Any) -> dict[str, Any]:
-        """Return the parameters of an operation, with its inner programs shortened."""
+        """Return the parameters of an operation, with its inner programs simplified."""
         names = _INNER.get(equation.primitive.name, ())
         inner = {name: jax.tree.map(self, equation.params[name]) for name in names}
         return {**equation.params, **inner}
@@ -209,16 +213,16 @@ def _variables(operands: Any) -> list[Any]:
 
 
 def _is_repeatable(equation: Any) -> bool:
-    # A result without a name cannot be used by another operation.
+    # Another operation cannot use a result without a name.
     return equation.primitive.name in _REPEATABLE and not any(
         isinstance(variable, jax.extend.core.DropVar) for variable in equation.outvars
     )
 
 
 def _key(equation: Any, operands: list[Any]) -> Hashable:
-    """Make a key that two operations share only if they compute the same."""
+    """Return a key that two operations share only if they compute the same."""
     params = tuple((name, _exact(equation.params[name])) for name in equation.params)
-    # The context holds settings of JAX, such as where an operation is computed.
+    # The context holds settings of JAX, such as the device of the operation.
     context = _exact(getattr(equation, "ctx", None))
     return equation.primitive, tuple(map(_operand, operands)), params, context
 
@@ -230,9 +234,10 @@ def _operand(variable: Any) -> Hashable:
 
 
 def _exact(value: Any) -> Hashable:
-    """Make a key of a parameter; what cannot be hashed is equal to itself alone.
+    """Return a key of a parameter; an object without a hash equals only itself.
 
-    Numbers that are equal but differ, as 0.0 and -0.0 or 1 and True, have other keys.
+    Numbers that compare equal but differ, such as 0.0 and -0.0 or 1 and True, have
+    different keys.
     """
     if isinstance(value, tuple | list):
         return type(value), *map(_exact, value)

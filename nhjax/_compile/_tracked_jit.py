@@ -1,14 +1,10 @@
 """Compilation that notices changes of globals and closed-over variables.
 
-The values that functions read beside their arguments, in a form to be compared.
-
-A compiled function keeps the values that globals and closed-over variables had when it
-was traced. The entries found here differ as soon as such a value does, so that a cache
-of compiled programs can take them as a key.
-
-The kinds of values that functions may read, each searched in its own way.
-
-The variables that the code of a function reads, and the modules of libraries.
+A function compiled by `jax.jit` keeps the values that globals and closed-over variables
+had when it was traced. `tracked_jit` traces the function again when such a value
+changes. At each call `captured` lists the values that the functions of the user read:
+it reads the names from their bytecode (`names`) and searches each value by its kind
+(`Kind`). The list is a part of the key under which compiled programs are cached.
 """
 
 import argparse
@@ -32,7 +28,7 @@ import numpy as np
 from ._garbage_collection import rare_collections
 
 
-# The attributes that are read of a variable, as in `module.part.constant`.
+# The attributes read from a variable, as in `module.part.constant`.
 Path: TypeAlias = tuple[str, ...]
 
 _LOADS_GLOBAL = ("LOAD_GLOBAL", "LOAD_NAME", "LOAD_FROM_DICT_OR_GLOBALS")
@@ -43,10 +39,10 @@ _LIBRARIES = ("equinox", "jax", "jaxlib", "jaxtyping", "nhjax", "numpy")
 
 
 class Names(NamedTuple):
-    """The variables that code reads, each with the attribute paths that start there.
+    """The variables that code reads, each with the attribute paths read from it.
 
     Variables that the code itself assigns are left out: a function must not be traced
-    anew because of what it did itself.
+    again because of what it did itself.
     """
 
     of_globals: dict[str, set[Path]]
@@ -96,7 +92,9 @@ def _without(
 
 @lru_cache(maxsize=4096)
 def is_installed(module: str) -> bool:
-    """Tell whether a module is Python's own or an installed library's, not a user's."""
+    """Return whether a module belongs to Python or an installed library, not to the
+    user.
+    """
     if module == "__main__":
         return False
     if module.partition(".")[0] in (*_LIBRARIES, *sys.builtin_module_names):
@@ -110,7 +108,7 @@ def is_installed(module: str) -> bool:
 
 
 class Kind(enum.Enum):
-    """The way in which a value is searched for the values that it contains."""
+    """How a value is searched for the values that it contains."""
 
     PLAIN = enum.auto()
     FLOAT = enum.auto()
@@ -130,7 +128,7 @@ class Kind(enum.Enum):
     OPAQUE = enum.auto()
 
 
-# The kind of a class is that of the first row that fits.
+# The kind of a class is given by the first row that fits.
 _KINDS: list[tuple[Kind, tuple[type, ...]]] = [
     (Kind.OPAQUE, (enum.Enum, types.ModuleType)),
     (Kind.NUMPY, (np.ndarray, np.generic)),
@@ -145,22 +143,22 @@ _KINDS: list[tuple[Kind, tuple[type, ...]]] = [
     (Kind.MAPPING, (dict, types.MappingProxyType)),
     (Kind.SEQUENCE, (list, tuple, deque, set, frozenset)),
     (Kind.CLASS, (type,)),
-    # These classes are not the user's, but made to hold the user's values.
+    # These classes belong to libraries, but hold values of the user.
     (Kind.OPEN, (types.SimpleNamespace, argparse.Namespace, eqx.Module)),
 ]
 
 
 @lru_cache(maxsize=4096)
 def kind_of(cls: type) -> Kind:
-    """Find the kind of the instances of a class."""
+    """Return the kind of the instances of a class."""
     for kind, classes in _KINDS:
         if issubclass(cls, classes):
             return kind
     return Kind.OPAQUE if is_installed(cls.__module__) else Kind.OPEN
 
 
-# If functions read more values than this, the rest is ignored: to compare it would take
-# longer than a short run.
+# If functions read more values than this, the other values are ignored: comparing them
+# would take longer than a short run.
 MOST_ENTRIES = 2000
 
 
@@ -172,13 +170,13 @@ class Place(NamedTuple):
 
 
 class Entry(NamedTuple):
-    """A value that a function reads, with the place where it does so.
+    """A value that a function reads, and where it was read.
 
-    The owner, the object in which the value was found, is kept so that its identity is
-    not reused. `key` serves for comparison between calls: it has the owner's number in
-    the order of the visit, or -1, where `place` has the owner's identity. `content`
-    serves for comparison within a call: a value that has parts stands there for itself,
-    whatever its number.
+    The owner, which is the object in which the value was found, is kept so that its
+    identity is not reused. `key` is compared between calls: it contains the owner's
+    number in the order of the visit, or -1, where `place` has the owner's identity.
+    `content` is compared within a call: there a value that has parts is compared by its
+    identity, not by its number.
     """
 
     key: tuple[int, Hashable, Hashable]
@@ -188,12 +186,12 @@ class Entry(NamedTuple):
 
     @property
     def atom(self) -> Hashable:
-        """Return the value in a form that can be compared and hashed."""
+        """The value in a form that can be compared and hashed."""
         return self.key[-1]
 
 
 class Identity:
-    """A wrapper of an object by which two are equal only if they hold the same object.
+    """A wrapper that compares objects by identity.
 
     The object is kept, so that its identity is not reused.
     """
@@ -209,16 +207,16 @@ class Identity:
 
 
 class Unrepeatable:
-    """A value that equals nothing but itself, which stands for a tracer.
+    """A value that equals only itself; it stands for a tracer.
 
     A program that was made with a tracer cannot be used again.
     """
 
 
 def captured(tree: Any, ignored: Collection[Place] = ()) -> list[Entry]:
-    """List what the functions among the leaves of a tree read, except ignored places.
+    """List the values that the functions in a tree read, except at ignored places.
 
-    The arrays among the leaves are left out, because they are arguments of the compiled
+    The arrays in the tree are left out, because they are arguments of the compiled
     program.
     """
     walk = _Walk(ignored)
@@ -227,7 +225,7 @@ def captured(tree: Any, ignored: Collection[Place] = ()) -> list[Entry]:
 
 
 def all_of(owner: object) -> Place:
-    """Make the place that stands for everything inside of an object."""
+    """Return the place that stands for everything inside an object."""
     return Place(id(owner), Ellipsis)
 
 
@@ -235,15 +233,15 @@ class _Walk:
     def __init__(self, ignored: Collection[Place]):
         self.entries: list[Entry] = []
         self.ignored = ignored
-        # The objects that were visited, by identity, with their numbers in order: equal
-        # structures have equal numbers. Identities are not reused meanwhile, as the
-        # entries hold the objects.
+        # The visited objects, by identity, with their numbers in order: equal
+        # structures have equal numbers. The entries keep the objects, so that
+        # identities are not reused.
         self.numbers: dict[int, int] = {}
         # The identities of the classes whose attributes have been recorded.
         self.searched: set[int] = set()
 
     def arguments(self, tree: Any) -> None:
-        """Record static fields, leaves that are no arrays, and the code of classes."""
+        """Record static fields, leaves that are not arrays, and the code of classes."""
         nodes = []
 
         def note(node: Any) -> bool:
@@ -304,13 +302,13 @@ class _Walk:
         elif kind is Kind.OPEN:
             self.attributes(value)
             self.methods(type(value))
-        # Decorators keep the function that they wrap under this name. The result of
-        # `jax.jit` is an object of a library's class, and so opaque.
+        # Decorators keep the wrapped function under this name. The result of `jax.jit`
+        # is an object of a library's class, and so opaque.
         if kind is Kind.FUNCTION or kind is Kind.OPAQUE:
             self.named(value, ("__wrapped__",))
 
     def named(self, value: Any, attributes: Collection[str]) -> None:
-        """Record those of the named attributes that the value has."""
+        """Record the attributes in a list of names that the value has."""
         for name in attributes:
             if hasattr(value, name):
                 self.read(value, name, getattr(value, name))
@@ -337,7 +335,7 @@ class _Walk:
                 elif isinstance(item, staticmethod | classmethod):
                     item = item.__func__
                 if isinstance(item, types.FunctionType):
-                    # Methods that a dataclass generates read nothing of the user's.
+                    # The generated methods of a dataclass read no values of the user.
                     if item.__code__.co_filename != "<string>":
                         self.read(base, name, item)
                 elif not (name.startswith("__") or name == "_abc_impl"):
@@ -360,7 +358,7 @@ class _Walk:
             self.read(function, "defaults", function.__defaults__)
         if function.__kwdefaults__:
             self.read(function, "kwdefaults", function.__kwdefaults__)
-        # The globals of a library are its own, and taken to stay the same.
+        # The globals of a library are assumed to stay the same.
         if is_installed(str(variables.get("__name__", ""))):
             return
         for name, paths in found.of_globals.items():
@@ -380,7 +378,7 @@ class _Walk:
 
 
 def _atom(value: Any, kind: Kind) -> Hashable | None:
-    """Return a value without parts, with its type; None if the value may have parts."""
+    """Return a value without parts, with its type; `None` if it may have parts."""
     if kind is Kind.PLAIN:
         return type(value), value
     if kind is Kind.FLOAT:
@@ -391,8 +389,8 @@ def _atom(value: Any, kind: Kind) -> Hashable | None:
     if kind is Kind.TRACER:
         return Unrepeatable()
     if kind is Kind.NUMPY and not value.dtype.hasobject:
-        # An array of NumPy can be changed in place, so that its contents are compared;
-        # an array of JAX cannot.
+        # Arrays of NumPy can be changed in place, so that their contents are compared.
+        # Arrays of JAX cannot.
         digest = hashlib.blake2b(value.tobytes(), digest_size=16).digest()
         return type(value), value.dtype, value.shape, digest
     is_closed = kind is Kind.OPAQUE and not hasattr(value, "__wrapped__")
@@ -418,7 +416,7 @@ def _static_fields(cls: type) -> list[str]:
 
 
 def _variables(value: Any) -> dict[str, Any]:
-    """Return the attributes of an object, read in a way that no class can make slow."""
+    """Return the attributes of an object without calling code of its class."""
     try:
         return object.__getattribute__(value, "__dict__")
     except AttributeError:
@@ -427,15 +425,15 @@ def _variables(value: Any) -> dict[str, Any]:
 
 T = TypeVar("T")
 
-# The largest number of entries in each of the two dictionaries below. If there are
-# more, all are forgotten, and programs that are still used are traced once more.
+# The largest number of entries in each of the two dictionaries below. When there are
+# more, all are dropped, and programs that are still used are traced once more.
 _MOST = 1000
 
 
 class _Key:
     """The values that functions read, as a key for compiled programs.
 
-    `is_traced` tells whether a program has just been traced with this key.
+    `is_traced` is set when a program has been traced with this key.
     """
 
     def __init__(self, atoms: tuple[Hashable, ...]):
@@ -450,20 +448,20 @@ class _Key:
         return isinstance(other, _Key) and self.atoms == other.atoms
 
 
-# Values that change while functions are traced, such as a list in which they count
-# their calls, are ignored: otherwise the functions would be traced anew for ever. Their
-# places are kept with the objects that own them, so that the identities of these are
-# not reused.
-_unsteady: dict[Place, object] = {}
-# The key that a program was traced with, found by what that key had become at the end
-# of tracing.
-_earlier: dict[_Key, _Key] = {}
+# Values that change during tracing, such as a list in which a function counts its
+# calls, are ignored: otherwise the function would be traced again forever. The
+# dictionary maps their places to the owners, so that the identities of these are not
+# reused.
+_changed_by_tracing: dict[Place, object] = {}
+# The key with which a program was traced, by the key as it was after tracing.
+_key_before_tracing: dict[_Key, _Key] = {}
 
 
 def tracked_jit(*tracked: str) -> Callable[[Callable[..., T]], Callable[..., T]]:
-    """Compile like `equinox.filter_jit`, and trace anew if what functions read changes.
+    """Compile like `equinox.filter_jit`; trace again if values that functions read
+    change.
 
-    It makes a decorator for a function that is called with positional arguments.
+    It returns a decorator for a function that is called with positional arguments.
 
     **Arguments:**
 
@@ -483,13 +481,13 @@ def tracked_jit(*tracked: str) -> Callable[[Callable[..., T]], Callable[..., T]]
         @wraps(function)
         def call(*args: Any) -> T:
             functions = [args[position] for position in which]
-            before = captured(functions, _unsteady)
+            before = captured(functions, _changed_by_tracing)
             key = _key(before)
-            key = _earlier.get(key, key)
+            key = _key_before_tracing.get(key, key)
             out = compiled(key, *args)
             if key.is_traced:
                 key.is_traced = False
-                _learn(key, before, functions)
+                _remember_changes(key, before, functions)
             return out
 
         return call
@@ -501,25 +499,25 @@ def _key(entries: list[Entry]) -> _Key:
     return _Key(tuple(entry.key for entry in entries))
 
 
-def _learn(key: _Key, before: list[Entry], functions: Any) -> None:
-    """Remember what tracing changed, so that the program is found again afterwards.
+def _remember_changes(key: _Key, before: list[Entry], functions: Any) -> None:
+    """Remember what tracing changed, so that the program is found at the next call.
 
-    The changed places are ignored from now on, and the key as it is after tracing
-    stands for the one as it was before.
+    From now on the changed places are ignored, and the key as it is after tracing leads
+    to the key as it was before.
     """
-    after = captured(functions, _unsteady)
+    after = captured(functions, _changed_by_tracing)
     changed = _changed(before, after)
     if not changed:
         return
-    for memory in (_unsteady, _earlier):
+    for memory in (_changed_by_tracing, _key_before_tracing):
         if len(memory) > _MOST:
             memory.clear()
-    _unsteady.update(changed)
-    _earlier[_key(captured(functions, _unsteady))] = key
+    _changed_by_tracing.update(changed)
+    _key_before_tracing[_key(captured(functions, _changed_by_tracing))] = key
 
 
 def _changed(before: list[Entry], after: list[Entry]) -> dict[Place, object]:
-    """Find the places at which two lists of entries differ, with their owners."""
+    """Find the places where two lists of entries differ, with their owners."""
     atoms = [{entry.place: entry for entry in entries} for entries in (before, after)]
     changed = {}
     for one, other in (atoms, atoms[::-1]):
@@ -528,7 +526,7 @@ def _changed(before: list[Entry], after: list[Entry]) -> dict[Place, object]:
             if isinstance(entry.content, Unrepeatable):
                 continue
             if there is None and isinstance(entry.owner, list | set | deque):
-                # The container grows, so that its next element would be new again.
+                # The container grows, so that its next element would again be new.
                 place = all_of(entry.owner)
             if there is None or there.content != entry.content:
                 changed[place] = entry.owner

@@ -1,10 +1,9 @@
-"""Operations that move numbers to places that are known beforehand.
+"""JAX's operations on arrays: shapes, indexing, gathers and scatters, reductions.
 
-Slices that start at indices which may be unknown until the program runs.
-
-Reading and storing at many places at once: `gather` and the kinds of `scatter`.
-
-Operations that combine many numbers into one: reductions, sums, products.
+Each operation takes the builder, the equation and the arrays of its operands, and
+returns arrays. Where the indices are known, numbers are moved while the graph is built,
+at no cost at run time. Where an index is not known, the array goes to memory, and the
+operation becomes loads and stores.
 """
 
 import math
@@ -15,50 +14,60 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from ._builder import Builder, InMemory, LARGE, MOST_NUMBERS, Operation, places, Value
+from ._builder import (
+    ArrayValue,
+    Builder,
+    flat_indices,
+    InMemory,
+    MOST_IN_REGISTERS,
+    MOST_ONE_BY_ONE,
+    Operation,
+)
 from ._graph import dtype_name, is_float, Node, Unsupported
 
 
-# What moves the elements of an array of NumPy, and results in a view.
+# A function that rearranges a NumPy array, and returns a view.
 _Move = Callable[[np.ndarray], np.ndarray]
 
 
-def moved(builder: Builder, value: Value, move: _Move) -> Value:
-    """Move the numbers of an array, in memory or not, like those of NumPy's."""
+def rearranged(builder: Builder, value: ArrayValue, move: _Move) -> ArrayValue:
+    """Rearrange the numbers of an array, in memory or not, as a NumPy function does."""
     if not isinstance(value, InMemory):
         return move(value)
     memory = builder.memory
-    view = move(places(value.shape))
-    if view.size <= LARGE:
+    view = move(flat_indices(value.shape))
+    if view.size <= MOST_IN_REGISTERS:
         out = np.empty(view.size, object)
         for index, place in enumerate(view.flat):
             out[index] = memory.load(value.buffer, None, int(place))
         return out.reshape(view.shape)
     target = memory.new(value.dtype, view.size)
-    memory.move(target, places(view.shape), value.buffer, view)
+    memory.move(target, flat_indices(view.shape), value.buffer, view)
     return InMemory(target, view.shape)
 
 
 def _moving(
     move: Callable[..., np.ndarray], builder: Builder, equation: Any, values: list
-) -> Value:
+) -> ArrayValue:
     aval = equation.outvars[0].aval
-    return moved(builder, values[0], partial(move, equation.params, aval.shape))
+    return rearranged(builder, values[0], partial(move, equation.params, aval.shape))
 
 
-def _reshape(builder: Builder, equation: Any, values: list[Value]) -> Value:
+def _reshape(builder: Builder, equation: Any, values: list[ArrayValue]) -> ArrayValue:
     is_reshape = equation.primitive.name == "reshape"
     if is_reshape and equation.params["dimensions"] is not None:
         raise Unsupported("a reshape in another order")
     return values[0].reshape(equation.outvars[0].aval.shape)
 
 
-def _broadcast_in_dim(builder: Builder, equation: Any, values: list[Value]) -> Value:
+def _broadcast_in_dim(
+    builder: Builder, equation: Any, values: list[ArrayValue]
+) -> ArrayValue:
     shape, value = equation.outvars[0].aval.shape, values[0]
     if not isinstance(value, InMemory) and value.size == 1:
         node = value.reshape(-1)[0]
         if node.op == "const" and node.attr == 0 and not np.signbit(float(node.attr)):
-            # So JAX makes tangents that are zero.
+            # JAX writes tangents that are zero in this way.
             node = builder.graph.zero(node.dtype)
         return builder.full(shape, node)
     if isinstance(value, InMemory) and math.prod(shape) == value.size:
@@ -71,7 +80,7 @@ def _broadcast_in_dim(builder: Builder, equation: Any, values: list[Value]) -> V
             inner[dimension] = length
         return np.broadcast_to(x.reshape(inner), shape)
 
-    return moved(builder, value, move)
+    return rearranged(builder, value, move)
 
 
 def _transpose(params: Any, shape: tuple[int, ...], x: np.ndarray) -> np.ndarray:
@@ -88,28 +97,35 @@ def _slice(params: Any, shape: tuple[int, ...], x: np.ndarray) -> np.ndarray:
     return x[tuple(map(slice, starts, limits, strides))]
 
 
-def _split(builder: Builder, equation: Any, values: list[Value]) -> list[Value]:
+def _split(
+    builder: Builder, equation: Any, values: list[ArrayValue]
+) -> list[ArrayValue]:
     axis, start, out = equation.params["axis"], 0, []
     for size in equation.params["sizes"]:
         part = (slice(None),) * axis + (slice(start, start + int(size)),)
-        out.append(moved(builder, values[0], lambda x, part=part: x[part]))
+        out.append(rearranged(builder, values[0], lambda x, part=part: x[part]))
         start += int(size)
     return out
 
 
-def _unstack(builder: Builder, equation: Any, values: list[Value]) -> list[Value]:
+def _unstack(
+    builder: Builder, equation: Any, values: list[ArrayValue]
+) -> list[ArrayValue]:
     axis = equation.params["axis"]
     rows = range(values[0].shape[axis])
 
-    def row(index: int) -> Value:
-        # A slice, since an index into an array of one axis would be no view.
+    def row(index: int) -> ArrayValue:
+        # A slice is used, because an index into an array of one axis would not be a
+        # view.
         part = (slice(None),) * axis + (slice(index, index + 1),)
-        return moved(builder, values[0], lambda x: x[part].squeeze(axis))
+        return rearranged(builder, values[0], lambda x: x[part].squeeze(axis))
 
     return [row(index) for index in rows]
 
 
-def _concatenate(builder: Builder, equation: Any, values: list[Value]) -> Value:
+def _concatenate(
+    builder: Builder, equation: Any, values: list[ArrayValue]
+) -> ArrayValue:
     axis, shape = equation.params["dimension"], equation.outvars[0].aval.shape
     starts = np.cumsum([0, *[value.shape[axis] for value in values]])
     parts = [
@@ -119,7 +135,7 @@ def _concatenate(builder: Builder, equation: Any, values: list[Value]) -> Value:
     return _assembled(builder, shape, parts, values)
 
 
-def _stack(builder: Builder, equation: Any, values: list[Value]) -> Value:
+def _stack(builder: Builder, equation: Any, values: list[ArrayValue]) -> ArrayValue:
     axis, shape = equation.params["axis"], equation.outvars[0].aval.shape
     parts = [
         (slice(None),) * axis + (slice(index, index + 1),)
@@ -130,16 +146,18 @@ def _stack(builder: Builder, equation: Any, values: list[Value]) -> Value:
 
 
 def _assembled(
-    builder: Builder, shape: tuple[int, ...], parts: list, values: list[Value]
-) -> Value:
+    builder: Builder, shape: tuple[int, ...], parts: list, values: list[ArrayValue]
+) -> ArrayValue:
     size = math.prod(shape)
-    if size > LARGE and any(isinstance(value, InMemory) for value in values):
+    if size > MOST_IN_REGISTERS and any(
+        isinstance(value, InMemory) for value in values
+    ):
         memory = builder.memory
         dtype = next(value.dtype for value in values if isinstance(value, InMemory))
         target = memory.new(dtype, size)
         for part, value in zip(parts, values, strict=True):
             if value.size:
-                memory.write(target, places(shape)[part], value)
+                memory.write(target, flat_indices(shape)[part], value)
         return InMemory(target, shape)
     out = np.empty(shape, object)
     for part, value in zip(parts, values, strict=True):
@@ -147,7 +165,7 @@ def _assembled(
     return out
 
 
-def _pad(builder: Builder, equation: Any, values: list[Value]) -> Value:
+def _pad(builder: Builder, equation: Any, values: list[ArrayValue]) -> ArrayValue:
     value, padding = values
     shape = equation.outvars[0].aval.shape
     node = builder.memory.registers(padding).reshape(-1)[0]
@@ -159,7 +177,8 @@ def _pad(builder: Builder, equation: Any, values: list[Value]) -> Value:
     ):
         low, _, interior = map(int, config)
         step = interior + 1
-        # Negative padding cuts off; these are the first and last indices that stay.
+        # Negative padding removes numbers; these are the first and last indices that
+        # stay.
         first = max(0, -(low // step))
         last = min(length, (most - 1 - low) // step + 1)
         inner.append(slice(first, max(first, last)))
@@ -167,12 +186,12 @@ def _pad(builder: Builder, equation: Any, values: list[Value]) -> Value:
         outer.append(slice(start, start + max(last - first, 0) * step, step))
     if any(part.start == part.stop for part in inner):
         return builder.full(shape, node)
-    part = moved(builder, value, lambda x: x[tuple(inner)])
+    part = rearranged(builder, value, lambda x: x[tuple(inner)])
     if isinstance(part, InMemory):
         memory = builder.memory
         target = memory.new(part.dtype, math.prod(shape))
-        memory.write(target, places(shape), builder.full(shape, node))
-        memory.write(target, places(shape)[tuple(outer)], part)
+        memory.write(target, flat_indices(shape), builder.full(shape, node))
+        memory.write(target, flat_indices(shape)[tuple(outer)], part)
         return InMemory(target, shape)
     out = np.empty(shape, object)
     out[...] = node
@@ -180,12 +199,12 @@ def _pad(builder: Builder, equation: Any, values: list[Value]) -> Value:
     return out
 
 
-def _tile(builder: Builder, equation: Any, values: list[Value]) -> Value:
+def _tile(builder: Builder, equation: Any, values: list[ArrayValue]) -> ArrayValue:
     inner, outer = [], []
     for count, length in zip(equation.params["reps"], values[0].shape, strict=True):
         inner += [1, length]
         outer += [int(count), length]
-    tiled = moved(
+    tiled = rearranged(
         builder, values[0], lambda x: np.broadcast_to(x.reshape(inner), outer)
     )
     return tiled.reshape(equation.outvars[0].aval.shape)
@@ -208,12 +227,12 @@ SHAPING: dict[str, Operation] = {
 }
 
 
-# No array is so long.
+# No array is that long.
 _FAR = 2**62
 
 
 def as_index(builder: Builder, node: Node) -> Node:
-    """Convert an index to a signed one of 64 bits."""
+    """Convert an index to int64."""
     if node.dtype == "uint64":
         far = builder.graph.constant(_FAR, "uint64")
         node = builder.graph.op("min", node, far)
@@ -223,7 +242,7 @@ def as_index(builder: Builder, node: Node) -> Node:
 def place_in_memory(
     builder: Builder, shape: Sequence[int], starts: Sequence[Node | int]
 ) -> Node:
-    """Find the place in memory of the element with the given index on each axis."""
+    """Return the index in memory of the element with the given index on each axis."""
     total = builder.integer(0)
     for axis, start in enumerate(starts):
         stride = math.prod(shape[axis + 1 :])
@@ -235,7 +254,10 @@ def place_in_memory(
 
 
 def _starts(
-    builder: Builder, shape: Sequence[int], sizes: Sequence[int], starts: list[Value]
+    builder: Builder,
+    shape: Sequence[int],
+    sizes: Sequence[int],
+    starts: list[ArrayValue],
 ) -> list[Node]:
     """Clamp the starts of a window so that it lies in the array."""
     out = []
@@ -252,43 +274,45 @@ def _window(start: Sequence[Node], sizes: Sequence[int]) -> tuple[slice, ...]:
     )
 
 
-def _dynamic_slice(builder: Builder, equation: Any, values: list[Value]) -> Value:
+def _dynamic_slice(
+    builder: Builder, equation: Any, values: list[ArrayValue]
+) -> ArrayValue:
     value, *starts = values
     sizes = equation.params["slice_sizes"]
     if math.prod(sizes) == 0:
         return np.empty(sizes, object)
     starts = _starts(builder, value.shape, sizes, starts)
     if all(start.is_constant for start in starts):
-        return moved(builder, value, lambda x: x[_window(starts, sizes)])
+        return rearranged(builder, value, lambda x: x[_window(starts, sizes)])
     memory, source = builder.memory, builder.memory.in_memory(value)
-    view = places(value.shape)[tuple(map(slice, sizes))]
+    view = flat_indices(value.shape)[tuple(map(slice, sizes))]
     shift = place_in_memory(builder, value.shape, starts)
-    if view.size <= LARGE:
+    if view.size <= MOST_IN_REGISTERS:
         out = np.empty(view.size, object)
         for index, place in enumerate(view.flat):
             out[index] = memory.load(source.buffer, shift, int(place))
         return out.reshape(sizes)
     target = memory.new(source.dtype, view.size)
-    everywhere = places(sizes)
+    everywhere = flat_indices(sizes)
     memory.move(target, everywhere, source.buffer, view, source_shift=shift)
     return InMemory(target, sizes)
 
 
 def _dynamic_update_slice(
-    builder: Builder, equation: Any, values: list[Value]
-) -> Value:
+    builder: Builder, equation: Any, values: list[ArrayValue]
+) -> ArrayValue:
     value, update, *starts = values
     if update.size == 0:
         return value
     starts = _starts(builder, value.shape, update.shape, starts)
     is_known = all(start.is_constant for start in starts)
-    if is_known and not isinstance(value, InMemory) and value.size <= MOST_NUMBERS:
+    if is_known and not isinstance(value, InMemory) and value.size <= MOST_ONE_BY_ONE:
         out = value.copy()
         window = _window(starts, update.shape)
         out[window] = builder.memory.registers(update)
         return out
     target = builder.memory.owned(value)
-    view = places(value.shape)[tuple(map(slice, update.shape))]
+    view = flat_indices(value.shape)[tuple(map(slice, update.shape))]
     shift = place_in_memory(builder, value.shape, starts)
     builder.memory.write(target.buffer, view, update, shift)
     return target
@@ -304,10 +328,10 @@ _Mode = jax.lax.GatherScatterMode
 
 
 class _Axes(NamedTuple):
-    """The axes of an array on which its windows start at places of their own.
+    """The axes of an array on which a window starts at a variable index.
 
-    - `indexed`: those whose starts are the entries of an index.
-    - `batched`: those that go along with the axes `sources` of the array of indices.
+    - `indexed`: the axes whose starts are the entries of an index.
+    - `batched`: the axes that go along with the axes `sources` of the array of indices.
     """
 
     indexed: Sequence[int]
@@ -323,10 +347,10 @@ def _located(
     place: tuple[int, ...],
     axes: _Axes,
 ) -> tuple[Node, Node]:
-    """Find where a window starts in memory, and whether it lies in the array.
+    """Return where a window starts in memory, and whether it lies in the array.
 
-    Its index stands at `place` in the array of indices. If the window lies outside, the
-    start is that of the nearest one inside.
+    Its index is at `place` in the array of indices. The start of a window outside the
+    array is clamped.
     """
     graph = builder.graph
     starts: list[Node | int] = [0] * len(shape)
@@ -349,18 +373,18 @@ def _mode(equation: Any) -> _Mode:
     return mode
 
 
-def _gather(builder: Builder, equation: Any, values: list[Value]) -> Value:
+def _gather(builder: Builder, equation: Any, values: list[ArrayValue]) -> ArrayValue:
     value, indices = values
     numbers, sizes = (
         equation.params["dimension_numbers"],
         equation.params["slice_sizes"],
     )
     aval, is_filled = equation.outvars[0].aval, _mode(equation) is _Mode.FILL_OR_DROP
-    if math.prod(aval.shape) > MOST_NUMBERS or value.size == 0:
+    if math.prod(aval.shape) > MOST_ONE_BY_ONE or value.size == 0:
         raise Unsupported("a gather of this size")
     indices = builder.memory.registers(indices)
     left_out = (*numbers.collapsed_slice_dims, *numbers.operand_batching_dims)
-    window = places(value.shape)[tuple(map(slice, sizes))]
+    window = flat_indices(value.shape)[tuple(map(slice, sizes))]
     window = window.reshape([s for d, s in enumerate(sizes) if d not in left_out])
     batch = indices.shape[:-1]
     fill = _fill(builder, equation, value)
@@ -381,15 +405,15 @@ def _gather(builder: Builder, equation: Any, values: list[Value]) -> Value:
     return np.moveaxis(out, inner_axes, list(numbers.offset_dims))
 
 
-def _number(builder: Builder, value: Value, shift: Node, offset: int) -> Node:
+def _number(builder: Builder, value: ArrayValue, shift: Node, offset: int) -> Node:
     if shift.is_constant and not isinstance(value, InMemory):
         return value.reshape(-1)[int(shift.attr) + offset]
     buffer = builder.memory.in_memory(value).buffer
     return builder.memory.load(buffer, shift, offset)
 
 
-def _fill(builder: Builder, equation: Any, value: Value) -> Node:
-    """Make what a gather reads outside of the array."""
+def _fill(builder: Builder, equation: Any, value: ArrayValue) -> Node:
+    """Return the number that a gather reads outside of the array."""
     dtype = equation.outvars[0].aval.dtype.name
     fill = equation.params["fill_value"]
     if fill is None:
@@ -404,8 +428,8 @@ def _fill(builder: Builder, equation: Any, value: Value) -> Node:
 
 
 def _scatter(
-    op: str | None, builder: Builder, equation: Any, values: list[Value]
-) -> Value:
+    op: str | None, builder: Builder, equation: Any, values: list[ArrayValue]
+) -> ArrayValue:
     value, indices, updates = values
     numbers, is_clipped = (
         equation.params["dimension_numbers"],
@@ -413,7 +437,7 @@ def _scatter(
     )
     if updates.size == 0 or value.size == 0:
         return value
-    if updates.size > MOST_NUMBERS:
+    if updates.size > MOST_ONE_BY_ONE:
         raise Unsupported("a scatter of this size")
     indices, updates = map(builder.memory.registers, (indices, updates))
     batch = indices.shape[:-1]
@@ -423,7 +447,7 @@ def _scatter(
     sizes, inner_sizes = [], iter(updates.shape[len(batch) :])
     for axis in range(len(value.shape)):
         sizes.append(1 if axis in left_out else next(inner_sizes))
-    window = places(value.shape)[tuple(map(slice, sizes))]
+    window = flat_indices(value.shape)[tuple(map(slice, sizes))]
     window = window.reshape(updates.shape[len(batch) :])
     located = {}
     axes = _Axes(
@@ -450,10 +474,10 @@ def _scatter(
 def _combined(
     builder: Builder, equation: Any, op: str | None, old: Node, new: Node
 ) -> Node:
-    """Combine the number in an array with its update, as a scatter stores it."""
+    """Combine a number of the array with its update."""
     if op is not None:
         return builder.graph.op(op, old, new)
-    # `x.at[index].apply(function)` is a scatter whose numbers come from a program.
+    # `x.at[index].apply(function)` is a scatter that combines numbers by a program.
     jaxpr = equation.params["update_jaxpr"]
     if jaxpr is None:
         return new
@@ -463,9 +487,9 @@ def _combined(
 
 
 def _target(
-    builder: Builder, value: Value, shifts: list[Node]
-) -> tuple[Callable[..., Any], Callable[..., None], Value]:
-    """Make functions that read and write an array, and the array when they are done."""
+    builder: Builder, value: ArrayValue, shifts: list[Node]
+) -> tuple[Callable[..., Any], Callable[..., None], ArrayValue]:
+    """Return functions that read and write an array, and the array after the writes."""
     if not isinstance(value, InMemory) and all(shift.is_constant for shift in shifts):
         out = value.copy()
         flat = out.reshape(-1)
@@ -515,7 +539,7 @@ def _extreme(dtype: str, sign: int) -> Any:
     return np.iinfo(dtype).max if sign > 0 else np.iinfo(dtype).min
 
 
-# The operation, and what it makes of no numbers at all.
+# The operation, and the result for an empty array.
 _REDUCTIONS = {
     "reduce_sum": ("add", lambda dtype: 0),
     "reduce_prod": ("mul", lambda dtype: 1),
@@ -528,7 +552,7 @@ _REDUCTIONS = {
 
 
 def _rows(x: np.ndarray, axes: Sequence[int]) -> tuple[tuple[int, ...], np.ndarray]:
-    """Bring the axes to the end, and make them one."""
+    """Move the axes to the end, and flatten them to one."""
     kept = [axis for axis in range(x.ndim) if axis not in axes]
     shape = tuple(x.shape[axis] for axis in kept)
     length = math.prod(x.shape[axis] for axis in axes)
@@ -536,7 +560,7 @@ def _rows(x: np.ndarray, axes: Sequence[int]) -> tuple[tuple[int, ...], np.ndarr
     return shape, x.reshape(math.prod(shape), length)
 
 
-def _reduce(builder: Builder, equation: Any, values: list[Value]) -> Value:
+def _reduce(builder: Builder, equation: Any, values: list[ArrayValue]) -> ArrayValue:
     op, empty = _REDUCTIONS[equation.primitive.name]
     dtype = dtype_name(equation.outvars[0].aval.dtype)
     x = builder.memory.registers(values[0])
@@ -558,8 +582,10 @@ def _folded(builder: Builder, op: str, numbers: Iterable[Node]) -> Node | None:
     return total
 
 
-def _arg(op: str, builder: Builder, equation: Any, values: list[Value]) -> Value:
-    """Find the index of the first NaN, or else of the first extremum."""
+def _arg(
+    op: str, builder: Builder, equation: Any, values: list[ArrayValue]
+) -> ArrayValue:
+    """Return the index of the first NaN, or of the first extremum without NaN."""
     graph = builder.graph
     dtype = dtype_name(equation.params["index_dtype"])
     x = builder.memory.registers(values[0])
@@ -580,7 +606,7 @@ def _arg(op: str, builder: Builder, equation: Any, values: list[Value]) -> Value
     return out.reshape(shape)
 
 
-def _cumulative(op: str, builder: Builder, equation: Any, values: list) -> Value:
+def _cumulative(op: str, builder: Builder, equation: Any, values: list) -> ArrayValue:
     axis, is_reversed = equation.params["axis"], equation.params["reverse"]
     x = builder.memory.registers(values[0])
     out = np.moveaxis(x, axis, 0).copy()
@@ -595,13 +621,15 @@ def _cumulative(op: str, builder: Builder, equation: Any, values: list) -> Value
     return np.moveaxis(out, 0, axis)
 
 
-def _dot_general(builder: Builder, equation: Any, values: list[Value]) -> Value:
+def _dot_general(
+    builder: Builder, equation: Any, values: list[ArrayValue]
+) -> ArrayValue:
     (left, right), (left_batch, right_batch) = equation.params["dimension_numbers"]
     graph, aval = builder.graph, equation.outvars[0].aval
     dtype = dtype_name(aval.dtype)
     a, b = map(builder.memory.registers, values)
     summed = math.prod(a.shape[axis] for axis in left)
-    if math.prod(aval.shape) * max(summed, 1) > 16 * MOST_NUMBERS:
+    if math.prod(aval.shape) * max(summed, 1) > 16 * MOST_ONE_BY_ONE:
         raise Unsupported("a large product of matrices")
     a = _arranged(a, left_batch, left)
     b = _arranged(b, right_batch, right)
@@ -617,7 +645,7 @@ def _dot_general(builder: Builder, equation: Any, values: list[Value]) -> Value:
 
 
 def _arranged(x: np.ndarray, batch: Sequence[int], summed: Sequence[int]) -> np.ndarray:
-    """Bring an operand into the shape (batch, free, summed)."""
+    """Transpose and reshape an operand to (batch, free, summed)."""
     free = [axis for axis in range(x.ndim) if axis not in (*batch, *summed)]
     sizes = [
         math.prod(x.shape[axis] for axis in axes) for axes in (batch, free, summed)
@@ -625,7 +653,9 @@ def _arranged(x: np.ndarray, batch: Sequence[int], summed: Sequence[int]) -> np.
     return x.transpose([*batch, *free, *summed]).reshape(sizes)
 
 
-def _small_product(builder: Builder, equation: Any, values: list[Value]) -> Value:
+def _small_product(
+    builder: Builder, equation: Any, values: list[ArrayValue]
+) -> ArrayValue:
     first, second, result = (equation.params[k] for k in ("first", "second", "result"))
     graph, aval = builder.graph, equation.outvars[0].aval
     a, b = map(builder.memory.registers, values)

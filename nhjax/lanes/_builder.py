@@ -1,9 +1,13 @@
-"""Arrays in memory: large ones, and those with an index that is not known.
+"""From a jaxpr to the graph: equation by equation, including inner programs.
 
-Loads and stores are statements, in the order of the program. A store goes into an array
-that nobody else uses: who wants to store into an array that is held gets a copy.
+An array is either in registers, as a NumPy array of nodes, or in memory. Large arrays
+are in memory, and so are arrays that are read or updated at an index that is not known.
+`Builder.run` interprets a jaxpr: for each equation it calls the operation that
+`_elementwise`, `_arrays` or `_control_flow` provides for the primitive.
 
-From a jaxpr to the graph: equations one after the other, inner programs included.
+Loads and stores are statements in the order of the program. A store needs an array that
+nothing else uses: `hold` and `release` count the users, and an array with other users
+is copied first.
 """
 
 import math
@@ -14,15 +18,15 @@ from typing import Any, TypeAlias
 import numpy as np
 from jax.extend.core import DropVar, Literal
 
-from ._graph import Buffer, counted, dtype_name, Graph, Node, Unsupported
+from ._graph import Buffer, counted_loop, dtype_name, Graph, Node, Unsupported
 
 
-# An array of nodes: each number has a name of its own.
+# An array in registers: a node for each number.
 Registers: TypeAlias = np.ndarray[Any, Any]
 
 
 class InMemory:
-    """An array that is the whole of a buffer, in row-major order."""
+    """An array that fills a buffer, in row-major order."""
 
     __slots__ = ("buffer", "shape")
 
@@ -44,27 +48,27 @@ class InMemory:
         return InMemory(self.buffer, shape)
 
 
-Value: TypeAlias = Registers | InMemory
+ArrayValue: TypeAlias = Registers | InMemory
 
 
-def hold(value: Value) -> None:
+def hold(value: ArrayValue) -> None:
     """Keep an array in memory from being overwritten."""
     if isinstance(value, InMemory):
         value.buffer.holders += 1
 
 
-def release(value: Value) -> None:
-    """Allow a piece of memory that `hold` has kept to be used again."""
+def release(value: ArrayValue) -> None:
+    """Undo `hold`."""
     if isinstance(value, InMemory):
         value.buffer.holders -= 1
 
 
-# Arrays of more numbers than this live in memory where there is a choice.
-LARGE = 128
-# At most so many numbers are loaded, stored or computed one by one.
-MOST_NUMBERS = 4096
-# Copies of more numbers than this become loops.
-_UNROLLED = 16
+# Larger arrays are kept in memory where there is a choice.
+MOST_IN_REGISTERS = 128
+# At most this many numbers are loaded, stored or computed one by one.
+MOST_ONE_BY_ONE = 4096
+# Longer copies become loops.
+_LONGEST_UNROLLED = 16
 
 
 class Memory:
@@ -74,7 +78,7 @@ class Memory:
         self.graph = graph
 
     def new(self, dtype: str, size: int) -> Buffer:
-        """Make scratch memory, whose contents are not defined."""
+        """Allocate scratch memory, whose contents are undefined."""
         return Buffer("scratch", dtype, size, self.graph.region, None)
 
     def load(self, buffer: Buffer, index: Node | None, offset: int = 0) -> Node:
@@ -104,23 +108,27 @@ class Memory:
         buffer.version += 1
 
     def write(
-        self, buffer: Buffer, view: np.ndarray, value: Value, shift: Node | None = None
+        self,
+        buffer: Buffer,
+        view: np.ndarray,
+        value: ArrayValue,
+        shift: Node | None = None,
     ) -> None:
-        """Store an array at the places that `view` lists, all moved by `shift`.
+        """Store an array at the indices in `view`, all shifted by `shift`.
 
-        The view is one of `places`, so that it is affine in its indices.
+        The view is a slice of `flat_indices`, so that it is affine in its indices.
         """
         if isinstance(value, InMemory):
-            self.move(buffer, view, value.buffer, places(value.shape), shift)
+            self.move(buffer, view, value.buffer, flat_indices(value.shape), shift)
             return
         flat = value.reshape(-1)
-        if flat.size > _UNROLLED and all(node is flat[0] for node in flat):
+        if flat.size > _LONGEST_UNROLLED and all(node is flat[0] for node in flat):
 
             def fill(k: Node) -> None:
                 index = self._sum(self.position(view, k), shift)
                 self.store(buffer, flat[0], index)
 
-            counted(self.graph, flat.size, fill)
+            counted_loop(self.graph, flat.size, fill)
             return
         _bound(flat.size)
         for node, place in zip(flat, view.reshape(-1), strict=True):
@@ -135,8 +143,8 @@ class Memory:
         target_shift: Node | None = None,
         source_shift: Node | None = None,
     ) -> None:
-        """Copy numbers from some places of a buffer to some of another one."""
-        if target_view.size <= _UNROLLED:
+        """Copy numbers from some indices of a buffer to some indices of another."""
+        if target_view.size <= _LONGEST_UNROLLED:
             numbers = [
                 self.load(source, source_shift, int(i)) for i in source_view.flat
             ]
@@ -150,10 +158,10 @@ class Memory:
             place = self._sum(self.position(target_view, k), target_shift)
             self.store(target, number, place)
 
-        counted(self.graph, target_view.size, body)
+        counted_loop(self.graph, target_view.size, body)
 
     def position(self, view: np.ndarray, k: Node) -> Node:
-        """Find the place of the number `k` of a view, in its row-major order."""
+        """Return the index in memory of element `k` of a view, in row-major order."""
         graph, total = self.graph, None
         first = int(view.flat[0])
         if np.array_equal(view.reshape(-1), first + np.arange(view.size)):
@@ -175,12 +183,12 @@ class Memory:
     ) -> InMemory:
         """Compute a large array element by element in a loop."""
         buffer = self.new(dtype, math.prod(shape))
-        counted(
+        counted_loop(
             self.graph, buffer.size, lambda k: self.store(buffer, element(k), index=k)
         )
         return InMemory(buffer, shape)
 
-    def registers(self, value: Value) -> Registers:
+    def registers(self, value: ArrayValue) -> Registers:
         """Load an array, if it is in memory."""
         if not isinstance(value, InMemory):
             return value
@@ -190,10 +198,10 @@ class Memory:
             out[place] = self.load(value.buffer, None, place)
         return out.reshape(value.shape)
 
-    def in_memory(self, value: Value) -> InMemory:
-        """Put an array into memory, where nothing is stored into it afterwards.
+    def in_memory(self, value: ArrayValue) -> InMemory:
+        """Put an array into memory that is not changed afterwards.
 
-        This happens where its last number becomes known, outside of loops in which it
+        It is stored where its last number becomes known, outside of loops in which it
         is read.
         """
         if isinstance(value, InMemory):
@@ -212,14 +220,14 @@ class Memory:
             else:
                 here, graph.region = graph.region, home
                 buffer = self.new(flat[0].dtype, flat.size)
-                self.write(buffer, places(flat.shape), flat)
+                self.write(buffer, flat_indices(flat.shape), flat)
                 buffer.is_fixed = True
                 graph.region = here
                 home.spills[key] = buffer
         return InMemory(home.spills[key], value.shape)
 
-    def owned(self, value: Value) -> InMemory:
-        """Put an array into memory that is free to be overwritten."""
+    def owned(self, value: ArrayValue) -> InMemory:
+        """Put an array into memory that may be overwritten."""
         if isinstance(value, InMemory):
             buffer = value.buffer
             if not buffer.is_fixed and buffer.holders == 0:
@@ -228,23 +236,23 @@ class Memory:
         else:
             dtype = value.reshape(-1)[0].dtype
         target = self.new(dtype, value.size)
-        self.write(target, places(value.shape), value)
+        self.write(target, flat_indices(value.shape), value)
         return InMemory(target, value.shape)
 
 
-def places(shape: tuple[int, ...]) -> np.ndarray:
-    """Number the elements of an array in memory."""
+def flat_indices(shape: tuple[int, ...]) -> np.ndarray:
+    """Return the indices in memory of the elements of an array."""
     return np.arange(math.prod(shape)).reshape(shape)
 
 
 def constant(graph: Graph, values: np.ndarray) -> Buffer:
-    """Make memory of known contents."""
+    """Create memory with known contents."""
     flat = np.ascontiguousarray(values).reshape(-1)
     return Buffer("constant", flat.dtype.name, flat.size, graph.root, flat)
 
 
 def _split(index: Node | None, offset: int) -> tuple[Node | None, int]:
-    """Move the known part of an index to the offset."""
+    """Move the constant part of an index to the offset."""
     while index is not None:
         if index.is_constant:
             return None, offset + int(index.attr)
@@ -259,7 +267,9 @@ def _split(index: Node | None, offset: int) -> tuple[Node | None, int]:
 
 
 def _origin(flat: np.ndarray) -> Buffer | None:
-    """Find the fixed memory that has just been loaded number by number."""
+    """Return the unchanged memory from which these numbers were loaded, if there is
+    one.
+    """
     first = flat[0]
     if first.op != "load" or first.args or not first.attr[0].is_fixed:
         return None
@@ -273,17 +283,17 @@ def _origin(flat: np.ndarray) -> Buffer | None:
 
 
 def _bound(size: int) -> None:
-    if size > MOST_NUMBERS:
+    if size > MOST_ONE_BY_ONE:
         raise Unsupported(f"{size} numbers one by one")
 
 
-# What makes the results of an equation: one array, or several if the primitive has
-# several results.
-Operation: TypeAlias = Callable[["Builder", Any, list[Value]], Any]
+# A function that computes the results of an equation: one array, or a list of arrays if
+# the primitive has multiple results.
+Operation: TypeAlias = Callable[["Builder", Any, list[ArrayValue]], Any]
 
 
 class Builder:
-    """The graph of a program while it is made.
+    """The graph of a program while it is built.
 
     `unroll` is the length up to which a scan is unrolled.
     """
@@ -292,25 +302,25 @@ class Builder:
         self.graph = Graph()
         self.memory = Memory(self.graph)
         self.operations, self.unroll = operations, unroll
-        # The equations around the present one, which name it.
+        # The enclosing equations, which identify the current one.
         self.path: list[int] = []
-        # For each loop, by its path, the numbers that are known not to be constant.
+        # For each loop, by its path, the numbers that are known to change.
         self.changing: dict[tuple[int, ...], set[int]] = {}
         self._last_uses: dict[int, tuple[Any, list[list[Any]]]] = {}
 
     def run(
-        self, jaxpr: Any, consts: Sequence[Any], args: Sequence[Value]
-    ) -> list[Value]:
+        self, jaxpr: Any, consts: Sequence[Any], args: Sequence[ArrayValue]
+    ) -> list[ArrayValue]:
         """Compute the results of a jaxpr."""
         if jaxpr.effects:
             raise Unsupported(f"effects: {', '.join(map(str, jaxpr.effects))}")
-        env: dict[Any, Value] = {}
+        env: dict[Any, ArrayValue] = {}
 
-        def bind(variable: Any, value: Value) -> None:
+        def bind(variable: Any, value: ArrayValue) -> None:
             hold(value)
             env[variable] = value
 
-        def read(variable: Any) -> Value:
+        def read(variable: Any) -> ArrayValue:
             if isinstance(variable, Literal):
                 aval: Any = variable.aval
                 return self.array(variable.val, dtype_name(aval.dtype))
@@ -322,7 +332,7 @@ class Builder:
             bind(variable, value)
         for equation, last in zip(jaxpr.eqns, self.last_uses(jaxpr), strict=True):
             values = [read(variable) for variable in equation.invars]
-            # What nobody else holds may be overwritten by the equation.
+            # An array that nothing else uses may be overwritten by the equation.
             for variable in last:
                 release(env.pop(variable))
             self.path.append(id(equation))
@@ -338,7 +348,7 @@ class Builder:
             release(value)
         return outs
 
-    def equation(self, equation: Any, values: list[Value]) -> list[Value]:
+    def equation(self, equation: Any, values: list[ArrayValue]) -> list[ArrayValue]:
         """Compute the results of one equation."""
         name = equation.primitive.name
         operation = self.operations.get(name)
@@ -349,7 +359,7 @@ class Builder:
         try:
             outs = operation(self, equation, values)
         except KeyError as error:
-            # Another release of JAX may have other parameters.
+            # Another release of JAX may have different parameters.
             parameter = error.args[0]
             if not isinstance(parameter, str) or parameter in equation.params:
                 raise
@@ -357,7 +367,7 @@ class Builder:
         return list(outs) if equation.primitive.multiple_results else [outs]
 
     def last_uses(self, jaxpr: Any) -> list[list[Any]]:
-        """List for each equation the variables that nothing after it uses."""
+        """List for each equation the variables that no later equation uses."""
         known = self._last_uses.get(id(jaxpr))
         if known is not None:
             return known[1]
@@ -372,8 +382,8 @@ class Builder:
         return lists[::-1]
 
     @contextmanager
-    def held(self, values: Sequence[Value]) -> Iterator[None]:
-        """Keep arrays from being overwritten inside of a `with` statement."""
+    def held(self, values: Sequence[ArrayValue]) -> Iterator[None]:
+        """Protect arrays from being overwritten inside a `with` statement."""
         for value in values:
             hold(value)
         yield
@@ -383,66 +393,68 @@ class Builder:
     # Arrays
 
     def array(self, values: Any, dtype: str) -> Registers:
-        """Make an array of constants."""
+        """Create an array of constants."""
         values = np.asarray(values)
         out = np.empty(values.shape, object)
         for index in np.ndindex(values.shape):
             out[index] = self.graph.constant(values[index], dtype)
         return out
 
-    def constant(self, value: Any, aval: Any) -> Value:
-        """Make an array of constants, in memory if it is large."""
+    def constant(self, value: Any, aval: Any) -> ArrayValue:
+        """Create an array of constants, in memory if it is large."""
         dtype = dtype_name(aval.dtype)
         values = np.asarray(value)
-        if values.size > LARGE:
+        if values.size > MOST_IN_REGISTERS:
             return InMemory(constant(self.graph, values), values.shape)
         return self.array(values, dtype)
 
     def full(self, shape: tuple[int, ...], node: Node) -> Registers:
-        """Make an array of one number everywhere, which takes no space."""
+        """Create an array with the same number everywhere, which takes no space."""
         out = np.empty((), object)
         out[()] = node
         return np.broadcast_to(out, shape)
 
-    def index(self, value: Value) -> Node:
-        """Read a scalar as an index."""
+    def index(self, value: ArrayValue) -> Node:
+        """Return a scalar as an index."""
         node = self.memory.registers(value).reshape(-1)[0]
         return self.graph.convert(node, "int64")
 
     def integer(self, value: int) -> Node:
-        """Make an integer constant, for indices."""
+        """Create an integer constant, for indices."""
         return self.graph.constant(value, "int64")
 
     def clamped(self, index: Node, most: int) -> Node:
-        """Bring an index into the range from 0 to `most`."""
+        """Clamp an index to the range from 0 to `most`."""
         index = self.graph.op("max", index, self.integer(0))
         return self.graph.op("min", index, self.integer(most))
 
-    def element(self, value: Value, shape: tuple[int, ...], k: Node) -> Node:
-        """Read the number `k` of an array that is broadcast to a shape, in its order.
+    def element(self, value: ArrayValue, shape: tuple[int, ...], k: Node) -> Node:
+        """Read element `k` of an array that is broadcast to a shape.
 
-        Axes of length one are broadcast, and scalars.
+        Axes of length one are broadcast, and so are scalars.
         """
         if not isinstance(value, InMemory):
             if _is_uniform(value):
                 return value.reshape(-1)[0]
             value = self.memory.in_memory(value)
-        view = np.broadcast_to(places(value.shape), shape)
+        view = np.broadcast_to(flat_indices(value.shape), shape)
         return self.memory.load(value.buffer, self.memory.position(view, k))
 
-    def each(
+    def map_numbers(
         self,
         shape: tuple[int, ...],
         dtype: str,
         function: Callable[..., Node],
-        *values: Value,
-    ) -> Value:
+        *values: ArrayValue,
+    ) -> ArrayValue:
         """Apply a function to the numbers of arrays, one after the other."""
         size = math.prod(shape)
         values = tuple(
             value.reshape(shape) if value.size == size else value for value in values
         )
-        if size > LARGE and any(isinstance(value, InMemory) for value in values):
+        if size > MOST_IN_REGISTERS and any(
+            isinstance(value, InMemory) for value in values
+        ):
             return self.memory.tabulate(
                 shape,
                 dtype,
@@ -452,7 +464,7 @@ class Builder:
         if size > 1 and all(map(_is_uniform, arrays)):
             node = function(*[array.reshape(-1)[0] for array in arrays])
             return self.full(shape, node)
-        if size > MOST_NUMBERS:
+        if size > MOST_ONE_BY_ONE:
             raise Unsupported(f"{size} numbers one by one")
         flat = [
             array.reshape(-1)

@@ -1,15 +1,12 @@
-"""Branches, and the programs that stand in an equation.
+"""Loops, branches and calls of a jaxpr: `while`, `scan`, `cond` and inner programs.
 
-The primitives `while` and `scan`; a short scan is unrolled.
+A loop carries arrays as parameters, number by number, or leaves them in place in
+memory. Numbers that start as constants are first assumed to stay constant. The body is
+built, and built again without the assumption for those numbers that do change. These
+numbers are remembered, so that building an outer loop again does not multiply the time
+with the depth of nesting.
 
-Loops: arrays that go around become parameters, or stay in place in memory.
-
-A number that goes around a loop is taken to be constant if it starts as a constant, the
-body is made, and made anew without that assumption for those numbers for which it did
-not hold. What was found is kept for when a loop around this one is made anew, so that
-the time does not multiply with the depth of loops.
-
-Which arrays of a loop are stored into at an index, and so belong into memory.
+Short scans are unrolled, unless their body contains loops.
 """
 
 import math
@@ -22,20 +19,22 @@ import numpy as np
 from jax.extend.core import Literal
 
 from ._builder import (
+    ArrayValue,
     Builder,
+    flat_indices,
     hold,
     InMemory,
-    LARGE,
+    MOST_IN_REGISTERS,
     Operation,
-    places,
     Registers,
     release,
-    Value,
 )
 from ._graph import BranchBuilder, dtype_name, LoopBuilder, Node
 
 
-def _call(builder: Builder, equation: Any, values: list[Value]) -> list[Value]:
+def _call(
+    builder: Builder, equation: Any, values: list[ArrayValue]
+) -> list[ArrayValue]:
     params = equation.params
     keys = ("jaxpr", "call_jaxpr", "program", "fun_jaxpr")
     inner = next(params[key] for key in keys if key in params)
@@ -43,7 +42,9 @@ def _call(builder: Builder, equation: Any, values: list[Value]) -> list[Value]:
     return builder.run(jaxpr, getattr(inner, "consts", ()), values)
 
 
-def _linear_solve(builder: Builder, equation: Any, values: list[Value]) -> list[Value]:
+def _linear_solve(
+    builder: Builder, equation: Any, values: list[ArrayValue]
+) -> list[ArrayValue]:
     lengths, jaxprs = equation.params["const_lengths"], equation.params["jaxprs"]
     start = lengths.matvec + lengths.vecmat
     consts = values[start : start + lengths.solve]
@@ -51,7 +52,9 @@ def _linear_solve(builder: Builder, equation: Any, values: list[Value]) -> list[
     return builder.run(jaxprs.solve.jaxpr, jaxprs.solve.consts, [*consts, *rest])
 
 
-def _cond(builder: Builder, equation: Any, values: list[Value]) -> list[Value]:
+def _cond(
+    builder: Builder, equation: Any, values: list[ArrayValue]
+) -> list[ArrayValue]:
     which, *args = values
     branches = equation.params["branches"]
     index = builder.memory.registers(which).reshape(-1)[0]
@@ -65,11 +68,11 @@ def _cond(builder: Builder, equation: Any, values: list[Value]) -> list[Value]:
 def _chosen(
     builder: Builder,
     index: Node,
-    runs: list[Callable[[], list[Value]]],
+    runs: list[Callable[[], list[ArrayValue]]],
     first: int,
     avals: list[Any],
-) -> list[Value]:
-    """Take the program that the index says; the last one for all larger indices."""
+) -> list[ArrayValue]:
+    """Run the branch of an index; larger indices select the last branch."""
     if first == len(runs) - 1:
         return runs[first]()
     graph = builder.graph
@@ -78,7 +81,7 @@ def _chosen(
     else:
         is_first = graph.op("le", index, graph.constant(first, index.dtype))
 
-    def rest() -> list[Value]:
+    def rest() -> list[ArrayValue]:
         return _chosen(builder, index, runs, first + 1, avals)
 
     return _branch(builder, is_first, runs[first], rest, avals)
@@ -87,11 +90,11 @@ def _chosen(
 def _branch(
     builder: Builder,
     predicate: Node,
-    yes: Callable[[], list[Value]],
-    no: Callable[[], list[Value]],
+    yes: Callable[[], list[ArrayValue]],
+    no: Callable[[], list[ArrayValue]],
     avals: list[Any],
-) -> list[Value]:
-    """Make a branch; only the side that is taken runs."""
+) -> list[ArrayValue]:
+    """Create a branch; only the side that is taken runs."""
     if predicate.is_constant:
         return yes() if predicate.attr else no()
     memory = builder.memory
@@ -101,13 +104,13 @@ def _branch(
         builder.path.append(side)
         outs.append(branch.on_side(side, run))
         builder.path.pop()
-    results: list[Value | None] = []
+    results: list[ArrayValue | None] = []
     numbers: tuple[list[Node], list[Node]] = ([], [])
     for aval, one, other in zip(avals, *outs, strict=True):
         pair = (one, other)
         shared = _shared(one, other)
         if shared is None and _goes_to_memory(one, other):
-            # Neither side may have changed what the other hands on.
+            # Neither side may change an array that the other side returns.
             target = memory.new(dtype_name(aval.dtype), one.size)
             shared = InMemory(target, aval.shape)
             for side, value in enumerate(pair):
@@ -127,13 +130,13 @@ def _branch(
     ]
 
 
-def _write(builder: Builder, target: Any, value: Value) -> list:
-    builder.memory.write(target, places(value.shape), value)
+def _write(builder: Builder, target: Any, value: ArrayValue) -> list:
+    builder.memory.write(target, flat_indices(value.shape), value)
     return []
 
 
-def _shared(one: Value, other: Value) -> Value | None:
-    """Find the array that both sides result in, if it is the same memory."""
+def _shared(one: ArrayValue, other: ArrayValue) -> ArrayValue | None:
+    """Return the array that both sides return, if it is the same one."""
     if isinstance(one, InMemory) and isinstance(other, InMemory):
         return one if one.buffer is other.buffer else None
     if isinstance(one, InMemory) or isinstance(other, InMemory):
@@ -142,9 +145,9 @@ def _shared(one: Value, other: Value) -> Value | None:
     return one if one.size and all(a is b for a, b in pairs) else None
 
 
-def _goes_to_memory(one: Value, other: Value) -> bool:
+def _goes_to_memory(one: ArrayValue, other: ArrayValue) -> bool:
     there = [isinstance(value, InMemory) for value in (one, other)]
-    return all(there) or (any(there) and one.size > LARGE)
+    return all(there) or (any(there) and one.size > MOST_IN_REGISTERS)
 
 
 def _taken(nodes: Any, aval: Any) -> np.ndarray:
@@ -154,8 +157,10 @@ def _taken(nodes: Any, aval: Any) -> np.ndarray:
     return out.reshape(aval.shape)
 
 
-def _expanded(builder: Builder, equation: Any, values: list[Value]) -> list[Value]:
-    """Run the program of an operation that JAX writes out when it compiles."""
+def _expanded(
+    builder: Builder, equation: Any, values: list[ArrayValue]
+) -> list[ArrayValue]:
+    """Run the program of an operation that JAX expands when it compiles."""
     expand = partial(equation.primitive.to_lojax, **equation.params)
     avals = [variable.aval for variable in equation.invars]
     args = [
@@ -177,30 +182,32 @@ BRANCHES: dict[str, Operation] = {
 }
 
 
-def _while(builder: Builder, equation: Any, values: list[Value]) -> list[Value]:
+def _while(
+    builder: Builder, equation: Any, values: list[ArrayValue]
+) -> list[ArrayValue]:
     params = equation.params
     test, body = params["cond_jaxpr"], params["body_jaxpr"]
     first, second = params["cond_nconsts"], params["body_nconsts"]
     of_test, of_body = values[:first], values[first : first + second]
     inits = values[first + second :]
     variables = body.jaxpr.invars[second:]
-    # What the body hands on as it is does not go around.
+    # Values that the body returns unchanged are not carried.
     is_same = [a is b for a, b in zip(variables, body.jaxpr.outvars, strict=True)]
     same, _ = _split(is_same, inits)
-    stored = {index - second for index in updated(body.jaxpr)}
+    stored = {index - second for index in updated_inputs(body.jaxpr)}
     goes_to_memory = [
-        value.size > 0 and (value.size > LARGE or index in stored)
+        value.size > 0 and (value.size > MOST_IN_REGISTERS or index in stored)
         for index, value in enumerate(inits)
     ]
 
-    def everything(carry: list[Value]) -> list[Value]:
+    def everything(carry: list[ArrayValue]) -> list[ArrayValue]:
         return _merged(is_same, same, carry)
 
-    def predicate(carry: list[Value]) -> Node:
+    def predicate(carry: list[ArrayValue]) -> Node:
         args = [*of_test, *everything(carry)]
         return builder.run(test.jaxpr, test.consts, args)[0].reshape(-1)[0]  # pyright: ignore
 
-    def step(carry: list[Value]) -> list[Value]:
+    def step(carry: list[ArrayValue]) -> list[ArrayValue]:
         args = [*of_body, *everything(carry)]
         return _split(is_same, builder.run(body.jaxpr, body.consts, args))[1]
 
@@ -220,7 +227,9 @@ def _merged(marks: Sequence[bool], marked: Sequence, others: Sequence) -> list:
     return [next(one) if mark else next(other) for mark in marks]
 
 
-def _scan(builder: Builder, equation: Any, values: list[Value]) -> list[Value]:
+def _scan(
+    builder: Builder, equation: Any, values: list[ArrayValue]
+) -> list[ArrayValue]:
     params, length = equation.params, equation.params["length"]
     first, count = _sizes(params)
     consts, carry = values[:first], values[first : first + count]
@@ -235,19 +244,19 @@ def _scan(builder: Builder, equation: Any, values: list[Value]) -> list[Value]:
 
 
 def _sizes(params: dict[str, Any]) -> tuple[int, int]:
-    """Count the operands of a scan that are the same in each round, and its carry."""
+    """Return the number of constants of a scan, and the number of carried arrays."""
     if "num_carry" in params:
         return params["num_consts"], params["num_carry"]
-    # Since JAX 0.12 a scan has the trees of its operands, without leaves, instead.
+    # Since JAX 0.12 a scan has the tree structures of its operands instead.
     consts, carry, _ = params["ft_in"].unpack()
     return len(consts), len(carry)
 
 
 def _has_loop(jaxpr: Any, builder: Builder) -> bool:
-    """Tell whether a program has loops that are not unrolled.
+    """Return whether a program has loops that are not unrolled.
 
-    A loop around such loops is not unrolled either, lest the program grow as their
-    number of rounds.
+    A loop around such loops is not unrolled either, so that the program does not grow
+    with the number of iterations.
     """
     for equation in jaxpr.eqns:
         name = equation.primitive.name
@@ -260,8 +269,8 @@ def _has_loop(jaxpr: Any, builder: Builder) -> bool:
     return False
 
 
-def _row(builder: Builder, value: Value, index: Node) -> Value:
-    """Read one of the rows that a scan goes over."""
+def _row(builder: Builder, value: ArrayValue, index: Node) -> ArrayValue:
+    """Read one of the rows over which a scan iterates."""
     shape = value.shape[1:]
     size = math.prod(shape)
     if size == 0:
@@ -270,10 +279,14 @@ def _row(builder: Builder, value: Value, index: Node) -> Value:
         return value[int(index.attr) : int(index.attr) + 1].reshape(shape)
     memory, source = builder.memory, builder.memory.in_memory(value)
     start = builder.graph.op("mul", index, builder.integer(size))
-    if size > LARGE:
+    if size > MOST_IN_REGISTERS:
         target = memory.new(source.dtype, size)
         memory.move(
-            target, places(shape), source.buffer, places(shape), source_shift=start
+            target,
+            flat_indices(shape),
+            source.buffer,
+            flat_indices(shape),
+            source_shift=start,
         )
         return InMemory(target, shape)
     out = np.empty(size, object)
@@ -284,18 +297,18 @@ def _row(builder: Builder, value: Value, index: Node) -> Value:
 
 def _unrolled(
     builder: Builder, equation: Any, consts: list, carry: list, rows: list
-) -> list[Value]:
+) -> list[ArrayValue]:
     params = equation.params
     body, length, count = params["jaxpr"], params["length"], len(carry)
     order = range(length - 1, -1, -1) if params["reverse"] else range(length)
-    saved: dict[int, list[Value]] = {}
+    saved: dict[int, list[ArrayValue]] = {}
     for index in order:
         row = [_row(builder, value, builder.integer(index)) for value in rows]
         builder.path.append(index)
         outs = builder.run(body.jaxpr, body.consts, [*consts, *carry, *row])
         builder.path.pop()
         carry, saved[index] = outs[:count], outs[count:]
-        # A row may lie in memory that the next round would overwrite.
+        # A row may lie in memory that the next iteration would overwrite.
         for value in saved[index]:
             hold(value)
     stacked = []
@@ -308,7 +321,7 @@ def _unrolled(
     return [*carry, *stacked]
 
 
-def _stacked(builder: Builder, aval: Any, values: list[Value]) -> Value:
+def _stacked(builder: Builder, aval: Any, values: list[ArrayValue]) -> ArrayValue:
     memory = builder.memory
     if not any(isinstance(value, InMemory) for value in values):
         out = np.empty(aval.shape, object)
@@ -318,23 +331,23 @@ def _stacked(builder: Builder, aval: Any, values: list[Value]) -> Value:
     size = values[0].size
     target = memory.new(dtype_name(aval.dtype), size * len(values))
     for index, value in enumerate(values):
-        view = places(value.shape) + index * size
+        view = flat_indices(value.shape) + index * size
         memory.write(target, view, value)
     return InMemory(target, aval.shape)
 
 
 def _scanned(
     builder: Builder, equation: Any, consts: list, carry: list, rows: list
-) -> list[Value]:
+) -> list[ArrayValue]:
     params, graph, memory = equation.params, builder.graph, builder.memory
     body, length, count = params["jaxpr"], params["length"], len(carry)
-    stored = {index - len(consts) for index in updated(body.jaxpr)}
+    stored = {index - len(consts) for index in updated_inputs(body.jaxpr)}
     of_carry = [
-        value.size > 0 and (value.size > LARGE or index in stored)
+        value.size > 0 and (value.size > MOST_IN_REGISTERS or index in stored)
         for index, value in enumerate(carry)
     ]
     avals = [variable.aval for variable in equation.outvars[count:]]
-    saved: list[Value] = []
+    saved: list[ArrayValue] = []
     for aval in avals:
         size = math.prod(aval.shape)
         if size == 0:
@@ -343,10 +356,10 @@ def _scanned(
             buffer = memory.new(dtype_name(aval.dtype), size)
             saved.append(InMemory(buffer, aval.shape))
 
-    def predicate(values: list[Value]) -> Node:
+    def predicate(values: list[ArrayValue]) -> Node:
         return graph.op("lt", builder.index(values[0]), builder.integer(length))
 
-    def step(values: list[Value]) -> list[Value]:
+    def step(values: list[ArrayValue]) -> list[ArrayValue]:
         k = builder.index(values[0])
         place = k
         if params["reverse"]:
@@ -359,7 +372,7 @@ def _scanned(
             for target, value in zip(after, outs[count:], strict=True):
                 if isinstance(target, InMemory):
                     shift = graph.op("mul", place, builder.integer(value.size))
-                    memory.write(target.buffer, places(value.shape), value, shift)
+                    memory.write(target.buffer, flat_indices(value.shape), value, shift)
         counter = builder.full((), graph.op("add", k, builder.integer(1)))
         return [counter, *outs[:count], *after]
 
@@ -371,29 +384,29 @@ def _scanned(
 SCANS: dict[str, Operation] = {"while": _while, "scan": _scan}
 
 
-_Predicate = Callable[[list[Value]], Node]
-_Body = Callable[[list[Value]], list[Value]]
+_Predicate = Callable[[list[ArrayValue]], Node]
+_Body = Callable[[list[ArrayValue]], list[ArrayValue]]
 
 
 def loop(
     builder: Builder,
-    inits: Sequence[Value],
+    inits: Sequence[ArrayValue],
     in_memory: Sequence[bool],
     predicate: _Predicate,
     body: _Body,
-) -> list[Value]:
-    """Make a loop; the arrays that go around it are in memory or in registers."""
+) -> list[ArrayValue]:
+    """Create a loop; `in_memory` says which of the carried arrays are in memory."""
     memory = builder.memory
-    carried: list[Value] = []
+    carried: list[ArrayValue] = []
     for value, is_there in zip(inits, in_memory, strict=True):
         carried.append(memory.owned(value) if is_there else memory.registers(value))
-        # The same array may go around twice, and needs two places then.
+        # An array may be carried twice, and then needs two copies.
         hold(carried[-1])
     for value in carried:
         release(value)
     buffers = [value.buffer for value in carried if isinstance(value, InMemory)]
     changing = builder.changing.setdefault(tuple(builder.path), set())
-    # Scalars that are integers count something.
+    # Integer scalars are counters, which change.
     for start, value in _starts(carried):
         if value.ndim == 0 and value[()].dtype.startswith("int"):
             changing.add(start)
@@ -416,7 +429,7 @@ def loop(
     return made.results()
 
 
-def _starts(values: Sequence[Value]) -> list[tuple[int, Registers]]:
+def _starts(values: Sequence[ArrayValue]) -> list[tuple[int, Registers]]:
     """List the arrays in registers, with the position of their first numbers."""
     position, out = 0, []
     for value in values:
@@ -427,12 +440,12 @@ def _starts(values: Sequence[Value]) -> list[tuple[int, Registers]]:
 
 
 class _Attempt:
-    """A loop in which numbers that start as constants are taken to remain so.
+    """A loop in which numbers that start as constants are assumed to stay constant.
 
-    Those whose positions are in `changing` are known to change.
+    The numbers at the positions in `changing` are known to change.
     """
 
-    def __init__(self, builder: Builder, carried: list[Value], changing: set[int]):
+    def __init__(self, builder: Builder, carried: list[ArrayValue], changing: set[int]):
         self.builder, self.carried = builder, carried
         self.loop = LoopBuilder(builder.graph)
         self.changing = changing
@@ -444,12 +457,12 @@ class _Attempt:
         self.runs_never = False
 
     def make(self, predicate: _Predicate, body: _Body) -> None:
-        """Make the loop's predicate and body."""
+        """Build the predicate and the body of the loop."""
         with self.loop:
-            arrays: list[Value] = []
+            arrays: list[ArrayValue] = []
             for value in self.carried:
                 if isinstance(value, InMemory):
-                    # What was loaded before the loop is not what it loads.
+                    # Values that were loaded before the loop are not valid inside it.
                     value.buffer.version += 1
                     arrays.append(value)
             in_registers = iter([self._parameters(*x) for x in _starts(self.carried)])
@@ -475,16 +488,16 @@ class _Attempt:
                 out[index] = self.loop.parameter(node)
         return out.reshape(value.shape)
 
-    def _take_over(self, values: list[Value]) -> None:
-        """Make the values of a round those with which the next one starts."""
+    def _take_over(self, values: list[ArrayValue]) -> None:
+        """Make the values of an iteration those with which the next one starts."""
         memory = self.builder.memory
         own = [v.buffer for v in self.carried if isinstance(v, InMemory)]
-        ready: list[Value] = []
+        ready: list[ArrayValue] = []
         for value, old in zip(values, self.carried, strict=True):
             if not isinstance(old, InMemory):
                 value = memory.registers(value)
             elif isinstance(value, InMemory) and value.buffer is not old.buffer:
-                # It would be overwritten if it went around as another array.
+                # The array would be overwritten when it takes the place of another one.
                 hold(value)
                 value_free = memory.owned(value) if value.buffer in own else value
                 release(value)
@@ -494,18 +507,18 @@ class _Attempt:
             if not isinstance(old, InMemory):
                 self.outs.extend(value.reshape(-1))  # pyright: ignore
             elif not (isinstance(value, InMemory) and value.buffer is old.buffer):
-                memory.write(old.buffer, places(old.shape), value)
+                memory.write(old.buffer, flat_indices(old.shape), value)
         self.loop.end([self.outs[position] for position in self.varying])
 
     def wrong(self) -> list[int]:
-        """List the numbers that were taken to be constant and are not."""
+        """List the numbers that were assumed to be constant and are not."""
         return [p for p, node in self.fixed.items() if self.outs[p] is not node]
 
-    def results(self) -> list[Value]:
+    def results(self) -> list[ArrayValue]:
         """Return the arrays after the loop."""
         nodes = dict(zip(self.varying, self.loop.results(), strict=True))
         nodes.update(self.fixed)
-        out: list[Value] = []
+        out: list[ArrayValue] = []
         position = 0
         for value in self.carried:
             if isinstance(value, InMemory):
@@ -523,10 +536,10 @@ _UPDATES = ("dynamic_update_slice", "scatter")
 _SAME = ("reshape", "squeeze", "expand_dims", "copy", "copy_p", "optimization_barrier")
 
 
-def updated(jaxpr: Any) -> frozenset[int]:
-    """List the inputs of a jaxpr that it, or a program in it, updates at an index.
+def updated_inputs(jaxpr: Any) -> frozenset[int]:
+    """List the inputs of a jaxpr that it, or an inner program, updates at an index.
 
-    An update at a place that is a number in the jaxpr does not count.
+    Such arrays belong in memory. Updates at an index that is a literal do not count.
     """
     origins: dict[Any, int] = {v: i for i, v in enumerate(jaxpr.invars)}
     found: set[int] = set()
@@ -546,7 +559,7 @@ def updated(jaxpr: Any) -> frozenset[int]:
                 if before in origins:
                     origins[after] = origins[before]
         for inner, first in inner_programs(equation):
-            for index in updated(inner):
+            for index in updated_inputs(inner):
                 variable = ins[first + index]
                 if variable in origins:
                     found.add(origins[variable])
@@ -554,13 +567,13 @@ def updated(jaxpr: Any) -> frozenset[int]:
 
 
 def inner_programs(equation: Any) -> Iterator[tuple[Any, int]]:
-    """List the programs in an equation, and where their operands start among its own.
+    """List the inner programs of an equation, and where their operands start.
 
-    Constants of loops are not overwritten, but it does no harm to list them.
+    Constants of loops are listed too, which does no harm.
     """
     params, name = equation.params, equation.primitive.name
     if name == "while":
-        # The operands of the body without those of the predicate.
+        # The operands of the body, without those of the predicate.
         yield params["body_jaxpr"].jaxpr, params["cond_nconsts"]
     elif name == "cond":
         for branch in params["branches"]:

@@ -107,8 +107,8 @@ def _call(op: str, results: int, *arguments: Value) -> tuple[Value, ...]:
 _LARGEST_QUOTIENT = 2.0**50
 _LONG_REMAINDER = "nhjax.long_remainder"
 
-# The remainder of |x| by |y| for finite x >= y > 0, by a long division of the mantissas
-# in which each step shifts the rest by up to 11 bits.
+# The remainder of |x| by |y| for finite x >= y > 0, by long division of the mantissas.
+# Each step shifts the remainder by up to 11 bits.
 _LONG_REMAINDER_HEAD = (
     f"define internal double @{_LONG_REMAINDER}(double %x, double %y)"
 )

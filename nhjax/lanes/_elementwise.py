@@ -1,4 +1,8 @@
-"""Operations that act number by number."""
+"""JAX's operations that act element by element.
+
+A function of scalars is applied to each number of the arrays; the tables at the end map
+JAX's primitives to these functions.
+"""
 
 from collections.abc import Callable
 from functools import partial
@@ -7,17 +11,20 @@ from typing import Any
 import jax
 import numpy as np
 
-from ._builder import Builder, Operation, Value
+from ._builder import ArrayValue, Builder, Operation
 from ._graph import dtype_name, is_float, Node, Unsupported
 
 
 def _each(
-    function: Callable[..., Node], builder: Builder, equation: Any, values: list[Value]
-) -> Value:
+    function: Callable[..., Node],
+    builder: Builder,
+    equation: Any,
+    values: list[ArrayValue],
+) -> ArrayValue:
     aval = equation.outvars[0].aval
     dtype = dtype_name(aval.dtype)
     bound = partial(function, builder, equation)
-    return builder.each(aval.shape, dtype, bound, *values)
+    return builder.map_numbers(aval.shape, dtype, bound, *values)
 
 
 def _plain(op: str) -> Callable[..., Node]:
@@ -78,7 +85,7 @@ def _round(builder: Builder, equation: Any, x: Node) -> Node:
 
 
 def _in_total_order(op: str) -> Callable[..., Node]:
-    """Compare floats by their bits: -NaN < -inf < ... < -0.0 < 0.0 < ... < NaN."""
+    """Compare floats in total order: -NaN < -inf < ... < -0.0 < 0.0 < ... < NaN."""
 
     def function(builder: Builder, equation: Any, *numbers: Node) -> Node:
         keys = [_sorting_key(builder, number) for number in numbers]
@@ -107,7 +114,7 @@ def _bitcast(builder: Builder, equation: Any, x: Node) -> Node:
 
 
 def _pattern(builder: Builder, x: Node, dtype: str) -> Node:
-    """Take the bits of a number as another one."""
+    """Reinterpret the bits of a number as another dtype."""
     if dtype == x.dtype:
         return x
     if "bool" in (dtype, x.dtype):
@@ -136,12 +143,14 @@ def _clamp(builder: Builder, equation: Any, low: Node, x: Node, high: Node) -> N
     return builder.graph.op("min", builder.graph.op("max", x, low), high)
 
 
-def _zeros_like(builder: Builder, equation: Any, values: list[Value]) -> Value:
+def _zeros_like(
+    builder: Builder, equation: Any, values: list[ArrayValue]
+) -> ArrayValue:
     aval = equation.outvars[0].aval
     return builder.full(aval.shape, builder.graph.zero(dtype_name(aval.dtype)))
 
 
-def _iota(builder: Builder, equation: Any, values: list[Value]) -> Value:
+def _iota(builder: Builder, equation: Any, values: list[ArrayValue]) -> ArrayValue:
     aval, dimension = equation.outvars[0].aval, equation.params["dimension"]
     dtype = dtype_name(aval.dtype)
     shape = [-1 if d == dimension else 1 for d in range(len(aval.shape))]
@@ -150,13 +159,13 @@ def _iota(builder: Builder, equation: Any, values: list[Value]) -> Value:
     return builder.constant(np.broadcast_to(numbers, aval.shape), aval)
 
 
-def _empty(builder: Builder, equation: Any, values: list[Value]) -> Value:
+def _empty(builder: Builder, equation: Any, values: list[ArrayValue]) -> ArrayValue:
     aval = equation.outvars[0].aval
     zero = builder.graph.constant(0, dtype_name(aval.dtype))
     return builder.full(aval.shape, zero)
 
 
-def _same(builder: Builder, equation: Any, values: list[Value]) -> Any:
+def _same(builder: Builder, equation: Any, values: list[ArrayValue]) -> Any:
     return values if equation.primitive.multiple_results else values[0]
 
 

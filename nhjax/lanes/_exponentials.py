@@ -1,15 +1,9 @@
-"""The exponential function and what is made of it, for vectors of float64.
+"""Exponentials, hyperbolic functions, logarithms, powers and the error function.
 
-With n the integer nearest to x / log(2), exp(x) is 2^n exp(r), |r| <= log(2) / 2.
-
-The logarithm and what is made of it, for vectors of float64.
-
-With x = 2^k m and m from sqrt(1/2) to sqrt(2), log(x) is k log(2) + log(m), and log(m)
-is 2 artanh(s) with s = (m - 1) / (m + 1).
-
-Powers and the cube root, for vectors of float64.
-
-The error function, for vectors of float64.
+All formulas are for vectors of float64. With n the integer nearest to x / log(2),
+exp(x) is 2^n exp(r) with |r| <= log(2) / 2. With x = 2^k m and m from sqrt(1/2) to
+sqrt(2), log(x) is k log(2) + log(m), and log(m) is 2 artanh(s) with s = (m - 1) / (m +
+1). Polynomials approximate the remaining factors.
 """
 
 import math
@@ -39,20 +33,20 @@ from ._writer import (
 
 
 _PER_LN2 = 1.4426950408889634
-# The first part of log(2) has 42 bits: its products with integers up to 2^11 are exact.
+# The high part of log(2) has 42 bits: its products with integers up to 2^11 are exact.
 LN2_HIGH = 0.6931471805598903
 LN2_LOW = 5.497923018708371e-14
 _LN2 = 0.6931471805599453
-# Beyond these bounds the exponential function is 0 and infinite.
+# Outside of these bounds the exponential function is 0 or infinite.
 LOWEST, HIGHEST = -746.0, 710.0
 
 
-def clamped(x: Value, lower: float, upper: float) -> Value:
-    """Restrict x to an interval, but leave NaN."""
+def clamp(x: Value, lower: float, upper: float) -> Value:
+    """Clamp x to an interval; NaN stays NaN."""
     return where(x < lower, lower, where(x > upper, upper, x))
 
 
-def reduced(x: Value, low: Value | float = 0.0) -> tuple[Value, DoubleDouble]:
+def reduce_by_log2(x: Value, low: Value | float = 0.0) -> tuple[Value, DoubleDouble]:
     """Return n, in the lowest bits of an integer, and r with x + low = n log(2) + r."""
     n, exponent = nearest(x * _PER_LN2)
     with x.writer.exact():
@@ -64,14 +58,14 @@ def reduced(x: Value, low: Value | float = 0.0) -> tuple[Value, DoubleDouble]:
 
 
 def exp_of_pair(x: Value, low: Value) -> tuple[Value, Value]:
-    """Return p and n, in the lowest bits of an integer, with exp(x + low) = p 2^n."""
-    exponent, (r, rest) = reduced(x, low)
+    """Return p, and n in the lowest bits of an integer, with exp(x + low) = p 2^n."""
+    exponent, (r, rest) = reduce_by_log2(x, low)
     return 1.0 + (r + (r * r * polynomial(r, EXP) + rest)), exponent
 
 
 def exp(x: Value) -> Value:
     """Return the exponential function of x."""
-    x = clamped(x, LOWEST, HIGHEST)
+    x = clamp(x, LOWEST, HIGHEST)
     n, exponent = nearest(x * _PER_LN2)
     with x.writer.exact():
         r = (x - n * LN2_HIGH) - n * LN2_LOW
@@ -80,16 +74,16 @@ def exp(x: Value) -> Value:
 
 def exp2(x: Value) -> Value:
     """Return 2 to the power of x."""
-    x = clamped(x, -1080.0, 1025.0)
+    x = clamp(x, -1080.0, 1025.0)
     n, exponent = nearest(x)
     r = (x - n) * _LN2
     return times_power_of_two(1.0 + (r + r * r * polynomial(r, EXP)), exponent)
 
 
 def _expm1_parts(x: Value) -> tuple[Value, DoubleDouble, Value]:
-    """Return n, a pair m with exp(x) - 1 = 2^n m, and 2^-n, for x from -50."""
-    exponent, (r, rest) = reduced(x)
-    # 2^-n would be subnormal for the largest x, where it does not count.
+    """Return n, a double-double m with exp(x) - 1 = 2^n m, and 2^-n, for x >= -50."""
+    exponent, (r, rest) = reduce_by_log2(x)
+    # 2^-n would be subnormal for the largest x, where it does not matter.
     unit = where(x > 100.0, 0.0, power_of_two(-exponent))
     high, low = fast_two_sum(1.0 - unit, r)
     tail = low + (r * r * polynomial(r, EXP) + rest)
@@ -98,7 +92,7 @@ def _expm1_parts(x: Value) -> tuple[Value, DoubleDouble, Value]:
 
 def expm1(x: Value) -> Value:
     """Return exp(x) - 1."""
-    exponent, (mantissa, _), _ = _expm1_parts(clamped(x, -50.0, HIGHEST))
+    exponent, (mantissa, _), _ = _expm1_parts(clamp(x, -50.0, HIGHEST))
     return with_sign(times_power_of_two(mantissa, exponent), x)
 
 
@@ -106,7 +100,7 @@ def tanh(x: Value) -> Value:
     """Return the hyperbolic tangent of x, as (exp(2x) - 1) / (exp(2x) + 1)."""
     double = absolute(x) * 2.0
     _, above, unit = _expm1_parts(where(double > 44.0, 44.0, double))
-    # exp(2x) - 1 was divided by 2^n, and so is the 2 by which exp(2x) + 1 is more.
+    # exp(2x) - 1 was divided by 2^n. So is the 2 by which exp(2x) + 1 is larger.
     high, low = two_sum(above[0], unit * 2.0)
     return with_sign(rounded_quotient(above, (high, low + above[1])), x)
 
@@ -116,7 +110,7 @@ def logistic(x: Value) -> Value:
     # With z = exp(-|x|) it is 1 / (1 + z) or z / (1 + z), for negative x.
     size = -absolute(x)
     size = where(size < LOWEST, LOWEST, size)
-    exponent, (r, rest) = reduced(size)
+    exponent, (r, rest) = reduce_by_log2(size)
     high, low = fast_two_sum(1.0, r)
     p = fast_two_sum(high, low + (r * r * polynomial(r, EXP) + rest))
     scale = where(size < -700.0, 0.0, power_of_two(exponent))
@@ -134,13 +128,13 @@ def _hyperbolic(x: Value, odd: bool) -> Value:
     2^(n - 1) ((1 - u) c + (1 + u) s), and cosh(x) the same with -u for u.
     """
     x = absolute(x)
-    exponent, (r, rest) = reduced(where(x > 711.0, 711.0, x))
+    exponent, (r, rest) = reduce_by_log2(where(x > 711.0, 711.0, x))
     u = where(x > 60.0, 0.0, power_of_two(-(exponent + exponent)))
     u = u if odd else -u
     z = r * r
     c, s = z * polynomial(z, COSH), r * z * polynomial(z, SINH) + rest
     high, low = fast_two_sum(1.0 - u, r)
-    # What r is multiplied by besides 1 stands alone, so that sinh(r) = r for small r.
+    # r itself is added last, without a factor, so that sinh(r) = r for small r.
     tail = u * r + (low + ((1.0 - u) * c + (1.0 + u) * s))
     return times_power_of_two(high + tail, exponent - 1)
 
@@ -161,17 +155,17 @@ _MANTISSA_BITS = 0x000FFFFFFFFFFFFF
 _TWO_52_BITS = 0x4330000000000000
 
 
-def parts(x: Value) -> tuple[Value, Value]:
+def exponent_and_mantissa(x: Value) -> tuple[Value, Value]:
     """Return k and m with x = 2^k m, for positive and finite x."""
     is_small = x < _SMALLEST_NORMAL
     bits = where(is_small, x * 2.0**54, x).bits() + (ONE_BITS - _ROOT_HALF_BITS)
     m = ((bits & _MANTISSA_BITS) + _ROOT_HALF_BITS).number()
-    # The integer k + 1023, put into the lowest bits of 2^52, is added to it.
+    # The integer k + 1023, in the lowest bits of 2^52, is added to 2^52.
     k = ((bits >> 52) | _TWO_52_BITS).number()
     return k - where(is_small, 2.0**52 + 1023 + 54, 2.0**52 + 1023), m
 
 
-def _sum(k: Value, f: Value, correction: Value | float) -> Value:
+def _log_of(k: Value, f: Value, correction: Value | float) -> Value:
     """Return k log(2) + log(1 + f) + correction, where 1 + f is m."""
     s = f / (2.0 + f)
     z, half = s * s, 0.5 * f * f
@@ -181,10 +175,10 @@ def _sum(k: Value, f: Value, correction: Value | float) -> Value:
 
 def log(x: Value) -> Value:
     """Return the logarithm of x."""
-    k, m = parts(x)
-    result = _sum(k, m - 1.0, 0.0)
+    k, m = exponent_and_mantissa(x)
+    result = _log_of(k, m - 1.0, 0.0)
     result = where(x.equals(0.0), -math.inf, where(x < 0.0, math.nan, result))
-    # This leaves NaN and infinity.
+    # NaN and infinity stay as they are.
     return where(x < math.inf, result, x)
 
 
@@ -193,12 +187,12 @@ def _log1p(x: Value, low: Value | float = 0.0, doublings: Value | float = 0.0) -
     with x.writer.exact():
         high, rest = two_sum(x.writer.constant("double", 1.0), x)
         rest = rest + low
-    k, m = parts(high)
+    k, m = exponent_and_mantissa(high)
     is_near = k.equals(0.0)
-    # In 1 + x the last digits of a small x are lost.
+    # 1 + x loses the last digits of a small x.
     f = where(is_near, x, m - 1.0)
     lost = where(is_near, low, rest) / high
-    return _sum(k + doublings, f, lost)
+    return _log_of(k + doublings, f, lost)
 
 
 def log1p(x: Value) -> Value:
@@ -256,25 +250,25 @@ _SIGN_BIT = -(2**63)
 
 
 def _long_log(x: Value) -> DoubleDouble:
-    """Return the logarithm of a positive x, to some 66 bits.
+    """Return the logarithm of a positive x, to about 66 bits.
 
-    The first part has 26 bits or less, and the second is what it leaves.
+    The high part has 26 bits or fewer.
     """
-    k, m = parts(x)
+    k, m = exponent_and_mantissa(x)
     f = m - 1.0
     d = 2.0 + f
     ratio = f / d
     with x.writer.exact():
-        # s = f / d is a + rest / d, where the products of the short a are exact.
+        # s = f / d is a + rest / d; the products of the short number a are exact.
         a, (f1, f2) = leading_bits(ratio, 24), halves(f)
         rest = ((f - 2.0 * a) - a * f1) - a * f2
-        # artanh(a) is a + a z (1 / 3 + z (...)), of which a third of z is c and more.
+        # artanh(a) is a + a z (1/3 + z (...)); a third of z is c plus a remainder.
         z = a * a
         c = leading_bits(z * _THIRD, 24)
         left = (z - 3.0 * c) * _THIRD
         high, low = fast_two_sum(a, a * c)
     more = a * (left + z * z * polynomial(z, LOG_LONG))
-    # The difference of artanh(s) and artanh(a) is that of an argument.
+    # The difference of artanh(s) and artanh(a) is the artanh of one small argument.
     more = low + (more + rest / (d - d * (a * ratio)))
     total, lost = fast_two_sum(k * LN2_HIGH, high * 2.0)
     low = lost + (k * LN2_LOW + more * 2.0)
@@ -284,31 +278,31 @@ def _long_log(x: Value) -> DoubleDouble:
 
 
 def _is_integer(x: Value) -> Value:
-    """Tell which x >= 0 are integers; infinity counts as one."""
+    """Return for which members x >= 0 is an integer; infinity counts as one."""
     with x.writer.exact():
         return (((x + 2.0**52) - 2.0**52).equals(x)) | (x >= 2.0**52)
 
 
 def pow(x: Value, y: Value) -> Value:
-    """Return x to the power of y, as exp(y log|x|) with the sign that x^y has."""
+    """Return x to the power of y: exp(y log|x|), with the sign of x^y."""
     size = absolute(x)
     high, low = _long_log(size)
-    # Beyond are 0, infinity and NaN.
+    # The cases 0, infinity and NaN.
     is_finite, is_zero = size < math.inf, size.equals(0.0)
     high = where(is_zero, -math.inf, where(is_finite, high, size))
     low = where(is_finite & (size > 0.0), low, 0.0)
     power, y1 = y * high, leading_bits(y, 26)
-    # What overflows has no second part, and neither has NaN.
+    # Results that overflow have no low part, and neither has NaN.
     is_moderate = absolute(power) < 750.0
     power = where(is_moderate, y1 * high, power)
     rest = where(is_moderate, (y - y1) * high + y * low, 0.0)
-    mantissa, exponent = exp_of_pair(clamped(power, LOWEST, HIGHEST), rest)
+    mantissa, exponent = exp_of_pair(clamp(power, LOWEST, HIGHEST), rest)
     result = times_power_of_two(mantissa, exponent)
     is_one = y.equals(0.0) | (size.equals(1.0) & absolute(y).equals(math.inf))
     result = where(is_one | x.equals(1.0), 1.0, result)
     is_whole = _is_integer(absolute(y))
     is_odd = is_whole & ~_is_integer(absolute(y) * 0.5)
-    # The sign bit counts, so that odd powers of -0.0 are negative.
+    # The sign bit is used, so that odd powers of -0.0 are negative.
     flips = where(is_odd, x.bits() & _SIGN_BIT, 0)
     result = (result.bits() ^ flips).number()
     has_no_value = (x < 0.0) & is_finite & ~is_whole
@@ -318,8 +312,8 @@ def pow(x: Value, y: Value) -> Value:
 def cbrt(x: Value) -> Value:
     """Return the cube root of x."""
     size = absolute(x)
-    k, m = parts(size)
-    # |x| = 2^(3q) w with w from 1 / 2 to 4.
+    k, m = exponent_and_mantissa(size)
+    # |x| = 2^(3q) w with w from 1/2 to 4.
     q, exponent = nearest(k * (1.0 / 3.0))
     left = k - 3.0 * q
     w = where(left > 0.0, m * 2.0, where(left < 0.0, m * 0.5, m))
@@ -327,17 +321,17 @@ def cbrt(x: Value) -> Value:
     is_low = m < 1.0
     guess = polynomial(where(is_low, m * 2.0, m), CBRT)
     guess = guess * where(is_low, factor * 2.0 ** (-1 / 3), factor)
-    # The cube of 17 bits is exact, and so is its difference to w.
+    # The cube of a number of 17 bits is exact, and so is its difference from w.
     guess = leading_bits(guess, 17)
     cube = guess * guess * guess
     d = (w - cube) / cube
-    # The cube root of 1 + d, less 1.
+    # The cube root of 1 + d, minus 1.
     more = d * (1 / 3 - d * (1 / 9 - d * (5 / 81)))
     root = times_power_of_two(guess + guess * more, exponent)
     return with_sign(where((size < math.inf) & (size > 0.0), root, size), x)
 
 
-# The polynomial for large arguments is one in 1 / (x + 2) less this.
+# For large arguments the polynomial is in 1 / (x + 2) minus this.
 _CENTRE = 0.229
 _TWO_OVER_ROOT_PI = 1.1283791670955126
 _ITS_REST = 1.533545961316588e-17
@@ -348,7 +342,7 @@ def erf(x: Value) -> Value:
     size = absolute(x)
     z = size * size
     near = size * _TWO_OVER_ROOT_PI + size * (polynomial(z, ERF) + _ITS_REST)
-    # It is 1 to the last digit from 6 on.
+    # From 6 on it is 1 to the last digit.
     size = where(size > 6.0, 6.0, size)
     beyond = polynomial(1.0 / (size + 2.0) - _CENTRE, ERFC) * exp(-(size * size))
     return with_sign(where(z < 1.0, near, 1.0 - beyond), x)

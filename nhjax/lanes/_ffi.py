@@ -1,17 +1,16 @@
-"""The structures of XLA's foreign function interface, as far as a handler reads them.
+"""The structures of XLA's foreign function interface, and its errors, in LLVM IR.
 
-They are those of the header `xla/ffi/api/c_api.h` in `jax.ffi.include_dir()`, as types
-of LLVM, which lays them out as the platform's C compiler does. What is listed here
-stays where it is: within a major version of the interface structures only grow at their
-ends, so that code which was compiled with an older header keeps working, and each tells
-its size. Names do change: these are those of version 0.3, and 0.5 has the same fields
-in the same places. A test compares them with the installed header.
-
-Errors of XLA's foreign function interface, made and destroyed, as LLVM IR.
+The structures are those of the header `xla/ffi/api/c_api.h` in `jax.ffi.include_dir()`,
+as LLVM types, which have the layout of the platform's C compiler. The listed fields
+keep their offsets: within a major version of the interface structures only grow at the
+end, so that code compiled with an older header keeps working, and each structure
+contains its size. Names may change: the names here are those of version 0.3, and
+version 0.5 has the same fields at the same offsets. A test compares them with the
+installed header.
 """
 
 # The lowest version of the interface that has all that the handler uses. A runtime
-# refuses a handler that claims a version newer than its own.
+# refuses a handler that requires a newer version than its own.
 MAJOR, MINOR = 0, 1
 
 # Values of the interface's enumerations.
@@ -21,7 +20,7 @@ INVALID_ARGUMENT, RESOURCE_EXHAUSTED = 3, 8
 _HEAD = {"struct_size": "i64", "extension_start": "ptr"}
 _LIST = {"size": "i64", "types": "ptr"}
 
-# Fields of each structure in their order, up to the last one that is used.
+# The fields of each structure in order, up to the last one that is used.
 STRUCTS: dict[str, dict[str, str]] = {
     "XLA_FFI_Extension_Base": {"struct_size": "i64", "type": "i32", "next": "ptr"},
     "XLA_FFI_Api_Version": {**_HEAD, "major_version": "i32", "minor_version": "i32"},
@@ -86,7 +85,7 @@ STRUCTS: dict[str, dict[str, str]] = {
 
 
 def type_definitions(structs: dict[str, dict[str, str]]) -> str:
-    """Return the text that defines the structures as types of LLVM."""
+    """Return the definitions of structures as LLVM types."""
     return "\n".join(
         f"%{name} = type {{ {', '.join(fields.values())} }}"
         for name, fields in structs.items()
@@ -94,18 +93,18 @@ def type_definitions(structs: dict[str, dict[str, str]]) -> str:
 
 
 def size_of(struct: str) -> str:
-    """Return the constant that is the size of a structure."""
+    """Return the constant expression for the size of a structure."""
     return f"ptrtoint (ptr getelementptr (%{struct}, ptr null, i32 1) to i64)"
 
 
 def field(pointer: str, struct: str, *path: str) -> str:
-    """Return the instruction that finds the address of a field.
+    """Return the instruction that computes the address of a field.
 
     **Arguments:**
 
     - `pointer`: the address of the structure.
     - `struct`: its name.
-    - `path`: the name of the field; if that is a structure itself, followed by the name
+    - `path`: the name of the field; if the field is a structure, followed by the name
         of a field of it.
     """
     indices, current = ["i32 0"], struct
@@ -116,7 +115,7 @@ def field(pointer: str, struct: str, *path: str) -> str:
     return f"getelementptr inbounds %{struct}, ptr {pointer}, {', '.join(indices)}"
 
 
-# The names of the messages, as constants of the module.
+# The names of the messages, which are constants of the module.
 NO_MEMORY, MISMATCH = "nhjax.no_memory", "nhjax.mismatch"
 NO_SCRATCH = "nhjax.no_scratch"
 

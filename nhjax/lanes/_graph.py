@@ -1,26 +1,21 @@
-"""The exception of programs that are not compiled here, which says why.
+"""The graph of scalar operations of one member, simplified while it is built.
 
-The graph of scalar operations of one member, hash-consed, in nested regions.
+A node is one number or one statement: a store, a loop or a branch. Every node lies in a
+region: the root, the body of a loop, or a side of a branch. Within a region nodes are
+ordered by their numbers, which is the order of creation, so that a node comes after its
+arguments and a load after the stores that it must see.
 
-A node is one number, or one statement: a store, a loop, a branch. Every node lies in a
-region: the body of a loop, a side of a branch, or the root. Within a region nodes are
-in the order of their numbers, which is the order in which they were made, so that a
-node comes after its arguments, and a load after the stores that it has to see.
+Pure nodes are hash-consed: an operation with the same arguments exists once. A pure
+node lies in the deepest region of its arguments, so that invariant code is hoisted out
+of loops. It never leaves the side of a branch in which it was created, because that
+side may not be taken.
 
-A pure node lies in the deepest region of its arguments, so that what does not change in
-a loop stands before it. It never leaves the side of a branch in which it was made, as
-that side may not be taken.
+`simplify` folds constants and removes operations, but never changes a result: rounding,
+infinities, NaN and -0.0 stay as they are. Only a structural zero makes a product zero
+whatever the other factor is.
 
-Arrays while a program is made: in registers, or in memory.
-
-`hold` and `release` count who uses an array in memory.
-
-Simplifications of scalar operations that never change a result.
-
-What is rounded, infinite, NaN or -0.0 stays so. Only a zero that is structural makes a
-product zero whatever the other factor.
-
-Loops and branches while they are made: nodes go into their regions meanwhile.
+The order of this file: the data (regions, nodes, memory), `Graph`, the rules of
+simplification, and the builders of loops and branches.
 """
 
 import sys
@@ -32,7 +27,7 @@ import numpy as np
 
 
 class Unsupported(Exception):
-    """Raised for a program that has to run in another way; the message says why."""
+    """A program cannot be compiled here; the message says why."""
 
 
 DTYPES = frozenset(
@@ -44,7 +39,9 @@ DTYPES = frozenset(
 
 @cache
 def dtype_name(dtype: Any) -> str:
-    """Return the name of a dtype that lanes can hold."""
+    """Return the name of a dtype; raise `Unsupported` for dtypes that kernels do not
+    have.
+    """
     name = getattr(dtype, "name", None) or str(dtype)
     if name not in DTYPES:
         raise Unsupported(f"arrays of {name}")
@@ -52,20 +49,20 @@ def dtype_name(dtype: Any) -> str:
 
 
 def is_float(dtype: str) -> bool:
-    """Tell whether a dtype, given by its name, is floating-point."""
+    """Return whether a dtype is floating-point."""
     return dtype.startswith("float")
 
 
 class Region:
-    """A place of nodes: the root, the body of a loop, or a side of a branch."""
+    """A list of nodes: the root, the body of a loop, or a side of a branch."""
 
     __slots__ = ("depth", "floor", "loads", "owner", "parent", "spills", "table")
 
     def __init__(self, parent: "Region | None", owner: "Node | None", is_side: bool):
         self.parent, self.owner = parent, owner
         self.depth = 0 if parent is None else parent.depth + 1
-        # The innermost side of a branch around a node, or the root. Only there are
-        # tables of nodes.
+        # The innermost side of a branch around this region, or the root. Only these
+        # have tables of pure nodes.
         self.floor = self if is_side or parent is None else parent.floor
         self.table: dict[Any, Node] = {}
         self.loads: dict[Any, Node] = {}
@@ -75,9 +72,11 @@ class Region:
 class Node:
     """A node of the graph: a number that is computed, or a statement.
 
-    `attr` is what the operation needs beside its arguments: the value of a constant,
-    the place of a load, the loop of a parameter. The fields from `live` on belong to
-    the passes over the finished graph.
+    `attr` is what the operation needs besides its arguments: the value of a constant,
+    the address of a load, the loop of a parameter. The fields from `is_live` on belong
+    to the passes over the finished graph: whether the node is needed, whether it
+    differs between members, whether a uniform value is needed as a vector too, and the
+    names in LLVM IR.
     """
 
     __slots__ = (
@@ -110,7 +109,7 @@ class Node:
 
     @property
     def is_constant(self) -> bool:
-        """Tell whether the value is known while the graph is made."""
+        """Whether the value is known while the graph is built."""
         return self.op == "const" or self.op == "zero"
 
 
@@ -118,7 +117,7 @@ class LoopInfo:
     """A loop: its parameters with their first and next values, and its predicate.
 
     The nodes of the region with numbers below `split` are computed before the
-    predicate, the others after it, in rounds that take place.
+    predicate, the others after it, in iterations that take place.
     """
 
     __slots__ = ("inits", "outs", "params", "predicate", "region", "results", "split")
@@ -134,7 +133,7 @@ class LoopInfo:
 
 
 class BranchInfo:
-    """A branch: two sides, the first for a predicate that is true, and their values."""
+    """A branch: its two sides, the first for a true predicate, and their results."""
 
     __slots__ = ("outs", "predicate", "regions", "results")
 
@@ -146,7 +145,7 @@ class BranchInfo:
 
 
 class Graph:
-    """All nodes, and the region in which the next ones are made."""
+    """All nodes, and the region in which new nodes are created."""
 
     def __init__(self):
         self.most_nodes = sys.maxsize
@@ -163,10 +162,10 @@ class Graph:
         return self.count
 
     def constant(self, value: Any, dtype: str, is_structural: bool = False) -> Node:
-        """Make the node of a constant.
+        """Return the node of a constant.
 
-        Of a structural zero it is known that a product with it is zero, whatever the
-        other factor: the zeros around an array that is padded, or those of tangents.
+        A product with a structural zero is zero whatever the other factor is.
+        Structural zeros come from padding and from tangents that do not exist.
         """
         value = np.dtype(dtype).type(value)
         op = "zero" if is_structural else "const"
@@ -178,7 +177,7 @@ class Graph:
         return node
 
     def zero(self, dtype: str) -> Node:
-        """Make the node of a zero that is known while the graph is made."""
+        """Return the node of a structural zero."""
         return self.constant(0, dtype, is_structural=True)
 
     def pure(
@@ -189,9 +188,9 @@ class Graph:
         attr: Any = None,
         within: Region | None = None,
     ) -> Node:
-        """Make a node without effects, or find the equal one that exists.
+        """Create a node without effects, or return the equal node that exists.
 
-        It is not hoisted out of the region `within`.
+        The node is not hoisted out of the region `within`.
         """
         key = (op, dtype, attr, *[arg.number for arg in args])
         floor: Region | None = self.region.floor
@@ -206,7 +205,7 @@ class Graph:
         return node
 
     def home(self, args: Iterable[Node], within: Region | None = None) -> Region:
-        """Find the region of a pure node with these arguments."""
+        """Return the region in which a pure node with these arguments lies."""
         home = self.region.floor
         if within is not None and within.depth > home.depth:
             home = within
@@ -218,13 +217,13 @@ class Graph:
     def statement(
         self, op: str, args: tuple[Node, ...], dtype: str = "", attr: Any = None
     ) -> Node:
-        """Make a node that stays where it is: a statement, or what one results in."""
+        """Create a node that stays where it is: a statement, or a result of one."""
         return Node(op, args, dtype, self.region, self.next_number(), attr)
 
     def op(self, op: str, *args: Node, dtype: str | None = None) -> Node:
-        """Make an elementwise operation, simplified.
+        """Create an elementwise operation, simplified.
 
-        The dtype of the result is that of the last argument, if nothing else is said.
+        The result has the dtype of the last argument unless `dtype` is given.
         """
         simpler = simplify(self, op, args)
         if simpler is not None:
@@ -236,7 +235,7 @@ class Graph:
         return self.pure(op, args, dtype)
 
     def select(self, predicate: Node, yes: Node, no: Node) -> Node:
-        """Make `yes` where the predicate holds, else `no`."""
+        """Return `yes` where the predicate holds, otherwise `no`."""
         return self.op("select", predicate, yes, no)
 
     def convert(self, node: Node, dtype: str) -> Node:
@@ -257,7 +256,9 @@ _COMMUTATIVE = frozenset(("add", "mul", "max", "min", "and", "or", "xor", "eq", 
 
 
 def converted(value: Any, dtype: str) -> Any:
-    """Convert a number of NumPy as XLA does: to integers it is rounded and clamped."""
+    """Convert a NumPy number as XLA does: to integers, floats are truncated and
+    clamped.
+    """
     kind = np.dtype(dtype).kind
     if kind in "iu" and value.dtype.kind == "f":
         if np.isnan(value):
@@ -274,8 +275,8 @@ class Buffer:
     """A piece of memory that a kernel reads or writes.
 
     The kind is "operand", "result", "constant" or "scratch". Operands and constants are
-    only read, results are only written, and scratch memory is both; `is_fixed` says
-    that nothing more is stored into it.
+    only read, results are only written, scratch memory is read and written. `is_fixed`
+    says that nothing more is stored.
     """
 
     __slots__ = (
@@ -294,8 +295,7 @@ class Buffer:
 
     def __init__(self, kind: str, dtype: str, size: int, region: Region, place: Any):
         self.kind, self.dtype, self.size, self.region = kind, dtype, size, region
-        # The number of the operand or result, the values of a constant, or the offset
-        # in scratch memory, which is known in the end.
+        # The index of the operand or result, or the values of a constant.
         self.place = place
         self.stores: list[Node] = []
         self.holders = self.version = 0
@@ -325,7 +325,7 @@ def _round_away(a: Any) -> Any:
     return whole + np.copysign(np.where(np.abs(a - whole) >= 0.5, 1, 0), a)
 
 
-# What NumPy computes from constants, just as the compiled program would.
+# The functions that fold constants, with the results of the compiled program.
 _FOLDS: dict[str, Callable[..., Any]] = {
     "add": np.add,
     "sub": np.subtract,
@@ -359,7 +359,7 @@ _Rule = Callable[[Graph, Any, Any], Node | None]
 
 
 def simplify(graph: Graph, op: str, args: Sequence[Node]) -> Node | None:
-    """Find a simpler node for an operation, if there is one."""
+    """Return a simpler node for an operation, or `None`."""
     if op == "select":
         return _select(graph, *args)
     rule = _RULES.get(op)
@@ -384,7 +384,7 @@ def _is(node: Node, value: float) -> bool:
 
 
 def _is_no_summand(node: Node) -> bool:
-    """Tell whether adding a number changes nothing; +0.0 changes -0.0."""
+    """Return whether adding a number changes nothing; +0.0 changes -0.0."""
     if node.op == "zero":
         return True
     if node.op != "const" or node.attr != 0:
@@ -502,7 +502,7 @@ def _compare(op: str) -> _Rule:
         if a is b and not is_float(a.dtype):
             return graph.constant(of_equals, "bool")
         if a.op == "convert" and a.args[0].dtype == "bool" and b.is_constant:
-            # The index of a branch is made from a predicate, and compared again.
+            # JAX converts a predicate to the index of a branch, which is then compared.
             one = np.dtype(a.dtype).type(1)
             at_no, at_yes = bool(fold(one - one, b.attr)), bool(fold(one, b.attr))
             if at_no == at_yes:
@@ -552,7 +552,7 @@ T = TypeVar("T")
 
 
 class LoopBuilder:
-    """A loop whose body is made inside of a `with` statement."""
+    """A loop whose body is created inside a `with` statement."""
 
     def __init__(self, graph: Graph):
         self.graph = graph
@@ -566,11 +566,13 @@ class LoopBuilder:
 
     def __exit__(self, *_: object) -> None:
         self.graph.region = self.node.region
-        # What was hoisted out of the loop has to come before it.
+        # Hoisted nodes have to come before the loop.
         self.node.number = self.graph.next_number()
 
     def parameter(self, init: Node) -> Node:
-        """Make a number that starts as `init` and is another one in each round."""
+        """Create a number that starts as `init` and changes from iteration to
+        iteration.
+        """
         info = self.info
         place = (self.node, len(info.params))
         node = self.graph.statement("param", (), init.dtype, place)
@@ -579,7 +581,7 @@ class LoopBuilder:
         return node
 
     def goes_on_while(self, predicate: Node) -> None:
-        """Set the predicate; what is made afterwards belongs to rounds that happen."""
+        """Set the predicate; nodes that follow belong to iterations that take place."""
         self.info.predicate = predicate
         self.info.split = self.graph.next_number()
 
@@ -588,7 +590,7 @@ class LoopBuilder:
         self.info.outs = list(outs)
 
     def results(self) -> list[Node]:
-        """Make the last values of the parameters, after the loop."""
+        """Create the last values of the parameters, after the loop."""
         info, out = self.info, []
         for index, (param, init, after) in enumerate(
             zip(info.params, info.inits, info.outs, strict=True)
@@ -604,8 +606,8 @@ class LoopBuilder:
         return out
 
 
-def counted(graph: Graph, length: int, body: Callable[[Node], None]) -> None:
-    """Make a loop over a counter from 0 to `length`, whose body only stores."""
+def counted_loop(graph: Graph, length: int, body: Callable[[Node], None]) -> None:
+    """Create a loop over a counter from 0 to `length` whose body only stores."""
     if length == 0:
         return
     with LoopBuilder(graph) as loop:
@@ -616,7 +618,7 @@ def counted(graph: Graph, length: int, body: Callable[[Node], None]) -> None:
 
 
 class BranchBuilder:
-    """A branch; its two sides are made one after the other."""
+    """A branch; its two sides are created one after the other."""
 
     def __init__(self, graph: Graph, predicate: Node):
         self.graph = graph
@@ -634,7 +636,7 @@ class BranchBuilder:
             self.graph.region = self.node.region
 
     def close(self, yes: list[Node], no: list[Node]) -> list[Node]:
-        """Choose between numbers of the two sides."""
+        """Select between numbers of the two sides."""
         graph, info = self.graph, self.info
         info.outs = (yes, no)
         self.node.number = graph.next_number()

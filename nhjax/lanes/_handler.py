@@ -1,31 +1,27 @@
-"""Blocks of members that the caller and the threads of XLA's pool share, as LLVM IR.
+"""The functions that XLA calls, in LLVM IR: they run a kernel on all members.
 
-A call of a kernel is divided into blocks, of as many members as the kernel computes at
-once. They are run on the caller's thread and, where it pays, on threads of the pool:
+XLA calls a handler through its typed foreign function interface: to query its metadata,
+or to compute results. Each program has its own handler, which only passes a description
+of the program to a function that all programs share. The shared function is compiled
+once in a process, because compiling it with each program took 20 to 50 ms.
 
-- Blocks are handed out by a counter, to the caller and to its helpers alike.
-- The caller asks the pool for helpers: for fewer than the pool has threads, as it works
-  itself, and for so few that each has work for longer than it takes to wake it.
-- At the end the caller waits for the blocks that others have begun. It does not wait
-  for helpers that have not started: there may be none, because the pool has no free
-  thread, or because this is a process that has forked and has no pool any more. So a
-  call always comes to its end, since whoever has begun a block needs nobody else to
-  finish it.
-- What helpers share with the caller, the job, is kept until the last of them has seen
-  that there is nothing left to do, which may be long after the call.
+A call is divided into blocks, of as many members as the kernel computes at once. The
+caller's thread runs blocks, and so do threads of XLA's pool where this pays:
 
-Several devices of one process share its pool, and threads of Python's do. For this
-reason a counter that all programs of the process share tells how many threads are at
-work in blocks. No helper is asked for if there are as many as the pool has threads, and
-helpers leave after a block if there are more.
+- An atomic counter hands out blocks, to the caller and to its helpers alike.
+- The caller asks the pool for helpers: for fewer than the pool has threads, because it
+    works itself, and for so few that each works longer than it takes to wake it.
+- At the end the caller waits for the blocks that helpers have begun. It does not wait
+    for helpers that have not started: there may be none, because the pool has no free
+    thread, or because this process was forked and has no pool any more. A call
+    therefore always ends, since a thread needs no other thread to finish its block.
+- The data that helpers share with the caller, the job, is kept until the last helper
+    has seen that no block is left, which may be long after the call.
 
-The functions that XLA calls, as text of LLVM IR: they run kernels on all members.
-
-A handler of XLA's typed foreign function interface answers a query about itself, or
-computes results from operands. Each program has a handler of its own, which only passes
-a description of the program to `@nhjax.handle`. That function and all that it calls are
-the same for all programs, so that they are compiled once in a process: compiling them
-with each program took 20 to 50 ms. How the work is shared among threads is in `_pool`.
+Several devices of one process share the pool, and so do several threads of Python. For
+this reason all programs of the process share a counter of the threads that are working
+in blocks. If there are as many as the pool has threads, no helper is asked for; if
+there are more, helpers leave after a block.
 """
 
 import time
@@ -47,16 +43,16 @@ from ._ffi import (
 )
 
 
-# The shortest work, in ns, for which a helper is woken, which takes some 10 µs.
+# The shortest work, in ns, for which a helper is woken. Waking it takes about 10 µs.
 _WORTH_A_HELPER = 50_000
-# How often the caller yields its core before it sleeps, which takes 50 µs at least;
-# then it sleeps for an eighth of the time that it has slept, so that it is late by no
-# more.
+# The number of times that the caller yields its core before it sleeps. A sleep takes at
+# least 50 µs, and an eighth of the time slept so far, so that the caller is late by at
+# most that part.
 _YIELDS, _SHORTEST_SLEEP, _LONGEST_SLEEP = 100, 50, 10_000
 
-# What a program's handler passes on: its kernel, the numbers of its operands and
-# results, how many members the kernel computes at once, whether the results are
-# batched, and how long the first block of the last call took, in ns.
+# The description of a program: its kernel, the numbers of its operands and results, the
+# number of members that the kernel computes at once, whether the results are batched,
+# and how long the first block of the last call took, in ns.
 PROGRAM = {
     "kernel": "ptr",
     "num_operands": "i64",
@@ -66,10 +62,10 @@ PROGRAM = {
     "block_time": "i64",
 }
 
-# What the threads that work on a call share: how many blocks have been begun and are
-# done, how many threads hold the job, how many the pool has, how many blocks there are,
-# the last member, whether a block failed, the addresses of the data, and the program.
-# The first two change all the time, and have cache lines of their own.
+# The data that the threads of a call share: the numbers of blocks begun and done, the
+# number of threads that hold the job, the number of threads of the pool, the number of
+# blocks, the last member, whether a block failed, the addresses of the data, and the
+# program. The first two change all the time, and have cache lines of their own.
 JOB = {
     "begun": "i64",
     "padding_1": "[7 x i64]",
@@ -87,17 +83,17 @@ JOB = {
 
 
 def program_field(name: str) -> str:
-    """Return the instruction that finds the address of a field of `%program`."""
+    """Return the instruction that computes the address of a field of `%program`."""
     index = list(PROGRAM).index(name)
     return f"getelementptr inbounds %Program, ptr %program, i32 0, i32 {index}"
 
 
 def job_field(name: str) -> str:
-    """Return the instruction that finds the address of a field of the job `%job`."""
+    """Return the instruction that computes the address of a field of the job `%job`."""
     return f"getelementptr inbounds %Job, ptr %job, i32 0, i32 {list(JOB).index(name)}"
 
 
-# The counter of all threads that are at work in blocks, of all programs.
+# The counter of the threads that are working in blocks, of all programs.
 WORKERS = "nhjax.workers"
 
 _POOL_DECLARATIONS = f"""
@@ -337,33 +333,33 @@ end:
 
 
 # The functions that share the blocks of a call. `@nhjax.run` runs one block and
-# `@nhjax.work` all that are left; `@nhjax.wanted` and `@nhjax.ask` are for helpers,
+# `@nhjax.work` all blocks that are left; `@nhjax.wanted` and `@nhjax.ask` get helpers,
 # `@nhjax.wait` waits for them, and `@nhjax.release` releases the job.
 POOL = "\n".join([_POOL_DECLARATIONS, _RUN, _WORK, _WANTED, _ASK, _WAITING])
 
 
-# The name of the handler of a program, and of the function that it calls.
-HANDLER, HANDLE = "nhjax.handler", "nhjax.handle"
+# The names of a program's handler, and of the function that all handlers call.
+HANDLER, SHARED_HANDLER = "nhjax.handler", "nhjax.handle"
 
-# The time of a block, in ns, as long as none has been run: long enough for as many
-# helpers as there are. Longer times are taken for this one, so that products with it do
-# not overflow.
+# The time of a block, in ns, until one has been run: long enough for as many helpers as
+# there are. Longer times are cut off here, so that products do not overflow.
 _LONG = 1 << 30
 
 
 def handler_ir(
     num_operands: int, num_results: int, width: int, is_batched: bool
 ) -> str:
-    """Return the text of a module: the handler of the function `@kernel` of another.
+    """Return a module with the handler of the function `@kernel` of another module.
 
-    It refers to the function `HANDLE` of the module `handle_ir()`.
+    It refers to the function `SHARED_HANDLER` of the module `shared_handler_ir()`.
 
     **Arguments:**
 
-    - `num_operands`, `num_results`: how many arrays the kernel reads and writes.
-    - `width`: how many members it computes at once.
-    - `is_batched`: whether the results have members, along the leading axis; else there
-        is one. A program without results has nothing to do.
+    - `num_operands`, `num_results`: the numbers of arrays that the kernel reads and
+        writes.
+    - `width`: the number of members that it computes at once.
+    - `is_batched`: whether the results have members, along the leading axis. Otherwise
+        there is one member. A program without results does nothing.
     """
     values = {
         "kernel": "@kernel",
@@ -377,17 +373,17 @@ def handler_ir(
     return f"""
 {type_definitions({"Program": PROGRAM})}
 declare i1 @kernel(ptr, ptr, i64, i64)
-declare ptr @{HANDLE}(ptr, ptr)
+declare ptr @{SHARED_HANDLER}(ptr, ptr)
 @nhjax.program = internal global %Program {{ {fields} }}
 define ptr @{HANDLER}(ptr %frame) {{
-  %error = call ptr @{HANDLE}(ptr %frame, ptr @nhjax.program)
+  %error = call ptr @{SHARED_HANDLER}(ptr %frame, ptr @nhjax.program)
   ret ptr %error
 }}
 """
 
 
-def handle_ir() -> str:
-    """Return the text of the module of `HANDLE`, which serves all programs."""
+def shared_handler_ir() -> str:
+    """Return the module of `SHARED_HANDLER`, which serves all programs."""
     parts = [
         type_definitions({**STRUCTS, "Program": PROGRAM, "Job": JOB}),
         _DECLARATIONS,
@@ -398,7 +394,7 @@ def handle_ir() -> str:
         _CALL,
         _OUTCOME,
         _EXECUTE,
-        _HANDLE,
+        _ENTRY,
     ]
     return "\n".join(parts)
 
@@ -556,9 +552,9 @@ lacking:
 
 
 _FRAME = "XLA_FFI_CallFrame"
-_HANDLE = f"""
+_ENTRY = f"""
 ; Answer a call by XLA of the handler of a program.
-define ptr @{HANDLE}(ptr %frame, ptr %program) {{
+define ptr @{SHARED_HANDLER}(ptr %frame, ptr %program) {{
   %extension_at = {field("%frame", _FRAME, "extension_start")}
   %extension = load ptr, ptr %extension_at
   %is_plain = icmp eq ptr %extension, null

@@ -1,6 +1,6 @@
-"""The instructions of LLVM for each pure operation.
+"""The LLVM instructions for each pure operation of the graph.
 
-Intrinsics of LLVM need no declaration.
+`write` is called with the operands as text. Intrinsics of LLVM need no declaration.
 """
 
 from collections.abc import Callable
@@ -21,7 +21,8 @@ from ._writer import (
 )
 
 
-# A node, the width of its result, and its arguments as text.
+# The arguments: the writer, the node, the width of its result, and its operands as
+# text.
 _Rule = Callable[[Writer, Node, int, list[str]], str]
 
 _FLOAT_COMPARISONS = {
@@ -79,7 +80,9 @@ def _div(writer: Writer, node: Node, width: int, args: list[str]) -> str:
 
 
 def _integer_division(writer: Writer, node: Node, width: int, args: list[str]) -> str:
-    """Divide, for zero and for the overflow of -1 as XLA does, where LLVM may trap."""
+    """Divide integers; zero and the overflow of -1 give XLA's results, where LLVM may
+    trap.
+    """
     a, b = args
     divisor, signed = node.args[1], is_signed(node.dtype)
     kind, flag = vector(scalar_type(node.dtype), width), vector("i1", width)
@@ -100,7 +103,7 @@ def _integer_division(writer: Writer, node: Node, width: int, args: list[str]) -
     safe = writer.value(f"select {flag} {is_odd}, {kind} {one}, {kind} {b}")
     out = writer.value(f"{op} {kind} {a}, {safe}")
     if node.op == "rem":
-        # The remainder by one is that by minus one too.
+        # The remainder by -1 equals the remainder by 1.
         return writer.value(f"select {flag} {is_zero}, {kind} {a}, {kind} {out}")
     if signed:
         minus = writer.value(f"sub {kind} {zero}, {a}")
@@ -144,7 +147,7 @@ def _extremum(writer: Writer, node: Node, width: int, args: list[str]) -> str:
         return _intrinsic(writer, sign + node.op, dtype, width, args)
     for index, arg in enumerate(node.args):
         if arg.is_constant and arg.attr != 0 and not np.isnan(arg.attr):
-            # Of zeros with signs, and of NaN, there is nothing to heed then.
+            # Signed zeros and NaN cannot matter then.
             known, other = args[index], args[1 - index]
             order = "ogt" if is_max else "olt"
             wins = writer.value(f"fcmp {order} {kind} {known}, {other}")
@@ -194,7 +197,7 @@ def _compare(writer: Writer, node: Node, width: int, args: list[str]) -> str:
 
 def _select(writer: Writer, node: Node, width: int, args: list[str]) -> str:
     kind = vector(scalar_type(node.dtype), width)
-    # One predicate for all lanes may choose between vectors.
+    # A uniform predicate may select between vectors.
     flag = vector("i1", width if node.args[0].is_divergent else 1)
     return writer.value(f"select {flag} {args[0]}, {kind} {args[1]}, {kind} {args[2]}")
 
@@ -234,9 +237,9 @@ _SHIFTS = {
 
 
 def _shift(writer: Writer, node: Node, width: int, args: list[str]) -> str:
-    """Shift integers, also by as many bits as they have, or more, as XLA does.
+    """Shift integers as XLA does, also by as many bits as they have, or more.
 
-    Such a shift leaves zero, and an arithmetic one to the right leaves sign bits.
+    Such a shift gives zero; an arithmetic shift to the right gives sign bits.
     """
     kind, flag = vector(scalar_type(node.dtype), width), vector("i1", width)
     size, op = bits(node.dtype), _SHIFTS[node.op]

@@ -1,12 +1,12 @@
-"""Text of LLVM IR to native code: optimised, compiled and loaded by llvmlite.
+"""From LLVM IR to native code: parsed, optimised, compiled and loaded by llvmlite.
 
-llvmlite is imported when a function of this module first needs it, so that nhjax can be
-imported without it.
+llvmlite is imported when a function of this module first needs it, so that the package
+can be imported without llvmlite.
 
-The code is position-independent and of the small code model, linked by JITLink: the
-constants of a kernel then lie within reach of short addresses. The large code model,
-which llvmlite calls the default of a JIT, loads the address of each constant first;
-this made kernels a tenth to a third slower, and their compilation too.
+The code is position-independent, has the small code model, and is linked by JITLink, so
+that the constants of a kernel are reached by short addresses. The large code model,
+llvmlite's default for a JIT, first loads the address of each constant: kernels were a
+tenth to a third slower, and compiled more slowly.
 """
 
 import platform
@@ -19,42 +19,42 @@ import numpy as np
 
 
 class Target(NamedTuple):
-    """A machine to compile for: LLVM's triple, name of the CPU, and features of it."""
+    """A machine to compile for: LLVM's triple, the CPU's name, and its features."""
 
     triple: str
     cpu: str
     features: str = ""
 
 
-# Where the call works: little-endian machines of 64 bits, with the functions of POSIX
-# that the handler calls. Elsewhere members run without lanes.
+# The supported platforms: 64-bit little-endian machines with the POSIX functions that
+# the handler calls.
 _PLATFORMS = {("linux", "x86_64"), ("linux", "aarch64"), ("darwin", "arm64")}
 
-# The level of LLVM's passes on the IR. The kernels are simplified when they are made:
-# level 1 gave the same speed as 3 in half of the time, and no passes at all gave code
-# that is 5 to 15 percent slower.
+# The level of LLVM's passes on the IR. Kernels are simplified when they are created:
+# level 1 gave the speed of level 3 in half of the time. Without passes the code was 5
+# to 15 percent slower.
 _PASSES = 1
 # The levels of the code generator for modules of fewer characters than this, and for
-# longer ones. Level 1 takes half of the time of 2; a short kernel was 6 percent slower
-# with it, and a long one 2 percent faster.
+# longer modules. Level 1 takes half of the time of level 2. With level 1 a short kernel
+# was 6 percent slower, and a long kernel 2 percent faster.
 _LONG_TEXT = 1_000_000
 _GENERATION_OF_SHORT, _GENERATION_OF_LONG = 2, 1
-# The level of both for programs that run once: all of the above left out.
+# The level of both for programs that are wanted quickly: no optimisation.
 _QUICK = 0
 
 
 @lru_cache(maxsize=1)
 def is_available() -> bool:
-    """Tell whether programs can be compiled and called, with llvmlite and here."""
+    """Return whether programs can be compiled and called in this process."""
     if (sys.platform, platform.machine()) not in _PLATFORMS:
         return False
     if sys.maxsize < 2**32:
-        # A Python of 32 bits.
+        # A 32-bit Python.
         return False
     try:
         _llvm()
     except (ImportError, OSError):
-        # It is not there, or cannot be loaded on this system.
+        # llvmlite is not installed, or cannot be loaded on this system.
         return False
     return True
 
@@ -88,7 +88,7 @@ def version() -> str:
 
 
 def host_width(dtype: Any) -> int:
-    """Return the number of members that fill a vector of this machine's."""
+    """Return the number of members that fill a vector register of this machine."""
     features = _llvm().get_host_cpu_features()
     bits = 128
     if features.get("avx512f") and features.get("avx512dq"):
@@ -106,8 +106,8 @@ def object_code(
     **Arguments:**
 
     - `texts`: the modules, in LLVM IR. They may declare the same functions.
-    - `exported`: the one function that is seen from outside.
-    - `target`: the machine, which need not be this one.
+    - `exported`: the only function that is visible from outside.
+    - `target`: the machine, which may be another one.
     - `is_quick`: whether to compile in a third of the time or less, to slower code.
     """
     module, machine = _compiled(texts, exported, target, is_quick)
@@ -115,20 +115,20 @@ def object_code(
 
 
 def assembly(texts: Sequence[str], exported: str, target: Target) -> str:
-    """Compile modules to the text of an assembler, to be read."""
+    """Compile modules to assembly text, for readers."""
     module, machine = _compiled(texts, exported, target, is_quick=False)
     return machine.emit_assembly(module)
 
 
 def load(code: bytes, name: str, symbol: str, imports: dict[str, int]) -> int:
-    """Load an object file of this machine's, and return the address of a function.
+    """Load an object file for this machine, and return the address of a function.
 
-    It stays until the process ends.
+    The code stays loaded until the process ends.
 
     **Arguments:**
 
     - `code`: the object file. Functions that it calls are looked up in the process.
-    - `name`: a name that no other file has.
+    - `name`: a name that no other object file has.
     - `symbol`: the name of the function.
     - `imports`: the addresses of other symbols that the file refers to.
     """
@@ -136,14 +136,14 @@ def load(code: bytes, name: str, symbol: str, imports: dict[str, int]) -> int:
     for imported, address in imports.items():
         builder.import_symbol(imported, address)
     library = builder.export_symbol(symbol).link(_linker(), name)
-    # Otherwise the code would be unmapped together with this object.
+    # Otherwise the code would be unmapped when this object is freed.
     library.detach()
     return library[symbol]
 
 
 @lru_cache(maxsize=1)
 def _linker() -> Any:
-    # llvmlite frees nothing when Python ends, so that this lives as long as XLA.
+    # llvmlite frees nothing when Python exits, so that this lives as long as XLA.
     return _llvm().create_lljit_compiler(
         _machine(host(), _GENERATION_OF_SHORT), use_jit_link=True
     )
@@ -167,16 +167,15 @@ def _machine(target: Target, level: int) -> Any:
 def _compiled(
     texts: Sequence[str], exported: str, target: Target, is_quick: bool
 ) -> tuple[Any, Any]:
-    """Return the module after all passes, and the machine that makes code of it."""
+    """Return the module after all passes, and the machine that generates its code."""
     llvm = _llvm()
     is_long = sum(map(len, texts)) >= _LONG_TEXT
     level = _GENERATION_OF_LONG if is_long else _GENERATION_OF_SHORT
     machine = _machine(target, _QUICK if is_quick else level)
-    # In the context that all modules share their types and constants would never be
-    # freed.
+    # The types and constants of modules in the global context are never freed.
     context = llvm.create_context()
     module, *others = [llvm.parse_assembly(text, context) for text in texts]
-    # Without these the passes would lay out structures as for no machine at all.
+    # Without these, the passes would use the layout of no particular machine.
     for part in (module, *others):
         part.triple = machine.triple
         part.data_layout = str(machine.target_data)
@@ -185,15 +184,15 @@ def _compiled(
     module.verify()
     for function in module.functions:
         if not function.is_declaration:
-            # Tables for exceptions are not needed: nothing raises one.
+            # No code raises exceptions, so that no tables for them are needed.
             function.add_function_attribute("nounwind")
-            # Of a function that nobody else calls no copy stays where it is inlined.
+            # Internal linkage lets LLVM remove functions that were inlined everywhere.
             if function.name != exported:
                 function.linkage = "internal"
     options = llvm.create_pipeline_tuning_options(
         speed_level=_QUICK if is_quick else _PASSES
     )
-    # The lanes are vectors already.
+    # The members are vectors already.
     options.loop_vectorization = options.loop_interleaving = False
     options.slp_vectorization = options.loop_unrolling = False
     builder = llvm.create_pass_builder(machine, options)

@@ -1,16 +1,14 @@
-"""The reduction of large arguments of sine and cosine, as Payne and Hanek do it.
-
-A number x = m 2^e, with an integer m of 53 bits, is multiplied by 2 / pi. Of the binary
-digits of 2 / pi those are left out that add multiples of 4 to the product, and of what
-follows 192 are used, which is enough for the float64 nearest to a multiple of pi / 2.
-
-Sine, cosine and tangent, for vectors of float64.
+"""Sine, cosine and tangent, and their inverses, for vectors of float64.
 
 With n the integer nearest to x / (pi / 2), x = n pi / 2 + r and |r| <= pi / 4. Sine and
-cosine are made in one function: each needs both polynomials anyhow, as the lanes differ
-in n, and LLVM merges two calls with the same argument.
+cosine are computed by one function: each needs both polynomials anyway, because n
+differs between the members of a vector, and LLVM merges two calls with the same
+argument.
 
-The inverse trigonometric functions, for vectors of float64.
+Large arguments are reduced by the method of Payne and Hanek. The number x = m 2^e, with
+an integer m of 53 bits, is multiplied by 2 / pi. The binary digits of 2 / pi that add
+multiples of 4 to the product are left out, and the next 192 digits are used. This is
+enough for the float64 nearest to a multiple of pi / 2.
 """
 
 import math
@@ -33,7 +31,7 @@ from ._writer import (
 )
 
 
-# The binary digits of 2 / pi behind the point, 64 in a word, after a word of zeros.
+# The binary digits of 2 / pi after the point, 64 in a word, after a word of zeros.
 _WORDS = """
     0000000000000000 a2f9836e4e441529 fc2757d1f534ddc0 db6295993c439041
     fe5163abdebbc561 b7246e3a424dd2e0 06492eea09d1921c fe1deb1cb129a73e
@@ -49,9 +47,9 @@ _REDUCED_LARGE = "nhjax.reduced_large"
 
 
 def _window(exponent: Value) -> list[Value]:
-    """Load the 192 digits of 2 / pi that matter, for x with this biased exponent."""
+    """Load the 192 digits of 2 / pi that matter for an x with this biased exponent."""
     writer = exponent.writer
-    # With e = exponent - 1075, those of weight 2^(e - i) >= 4 are left out.
+    # With e = exponent - 1075, digits of weight 2^(e - i) >= 4 are left out.
     skipped = where(exponent < 1013, 0, exponent - 1013)
     word, shift = skipped >> 6, skipped & 63
     words = []
@@ -68,10 +66,10 @@ def _window(exponent: Value) -> list[Value]:
     ]
 
 
-def _function() -> str:
-    """Return the definition of a function of x that returns n and r as a pair.
+def _reduction_of_large() -> str:
+    """Return the definition of a function of x that returns n and r as a double-double.
 
-    They are as for small arguments: x is n pi / 2 + r up to multiples of 2 pi.
+    As for small arguments, x is n pi / 2 + r up to multiples of 2 pi.
     """
     writer = Writer(1)
     bits = Value(writer, "double", "%x").bits()
@@ -96,7 +94,8 @@ def _function() -> str:
     high = (upper & ~_LOWEST_BITS).cast("uitofp", "double") * scale
     low = ((upper & _LOWEST_BITS) << 53) | (lower >> 11)
     low = low.cast("uitofp", "double") * 2.0**-53 * scale
-    # Both signs count: that of r where |n| pi / 2 is more, and that of x.
+    # Two signs enter: the sign of r, where |n| pi / 2 is larger than |x|, and that of
+    # x.
     is_left = bits < 0
     sign = where(is_negative, -(2**63), 0) ^ (bits & -(2**63))
     quadrant = n.cast("trunc", "i64")
@@ -114,28 +113,28 @@ def _function() -> str:
     return f"{table}{writer.definition(head)}\n"
 
 
-_REDUCED_LARGE_DEFINITION = _function()
+_REDUCED_LARGE_DEFINITION = _reduction_of_large()
 
 
 _PER_HALF_PI = 0.6366197723675814
-# pi / 2 in three parts, the first two of 38 bits: their products with integers of up
-# to 2^15 are exact, which is how large n is for the largest argument here.
-_PARTS = (1.5707963267923333, 2.5633441515839558e-12, 1.0562999066987428e-23)
-_MOST = 51471.0
+# pi / 2 in three parts. The first two have 38 bits: their products with integers up to
+# 2^15 are exact, and n is not larger for the largest argument below.
+_HALF_PI_PARTS = (1.5707963267923333, 2.5633441515839558e-12, 1.0562999066987428e-23)
+_LARGEST_DIRECT = 51471.0
 
 
-def _reduced(x: Value) -> tuple[Value, DoubleDouble]:
-    """Return n, in the lowest bits of an integer, and r as a pair."""
+def _reduce(x: Value) -> tuple[Value, DoubleDouble]:
+    """Return n, in the lowest bits of an integer, and r as a double-double."""
     n, bits = nearest(x * _PER_HALF_PI)
     with x.writer.exact():
-        first, second = x - n * _PARTS[0], n * _PARTS[1]
+        first, second = x - n * _HALF_PI_PARTS[0], n * _HALF_PI_PARTS[1]
         difference, error = two_sum(first, -second)
-        small = n * _PARTS[2] - error
+        small = n * _HALF_PI_PARTS[2] - error
         high = difference - small
         low = (difference - high) - small
     size = absolute(x)
-    # Infinity and NaN give NaN here already.
-    is_large = (size > _MOST) & (size < math.inf)
+    # Infinity and NaN already give NaN.
+    is_large = (size > _LARGEST_DIRECT) & (size < math.inf)
 
     def otherwise() -> tuple[Value, ...]:
         x.writer.helpers[_REDUCED_LARGE] = _REDUCED_LARGE_DEFINITION
@@ -160,7 +159,7 @@ def _sine_and_cosine(r: DoubleDouble) -> tuple[DoubleDouble, DoubleDouble]:
 
 def sine_and_cosine(x: Value) -> tuple[Value, Value]:
     """Return the sine and the cosine of x."""
-    n, r = _reduced(x)
+    n, r = _reduce(x)
     (s, s_rest), (c, c_rest) = _sine_and_cosine(r)
     s, c = s + s_rest, c + c_rest
     is_odd = (n & 1).equals(1)
@@ -172,7 +171,7 @@ def sine_and_cosine(x: Value) -> tuple[Value, Value]:
 
 def tan(x: Value) -> Value:
     """Return the tangent of x."""
-    n, r = _reduced(x)
+    n, r = _reduce(x)
     s, c = (fast_two_sum(*pair) for pair in _sine_and_cosine(r))
     is_odd = (n & 1).equals(1)
     above = [where(is_odd, b, a) for a, b in zip(s, c, strict=True)]
@@ -183,7 +182,7 @@ def tan(x: Value) -> Value:
 
 
 _HALF_PI, _HALF_PI_LOW = math.pi / 2, 6.123233995736766e-17
-# Multiples of pi / 4, each as what float64 makes of it and what that leaves.
+# Multiples of pi / 4: the nearest float64, and the remainder.
 _QUARTERS = {
     0: (0.0, 0.0),
     1: (math.pi / 4, _HALF_PI_LOW / 2),
@@ -194,16 +193,16 @@ _QUARTERS = {
 
 
 class _Angle(NamedTuple):
-    """The angle arctan(a / b), a multiple of pi / 4 and arctan(t), |t| <= 1/2."""
+    """The angle arctan(a / b): a multiple of pi / 4 plus arctan(t), |t| <= 1/2."""
 
     is_low: Value
     is_high: Value
     t: Value
-    # What arctan(t) is more than t.
+    # arctan(t) - t.
     rest: Value
 
     def after(self, low: int, middle: int, high: int, sign: float) -> Value:
-        """Return a multiple of pi / 4, chosen by that of the angle, +- arctan(t)."""
+        """Return a multiple of pi / 4, selected by that of the angle, +- arctan(t)."""
         multiples = zip(*(_QUARTERS[i] for i in (low, middle, high)), strict=True)
         first, second = (
             where(self.is_low, x, where(self.is_high, z, y)) for x, y, z in multiples
@@ -235,21 +234,22 @@ def atan(x: Value) -> Value:
 def atan2(y: Value, x: Value) -> Value:
     """Return the angle from the first axis of the point (x, y)."""
     a, b = absolute(y), absolute(x)
-    # Of two infinities the angle is that of equals; that of zeros is 0 or pi.
+    # Two infinities have the angle of equal numbers; two zeros have 0 or pi.
     are_infinite = a.equals(math.inf) & b.equals(math.inf)
     a, b = where(are_infinite, 1.0, a), where(are_infinite, 1.0, b)
     scale = where((a > 2.0**1000) | (b > 2.0**1000), 0.25, 1.0)
     are_zero = a.equals(0.0) & b.equals(0.0)
     angle = _angle(a * scale, where(are_zero, 1.0, b * scale))
     right, left = angle.after(0, 1, 2, 1.0), angle.after(4, 3, 2, -1.0)
-    # The sign bit tells -0.0 from 0.0.
+    # The sign bit distinguishes -0.0 from 0.0.
     return with_sign(where(x.bits() < 0, left, right), y)
 
 
 def _half_angle(x: Value) -> tuple[Value, Value, Value]:
-    """Return whether |x| > 1/2, then t and arcsin(t) - t.
+    """Return whether |x| > 1/2, t, and arcsin(t) - t.
 
-    There t = sqrt((1 - |x|) / 2), so that arcsin|x| = pi / 2 - 2 arcsin(t); else |x|.
+    If |x| > 1/2, t = sqrt((1 - |x|) / 2), so that arcsin|x| = pi / 2 - 2 arcsin(t).
+    Otherwise t = |x|.
     """
     size = absolute(x)
     is_large = size > 0.5

@@ -353,11 +353,13 @@ class Value:
         return self._compare("oge", "sge", other)
 
     def equals(self, other: "Operand") -> "Value":
-        """Tell in which lanes two values are equal; NaN equals nothing."""
+        """Return for which members two values are equal; NaN equals nothing."""
         return self._compare("oeq", "eq", other)
 
     def cast(self, instruction: str, kind: str) -> "Value":
-        """Convert by one of the instructions `zext`, `trunc`, `bitcast`, `uitofp`."""
+        """Convert by an instruction: `zext`, `trunc`, `bitcast`, `uitofp`, `fpext`,
+        `fptrunc`.
+        """
         types = f"{self.typed()} to {self.writer.type(kind)}"
         return self.writer.compute(kind, f"{instruction} {types}")
 
@@ -374,7 +376,7 @@ Operand: TypeAlias = Value | float | int
 
 
 def where(condition: Value, chosen: Operand, other: Operand) -> Value:
-    """Return `chosen` in the lanes where the condition holds, else `other`."""
+    """Return `chosen` for the members where the condition holds, otherwise `other`."""
     writer = condition.writer
     kinds = [x.kind for x in (chosen, other) if isinstance(x, Value)]
     kind = kinds[0] if kinds else "i64" if isinstance(chosen, int) else "double"
@@ -394,12 +396,12 @@ def absolute(x: Value) -> Value:
 
 
 def with_sign(x: Value, sign: Value) -> Value:
-    """Return |x| with the sign of another value, also of zeros."""
+    """Return |x| with the sign of another value; the signs of zeros count."""
     return _intrinsic("copysign", x, sign)
 
 
 def square_root(x: Value) -> Value:
-    """Return the square root of x, rounded correctly."""
+    """Return the correctly rounded square root of x."""
     return _intrinsic("sqrt", x)
 
 
@@ -413,7 +415,7 @@ def _intrinsic(name: str, *arguments: Value) -> Value:
 # round-off of the first.
 DoubleDouble: TypeAlias = tuple[Value, Value]
 
-# Adding this rounds to an integer, which is then in the lowest bits.
+# Adding this rounds to an integer, which then stands in the lowest bits.
 _TO_INTEGER = 1.5 * 2.0**52
 # The bits of 1.0.
 ONE_BITS = 0x3FF0000000000000
@@ -422,10 +424,10 @@ _HALF_UNIT = 1 << 26
 
 
 def polynomial(x: Value, coefficients: Sequence[float]) -> Value:
-    """Evaluate a polynomial, given its coefficients by rising powers.
+    """Evaluate a polynomial with the given coefficients, lowest power first.
 
-    The even and the odd powers are evaluated apart, each in the same way, much as in
-    Estrin's scheme: fewer products wait for one another than in Horner's.
+    As in Estrin's scheme, the even and the odd powers are evaluated separately, each in
+    the same way: fewer products wait for one another than in Horner's scheme.
     """
     powers = [x]
     while 2 ** len(powers) < len(coefficients):
@@ -443,9 +445,9 @@ def polynomial(x: Value, coefficients: Sequence[float]) -> Value:
 
 
 def nearest(x: Value) -> tuple[Value, Value]:
-    """Return the integer nearest to x, and bits of which the lowest are that integer.
+    """Return the integer nearest to x, as a float and in the lowest bits of an integer.
 
-    For |x| < 2^51, with 51 bits for the integer and its sign.
+    This holds for |x| < 2^51; 51 bits are the integer and its sign.
     """
     with x.writer.exact():
         shifted = x + _TO_INTEGER
@@ -453,10 +455,10 @@ def nearest(x: Value) -> tuple[Value, Value]:
 
 
 def times_power_of_two(x: Value, exponent: Value) -> Value:
-    """Return x 2^n, rounded once, where n is in the 13 lowest bits.
+    """Return x 2^n, rounded once, where n is in the lowest 13 bits.
 
-    For |n| of at most 2000: half of the power is multiplied first, so that neither
-    factor overflows, and a result that is subnormal is rounded only at last.
+    It needs |n| <= 2000. Half of the power is multiplied first, so that neither factor
+    overflows and a subnormal result is rounded only in the last product.
     """
     half = exponent >> 1
     first = ((half << 52) + ONE_BITS).number()
@@ -465,12 +467,12 @@ def times_power_of_two(x: Value, exponent: Value) -> Value:
 
 
 def power_of_two(exponent: Value) -> Value:
-    """Return 2^n for n from -1022 to 1023 in the 12 lowest bits of an integer."""
+    """Return 2^n for n from -1022 to 1023, in the lowest 12 bits of an integer."""
     return ((exponent << 52) + ONE_BITS).number()
 
 
 def fast_two_sum(a: Value | float, b: Value) -> DoubleDouble:
-    """Return a + b without error, where a is 0 or |a| is at least |b|."""
+    """Return a + b without error, if a is 0 or |a| >= |b|."""
     with b.writer.exact():
         high = a + b
         return high, b - (high - a)
@@ -485,19 +487,19 @@ def two_sum(a: Value, b: Value) -> DoubleDouble:
 
 
 def leading_bits(x: Value, count: int) -> Value:
-    """Return a number of that many binary digits, which is x without the others."""
+    """Return x truncated to a number of binary digits."""
     return (x.bits() & -(1 << (53 - count))).number()
 
 
 def halves(x: Value) -> DoubleDouble:
-    """Split x into two numbers of 26 bits, such that products of these are exact."""
+    """Split x into two numbers of 26 bits, such that their products are exact."""
     with x.writer.exact():
         upper = leading_bits((x.bits() + _HALF_UNIT).number(), 26)
         return upper, x - upper
 
 
 def two_product(a: Value, b: Value) -> DoubleDouble:
-    """Return a b without error, if there is no underflow."""
+    """Return a b without error, unless it underflows."""
     with a.writer.exact():
         high = a * b
         (a1, a2), (b1, b2) = halves(a), halves(b)
@@ -505,13 +507,13 @@ def two_product(a: Value, b: Value) -> DoubleDouble:
 
 
 def product(a: DoubleDouble, b: DoubleDouble) -> DoubleDouble:
-    """Return the product of two pairs."""
+    """Return the product of two double-double numbers."""
     high, low = two_product(a[0], b[0])
     return fast_two_sum(high, low + (a[0] * b[1] + a[1] * b[0]))
 
 
 def quotient(a: DoubleDouble, b: DoubleDouble) -> DoubleDouble:
-    """Return the quotient of two pairs."""
+    """Return the quotient of two double-double numbers."""
     high = a[0] / b[0]
     back, error = two_product(high, b[0])
     with high.writer.exact():
@@ -520,17 +522,16 @@ def quotient(a: DoubleDouble, b: DoubleDouble) -> DoubleDouble:
 
 
 def rounded_quotient(a: DoubleDouble, b: DoubleDouble) -> Value:
-    """Return the quotient of two pairs to little more than half an ulp.
+    """Return the quotient of two double-double numbers to little more than half an ulp.
 
-    The quotient of the first numbers is rounded, and only the effect of the second
-    numbers is added.
+    The quotient of the high parts is rounded, and the effect of the low parts is added.
     """
     first = a[0] / b[0]
     return first + (a[1] - first * b[1]) / b[0]
 
 
 def root(a: DoubleDouble) -> DoubleDouble:
-    """Return the square root of a pair that is positive."""
+    """Return the square root of a positive double-double number."""
     high = square_root(a[0])
     back, error = two_product(high, high)
     with high.writer.exact():

@@ -8,7 +8,7 @@ import pytest
 
 import nhjax
 from nhjax import LobattoIIIAB, systems
-from nhjax._compile import as_cpu_kernel, Programs
+from nhjax._compile import as_cpu_kernel, TraceCache
 
 
 MARK = 'xla_cpu_small_call = "true"'
@@ -260,7 +260,7 @@ def test_a_function_is_traced_once_for_each_kind_of_arguments():
         traced.append(x.shape)
         return factor * jnp.sin(x)
 
-    programs = Programs()
+    programs = TraceCache()
 
     def value(x, factor=2.0):
         return jnp.sum(as_cpu_kernel(scaled, x, factor, programs=programs))
@@ -276,7 +276,7 @@ def test_a_function_is_traced_once_for_each_kind_of_arguments():
 
 
 def test_a_program_with_what_another_trace_computed_is_not_kept():
-    programs = Programs()
+    programs = TraceCache()
 
     def value(x):
         return as_cpu_kernel(lambda y, x=x: x * y, jnp.ones(()), programs=programs)

@@ -86,8 +86,8 @@ def test_arrays_in_memory_hold_what_those_of_jax_do(program, seed, width, batche
     names = [name for name in sys.modules if name.startswith("nhjax.lanes.")]
     with pytest.MonkeyPatch.context() as patch:
         # Nearly all arrays of these programs are large then, and copied in loops.
-        patch.setattr(_builder, "_UNROLLED", 1)
+        patch.setattr(_builder, "_LONGEST_UNROLLED", 1)
         for name in names:
-            if hasattr(sys.modules[name], "LARGE"):
-                patch.setattr(sys.modules[name], "LARGE", 1)
+            if hasattr(sys.modules[name], "MOST_IN_REGISTERS"):
+                patch.setattr(sys.modules[name], "MOST_IN_REGISTERS", 1)
         compare(program, seed, width, batched)

@@ -74,7 +74,7 @@ def loaded(texts, symbol):
 
 
 def with_handler(body, is_batched=True):
-    """A kernel and its handler, which refers to the module of `handle_ir`."""
+    """A kernel and its handler, which refers to the module of `shared_handler_ir`."""
     return [kernel_ir(body), _handler.handler_ir(1, 1, WIDTH, is_batched)]
 
 
@@ -82,7 +82,7 @@ class Program:
     """The handler of a kernel that triples, with its allocations and clock in hand."""
 
     def __init__(self, is_batched=True):
-        text = _handler.handle_ir()
+        text = _handler.shared_handler_ir()
         for name, stand_in in STAND_INS.items():
             assert f"@{name}(" in text
             text = text.replace(f"@{name}(", f"@{stand_in}(")
@@ -316,7 +316,7 @@ def test_another_number_of_arrays_is_an_error(program):
 
 
 def test_lack_of_memory_is_an_error():
-    text = _handler.handle_ir()
+    text = _handler.shared_handler_ir()
     declared = "declare ptr @malloc(i64)"
     assert declared in text
     text = text.replace(
@@ -337,7 +337,8 @@ define i1 @kernel(ptr %operands, ptr %results, i64 %first, i64 %last) {
   ret i1 %is_later
 }
 """
-    texts = [kernel, _handler.handler_ir(1, 1, WIDTH, True), _handler.handle_ir()]
+    handler = _handler.handler_ir(1, 1, WIDTH, True)
+    texts = [kernel, handler, _handler.shared_handler_ir()]
     handler = loaded(texts, _handler.HANDLER)
     for members, is_lacking in ((WIDTH, False), (3 * WIDTH, True)):
         runtime = Runtime(threads=2)
@@ -363,5 +364,5 @@ def test_a_program_without_members_runs_once():
 def test_a_program_without_results_does_nothing():
     kernel = "define i1 @kernel(ptr %operands, ptr %results, i64 %first, i64 %last) {"
     handler = _handler.handler_ir(1, 0, WIDTH, True)
-    texts = [f"{kernel} unreachable }}", handler, _handler.handle_ir()]
+    texts = [f"{kernel} unreachable }}", handler, _handler.shared_handler_ir()]
     assert Runtime().call(loaded(texts, _handler.HANDLER), [np.ones(3)], []) is None

@@ -31,7 +31,7 @@ TARGETS = {
 @pytest.mark.parametrize("name", TARGETS)
 def test_a_kernel_and_its_handler_compile_for(name):
     target, register = TARGETS[name]
-    texts = [VECTORS, _handler.handler_ir(1, 1, 8, True), _handler.handle_ir()]
+    texts = [VECTORS, _handler.handler_ir(1, 1, 8, True), _handler.shared_handler_ir()]
     made = texts, _handler.HANDLER, target
     text = _native.assembly(*made)
     assert _handler.HANDLER in text

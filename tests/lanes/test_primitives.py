@@ -300,7 +300,7 @@ def test_parameters_of_another_release_are_refused_by_name():
     equation = equation.replace(params=params)
     jaxpr = program.jaxpr.replace(eqns=[equation])
     with pytest.raises(Unsupported, match="rev without its dimensions"):
-        _program.trace(program.replace(jaxpr=jaxpr))
+        _program.build_graph(program.replace(jaxpr=jaxpr))
 
 
 def test_effects_are_refused():

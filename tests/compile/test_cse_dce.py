@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from jax import lax
 
-from nhjax._compile import shortened
+from nhjax._compile import cse_dce
 
 
 X = np.linspace(-1.0, 2.0, 5)
@@ -30,7 +30,7 @@ def test_what_is_repeated_is_computed_once():
         return jnp.sin(2 * x) + jnp.cos(jnp.sin(2 * x)), jnp.sin(2 * x)
 
     program = program_of(function)
-    short = shortened(program)
+    short = cse_dce(program)
     assert sorted(operations(short)) == ["add", "cos", "mul", "sin"]
     for one, other in zip(results(short), results(program), strict=True):
         np.testing.assert_array_equal(one, other)
@@ -41,14 +41,14 @@ def test_what_nothing_uses_goes():
         jnp.exp(jnp.cos(x))
         return jnp.sin(x)
 
-    assert operations(shortened(program_of(function))) == ["sin"]
+    assert operations(cse_dce(program_of(function))) == ["sin"]
 
 
 def test_results_may_be_operands_constants_and_the_same_twice():
     def function(x):
         return x, jnp.sin(x), 1.0, jnp.sin(x)
 
-    short = shortened(program_of(function))
+    short = cse_dce(program_of(function))
     assert operations(short) == ["sin"]
     same, one, constant, other = results(short)
     np.testing.assert_array_equal(same, X)
@@ -69,7 +69,7 @@ def test_results_may_be_operands_constants_and_the_same_twice():
 )
 def test_what_differs_stays(function):
     program = program_of(function)
-    short = shortened(program)
+    short = cse_dce(program)
     assert operations(short) == operations(program)
     for one, other in zip(results(short), results(program), strict=True):
         np.testing.assert_array_equal(np.signbit(one), np.signbit(other))
@@ -120,7 +120,7 @@ INNER = [_scan, _while, _cond, _jitted, _remat, _solve, _with_rule]
 @pytest.mark.parametrize("function", INNER)
 def test_programs_within_are_shortened_too(function):
     program = program_of(function)
-    short = shortened(program)
+    short = cse_dce(program)
     for one, other in zip(results(short), results(program), strict=True):
         np.testing.assert_array_equal(one, other)
     text = str(short)
@@ -136,7 +136,7 @@ def test_shortened_programs_have_the_same_derivatives(function):
 
     for of in (jax.grad, lambda f: jax.jacfwd(f)):
         expected = of(cost(program))(X)
-        np.testing.assert_array_equal(of(cost(shortened(program)))(X), expected)
+        np.testing.assert_array_equal(of(cost(cse_dce(program)))(X), expected)
 
 
 def test_effects_stay(capfd):
@@ -145,7 +145,7 @@ def test_effects_stay(capfd):
         jax.debug.print("seen {}", x[0])
         return x
 
-    results(shortened(program_of(function)))
+    results(cse_dce(program_of(function)))
     jax.effects_barrier()
     assert capfd.readouterr().out.count("seen -1.0") == 2
 
@@ -159,7 +159,7 @@ def test_operations_under_other_settings_of_jax_stay():
 
     key = jax.random.PRNGKey(0)
     program = program_of(function, key)
-    one, other = results(shortened(program), key)
+    one, other = results(cse_dce(program), key)
     for got, expected in zip((one, other), results(program, key), strict=True):
         np.testing.assert_array_equal(got, expected)
     assert np.any(one != other)
@@ -178,7 +178,7 @@ def test_a_result_without_a_name_does_not_stand_for_one_with_a_name():
         outvars[place] = jax.extend.core.DropVar(outvars[place].aval)
     named = dict(zip(map(id, splits), variables, strict=True))
     equations = [e.replace(outvars=named.get(id(e), e.outvars)) for e in program.eqns]
-    short = shortened(program.replace(jaxpr=program.jaxpr.replace(eqns=equations)))
+    short = cse_dce(program.replace(jaxpr=program.jaxpr.replace(eqns=equations)))
     np.testing.assert_array_equal(results(short)[0], function(X))
     operands = [v for e in short.eqns for v in e.invars]
     assert not any(isinstance(v, jax.extend.core.DropVar) for v in operands)
@@ -192,8 +192,8 @@ def test_results_with_names_come_from_one_operation():
 
     program = program_of(function)
     assert operations(program).count("split") == 2
-    assert operations(shortened(program)).count("split") == 1
-    np.testing.assert_array_equal(results(shortened(program))[0], function(X))
+    assert operations(cse_dce(program)).count("split") == 1
+    np.testing.assert_array_equal(results(cse_dce(program))[0], function(X))
 
 
 def test_a_program_that_stands_at_many_places_stays_one():
@@ -201,7 +201,7 @@ def test_a_program_that_stands_at_many_places_stays_one():
     for _ in range(14):
         inner = jax.jit(function)
         function = lambda x, inner=inner: inner(x) + inner(x + 1)  # noqa: E731
-    short = shortened(program_of(function))
+    short = cse_dce(program_of(function))
     depth, programs = 0, [short]
     while programs:
         inner = [
