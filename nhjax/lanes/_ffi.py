@@ -132,7 +132,7 @@ ERRORS = f"""
 {_constant_string(NO_SCRATCH, "no memory for the arrays that a program works with")}
 {_constant_string(MISMATCH, "unexpected numbers of arrays")}
 
-; Make an error, for XLA to destroy.
+; Create an error, which XLA will destroy.
 define internal ptr @nhjax.error(ptr %frame, ptr %message, i32 %code) {{
   %args = alloca %{_CREATE}
   store %{_CREATE} zeroinitializer, ptr %args
@@ -149,7 +149,7 @@ define internal ptr @nhjax.error(ptr %frame, ptr %message, i32 %code) {{
   ret ptr %error
 }}
 
-; Whether a call of the interface failed; its error, which is ours then, is destroyed.
+; Return whether a call of the interface failed, and destroy its error, which is ours.
 define internal i1 @nhjax.failed(ptr %api, ptr %error) {{
   %is_fine = icmp eq ptr %error, null
   br i1 %is_fine, label %fine, label %failed

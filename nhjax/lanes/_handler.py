@@ -140,7 +140,7 @@ done:
 
 
 _WORK = f"""
-; What the caller does: run blocks as long as there are any.
+; Run blocks until none is left, as the caller does.
 define internal void @nhjax.work(ptr %job) {{
   %begun_at = {job_field("begun")}
   %blocks_at = {job_field("blocks")}
@@ -157,7 +157,7 @@ end:
   ret void
 }}
 
-; Let go of the job, and free it if no other thread holds it.
+; Release the job, and free it if no other thread holds it.
 define internal void @nhjax.release(ptr %job) {{
   %holders_at = {job_field("holders")}
   %holders = atomicrmw sub ptr %holders_at, i64 1 acq_rel
@@ -170,7 +170,7 @@ end:
   ret void
 }}
 
-; What a helper does: run blocks as long as there are any, and room for it at work.
+; Run blocks until none is left or too many threads are working, as a helper does.
 define internal void @nhjax.help(ptr %job) {{
   %threads_at = {job_field("threads")}
   %threads = load i64, ptr %threads_at
@@ -184,7 +184,7 @@ next:
   %is_full = icmp sgt i64 %workers, %threads
   br i1 %is_full, label %part, label %begin
 part:
-  ; Of several that find too many at work, no more leave than there are too many.
+  ; If several helpers find too many threads, only the surplus leaves.
   %with_this = atomicrmw sub ptr @{WORKERS}, i64 1 monotonic
   %is_too_many = icmp sgt i64 %with_this, %threads
   br i1 %is_too_many, label %release, label %rejoin
@@ -210,8 +210,8 @@ release:
 
 _THREADS = "XLA_FFI_ThreadPool_NumThreads_Args"
 _WANTED = f"""
-; How many helpers are worth their waking, and have room beside the threads that are at
-; work, this one included, if so many blocks are left to them and each takes so long.
+; Return how many helpers are worth waking for this many blocks that take this long,
+; at most as many as the pool has threads that are not working.
 define internal i64 @nhjax.wanted(
   ptr %frame, ptr %job, i64 %blocks, i64 %block_time
 ) {{
@@ -299,7 +299,7 @@ end:
 
 
 _WAITING = f"""
-; Wait until all blocks are done, those that other threads have begun.
+; Wait until all blocks are done, including those that other threads have begun.
 define internal void @nhjax.wait(ptr %job) {{
   %blocks_at = {job_field("blocks")}
   %blocks = load i64, ptr %blocks_at
@@ -403,7 +403,7 @@ _DECLARATIONS = f"""
 declare ptr @malloc(i64)
 declare i32 @clock_gettime(i32, ptr)
 
-; The time in ns, from some moment on.
+; Return the time in ns since some fixed moment.
 define internal i64 @nhjax.clock() {{
   %time = alloca {{ i64, i64 }}
   call i32 @clock_gettime(i32 {getattr(time, "CLOCK_MONOTONIC", 1)}, ptr %time)
@@ -415,7 +415,7 @@ define internal i64 @nhjax.clock() {{
   ret i64 %now
 }}
 
-; Put the addresses of the data of all arrays of a list into one of addresses.
+; Write the addresses of the data of all arrays of a list into an array.
 define internal void @nhjax.gather(ptr %buffers, i64 %number, ptr %addresses) {{
   br label %next
 next:
@@ -439,7 +439,7 @@ end:
 
 _VERSION = ("XLA_FFI_Metadata", "api_version")
 _METADATA = f"""
-; The answer to the query for metadata.
+; Answer the query for metadata.
 define internal void @nhjax.answer(ptr %extension) {{
   %metadata_at = {field("%extension", "XLA_FFI_Metadata_Extension", "metadata")}
   %metadata = load ptr, ptr %metadata_at
@@ -459,8 +459,8 @@ define internal void @nhjax.answer(ptr %extension) {{
 
 
 _MEMBERS = f"""
-; The number of members: none without results, one where they are not batched, otherwise
-; the leading dimension of the first result.
+; Return the number of members: 0 without results, 1 without a batch, otherwise the
+; leading dimension of the first result.
 define internal i64 @nhjax.members(ptr %program, ptr %rets) {{
   %num_results_at = {program_field("num_results")}
   %num_results = load i64, ptr %num_results_at
@@ -486,9 +486,9 @@ batch:
 
 
 _CALL = f"""
-; Run all blocks of a job. The first is timed: from the time of the last call's it is
-; guessed before it how many helpers are worth asking for, and if these were none and
-; the block took longer, the guess is made again.
+; Run all blocks of a job. The time of the first block of the last call determines how
+; many helpers are asked for. If none was, the time of the first block of this call
+; determines it again.
 define internal void @nhjax.call(ptr %frame, ptr %job) {{
   %program_at = {job_field("program")}
   %program = load ptr, ptr %program_at
@@ -533,7 +533,7 @@ end:
 """
 
 _OUTCOME = f"""
-; Run a job to its end and let go of it; return an error if a block failed.
+; Run a job to its end and release it; return an error if a block failed.
 define internal ptr @nhjax.outcome(ptr %frame, ptr %job) {{
   call void @nhjax.call(ptr %frame, ptr %job)
   %failed_at = {job_field("failed")}
@@ -553,7 +553,7 @@ lacking:
 
 _FRAME = "XLA_FFI_CallFrame"
 _ENTRY = f"""
-; Answer a call by XLA of the handler of a program.
+; Answer XLA's call of the handler of a program.
 define ptr @{SHARED_HANDLER}(ptr %frame, ptr %program) {{
   %extension_at = {field("%frame", _FRAME, "extension_start")}
   %extension = load ptr, ptr %extension_at
@@ -575,7 +575,7 @@ execute:
 
 
 _EXECUTE = f"""
-; Compute the results of a program, after checks.
+; Check the arrays, and compute the results of a program.
 define internal ptr @nhjax.execute(ptr %frame, ptr %program) {{
   %num_operands_at = {field("%frame", _FRAME, "args", "size")}
   %num_operands = load i64, ptr %num_operands_at

@@ -25,7 +25,7 @@ def results(program, *args):
     return jax.extend.core.jaxpr_as_fun(program)(*(args or (X,)))
 
 
-def test_what_is_repeated_is_computed_once():
+def test_repeated_operations_are_removed():
     def function(x):
         return jnp.sin(2 * x) + jnp.cos(jnp.sin(2 * x)), jnp.sin(2 * x)
 
@@ -36,7 +36,7 @@ def test_what_is_repeated_is_computed_once():
         np.testing.assert_array_equal(one, other)
 
 
-def test_what_nothing_uses_goes():
+def test_unused_operations_of_jaxpr_are_removed():
     def function(x):
         jnp.exp(jnp.cos(x))
         return jnp.sin(x)
@@ -44,7 +44,7 @@ def test_what_nothing_uses_goes():
     assert operations(cse_dce(program_of(function))) == ["sin"]
 
 
-def test_results_may_be_operands_constants_and_the_same_twice():
+def test_results_that_are_operands_or_constants_stay():
     def function(x):
         return x, jnp.sin(x), 1.0, jnp.sin(x)
 
@@ -67,7 +67,7 @@ def test_results_may_be_operands_constants_and_the_same_twice():
         lambda x: (jnp.take(x, 7, fill_value=0.0), jnp.take(x, 7, fill_value=-0.0)),
     ],
 )
-def test_what_differs_stays(function):
+def test_operations_that_differ_stay(function):
     program = program_of(function)
     short = cse_dce(program)
     assert operations(short) == operations(program)
@@ -118,7 +118,7 @@ INNER = [_scan, _while, _cond, _jitted, _remat, _solve, _with_rule]
 
 
 @pytest.mark.parametrize("function", INNER)
-def test_programs_within_are_shortened_too(function):
+def test_inner_jaxprs_are_simplified_too(function):
     program = program_of(function)
     short = cse_dce(program)
     for one, other in zip(results(short), results(program), strict=True):
@@ -128,7 +128,7 @@ def test_programs_within_are_shortened_too(function):
 
 
 @pytest.mark.parametrize("function", [f for f in INNER if f is not _while])
-def test_shortened_programs_have_the_same_derivatives(function):
+def test_simplified_jaxprs_have_the_same_derivatives(function):
     program = program_of(function)
 
     def cost(program):
@@ -139,7 +139,7 @@ def test_shortened_programs_have_the_same_derivatives(function):
         np.testing.assert_array_equal(of(cost(cse_dce(program)))(X), expected)
 
 
-def test_effects_stay(capfd):
+def test_operations_with_effects_stay(capfd):
     def function(x):
         jax.debug.print("seen {}", x[0])
         jax.debug.print("seen {}", x[0])
@@ -165,7 +165,7 @@ def test_operations_under_other_settings_of_jax_stay():
     assert np.any(one != other)
 
 
-def test_a_result_without_a_name_does_not_stand_for_one_with_a_name():
+def test_unnamed_result_does_not_replace_a_named_one():
     def function(x):
         first, _ = lax.split(x, (2, 3))
         _, second = lax.split(x, (2, 3))
@@ -184,7 +184,7 @@ def test_a_result_without_a_name_does_not_stand_for_one_with_a_name():
     assert not any(isinstance(v, jax.extend.core.DropVar) for v in operands)
 
 
-def test_results_with_names_come_from_one_operation():
+def test_named_results_come_from_one_operation():
     def function(x):
         first, rest = lax.split(x, (2, 3))
         start, second = lax.split(x, (2, 3))
@@ -196,7 +196,7 @@ def test_results_with_names_come_from_one_operation():
     np.testing.assert_array_equal(results(cse_dce(program))[0], function(X))
 
 
-def test_a_program_that_stands_at_many_places_stays_one():
+def test_jaxpr_that_occurs_many_times_stays_one():
     function = lambda x: jnp.sin(x) * jnp.sin(x)  # noqa: E731
     for _ in range(14):
         inner = jax.jit(function)
