@@ -16,7 +16,7 @@ import jax.numpy as jnp
 
 import nhjax
 from nhjax import systems
-from nhjax._lanes import _registration
+from nhjax.lanes import _program
 
 from ._report import markdown_table, write
 
@@ -44,7 +44,7 @@ _CALL = re.compile(r"@(nhjax\.\w+)\.f64")
 def programs(name: str, jacobian: Literal["leading", "first_order"]) -> list[str]:
     """The programs in LLVM's language to which a batch of runs is compiled."""
     example, found = getattr(systems, name)(), []
-    compiled = _registration.object_code
+    compiled = _program.object_code
 
     def kept(texts, *rest):
         found.extend(texts)
@@ -63,7 +63,7 @@ def programs(name: str, jacobian: Literal["leading", "first_order"]) -> list[str
 
     y0 = example.initial_state()
     batch = jax.tree.map(lambda x: jnp.broadcast_to(x, (16, *x.shape)), y0)
-    with mock.patch.object(_registration, "object_code", kept):
+    with mock.patch.object(_program, "object_code", kept):
         jax.jit(jax.vmap(run)).lower(batch)
     return found
 

@@ -21,7 +21,7 @@ PACKAGE = DOCS.parent / "nhjax"
 # From the ground up. Within a floor a room may import from those to its left.
 FLOORS = (
     ("_custom_types", "_errors", "_results"),
-    ("_lanes",),
+    ("lanes",),
     ("_compile",),
     ("_method",),
     ("_numerics",),
@@ -227,7 +227,7 @@ _COLUMNS = {
     "_custom_types": 1.2,
     "_errors": 2.8,
     "_results": 3.6,
-    "_lanes": 0.4,
+    "lanes": 0.4,
     "_compile": 0.4,
     "_method": 4.0,
     "_numerics": 0.9,

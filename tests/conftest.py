@@ -31,7 +31,7 @@ gc.set_threshold(100_000)
 import jax
 import pytest
 
-from nhjax._lanes import _registration
+from nhjax.lanes import _program
 
 
 jax.config.update("jax_enable_x64", True)
@@ -86,7 +86,7 @@ def quick_compilation():
 def optimised_kernels():
     """Kernels of nhjax as users have them, unlike what XLA compiles around them."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(_registration, "is_quick", lambda: False)
+        patch.setattr(_program, "is_quick", lambda: False)
         yield
 
 

@@ -1,15 +1,15 @@
-"""Compilation of whole programs by three engines, anew when what they read changes."""
+"""Compilation of whole programs by three engines, with derivatives and `vmap`."""
 
-from ._elementary import (
+from ._batched_call import batched_call as batched_call
+from ._jaxprs import (
     CALLING as CALLING,
+    cse_dce as cse_dce,
     ELEMENTWISE as ELEMENTWISE,
     LARGEST_REDUCTION as LARGEST_REDUCTION,
     SMALL_PRODUCT as SMALL_PRODUCT,
 )
-from ._engine import engines as engines, EngineUse as EngineUse
-from ._ensemble import ensemble as ensemble
-from ._kernel import as_cpu_kernel as as_cpu_kernel, Programs as Programs
-from ._shortened import shortened as shortened
+from ._kernel import as_cpu_kernel as as_cpu_kernel, TraceCache as TraceCache
+from ._lowering import engines as engines, EngineUse as EngineUse
 from ._small_product import (
     LONGEST_SUM as LONGEST_SUM,
     small_product as small_product,

@@ -1,20 +1,20 @@
-"""A single run on the CPU: by nhjax's own compiler, or as one kernel of XLA's.
+"""Which engine compiles a single run on the CPU, and why.
 
-nhjax's own compiler makes scalars of all arrays, which is best while these are small.
-For loops over larger arrays XLA uses vectors, also in a single run.
+nhjax's own compiler turns all arrays into scalars, which is fastest while arrays are
+small. For loops over larger arrays XLA uses vectors, also in a single run.
 
-XLA runs a program on the CPU as a sequence of kernels, and each costs some 50 ns to
-start, which is as long as the arithmetic of tens of numbers takes. An iteration on the
-stages of a step is some fifty such kernels. A called computation that is marked as
-small is compiled to a single kernel instead, its loops included; on the gallery's
-systems that is three to five times faster.
-
-The mark is internal to the compiler, and its meaning may change. Without the mark, as
-on other devices, the results are the same.
+XLA runs a program on the CPU as a sequence of kernels. Starting a kernel takes about 50
+ns, as long as the arithmetic of tens of numbers, and one iteration of a stage solver is
+about fifty such kernels. A called computation that is marked as small is compiled to a
+single kernel instead, including its loops. On the gallery's systems this is three to
+five times faster. The mark is internal to XLA, and its meaning may change. Without the
+mark, as on other devices, the results are the same.
 """
 
+import os
+from collections.abc import Callable
 from contextvars import ContextVar
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.extend
@@ -22,31 +22,103 @@ import jax.numpy as jnp
 from jax.interpreters import mlir
 from jaxlib.mlir import ir
 
-from .._lanes import is_available, single_target, Unsupported
-from ._collection import rare_collections
-from ._elementary import array_size, is_elementary, LARGEST_REDUCTION
-from ._engine import chosen_engine, note
-from ._kernel import kernel
-from ._marks import merged, split
+from ..lanes import compile_single, is_available, Unsupported
+from ._garbage_collection import rare_collections
+from ._jaxprs import fits_one_kernel, LARGEST_REDUCTION, rms_array_size
+from ._kernel import kernel, merge_lists, partition_list
 
 
-# Whether a kernel is being lowered; kernels inside of it do not become kernels of their
-# own.
+# In the order in which they are tried.
+ENGINES = ("lanes", "kernels", "xla")
+
+
+class EngineUse(NamedTuple):
+    """The engine that compiles one program, and the reason.
+
+    - `engine`: `"lanes"` is nhjax's own compiler, which vectorises over the members of
+        an ensemble (SIMD); `"kernels"` is XLA with one kernel for each member; `"xla"`
+        is XLA without such kernels.
+    - `reason`: why the engines before it were not used, or that it was chosen.
+    - `members`: the number of members of an ensemble; `None` for a single run.
+    """
+
+    engine: str
+    reason: str
+    members: int | None
+
+
+def chosen_engine() -> str:
+    """Read `NHJAX_ENGINE` from the environment: the first engine to be tried."""
+    chosen = os.environ.get("NHJAX_ENGINE", ENGINES[0])
+    if chosen not in ENGINES:
+        raise ValueError(
+            f"The environment variable NHJAX_ENGINE is {chosen!r}, which is none of "
+            f"{', '.join(map(repr, ENGINES))}: set it to one of these, or unset it."
+        )
+    return chosen
+
+
+# A list while `engines` lowers programs, otherwise `None`.
+_uses: ContextVar[list[EngineUse] | None] = ContextVar("uses", default=None)
+
+
+def record_engine(engine: str, reason: str, members: int | None) -> None:
+    """Record which engine compiles a program, if `engines` asked for it."""
+    uses = _uses.get()
+    if uses is not None:
+        uses.append(EngineUse(engine, reason, members))
+
+
+def engines(function: Callable[..., Any], *args: Any) -> tuple[EngineUse, ...]:
+    """Return which engines compile the programs of `function(*args)` on a CPU, and why.
+
+    The function is compiled, but not run. On the CPU nhjax itself compiles an ensemble,
+    which is a run under `jax.vmap`, where it can, and vectorises over its members
+    (SIMD). The environment variable `NHJAX_ENGINE` selects the first engine that is
+    tried: `lanes` (the default), `kernels` or `xla`. Programs that were compiled before
+    keep their engine until `jax.clear_caches()`.
+
+    **Arguments:**
+
+    - `function`: a function of arrays that can be compiled by `jax.jit`.
+    - `args`: its arguments, trees of arrays.
+
+    **Returns:** an `EngineUse` for each program, in the order of compilation: the
+    engine, the reason, and the number of members.
+
+    !!! example
+
+        ```python
+        run = jax.vmap(lambda y0: nhjax.step(system, method, 0.0, 0.1, y0))
+        for use in nhjax.engines(run, ensemble):
+            print(use.engine, use.members, use.reason)
+        ```
+    """
+    token = _uses.set(uses := [])
+    try:
+        # A new function, so that JAX does not return a cached result.
+        jax.jit(lambda *args: function(*args)).lower(*args)
+    finally:
+        _uses.reset(token)
+    return tuple(uses)
+
+
+# Whether a kernel is being lowered. Kernels inside it do not become kernels themselves.
 _within = ContextVar("within", default=False)
 
 
 def is_within_kernel() -> bool:
-    """Tell whether what is being lowered is a part of a kernel."""
+    """Return whether a part of a kernel is being lowered."""
     return _within.get()
 
 
 def is_exported(ctx: Any) -> bool:
-    """Tell whether a program is lowered to be run by other processes."""
+    """Return whether a program is lowered to be run by other processes."""
     return bool(ctx.module_context.lowering_parameters.for_export)
 
 
 def reason_against_lanes() -> str | None:
-    """Say why nhjax's own compiler is not asked for; `None` if it is."""
+    """Return why nhjax's own compiler is not tried, or `None` if it is."""
     if chosen_engine() != "lanes":
         return "chosen"
     if is_within_kernel():
@@ -57,62 +129,62 @@ def reason_against_lanes() -> str | None:
 
 
 def reason_against_kernel(program: Any) -> str | None:
-    """Say why XLA is not asked for one kernel, or cannot make it; `None` if it can."""
+    """Return why XLA is not asked for a single kernel, or `None` if it is."""
     if chosen_engine() == "xla":
         return "chosen"
     # The dtype of random keys has no attribute `kind`, which gives None here.
     kinds = {getattr(aval.dtype, "kind", None) for aval in program.in_avals}
     if not kinds <= set("fiub"):
         return "an operand is neither a real number nor an integer nor a boolean"
-    if not is_elementary(program.jaxpr):
+    if not fits_one_kernel(program.jaxpr):
         return "an operation is large, or calls a library"
     return None
 
 
-# Of the gallery's systems with 2 to 8 stages, and larger ones, those whose arrays have
-# fewer numbers than this run faster by nhjax's own compiler, and the others by XLA's.
+# Measured on the gallery's systems with 2 to 8 stages, and on larger ones: nhjax's own
+# compiler is faster below this root mean square of array sizes, and XLA above it.
 _SMALL_ARRAYS = 40
 
 
 @rare_collections()
 def _lowered(ctx, *operands, program, is_brief):
     if is_exported(ctx):
-        # Machine code of this process would mean nothing to another.
-        note("xla", "the program is exported", None)
+        # Another process could not call machine code of this one.
+        record_engine("xla", "the program is exported", None)
         return _by_xla(ctx, *operands, program=program, is_brief=is_brief)
     if is_within_kernel():
         return _by_xla(ctx, *operands, program=program, is_brief=is_brief)
     reason = reason_against_lanes()
-    if reason is None and array_size(program.jaxpr) > _SMALL_ARRAYS:
+    if reason is None and rms_array_size(program.jaxpr) > _SMALL_ARRAYS:
         reason = "its arrays are so large that XLA uses vectors for them"
     if reason is None:
         try:
-            name = single_target(program, is_brief)
+            name = compile_single(program, is_brief)
         except Unsupported as error:
             reason = str(error)
         else:
-            note("lanes", "the first choice", None)
+            record_engine("lanes", "the first choice", None)
             return jax.ffi.ffi_lowering(name)(ctx, *operands)
     against = reason_against_kernel(program)
     if against is not None:
-        note("xla", against, None)
+        record_engine("xla", against, None)
         return _by_xla(ctx, *operands, program=program, is_brief=is_brief)
-    note("kernels", reason, None)
-    return _marked(ctx, *operands, program=program)
+    record_engine("kernels", reason, None)
+    return _as_one_kernel(ctx, *operands, program=program)
 
 
-def _marked(ctx, *operands, program):
+def _as_one_kernel(ctx, *operands, program):
     run = jax.extend.core.jaxpr_as_fun(program)
 
     def call(*operands):
-        # The compiler would remove operands without elements: they are left out here.
+        # XLA would remove operands without elements, so that they are left out here.
         is_full = [x.size > 0 for x in operands]
-        full, empty = split(is_full, operands)
+        full, empty = partition_list(is_full, operands)
 
         def kernel(*full):
-            return run(*merged(is_full, _tied(full), map(jnp.zeros_like, empty)))
+            return run(*merge_lists(is_full, _tied(full), map(jnp.zeros_like, empty)))
 
-        # The barrier hides which operands are constants: those would be removed too.
+        # The barrier hides which operands are constants, which XLA would remove too.
         return jax.jit(kernel)(*jax.lax.optimization_barrier(full))
 
     token = _within.set(True)
@@ -128,11 +200,11 @@ def _marked(ctx, *operands, program):
 
 
 def _tied(operands: tuple[Any, ...]) -> list[Any]:
-    """Return the same operands, made so that the compiler cannot find one unused.
+    """Return the same operands, in a form in which XLA cannot find one to be unused.
 
-    The compiler aborts if a parameter of a marked call is not used, even if this turns
-    out only after all simplifications. For this reason every small operand is made to
-    depend on all others in a way that never changes its value.
+    XLA aborts if a parameter of a marked call is unused, even if this turns out only
+    after all simplifications. For this reason every small operand is made to depend on
+    all others, in a way that never changes its value.
     """
     firsts = [x.reshape(-1)[0] for x in operands]
     signs = [(x != jnp.zeros_like(x)).astype(jnp.int32) for x in firsts]

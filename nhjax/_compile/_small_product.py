@@ -1,7 +1,7 @@
-"""The sum of products of two small arrays, one operation until it is lowered.
+"""The sum of products of two small arrays, as one operation until it is lowered.
 
-Written out when a function is traced it would be some five operations, and several
-times as many in its derivatives: tracing a gradient took 15 to 40 percent longer.
+As separate operations it would be about five, and several times as many in its
+derivatives: tracing a gradient took 15 to 40 percent longer.
 """
 
 import itertools
@@ -17,18 +17,18 @@ import jax.numpy as jnp
 from jax.interpreters import ad, batching, mlir
 from jaxtyping import Array
 
-from ._elementary import SMALL_PRODUCT
+from ._jaxprs import SMALL_PRODUCT
 from ._kernel import never_high
 
 
-# Sums of more terms are not written out.
+# Longer sums are not written out term by term.
 LONGEST_SUM = 128
 
 
 # The parameters `first`, `second` and `result` are the indices of the operands and of
-# the result, as in the subscripts of an einsum; each that is summed stands in both
-# operands. If `by_terms` is true the terms are added one by one. The operands have one
-# dtype, of real or complex numbers.
+# the result, as in the subscripts of an einsum. Each index that is summed occurs in
+# both operands. If `by_terms` is true, the terms are added one by one. Both operands
+# have the same dtype, real or complex.
 small_product = jax.extend.core.Primitive(SMALL_PRODUCT)
 small_product.is_high = never_high
 
@@ -49,7 +49,9 @@ def _written_out(
 
 
 def _aligned(x: Array, indices: str, order: list[str]) -> Array:
-    """Put the axes of x in the given order; missing axes get length one."""
+    """Transpose x to the given order of indices; missing indices get an axis of length
+    1.
+    """
     present = [index for index in order if index in indices]
     x = jnp.transpose(x, [indices.index(index) for index in present])
     return jnp.expand_dims(
@@ -76,7 +78,8 @@ def _shape(a: Any, b: Any, **params: Any) -> Any:
         lengths |= zip(params["second"], b.shape, strict=True)
         shape = tuple(lengths[index] for index in params["result"])
         return jax.core.ShapedArray(shape, a.dtype)
-    # Of operands that are spread over devices JAX tells how the result is spread.
+    # For operands that are sharded over devices, JAX determines the sharding of the
+    # result.
     return jax.make_jaxpr(partial(_written_out, **params))(a, b).out_avals[0]
 
 
@@ -89,8 +92,8 @@ def _pull_second(cotangent, x, _, *, first, second, result, by_terms):
 
 
 def _pulled(cotangent, other, first: str, second: str, result: str, by_terms: bool):
-    # The cotangent of an operand that is the same for all members of a batch is a sum
-    # over them, which may be too long to be written out.
+    # The cotangent of an operand that all members of a batch share is a sum over the
+    # members, which may be too long to be written out.
     lengths = zip(first, cotangent.shape, strict=True)
     terms = math.prod(n for index, n in lengths if index not in result)
     indices = {"first": first, "second": second, "result": result}

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from .._compile import as_cpu_kernel, Programs
+from .._compile import as_cpu_kernel, TraceCache
 from .._custom_types import BoolScalar, FloatScalar
 from .._method import AbstractMethod
 from .._numerics import has_tangent, nan_tangent_unless, zero_unless
@@ -77,7 +77,7 @@ def differentiable_cut_step(
     arguments: StepArguments,
     conditions: Conditions,
     options: CutOptions,
-    programs: Programs,
+    programs: TraceCache,
 ) -> Cut:
     """Take a step of size h, or of the size θ h at whose end the first event is.
 
@@ -117,7 +117,7 @@ def _first(
     arguments: StepArguments,
     conditions: Conditions,
     options: CutOptions,
-    programs: Programs,
+    programs: TraceCache,
 ) -> _Found:
     """Find the first event in a step, by steps of different sizes from its start."""
     h, sign = arguments.h, options.sides.sign
@@ -146,7 +146,7 @@ def _trial(
     arguments: StepArguments,
     conditions: Conditions,
     options: CutOptions,
-    programs: Programs,
+    programs: TraceCache,
     h: FloatScalar,
 ) -> Cut:
     """Take a step of any size, and compute the conditions at its end."""
@@ -263,7 +263,7 @@ def primitive_cut_step(
     arguments: StepArguments,
     conditions: Conditions,
     options: CutOptions,
-    programs: Programs,
+    programs: TraceCache,
 ) -> Cut:
     """Take a step by `differentiable_cut_step`, in a program that is traced once."""
     # The reason is that of `primitive_step`.

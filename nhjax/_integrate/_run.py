@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Int, PyTree
 
-from .._compile import as_cpu_kernel, Programs, tracked_jit
+from .._compile import as_cpu_kernel, TraceCache, tracked_jit
 from .._custom_types import Args, FloatScalar, IntScalar
 from .._method import AbstractMethod
 from .._numerics import ClosureConverted, nan_gradient_unless
@@ -61,7 +61,7 @@ def run(
         dt=grid.dt,
         args=args,
         invariants=kept_invariants(options.invariants, system, t0, state, args),
-        programs=Programs(),
+        programs=TraceCache(),
     )
     sampled = _sampled_steps(saveat, grid)
     places = record_places(saveat.dense, sampled, grid.num_steps)

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from .._compile import Programs
+from .._compile import TraceCache
 from .._custom_types import Args, BoolScalar, FloatScalar
 from .._method import AbstractMethod
 from .._numerics import max_norm, tree_where
@@ -80,7 +80,7 @@ class Stepping(eqx.Module):
     dt: FloatScalar
     args: Args
     invariants: Invariants | None
-    programs: Programs
+    programs: TraceCache
     round_off: RoundOff | None = None
 
     def time(self, k: Int[Array, ""] | int) -> FloatScalar:

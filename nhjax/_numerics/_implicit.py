@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, PyTree
 
-from .._compile import shortened
+from .._compile import cse_dce
 from .._custom_types import BoolScalar, FloatScalar
 from ._contraction import with_small_products
 from ._iteration import dense_increment, iterate, Sizes, Solved
@@ -216,7 +216,7 @@ class ClosureConverted(eqx.Module):
             lambda dynamic: function(*eqx.combine(dynamic, static)), return_shape=True
         )(dynamic)
         closed = jax.make_jaxpr(with_small_products(closed))(*jax.tree.leaves(dynamic))
-        closed = shortened(closed)
+        closed = cse_dce(closed)
         self.consts, self.jaxpr = list(closed.consts), closed.jaxpr
         self.treedef = jax.tree.structure(shape)
 

@@ -6,7 +6,7 @@ from typing import TypeAlias
 import equinox as eqx
 import jax
 
-from .._compile import as_cpu_kernel, Programs
+from .._compile import as_cpu_kernel, TraceCache
 from .._custom_types import BoolScalar
 from .._manifold import unframed
 from .._method import AbstractMethod
@@ -35,7 +35,7 @@ def differentiable_step(
     method: AbstractMethod,
     stage_solver: AbstractStageSolver,
     skip: BoolScalar,
-    programs: Programs,
+    programs: TraceCache,
 ) -> StepOutcome:
     """Take one step as `step` does, with a derivative that skips the iterations.
 
@@ -129,7 +129,7 @@ def primitive_step(
     method: AbstractMethod,
     stage_solver: AbstractStageSolver,
     skip: BoolScalar,
-    programs: Programs,
+    programs: TraceCache,
 ) -> StepOutcome:
     """Take one step by `differentiable_step`, in a program that is traced once."""
     # When JAX splits a scan into a known and a linear part, it drops the derivative

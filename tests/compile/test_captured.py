@@ -239,7 +239,7 @@ def unchanged():
 
 
 @pytest.mark.parametrize("reader", READERS, ids=lambda reader: reader.__name__)
-def test_what_is_read_is_never_stale_and_never_traced_twice(reader):
+def test_tracked_jit_after_changed_value_traces_once(reader):
     lagrangian, change = reader()
     np.testing.assert_allclose(end(lagrangian)[0], -0.5, rtol=1e-13)
     # That of `initial_state` looks at the shapes at every call.
@@ -258,7 +258,7 @@ def test_what_is_read_is_never_stale_and_never_traced_twice(reader):
     np.testing.assert_allclose(end(lagrangian)[0], -0.5, rtol=1e-13)
 
 
-def test_a_constraint_a_force_and_what_is_saved_are_never_stale():
+def test_tracked_jit_of_constraint_force_and_output_is_never_stale():
     values = {"slope": 0.0, "push": 0.0, "factor": 1.0}
     parts = {
         "nonholonomic": lambda t, q, v, args: v[1] - values["slope"] * v[0],
@@ -277,7 +277,7 @@ def test_a_constraint_a_force_and_what_is_saved_are_never_stale():
         np.testing.assert_allclose(got, x, rtol=1e-12, atol=1e-15)
 
 
-def test_the_initial_state_is_never_stale():
+def test_tracked_jit_of_initial_state_is_never_stale():
     values = [2.0]
     system = nhjax.LagrangianSystem(lambda t, q, v, args: 0.5 * values[0] * v @ v)
     for mass in (2.0, 3.0):
@@ -286,7 +286,7 @@ def test_the_initial_state_is_never_stale():
         assert float(y.p[0]) == mass
 
 
-def test_functions_in_args_are_never_stale():
+def test_tracked_jit_of_functions_in_args_is_never_stale():
     values = [1.0]
     system = nhjax.LagrangianSystem(lambda t, q, v, args: falling(v, q, args()))
 

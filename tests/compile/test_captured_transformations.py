@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import nhjax
-from nhjax._compile._captured import captured, MOST_ENTRIES
+from nhjax._compile._tracked_jit import captured, MOST_ENTRIES
 from oracles.falling import (
     end,
     falling,
@@ -43,7 +43,7 @@ def reads_global(t, q, v, args):
 # Transformations ----------------------------------------------------------------------
 
 
-def test_leaves_of_a_module_are_arguments():
+def test_tracked_jit_of_module_takes_leaves_as_arguments():
     end(Scaled(jnp.asarray(1.0)))
     checks = len(traces)
     end(Scaled(jnp.asarray(1.0)))
@@ -79,14 +79,14 @@ def pushed_forward(function):
 
 
 @pytest.mark.parametrize("transform", [plain, jax.jit, one_of_a_batch])
-def test_functions_may_close_over_what_is_transformed(transform):
+def test_function_that_closes_over_transformed_value_works(transform):
     for g in (1.0, 3.0):
         got = transform(reached_with)(jnp.asarray(g))
         np.testing.assert_allclose(got, -0.5 * g, rtol=1e-13)
 
 
 @pytest.mark.parametrize("transform", [jax.grad, pushed_forward])
-def test_functions_may_close_over_what_is_differentiated(transform):
+def test_function_that_closes_over_differentiated_value_works(transform):
     def square(x):
         return reached_with(x**2)
 
@@ -95,7 +95,7 @@ def test_functions_may_close_over_what_is_differentiated(transform):
         np.testing.assert_allclose(got, -g, rtol=1e-13)
 
 
-def test_a_tracer_of_an_earlier_transformation_is_not_used_again():
+def test_tracer_of_earlier_transformation_is_not_reused():
     holder = []
 
     def lagrangian(t, q, v, args):
@@ -110,7 +110,7 @@ def test_a_tracer_of_an_earlier_transformation_is_not_used_again():
         np.testing.assert_allclose((value, rate), (-0.5 * g, -0.5), rtol=1e-13)
 
 
-def test_under_a_jit_of_the_user_globals_are_those_of_the_trace(monkeypatch):
+def test_globals_under_jit_of_user_are_those_of_the_trace(monkeypatch):
     function = jax.jit(lambda x: x + reached_of(reads_global))
     first = float(function(0.0))
     monkeypatch.setitem(globals(), "GRAVITY", 3.0)
@@ -120,7 +120,7 @@ def test_under_a_jit_of_the_user_globals_are_those_of_the_trace(monkeypatch):
 # What is not tracked ------------------------------------------------------------------
 
 
-def test_what_functions_change_themselves_causes_no_retrace():
+def test_value_changed_by_tracing_causes_no_retrace():
     made: dict[str, Any] = {"g": 1.0}
     calls: list[int] = []
 
@@ -141,7 +141,7 @@ def test_what_functions_change_themselves_causes_no_retrace():
     np.testing.assert_allclose(end(lagrangian)[0], -1.5, rtol=1e-13)
 
 
-def test_circles_and_things_without_a_hash():
+def test_captured_values_with_cycles_or_without_hash_are_compared():
     circle: list[Any] = [1.0]
     circle.append({"again": circle, 3: {1, 2}, (1, 2): bytearray(b"x")})
     planet: Any = Planet()
@@ -155,12 +155,12 @@ def test_circles_and_things_without_a_hash():
     np.testing.assert_allclose([first, end(lagrangian)[0]], [-0.5, -1.5], rtol=1e-13)
 
 
-def test_the_rest_of_a_huge_container_is_not_looked_at():
+def test_captured_values_of_huge_container_are_limited():
     many = [float(i) for i in range(100_000)]
     assert len(captured(lambda: many)) == MOST_ENTRIES
 
 
-def test_no_library_is_looked_into():
+def test_captured_values_of_library_are_not_searched():
     def function(q):
         return jnp.sin(q) + np.pi + jax.nn.relu(q) + eqx.is_array(q)
 
@@ -168,7 +168,7 @@ def test_no_library_is_looked_into():
     assert len(captured(function)) <= 6
 
 
-def test_a_list_that_tracing_fills_does_not_hide_what_comes_after_it():
+def test_captured_values_after_list_filled_by_tracing_are_compared():
     log, constants = [], {"g": 9.81}
 
     def lagrangian(t, q, v, args):

@@ -5,7 +5,7 @@ import threading
 
 import pytest
 
-from nhjax._compile._collection import rare_collections
+from nhjax._compile._garbage_collection import rare_collections
 
 
 @pytest.fixture(autouse=True)
@@ -16,7 +16,7 @@ def as_python_starts():
     gc.set_threshold(*before)
 
 
-def test_collections_are_rarer_inside_and_as_before_afterwards():
+def test_garbage_collection_is_rarer_inside_and_restored_after():
     with rare_collections():
         first, *rest = gc.get_threshold()
         with rare_collections():
@@ -27,21 +27,21 @@ def test_collections_are_rarer_inside_and_as_before_afterwards():
     assert gc.get_threshold() == (700, 10, 10)
 
 
-def test_an_error_puts_them_back():
+def test_garbage_collection_after_error_is_restored():
     with pytest.raises(KeyError), rare_collections():
         raise KeyError
     assert gc.get_threshold() == (700, 10, 10)
 
 
 @pytest.mark.parametrize("first", [0, 1_000_000])
-def test_a_collector_that_is_off_or_rarer_is_left_alone(first):
+def test_garbage_collection_that_is_off_or_rarer_is_unchanged(first):
     gc.set_threshold(first, 10, 10)
     with rare_collections():
         assert gc.get_threshold() == (first, 10, 10)
     assert gc.get_threshold() == (first, 10, 10)
 
 
-def test_the_last_of_several_threads_puts_them_back():
+def test_garbage_collection_is_restored_by_last_thread():
     entered, leave = threading.Event(), threading.Event()
 
     def other():

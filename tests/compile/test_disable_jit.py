@@ -15,7 +15,7 @@ METHOD = nhjax.LobattoIIIAB(2)
 
 
 @pytest.mark.long
-def test_three_steps_and_their_gradient_are_those_of_the_compiled_program():
+def test_steps_with_disable_jit_equal_compiled_steps():
     y0 = PARTICLE.initial_state()
 
     def loss(dt):
@@ -35,7 +35,7 @@ def test_three_steps_and_their_gradient_are_those_of_the_compiled_program():
     assert int(other.stats["num_steps"]) == 3
 
 
-def test_the_end_of_a_run_at_an_event_is_that_of_the_compiled_program():
+def test_event_with_disable_jit_equals_compiled_event():
     fall = nhjax.LagrangianSystem(lambda t, q, v, args: 0.5 * v[0] ** 2 - q[0])
     y0 = nhjax.initial_state(fall, jnp.array([1.0]), jnp.array([0.0]))
     ground = nhjax.Event(lambda t, y, args: y.q[0])
@@ -51,7 +51,7 @@ def test_the_end_of_a_run_at_an_event_is_that_of_the_compiled_program():
     assert int(sol.stats["num_events"]) == 1
 
 
-def test_a_function_in_a_kernel_sees_numbers():
+def test_function_with_disable_jit_sees_numbers():
     seen = []
 
     def function(x):
@@ -63,14 +63,14 @@ def test_a_function_in_a_kernel_sees_numbers():
     assert seen == [1.5]
 
 
-def test_a_kernel_that_was_traced_before_is_evaluated():
+def test_kernel_traced_before_disable_jit_is_evaluated():
     traced = jax.make_jaxpr(lambda x: as_cpu_kernel(jnp.sin, x))(0.5)
     with jax.disable_jit():
         (got,) = jaxpr_as_fun(traced)(jnp.asarray(0.5))
     np.testing.assert_allclose(got, np.sin(0.5), rtol=1e-15)
 
 
-def test_a_start_that_is_refused_is_refused_with_the_same_words():
+def test_refused_start_with_disable_jit_has_same_message():
     system = PARTICLE.system
     wrong = PARTICLE.v0 + jnp.array([0.0, 0.0, 1.0])
     with (

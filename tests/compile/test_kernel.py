@@ -8,7 +8,7 @@ import pytest
 
 import nhjax
 from nhjax import LobattoIIIAB, systems
-from nhjax._compile import as_cpu_kernel, Programs
+from nhjax._compile import as_cpu_kernel, TraceCache
 
 
 MARK = 'xla_cpu_small_call = "true"'
@@ -58,12 +58,12 @@ def assert_same(got, expected):
 
 @pytest.mark.usefixtures("engine")
 @pytest.mark.parametrize("compiled", [False, True])
-def test_a_kernel_computes_what_its_function_does(compiled):
+def test_kernel_computes_what_its_function_does(compiled):
     function = jax.jit(in_kernel) if compiled else in_kernel
     assert_same(function(*OPERANDS), pendulum(*OPERANDS))
 
 
-def test_the_engine_is_that_of_the_environment(engine):
+def test_engine_is_that_of_the_environment(engine):
     (use,) = nhjax.engines(in_kernel, *OPERANDS)
     assert (use.engine, use.members) == (engine, None)
     text = jax.jit(lambda *x: in_kernel(*x)).lower(*OPERANDS).as_text()
@@ -71,7 +71,7 @@ def test_the_engine_is_that_of_the_environment(engine):
     assert ("nhjax_lanes_" in text) == (engine == "lanes")
 
 
-def test_an_unknown_engine_is_named_with_those_that_there_are(monkeypatch):
+def test_unknown_engine_raises_with_known_ones(monkeypatch):
     monkeypatch.setenv("NHJAX_ENGINE", "lane")
     with pytest.raises(ValueError, match="is 'lane', which is none of 'lanes'"):
         nhjax.engines(in_kernel, *OPERANDS)
@@ -101,13 +101,13 @@ def test_an_unknown_engine_is_named_with_those_that_there_are(monkeypatch):
         "checkpoint",
     ],
 )
-def test_derivatives_of_a_kernel(transform):
+def test_kernel_has_derivatives_of_its_function(transform):
     point = OPERANDS[0]["g"], OPERANDS[1]
     got = jax.jit(transform(height(in_kernel)))(*point)
     assert_same(got, transform(height(pendulum))(*point))
 
 
-def test_derivatives_keep_no_constants():
+def test_kernel_derivatives_store_no_constants():
     matrix = jnp.arange(16.0).reshape(4, 4)
 
     def f(x):
@@ -123,7 +123,7 @@ def test_derivatives_keep_no_constants():
     assert_same(jax.jit(pulled)(jnp.ones(4)), (jax.vjp(f, jnp.ones(4))[1](jnp.ones(4))))
 
 
-def test_a_loop_of_unknown_length_is_pushed_forward():
+def test_kernel_with_while_loop_has_forward_mode():
     def grown(x):
         return jax.lax.while_loop(lambda x: x < 10, lambda x: x * x, x)
 
@@ -132,7 +132,7 @@ def test_a_loop_of_unknown_length_is_pushed_forward():
 
 
 @pytest.mark.parametrize("axes", [(0, None), (None, 1), (0, 1)])
-def test_batches_of_kernels(axes):
+def test_kernel_under_vmap_computes_each_member(axes):
     g, x = jnp.array([9.0, 10.0, 11.0]), jnp.arange(6.0).reshape(2, 3) / 10
     point = g if axes[0] == 0 else g[0], x if axes[1] == 1 else x[:, 0]
 
@@ -144,7 +144,7 @@ def test_batches_of_kernels(axes):
     assert_same(jax.jit(both(in_kernel))(*point), both(pendulum)(*point))
 
 
-def test_batches_of_batches_of_kernels():
+def test_kernel_under_two_vmaps_computes_each_member():
     def nested(f):
         inner = jax.vmap(height(f), in_axes=(None, 0))
         return jax.vmap(inner, in_axes=(0, None))
@@ -180,7 +180,7 @@ def is_large(x):
 @pytest.mark.parametrize(
     "function", [sorts, scatters, multiplies, sums_much, factorises, is_large]
 )
-def test_what_no_kernel_can_do_is_done_without(function):
+def test_function_that_kernels_refuse_is_computed_by_xla(function):
     x = jnp.linspace(0.0, 1.0, 7)
     program = jax.jit(lambda x: as_cpu_kernel(function, x))
     assert MARK not in program.lower(x).as_text()
@@ -189,13 +189,13 @@ def test_what_no_kernel_can_do_is_done_without(function):
     assert_same(jax.jit(jax.vmap(program))(xs), jnp.stack([function(x) for x in xs]))
 
 
-def test_random_keys_are_no_operands_of_a_kernel():
+def test_random_keys_as_operands_are_computed_by_xla():
     key = jax.random.key(0)
     got = jax.jit(lambda key: as_cpu_kernel(lambda key: key, key))(key)
     assert_same(jax.random.key_data(got), jax.random.key_data(key))
 
 
-def test_printing_stays(capfd):
+def test_kernel_with_printing_prints(capfd):
     def loud(x):
         jax.debug.print("x = {}", x)
         return 2 * x
@@ -205,7 +205,7 @@ def test_printing_stays(capfd):
     assert "x = 1.5" in capfd.readouterr().out
 
 
-def test_a_run_is_compiled_as_a_whole_and_one_with_a_factorisation_is_not():
+def test_run_without_factorisation_is_one_kernel():
     def taken(system):
         y0 = nhjax.initial_state(system, q=jnp.ones(2), v=jnp.zeros(2))
 
@@ -243,7 +243,7 @@ def test_a_run_is_compiled_as_a_whole_and_one_with_a_factorisation_is_not():
     ],
     ids=["ball", "top", "101 coordinates", "41 coordinates"],
 )
-def test_high_orders_and_many_coordinates_are_one_kernel(example, stages):
+def test_run_of_high_order_is_one_kernel(example, stages):
     def run(y0):
         method = LobattoIIIAB(stages)
         return nhjax.integrate(
@@ -253,14 +253,14 @@ def test_high_orders_and_many_coordinates_are_one_kernel(example, stages):
     assert MARK in jax.jit(run).lower(example.initial_state()).as_text()
 
 
-def test_a_function_is_traced_once_for_each_kind_of_arguments():
+def test_trace_cache_traces_once_for_each_kind_of_arguments():
     traced = []
 
     def scaled(x, factor):
         traced.append(x.shape)
         return factor * jnp.sin(x)
 
-    programs = Programs()
+    programs = TraceCache()
 
     def value(x, factor=2.0):
         return jnp.sum(as_cpu_kernel(scaled, x, factor, programs=programs))
@@ -275,8 +275,8 @@ def test_a_function_is_traced_once_for_each_kind_of_arguments():
     assert traced == [(3,), (2,), (3,)]
 
 
-def test_a_program_with_what_another_trace_computed_is_not_kept():
-    programs = Programs()
+def test_trace_cache_does_not_keep_tracers_of_other_traces():
+    programs = TraceCache()
 
     def value(x):
         return as_cpu_kernel(lambda y, x=x: x * y, jnp.ones(()), programs=programs)

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from jax import lax
 
-from nhjax import _lanes
+from nhjax import lanes
 from oracles import lane_processes
 from oracles.lane_kernels import kernel_ir, SHARED, TRIPLE, WIDTH
 
@@ -40,45 +40,45 @@ def printed(*command, **environment):
 
 @pytest.fixture(scope="module")
 def triple():
-    return _lanes.registered(kernel_ir(TRIPLE), 1, 1, WIDTH, True)
+    return lanes.register_kernel(kernel_ir(TRIPLE), 1, 1, WIDTH, True)
 
 
 @pytest.mark.parametrize("members", [0, 1, WIDTH - 1, WIDTH, WIDTH + 1, 100_000])
-def test_every_number_of_members(triple, members):
+def test_kernel_of_any_number_of_members_computes_each(triple, members):
     x = jnp.arange(members, dtype=jnp.float64)
     np.testing.assert_array_equal(call(triple, x), 3 * np.arange(members))
 
 
-def test_subnormal_numbers_are_those_of_xla(triple):
+def test_kernel_with_subnormal_numbers_flushes_as_xla(triple):
     """XLA flushes them to zero, in the threads of its pool and in the caller's."""
     x = jnp.full(100_000, 5e-324)
     np.testing.assert_array_equal(call(triple, x), jax.jit(lambda x: 3 * x)(x))
 
 
-def test_a_kernel_without_memory_to_work_in_is_an_error_of_jax():
+def test_kernel_without_scratch_memory_raises_in_jax():
     def sums(x):
         # Too many numbers for the stack.
         places = jnp.zeros(3000)
         return lax.fori_loop(0, 20, lambda k, y: y.at[100 * k].add(x[k]), places)[:1000]
 
     x = jnp.arange(20.0 * WIDTH).reshape(WIDTH, 20)
-    text = _lanes.member_ir(jax.make_jaxpr(sums)(x[0]), (True,), WIDTH)
+    text = lanes.llvm_ir(jax.make_jaxpr(sums)(x[0]), (True,), WIDTH)
     declared = "declare ptr @malloc(i64)"
     assert declared in text
-    name = _lanes.registered(text, 1, 1, WIDTH, True)
+    name = lanes.register_kernel(text, 1, 1, WIDTH, True)
     found = call(name, x, shape=(WIDTH, 1000))
     np.testing.assert_array_equal(found, jax.vmap(sums)(x))
     lacking = "define internal ptr @malloc(i64 %size) { ret ptr null }"
     text = text.replace(declared, lacking)
-    name = _lanes.registered(text, 1, 1, WIDTH, True)
+    name = lanes.register_kernel(text, 1, 1, WIDTH, True)
     message = "RESOURCE_EXHAUSTED: no memory for the arrays that a program works with"
     with pytest.raises(jax.errors.JaxRuntimeError, match=message):
         jax.block_until_ready(call(name, x, shape=(WIDTH, 1000)))
 
 
 @pytest.mark.parametrize("members", [1, WIDTH + 1, 1000])
-def test_an_operand_that_all_members_share(members):
-    name = _lanes.registered(kernel_ir(SHARED), 2, 1, WIDTH, True)
+def test_kernel_with_shared_operand_reads_it_for_each_member(members):
+    name = lanes.register_kernel(kernel_ir(SHARED), 2, 1, WIDTH, True)
     x = jnp.arange(members, dtype=jnp.float64)
     shared = jnp.full(1, 5.0)
     np.testing.assert_array_equal(call(name, x, shared), np.arange(members) + 5)
@@ -88,62 +88,62 @@ def test_an_operand_that_all_members_share(members):
 def test_arrays_without_elements(members):
     """A kernel that does not touch its arrays, which have no elements."""
     kernel = kernel_ir("")
-    name = _lanes.registered(kernel, 1, 1, WIDTH, True)
+    name = lanes.register_kernel(kernel, 1, 1, WIDTH, True)
     x = jnp.zeros((members, 0))
     assert call(name, x).shape == (members, 0)
 
 
-def test_one_member_without_a_batch():
-    name = _lanes.registered(kernel_ir(TRIPLE, width=1), 1, 1, 1, False)
+def test_kernel_without_batch_computes_one_member():
+    name = lanes.register_kernel(kernel_ir(TRIPLE, width=1), 1, 1, 1, False)
     np.testing.assert_array_equal(call(name, jnp.full(1, 2.0)), [6.0])
 
 
-def test_wrong_numbers_of_arrays_are_an_error_of_jax(triple):
+def test_kernel_with_wrong_number_of_arrays_raises_in_jax(triple):
     x = jnp.ones(3)
     with pytest.raises(jax.errors.JaxRuntimeError, match="unexpected numbers"):
         call(triple, x, x)
 
 
-def test_equal_programs_are_compiled_once(triple):
-    before = _lanes.held()
-    assert _lanes.registered(kernel_ir(TRIPLE), 1, 1, WIDTH, True) == triple
-    assert _lanes.held() == before
+def test_kernel_registered_twice_is_compiled_once(triple):
+    before = lanes.compiled_code()
+    assert lanes.register_kernel(kernel_ir(TRIPLE), 1, 1, WIDTH, True) == triple
+    assert lanes.compiled_code() == before
     assert before.bytes > 0
     others = [(1, 1, WIDTH, False), (1, 1, WIDTH + 1, True), (2, 1, WIDTH, True)]
-    names = {_lanes.registered(kernel_ir(TRIPLE), *other) for other in others}
+    names = {lanes.register_kernel(kernel_ir(TRIPLE), *other) for other in others}
     assert len(names | {triple}) == 4
 
 
-def test_what_is_held_grows_by_each_program():
-    before = _lanes.held()
+def test_compiled_code_after_new_kernel_grows():
+    before = lanes.compiled_code()
     unused = "@grows = global i32 0\n"
-    _lanes.registered(kernel_ir(TRIPLE, before=unused), 1, 1, WIDTH, True)
-    after = _lanes.held()
+    lanes.register_kernel(kernel_ir(TRIPLE, before=unused), 1, 1, WIDTH, True)
+    after = lanes.compiled_code()
     assert after.programs == before.programs + 1
     assert after.bytes > before.bytes
 
 
-def test_a_module_of_a_million_characters():
+def test_kernel_of_a_million_characters_compiles():
     """Its code is generated at another level than that of shorter modules."""
     comment = f"; {'.' * 1_000_000}\n"
-    name = _lanes.registered(kernel_ir(TRIPLE, before=comment), 1, 1, WIDTH, True)
+    name = lanes.register_kernel(kernel_ir(TRIPLE, before=comment), 1, 1, WIDTH, True)
     x = np.arange(1001.0)
     np.testing.assert_array_equal(call(name, x), 3 * x)
 
 
-def test_text_that_is_not_a_kernel_is_refused():
+def test_kernel_with_invalid_ir_raises():
     with pytest.raises(RuntimeError, match="parsing"):
-        _lanes.registered("this is not LLVM IR", 1, 1, WIDTH, True)
+        lanes.register_kernel("this is not LLVM IR", 1, 1, WIDTH, True)
 
 
-def test_threads_that_want_the_same_program_at_once():
+def test_kernel_wanted_by_several_threads_is_compiled_once():
     kernel = kernel_ir(TRIPLE, before="@at_once = global i32 0\n")
-    before = _lanes.held().programs
+    before = lanes.compiled_code().programs
     start, names = threading.Barrier(8), []
 
     def want():
         start.wait()
-        name = _lanes.registered(kernel, 1, 1, WIDTH, True)
+        name = lanes.register_kernel(kernel, 1, 1, WIDTH, True)
         x = np.arange(1000.0)
         np.testing.assert_array_equal(call(name, x), 3 * x)
         names.append(name)
@@ -155,39 +155,39 @@ def test_threads_that_want_the_same_program_at_once():
         thread.join()
     assert len(names) == 8
     assert len(set(names)) == 1
-    assert _lanes.held().programs == before + 1
+    assert lanes.compiled_code().programs == before + 1
 
 
-def test_calls_from_more_threads_than_the_pool_has():
+def test_kernel_called_from_more_threads_than_the_pool_finishes():
     assert printed("many_callers", NPROC="2") == "calls: 160"
 
 
 @pytest.mark.parametrize("threads", [1, 2, 4])
-def test_no_more_threads_than_the_pool_has(threads):
+def test_kernel_uses_at_most_the_threads_of_the_pool(threads):
     # The pool's threads take part if they are there: the blocks last for 0.8 s in all.
     assert printed("threads", 1, NPROC=str(threads)) == f"most: {threads}"
 
 
-def test_several_devices_share_the_pool():
+def test_kernel_on_several_devices_shares_the_pool():
     flags = "--xla_force_host_platform_device_count=2"
     most = int(printed("threads", 2, NPROC="4", XLA_FLAGS=flags).split()[-1])
     # The second device's own thread may come when there are four at work.
     assert 2 <= most <= 5
 
 
-def test_a_child_of_a_process_that_forks():
+def test_kernel_in_forked_process_finishes():
     assert printed("forked") == "child: 0"
 
 
 @pytest.mark.long
-def test_an_executable_from_jaxs_cache(tmp_path):
+def test_kernel_in_executable_from_jax_cache_runs(tmp_path):
     assert printed("cached", tmp_path) == "hits: 0"
     assert list(tmp_path.iterdir())
     assert printed("cached", tmp_path) != "hits: 0"
 
 
 @pytest.mark.long
-def test_an_executable_that_was_saved(tmp_path):
+def test_kernel_in_saved_executable_runs_or_is_refused(tmp_path):
     path = tmp_path / "executable"
     printed("saved", path)
     assert printed("loaded", path, "registered") == "ran"

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from nhjax._lanes import member_ir
+from nhjax.lanes import llvm_ir
 from oracles import lanes_run
 from oracles.lanes_samples import (
     assert_as_jax,
@@ -18,7 +18,7 @@ from oracles.lanes_samples import (
 
 
 @WIDTHS
-def test_lanes_leave_a_loop_one_by_one(width):
+def test_loop_that_members_leave_one_by_one_keeps_their_results(width):
     def function(times, x):
         return repeated(times, lambda k, x: jnp.sin(x) + k.astype(float), x)
 
@@ -30,7 +30,7 @@ def test_lanes_leave_a_loop_one_by_one(width):
 
 
 @WIDTHS
-def test_a_lane_that_has_ended_does_not_keep_an_inner_loop_running(width):
+def test_inner_loop_of_finished_member_does_not_run(width):
     def function(times, x):
         def body(k, x):
             x = lax.while_loop(lambda y: (y > 1) | (k >= times), lambda y: y / 2, x)
@@ -50,7 +50,7 @@ def test_a_lane_that_has_ended_does_not_keep_an_inner_loop_running(width):
 
 
 @WIDTHS
-def test_a_loop_runs_for_the_lanes_that_take_its_branch(width):
+def test_loop_in_branch_runs_for_members_of_the_branch(width):
     def function(p, x):
         def endless_elsewhere(x):
             return lax.while_loop(lambda y: (y < 50) | ~p, lambda y: y + 1, x)
@@ -63,7 +63,7 @@ def test_a_loop_runs_for_the_lanes_that_take_its_branch(width):
 
 
 @WIDTHS
-def test_a_loop_equal_in_all_lanes_does_not_run_in_a_branch_of_none(width):
+def test_uniform_loop_in_branch_of_no_member_does_not_run(width):
     """Its predicate is one for all lanes, so that no mask could end it."""
 
     def function(p, x):
@@ -81,20 +81,20 @@ def test_a_loop_equal_in_all_lanes_does_not_run_in_a_branch_of_none(width):
 
 
 @WIDTHS
-def test_what_is_equal_in_all_lanes_differs_after_a_loop_that_they_leave(width):
+def test_uniform_value_after_divergent_loop_is_divergent(width):
     def function(times):
         return repeated(times, lambda k, x: x + k.astype(float), jnp.zeros(()))
 
     assert_as_jax(function, width, count(12))
 
 
-def test_a_branch_equal_in_all_lanes_is_a_real_one():
+def test_branch_with_uniform_predicate_is_a_jump():
     def function(p, x):
         return lax.cond(p, lambda x: jnp.sin(x), lambda x: jnp.exp(x), x)
 
     shapes = (jax.ShapeDtypeStruct((), bool), jax.ShapeDtypeStruct((), np.float64))
     program = jax.make_jaxpr(function)(*shapes)
-    shared = member_ir(program, (False, True), 8)
+    shared = llvm_ir(program, (False, True), 8)
     member = shared[shared.index("@member") : shared.index("@kernel")]
     assert "phi <8 x double>" in member
     assert "select <8 x i1>" not in member

@@ -8,7 +8,9 @@ import numpy as np
 import pytest
 import scipy.special
 
-from nhjax._lanes import _coefficients, definition, library, SUPPORTED, symbol
+from nhjax.lanes import _coefficients
+from nhjax.lanes._elementary_functions import definitions, SUPPORTED
+from nhjax.lanes._writer import symbol
 from oracles import approximations, ulps
 from oracles.native_lanes import Native
 
@@ -21,20 +23,20 @@ EVERYTHING = [(op, dtype, width) for op in OPS for dtype in DTYPES for width in 
 
 @pytest.fixture(scope="module")
 def native():
-    return Native(library(EVERYTHING), [symbol(*key) for key in EVERYTHING])
+    return Native(definitions(EVERYTHING), [symbol(*key) for key in EVERYTHING])
 
 
 @pytest.fixture(scope="module")
 def rounded():
     """The same functions where each product is rounded before it is added."""
     keys = [(op, "float64", 4) for op in OPS]
-    text = library(keys).replace("contract ", "")
+    text = definitions(keys).replace("contract ", "")
     return Native(text, [symbol(*key) for key in keys])
 
 
 @pytest.mark.parametrize("dtype", DTYPES)
 @pytest.mark.parametrize("op", OPS)
-def test_errors_are_below_two_ulps(op, dtype, native, rounded):
+def test_elementary_function_errs_by_less_than_two_ulps(op, dtype, native, rounded):
     given = ulps.arguments(op, 0, 1500, DTYPES[dtype])
     exact = ulps.exact_values(op, given)
     # Conversions of float32 leave little more than the last rounding.
@@ -73,14 +75,14 @@ HARD = {
 
 
 @pytest.mark.parametrize("op", HARD)
-def test_hard_arguments(op, native):
+def test_elementary_function_at_hard_arguments_errs_by_less_than_two_ulps(op, native):
     given = [np.array(HARD[op], np.float64)]
     got = native(symbol(op, "float64", 8), *given)
     assert ulps.errors(got, ulps.exact_values(op, given)).max() < 2
 
 
 @pytest.mark.parametrize("dtype", DTYPES)
-def test_remainders_are_exact(dtype, native):
+def test_remainder_of_any_arguments_is_exact(dtype, native):
     given = ulps.arguments("rem", 3, 20000, DTYPES[dtype])
     got = native(symbol("rem", dtype, 8), *given)
     np.testing.assert_array_equal(got, np.fmod(*given))
@@ -112,7 +114,7 @@ def _specials(dtype):
 @pytest.mark.parametrize("width", WIDTHS)
 @pytest.mark.parametrize("dtype", DTYPES)
 @pytest.mark.parametrize("op", OPS)
-def test_special_values_are_those_of_c(op, dtype, width, native):
+def test_elementary_function_at_special_values_is_that_of_c(op, dtype, width, native):
     values = _specials(DTYPES[dtype])
     given = [values]
     if op in ulps.BINARY:
@@ -132,19 +134,21 @@ LARGEST_ERRORS = {"LOG_LONG": -66, "CBRT": -18}
 
 
 @pytest.mark.parametrize("name", approximations.APPROXIMATIONS)
-def test_polynomials_are_as_close_as_float64_needs(name):
+def test_polynomial_coefficients_are_as_accurate_as_float64(name):
     coefficients = getattr(_coefficients, name)
     bound = 2.0 ** LARGEST_ERRORS.get(name, -55)
     assert approximations.worst_error(name, coefficients) < bound
 
 
-def test_coefficients_are_those_that_are_computed():
+def test_polynomial_coefficients_equal_computed_ones():
     source = inspect.getsource(_coefficients)
     assert source == approximations.module()
 
 
-def test_a_library_defines_each_function_once():
-    names = re.findall(r"^(?:define|declare).*?@([\w.]+)", library(EVERYTHING), re.M)
+def test_definitions_of_all_functions_define_each_once():
+    names = re.findall(
+        r"^(?:define|declare).*?@([\w.]+)", definitions(EVERYTHING), re.M
+    )
     assert len(names) == len(set(names))
     assert all(name.startswith("nhjax.") for name in names)
     assert {symbol(*key) for key in EVERYTHING} <= set(names)
@@ -154,7 +158,7 @@ def test_sine_and_cosine_of_one_argument_are_one_call():
     """LLVM merges the calls: the two cost what one does."""
     both = "\n".join(
         [
-            library([("sin", "float64", 4), ("cos", "float64", 4)]),
+            definitions([("sin", "float64", 4), ("cos", "float64", 4)]),
             "define <4 x double> @sum(<4 x double> %x) {",
             f"  %s = call <4 x double> @{symbol('sin', 'float64', 4)}(<4 x double> %x)",
             f"  %c = call <4 x double> @{symbol('cos', 'float64', 4)}(<4 x double> %x)",
@@ -180,15 +184,15 @@ TRIPLES = [
 
 @pytest.mark.parametrize("width", [1, 2, 8])
 @pytest.mark.parametrize("triple", TRIPLES)
-def test_no_library_is_called_on_any_platform(triple, width):
+def test_elementary_functions_on_any_platform_call_no_library(triple, width):
     """Nor is one needed by a processor without special instructions."""
     keys = [(op, dtype, width) for op in OPS for dtype in DTYPES]
-    text = library(keys).replace("define internal", "define")
+    text = definitions(keys).replace("define internal", "define")
     assert _called_outside(text, triple) == set()
 
 
 @pytest.mark.parametrize("triple", TRIPLES)
-def test_calls_of_a_library_are_found(triple):
+def test_call_of_a_library_is_found(triple):
     text = """
         define double @other(double %x) {
           %y = call double @llvm.sin.f64(double %x)
@@ -219,12 +223,12 @@ def _parsed(text, triple):
     return module, machine
 
 
-def test_one_definition_is_complete():
+def test_definition_of_one_function_is_complete():
     for op in OPS:
-        Native(definition(op, "float64", 2), [symbol(op, "float64", 2)])
+        Native(definitions([(op, "float64", 2)]), [symbol(op, "float64", 2)])
 
 
-def test_other_primitives_are_not_supported():
+def test_elementary_function_without_formula_is_not_supported():
     assert "sqrt" not in SUPPORTED
     with pytest.raises(KeyError):
-        definition("lgamma", "float64", 4)
+        definitions([("lgamma", "float64", 4)])

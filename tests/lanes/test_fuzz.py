@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, strategies as st
 
-from nhjax._lanes import _memory
+from nhjax.lanes import _builder
 from oracles import lanes_run
 from oracles.random_programs import programs
 from oracles.random_steps import evaluate, numbers
@@ -76,18 +76,20 @@ def compare(program, seed, width, batched):
 
 @pytest.mark.long
 @fuzzed(EXAMPLES)
-def test_lanes_compute_what_jax_does(program, seed, width, batched):
+def test_random_program_computes_what_jax_does(program, seed, width, batched):
     compare(program, seed, width, batched)
 
 
 @pytest.mark.long
 @fuzzed(max(EXAMPLES // 4, 1))
-def test_arrays_in_memory_hold_what_those_of_jax_do(program, seed, width, batched):
-    names = [name for name in sys.modules if name.startswith("nhjax._lanes.")]
+def test_random_program_with_arrays_in_memory_computes_what_jax_does(
+    program, seed, width, batched
+):
+    names = [name for name in sys.modules if name.startswith("nhjax.lanes.")]
     with pytest.MonkeyPatch.context() as patch:
         # Nearly all arrays of these programs are large then, and copied in loops.
-        patch.setattr(_memory, "_UNROLLED", 1)
+        patch.setattr(_builder, "_LONGEST_UNROLLED", 1)
         for name in names:
-            if hasattr(sys.modules[name], "LARGE"):
-                patch.setattr(sys.modules[name], "LARGE", 1)
+            if hasattr(sys.modules[name], "MOST_IN_REGISTERS"):
+                patch.setattr(sys.modules[name], "MOST_IN_REGISTERS", 1)
         compare(program, seed, width, batched)

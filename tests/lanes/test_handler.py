@@ -7,7 +7,7 @@ import threading
 import numpy as np
 import pytest
 
-from nhjax._lanes import _ffi_structs, _handler, _native, _pool
+from nhjax.lanes import _ffi, _handler, _native
 from oracles import ffi_runtime
 from oracles.ffi_runtime import Runtime
 from oracles.lane_kernels import kernel_ir, TRIPLE, WIDTH
@@ -69,12 +69,12 @@ WORKERS = ctypes.c_int64(0)
 def loaded(texts, symbol):
     """The address of a function of modules that are compiled for this machine."""
     code = _native.object_code(texts, symbol, _native.host())
-    imports = {_pool.WORKERS: ctypes.addressof(WORKERS)}
+    imports = {_handler.WORKERS: ctypes.addressof(WORKERS)}
     return _native.load(code, f"test_{next(NUMBERS)}", symbol, imports)
 
 
 def with_handler(body, is_batched=True):
-    """A kernel and its handler, which refers to the module of `handle_ir`."""
+    """A kernel and its handler, which refers to the module of `shared_handler_ir`."""
     return [kernel_ir(body), _handler.handler_ir(1, 1, WIDTH, is_batched)]
 
 
@@ -82,7 +82,7 @@ class Program:
     """The handler of a kernel that triples, with its allocations and clock in hand."""
 
     def __init__(self, is_batched=True):
-        text = _handler.handle_ir()
+        text = _handler.shared_handler_ir()
         for name, stand_in in STAND_INS.items():
             assert f"@{name}(" in text
             text = text.replace(f"@{name}(", f"@{stand_in}(")
@@ -130,18 +130,18 @@ def in_header(struct):
     return structs[struct if struct in structs else RENAMED[struct]]
 
 
-@pytest.mark.parametrize("struct", _ffi_structs.STRUCTS)
-def test_fields_lie_where_the_header_puts_them(struct):
-    fields = _ffi_structs.STRUCTS[struct]
+@pytest.mark.parametrize("struct", _ffi.STRUCTS)
+def test_ffi_fields_have_offsets_of_the_header(struct):
+    fields = _ffi.STRUCTS[struct]
     stores = "\n".join(
         f"""
-        %p{k} = {_ffi_structs.field("null", struct, name)}
+        %p{k} = {_ffi.field("null", struct, name)}
         %i{k} = ptrtoint ptr %p{k} to i64
         %o{k} = getelementptr i64, ptr %offsets, i64 {k}
         store i64 %i{k}, ptr %o{k}"""
         for k, name in enumerate(fields)
     )
-    text = _ffi_structs.type_definitions(_ffi_structs.STRUCTS)
+    text = _ffi.type_definitions(_ffi.STRUCTS)
     text += f"define void @offsets(ptr %offsets) {{ {stores}\n ret void }}"
     offsets = (ctypes.c_int64 * len(fields))()
     ctypes.CFUNCTYPE(None, ctypes.c_void_p)(loaded([text], "offsets"))(offsets)
@@ -153,17 +153,17 @@ def test_fields_lie_where_the_header_puts_them(struct):
         assert name == expected or name not in checked
 
 
-def test_what_is_asked_of_the_runtime_has_the_size_of_the_header():
-    for struct in _ffi_structs.STRUCTS:
+def test_ffi_arguments_have_sizes_of_the_header():
+    for struct in _ffi.STRUCTS:
         if not struct.endswith("_Args") or struct == "XLA_FFI_Args":
             continue
-        text = _ffi_structs.type_definitions(_ffi_structs.STRUCTS)
-        text += f"define i64 @size() {{ ret i64 {_ffi_structs.size_of(struct)} }}"
+        text = _ffi.type_definitions(_ffi.STRUCTS)
+        text += f"define i64 @size() {{ ret i64 {_ffi.size_of(struct)} }}"
         size = ctypes.CFUNCTYPE(ctypes.c_int64)(loaded([text], "size"))()
         assert size == ctypes.sizeof(in_header(struct))
 
 
-def test_metadata_claims_the_lowest_version(program):
+def test_handler_metadata_claims_the_lowest_version(program):
     metadata = Runtime().metadata(program.handler)
     version = metadata.api_version
     assert (version.major_version, version.minor_version) == (0, 1)
@@ -172,7 +172,7 @@ def test_metadata_claims_the_lowest_version(program):
 
 
 @pytest.mark.parametrize("members", [0, 1, WIDTH - 1, WIDTH, WIDTH + 1, 1001])
-def test_the_caller_does_all_blocks_if_no_helper_starts(program, members):
+def test_handler_without_helpers_runs_all_blocks(program, members):
     runtime = Runtime(threads=4)
     program.triples(runtime, members)
     blocks = -(-members // WIDTH)
@@ -184,14 +184,14 @@ def test_the_caller_does_all_blocks_if_no_helper_starts(program, members):
     assert program.held() == 0
 
 
-def test_tasks_that_run_at_once_in_the_callers_thread(program):
+def test_handler_with_tasks_in_its_own_thread_finishes(program):
     runtime = Runtime(threads=4, schedule=lambda task: task() is None)
     program.triples(runtime, 1001)
     assert runtime.offers == 3
     assert program.held() == 0
 
 
-def test_tasks_that_run_in_threads(program):
+def test_handler_with_tasks_in_threads_finishes(program):
     threads = []
 
     def start(task):
@@ -208,7 +208,7 @@ def test_tasks_that_run_in_threads(program):
     assert program.held() == 0
 
 
-def test_a_pool_that_takes_no_task(program):
+def test_handler_with_pool_that_refuses_tasks_finishes(program):
     runtime = Runtime(threads=4, schedule=lambda task: False)
     program.triples(runtime, 1001)
     # After the first refusal no more is asked; each error is destroyed.
@@ -218,7 +218,7 @@ def test_a_pool_that_takes_no_task(program):
     assert program.held() == 0
 
 
-def test_no_pool(program):
+def test_handler_without_pool_finishes(program):
     runtime = Runtime(threads=None)
     program.triples(runtime, 1001)
     assert runtime.offers == 0
@@ -227,7 +227,7 @@ def test_no_pool(program):
     assert program.held() == 0
 
 
-def test_an_interface_that_ends_before_the_pool(program):
+def test_handler_with_interface_without_pool_asks_no_helper(program):
     runtime = Runtime(threads=4)
     runtime.api.struct_size = ffi_runtime.STRUCTS[
         "XLA_FFI_Api"
@@ -237,14 +237,14 @@ def test_an_interface_that_ends_before_the_pool(program):
 
 
 @pytest.mark.parametrize("threads", [-1, 0, 1])
-def test_a_pool_of_one_thread_is_not_asked(program, threads):
+def test_handler_with_pool_of_one_thread_asks_no_helper(program, threads):
     runtime = Runtime(threads=threads)
     program.triples(runtime, 1001)
     assert runtime.offers == 0
 
 
 @pytest.mark.parametrize("others", [1, 2, 3, 7])
-def test_as_many_helpers_are_asked_for_as_there_is_room(program, others):
+def test_handler_with_busy_threads_asks_as_many_helpers_as_fit(program, others):
     runtime = Runtime(threads=4)
     WORKERS.value = others
     program.triples(runtime, 1001)
@@ -254,7 +254,7 @@ def test_as_many_helpers_are_asked_for_as_there_is_room(program, others):
     assert program.held() == 0
 
 
-def test_a_helper_that_finds_no_room_leaves(program):
+def test_helper_with_too_many_threads_leaves(program):
     x, y = np.arange(1001.0), np.full(1001, -1.0)
     seen = []
 
@@ -273,7 +273,7 @@ def test_a_helper_that_finds_no_room_leaves(program):
     assert program.held() == 0
 
 
-def test_before_the_first_call_helpers_are_asked_for():
+def test_handler_before_first_call_asks_for_helpers():
     runtime = Runtime(threads=4)
     program = Program()
     program.step.value = 1
@@ -281,7 +281,7 @@ def test_before_the_first_call_helpers_are_asked_for():
     assert runtime.offers == 3
 
 
-def test_a_short_program_wakes_nobody(program):
+def test_handler_of_short_program_asks_no_helper(program):
     program.step.value = 1_000
     program.triples(Runtime(threads=1), 1)
     runtime = Runtime(threads=8)
@@ -293,7 +293,7 @@ def test_a_short_program_wakes_nobody(program):
     runtime.run_tasks()
 
 
-def test_a_program_that_takes_longer_than_last_time_asks_after_its_first_block(program):
+def test_handler_of_slower_call_asks_helpers_after_first_block(program):
     program.step.value = 1_000
     program.triples(Runtime(threads=1), 1)
     program.step.value = 1_000_000
@@ -305,7 +305,7 @@ def test_a_program_that_takes_longer_than_last_time_asks_after_its_first_block(p
     runtime.run_tasks()
 
 
-def test_another_number_of_arrays_is_an_error(program):
+def test_handler_with_wrong_number_of_arrays_returns_error(program):
     runtime = Runtime()
     x, y = np.ones(3), np.zeros(3)
     error = runtime.call(program.handler, [x, x], [y])
@@ -315,8 +315,8 @@ def test_another_number_of_arrays_is_an_error(program):
     np.testing.assert_array_equal(y, 0.0)
 
 
-def test_lack_of_memory_is_an_error():
-    text = _handler.handle_ir()
+def test_handler_without_memory_for_job_returns_error():
+    text = _handler.shared_handler_ir()
     declared = "declare ptr @malloc(i64)"
     assert declared in text
     text = text.replace(
@@ -329,7 +329,7 @@ def test_lack_of_memory_is_an_error():
     assert runtime.messages[error] == (8, "no memory to share a call's blocks")
 
 
-def test_a_block_that_finds_no_memory_is_an_error():
+def test_handler_of_failed_block_returns_error():
     # The first block finds some.
     kernel = """
 define i1 @kernel(ptr %operands, ptr %results, i64 %first, i64 %last) {
@@ -337,7 +337,8 @@ define i1 @kernel(ptr %operands, ptr %results, i64 %first, i64 %last) {
   ret i1 %is_later
 }
 """
-    texts = [kernel, _handler.handler_ir(1, 1, WIDTH, True), _handler.handle_ir()]
+    handler = _handler.handler_ir(1, 1, WIDTH, True)
+    texts = [kernel, handler, _handler.shared_handler_ir()]
     handler = loaded(texts, _handler.HANDLER)
     for members, is_lacking in ((WIDTH, False), (3 * WIDTH, True)):
         runtime = Runtime(threads=2)
@@ -350,7 +351,7 @@ define i1 @kernel(ptr %operands, ptr %results, i64 %first, i64 %last) {
     assert WORKERS.value == 0
 
 
-def test_a_program_without_members_runs_once():
+def test_handler_without_batch_runs_once():
     program = Program(is_batched=False)
     runtime = Runtime(threads=4)
     x, y = np.full(3, 2.0), np.zeros(3)
@@ -360,8 +361,8 @@ def test_a_program_without_members_runs_once():
     assert runtime.offers == 0
 
 
-def test_a_program_without_results_does_nothing():
+def test_handler_without_results_does_nothing():
     kernel = "define i1 @kernel(ptr %operands, ptr %results, i64 %first, i64 %last) {"
     handler = _handler.handler_ir(1, 0, WIDTH, True)
-    texts = [f"{kernel} unreachable }}", handler, _handler.handle_ir()]
+    texts = [f"{kernel} unreachable }}", handler, _handler.shared_handler_ir()]
     assert Runtime().call(loaded(texts, _handler.HANDLER), [np.ones(3)], []) is None

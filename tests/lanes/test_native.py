@@ -7,8 +7,8 @@ import sys
 import jax.numpy as jnp
 import pytest
 
-from nhjax import _lanes
-from nhjax._lanes import _handler, _native
+from nhjax import lanes
+from nhjax.lanes import _handler, _native
 from oracles import lane_processes
 from oracles.lane_kernels import VECTORS
 
@@ -29,9 +29,9 @@ TARGETS = {
 
 
 @pytest.mark.parametrize("name", TARGETS)
-def test_a_kernel_and_its_handler_compile_for(name):
+def test_kernel_and_handler_compile_for_each_platform(name):
     target, register = TARGETS[name]
-    texts = [VECTORS, _handler.handler_ir(1, 1, 8, True), _handler.handle_ir()]
+    texts = [VECTORS, _handler.handler_ir(1, 1, 8, True), _handler.shared_handler_ir()]
     made = texts, _handler.HANDLER, target
     text = _native.assembly(*made)
     assert _handler.HANDLER in text
@@ -40,7 +40,7 @@ def test_a_kernel_and_its_handler_compile_for(name):
 
 
 @pytest.mark.parametrize("cpu", ["skylake-avx512", "sapphirerapids", "znver4"])
-def test_vectors_of_512_bits_stay_whole(cpu):
+def test_kernel_with_avx512_uses_512_bit_vectors(cpu):
     """These prefer vectors of 256 bits for what the compiler makes vectors of."""
     machine = _native.Target(LINUX, cpu)
     text = _native.assembly([VECTORS], "kernel", machine)
@@ -48,16 +48,16 @@ def test_vectors_of_512_bits_stay_whole(cpu):
     assert "%ymm" not in text
 
 
-def test_products_and_sums_are_contracted_where_the_machine_can():
+def test_kernel_with_fma_contracts_products_and_sums():
     for name, has_fma in [("x86-64", False), ("x86-64-v3", True), ("aarch64", True)]:
         text = _native.assembly([VECTORS], "kernel", TARGETS[name][0])
         assert bool(re.search(r"\bvfmadd|\bfmla", text)) == has_fma
 
 
-def test_the_width_is_that_of_the_hosts_vectors():
-    width = _lanes.host_width(jnp.float64)
+def test_host_width_equals_elements_of_vector_registers():
+    width = lanes.host_width(jnp.float64)
     assert width in (2, 4, 8)
-    assert _lanes.host_width(jnp.float32) == 2 * width
+    assert lanes.host_width(jnp.float32) == 2 * width
     text = VECTORS.replace("<8 x double>", f"<{width} x double>")
     made = _native.assembly([text], "kernel", _native.host())
     # One product of this width is one instruction.
@@ -68,20 +68,20 @@ def run(*command):
     return subprocess.run(command, capture_output=True, text=True, check=True).stdout
 
 
-def test_lanes_are_available_here():
-    assert _lanes.is_available()
+def test_compiler_on_this_machine_is_available():
+    assert lanes.is_available()
 
 
 @pytest.mark.parametrize(
     ("system", "machine"), [("win32", "AMD64"), ("linux", "riscv64"), ("linux", "i686")]
 )
-def test_other_platforms_have_no_lanes(monkeypatch, system, machine):
+def test_compiler_on_other_platforms_is_not_available(monkeypatch, system, machine):
     monkeypatch.setattr(_native.sys, "platform", system)
     monkeypatch.setattr(_native.platform, "machine", lambda: machine)
     assert not _native.is_available.__wrapped__()
 
 
-def test_without_llvmlite_the_package_works_and_has_no_lanes():
+def test_package_without_llvmlite_runs_without_compiler():
     """Nor does the import of nhjax import llvmlite where it is."""
     out = run(sys.executable, lane_processes.__file__, "without_llvmlite")
     assert out == "imported: False available: False\n"

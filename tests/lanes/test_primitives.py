@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 from jax import lax
 
-from nhjax._compile import _elementary
-from nhjax._lanes import _trace, Unsupported
+from nhjax._compile import _jaxprs
 from nhjax._numerics import small_einsum
+from nhjax.lanes import _program, Unsupported
 from oracles import lanes_run
 from oracles.random_steps import Kind, numbers
 
@@ -234,20 +234,20 @@ _INEXACT = """
 """.split()  # noqa: SIM905
 
 
-def test_every_primitive_of_a_kernel_has_a_case():
+def test_primitives_that_kernels_contain_have_cases():
     names = [
-        *_elementary.ELEMENTWISE,
-        *_elementary._REDUCING,
-        *_elementary._SHAPING,
-        *_elementary._MOVING,
-        *_elementary._CONTAINING,
-        _elementary.SMALL_PRODUCT,
+        *_jaxprs.ELEMENTWISE,
+        *_jaxprs._REDUCING,
+        *_jaxprs._SHAPING,
+        *_jaxprs._MOVING,
+        *_jaxprs._CONTAINING,
+        _jaxprs.SMALL_PRODUCT,
     ]
     assert set(names) <= set(_CASES)
 
 
 @pytest.mark.parametrize("name", sorted(_CASES))
-def test_lanes_agree_with_jax(name):
+def test_primitive_computes_what_jax_does(name):
     for number, (function, kinds) in enumerate(_CASES[name]):
         operands = [numbers(kind, MEMBERS, number + i) for i, kind in enumerate(kinds)]
         expected = jax.tree.leaves(jax.jit(jax.vmap(function))(*operands))
@@ -281,29 +281,29 @@ def _assert_close(got, expected, is_inexact, message):
         (lambda x: jnp.tile(x, 9000) * jnp.arange(27000.0), "one by one"),
     ],
 )
-def test_what_is_not_supported_says_so(function, reason):
+def test_unsupported_program_raises_with_reason(function, reason):
     with pytest.raises(Unsupported, match=reason):
         lanes_run.run_batched(function, 4, np.ones((2, 3)))
 
 
-def test_programs_that_take_long_to_compile_are_refused(monkeypatch):
-    monkeypatch.setattr(_trace, "MOST_NODES", 100)
+def test_program_with_too_many_nodes_is_refused(monkeypatch):
+    monkeypatch.setattr(_program, "MOST_NODES", 100)
     lanes_run.run_batched(lambda x: jnp.sin(x), 4, np.ones((2, 10)))
     with pytest.raises(Unsupported, match="more than 120 operations"):
         lanes_run.run_batched(lambda x: jnp.outer(x, x), 4, np.ones((2, 20)))
 
 
-def test_parameters_of_another_release_are_refused_by_name():
+def test_primitive_with_unknown_parameters_is_refused_by_name():
     program = jax.make_jaxpr(lambda x: lax.rev(x, (0,)))(np.zeros(3))
     (equation,) = program.eqns
     params = {f"{key}_elsewhere": value for key, value in equation.params.items()}
     equation = equation.replace(params=params)
     jaxpr = program.jaxpr.replace(eqns=[equation])
     with pytest.raises(Unsupported, match="rev without its dimensions"):
-        _trace.trace(program.replace(jaxpr=jaxpr))
+        _program.build_graph(program.replace(jaxpr=jaxpr))
 
 
-def test_effects_are_refused():
+def test_program_with_effects_is_refused():
     def function(x):
         jax.debug.print("{}", x)
         return x

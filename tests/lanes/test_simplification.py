@@ -4,14 +4,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from nhjax._lanes import member_ir
+from nhjax.lanes import llvm_ir
 from oracles import lanes_run
 from oracles.lanes_samples import (
     repeated,
 )
 
 
-def test_a_zero_of_data_does_not_swallow_nan():
+def test_product_with_zero_of_data_keeps_nan():
     def function(x):
         return x * 0.0, x - x, 0.0 / x, x + 0.0
 
@@ -24,39 +24,39 @@ def test_a_zero_of_data_does_not_swallow_nan():
         np.testing.assert_array_equal(*signs)
 
 
-def test_a_structural_zero_leaves_nothing_to_compute():
+def test_product_with_structural_zero_is_removed():
     def function(x):
         return jnp.pad(x, (1, 1)) * jnp.concatenate([x, x])[:5] + jnp.zeros(5)
 
     program = jax.make_jaxpr(function)(jax.ShapeDtypeStruct((3,), np.float64))
-    text = member_ir(program, (True,), 8)
+    text = llvm_ir(program, (True,), 8)
     assert text.count("fmul") == 3
     assert text.count("fadd") == 0
 
 
-def test_what_is_not_used_is_not_computed():
+def test_unused_operations_are_removed():
     def function(x):
         unused = repeated(5, lambda k, y: jnp.sin(y), x)
         return x * 2, (unused, x)[1]
 
     program = jax.make_jaxpr(function)(jax.ShapeDtypeStruct((3,), np.float64))
-    text = member_ir(program, (True,), 8)
+    text = llvm_ir(program, (True,), 8)
     assert "phi" not in text
     assert "nhjax.sin" not in text
 
 
-def test_what_does_not_change_is_computed_before_a_loop():
+def test_loop_invariant_operations_are_hoisted():
     def function(x):
         return repeated(5, lambda k, y: y + jnp.sin(x), x)
 
     program = jax.make_jaxpr(function)(jax.ShapeDtypeStruct((), np.float64))
-    lines = member_ir(program, (True,), 8).splitlines()
+    lines = llvm_ir(program, (True,), 8).splitlines()
     call = next(i for i, line in enumerate(lines) if "call" in line and "sin" in line)
     loop = next(i for i, line in enumerate(lines) if "phi" in line)
     assert call < loop
 
 
-def test_the_time_to_make_nested_loops_does_not_multiply():
+def test_nested_loops_are_built_in_linear_time():
     """A loop is made anew when a number turns out not to be constant, but once."""
     depth, made = 6, []
 
@@ -67,7 +67,7 @@ def test_the_time_to_make_nested_loops_does_not_multiply():
         return repeated(9, lambda k, y: nested(level - 1, y), x)
 
     program = jax.make_jaxpr(lambda x: nested(depth, jnp.zeros(())) + x)(1.0)
-    text = member_ir(program, (True,), 4)
+    text = llvm_ir(program, (True,), 4)
     assert text.count("phi double") == depth
     # Numbers that are made and dropped leave gaps.
     assert int(text.split("%v")[-1].split()[0].strip(",")) < 400

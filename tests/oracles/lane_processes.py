@@ -16,7 +16,7 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parent.parent))
 
-from nhjax import _lanes
+from nhjax import lanes
 from oracles.lane_kernels import COUNT_THREADS, kernel_ir, RUNNING, TRIPLE, WIDTH
 
 
@@ -25,7 +25,7 @@ jax.config.update("jax_enable_x64", True)
 
 def called(body: str, before: str = ""):
     """A compiled function that calls a kernel."""
-    name = _lanes.registered(kernel_ir(body, before=before), 1, 1, WIDTH, True)
+    name = lanes.register_kernel(kernel_ir(body, before=before), 1, 1, WIDTH, True)
     return lambda x: jax.ffi.ffi_call(name, jax.ShapeDtypeStruct(x.shape, x.dtype))(x)
 
 
@@ -93,7 +93,7 @@ def forked() -> None:
             if is_over.is_set():
                 return
             before = f"@unused{number} = global i32 {number}\n"
-            _lanes.registered(kernel_ir(TRIPLE, before=before), 1, 1, WIDTH, True)
+            lanes.register_kernel(kernel_ir(TRIPLE, before=before), 1, 1, WIDTH, True)
 
     thread = threading.Thread(target=compile_on)
     thread.start()
@@ -106,9 +106,9 @@ def forked() -> None:
             # Its blocks are long enough to ask for helpers, and none comes.
             np.testing.assert_array_equal(count(sleeps), 1.0)
             before = "@other = global i32 0\n"
-            programs = _lanes.held().programs
-            _lanes.registered(kernel_ir(TRIPLE, before=before), 1, 1, WIDTH, True)
-            assert _lanes.held().programs == programs + 1
+            programs = lanes.compiled_code().programs
+            lanes.register_kernel(kernel_ir(TRIPLE, before=before), 1, 1, WIDTH, True)
+            assert lanes.compiled_code().programs == programs + 1
             ended = 0
         finally:
             os._exit(ended)
@@ -162,7 +162,7 @@ def without_llvmlite() -> None:
     for name in [name for name in sys.modules if name.startswith("llvmlite")]:
         del sys.modules[name]
     sys.modules["llvmlite"] = None  # pyright: ignore[reportArgumentType]
-    print("imported:", was_imported, "available:", _lanes.is_available())
+    print("imported:", was_imported, "available:", lanes.is_available())
 
 
 if __name__ == "__main__":

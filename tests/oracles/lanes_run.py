@@ -9,7 +9,7 @@ import jax
 import llvmlite.binding as llvm
 import numpy as np
 
-from nhjax._lanes import member_ir
+from nhjax.lanes import llvm_ir
 
 
 llvm.initialize_native_target()
@@ -39,7 +39,7 @@ def prepared(
 ) -> tuple[Any, dict[str, float]]:
     """Compile a closed jaxpr; return the kernel, and what that took."""
     start = time.process_time()
-    text = member_ir(program, tuple(is_batched), width, contract=contract)
+    text = llvm_ir(program, tuple(is_batched), width, contract=contract)
     middle = time.process_time()
     engine = compiled(text)
     kernel = ctypes.CFUNCTYPE(None, *[ctypes.c_void_p] * 2, *[ctypes.c_int64] * 2)(

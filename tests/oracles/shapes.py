@@ -14,7 +14,7 @@ _checked = beartype(conf=BeartypeConf(is_pep484_tower=True))
 
 
 # They transform programs and write native code.
-WITHOUT_SHAPES = ("nhjax._compile", "nhjax._lanes")
+WITHOUT_SHAPES = ("nhjax._compile", "nhjax.lanes")
 
 
 def checked(function: Callable[..., Any]) -> Callable[..., Any]:

@@ -12,7 +12,8 @@ import mpmath
 import numpy as np
 from mpmath import mp, mpf
 
-from nhjax._lanes import library, SUPPORTED, symbol
+from nhjax.lanes._elementary_functions import definitions, SUPPORTED
+from nhjax.lanes._writer import symbol
 from oracles.native_lanes import Native
 
 
@@ -173,7 +174,8 @@ def main(count: int, ops: list[str]) -> None:
     for dtype in (np.float64, np.float32):
         name = np.dtype(dtype).name
         native = Native(
-            library([(op, name, 8) for op in ops]), [symbol(op, name, 8) for op in ops]
+            definitions([(op, name, 8) for op in ops]),
+            [symbol(op, name, 8) for op in ops],
         )
         for op in ops:
             given = arguments(op, 1, count, dtype)

@@ -1,0 +1,41 @@
+"""Less frequent garbage collection while programs are traced and compiled."""
+
+import gc
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+
+# A large program consists of millions of objects, nearly all of which live as long as
+# the program. By default Python looks for cycles each time that 700 objects have been
+# created. This took a third of the time to trace a bicycle's gradient, and found almost
+# nothing.
+_OBJECTS = 100_000
+
+_lock = threading.Lock()
+_inside = 0
+_outside: tuple[int, int, int] = gc.get_threshold()
+
+
+@contextmanager
+def rare_collections() -> Iterator[None]:
+    """Make Python look for cyclic garbage less often inside the block.
+
+    The thresholds are those of the whole process: the first thread that enters such a
+    block sets them, and the last thread that leaves restores them. Where the collector
+    is switched off, or runs even less often, nothing changes.
+    """
+    global _inside, _outside
+    with _lock:
+        if _inside == 0:
+            _outside = gc.get_threshold()
+            if 0 < _outside[0] < _OBJECTS:
+                gc.set_threshold(_OBJECTS, *_outside[1:])
+        _inside += 1
+    try:
+        yield
+    finally:
+        with _lock:
+            _inside -= 1
+            if _inside == 0:
+                gc.set_threshold(*_outside)

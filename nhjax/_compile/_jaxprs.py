@@ -1,0 +1,254 @@
+"""Jaxprs: which operations they contain, and the removal of superfluous operations.
+
+`fits_one_kernel` decides by the kinds and sizes of operations whether XLA can compile a
+program to a single kernel of the CPU. `cse_dce` removes repeated operations
+(common-subexpression elimination) and unused operations (dead-code elimination). This
+pays because derivatives compute the function on the way, so that a traced program
+contains much of it several times, and all that transforms and compiles programs would
+work on each copy.
+"""
+
+import itertools
+import math
+from collections.abc import Hashable, Iterator, Mapping
+from typing import Any
+
+import jax
+import jax.extend
+import numpy as np
+from jaxtyping import PyTree
+
+
+# The lists below contain, by JAX's names, the operations that XLA can put into one
+# kernel. Calls into libraries (products of matrices, factorisations, transforms),
+# sorting, scattering and callbacks are not in the lists.
+#
+# These operations act element by element, which `_index_sets` relies on: no other may
+# be listed here.
+ELEMENTWISE = """
+    abs acos acosh add add_any and asin asinh atan atan2 atanh
+    bitcast_convert_type cbrt ceil clamp convert_element_type cos cosh div eq erf
+    exp exp2 expm1 floor ge gt integer_pow is_finite le log log1p logistic lt max
+    min mul ne neg not or pow rem round rsqrt select_n sign sin sinh sqrt square
+    stop_gradient sub tan tanh xor zeros_like
+""".split()  # noqa: SIM905
+_REDUCING = """
+    argmax argmin reduce_and reduce_max reduce_min reduce_or reduce_prod
+    reduce_sum
+""".split()  # noqa: SIM905
+_SHAPING = """
+    concatenate copy copy_p expand_dims pad rev slice split squeeze stack
+    transpose unstack
+""".split()  # noqa: SIM905
+# The arrays of these operations may be large, such as the rows that are saved, because
+# only a part of an array is moved.
+_MOVING = """
+    broadcast_in_dim dynamic_slice dynamic_update_slice empty empty2 iota
+    reshape
+""".split()  # noqa: SIM905
+ARITHMETIC_AND_SHAPES = (*ELEMENTWISE, *_REDUCING, *_SHAPING, *_MOVING)
+_ARITHMETIC = {"add", "add_any", "div", "mul", "neg", "sub"}
+# nhjax's own operation, which is lowered to arithmetic and shapes.
+SMALL_PRODUCT = "small_product"
+# These operations contain programs, whose operations are checked in turn.
+CALLING = """
+    checkpoint closed_call custom_jvp_call custom_vjp_call jit remat2
+""".split()  # noqa: SIM905
+_CONTAINING = [*CALLING, "cond", "custom_linear_solve", "cpu_kernel", "scan", "while"]
+# Numbers of elements. XLA leaves larger reductions to a library, and shares work on
+# larger arrays among threads, which a kernel cannot start.
+LARGEST_REDUCTION = 1024
+LARGEST_ARRAY = 4096
+
+
+def fits_one_kernel(program: Any) -> bool:
+    """Return whether all operations of a jaxpr can go into one kernel of the CPU."""
+    return all(map(_fits_one_kernel, program.eqns))
+
+
+def _fits_one_kernel(equation: Any) -> bool:
+    name = equation.primitive.name
+    if name in _CONTAINING:
+        return all(map(fits_one_kernel, _programs(equation.params)))
+    if name in _MOVING:
+        return True
+    if name == SMALL_PRODUCT and not equation.params["by_terms"]:
+        return _terms(equation) * _size(equation.outvars[0]) <= LARGEST_REDUCTION
+    if name.startswith("reduce_") and _size(equation.invars[0]) > LARGEST_REDUCTION:
+        return False
+    small = all(_size(x) <= LARGEST_ARRAY for x in equation.outvars)
+    return small and name in (*ELEMENTWISE, *_REDUCING, *_SHAPING, SMALL_PRODUCT)
+
+
+def _terms(product: Any) -> int:
+    """Count the terms of each sum of a small product."""
+    pairs = zip(product.params["first"], product.invars[0].aval.shape, strict=True)
+    return math.prod(n for index, n in pairs if index not in product.params["result"])
+
+
+def _size(variable: Any) -> int:
+    return math.prod(variable.aval.shape)
+
+
+def _programs(params: PyTree[Any]) -> Iterator[Any]:
+    for leaf in jax.tree.leaves(params):
+        leaf = getattr(leaf, "jaxpr", leaf)
+        if hasattr(leaf, "eqns"):
+            yield leaf
+
+
+def rms_array_size(program: Any) -> float:
+    """Return the root mean square of the sizes of arrays in arithmetic."""
+    sizes = [size * size for size in _arithmetic_sizes(program)]
+    return math.sqrt(sum(sizes) / len(sizes)) if sizes else 0.0
+
+
+def _arithmetic_sizes(program: Any) -> Iterator[int]:
+    for equation in program.eqns:
+        if equation.primitive.name in _ARITHMETIC:
+            yield _size(equation.outvars[0])
+        if equation.primitive.name == SMALL_PRODUCT:
+            yield from _sizes_of_product(equation)
+        for part in _programs(equation.params):
+            yield from _arithmetic_sizes(part)
+
+
+def _sizes_of_product(product: Any) -> Iterator[int]:
+    """List the sizes of arrays in the arithmetic that a small product is lowered to."""
+    size, terms = _size(product.outvars[0]), _terms(product)
+    if product.params["by_terms"]:
+        yield from itertools.repeat(size, 2 * terms - 1)
+    else:
+        yield size * terms
+
+
+# Only these operations are removed when repeated: they have no state, unlike random
+# numbers, and no parameters that a user chooses.
+_REPEATABLE = frozenset(
+    (*ARITHMETIC_AND_SHAPES, "dot_general", "gather", SMALL_PRODUCT)
+)
+# The operations whose inner programs are simplified, and the parameters that hold these
+# programs. Other operations with inner programs have rules that rely on them.
+_INNER = {
+    "checkpoint": ("jaxpr",),
+    "cond": ("branches",),
+    "custom_jvp_call": ("call_jaxpr",),
+    "custom_linear_solve": ("jaxprs",),
+    "jit": ("jaxpr",),
+    "remat2": ("jaxpr",),
+    "scan": ("jaxpr",),
+    "while": ("body_jaxpr", "cond_jaxpr"),
+}
+
+
+def cse_dce(program: Any) -> Any:
+    """Remove unused and repeated operations from a jaxpr and from its inner programs.
+
+    The operations that stay are not changed, so that results are the same to the last
+    bit.
+    """
+    return _Simplifier()(program)
+
+
+class _Simplifier:
+    """The removal of operations; a program that occurs several times is simplified
+    once.
+    """
+
+    def __init__(self):
+        # The original program is kept too, so that its identity is not reused.
+        self._known: dict[int, tuple[Any, Any]] = {}
+
+    def __call__(self, program: Any) -> Any:
+        if id(program) not in self._known:
+            short = (
+                program.replace(jaxpr=self._open(program.jaxpr))
+                if hasattr(program, "jaxpr")
+                else self._open(program)
+            )
+            self._known[id(program)] = program, short
+        return self._known[id(program)][1]
+
+    def _open(self, jaxpr: Any) -> Any:
+        first: dict[Any, Any] = {}
+        made: dict[Hashable, list[Any]] = {}
+        equations = []
+
+        def same(variable: Any) -> Any:
+            if isinstance(variable, jax.extend.core.Literal):
+                return variable
+            return first.get(variable, variable)
+
+        for equation in _used(jaxpr):
+            operands = [same(variable) for variable in equation.invars]
+            if _is_repeatable(equation):
+                key = _key(equation, operands)
+                if key in made:
+                    first.update(zip(equation.outvars, made[key], strict=True))
+                    continue
+                made[key] = equation.outvars
+            params = self._params(equation)
+            equations.append(equation.replace(invars=operands, params=params))
+        return jaxpr.replace(eqns=equations, outvars=[same(v) for v in jaxpr.outvars])
+
+    def _params(self, equation: Any) -> dict[str, Any]:
+        """Return the parameters of an operation, with its inner programs simplified."""
+        names = _INNER.get(equation.primitive.name, ())
+        inner = {name: jax.tree.map(self, equation.params[name]) for name in names}
+        return {**equation.params, **inner}
+
+
+def _used(jaxpr: Any) -> list[Any]:
+    """List the operations whose results are used, or that have effects."""
+    used, found = set(_variables(jaxpr.outvars)), []
+    for equation in reversed(jaxpr.eqns):
+        if equation.effects or not used.isdisjoint(equation.outvars):
+            used.update(_variables(equation.invars))
+            found.append(equation)
+    return found[::-1]
+
+
+def _variables(operands: Any) -> list[Any]:
+    return [v for v in operands if not isinstance(v, jax.extend.core.Literal)]
+
+
+def _is_repeatable(equation: Any) -> bool:
+    # Another operation cannot use a result without a name.
+    return equation.primitive.name in _REPEATABLE and not any(
+        isinstance(variable, jax.extend.core.DropVar) for variable in equation.outvars
+    )
+
+
+def _key(equation: Any, operands: list[Any]) -> Hashable:
+    """Return a key that two operations share only if they compute the same."""
+    params = tuple((name, _exact(equation.params[name])) for name in equation.params)
+    # The context holds settings of JAX, such as the device of the operation.
+    context = _exact(getattr(equation, "ctx", None))
+    return equation.primitive, tuple(map(_operand, operands)), params, context
+
+
+def _operand(variable: Any) -> Hashable:
+    if not isinstance(variable, jax.extend.core.Literal):
+        return variable
+    return _exact(np.asarray(variable.val)[()]), str(variable.aval)
+
+
+def _exact(value: Any) -> Hashable:
+    """Return a key of a parameter; an object without a hash equals only itself.
+
+    Numbers that compare equal but differ, such as 0.0 and -0.0 or 1 and True, have
+    different keys.
+    """
+    if isinstance(value, tuple | list):
+        return type(value), *map(_exact, value)
+    if isinstance(value, Mapping):
+        return type(value), *((name, _exact(value[name])) for name in value)
+    if isinstance(value, np.generic):
+        return type(value), value.dtype.str, value.tobytes()
+    if isinstance(value, float | complex):
+        return type(value), repr(value)
+    try:
+        hash(value)
+    except TypeError:
+        return type(value), id(value)
+    return type(value), value

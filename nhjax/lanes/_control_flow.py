@@ -1,0 +1,585 @@
+"""Loops, branches and calls of a jaxpr: `while`, `scan`, `cond` and inner programs.
+
+A loop carries arrays as parameters, number by number, or leaves them in place in
+memory. Numbers that start as constants are first assumed to stay constant. The body is
+built, and built again without the assumption for those numbers that do change. These
+numbers are remembered, so that building an outer loop again does not multiply the time
+with the depth of nesting.
+
+Short scans are unrolled, unless their body contains loops.
+"""
+
+import math
+from collections.abc import Callable, Iterator, Sequence
+from functools import partial
+from typing import Any
+
+import jax
+import numpy as np
+from jax.extend.core import Literal
+
+from ._builder import (
+    ArrayValue,
+    Builder,
+    flat_indices,
+    hold,
+    InMemory,
+    MOST_IN_REGISTERS,
+    Operation,
+    Registers,
+    release,
+)
+from ._graph import BranchBuilder, dtype_name, LoopBuilder, Node
+
+
+def _call(
+    builder: Builder, equation: Any, values: list[ArrayValue]
+) -> list[ArrayValue]:
+    params = equation.params
+    keys = ("jaxpr", "call_jaxpr", "program", "fun_jaxpr")
+    inner = next(params[key] for key in keys if key in params)
+    jaxpr = getattr(inner, "jaxpr", inner)
+    return builder.run(jaxpr, getattr(inner, "consts", ()), values)
+
+
+def _linear_solve(
+    builder: Builder, equation: Any, values: list[ArrayValue]
+) -> list[ArrayValue]:
+    lengths, jaxprs = equation.params["const_lengths"], equation.params["jaxprs"]
+    start = lengths.matvec + lengths.vecmat
+    consts = values[start : start + lengths.solve]
+    rest = values[start + lengths.solve + lengths.transpose_solve :]
+    return builder.run(jaxprs.solve.jaxpr, jaxprs.solve.consts, [*consts, *rest])
+
+
+def _cond(
+    builder: Builder, equation: Any, values: list[ArrayValue]
+) -> list[ArrayValue]:
+    which, *args = values
+    branches = equation.params["branches"]
+    index = builder.memory.registers(which).reshape(-1)[0]
+    avals = [variable.aval for variable in equation.outvars]
+    runs = [
+        partial(builder.run, branch.jaxpr, branch.consts, args) for branch in branches
+    ]
+    return _chosen(builder, index, runs, 0, avals)
+
+
+def _chosen(
+    builder: Builder,
+    index: Node,
+    runs: list[Callable[[], list[ArrayValue]]],
+    first: int,
+    avals: list[Any],
+) -> list[ArrayValue]:
+    """Run the branch of an index; larger indices select the last branch."""
+    if first == len(runs) - 1:
+        return runs[first]()
+    graph = builder.graph
+    if index.dtype == "bool":
+        is_first = graph.op("not", index)
+    else:
+        is_first = graph.op("le", index, graph.constant(first, index.dtype))
+
+    def rest() -> list[ArrayValue]:
+        return _chosen(builder, index, runs, first + 1, avals)
+
+    return _branch(builder, is_first, runs[first], rest, avals)
+
+
+def _branch(
+    builder: Builder,
+    predicate: Node,
+    yes: Callable[[], list[ArrayValue]],
+    no: Callable[[], list[ArrayValue]],
+    avals: list[Any],
+) -> list[ArrayValue]:
+    """Create a branch; only the side that is taken runs."""
+    if predicate.is_constant:
+        return yes() if predicate.attr else no()
+    memory = builder.memory
+    branch = BranchBuilder(builder.graph, predicate)
+    outs = []
+    for side, run in enumerate((yes, no)):
+        builder.path.append(side)
+        outs.append(branch.on_side(side, run))
+        builder.path.pop()
+    results: list[ArrayValue | None] = []
+    numbers: tuple[list[Node], list[Node]] = ([], [])
+    for aval, one, other in zip(avals, *outs, strict=True):
+        pair = (one, other)
+        shared = _shared(one, other)
+        if shared is None and _goes_to_memory(one, other):
+            # Neither side may change an array that the other side returns.
+            target = memory.new(dtype_name(aval.dtype), one.size)
+            shared = InMemory(target, aval.shape)
+            for side, value in enumerate(pair):
+                branch.on_side(
+                    side,
+                    partial(_write, builder, target, value),
+                )
+        results.append(shared)
+        if shared is None:
+            for side, value in enumerate(pair):
+                load = partial(memory.registers, value)
+                numbers[side].extend(branch.on_side(side, load).reshape(-1))  # pyright: ignore
+    nodes = iter(branch.close(*numbers))
+    return [
+        _taken(nodes, aval) if result is None else result
+        for aval, result in zip(avals, results, strict=True)
+    ]
+
+
+def _write(builder: Builder, target: Any, value: ArrayValue) -> list:
+    builder.memory.write(target, flat_indices(value.shape), value)
+    return []
+
+
+def _shared(one: ArrayValue, other: ArrayValue) -> ArrayValue | None:
+    """Return the array that both sides return, if it is the same one."""
+    if isinstance(one, InMemory) and isinstance(other, InMemory):
+        return one if one.buffer is other.buffer else None
+    if isinstance(one, InMemory) or isinstance(other, InMemory):
+        return None
+    pairs = zip(one.reshape(-1), other.reshape(-1), strict=True)
+    return one if one.size and all(a is b for a, b in pairs) else None
+
+
+def _goes_to_memory(one: ArrayValue, other: ArrayValue) -> bool:
+    there = [isinstance(value, InMemory) for value in (one, other)]
+    return all(there) or (any(there) and one.size > MOST_IN_REGISTERS)
+
+
+def _taken(nodes: Any, aval: Any) -> np.ndarray:
+    out = np.empty(int(np.prod(aval.shape)), object)
+    for index in range(out.size):
+        out[index] = next(nodes)
+    return out.reshape(aval.shape)
+
+
+def _expanded(
+    builder: Builder, equation: Any, values: list[ArrayValue]
+) -> list[ArrayValue]:
+    """Run the program of an operation that JAX expands when it compiles."""
+    expand = partial(equation.primitive.to_lojax, **equation.params)
+    avals = [variable.aval for variable in equation.invars]
+    args = [
+        jax.ShapeDtypeStruct(a.shape, a.dtype, weak_type=a.weak_type) for a in avals
+    ]
+    program = jax.make_jaxpr(expand)(*args)
+    return builder.run(program.jaxpr, program.consts, values)
+
+
+_CALLS = """
+    checkpoint closed_call core_call custom_jvp_call custom_vjp_call
+    custom_vjp_call_jaxpr jit cpu_kernel pjit remat remat2
+""".split()  # noqa: SIM905
+BRANCHES: dict[str, Operation] = {
+    **dict.fromkeys(_CALLS, _call),
+    "call_hi_primitive": _expanded,
+    "cond": _cond,
+    "custom_linear_solve": _linear_solve,
+}
+
+
+def _while(
+    builder: Builder, equation: Any, values: list[ArrayValue]
+) -> list[ArrayValue]:
+    params = equation.params
+    test, body = params["cond_jaxpr"], params["body_jaxpr"]
+    first, second = params["cond_nconsts"], params["body_nconsts"]
+    of_test, of_body = values[:first], values[first : first + second]
+    inits = values[first + second :]
+    variables = body.jaxpr.invars[second:]
+    # Values that the body returns unchanged are not carried.
+    is_same = [a is b for a, b in zip(variables, body.jaxpr.outvars, strict=True)]
+    same, _ = _split(is_same, inits)
+    stored = {index - second for index in updated_inputs(body.jaxpr)}
+    goes_to_memory = [
+        value.size > 0 and (value.size > MOST_IN_REGISTERS or index in stored)
+        for index, value in enumerate(inits)
+    ]
+
+    def everything(carry: list[ArrayValue]) -> list[ArrayValue]:
+        return _merged(is_same, same, carry)
+
+    def predicate(carry: list[ArrayValue]) -> Node:
+        args = [*of_test, *everything(carry)]
+        return builder.run(test.jaxpr, test.consts, args)[0].reshape(-1)[0]  # pyright: ignore
+
+    def step(carry: list[ArrayValue]) -> list[ArrayValue]:
+        args = [*of_body, *everything(carry)]
+        return _split(is_same, builder.run(body.jaxpr, body.consts, args))[1]
+
+    with builder.held([*of_test, *of_body, *same]):
+        moving, _ = _split([not s for s in is_same], inits)
+        flags, _ = _split([not s for s in is_same], goes_to_memory)
+        return everything(loop(builder, moving, flags, predicate, step))
+
+
+def _split(marks: Sequence[bool], values: Sequence) -> tuple[list, list]:
+    pairs = list(zip(marks, values, strict=True))
+    return [x for mark, x in pairs if mark], [x for mark, x in pairs if not mark]
+
+
+def _merged(marks: Sequence[bool], marked: Sequence, others: Sequence) -> list:
+    one, other = iter(marked), iter(others)
+    return [next(one) if mark else next(other) for mark in marks]
+
+
+def _scan(
+    builder: Builder, equation: Any, values: list[ArrayValue]
+) -> list[ArrayValue]:
+    params, length = equation.params, equation.params["length"]
+    first, count = _sizes(params)
+    consts, carry = values[:first], values[first : first + count]
+    rows = values[first + count :]
+    with builder.held([*consts, *rows]):
+        is_short = length <= 1 or (
+            length <= builder.unroll and not _has_loop(params["jaxpr"].jaxpr, builder)
+        )
+        if is_short:
+            return _unrolled(builder, equation, consts, carry, rows)
+        return _scanned(builder, equation, consts, carry, rows)
+
+
+def _sizes(params: dict[str, Any]) -> tuple[int, int]:
+    """Return the number of constants of a scan, and the number of carried arrays."""
+    if "num_carry" in params:
+        return params["num_consts"], params["num_carry"]
+    # Since JAX 0.12 a scan has the tree structures of its operands instead.
+    consts, carry, _ = params["ft_in"].unpack()
+    return len(consts), len(carry)
+
+
+def _has_loop(jaxpr: Any, builder: Builder) -> bool:
+    """Return whether a program has loops that are not unrolled.
+
+    A loop around such loops is not unrolled either, so that the program does not grow
+    with the number of iterations.
+    """
+    for equation in jaxpr.eqns:
+        name = equation.primitive.name
+        if name == "while":
+            return True
+        if name == "scan" and equation.params["length"] > builder.unroll:
+            return True
+        if any(_has_loop(inner, builder) for inner, _ in inner_programs(equation)):
+            return True
+    return False
+
+
+def _row(builder: Builder, value: ArrayValue, index: Node) -> ArrayValue:
+    """Read one of the rows over which a scan iterates."""
+    shape = value.shape[1:]
+    size = math.prod(shape)
+    if size == 0:
+        return np.empty(shape, object)
+    if index.is_constant and not isinstance(value, InMemory):
+        return value[int(index.attr) : int(index.attr) + 1].reshape(shape)
+    memory, source = builder.memory, builder.memory.in_memory(value)
+    start = builder.graph.op("mul", index, builder.integer(size))
+    if size > MOST_IN_REGISTERS:
+        target = memory.new(source.dtype, size)
+        memory.move(
+            target,
+            flat_indices(shape),
+            source.buffer,
+            flat_indices(shape),
+            source_shift=start,
+        )
+        return InMemory(target, shape)
+    out = np.empty(size, object)
+    for offset in range(size):
+        out[offset] = memory.load(source.buffer, start, offset)
+    return out.reshape(shape)
+
+
+def _unrolled(
+    builder: Builder, equation: Any, consts: list, carry: list, rows: list
+) -> list[ArrayValue]:
+    params = equation.params
+    body, length, count = params["jaxpr"], params["length"], len(carry)
+    order = range(length - 1, -1, -1) if params["reverse"] else range(length)
+    saved: dict[int, list[ArrayValue]] = {}
+    for index in order:
+        row = [_row(builder, value, builder.integer(index)) for value in rows]
+        builder.path.append(index)
+        outs = builder.run(body.jaxpr, body.consts, [*consts, *carry, *row])
+        builder.path.pop()
+        carry, saved[index] = outs[:count], outs[count:]
+        # A row may lie in memory that the next iteration would overwrite.
+        for value in saved[index]:
+            hold(value)
+    stacked = []
+    for column, variable in enumerate(equation.outvars[count:]):
+        values = [saved[index][column] for index in range(length)]
+        stacked.append(_stacked(builder, variable.aval, values))
+    for index in order:
+        for value in saved[index]:
+            release(value)
+    return [*carry, *stacked]
+
+
+def _stacked(builder: Builder, aval: Any, values: list[ArrayValue]) -> ArrayValue:
+    memory = builder.memory
+    if not any(isinstance(value, InMemory) for value in values):
+        out = np.empty(aval.shape, object)
+        for index, value in enumerate(values):
+            out[index, ...] = value
+        return out
+    size = values[0].size
+    target = memory.new(dtype_name(aval.dtype), size * len(values))
+    for index, value in enumerate(values):
+        view = flat_indices(value.shape) + index * size
+        memory.write(target, view, value)
+    return InMemory(target, aval.shape)
+
+
+def _scanned(
+    builder: Builder, equation: Any, consts: list, carry: list, rows: list
+) -> list[ArrayValue]:
+    params, graph, memory = equation.params, builder.graph, builder.memory
+    body, length, count = params["jaxpr"], params["length"], len(carry)
+    stored = {index - len(consts) for index in updated_inputs(body.jaxpr)}
+    of_carry = [
+        value.size > 0 and (value.size > MOST_IN_REGISTERS or index in stored)
+        for index, value in enumerate(carry)
+    ]
+    avals = [variable.aval for variable in equation.outvars[count:]]
+    saved: list[ArrayValue] = []
+    for aval in avals:
+        size = math.prod(aval.shape)
+        if size == 0:
+            saved.append(np.empty(aval.shape, object))
+        else:
+            buffer = memory.new(dtype_name(aval.dtype), size)
+            saved.append(InMemory(buffer, aval.shape))
+
+    def predicate(values: list[ArrayValue]) -> Node:
+        return graph.op("lt", builder.index(values[0]), builder.integer(length))
+
+    def step(values: list[ArrayValue]) -> list[ArrayValue]:
+        k = builder.index(values[0])
+        place = k
+        if params["reverse"]:
+            place = graph.op("sub", builder.integer(length - 1), k)
+        row = [_row(builder, value, place) for value in rows]
+        args = [*consts, *values[1 : 1 + count], *row]
+        outs = builder.run(body.jaxpr, body.consts, args)
+        after = values[1 + count :]
+        with builder.held(outs):
+            for target, value in zip(after, outs[count:], strict=True):
+                if isinstance(target, InMemory):
+                    shift = graph.op("mul", place, builder.integer(value.size))
+                    memory.write(target.buffer, flat_indices(value.shape), value, shift)
+        counter = builder.full((), graph.op("add", k, builder.integer(1)))
+        return [counter, *outs[:count], *after]
+
+    counter = builder.full((), builder.integer(0))
+    flags = [False, *of_carry, *[isinstance(value, InMemory) for value in saved]]
+    return loop(builder, [counter, *carry, *saved], flags, predicate, step)[1:]
+
+
+SCANS: dict[str, Operation] = {"while": _while, "scan": _scan}
+
+
+_Predicate = Callable[[list[ArrayValue]], Node]
+_Body = Callable[[list[ArrayValue]], list[ArrayValue]]
+
+
+def loop(
+    builder: Builder,
+    inits: Sequence[ArrayValue],
+    in_memory: Sequence[bool],
+    predicate: _Predicate,
+    body: _Body,
+) -> list[ArrayValue]:
+    """Create a loop; `in_memory` says which of the carried arrays are in memory."""
+    memory = builder.memory
+    carried: list[ArrayValue] = []
+    for value, is_there in zip(inits, in_memory, strict=True):
+        carried.append(memory.owned(value) if is_there else memory.registers(value))
+        # An array may be carried twice, and then needs two copies.
+        hold(carried[-1])
+    for value in carried:
+        release(value)
+    buffers = [value.buffer for value in carried if isinstance(value, InMemory)]
+    changing = builder.changing.setdefault(tuple(builder.path), set())
+    # Integer scalars are counters, which change.
+    for start, value in _starts(carried):
+        if value.ndim == 0 and value[()].dtype.startswith("int"):
+            changing.add(start)
+    while True:
+        before = [len(buffer.stores) for buffer in buffers]
+        made = _Attempt(builder, carried, changing)
+        made.make(predicate, body)
+        if made.runs_never:
+            break
+        wrong = made.wrong()
+        if not wrong:
+            break
+        changing.update(wrong)
+        for buffer, length in zip(buffers, before, strict=True):
+            del buffer.stores[length:]
+    if made.runs_never:
+        return carried
+    for buffer in buffers:
+        buffer.version += 1
+    return made.results()
+
+
+def _starts(values: Sequence[ArrayValue]) -> list[tuple[int, Registers]]:
+    """List the arrays in registers, with the position of their first numbers."""
+    position, out = 0, []
+    for value in values:
+        if not isinstance(value, InMemory):
+            out.append((position, value))
+            position += value.size
+    return out
+
+
+class _Attempt:
+    """A loop in which numbers that start as constants are assumed to stay constant.
+
+    The numbers at the positions in `changing` are known to change.
+    """
+
+    def __init__(self, builder: Builder, carried: list[ArrayValue], changing: set[int]):
+        self.builder, self.carried = builder, carried
+        self.loop = LoopBuilder(builder.graph)
+        self.changing = changing
+        # By position: the constants that are assumed not to change, and the positions
+        # of the parameters.
+        self.fixed: dict[int, Node] = {}
+        self.varying: list[int] = []
+        self.outs: list[Node] = []
+        self.runs_never = False
+
+    def make(self, predicate: _Predicate, body: _Body) -> None:
+        """Build the predicate and the body of the loop."""
+        with self.loop:
+            arrays: list[ArrayValue] = []
+            for value in self.carried:
+                if isinstance(value, InMemory):
+                    # Values that were loaded before the loop are not valid inside it.
+                    value.buffer.version += 1
+                    arrays.append(value)
+            in_registers = iter([self._parameters(*x) for x in _starts(self.carried)])
+            arrays = [
+                value if isinstance(value, InMemory) else next(in_registers)
+                for value in self.carried
+            ]
+            with self.builder.held(arrays):
+                go_on = predicate(arrays)
+            self.loop.goes_on_while(go_on)
+            self.runs_never = go_on.is_constant and not go_on.attr
+            if not self.runs_never:
+                self._take_over(body(arrays))
+
+    def _parameters(self, start: int, value: Registers) -> Registers:
+        out = np.empty(value.size, object)
+        for index, node in enumerate(value.reshape(-1)):
+            position = start + index
+            if node.is_constant and position not in self.changing:
+                self.fixed[position] = out[index] = node
+            else:
+                self.varying.append(position)
+                out[index] = self.loop.parameter(node)
+        return out.reshape(value.shape)
+
+    def _take_over(self, values: list[ArrayValue]) -> None:
+        """Make the values of an iteration those with which the next one starts."""
+        memory = self.builder.memory
+        own = [v.buffer for v in self.carried if isinstance(v, InMemory)]
+        ready: list[ArrayValue] = []
+        for value, old in zip(values, self.carried, strict=True):
+            if not isinstance(old, InMemory):
+                value = memory.registers(value)
+            elif isinstance(value, InMemory) and value.buffer is not old.buffer:
+                # The array would be overwritten when it takes the place of another one.
+                hold(value)
+                value_free = memory.owned(value) if value.buffer in own else value
+                release(value)
+                value = value_free
+            ready.append(value)
+        for value, old in zip(ready, self.carried, strict=True):
+            if not isinstance(old, InMemory):
+                self.outs.extend(value.reshape(-1))  # pyright: ignore
+            elif not (isinstance(value, InMemory) and value.buffer is old.buffer):
+                memory.write(old.buffer, flat_indices(old.shape), value)
+        self.loop.end([self.outs[position] for position in self.varying])
+
+    def wrong(self) -> list[int]:
+        """List the numbers that were assumed to be constant and are not."""
+        return [p for p, node in self.fixed.items() if self.outs[p] is not node]
+
+    def results(self) -> list[ArrayValue]:
+        """Return the arrays after the loop."""
+        nodes = dict(zip(self.varying, self.loop.results(), strict=True))
+        nodes.update(self.fixed)
+        out: list[ArrayValue] = []
+        position = 0
+        for value in self.carried:
+            if isinstance(value, InMemory):
+                out.append(value)
+                continue
+            array = np.empty(value.size, object)
+            for index in range(value.size):
+                array[index] = nodes[position + index]
+            position += value.size
+            out.append(array.reshape(value.shape))
+        return out
+
+
+_UPDATES = ("dynamic_update_slice", "scatter")
+_SAME = ("reshape", "squeeze", "expand_dims", "copy", "copy_p", "optimization_barrier")
+
+
+def updated_inputs(jaxpr: Any) -> frozenset[int]:
+    """List the inputs of a jaxpr that it, or an inner program, updates at an index.
+
+    Such arrays belong in memory. Updates at an index that is a literal do not count.
+    """
+    origins: dict[Any, int] = {v: i for i, v in enumerate(jaxpr.invars)}
+    found: set[int] = set()
+    for equation in jaxpr.eqns:
+        name = equation.primitive.name
+        ins = [None if isinstance(v, Literal) else v for v in equation.invars]
+        if name.startswith(_UPDATES):
+            origin = origins.get(ins[0])
+            is_slice = name == "dynamic_update_slice"
+            places = equation.invars[2:] if is_slice else equation.invars[1:2]
+            if origin is not None:
+                if any(not isinstance(v, Literal) for v in places):
+                    found.add(origin)
+                origins[equation.outvars[0]] = origin
+        elif name in _SAME:
+            for before, after in zip(ins, equation.outvars, strict=True):
+                if before in origins:
+                    origins[after] = origins[before]
+        for inner, first in inner_programs(equation):
+            for index in updated_inputs(inner):
+                variable = ins[first + index]
+                if variable in origins:
+                    found.add(origins[variable])
+    return frozenset(found)
+
+
+def inner_programs(equation: Any) -> Iterator[tuple[Any, int]]:
+    """List the inner programs of an equation, and where their operands start.
+
+    Constants of loops are listed too, which does no harm.
+    """
+    params, name = equation.params, equation.primitive.name
+    if name == "while":
+        # The operands of the body, without those of the predicate.
+        yield params["body_jaxpr"].jaxpr, params["cond_nconsts"]
+    elif name == "cond":
+        for branch in params["branches"]:
+            yield branch.jaxpr, 1
+    else:
+        for key in ("jaxpr", "call_jaxpr", "program", "fun_jaxpr"):
+            if key in params:
+                yield getattr(params[key], "jaxpr", params[key]), 0
+                return

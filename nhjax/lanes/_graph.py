@@ -1,0 +1,647 @@
+"""The graph of scalar operations of one member, simplified while it is built.
+
+A node is one number or one statement: a store, a loop or a branch. Every node lies in a
+region: the root, the body of a loop, or a side of a branch. Within a region nodes are
+ordered by their numbers, which is the order of creation, so that a node comes after its
+arguments and a load after the stores that it must see.
+
+Pure nodes are hash-consed: an operation with the same arguments exists once. A pure
+node lies in the deepest region of its arguments, so that invariant code is hoisted out
+of loops. It never leaves the side of a branch in which it was created, because that
+side may not be taken.
+
+`simplify` folds constants and removes operations, but never changes a result: rounding,
+infinities, NaN and -0.0 stay as they are. Only a structural zero makes a product zero
+whatever the other factor is.
+
+The order of this file: the data (regions, nodes, memory), `Graph`, the rules of
+simplification, and the builders of loops and branches.
+"""
+
+import sys
+from collections.abc import Callable, Iterable, Sequence
+from functools import cache
+from typing import Any, TypeVar
+
+import numpy as np
+
+
+class Unsupported(Exception):
+    """A program cannot be compiled here; the message says why."""
+
+
+DTYPES = frozenset(
+    """
+    bool int8 int16 int32 int64 uint8 uint16 uint32 uint64 float32 float64
+    """.split()  # noqa: SIM905
+)
+
+
+@cache
+def dtype_name(dtype: Any) -> str:
+    """Return the name of a dtype; raise `Unsupported` for dtypes that kernels do not
+    have.
+    """
+    name = getattr(dtype, "name", None) or str(dtype)
+    if name not in DTYPES:
+        raise Unsupported(f"arrays of {name}")
+    return name
+
+
+def is_float(dtype: str) -> bool:
+    """Return whether a dtype is floating-point."""
+    return dtype.startswith("float")
+
+
+class Region:
+    """A list of nodes: the root, the body of a loop, or a side of a branch."""
+
+    __slots__ = ("depth", "floor", "loads", "owner", "parent", "spills", "table")
+
+    def __init__(self, parent: "Region | None", owner: "Node | None", is_side: bool):
+        self.parent, self.owner = parent, owner
+        self.depth = 0 if parent is None else parent.depth + 1
+        # The innermost side of a branch around this region, or the root. Only these
+        # have tables of pure nodes.
+        self.floor = self if is_side or parent is None else parent.floor
+        self.table: dict[Any, Node] = {}
+        self.loads: dict[Any, Node] = {}
+        self.spills: dict[Any, Any] = {}
+
+
+class Node:
+    """A node of the graph: a number that is computed, or a statement.
+
+    `attr` is what the operation needs besides its arguments: the value of a constant,
+    the address of a load, the loop of a parameter. The fields from `is_live` on belong
+    to the passes over the finished graph: whether the node is needed, whether it
+    differs between members, whether a uniform value is needed as a vector too, and the
+    names in LLVM IR.
+    """
+
+    __slots__ = (
+        "args",
+        "attr",
+        "dtype",
+        "is_broadcast",
+        "is_divergent",
+        "is_live",
+        "name",
+        "number",
+        "op",
+        "region",
+        "vector_name",
+    )
+
+    def __init__(
+        self,
+        op: str,
+        args: "tuple[Node, ...]",
+        dtype: str,
+        region: Region,
+        number: int,
+        attr: Any = None,
+    ):
+        self.op, self.args, self.dtype = op, args, dtype
+        self.region, self.number, self.attr = region, number, attr
+        self.is_live = self.is_divergent = self.is_broadcast = False
+        self.name = self.vector_name = ""
+
+    @property
+    def is_constant(self) -> bool:
+        """Whether the value is known while the graph is built."""
+        return self.op == "const" or self.op == "zero"
+
+
+class LoopInfo:
+    """A loop: its parameters with their first and next values, and its predicate.
+
+    The nodes of the region with numbers below `split` are computed before the
+    predicate, the others after it, in iterations that take place.
+    """
+
+    __slots__ = ("inits", "outs", "params", "predicate", "region", "results", "split")
+
+    def __init__(self, region: Region):
+        self.region = region
+        self.params: list[Node] = []
+        self.inits: list[Node] = []
+        self.outs: list[Node] = []
+        self.results: list[Node] = []
+        self.predicate: Node
+        self.split = 0
+
+
+class BranchInfo:
+    """A branch: its two sides, the first for a true predicate, and their results."""
+
+    __slots__ = ("outs", "predicate", "regions", "results")
+
+    def __init__(self, predicate: Node):
+        self.predicate = predicate
+        self.regions: list[Region] = []
+        self.outs: tuple[list[Node], list[Node]] = ([], [])
+        self.results: list[Node] = []
+
+
+class Graph:
+    """All nodes, and the region in which new nodes are created."""
+
+    def __init__(self):
+        self.most_nodes = sys.maxsize
+        self.root = Region(None, None, is_side=False)
+        self.region = self.root
+        self.count = 0
+        self.constants: dict[Any, Node] = {}
+
+    def next_number(self) -> int:
+        """Return the number for the next node."""
+        self.count += 1
+        if self.count > self.most_nodes:
+            raise Unsupported(f"more than {self.most_nodes} operations on numbers")
+        return self.count
+
+    def constant(self, value: Any, dtype: str, is_structural: bool = False) -> Node:
+        """Return the node of a constant.
+
+        A product with a structural zero is zero whatever the other factor is.
+        Structural zeros come from padding and from tangents that do not exist.
+        """
+        value = np.dtype(dtype).type(value)
+        op = "zero" if is_structural else "const"
+        key = (op, dtype, value.tobytes())
+        node = self.constants.get(key)
+        if node is None:
+            node = Node(op, (), dtype, self.root, self.next_number(), value)
+            self.constants[key] = node
+        return node
+
+    def zero(self, dtype: str) -> Node:
+        """Return the node of a structural zero."""
+        return self.constant(0, dtype, is_structural=True)
+
+    def pure(
+        self,
+        op: str,
+        args: tuple[Node, ...],
+        dtype: str,
+        attr: Any = None,
+        within: Region | None = None,
+    ) -> Node:
+        """Create a node without effects, or return the equal node that exists.
+
+        The node is not hoisted out of the region `within`.
+        """
+        key = (op, dtype, attr, *[arg.number for arg in args])
+        floor: Region | None = self.region.floor
+        while floor is not None:
+            node = floor.table.get(key)
+            if node is not None:
+                return node
+            floor = floor.parent.floor if floor.parent is not None else None
+        home = self.home(args, within)
+        node = Node(op, args, dtype, home, self.next_number(), attr)
+        self.region.floor.table[key] = node
+        return node
+
+    def home(self, args: Iterable[Node], within: Region | None = None) -> Region:
+        """Return the region in which a pure node with these arguments lies."""
+        home = self.region.floor
+        if within is not None and within.depth > home.depth:
+            home = within
+        for arg in args:
+            if arg.region.depth > home.depth:
+                home = arg.region
+        return home
+
+    def statement(
+        self, op: str, args: tuple[Node, ...], dtype: str = "", attr: Any = None
+    ) -> Node:
+        """Create a node that stays where it is: a statement, or a result of one."""
+        return Node(op, args, dtype, self.region, self.next_number(), attr)
+
+    def op(self, op: str, *args: Node, dtype: str | None = None) -> Node:
+        """Create an elementwise operation, simplified.
+
+        The result has the dtype of the last argument unless `dtype` is given.
+        """
+        simpler = simplify(self, op, args)
+        if simpler is not None:
+            return simpler
+        if op in _COMMUTATIVE and args[0].number > args[1].number:
+            args = (args[1], args[0])
+        if dtype is None:
+            dtype = "bool" if op in COMPARISONS else args[-1].dtype
+        return self.pure(op, args, dtype)
+
+    def select(self, predicate: Node, yes: Node, no: Node) -> Node:
+        """Return `yes` where the predicate holds, otherwise `no`."""
+        return self.op("select", predicate, yes, no)
+
+    def convert(self, node: Node, dtype: str) -> Node:
+        """Convert a number to another dtype."""
+        if node.dtype == dtype:
+            return node
+        if node.op == "zero":
+            return self.zero(dtype)
+        if node.op == "const":
+            return self.constant(converted(node.attr, dtype), dtype)
+        if dtype == "bool":
+            return self.op("ne", node, self.constant(0, node.dtype))
+        return self.pure("convert", (node,), dtype)
+
+
+COMPARISONS = frozenset(("eq", "ne", "lt", "le", "gt", "ge", "is_finite"))
+_COMMUTATIVE = frozenset(("add", "mul", "max", "min", "and", "or", "xor", "eq", "ne"))
+
+
+def converted(value: Any, dtype: str) -> Any:
+    """Convert a NumPy number as XLA does: to integers, floats are truncated and
+    clamped.
+    """
+    kind = np.dtype(dtype).kind
+    if kind in "iu" and value.dtype.kind == "f":
+        if np.isnan(value):
+            return np.dtype(dtype).type(0)
+        limits = np.iinfo(dtype)
+        if np.isinf(value):
+            return np.dtype(dtype).type(limits.max if value > 0 else limits.min)
+        return np.dtype(dtype).type(min(max(int(value), limits.min), limits.max))
+    with np.errstate(all="ignore"):
+        return value.astype(dtype)
+
+
+class Buffer:
+    """A piece of memory that a kernel reads or writes.
+
+    The kind is "operand", "result", "constant" or "scratch". Operands and constants are
+    only read, results are only written, scratch memory is read and written. `is_fixed`
+    says that nothing more is stored.
+    """
+
+    __slots__ = (
+        "dtype",
+        "holders",
+        "is_divergent",
+        "is_fixed",
+        "is_live",
+        "kind",
+        "place",
+        "region",
+        "size",
+        "stores",
+        "version",
+    )
+
+    def __init__(self, kind: str, dtype: str, size: int, region: Region, place: Any):
+        self.kind, self.dtype, self.size, self.region = kind, dtype, size, region
+        # The index of the operand or result, or the values of a constant.
+        self.place = place
+        self.stores: list[Node] = []
+        self.holders = self.version = 0
+        self.is_fixed = kind in ("operand", "constant")
+        self.is_divergent = self.is_live = False
+
+
+def _quotient(a: Any, b: Any) -> Any:
+    if a.dtype.kind == "f":
+        return a / b
+    if b == 0:
+        return -1 if a.dtype.kind == "i" else np.iinfo(a.dtype).max
+    size = abs(int(a)) // abs(int(b))
+    return _wrapped(size if (a < 0) == (b < 0) else -size, a.dtype)
+
+
+def _remainder(a: Any, b: Any) -> Any:
+    return a if a.dtype.kind != "f" and b == 0 else np.fmod(a, b)
+
+
+def _wrapped(value: int, dtype: np.dtype) -> Any:
+    return np.array(value % 2 ** (8 * dtype.itemsize), f"u{dtype.itemsize}").view(dtype)
+
+
+def _round_away(a: Any) -> Any:
+    whole = np.trunc(a)
+    return whole + np.copysign(np.where(np.abs(a - whole) >= 0.5, 1, 0), a)
+
+
+# The functions that fold constants, with the results of the compiled program.
+_FOLDS: dict[str, Callable[..., Any]] = {
+    "add": np.add,
+    "sub": np.subtract,
+    "mul": np.multiply,
+    "div": _quotient,
+    "rem": _remainder,
+    "neg": np.negative,
+    "abs": np.abs,
+    "max": np.maximum,
+    "min": np.minimum,
+    "sign": np.sign,
+    "sqrt": np.sqrt,
+    "floor": np.floor,
+    "ceil": np.ceil,
+    "round_even": np.rint,
+    "round_away": _round_away,
+    "and": np.bitwise_and,
+    "or": np.bitwise_or,
+    "xor": np.bitwise_xor,
+    "not": np.bitwise_not,
+    "eq": np.equal,
+    "ne": np.not_equal,
+    "lt": np.less,
+    "le": np.less_equal,
+    "gt": np.greater,
+    "ge": np.greater_equal,
+    "is_finite": np.isfinite,
+}
+
+_Rule = Callable[[Graph, Any, Any], Node | None]
+
+
+def simplify(graph: Graph, op: str, args: Sequence[Node]) -> Node | None:
+    """Return a simpler node for an operation, or `None`."""
+    if op == "select":
+        return _select(graph, *args)
+    rule = _RULES.get(op)
+    if rule is not None:
+        first = args[0]
+        simpler = rule(graph, first, args[1] if len(args) > 1 else first)
+        if simpler is not None:
+            return simpler
+    fold = _FOLDS.get(op)
+    if fold is None:
+        return None
+    for arg in args:
+        if arg.op != "const" and arg.op != "zero":
+            return None
+    with np.errstate(all="ignore"):
+        value = fold(*[arg.attr for arg in args])
+    return graph.constant(value, "bool" if op in COMPARISONS else args[0].dtype)
+
+
+def _is(node: Node, value: float) -> bool:
+    return node.op == "const" and bool(node.attr == value)
+
+
+def _is_no_summand(node: Node) -> bool:
+    """Return whether adding a number changes nothing; +0.0 changes -0.0."""
+    if node.op == "zero":
+        return True
+    if node.op != "const" or node.attr != 0:
+        return False
+    return not is_float(node.dtype) or bool(np.signbit(node.attr))
+
+
+def _add(graph: Graph, a: Node, b: Node) -> Node | None:
+    if _is_no_summand(a):
+        return b
+    if _is_no_summand(b):
+        return a
+    if b.op == "neg":
+        return graph.op("sub", a, b.args[0])
+    if a.op == "neg":
+        return graph.op("sub", b, a.args[0])
+    return None
+
+
+def _sub(graph: Graph, a: Node, b: Node) -> Node | None:
+    if b.op == "zero" or (_is(b, 0) and not _is_no_summand(b)):
+        return a
+    if not is_float(a.dtype) and (_is(b, 0) or a is b):
+        return a if a is not b else graph.constant(0, a.dtype)
+    if a.op == "zero":
+        return graph.op("neg", b)
+    if b.op == "neg":
+        return graph.op("add", a, b.args[0])
+    return None
+
+
+def _mul(graph: Graph, a: Node, b: Node) -> Node | None:
+    for x, y in ((a, b), (b, a)):
+        if x.op == "zero" or (_is(x, 0) and not is_float(x.dtype)):
+            return x
+        if _is(x, 1):
+            return y
+        if _is(x, -1) and x.dtype[0] != "u":
+            return graph.op("neg", y)
+    if a.op == "neg" and b.op == "neg":
+        return graph.op("mul", a.args[0], b.args[0])
+    return None
+
+
+def _div(graph: Graph, a: Node, b: Node) -> Node | None:
+    if _is(b, 1):
+        return a
+    if not is_float(a.dtype):
+        return None
+    if a.op == "zero" and b.op != "zero":
+        return a
+    if b.op == "const" and not a.is_constant and np.isfinite(b.attr):
+        # The product with the reciprocal of a power of two is exact.
+        exponent = np.frexp(b.attr)[1]
+        if abs(np.frexp(b.attr)[0]) == 0.5 and abs(exponent) < 120:
+            return graph.op("mul", a, graph.constant(1 / b.attr, b.dtype))
+    return None
+
+
+def _neg(graph: Graph, a: Node, _: Node) -> Node | None:
+    if a.op == "neg":
+        return a.args[0]
+    return a if a.op == "zero" else None
+
+
+def _abs(graph: Graph, a: Node, _: Node) -> Node | None:
+    if a.op == "abs" or a.dtype[0] == "u":
+        return a
+    if a.op == "neg":
+        return graph.op("abs", a.args[0])
+    return None
+
+
+def _extremum(graph: Graph, a: Node, b: Node) -> Node | None:
+    return a if a is b else None
+
+
+def _and(graph: Graph, a: Node, b: Node) -> Node | None:
+    for x, y in ((a, b), (b, a)):
+        if x.is_constant and not x.attr:
+            return x
+        if x.is_constant and x.attr == _ones(x.dtype):
+            return y
+    return a if a is b else None
+
+
+def _or(graph: Graph, a: Node, b: Node) -> Node | None:
+    for x, y in ((a, b), (b, a)):
+        if x.is_constant and not x.attr:
+            return y
+        if x.is_constant and x.attr == _ones(x.dtype):
+            return x
+    return a if a is b else None
+
+
+def _ones(dtype: str) -> Any:
+    return dtype == "bool" or np.invert(np.dtype(dtype).type(0))
+
+
+_OPPOSITE = {"eq": "ne", "ne": "eq"}
+
+
+def _not(graph: Graph, a: Node, _: Node) -> Node | None:
+    if a.op == "not":
+        return a.args[0]
+    if a.op in _OPPOSITE:
+        return graph.op(_OPPOSITE[a.op], *a.args)
+    return None
+
+
+def _compare(op: str) -> _Rule:
+    fold, of_equals = _FOLDS[op], op in ("eq", "le", "ge")
+
+    def rule(graph: Graph, a: Node, b: Node) -> Node | None:
+        if a is b and not is_float(a.dtype):
+            return graph.constant(of_equals, "bool")
+        if a.op == "convert" and a.args[0].dtype == "bool" and b.is_constant:
+            # JAX converts a predicate to the index of a branch, which is then compared.
+            one = np.dtype(a.dtype).type(1)
+            at_no, at_yes = bool(fold(one - one, b.attr)), bool(fold(one, b.attr))
+            if at_no == at_yes:
+                return graph.constant(at_no, "bool")
+            return a.args[0] if at_yes else graph.op("not", a.args[0])
+        if a.dtype == "bool" and b.is_constant and op in ("eq", "ne"):
+            return a if bool(b.attr) == (op == "eq") else graph.op("not", a)
+        return None
+
+    return rule
+
+
+def _select(graph: Graph, predicate: Node, yes: Node, no: Node) -> Node | None:
+    if predicate.is_constant:
+        return yes if predicate.attr else no
+    if yes is no:
+        return yes
+    if predicate.op == "not":
+        return graph.op("select", predicate.args[0], no, yes)
+    if yes.dtype == "bool":
+        if yes.is_constant:
+            rest = predicate if yes.attr else graph.op("not", predicate)
+            return graph.op("or" if yes.attr else "and", rest, no)
+        if no.is_constant:
+            rest = graph.op("not", predicate) if no.attr else predicate
+            return graph.op("or" if no.attr else "and", rest, yes)
+    return None
+
+
+_RULES: dict[str, _Rule] = {
+    "add": _add,
+    "sub": _sub,
+    "mul": _mul,
+    "div": _div,
+    "neg": _neg,
+    "abs": _abs,
+    "max": _extremum,
+    "min": _extremum,
+    "and": _and,
+    "or": _or,
+    "not": _not,
+    **{op: _compare(op) for op in ("eq", "ne", "lt", "le", "gt", "ge")},
+}
+
+
+T = TypeVar("T")
+
+
+class LoopBuilder:
+    """A loop whose body is created inside a `with` statement."""
+
+    def __init__(self, graph: Graph):
+        self.graph = graph
+        self.node = Node("loop", (), "", graph.region, 0)
+        self.info = LoopInfo(Region(graph.region, self.node, is_side=False))
+        self.node.attr = self.info
+
+    def __enter__(self) -> "LoopBuilder":
+        self.graph.region = self.info.region
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.graph.region = self.node.region
+        # Hoisted nodes have to come before the loop.
+        self.node.number = self.graph.next_number()
+
+    def parameter(self, init: Node) -> Node:
+        """Create a number that starts as `init` and changes from iteration to
+        iteration.
+        """
+        info = self.info
+        place = (self.node, len(info.params))
+        node = self.graph.statement("param", (), init.dtype, place)
+        info.params.append(node)
+        info.inits.append(init)
+        return node
+
+    def goes_on_while(self, predicate: Node) -> None:
+        """Set the predicate; nodes that follow belong to iterations that take place."""
+        self.info.predicate = predicate
+        self.info.split = self.graph.next_number()
+
+    def end(self, outs: Sequence[Node]) -> None:
+        """Set the next values of the parameters."""
+        self.info.outs = list(outs)
+
+    def results(self) -> list[Node]:
+        """Create the last values of the parameters, after the loop."""
+        info, out = self.info, []
+        for index, (param, init, after) in enumerate(
+            zip(info.params, info.inits, info.outs, strict=True)
+        ):
+            # A parameter that the body returns unchanged keeps its first value.
+            if after is param:
+                out.append(init)
+            else:
+                place = (self.node, index)
+                result = self.graph.statement("result", (), init.dtype, place)
+                info.results.append(result)
+                out.append(result)
+        return out
+
+
+def counted_loop(graph: Graph, length: int, body: Callable[[Node], None]) -> None:
+    """Create a loop over a counter from 0 to `length` whose body only stores."""
+    if length == 0:
+        return
+    with LoopBuilder(graph) as loop:
+        k = loop.parameter(graph.constant(0, "int64"))
+        loop.goes_on_while(graph.op("lt", k, graph.constant(length, "int64")))
+        body(k)
+        loop.end([graph.op("add", k, graph.constant(1, "int64"))])
+
+
+class BranchBuilder:
+    """A branch; its two sides are created one after the other."""
+
+    def __init__(self, graph: Graph, predicate: Node):
+        self.graph = graph
+        self.node = Node("branch", (), "", graph.region, 0)
+        self.info = BranchInfo(predicate)
+        self.info.regions = [Region(graph.region, self.node, True) for _ in range(2)]
+        self.node.attr = self.info
+
+    def on_side(self, side: int, function: Callable[[], T]) -> T:
+        """Call a function whose nodes go into one of the sides."""
+        self.graph.region = self.info.regions[side]
+        try:
+            return function()
+        finally:
+            self.graph.region = self.node.region
+
+    def close(self, yes: list[Node], no: list[Node]) -> list[Node]:
+        """Select between numbers of the two sides."""
+        graph, info = self.graph, self.info
+        info.outs = (yes, no)
+        self.node.number = graph.next_number()
+        info.results = [
+            graph.statement("result", (), node.dtype, (self.node, index))
+            for index, node in enumerate(yes)
+        ]
+        return info.results

@@ -1,0 +1,295 @@
+"""The whole way of a program, from a jaxpr to a name that XLA can call.
+
+`compile_batched` and `compile_single` build the graph of a program (`build_graph`),
+write its kernel (`llvm_ir`), compile it together with a handler, and register the
+handler with XLA under a name (`register_kernel`).
+
+The name is a hash of the kernel, the machine, the version of the compiler and the level
+of optimisation, so that equal programs have equal names in all processes and are
+compiled once in a process. XLA keeps names as long as the process runs, and an
+executable may call them at any time. Code is therefore never freed: a program takes 20
+to 150 KB, and `compiled_code` returns the total.
+
+Executables in JAX's persistent cache call programs by these names too. JAX lowers a
+program before it looks for its executable, and lowering registers the name. If an
+executable is loaded in another way, in a process that has not registered the name, XLA
+refuses it.
+"""
+
+import ctypes
+import functools
+import hashlib
+import math
+import os
+import threading
+from typing import Any, NamedTuple
+
+import jax
+import jax.ffi
+
+from ._arrays import GATHERS, INDEXING, REDUCTIONS, SHAPING
+from ._builder import (
+    ArrayValue,
+    Builder,
+    flat_indices,
+    InMemory,
+    MOST_IN_REGISTERS,
+    Operation,
+)
+from ._control_flow import BRANCHES, SCANS
+from ._elementary_functions import definitions
+from ._elementwise import ELEMENTWISE
+from ._emission import emit
+from ._graph import Buffer, dtype_name, Region
+from ._handler import HANDLER, handler_ir, SHARED_HANDLER, shared_handler_ir, WORKERS
+from ._native import host, host_width, load, object_code, version
+
+
+def compile_single(program: Any, is_brief: bool = False) -> str:
+    """Compile a program for a single run, and return the name to call it by.
+
+    With `is_brief` it is compiled in less time, to slower code.
+
+    **Raises:** `Unsupported` if the program cannot be compiled.
+    """
+    shared = (False,) * len(program.in_avals)
+    kernel = llvm_ir(program, shared, 1)
+    return register_kernel(
+        kernel,
+        len(program.in_avals),
+        len(program.out_avals),
+        1,
+        is_batched=False,
+        is_brief=is_brief,
+    )
+
+
+def compile_batched(
+    program: Any, is_batched: tuple[bool, ...], is_brief: bool = False
+) -> str:
+    """Compile the program of one member for many members, and return its name.
+
+    **Arguments:**
+
+    - `program`: a closed jaxpr, the program of one member.
+    - `is_batched`: for each operand, whether every member has its own, along the
+        leading axis. All results have this axis.
+    - `is_brief`: whether to compile in less time, to slower code.
+
+    **Returns:** a name for `jax.ffi.ffi_call` and `jax.ffi.ffi_lowering`.
+
+    **Raises:** `Unsupported` if the program cannot be compiled.
+    """
+    width = host_width("float64" if _is_double(program) else "float32")
+    kernel = llvm_ir(program, is_batched, width)
+    return register_kernel(
+        kernel,
+        len(program.in_avals),
+        len(program.out_avals),
+        width,
+        is_batched=True,
+        is_brief=is_brief,
+    )
+
+
+def _is_double(program: Any) -> bool:
+    avals = [*program.in_avals, *program.out_avals]
+    return any(aval.dtype == "float64" for aval in avals) or not any(
+        aval.dtype == "float32" for aval in avals
+    )
+
+
+def llvm_ir(
+    program: Any, is_batched: tuple[bool, ...], width: int, *, contract: bool = True
+) -> str:
+    """Write a kernel that runs a program for `width` members at a time.
+
+    **Arguments:**
+
+    - `program`: the closed jaxpr of one member.
+    - `is_batched`: for each operand, whether it has the member as its leading axis.
+    - `width`: the number of members in a vector, a power of two.
+    - `contract`: whether a product and a sum may be rounded together.
+
+    **Returns:**
+
+    The text of an LLVM module with the function `i1 kernel(ptr operands, ptr results,
+    i64 first, i64 last)`. It computes the members from `first` to `first + width - 1`;
+    those beyond `last` repeat `last`. It returns whether it failed, because there was
+    no scratch memory.
+
+    **Raises:** `Unsupported` if the program cannot be compiled.
+    """
+    traced = build_graph(program)
+    kernel, wanted = emit(traced.root, traced.results, is_batched, width, contract)
+    return f"{kernel}{definitions(wanted)}\n"
+
+
+# Scans of at most this length are unrolled.
+LONGEST_UNROLLED_SCAN = 8
+# Programs with more nodes than this are refused, unless they have fewer than 40 nodes
+# for each of JAX's operations. LLVM takes about 10 s for so many nodes, and minutes for
+# more. XLA keeps loops over arrays: it takes a few seconds where arrays are large, but
+# longer than LLVM where there are many small ones.
+MOST_NODES, NODES_PER_OPERATION = 100_000, 40
+
+OPERATIONS: dict[str, Operation] = {
+    **ELEMENTWISE,
+    **SHAPING,
+    **REDUCTIONS,
+    **INDEXING,
+    **GATHERS,
+    **SCANS,
+    **BRANCHES,
+}
+
+
+class ProgramGraph(NamedTuple):
+    """A finished graph: its root region, and the memory of the results."""
+
+    root: Region
+    results: list[Buffer]
+
+
+def build_graph(program: Any) -> ProgramGraph:
+    """Build the graph of a closed jaxpr of one member."""
+    builder = Builder(OPERATIONS, LONGEST_UNROLLED_SCAN)
+    builder.graph.most_nodes = max(
+        MOST_NODES, NODES_PER_OPERATION * _count_operations(program.jaxpr)
+    )
+    root = builder.graph.root
+    args = []
+    for index, variable in enumerate(program.jaxpr.invars):
+        aval = variable.aval
+        dtype = dtype_name(aval.dtype)
+        buffer = Buffer("operand", dtype, math.prod(aval.shape), root, index)
+        array: ArrayValue = InMemory(buffer, aval.shape)
+        if buffer.size <= MOST_IN_REGISTERS:
+            array = builder.memory.registers(array)
+        args.append(array)
+    values = builder.run(program.jaxpr, program.consts, args)
+    results = []
+    for index, (variable, value) in enumerate(
+        zip(program.jaxpr.outvars, values, strict=True)
+    ):
+        dtype = dtype_name(variable.aval.dtype)
+        buffer = Buffer("result", dtype, value.size, root, index)
+        if value.size:
+            builder.memory.write(buffer, flat_indices(value.shape), value)
+        results.append(buffer)
+    return ProgramGraph(root, results)
+
+
+def _count_operations(jaxpr: Any) -> int:
+    """Count the operations of a jaxpr and of its inner programs."""
+    count = len(jaxpr.eqns)
+    for equation in jaxpr.eqns:
+        if equation.primitive.name == "small_product":
+            # It stands for two broadcasts, a product and a sum.
+            count += 3
+        for part in jax.tree.leaves(equation.params):
+            part = getattr(part, "jaxpr", part)
+            count += _count_operations(part) if hasattr(part, "eqns") else 0
+    return count
+
+
+# The size in bytes of the code of each program, by its name.
+_programs: dict[str, int] = {}
+
+# The number of threads that are working in kernels, which all programs count together.
+_workers = ctypes.c_int64(0)
+
+# One program is compiled at a time: LLVM must not be used by two threads at once, and
+# if two threads want the same program, the second finds it compiled.
+_lock = threading.RLock()
+
+
+def _after_fork() -> None:
+    # The threads that were working belong to the parent.
+    _workers.value = 0
+    _lock.release()
+
+
+# A fork waits for the lock, so that the child gets a compiler in a consistent state.
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(
+        before=_lock.acquire, after_in_parent=_lock.release, after_in_child=_after_fork
+    )
+
+
+class CompiledCode(NamedTuple):
+    """The number of compiled programs, and the total size of their code in bytes."""
+
+    programs: int
+    bytes: int
+
+
+def compiled_code() -> CompiledCode:
+    """Return how many programs have been compiled, and the size of their code."""
+    with _lock:
+        return CompiledCode(len(_programs), sum(_programs.values()))
+
+
+def register_kernel(
+    kernel_ir: str,
+    num_operands: int,
+    num_results: int,
+    width: int,
+    is_batched: bool,
+    is_brief: bool = False,
+) -> str:
+    """Compile and register a kernel, unless that has been done, and return its name.
+
+    **Arguments:**
+
+    - `kernel_ir`: a module in LLVM IR with `define i1 @kernel(ptr %operands, ptr
+        %results, i64 %first, i64 %last)`, which computes the members from `%first` on:
+        `width` of them, but none after `%last`. `%operands` and `%results` are arrays
+        of the addresses of the data. Several threads may run it at the same time, on
+        different members.
+    - `num_operands`, `num_results`: the numbers of arrays that it reads and writes.
+    - `width`: the number of members that it computes at once.
+    - `is_batched`: whether the results have members, along the leading axis. Otherwise
+        it is called once, for member 0.
+    - `is_brief`: whether to compile in less time, to slower code.
+
+    **Returns:** a name for `jax.ffi.ffi_call` and `jax.ffi.ffi_lowering`.
+    """
+    handler = handler_ir(num_operands, num_results, width, is_batched)
+    quick = is_brief or is_quick()
+    name = _name(kernel_ir, handler, "quick" if quick else "optimised")
+    with _lock:
+        if name not in _programs:
+            code = object_code([kernel_ir, handler], HANDLER, host(), quick)
+            imports = {SHARED_HANDLER: _shared_handler()}
+            address = ctypes.c_void_p(load(code, name, HANDLER, imports))
+            jax.ffi.register_ffi_target(
+                name, jax.ffi.pycapsule(address), platform="cpu", api_version=1
+            )
+            _programs[name] = len(code)
+    return name
+
+
+@functools.cache
+def _shared_handler() -> int:
+    """Return the address of the function that the handlers of all programs call.
+
+    It runs for less than a microsecond besides the kernels, so that optimising it would
+    cost more than it gains.
+    """
+    code = object_code([shared_handler_ir()], SHARED_HANDLER, host(), is_quick=True)
+    imports = {WORKERS: ctypes.addressof(_workers)}
+    return load(code, "nhjax_lanes_handle", SHARED_HANDLER, imports)
+
+
+def is_quick() -> bool:
+    """Return whether JAX is set to optimise little, so that programs compile sooner."""
+    return bool(jax.config.read("jax_disable_most_optimizations"))
+
+
+def _name(*texts: str) -> str:
+    digest = hashlib.sha256()
+    for part in (*texts, *host(), version()):
+        digest.update(part.encode())
+        digest.update(b"\0")
+    return f"nhjax_lanes_{digest.hexdigest()[:32]}"
