@@ -47,7 +47,7 @@ class AbstractReduction(eqx.Module):
 
     @abstractmethod
     def merge(self, one: PyTree[Array], other: PyTree[Array]) -> PyTree[Array]:
-        """Combine the states of two sets of members; those of `one` come first."""
+        """Combine the states of two sets of members; `one` comes first."""
 
     @abstractmethod
     def finish(self, state: PyTree[Array]) -> Any:

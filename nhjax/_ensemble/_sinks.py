@@ -1,4 +1,4 @@
-"""What an ensemble returns, and the sinks that collect it in memory.
+"""The outcome of an ensemble, and the sinks that collect results in memory.
 
 A sink decides which chunks a process runs, starts them, collects their results, and
 creates the outcome. The sinks that write to disk are in `_store`.
@@ -260,7 +260,7 @@ class ReductionSink(AbstractSink):
         return self.job.states(chunk, self.reductions)
 
     def collect(self, chunk: int, content: Any, failures: list[list[int]]) -> None:
-        """Merge the state of a chunk, or those of a round of chunks."""
+        """Merge the state of a chunk, or the states of a round of chunks."""
         del chunk
         if self.in_rounds and self.job.processes.count > 1:
             self._merge_round(self._packed(content, FailureList(failures)))
@@ -326,7 +326,7 @@ class ReductionSink(AbstractSink):
         return jax.device_put(state, self.job.layout.devices[0])
 
     def _packed(self, state: Any, failures: FailureList) -> bytes:
-        # With dtypes, because they may differ from those of the neutral state.
+        # Dtypes are included, because they may differ from the neutral state.
         leaves = [np.asarray(x) for x in jax.tree.leaves(state)]
         kinds = json.dumps([[x.dtype.name, x.shape] for x in leaves]).encode()
         head = np.int64(len(kinds)).tobytes() + kinds

@@ -166,17 +166,17 @@ class ZarrSink(AbstractSink):
                 self._create()
             token = os.urandom(16).hex().encode() if processes.count > 1 else b""
             self.lock.write(token)
-        told = json.loads(
+        shared = json.loads(
             processes.broadcast(
                 json.dumps([token.decode(), [*lines.values()]]).encode()
             )
         )
         if processes.index > 0:
-            self._check_shared(told[0])
+            self._check_shared(shared[0])
             self.journal.open_part()
         # All processes wait here until all parts are locked.
         processes.allgather()
-        return {line["chunk"]: line for line in told[1]}
+        return {line["chunk"]: line for line in shared[1]}
 
     def _check_shared(self, token: str) -> None:
         """Raise unless this process reads the token that process 0 has written."""

@@ -66,7 +66,7 @@ def units_of_coordinates(
 ) -> dict[str, Any]:
     """Return labels of coordinates: their units and the units of their velocities.
 
-    Momenta have no labels, because their units do not follow from those of coordinates.
+    Momenta have no labels, because their units do not follow from the coordinates.
 
     **Returns:** a dictionary from names to pairs of a dimension and the units along it.
     """
@@ -148,7 +148,7 @@ def _result_names(result: Any) -> np.ndarray:
 
 
 def _saved(ys: Any, dims: tuple[str, ...]) -> dict[str, Any]:
-    """Name the saved arrays, and their axes after those of `dims`."""
+    """Name the saved arrays, and their axes after `dims`."""
     if not isinstance(ys, State):
         return _named(ys, dims, "value", None)
     of = ys.v.shape[-1:]

@@ -39,7 +39,7 @@ def trajectory(
     - `sol`: a `Solution` with saved states; for a batch, one path is drawn for each
         member.
     - `coordinates`: the indices of two or three entries of q. On a group, they index
-        the flattened numbers of an element; on a product, those of all factors in turn.
+        the flattened numbers of an element; on a product, of all factors in turn.
     - `names`: the names of the coordinates, for the labels of the axes.
     - `ax`: the axes to draw into; three coordinates need a 3d projection.
     - `style`: passed on to `Axes.plot`.
@@ -272,11 +272,11 @@ def _names(names: Sequence[str] | None, default: list[str]) -> Sequence[str]:
 
 
 def new_axes(ax: "Axes | None", projection: str | None = None) -> "Axes":
-    """Return the axes given by the user, or those of a new figure."""
+    """Return the axes given by the user, or the axes of a new figure."""
     if ax is not None:
         if not hasattr(ax, "plot"):
             raise TypeError(
-                "`ax` must be axes of matplotlib, such as those of "
+                "`ax` must be axes of matplotlib, for example from "
                 f"`matplotlib.pyplot.subplots()`, got {reprlib.repr(ax)} of type "
                 f"{type(ax).__name__}."
             )

@@ -253,8 +253,8 @@ def ball_invariants(
     is 1e-12 in the paper and round-off here. The fourth, the moving energy, oscillates
     like the energy of a holonomic system. In addition, this study measures whether the
     moving energy stays bounded, its order, and the distance of the ball from its exact
-    position on a circle. The paper does not give its data; this study uses those of
-    `nhjax.systems.TurntableBall`, a solid ball, with the constraints in the spatial
+    position on a circle. The paper does not give its data; this study uses the data
+    of `nhjax.systems.TurntableBall`, a solid ball, with the constraints in the spatial
     angular velocity.
 
     **Arguments:**

@@ -224,7 +224,7 @@ def chaotic_energy(
     - `closure`: the closure of the multipliers, as for `nhjax.LobattoIIIAB`; by default
         that of the paper.
     - `times`: the times at which to report μ, averaged over a window of ±5; by default
-        those of 10, 50, 100 and 200 within the run, or its end if there are none.
+        the times 10, 50, 100 and 200 within the run, or its end for a shorter run.
     - `save_every`: the number of steps between saved energies.
     - `progress`: whether to show a progress bar for each run on the standard error
         stream.

@@ -1,4 +1,4 @@
-"""Statistics of ensembles equal those of exact fractions for every chunk size."""
+"""Statistics of ensembles equal exact fractions for every chunk size."""
 
 from fractions import Fraction
 
