@@ -11,7 +11,7 @@ from ._dataset import (
     units_of_coordinates as units_of_coordinates,
 )
 from ._event import Event as Event
-from ._integrate import integrate as integrate
+from ._integrate import integrate as integrate, step as step
 from ._interpolation import DenseInterpolation as DenseInterpolation
 from ._log import EventLog as EventLog
 from ._progress_meter import (
@@ -21,6 +21,5 @@ from ._progress_meter import (
     TqdmProgressMeter as TqdmProgressMeter,
 )
 from ._reversible import ReversibleAdjoint as ReversibleAdjoint
-from ._saveat import SaveAt as SaveAt
+from ._saving import SaveAt as SaveAt
 from ._solution import raise_failures as raise_failures, Solution as Solution
-from ._step import step as step

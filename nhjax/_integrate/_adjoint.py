@@ -14,7 +14,7 @@ from jaxtyping import Array, Int
 
 from ._loop import Loop
 from ._saving import Rows
-from ._stepping import Carry
+from ._stepper import Carry
 
 
 _Run: TypeAlias = tuple[Carry, Rows]

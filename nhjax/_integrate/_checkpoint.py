@@ -18,7 +18,10 @@ from .._system import (
     Linearisation,
     State,
 )
-from ._checks import MOST_STEPS
+
+
+# Steps are counted in int32.
+MOST_STEPS = 2**31 - 1
 
 
 class Checkpoint(eqx.Module):

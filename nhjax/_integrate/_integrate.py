@@ -1,11 +1,20 @@
-import warnings
-from collections.abc import Sequence
-from dataclasses import replace
-from typing import Literal
+"""The functions `integrate` and `step`: checks, the compiled run, and its solution."""
 
+import reprlib
+import warnings
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from functools import partial
+from typing import Any, Literal, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.extend
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Int, PyTree
 
+from .._compile import as_cpu_kernel, Programs, tracked_jit
 from .._custom_types import (
     Args,
     BoolScalar,
@@ -14,20 +23,26 @@ from .._custom_types import (
     IntScalar,
     PhaseFunction,
 )
-from .._errors import Check, hold, is_traced, require
+from .._errors import Check, hold, is_traced, naming, require, ShapeError
 from .._method import AbstractMethod, Gauss, LobattoIIIAB, PartitionedRungeKutta
+from .._numerics import ClosureConverted, nan_gradient_unless, nan_unless
 from .._results import RESULTS
 from .._step import (
     AbstractStageSolver,
     is_simplified_alone,
     leaves_steps_to_newton,
+    RoundOff,
     SimplifiedNewton,
+    StepRecord,
 )
 from .._system import (
     AbstractMechanicalSystem,
     check_flag,
     check_type,
+    closure_converted,
     finite,
+    function_noise,
+    FunctionNoise,
     HamiltonianSystem,
     LagrangianSystem,
     parameters,
@@ -36,20 +51,65 @@ from .._system import (
     State,
 )
 from ._adjoint import AbstractAdjoint, DirectAdjoint
-from ._checkpoint import check_start, Checkpoint, countable_from, time_of
-from ._checks import advancing, check_num_steps, countable, is_tracing
-from ._event import checked_events, Event
-from ._interpolation import require_collocation
-from ._options import Means, Options, TimeGrid
-from ._progress_meter import AbstractProgressMeter, NoProgressMeter
-from ._run import run
-from ._saveat import SaveAt
-from ._solution import (
-    is_singular_from_the_start,
-    is_unsolved,
-    raise_failures,
-    Solution,
+from ._checkpoint import (
+    check_start,
+    Checkpoint,
+    countable_from,
+    MOST_STEPS,
+    start_of,
+    time_of,
 )
+from ._conservation import kept_invariants
+from ._event import checked_events, Event
+from ._event_stepper import EventStepping
+from ._interpolation import (
+    DenseInterpolation,
+    interpolate,
+    require_collocation,
+    step_index,
+)
+from ._log import EventLog, log_at_end, reported
+from ._loop import Loop
+from ._progress_meter import AbstractProgressMeter, NoProgressMeter
+from ._saving import (
+    record_places,
+    RecordPlaces,
+    Rows,
+    SaveAt,
+    Saving,
+    stack_saved,
+    static_length,
+)
+from ._solution import is_singular_from_the_start, is_unsolved, raise_failures, Solution
+from ._stepper import as_checkpoint, Carry, progress_of, reported_statistics, Stepping
+
+
+class TimeGrid(eqx.Module):
+    """The nodes t_k = t0 + k dt of a run, for k = 0, ..., num_steps."""
+
+    t0: FloatScalar
+    dt: FloatScalar
+    num_steps: int | IntScalar
+
+
+class Options(eqx.Module):
+    """The functions of a user beside the system's: what is saved, kept and waited for.
+
+    The fields are the arguments of `integrate` of the same names, and `events` its
+    `event` as a tuple.
+    """
+
+    saveat: SaveAt
+    invariants: str | Callable[..., Any] | None
+    events: tuple[Event, ...] | None
+
+
+class Means(eqx.Module):
+    """The means by which steps are solved, differentiated and reported."""
+
+    stage_solver: AbstractStageSolver
+    adjoint: AbstractAdjoint
+    meter: AbstractProgressMeter
 
 
 METHODS = LobattoIIIAB, Gauss, PartitionedRungeKutta
@@ -297,3 +357,397 @@ def _what_needs_the_length(saveat: SaveAt, meter: AbstractProgressMeter) -> str 
         "the `progress_meter`": not meter.silent,
     }
     return next((name for name, needed in needs.items() if needed), None)
+
+
+@tracked_jit("system", "args", "options")
+def run(
+    system: AbstractMechanicalSystem,
+    method: AbstractMethod,
+    y0: State | Checkpoint,
+    grid: TimeGrid,
+    args: Args,
+    options: Options,
+    means: Means,
+) -> Solution:
+    """Integrate with arguments that have been checked, and return the solution."""
+    t0, saveat = grid.t0, options.saveat
+    state, origin = start_of(y0, t0, grid.dt)
+    check_saved(saveat.fn, t0, state, args)
+    # Arrays that the user's functions close over become leaves, for derivatives.
+    system = closure_converted(system, t0, state, args)
+    stepping = Stepping(
+        system=system,
+        method=method,
+        stage_solver=means.stage_solver,
+        origin=origin,
+        dt=grid.dt,
+        args=args,
+        invariants=kept_invariants(options.invariants, system, t0, state, args),
+        programs=Programs(),
+    )
+    sampled = _sampled_steps(saveat, grid)
+    places = record_places(saveat.dense, sampled, grid.num_steps)
+    events = EventStepping.of(options.events, stepping, state, grid.num_steps)
+    fn = ClosureConverted(saveat.fn, t0, state, args)
+    saving = _saving(saveat, fn, grid.num_steps, places, events)
+    loop = Loop(stepping, saving, means.meter, events)
+    round_off, start, carry, rows = _all_steps(
+        means.adjoint, loop, y0, saveat.checkpoint
+    )
+    given = system, y0, t0, grid.dt, args
+    end = _end(loop, carry, rows, (given, options.events))
+    ts, ys = _output(saveat, loop, grid, start, end, sampled)
+    return Solution(
+        t0=t0,
+        t1=end.t,
+        ts=ts,
+        ys=ys,
+        stats=reported_statistics(carry.stats, method),
+        result=carry.result,
+        interpolation=_interpolation(loop, grid, end.rows) if saveat.dense else None,
+        checkpoint=(
+            as_checkpoint(stepping, round_off, carry, end.state)
+            if saveat.checkpoint
+            else None
+        ),
+        coordinates=system.coordinates,
+        events=end.log,
+    )
+
+
+def _sampled_steps(saveat: SaveAt, grid: TimeGrid) -> Int[Array, " k"] | None:
+    """Find the steps in which the times of `SaveAt(ts=...)` lie; None without these."""
+    if saveat.ts is None:
+        return None
+    length = static_length(grid.num_steps)
+    return jax.vmap(lambda t: step_index(t, grid.t0, grid.dt, length))(saveat.ts)
+
+
+def _all_steps(
+    adjoint: AbstractAdjoint, loop: Loop, y0: State | Checkpoint, checkpoint: bool
+) -> tuple[RoundOff, State, Carry, Rows]:
+    """Take all steps.
+
+    Return the measured round-off, the first state, what is carried at the end, and the
+    rows that were saved.
+    """
+
+    def start(loop: Loop, y0: State | Checkpoint, noise: FunctionNoise | None):
+        first = loop.start(y0, noise)
+        return loop.stepping.round_off_at(y0, first.step_state, noise), first
+
+    def steps(loop: Loop, round_off: RoundOff, first: Carry):
+        loop = loop.with_round_off(round_off)
+        run = adjoint.run(loop, loop.moving(first))
+        return round_off, first.step_state.state, *run
+
+    def whole(loop: Loop, y0: State, noise: FunctionNoise):
+        return steps(loop, *start(loop, y0, noise))
+
+    noise = None
+    if isinstance(y0, State):
+        # A kernel of its own: the loop over steps is compiled to faster code without
+        # another loop before it. In a batch of runs from one state it is no batch.
+        stepping = loop.stepping
+        u = stepping.system.fibre_coordinate(y0)
+        given = stepping.time(0), y0.q, u, y0.multiplier, stepping.args
+        given = stepping.system, *given
+        noise = as_cpu_kernel(function_noise, *given, is_brief=True)
+        if not checkpoint:
+            return as_cpu_kernel(whole, loop, y0, noise)
+    # What a compiler knows of the start of a loop, such as zeros in the matrices there,
+    # changes how it rounds in the loop. Here it knows nothing, so that a run which goes
+    # on from another takes its steps by the same instructions.
+    first = as_cpu_kernel(start, loop, y0, noise)
+    given, rest = eqx.partition((loop, first), eqx.is_array)
+    loop, first = eqx.combine(jax.lax.optimization_barrier(given), rest)
+    return as_cpu_kernel(steps, loop, *first)
+
+
+def _saving(
+    saveat: SaveAt,
+    fn: ClosureConverted,
+    num_steps: int | IntScalar,
+    places: RecordPlaces,
+    events: EventStepping | None,
+) -> Saving:
+    """Make the choice of what the steps of a run save."""
+    return Saving(
+        fn=fn,
+        num_steps=num_steps,
+        stride=saveat.steps,
+        num_saved=static_length(num_steps) // saveat.steps if saveat.steps else 0,
+        num_records=places.number,
+        record_slots=places.slots,
+        num_events=0 if events is None else events.num_kept,
+    )
+
+
+class _End(NamedTuple):
+    """The state and the time at the end of a run, the rows that it saved, and its log.
+
+    The log of events is None in a run without events.
+    """
+
+    state: State
+    t: FloatScalar
+    rows: Rows
+    log: EventLog | None
+
+
+def _end(loop: Loop, carry: Carry, rows: Rows, given: Any) -> _End:
+    """Find the end of a run; derivatives by what is `given` are NaN if it failed."""
+    stepping, events, state = loop.stepping, loop.events, carry.step_state.state
+    went_well, t1 = carry.result == RESULTS.successful, stepping.time(loop.num_steps)
+    if events is None:
+        state, rows = nan_gradient_unless(went_well, (state, rows), given)
+        return _End(state, t1, rows, None)
+    progress, ended = progress_of(carry), carry.result == RESULTS.event_occurred
+    t1 = jnp.where(ended, events.time(progress), t1)
+    found = state, rows, t1
+    state, rows, t1 = nan_gradient_unless(ended | went_well, found, given)
+    log = log_at_end(progress, t1, state) if rows.log is None else rows.log
+    return _End(state, t1, rows, reported(log, progress.num))
+
+
+def _output(
+    saveat: SaveAt,
+    loop: Loop,
+    grid: TimeGrid,
+    start: State,
+    end: _End,
+    sampled: Int[Array, " k"] | None,
+) -> tuple[PyTree[Array], PyTree[Array]]:
+    """Join what was saved at the start, on the way and at the end: times and values."""
+    saving, args, ts = loop.saving, loop.stepping.args, saveat.ts
+    pieces = []
+    if saveat.t0:
+        pieces.append(_one(saving.saved(grid.t0, start, args)))
+    if saveat.steps:
+        pieces.append(jax.tree.map(lambda x: x[:-1], end.rows.saved))
+    if ts is not None and sampled is not None and saving.record_slots is not None:
+        row = saving.record_slots[sampled]
+        records = jax.tree.map(lambda x: x[row], end.rows.record)
+        pieces.append(jax.vmap(partial(_sample, loop))(ts, sampled, records))
+    if saveat.saves_end(grid.num_steps):
+        pieces.append(_one(saving.saved(end.t, end.state, args)))
+    return stack_saved(pieces) if pieces else (None, None)
+
+
+def _interpolation(loop: Loop, grid: TimeGrid, rows: Rows) -> DenseInterpolation:
+    """Make the dense output from the records of all steps."""
+    stepping = loop.stepping
+    return DenseInterpolation(
+        system=stepping.system,
+        method=stepping.method,
+        num_steps=static_length(grid.num_steps),
+        t0=grid.t0,
+        dt=grid.dt,
+        records=jax.tree.map(lambda x: x[:-1], rows.record),
+        args=stepping.args,
+    )
+
+
+def _one(saved: PyTree[Array]) -> PyTree[Array]:
+    """Make a piece of the output, with a time axis of length one, from one entry."""
+    return jax.tree.map(lambda x: x[None], saved)
+
+
+def _sample(
+    loop: Loop, t: FloatScalar, k: Int[Array, ""], record: StepRecord
+) -> PyTree[Array]:
+    """Compute what is saved at a time t that lies inside of step k."""
+    run = loop.stepping
+    start, h = run.time(k), run.dt
+    theta = (t - start) / h
+    y = interpolate(run.system, run.method, record, start, h, theta, run.args)
+    return loop.saving.saved(t, y, run.args)
+
+
+def step(
+    system: AbstractMechanicalSystem,
+    method: AbstractMethod,
+    t: FloatScalarLike,
+    dt: FloatScalarLike,
+    y: State,
+    args: Args = None,
+    *,
+    stage_solver: AbstractStageSolver = SimplifiedNewton(),
+    throw: bool = True,
+    invariants: Literal["energy"] | PhaseFunction | None = None,
+) -> State:
+    """Take one step of size `dt`, from the state `y` at `t` to the state at `t + dt`.
+
+    The step solves the discrete equations of the paper (its four summaries), and its
+    result is the same to the last bit as that of `integrate` with `num_steps=1`. Use it
+    for control loops, environments and other time loops that `integrate` does not
+    offer. It works under `jit`, `vmap`, `grad`, `jvp`, `hessian` and inside of
+    `jax.lax.scan`. Over many steps `integrate` is faster and its rounding errors are
+    smaller, because it sums q and p with a compensation that a `State` does not hold.
+
+    **Arguments:**
+
+    - `system`, `method`: as for `nhjax.integrate`.
+    - `t`: the time of `y`.
+    - `dt`: the step size, a scalar, in units of time; negative to go back.
+    - `y`: a consistent state, from `nhjax.initial_state`, from a `Solution` or from a
+        step before.
+    - `args`: passed on to the functions of the system, for instance the controls that
+        are held during the step.
+    - `stage_solver`: `nhjax.SimplifiedNewton()` by default, or `nhjax.Newton()`.
+    - `throw`: raise if the step cannot be solved. Otherwise all numbers of the state
+        that is returned are NaN.
+    - `invariants`: what the step keeps at its value in `y`, as for `nhjax.integrate`.
+
+    **Returns:** the `State` at `t + dt`.
+
+    **Raises:** as `nhjax.integrate` does.
+
+    !!! example
+
+        >>> import nhjax
+        >>> disc = nhjax.systems.VerticalRollingDisc()
+        >>> y, method = disc.initial_state(), nhjax.LobattoIIIAB(3)
+        >>> y = nhjax.step(disc.system, method, t=0.0, dt=0.1, y=y)
+        >>> y.q.shape
+        (4,)
+    """
+    check_type("y", y, State, "Make one with nhjax.initial_state.")
+    t = real_scalar("t", t, jnp.result_type(float))
+    sol = integrate(
+        system,
+        method,
+        y,
+        dt=dt,
+        num_steps=1,
+        t0=t,
+        args=args,
+        stage_solver=stage_solver,
+        throw=throw,
+        invariants=invariants,
+    )
+    end = jax.tree.map(lambda x: x[0], sol.ys)
+    if throw:
+        return end
+    return nan_unless(sol.result == RESULTS.successful, end)
+
+
+def check_num_steps(num_steps: Any, needed_by: str | None) -> int | IntScalar:
+    """Return `num_steps` as an int >= 1, or as an array if no option needs its value.
+
+    **Arguments:**
+
+    - `num_steps`: the argument of the user.
+    - `needed_by`: the name of an option that needs the number of steps when tracing,
+        for instance because the shape of its output depends on it; None if there is
+        none.
+    """
+    if isinstance(num_steps, jax.Array | np.ndarray):
+        return _traced_count(num_steps, needed_by)
+    if isinstance(num_steps, bool) or not isinstance(num_steps, int | np.integer):
+        raise TypeError(
+            "`num_steps` must be an int, or an integer array of shape (), got "
+            f"{num_steps!r} of type {type(num_steps).__name__}."
+        )
+    _require_count(int(num_steps))
+    return int(num_steps)
+
+
+def _traced_count(num_steps: Array | np.ndarray, needed_by: str | None) -> IntScalar:
+    if not jnp.issubdtype(num_steps.dtype, jnp.integer):
+        raise TypeError(
+            "`num_steps` must be an int, or an integer array of shape (), got "
+            f"{num_steps!r} of dtype {num_steps.dtype}."
+        )
+    if num_steps.shape != ():
+        raise ShapeError(
+            f"`num_steps` has shape {num_steps.shape}, but a scalar is needed; for "
+            "runs of several lengths use `jax.vmap`."
+        )
+    if needed_by is not None:
+        raise TypeError(
+            f"`num_steps` must be an int known when tracing (under `jax.jit` a static "
+            f"argument), because {needed_by} depends on it; got {num_steps!r} of type "
+            f"{type(num_steps).__name__}."
+        )
+    if not is_traced(num_steps):
+        _require_count(int(num_steps))
+    return jnp.asarray(num_steps)
+
+
+def _require_count(num_steps: int) -> None:
+    if not 1 <= num_steps <= MOST_STEPS:
+        raise _count_error(num_steps)
+
+
+def _count_error(num_steps: Any) -> ValueError:
+    return ValueError(f"`num_steps` must be in 1..2^31 - 1, got {num_steps}.")
+
+
+def countable(num_steps: int | IntScalar) -> list[Check]:
+    """Make the check that a traced number of steps is in its range.
+
+    The list is empty for a number that is known, which `check_num_steps` has checked.
+    """
+    if isinstance(num_steps, int) or not is_traced(num_steps):
+        return []
+    ok = num_steps >= 1
+    if jnp.iinfo(num_steps.dtype).max > MOST_STEPS:
+        ok = ok & (num_steps <= MOST_STEPS)
+    return [Check(ok, _count_error, (num_steps,))]
+
+
+def advancing(t0: FloatScalar, dt: FloatScalar) -> Check:
+    """Make the check that t0 + dt differs from t0, so that time advances."""
+    # Known values are compared on the host with NumPy, where an operation takes a tenth
+    # of the time.
+    numpy: Any = jnp if is_traced(t0, dt) else np
+    first, h = numpy.asarray(t0), numpy.asarray(dt)
+    # Infinite numbers have a check of their own.
+    with np.errstate(over="ignore", invalid="ignore"):
+        ok = first + h != first
+    return Check(ok, _standstill_error, (first, h))
+
+
+def _standstill_error(first: Any, h: Any) -> ValueError:
+    return ValueError(
+        f"`dt` = {h} is below the round-off of the time `t0` = {first} in {h.dtype}: "
+        "t0 + dt equals t0, and time would not advance. Measure time from a later "
+        "origin, or take larger steps."
+    )
+
+
+def check_saved(
+    fn: Callable[[Any, Any, Any], PyTree[Array]], t: FloatScalar, y: Any, args: Args
+) -> None:
+    """Raise a `TypeError` unless `SaveAt(fn=...)` returns what can be saved, arrays."""
+    with naming("SaveAt: fn(t, y, args)", fn, args):
+        leaves = jax.tree.leaves(eqx.filter_eval_shape(fn, t, y, args))
+    wrong = [
+        leaf
+        for leaf in leaves
+        if not (isinstance(leaf, jax.ShapeDtypeStruct) or eqx.is_array_like(leaf))
+    ]
+    if leaves and not wrong:
+        return
+    got = "nothing: does it lack a `return`?"
+    if wrong:
+        got = f"{reprlib.repr(wrong[0])} of type {type(wrong[0]).__name__}."
+    raise TypeError(
+        f"SaveAt: `fn(t, y, args)` must return an array, or a tree of arrays, got {got}"
+    )
+
+
+# JAX keeps what is being traced, if anything, in a state that can only be compared
+# with another. In releases of JAX that do not make this function public, `is_tracing`
+# always returns True.
+_trace_state = getattr(jax.extend.core, "get_opaque_trace_state", lambda **_: object())
+with jax.ensure_compile_time_eval():
+    # This gives the state outside of all transformations also if this module is
+    # imported inside of one.
+    _NOT_TRACING = _trace_state(convention="nhjax")
+
+
+def is_tracing() -> bool:
+    """Tell whether this is called inside a transformation such as jit, vmap or grad."""
+    return _trace_state(convention="nhjax") != _NOT_TRACING

@@ -13,13 +13,12 @@ from .._results import RESULTS
 from .._step import RoundOff
 from .._system import FunctionNoise, State
 from ._checkpoint import Checkpoint
-from ._checks import static_length
-from ._event_stepping import EventStepping
+from ._event_stepper import EventStepping
 from ._log import LogEntry, no_entry
 from ._progress import Known
 from ._progress_meter import AbstractProgressMeter
-from ._saving import Rows, Saving
-from ._stepping import Carry, progress_of, Stepping, Taken
+from ._saving import Rows, Saving, static_length
+from ._stepper import Carry, progress_of, Stepping, Taken
 
 
 class Loop(eqx.Module):

@@ -14,7 +14,7 @@ from ._adjoint import AbstractAdjoint, count, DirectAdjoint
 from ._loop import Loop
 from ._progress_meter import NoProgressMeter
 from ._saving import Rows
-from ._stepping import Carry
+from ._stepper import Carry
 from ._way_back import way_back
 
 

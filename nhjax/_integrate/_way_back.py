@@ -14,11 +14,9 @@ from .._step import first_step_state, StepState
 from .._system import State
 from ._log import log_at_end, LogEntry
 from ._loop import Loop
-from ._progress import Known, Progress
+from ._progress import Known, Progress, Sides
 from ._saving import Rows
-from ._sides import Sides
-from ._step_back import PartOfStep, step_back, WholeStep
-from ._stepping import Carry, progress_of
+from ._stepper import Carry, PartOfStep, progress_of, step_back, WholeStep
 
 
 class AbstractWayBack(eqx.Module):

@@ -1,6 +1,7 @@
-"""The steps of a run: what is carried from one to the next, and how each is taken."""
+"""The steps of a run: the loop carry, one step forward and one step back."""
 
-from typing import NamedTuple
+from abc import abstractmethod
+from typing import Any, NamedTuple, TypeAlias
 
 import equinox as eqx
 import jax
@@ -10,10 +11,11 @@ from jaxtyping import Array, Float, Int
 from .._compile import Programs
 from .._custom_types import Args, BoolScalar, FloatScalar
 from .._method import AbstractMethod
-from .._numerics import max_norm, tree_where
+from .._numerics import iterate, max_norm, Sizes, tree_where
 from .._results import RESULTS
 from .._step import (
     AbstractStageSolver,
+    estimated_error,
     first_step_state,
     Invariants,
     largest_violation,
@@ -35,7 +37,9 @@ from .._system import (
 from ._checkpoint import Checkpoint, Origin, resumed
 from ._conservation import conserves
 from ._progress import Progress
-from ._statistics import first_statistics, Statistics, updated_statistics
+
+
+Statistics: TypeAlias = dict[str, Any]
 
 
 class Carry(NamedTuple):
@@ -229,3 +233,201 @@ def is_consistent(
         & (system.manifold_of(y.q).distance_to_group(y.q) <= small)
         & (max_norm(derivative - given) <= small * size)
     )
+
+
+def first_statistics(
+    violation: FloatScalar, redundant: Int[Array, ""], is_good: BoolScalar
+) -> Statistics:
+    """Make the statistics of a run before its first step.
+
+    **Arguments:**
+
+    - `violation`: the largest constraint violation of the initial state.
+    - `redundant`: how many constraints follow from others at the initial state.
+    - `is_good`: whether the run can start; otherwise step 0 counts as failed.
+    """
+    zero, none = jnp.zeros_like(violation), jnp.zeros((), jnp.int32)
+    return {
+        "num_steps": none,
+        "num_iterations": none,
+        "num_newton_steps": none,
+        "num_redundant": redundant,
+        "max_residual": zero,
+        "max_constraint_violation": violation,
+        "max_multiplier_defect": zero,
+        "failed_step": jnp.where(is_good, none - 1, none),
+        "worst_coordinate": none - 1,
+    }
+
+
+def reported_statistics(stats: Statistics, method: AbstractMethod) -> Statistics:
+    """Make the statistics that a solution has, of those that are carried."""
+    stats = dict(stats)
+    ratios = stats.pop("max_error_ratios", None)
+    if ratios is not None:
+        stats["max_error_estimate"] = estimated_error(ratios, method)
+    return stats
+
+
+def updated_statistics(
+    stats: Statistics,
+    outcome: StepOutcome,
+    alive: BoolScalar,
+    good: BoolScalar,
+    k: Int[Array, ""],
+) -> Statistics:
+    """Update the statistics of a run after its step k.
+
+    **Arguments:**
+
+    - `stats`: the statistics before the step.
+    - `outcome`: the outcome of the step.
+    - `alive`: whether the run had not failed before, so that the step was taken.
+    - `good`: whether the step was taken and solved.
+    - `k`: the index of the step.
+    """
+
+    def larger(name, value):
+        return jnp.where(good, jnp.maximum(stats[name], value), stats[name])
+
+    failed = alive & ~good
+    optional = {
+        "max_invariant_error": outcome.invariant_error,
+        "max_error_ratios": outcome.error_ratios,
+    }
+    present = {k: x for k, x in optional.items() if x is not None}
+    return {name: larger(name, x) for name, x in present.items()} | {
+        "num_steps": stats["num_steps"] + good.astype(jnp.int32),
+        "num_iterations": stats["num_iterations"]
+        + jnp.where(alive, outcome.num_iterations, 0),
+        "num_newton_steps": stats["num_newton_steps"]
+        + (good & outcome.newton).astype(jnp.int32),
+        "num_redundant": stats["num_redundant"],
+        "max_residual": larger("max_residual", outcome.residual),
+        "max_constraint_violation": larger(
+            "max_constraint_violation", outcome.constraint_violation
+        ),
+        "max_multiplier_defect": larger(
+            "max_multiplier_defect", outcome.multiplier_defect
+        ),
+        "failed_step": jnp.where(failed, k, stats["failed_step"]),
+        "worst_coordinate": jnp.where(
+            failed, outcome.worst_coordinate, stats["worst_coordinate"]
+        ),
+    }
+
+
+class AbstractStepInterval(eqx.Module):
+    """The time interval of a step that is to be retraced."""
+
+    @property
+    @abstractmethod
+    def start(self) -> FloatScalar:
+        """Return the time at which the step started."""
+
+    @property
+    @abstractmethod
+    def end(self) -> FloatScalar:
+        """Return the time at which the step ended."""
+
+    @property
+    @abstractmethod
+    def size(self) -> FloatScalar:
+        """Return the size of the step."""
+
+
+class WholeStep(AbstractStepInterval):
+    """The time interval of step k of a run without events."""
+
+    stepping: Stepping
+    k: Int[Array, ""]
+
+    @property
+    def start(self) -> FloatScalar:
+        """Return the time t_k at which the step started."""
+        return self.stepping.time(self.k)
+
+    @property
+    def end(self) -> FloatScalar:
+        """Return the time t_{k+1} at which the step ended."""
+        return self.stepping.time(self.k + 1)
+
+    @property
+    def size(self) -> FloatScalar:
+        """Return the step size dt."""
+        return self.stepping.dt
+
+
+class PartOfStep(AbstractStepInterval):
+    """The time interval of a part of a step, from a time `since`, of some `length`."""
+
+    since: FloatScalar
+    length: FloatScalar
+
+    @property
+    def start(self) -> FloatScalar:
+        """Return the time at which the step started."""
+        return self.since
+
+    @property
+    def end(self) -> FloatScalar:
+        """Return the time at which the step ended."""
+        return self.since + self.length
+
+    @property
+    def size(self) -> FloatScalar:
+        """Return the size of the step."""
+        return self.length
+
+
+def step_back(
+    stepping: Stepping, step_state: StepState, interval: AbstractStepInterval
+) -> StepState:
+    """Compute the state that a step started from, given the one that it led to."""
+    go_on = jnp.asarray(False)
+
+    def back_from(step_state: StepState) -> StepState:
+        t, h = interval.end, -interval.size
+        return stepping.one_step(step_state, t, h, go_on).step_state
+
+    if _retraces(stepping, step_state):
+        return back_from(step_state)
+
+    # Let y be the end of a step back from z. Each sweep moves z by the difference
+    # between `step_state` and the end of the step forward from y. The two steps undo
+    # each other up to a small error, so that this iteration contracts far faster than
+    # one that moves y would.
+    target = step_state.state
+    manifold = stepping.system.manifold_of(target.q)
+    propagated = stepping.method.closure == "propagated"
+
+    def sweep(z: State):
+        y = back_from(eqx.tree_at(lambda x: x.state, step_state, z))
+        t, h = interval.start, interval.size
+        reached = stepping.one_step(y, t, h, go_on).step_state.state
+        to_reached = manifold.inverse(reached.q)
+        xi = manifold.local(manifold.compose(to_reached, target.q))
+        misses = [xi, target.p - reached.p]
+        multiplier = z.multiplier
+        if propagated:
+            miss = target.multiplier - reached.multiplier
+            misses.append(interval.size * miss)
+            multiplier = multiplier + miss
+        size = max_norm(*misses)
+        z = State(manifold.act(z.q, xi), z.v, z.p + misses[1], multiplier)
+        return z, Sizes(size), y
+
+    scale = 1 + max_norm(target.p)
+    limit = stepping.stage_solver.max_iterations
+    return iterate(sweep, target, scale, max_iterations=limit).aux
+
+
+def _retraces(stepping: Stepping, step_state: StepState) -> bool:
+    """Tell whether a step of -h undoes a step of h, up to round-off."""
+    system, method = stepping.system, stepping.method
+    is_flat = system.manifold_of(step_state.state.q).is_flat
+    if not is_flat and method.chart != "middle":
+        return False
+    if system.nonholonomic is not None and method.closure == "consistent":
+        return False
+    return method.is_symmetric
