@@ -10,13 +10,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, PyTree
 
-from .._custom_types import Args, FloatScalar, IntScalar
+from .._custom_types import Args, BoolScalar, FloatScalar, IntScalar
 from .._errors import Check, DTypeError, is_traced, NonFiniteError
 from .._step import StepRecord
 from .._system import State
 from ._interpolation import step_position
-from ._log import LogEntry
-from ._stepper import Taken
 
 
 def save_state(t: FloatScalar, y: State, args: Any) -> State:
@@ -26,9 +24,9 @@ def save_state(t: FloatScalar, y: State, args: Any) -> State:
 
 
 class SaveAt(eqx.Module):
-    """The choice of what `integrate` saves of a trajectory.
+    """The output of `integrate`: which states of a trajectory it saves.
 
-    The options have the same meanings as those of `diffrax.SaveAt`.
+    The options have the same meanings as the options of `diffrax.SaveAt`.
 
     **Arguments:**
 
@@ -40,13 +38,13 @@ class SaveAt(eqx.Module):
         `t1=True` the final state is saved too, but not twice.
     - `dense`: save the collocation polynomials for `Solution.evaluate`.
     - `fn`: save `fn(t, y, args)` instead of y.
-    - `checkpoint`: save as `Solution.checkpoint` what a later run needs to go on bit
+    - `checkpoint`: save a `Solution.checkpoint`, from which a later run continues bit
         for bit; see `nhjax.Checkpoint`.
 
     The output has exactly as many entries as are saved. Saving every k-th step
     (`steps=k`) and saving at given times (`ts`) need no buffer of the length of the
-    run, unless `dense` asks for one. The samples at `ts` are computed after the run,
-    from the records of the steps that contain them.
+    run, unless `dense` needs one. The samples at `ts` are computed after the run, from
+    the records of the steps that contain them.
 
     **Raises:** `ValueError` if nothing is saved, a flag is not a bool, `steps` is not a
     bool or an int >= 1, `ts` is not a sorted vector, or `ts` and `steps` are given
@@ -87,8 +85,8 @@ class SaveAt(eqx.Module):
         for name, flag in flags.items():
             if not isinstance(flag, bool):
                 raise ValueError(
-                    f"SaveAt: `{name}` must be True or False, got {flag!r}; times "
-                    "belong in `ts`, and `integrate` sets the ends of the run."
+                    f"SaveAt: `{name}` must be True or False, got {flag!r}. Give times "
+                    "as `ts`, and the start and end of the run to `integrate`."
                 )
         if not isinstance(steps, int | np.integer) or steps < 0:
             raise ValueError(
@@ -96,13 +94,13 @@ class SaveAt(eqx.Module):
             )
         if not (t0 or t1 or dense or steps or checkpoint or ts is not None):
             raise ValueError(
-                "SaveAt: nothing is saved. Ask for some of `t0`, `t1`, `ts`, `steps`, "
-                "`dense`, `checkpoint`."
+                "SaveAt: nothing is saved. Give at least one of `t0`, `t1`, `ts`, "
+                "`steps`, `dense`, `checkpoint`."
             )
         if ts is not None and steps:
             raise ValueError(
-                "SaveAt: give `ts` or `steps`, not both; with `dense=True` the "
-                "solution can be evaluated anywhere afterwards."
+                "SaveAt: give `ts` or `steps`, not both. With `dense=True` the "
+                "solution can be evaluated at any time afterwards."
             )
         if not callable(fn):
             raise ValueError(
@@ -122,7 +120,7 @@ class SaveAt(eqx.Module):
     def checks(
         self, t0: FloatScalar, dt: FloatScalar, num_steps: int | IntScalar
     ) -> list[Check]:
-        """Make the checks of `ts` against a run; raise if nothing is saved in it."""
+        """Return the checks of `ts` for a run; raise if the run saves nothing."""
         if self.num_saved(num_steps) == 0 and not (self.dense or self.checkpoint):
             raise ValueError(
                 f"SaveAt: `steps={self.steps}` saves nothing in a run of {num_steps} "
@@ -131,8 +129,8 @@ class SaveAt(eqx.Module):
         if self.ts is None:
             return []
         ts = self.ts.astype(dt.dtype)
-        # Positions in units of steps make the checks the same for both directions of
-        # time and for all dtypes.
+        # In units of steps, the checks are the same for both directions of time and for
+        # all dtypes.
         position, inside = step_position(ts, t0, dt, static_length(num_steps))
         return [
             Check(jnp.all(inside), _outside, (ts, t0, dt, num_steps)),
@@ -146,13 +144,13 @@ class SaveAt(eqx.Module):
         return self.t0 + sampled + strided + self.saves_end(num_steps)
 
     def saves_end(self, num_steps: int | IntScalar) -> bool:
-        """Tell whether `t1` adds an entry for a final state that `steps` leaves out."""
+        """Return whether `t1` adds a final state that `steps` does not save."""
         last_is_saved = bool(self.steps) and static_length(num_steps) % self.steps == 0
         return self.t1 and not last_is_saved
 
 
 def static_length(num_steps: int | IntScalar) -> int:
-    """Return a number of steps that `check_num_steps` has made an int, as an int."""
+    """Return a number of steps that is known when tracing, as an int for the types."""
     assert isinstance(num_steps, int)
     return num_steps
 
@@ -185,7 +183,7 @@ def _times(ts: Any) -> Float[Array, " k"]:
         if is_traced(*jax.tree.leaves(ts)):
             ts = jnp.asarray(ts)
         else:
-            # Known times stay known inside of `jit`.
+            # Concrete times stay concrete inside `jit`.
             with jax.ensure_compile_time_eval():
                 ts = jnp.asarray(ts)
     except (TypeError, ValueError):
@@ -200,7 +198,7 @@ def _times(ts: Any) -> Float[Array, " k"]:
     if ts.ndim != 1 or ts.shape[0] == 0:
         raise ValueError(f"SaveAt: `ts` must have shape (k,), k >= 1, got {ts.shape}.")
     if not is_traced(ts):
-        # By NumPy: inside of `jit` operations of JAX on known numbers give none.
+        # NumPy is needed: inside `jit`, operations of JAX return traced values.
         known = np.asarray(ts)
         if not np.all(np.isfinite(known)):
             raise NonFiniteError(f"SaveAt: `ts` is not finite: {ts}.")
@@ -211,19 +209,21 @@ def _times(ts: Any) -> Float[Array, " k"]:
 
 
 class Rows(NamedTuple):
-    """The entries that one step saves, or the buffers with the entries of all steps.
+    """The entries that one iteration saves, or the buffers with the entries of all.
 
     - `saved`: the time and the value of `SaveAt(fn=...)`; None if steps save none.
     - `record`: the record of the step for interpolation; None if none is kept.
-    - `log`: the entry of an event for the log; None in a run that keeps none.
-    - `row`: in a run with events the index of the step whose rows these are, which may
-        be none; None in other runs, and in buffers.
+    - `log`: an entry of the stepper's log; None without a log.
+    - `row`: the index of the output row, if it can differ from the index of the
+        iteration; otherwise None, as in buffers.
+    - `log_slot`: the index of the entry in the log; None without a log and in buffers.
     """
 
     saved: PyTree[Array] | None
     record: StepRecord | None
-    log: LogEntry | None = None
+    log: PyTree[Array] | None = None
     row: Int[Array, ""] | None = None
+    log_slot: Int[Array, ""] | None = None
 
 
 class RecordPlaces(NamedTuple):
@@ -246,7 +246,7 @@ def record_places(
     if dense or sampled is None:
         return RecordPlaces(length, jnp.arange(length + 1, dtype=jnp.int32))
     # There is one row for each sample, and samples in the same step share the row of
-    # the first: there may be more steps than samples, and more samples than steps.
+    # the first. There may be more steps than samples, and more samples than steps.
     number = sampled.shape[0]
     slots = jnp.full((length + 1,), number, jnp.int32)
     first = slots.at[sampled].min(jnp.arange(number, dtype=jnp.int32))
@@ -254,61 +254,78 @@ def record_places(
 
 
 class Saving(eqx.Module):
-    """The choice of what the steps of a run save, and the places where they save it.
+    """What the iterations of a run save, and where in the buffers they save it.
 
     A run saves the value of `fn` at the state after every `stride`-th step (after none
-    if `stride` is 0), which makes `num_saved` entries, and `num_records` records of
-    steps. `num_saved` and `num_steps` are Python's integers where their values are
-    needed during tracing.
+    if `stride` is 0), which makes `num_saved` entries. It keeps `num_records` records
+    of steps, and `log_length` entries of the stepper's log. `num_steps` is used only if
+    steps save rows or records.
     """
 
     fn: Callable[[FloatScalar, State, Args], PyTree[Array]]
-    num_steps: int | Int[Array, ""]
+    num_steps: int = eqx.field(static=True)
     stride: int = eqx.field(static=True)
     num_saved: int = eqx.field(static=True)
     num_records: int = eqx.field(static=True)
     record_slots: Int[Array, " nodes"] | None
-    num_events: int = eqx.field(static=True, default=0)
+    log_length: int = eqx.field(static=True)
+
+    @classmethod
+    def of(
+        cls,
+        saveat: SaveAt,
+        fn: Callable[[FloatScalar, State, Args], PyTree[Array]],
+        num_steps: int | IntScalar,
+        places: RecordPlaces,
+        log_length: int,
+    ) -> "Saving":
+        """Return the choice that `saveat` makes, whose function is `fn`."""
+        needs_length = saveat.steps or places.slots is not None
+        length = static_length(num_steps) if needs_length else 0
+        return cls(
+            fn=fn,
+            num_steps=length,
+            stride=saveat.steps,
+            num_saved=length // saveat.steps if saveat.steps else 0,
+            num_records=places.number,
+            record_slots=places.slots,
+            log_length=log_length,
+        )
 
     def saved(self, t: FloatScalar, y: State, args: Args) -> PyTree[Array]:
         """Compute the entry that is saved of a state: its time, and `fn` at it."""
         return t, jax.tree.map(jnp.asarray, self.fn(t, y, args))
 
-    def rows(
-        self,
-        t: FloatScalar,
-        y: State,
-        args: Args,
-        taken: Taken,
-        k: Int[Array, ""],
-    ) -> Rows:
-        """Compute the rows that step k saves, which leads to the state y at t."""
-        return Rows(self._state_row(t, y, args, k), self._record_row(taken))
-
-    def _state_row(
+    def row_of_state(
         self, t: FloatScalar, y: State, args: Args, k: Int[Array, ""]
     ) -> PyTree[Array] | None:
+        """Compute what row k saves of the state y at t, if it saves anything."""
+
         def save():
             return self.saved(t, y, args)
 
         if self.stride <= 1:
             return save() if self.stride else None
-        nothing = jax.tree.map(
+        zeros = jax.tree.map(
             lambda x: jnp.zeros(x.shape, x.dtype), jax.eval_shape(save)
         )
-        return jax.lax.cond(self._slot(k) < self.num_saved, save, lambda: nothing)
+        return jax.lax.cond(self._slot(k) < self.num_saved, save, lambda: zeros)
 
-    def _record_row(self, taken: Taken) -> StepRecord | None:
+    def row_of_record(
+        self, record: StepRecord, is_good: BoolScalar
+    ) -> StepRecord | None:
+        """Return the record to save of a step, if records are saved.
+
+        After a failure, records describe a system at rest, so that dense output stays
+        at the last good state.
+        """
         if not self.num_records:
             return None
-        # After a failure the records are those of a system at rest, so that dense
-        # output stays at the last good state.
-        record, good = taken
         return StepRecord(
             record.start,
-            jnp.where(good, record.velocity, 0),
-            jnp.where(good, record.force, 0),
-            jnp.where(good, record.multiplier, record.start.multiplier),
+            jnp.where(is_good, record.velocity, 0),
+            jnp.where(is_good, record.force, 0),
+            jnp.where(is_good, record.multiplier, record.start.multiplier),
         )
 
     def _slot(self, k: Int[Array, ""]) -> Int[Array, ""]:
@@ -316,9 +333,9 @@ class Saving(eqx.Module):
         return jnp.where(kept, (k + 1) // self.stride - 1, self.num_saved)
 
     def empty(self, row: Rows) -> Rows:
-        """Make buffers of zeros for all rows that are saved, and for one more.
+        """Return buffers of zeros for all rows that are saved, and for one extra row.
 
-        `row` is what one step saves; its arrays may be given by their shapes alone.
+        `row` is what one iteration saves, as arrays or as their shapes.
         """
 
         def buffers(length, tree):
@@ -329,11 +346,14 @@ class Saving(eqx.Module):
         return Rows(
             buffers(self.num_saved, row.saved),
             buffers(self.num_records, row.record),
-            buffers(self.num_events, row.log),
+            buffers(self.log_length, row.log),
         )
 
     def write(self, buffers: Rows, rows: Rows, k: Int[Array, ""]) -> Rows:
-        """Write the rows of step k to their places; save nothing if k >= num_steps."""
+        """Write the rows of iteration k to their places.
+
+        Rows with an index of `num_steps` or more go to the extra row.
+        """
 
         def put(buffer, row, slot):
             return jax.tree.map(
@@ -342,12 +362,10 @@ class Saving(eqx.Module):
                 row,
             )
 
-        saved, records, log, _ = buffers
-        if rows.row is not None:
-            # Steps that are cut have iterations of their own, but no more rows.
-            k = rows.row
+        saved, records, log = buffers[:3]
+        k = k if rows.row is None else rows.row
         if rows.log is not None:
-            log = put(log, rows.log, rows.log.slot)
+            log = put(log, rows.log, rows.log_slot)
         if self.stride:
             saved = put(saved, rows.saved, self._slot(k))
         if self.record_slots is not None:
@@ -356,20 +374,16 @@ class Saving(eqx.Module):
         return Rows(saved, records, log)
 
     def read(
-        self, buffers: Rows, k: Int[Array, ""], event: Int[Array, ""] | None = None
+        self, buffers: Rows, k: Int[Array, ""], log_slot: Int[Array, ""] | None = None
     ) -> Rows:
-        """Read the rows of step k from the buffers, from where `write` puts them.
-
-        In a run with events k is the row that an iteration fills, and `event` the place
-        of the event in the log.
-        """
+        """Read output row k and an entry of the log, from where `write` puts them."""
 
         def get(buffer, slot):
             return jax.tree.map(lambda x: x[slot], buffer)
 
-        saved, records, log, _ = buffers
+        saved, records, log = buffers[:3]
         if log is not None:
-            log = get(log, event)
+            log = get(log, log_slot)
         if self.stride:
             saved = get(saved, self._slot(k))
         if self.record_slots is not None:

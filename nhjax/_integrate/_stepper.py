@@ -1,17 +1,25 @@
-"""The steps of a run: the loop carry, one step forward and one step back."""
+"""The stepper protocol, by which the time loop advances, and the plain stepper.
+
+A stepper has a carry of its own, which goes from one iteration of the loop to the next:
+`init` makes it, `advance` performs one iteration, and `finish` returns the end of the
+run. The plain stepper takes one step of the method in each iteration. The stepper of
+runs with events, in the room `_events`, is built on it. The loop and the adjoints work
+with any stepper.
+"""
 
 from abc import abstractmethod
-from typing import Any, NamedTuple, TypeAlias
+from dataclasses import replace
+from typing import Any, Generic, NamedTuple, TypeAlias, TypeVar
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float, Int, PyTree
 
 from .._compile import Programs
-from .._custom_types import Args, BoolScalar, FloatScalar
+from .._custom_types import Args, BoolScalar, FloatScalar, IntScalar
 from .._method import AbstractMethod
-from .._numerics import iterate, max_norm, Sizes, tree_where
+from .._numerics import iterate, max_norm, nan_gradient_unless, Sizes, tree_where
 from .._results import RESULTS
 from .._step import (
     AbstractStageSolver,
@@ -36,45 +44,170 @@ from .._system import (
 )
 from ._checkpoint import Checkpoint, Origin, resumed
 from ._conservation import conserves
-from ._progress import Progress
 
 
 Statistics: TypeAlias = dict[str, Any]
 
 
-class Carry(NamedTuple):
-    """The data that the time loop carries from one step to the next.
+class AbstractCarry(eqx.Module):
+    """The data that the time loop carries from one iteration to the next."""
 
-    Derivatives pass through `step_state` alone, and in a run with events through the
-    time in `progress`, which other runs do not have.
+    step_state: eqx.AbstractVar[StepState]
+    result: eqx.AbstractVar[RESULTS]
+    stats: eqx.AbstractVar[Statistics]
+
+
+class StepResult(NamedTuple):
+    """What one iteration of the time loop offers to save.
+
+    - `t`: the time that the iteration reached.
+    - `record`: the record of the step, for interpolation.
+    - `is_good`: whether a step was taken and solved.
+    - `row`: the index of the output row that the iteration fills, equal to the number
+        of steps if it fills none. It is None if iteration k always fills row k.
+    - `log_entry`, `log_slot`: an entry for the log of the stepper and its index there,
+        equal to the length of the log if nothing is logged. They are None for a stepper
+        without a log.
     """
+
+    t: FloatScalar
+    record: StepRecord
+    is_good: BoolScalar
+    row: Int[Array, ""] | None = None
+    log_entry: PyTree[Array] | None = None
+    log_slot: Int[Array, ""] | None = None
+
+
+Rows = TypeVar("Rows")
+Log = TypeVar("Log")
+
+
+class RunEnd(NamedTuple, Generic[Rows, Log]):
+    """The end of a run: its state and time, the saved rows, and the log reported.
+
+    The `log` is None for a stepper without a log.
+    """
+
+    state: State
+    t: FloatScalar
+    rows: Rows
+    log: Log
+
+
+C = TypeVar("C", bound=AbstractCarry)
+# What a reverse replay knows about an iteration besides its state.
+R = TypeVar("R")
+
+
+class AbstractStepper(eqx.Module, Generic[C, R]):
+    """The way in which the time loop of a run advances."""
+
+    # The stepper that takes single steps of the method.
+    plain: eqx.AbstractVar["PlainStepper"]
+
+    @property
+    @abstractmethod
+    def num_iterations(self) -> int | IntScalar:
+        """Return the number of iterations within which the run is certain to end."""
+
+    @property
+    @abstractmethod
+    def log_length(self) -> int:
+        """Return the number of entries for which the log has room, 0 without a log."""
+
+    @abstractmethod
+    def with_round_off(self, round_off: RoundOff) -> "AbstractStepper[C, R]":
+        """Return the same stepper with the measured round-off of the system."""
+
+    @abstractmethod
+    def init(self, y0: State | Checkpoint, noise: FunctionNoise | None) -> C:
+        """Return the carry before the first iteration.
+
+        The `noise` of the functions of the system is needed for a state. A checkpoint
+        already holds the quantities that follow from it.
+        """
+
+    @abstractmethod
+    def advance(
+        self, carry: C, i: Int[Array, ""], replay: R | None = None
+    ) -> tuple[C, StepResult]:
+        """Perform iteration i. A run that has ended or failed keeps its state.
+
+        With `replay` the iteration is repeated as a reverse replay found it.
+        """
+
+    @abstractmethod
+    def blank_result(self, carry: C) -> StepResult:
+        """Return a step result of the right shapes, without tracing a step."""
+
+    @abstractmethod
+    def succeeded(self, carry: C) -> BoolScalar:
+        """Return whether the run came to its end without a failure."""
+
+    @abstractmethod
+    def finish(
+        self, carry: C, rows: Rows, log: PyTree[Array] | None, given: Any
+    ) -> RunEnd[Rows, Any]:
+        """Return the end of the run, from the last carry and all that was saved.
+
+        If the run failed, the derivatives with respect to all that was `given` are NaN.
+        """
+
+    @abstractmethod
+    def differentiable(self, carry: C) -> PyTree[Array]:
+        """Return the nodes of a carry, or of its cotangent, that have derivatives."""
+
+    @abstractmethod
+    def reverse_replay(
+        self, start: C, end: C, log: PyTree[Array] | None
+    ) -> "AbstractReverseReplay[C, R]":
+        """Return the replay of a run from its `end` back to its `start`."""
+
+
+class AbstractReverseReplay(eqx.Module, Generic[C, R]):
+    """The replay of a run from its end, which finds where each iteration started."""
+
+    @property
+    @abstractmethod
+    def after_end(self) -> R:
+        """Return what `back` needs to know for the last iteration."""
+
+    @abstractmethod
+    def back(
+        self, following: R, step_state: StepState, i: Int[Array, ""]
+    ) -> tuple[R, StepState]:
+        """Find what iteration i did and the state it started from.
+
+        `following` and `step_state` belong to the iteration after it.
+        """
+
+    @abstractmethod
+    def carry_before(self, replay: R, step_state: StepState, i: Int[Array, ""]) -> C:
+        """Return a carry from which `advance(carry, i, replay)` repeats iteration i."""
+
+    @abstractmethod
+    def places(
+        self, replay: R, i: Int[Array, ""]
+    ) -> tuple[Int[Array, ""], Int[Array, ""] | None]:
+        """Return the output row that iteration i filled, and its place in the log."""
+
+
+class PlainCarry(AbstractCarry):
+    """The carry of a run without events. Derivatives pass through the state alone."""
 
     step_state: StepState
     result: RESULTS
     stats: Statistics
-    progress: Progress | None = None
 
 
-def progress_of(carry: Carry) -> Progress:
-    """Return the progress of a run that has events."""
-    assert carry.progress is not None
-    return carry.progress
+class PlainStepper(AbstractStepper[PlainCarry, None]):
+    """One step of the method per iteration, from node to node.
 
-
-class Taken(NamedTuple):
-    """The record of a step that was taken, and whether the step was solved."""
-
-    record: StepRecord
-    good: BoolScalar
-
-
-class Stepping(eqx.Module):
-    """The system, method and options of a run, with functions that take its steps.
-
-    `programs` keeps the program of a step, which is the same for each way in which the
-    run is differentiated. The first step is number `origin.first_step` of those counted
-    from `origin.t0`. The `round_off` of the functions of the system is measured at the
-    start; see `round_off_at`.
+    - `programs`: the traced program of a step, shared by all derivatives of the run.
+    - `origin`: where times and steps are counted from. The first step of the run has
+        the number `origin.first_step`.
+    - `round_off`: the round-off of the functions of the system, measured at the start;
+        see `round_off_at`.
     """
 
     system: AbstractMechanicalSystem
@@ -85,20 +218,36 @@ class Stepping(eqx.Module):
     args: Args
     invariants: Invariants | None
     programs: Programs
-    round_off: RoundOff | None = None
+    round_off: RoundOff | None
+    num_steps: int | IntScalar
 
-    def time(self, k: Int[Array, ""] | int) -> FloatScalar:
+    @property
+    def plain(self) -> "PlainStepper":
+        """Return this stepper."""
+        return self
+
+    @property
+    def num_iterations(self) -> int | IntScalar:
+        """Return the number of steps."""
+        return self.num_steps
+
+    @property
+    def log_length(self) -> int:
+        """Return 0: nothing is logged."""
+        return 0
+
+    def with_round_off(self, round_off: RoundOff) -> "PlainStepper":
+        """Return the same stepper with the measured round-off of the system."""
+        return replace(self, round_off=round_off)
+
+    def time(self, k: Int[Array, ""] | IntScalar | int) -> FloatScalar:
         """Compute the time t_k as a product, since a running sum of dt would drift."""
         t0, first_step, shift = self.origin
         number = (first_step + k).astype(self.dt.dtype)
         return t0 + number * self.dt + shift
 
-    def start(self, y0: State | Checkpoint, noise: FunctionNoise | None) -> Carry:
-        """Make the carry of the time loop before the first step.
-
-        The noise of the functions of the system is given with a state, not with a
-        checkpoint, which has what follows from it.
-        """
+    def init(self, y0: State | Checkpoint, noise: FunctionNoise | None) -> PlainCarry:
+        """Return the carry before the first step, with a failure if it cannot start."""
         system, t, args = self.system, self.time(0), self.args
         checkpoint = y0 if isinstance(y0, Checkpoint) else None
         if isinstance(y0, Checkpoint):
@@ -116,16 +265,18 @@ class Stepping(eqx.Module):
             RESULTS.inconsistent_start,
         )
         if y0.multiplier.shape[0] > 1:
-            # That of one constraint is found singular by the first step.
+            # With a single constraint, the first step detects a singular matrix.
             result = RESULTS.where(
                 (result == RESULTS.successful) & ~step_state.lin.determines_multipliers,
                 RESULTS.singular_stage_matrix,
                 result,
             )
         if self.invariants is not None:
-            kept = conserves(system, self.invariants, t, self.dt, y0, args)
+            conserved = conserves(system, self.invariants, t, self.dt, y0, args)
             result = RESULTS.where(
-                (result == RESULTS.successful) & ~kept, RESULTS.not_conserved, result
+                (result == RESULTS.successful) & ~conserved,
+                RESULTS.not_conserved,
+                result,
             )
         result = RESULTS.where(all_finite(y0), result, RESULTS.nonfinite_state)
         violation = largest_violation(system, t, step_state, args)
@@ -135,15 +286,15 @@ class Stepping(eqx.Module):
             stats["max_invariant_error"] = jnp.zeros_like(violation)
         if self.method.embedded_difference is not None:
             stats["max_error_ratios"] = jnp.zeros((2,), violation.dtype)
-        return Carry(step_state, result, stats)
+        return PlainCarry(step_state, result, stats)
 
     def round_off_at(
         self, y0: State | Checkpoint, first: StepState, noise: FunctionNoise | None
     ) -> RoundOff:
-        """Compute the round-off of steps from the noise of the functions.
+        """Compute the round-off of steps from the noise of the system's functions.
 
-        A checkpoint holds the value of the first run: a resumed run takes the same
-        steps.
+        A checkpoint holds the value of the first run, so that a resumed run takes the
+        same steps.
         """
         if isinstance(y0, Checkpoint):
             return jax.lax.stop_gradient(RoundOff.of_arrays(y0.round_off))
@@ -153,57 +304,176 @@ class Stepping(eqx.Module):
     def one_step(
         self, step_state: StepState, t: FloatScalar, h: FloatScalar, skip: BoolScalar
     ) -> StepOutcome:
-        """Take one step of size h from t; h may be negative, to go back."""
+        """Take one step of size h from t. A negative h goes back."""
         start = step_state.differentiated_in_state()
         given = self.system, t, h, start, self.args, self.invariants, self.round_off
         arguments = StepArguments(*given)
         method, stage_solver = self.method, self.stage_solver
         return primitive_step(arguments, method, stage_solver, skip, self.programs)
 
-    def nothing_taken(self, carry: Carry) -> Taken:
-        """Make the record of a step that was not taken, all zeros at the stages."""
+    def advance(
+        self, carry: PlainCarry, i: Int[Array, ""], replay: None = None
+    ) -> tuple[PlainCarry, StepResult]:
+        """Take step i. A run that has failed keeps its last good state."""
+        del replay
+        alive = carry.result == RESULTS.successful
+        outcome = self.one_step(carry.step_state, self.time(i), self.dt, ~alive)
+        good = alive & (outcome.result == RESULTS.successful)
+        step_state = tree_where(good, outcome.step_state, carry.step_state)
+        # JAX differentiates the body of a loop repeatedly, until it knows which parts
+        # of the carry have derivatives. This tells it the first time.
+        step_state = step_state.differentiated_in_state()
+        result = RESULTS.where(alive, outcome.result, carry.result)
+        stats = updated_statistics(carry.stats, outcome, alive, good, i)
+        carry = PlainCarry(step_state, result, jax.lax.stop_gradient(stats))
+        return carry, StepResult(self.time(i + 1), outcome.record, good)
+
+    def blank_result(self, carry: AbstractCarry) -> StepResult:
+        """Return the result of no step, with zeros at the stages."""
         state = carry.step_state.state
 
         def at_stages(x: Array) -> Array:
             return jnp.zeros((self.method.stages, *x.shape), x.dtype)
 
         stages = map(at_stages, (state.v, state.p, state.multiplier))
-        return Taken(StepRecord(state, *stages), jnp.zeros((), bool))
+        record = StepRecord(state, *stages)
+        return StepResult(self.time(0), record, jnp.zeros((), bool))
 
-    def advance(self, carry: Carry, k: Int[Array, ""]) -> tuple[Carry, Taken]:
-        """Take step k; a trajectory that has failed keeps its last good state."""
-        alive = carry.result == RESULTS.successful
-        outcome = self.one_step(carry.step_state, self.time(k), self.dt, ~alive)
-        good = alive & (outcome.result == RESULTS.successful)
-        step_state = tree_where(good, outcome.step_state, carry.step_state)
-        # A loop is differentiated again and again until it is known which parts of its
-        # carry have derivatives: here it is known from the first time on.
-        step_state = step_state.differentiated_in_state()
-        result = RESULTS.where(alive, outcome.result, carry.result)
-        stats = updated_statistics(carry.stats, outcome, alive, good, k)
-        carry = Carry(step_state, result, jax.lax.stop_gradient(stats))
-        return carry, Taken(outcome.record, good)
+    def succeeded(self, carry: PlainCarry) -> BoolScalar:
+        """Return whether all steps were solved."""
+        return carry.result == RESULTS.successful
+
+    def finish(
+        self, carry: PlainCarry, rows: Rows, log: None, given: Any
+    ) -> RunEnd[Rows, None]:
+        """Return the end of the run, at the last node."""
+        del log
+        t1 = self.time(self.num_steps)
+        found = carry.step_state.state, rows
+        state, rows = nan_gradient_unless(self.succeeded(carry), found, given)
+        return RunEnd(state, t1, rows, None)
+
+    def differentiable(self, carry: PlainCarry) -> State:
+        """Return the state, or its cotangent."""
+        return carry.step_state.state
+
+    def reverse_replay(
+        self, start: PlainCarry, end: PlainCarry, log: None
+    ) -> "PlainReverseReplay":
+        """Return the replay of a run, step by step."""
+        del end, log
+        return PlainReverseReplay(self, start)
+
+    def checkpoint(
+        self, round_off: RoundOff, carry: AbstractCarry, end: State
+    ) -> Checkpoint:
+        """Return the checkpoint after the last step.
+
+        `end` is the last state with the derivatives that the checkpoint is to have, and
+        `round_off` the one that the run started with.
+        """
+        origin, last = self.origin, carry.step_state
+        return Checkpoint(
+            end,
+            last.q_compensation,
+            last.p_compensation,
+            tuple(jax.tree.leaves(last.lin)),
+            tuple(jax.tree.leaves(round_off)),
+            origin.t0 + origin.shift,
+            self.dt,
+            origin.first_step + carry.stats["num_steps"],
+        )
 
 
-def as_checkpoint(
-    stepping: Stepping, round_off: RoundOff, carry: Carry, end: State
-) -> Checkpoint:
-    """Make the checkpoint of what is carried after the last step, with the state `end`.
+class PlainReverseReplay(AbstractReverseReplay[PlainCarry, None]):
+    """The replay of a run without events: the index of a step says where it started."""
 
-    That is the last state with the derivatives that it is to have. The round-off is the
-    one that the run started with.
-    """
-    origin, last = stepping.origin, carry.step_state
-    return Checkpoint(
-        end,
-        last.q_compensation,
-        last.p_compensation,
-        tuple(jax.tree.leaves(last.lin)),
-        tuple(jax.tree.leaves(round_off)),
-        origin.t0 + origin.shift,
-        stepping.dt,
-        origin.first_step + carry.stats["num_steps"],
-    )
+    stepper: PlainStepper
+    start: PlainCarry
+
+    @property
+    def after_end(self) -> None:
+        """Return None: only the state needs to be known."""
+        return None
+
+    def back(
+        self, following: None, step_state: StepState, i: Int[Array, ""]
+    ) -> tuple[None, StepState]:
+        """Find the state that step i started from."""
+        stepper = self.stepper
+        interval = StepInterval(stepper.time(i), stepper.time(i + 1), stepper.dt)
+        return None, step_back(stepper, step_state, interval)
+
+    def carry_before(
+        self, replay: None, step_state: StepState, i: Int[Array, ""]
+    ) -> PlainCarry:
+        """Return the carry before step i."""
+        return PlainCarry(step_state, self.start.result, self.start.stats)
+
+    def places(self, replay: None, i: Int[Array, ""]) -> tuple[Int[Array, ""], None]:
+        """Return the index of the step: step i fills row i."""
+        return i, None
+
+
+class StepInterval(NamedTuple):
+    """The time interval of a step that is to be undone, and the size of the step."""
+
+    start: FloatScalar
+    end: FloatScalar
+    size: FloatScalar
+
+
+def step_back(
+    stepper: PlainStepper, step_state: StepState, interval: StepInterval
+) -> StepState:
+    """Compute the state that a step started from, given the state that it led to."""
+    run = jnp.asarray(False)
+
+    def back_from(step_state: StepState) -> StepState:
+        t, h = interval.end, -interval.size
+        return stepper.one_step(step_state, t, h, run).step_state
+
+    if _is_undone_by_negative_step(stepper, step_state):
+        return back_from(step_state)
+
+    # Let y be the end of a step back from z. Each iteration moves z by the difference
+    # between `step_state` and the end of the step forward from y. The two steps undo
+    # each other up to a small error, so this iteration converges far faster than one
+    # that moves y.
+    target = step_state.state
+    manifold = stepper.system.manifold_of(target.q)
+    propagated = stepper.method.closure == "propagated"
+
+    def move(z: State):
+        y = back_from(eqx.tree_at(lambda x: x.state, step_state, z))
+        t, h = interval.start, interval.size
+        reached = stepper.one_step(y, t, h, run).step_state.state
+        to_reached = manifold.inverse(reached.q)
+        xi = manifold.local(manifold.compose(to_reached, target.q))
+        misses = [xi, target.p - reached.p]
+        multiplier = z.multiplier
+        if propagated:
+            miss = target.multiplier - reached.multiplier
+            misses.append(interval.size * miss)
+            multiplier = multiplier + miss
+        size = max_norm(*misses)
+        z = State(manifold.act(z.q, xi), z.v, z.p + misses[1], multiplier)
+        return z, Sizes(size), y
+
+    scale = 1 + max_norm(target.p)
+    limit = stepper.stage_solver.max_iterations
+    return iterate(move, target, scale, max_iterations=limit).aux
+
+
+def _is_undone_by_negative_step(stepper: PlainStepper, step_state: StepState) -> bool:
+    """Return whether a step of -h undoes a step of h, up to round-off."""
+    system, method = stepper.system, stepper.method
+    is_flat = system.manifold_of(step_state.state.q).is_flat
+    if not is_flat and method.chart != "middle":
+        return False
+    if system.nonholonomic is not None and method.closure == "consistent":
+        return False
+    return method.is_symmetric
 
 
 def is_consistent(
@@ -213,14 +483,13 @@ def is_consistent(
     args: Args,
     violations: tuple[Float[Array, " l"], Float[Array, " k"]],
 ) -> BoolScalar:
-    """Tell whether the initial state is consistent, up to small errors.
+    """Return whether a state is consistent, up to small errors.
 
-    `violations` are those of constraints that are round-off.
-
-    It is if it lies on the group, satisfies the constraints, and its v and p belong
-    together by the Legendre transform. The bound on the errors is meant to find a state
-    of another system, or one of which a single part was changed by hand. It is large
-    enough for the perturbations by which derivatives are approximated.
+    A consistent state lies on the group and satisfies the constraints, and the Legendre
+    transform maps its v to its p. `violations` are the constraint violations that count
+    as round-off. The bound on the errors detects a state of another system, and one of
+    which a single part was changed by hand. It is large enough for the perturbations of
+    finite differences.
     """
     y, lin = start.state, start.lin
     small = float(jnp.finfo(y.p.dtype).eps) ** 0.25
@@ -238,12 +507,12 @@ def is_consistent(
 def first_statistics(
     violation: FloatScalar, redundant: Int[Array, ""], is_good: BoolScalar
 ) -> Statistics:
-    """Make the statistics of a run before its first step.
+    """Return the statistics of a run before its first step.
 
     **Arguments:**
 
     - `violation`: the largest constraint violation of the initial state.
-    - `redundant`: how many constraints follow from others at the initial state.
+    - `redundant`: the number of redundant constraints at the initial state.
     - `is_good`: whether the run can start; otherwise step 0 counts as failed.
     """
     zero, none = jnp.zeros_like(violation), jnp.zeros((), jnp.int32)
@@ -261,7 +530,7 @@ def first_statistics(
 
 
 def reported_statistics(stats: Statistics, method: AbstractMethod) -> Statistics:
-    """Make the statistics that a solution has, of those that are carried."""
+    """Return the statistics of a solution, from the statistics in the carry."""
     stats = dict(stats)
     ratios = stats.pop("max_error_ratios", None)
     if ratios is not None:
@@ -276,13 +545,13 @@ def updated_statistics(
     good: BoolScalar,
     k: Int[Array, ""],
 ) -> Statistics:
-    """Update the statistics of a run after its step k.
+    """Return the statistics of a run after its step k.
 
     **Arguments:**
 
     - `stats`: the statistics before the step.
     - `outcome`: the outcome of the step.
-    - `alive`: whether the run had not failed before, so that the step was taken.
+    - `alive`: whether the step was taken, because the run had not failed before.
     - `good`: whether the step was taken and solved.
     - `k`: the index of the step.
     """
@@ -315,119 +584,3 @@ def updated_statistics(
             failed, outcome.worst_coordinate, stats["worst_coordinate"]
         ),
     }
-
-
-class AbstractStepInterval(eqx.Module):
-    """The time interval of a step that is to be retraced."""
-
-    @property
-    @abstractmethod
-    def start(self) -> FloatScalar:
-        """Return the time at which the step started."""
-
-    @property
-    @abstractmethod
-    def end(self) -> FloatScalar:
-        """Return the time at which the step ended."""
-
-    @property
-    @abstractmethod
-    def size(self) -> FloatScalar:
-        """Return the size of the step."""
-
-
-class WholeStep(AbstractStepInterval):
-    """The time interval of step k of a run without events."""
-
-    stepping: Stepping
-    k: Int[Array, ""]
-
-    @property
-    def start(self) -> FloatScalar:
-        """Return the time t_k at which the step started."""
-        return self.stepping.time(self.k)
-
-    @property
-    def end(self) -> FloatScalar:
-        """Return the time t_{k+1} at which the step ended."""
-        return self.stepping.time(self.k + 1)
-
-    @property
-    def size(self) -> FloatScalar:
-        """Return the step size dt."""
-        return self.stepping.dt
-
-
-class PartOfStep(AbstractStepInterval):
-    """The time interval of a part of a step, from a time `since`, of some `length`."""
-
-    since: FloatScalar
-    length: FloatScalar
-
-    @property
-    def start(self) -> FloatScalar:
-        """Return the time at which the step started."""
-        return self.since
-
-    @property
-    def end(self) -> FloatScalar:
-        """Return the time at which the step ended."""
-        return self.since + self.length
-
-    @property
-    def size(self) -> FloatScalar:
-        """Return the size of the step."""
-        return self.length
-
-
-def step_back(
-    stepping: Stepping, step_state: StepState, interval: AbstractStepInterval
-) -> StepState:
-    """Compute the state that a step started from, given the one that it led to."""
-    go_on = jnp.asarray(False)
-
-    def back_from(step_state: StepState) -> StepState:
-        t, h = interval.end, -interval.size
-        return stepping.one_step(step_state, t, h, go_on).step_state
-
-    if _retraces(stepping, step_state):
-        return back_from(step_state)
-
-    # Let y be the end of a step back from z. Each sweep moves z by the difference
-    # between `step_state` and the end of the step forward from y. The two steps undo
-    # each other up to a small error, so that this iteration contracts far faster than
-    # one that moves y would.
-    target = step_state.state
-    manifold = stepping.system.manifold_of(target.q)
-    propagated = stepping.method.closure == "propagated"
-
-    def sweep(z: State):
-        y = back_from(eqx.tree_at(lambda x: x.state, step_state, z))
-        t, h = interval.start, interval.size
-        reached = stepping.one_step(y, t, h, go_on).step_state.state
-        to_reached = manifold.inverse(reached.q)
-        xi = manifold.local(manifold.compose(to_reached, target.q))
-        misses = [xi, target.p - reached.p]
-        multiplier = z.multiplier
-        if propagated:
-            miss = target.multiplier - reached.multiplier
-            misses.append(interval.size * miss)
-            multiplier = multiplier + miss
-        size = max_norm(*misses)
-        z = State(manifold.act(z.q, xi), z.v, z.p + misses[1], multiplier)
-        return z, Sizes(size), y
-
-    scale = 1 + max_norm(target.p)
-    limit = stepping.stage_solver.max_iterations
-    return iterate(sweep, target, scale, max_iterations=limit).aux
-
-
-def _retraces(stepping: Stepping, step_state: StepState) -> bool:
-    """Tell whether a step of -h undoes a step of h, up to round-off."""
-    system, method = stepping.system, stepping.method
-    is_flat = system.manifold_of(step_state.state.q).is_flat
-    if not is_flat and method.chart != "middle":
-        return False
-    if system.nonholonomic is not None and method.closure == "consistent":
-        return False
-    return method.is_symmetric

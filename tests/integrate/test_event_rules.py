@@ -267,7 +267,10 @@ def test_functions_that_return_something_else_are_refused(message):
     [
         ({"saveat": SaveAt(dense=True)}, "Save at `steps`"),
         ({"saveat": SaveAt(ts=[0.5])}, "Save at `steps`"),
-        ({"saveat": SaveAt(t1=True, checkpoint=True)}, "Go on from its last state"),
+        (
+            {"saveat": SaveAt(t1=True, checkpoint=True)},
+            "Start another run from the last state",
+        ),
         ({"invariants": "energy"}, "Leave out one"),
     ],
 )

@@ -38,7 +38,7 @@ def test_max_iterations(solver, count):
 @pytest.mark.parametrize(
     ("arguments", "exception", "message"),
     [
-        ({}, ValueError, "nothing is saved. Ask for some of `t0`"),
+        ({}, ValueError, "nothing is saved. Give at least one of `t0`"),
         ({"steps": 0}, ValueError, "nothing is saved"),
         ({"steps": -3}, ValueError, "`steps` must be a bool or an int >= 1, got -3"),
         ({"steps": 2.0}, ValueError, "`steps`.*got 2.0"),

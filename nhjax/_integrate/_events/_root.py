@@ -7,12 +7,12 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from .._compile import as_cpu_kernel, Programs
-from .._custom_types import BoolScalar, FloatScalar
-from .._method import AbstractMethod
-from .._numerics import has_tangent, nan_tangent_unless, zero_unless
-from .._results import RESULTS
-from .._step import (
+from ..._compile import as_cpu_kernel, Programs
+from ..._custom_types import BoolScalar, FloatScalar
+from ..._method import AbstractMethod
+from ..._numerics import has_tangent, nan_tangent_unless, zero_unless
+from ..._results import RESULTS
+from ..._step import (
     AbstractStageSolver,
     change_of_step,
     primitive_step,
@@ -20,12 +20,11 @@ from .._step import (
     StepOutcome,
     tangent_of_outcome,
 )
-from .._system import State
-from ._event import Conditions, with_continuous_multiplier
-from ._progress import Sides
+from ..._system import State
+from ._event import Conditions, ConditionSigns, with_continuous_multiplier
 
 
-class Cut(NamedTuple):
+class TruncatedStep(NamedTuple):
     """A step to a node or to an event.
 
     - `outcome`: the outcome of the step.
@@ -42,70 +41,72 @@ class Cut(NamedTuple):
     crossed: Bool[Array, " e"]
 
 
-class CutOptions(eqx.Module):
-    """How a step is taken: by which method and stage solver, and whether it is cut.
+class TruncationOptions(eqx.Module):
+    """How a step is taken, and whether it is truncated.
 
-    - `skip`: whether nothing is to be done, and the result to be discarded.
-    - `sides`: the sides of zero of the conditions at the start of the step.
-    - `is_cut`: whether there is an event in the step, where it is to be cut.
-    - `far`: the conditions at the end of the whole step, if so.
-    - `known`: the event at which the step of the given size is known to end, -1 if at
-        none; None if it is to be found.
+    - `skip`: whether to do nothing, because the result is discarded.
+    - `signs`: the signs of the conditions at the start of the step.
+    - `truncates`: whether to truncate the step at the first event in it.
+    - `values_at_end`: in that case the conditions at the end of the whole step.
+    - `known_event`: the event at which a step of the given size is known to end, -1 for
+        none; None if the event must be searched for.
     """
 
     method: AbstractMethod = eqx.field(static=True)
     stage_solver: AbstractStageSolver
     skip: BoolScalar
-    sides: Sides
-    is_cut: BoolScalar
-    far: Float[Array, " e"]
-    known: Int[Array, ""] | None
+    signs: ConditionSigns
+    truncates: BoolScalar
+    values_at_end: Float[Array, " e"]
+    known_event: Int[Array, ""] | None
 
     def without_start_zero(
         self, values: Float[Array, " e"], h: FloatScalar
     ) -> Float[Array, " e"]:
         """Divide the conditions that are zero at the start by the size of the step.
 
-        This removes the zero at the start; their other zeros stay where they are.
+        This removes the zero at the start and keeps all other zeros.
         """
-        return jnp.where(self.sides.at_zero, values / jnp.abs(h), values)
+        return jnp.where(self.signs.at_zero, values / jnp.abs(h), values)
 
 
 @eqx.filter_custom_jvp
-def differentiable_cut_step(
+def differentiable_truncated_step(
     arguments: StepArguments,
     conditions: Conditions,
-    options: CutOptions,
+    options: TruncationOptions,
     programs: Programs,
-) -> Cut:
-    """Take a step of size h, or of the size θ h at whose end the first event is.
+) -> TruncatedStep:
+    """Take a step of size h, or of size θ h if it is truncated at the first event.
 
-    The size θ h of a step that is cut is a root of g(t + θ h, y(θ h)), where g is the
+    The size θ h of a truncated step is a root of g(t + θ h, y(θ h)), where g is the
     condition of the event and y the end of the step, so that
 
     d(θ h) = - (∂g/∂h)⁻¹ dg,
 
-    with dg at fixed size. A size that does not change g has no derivative: it is NaN.
+    with dg at fixed size. If g does not change with the size, the derivative is NaN.
     """
     h, none = arguments.h, -jnp.ones((), jnp.int32)
     found = _Found(h, none, RESULTS.successful)
-    if options.known is not None:
-        found = found._replace(fired=options.known)
+    if options.known_event is not None:
+        found = found._replace(fired=options.known_event)
     else:
         found = jax.lax.cond(
-            options.is_cut,
+            options.truncates,
             lambda: _first(arguments, conditions, options, programs),
             lambda: found,
         )
-    cut = _trial(arguments, conditions, options, programs, found.h)
+    step = _trial(arguments, conditions, options, programs, found.h)
     result = RESULTS.where(
-        found.result == RESULTS.successful, cut.outcome.result, found.result
+        found.result == RESULTS.successful, step.outcome.result, found.result
     )
-    return cut._replace(outcome=cut.outcome._replace(result=result), fired=found.fired)
+    return step._replace(
+        outcome=step.outcome._replace(result=result), fired=found.fired
+    )
 
 
 class _Found(NamedTuple):
-    """The size of a step that is cut, and its event; or why it was not found."""
+    """The size of a truncated step and its event, or why the search failed."""
 
     h: FloatScalar
     fired: Int[Array, ""]
@@ -115,22 +116,28 @@ class _Found(NamedTuple):
 def _first(
     arguments: StepArguments,
     conditions: Conditions,
-    options: CutOptions,
+    options: TruncationOptions,
     programs: Programs,
 ) -> _Found:
-    """Find the first event in a step, by steps of different sizes from its start."""
-    h, sign = arguments.h, options.sides.sign
-    far = options.without_start_zero(options.far, h)
+    """Find the first event in a step, by steps of other sizes from the same start."""
+    h, sign = arguments.h, options.signs.sign
+    values_at_end = options.without_start_zero(options.values_at_end, h)
     one = jnp.ones((), h.dtype)
-    whole = Bracket.open_from(options.sides.value)
-    whole = whole.with_point(one, far, conditions.crossed(sign, far))
+    whole = Bracket.open_from(options.signs.value)
+    whole = whole.with_point(
+        one, values_at_end, conditions.crossed(sign, values_at_end)
+    )
 
     def narrower(search: tuple[Bracket, FloatScalar, RESULTS]):
         bracket, _, _ = search
         theta = bracket.next_place()
-        cut = _trial(arguments, conditions, options, programs, theta * h)
-        values = options.without_start_zero(cut.values, cut.h)
-        return bracket.with_point(theta, values, cut.crossed), theta, cut.outcome.result
+        step = _trial(arguments, conditions, options, programs, theta * h)
+        values = options.without_start_zero(step.values, step.h)
+        return (
+            bracket.with_point(theta, values, step.crossed),
+            theta,
+            step.outcome.result,
+        )
 
     bracket, last, result = jax.lax.while_loop(
         lambda search: (search[2] == RESULTS.successful) & ~search[0].found,
@@ -144,10 +151,10 @@ def _first(
 def _trial(
     arguments: StepArguments,
     conditions: Conditions,
-    options: CutOptions,
+    options: TruncationOptions,
     programs: Programs,
     h: FloatScalar,
-) -> Cut:
+) -> TruncatedStep:
     """Take a step of any size, and compute the conditions at its end."""
     at, method = eqx.tree_at(lambda x: x.h, arguments, h), options.method
     stage_solver, skip = options.stage_solver, options.skip
@@ -157,10 +164,10 @@ def _trial(
     unknown = solved & ~jnp.all(jnp.isfinite(values))
     result = RESULTS.where(unknown, RESULTS.nonfinite_event, outcome.result)
     crossed = conditions.crossed(
-        options.sides.sign, options.without_start_zero(values, h)
+        options.signs.sign, options.without_start_zero(values, h)
     )
     none = -jnp.ones((), jnp.int32)
-    return Cut(outcome._replace(result=result), h, none, values, crossed)
+    return TruncatedStep(outcome._replace(result=result), h, none, values, crossed)
 
 
 def _values(
@@ -172,61 +179,63 @@ def _values(
     return conditions(t, y, args)
 
 
-@differentiable_cut_step.def_jvp
-def _differentiable_cut_step_jvp(primals, tangents):
+@differentiable_truncated_step.def_jvp
+def _differentiable_truncated_step_jvp(primals, tangents):
     arguments, conditions, options, _ = primals
     of_arguments, of_conditions = tangents[:2]
-    cut = primitive_cut_step(*primals)
-    is_cut = cut.fired >= 0
-    # The size of a step that is cut is found, not given.
-    arguments = eqx.tree_at(lambda x: x.h, arguments, cut.h)
+    step = primitive_truncated_step(*primals)
+    truncates = step.fired >= 0
+    # The size of a truncated step is a result, not an argument.
+    arguments = eqx.tree_at(lambda x: x.h, arguments, step.h)
     rate = of_arguments.h
-    rate = jnp.zeros_like(cut.h) if rate is None else jnp.where(is_cut, 0, rate)
+    rate = jnp.zeros_like(step.h) if rate is None else jnp.where(truncates, 0, rate)
     of_arguments = eqx.tree_at(
         lambda x: x.h, of_arguments, rate, is_leaf=lambda leaf: leaf is None
     )
     given, fixed = eqx.partition(arguments, has_tangent(of_arguments))
     functions, others = eqx.partition(conditions, has_tangent(of_conditions))
-    changes = _changes(arguments, others, options, cut, fixed)
+    changes = _changes(arguments, others, options, step, fixed)
     rates = of_arguments, of_conditions
-    # By the checkpoint nothing but states and stages is kept for a reverse pass.
+    # With `jax.checkpoint` reverse mode stores only states and stages.
     change, dh = jax.checkpoint(changes, prevent_cse=False)(
-        given, functions, cut.outcome.stages, cut.outcome.step_state.state, rates
+        given, functions, step.outcome.stages, step.outcome.step_state.state, rates
     )
-    none = jax.tree.map(lambda _: None, cut)
-    tangent = tangent_of_outcome(cut.outcome, change)
-    return cut, none._replace(outcome=tangent, h=dh)
+    none = jax.tree.map(lambda _: None, step)
+    tangent = tangent_of_outcome(step.outcome, change)
+    return step, none._replace(outcome=tangent, h=dh)
 
 
 def _changes(
     arguments: StepArguments,
     others: Conditions,
-    options: CutOptions,
-    cut: Cut,
+    options: TruncationOptions,
+    step: TruncatedStep,
     fixed: StepArguments,
 ):
-    """Make the function of the changes of a step and of its size.
+    """Return the function that computes the tangents of a step and of its size.
 
-    `others` and `fixed` are the parts of the conditions and of the arguments that do
-    not change.
+    `others` and `fixed` are the parts of the conditions and of the arguments without
+    tangents.
     """
-    ok = ~options.skip & (cut.outcome.result == RESULTS.successful)
-    is_cut = ok & (cut.fired >= 0)
+    ok = ~options.skip & (step.outcome.result == RESULTS.successful)
+    truncates = ok & (step.fired >= 0)
     is_size = eqx.tree_at(lambda x: x.h, jax.tree.map(lambda _: False, arguments), True)
     size, rest = eqx.partition(arguments, is_size)
-    unit = eqx.tree_at(lambda x: x.h, size, jnp.ones_like(cut.h))
-    method, stage_solver, x = options.method, options.stage_solver, cut.outcome.stages
+    unit = eqx.tree_at(lambda x: x.h, size, jnp.ones_like(step.h))
+    method, stage_solver, x = options.method, options.stage_solver, step.outcome.stages
     change_with = change_of_step(arguments, method, stage_solver, ok, x, fixed)
-    change_with_size = change_of_step(arguments, method, stage_solver, is_cut, x, rest)
+    change_with_size = change_of_step(
+        arguments, method, stage_solver, truncates, x, rest
+    )
 
     def condition(given, fixed, functions, y):
         at, all_of_them = eqx.combine(given, fixed), eqx.combine(functions, others)
-        return _values(at, all_of_them, method, y)[cut.fired]
+        return _values(at, all_of_them, method, y)[step.fired]
 
     def changes(given, functions, x, y, rates):
         change = change_with(given, x, rates[0])
         by_size = jax.lax.cond(
-            is_cut,
+            truncates,
             lambda: change_with_size(size, x, unit),
             lambda: jax.tree.map(jnp.zeros_like, change),
         )
@@ -235,14 +244,14 @@ def _changes(
             (size, y),
             (unit, by_size[1]),
         )
-        # Where nothing is cut a condition need not have a derivative.
+        # Without an event, a condition need not have a derivative.
         _, gained = jax.jvp(
             lambda given, functions, y: condition(given, fixed, functions, y),
             (given, functions, y),
-            zero_unless(is_cut, (*rates, change[1])),
+            zero_unless(truncates, (*rates, change[1])),
         )
-        resolved = ~is_cut | (jnp.abs(slope * cut.h) > _flat(options.sides, cut))
-        dh = -zero_unless(is_cut, gained) / jnp.where(is_cut & resolved, slope, 1)
+        resolved = ~truncates | (jnp.abs(slope * step.h) > _flat(options.signs, step))
+        dh = -zero_unless(truncates, gained) / jnp.where(truncates & resolved, slope, 1)
         moved: Any = sum(jnp.sum(x) for x in jax.tree.leaves(rates))
         dh = nan_tangent_unless(resolved, jnp.where(resolved, dh, moved))
         total = jax.tree.map(lambda a, b: a + dh * b, change, by_size)
@@ -251,23 +260,25 @@ def _changes(
     return changes
 
 
-def _flat(sides: Sides, cut: Cut) -> FloatScalar:
+def _flat(signs: ConditionSigns, step: TruncatedStep) -> FloatScalar:
     """Compute the change over a step below which a condition counts as constant."""
-    start = sides.scale(cut.h)[cut.fired]
+    start = signs.scale(step.h)[step.fired]
     small = float(jnp.finfo(start.dtype).eps) ** 0.5
     return small * start
 
 
-def primitive_cut_step(
+def primitive_truncated_step(
     arguments: StepArguments,
     conditions: Conditions,
-    options: CutOptions,
+    options: TruncationOptions,
     programs: Programs,
-) -> Cut:
-    """Take a step by `differentiable_cut_step`, in a program that is traced once."""
-    # The reason is that of `primitive_step`.
+) -> TruncatedStep:
+    """Take a step by `differentiable_truncated_step`, in a program traced once.
+
+    `primitive_step` says why.
+    """
     return as_cpu_kernel(
-        differentiable_cut_step,
+        differentiable_truncated_step,
         arguments,
         conditions,
         options,
@@ -277,17 +288,18 @@ def primitive_cut_step(
 
 
 class Bracket(eqx.Module):
-    """An interval of θ in which the first of some functions crosses zero.
+    """An interval of θ in which the first of several functions crosses zero.
 
-    None has crossed it at the lower end, and the `crossed` ones have at the upper end.
-    The next place to look at is that of Chandrupatla (1997): inverse quadratic
-    interpolation where the three last points allow it, and otherwise the middle. It
-    needs about as few evaluations as Newton's method, and never more than some three
-    times those of bisection.
+    At the lower end no function has crossed zero, and at the upper end the `crossed`
+    ones have. The next point follows Chandrupatla (1997): inverse quadratic
+    interpolation if the last three points allow it, and otherwise bisection. It needs
+    about as few evaluations as Newton's method, and at most about three times as many
+    as bisection.
 
-    - `new`, `other`, `old`: the newest point, the other end, and the one before. Each
+    - `new`, `other`, `old`: the newest point, the other end, and the point before. Each
         is θ and the values of all functions there.
     - `is_upper`: whether the newest point is the upper end.
+    - `crossed`: the functions that have crossed zero at the upper end.
     """
 
     new: tuple[FloatScalar, Float[Array, " e"]]
@@ -300,13 +312,13 @@ class Bracket(eqx.Module):
     def open_from(cls, values: Float[Array, " e"]) -> "Bracket":
         """Start at θ = 0 with these values; the first point to add is θ = 1."""
         start = jnp.zeros((), values.dtype), values
-        nothing = jnp.zeros(values.shape, bool)
-        return cls(start, start, start, jnp.asarray(False), nothing)
+        none = jnp.zeros(values.shape, bool)
+        return cls(start, start, start, jnp.asarray(False), none)
 
     def with_point(
         self, theta: FloatScalar, values: Float[Array, " e"], crossed: Bool[Array, " e"]
     ) -> "Bracket":
-        """Shorten the interval by a point in it, where some functions have crossed."""
+        """Shorten the interval by a point in it, where `crossed` have crossed zero."""
         is_upper = jnp.any(crossed)
         same = is_upper == self.is_upper
 
@@ -333,7 +345,7 @@ class Bracket(eqx.Module):
 
     @property
     def found(self) -> BoolScalar:
-        """Tell whether the upper end is the zero, to round-off."""
+        """Return whether the upper end is the zero, up to round-off."""
         lower, upper = self._ends
         values = jnp.where(self.is_upper, self.new[1], self.other[1])
         exact = jnp.all(~self.crossed | (values == 0))
@@ -344,14 +356,14 @@ class Bracket(eqx.Module):
         return 2 * float(jnp.finfo(self.new[0].dtype).eps)
 
     def next_place(self) -> FloatScalar:
-        """Find the place where the first of the crossed functions seems to vanish."""
+        """Estimate where the first of the crossed functions vanishes."""
         (a, fa), (b, fb), (c, fc) = self.new, self.other, self.old
         linear = fa / (fa - fb)
         xi, phi = (a - b) / (c - b), (fa - fb) / (fc - fb)
         may_be_quadratic = (phi**2 < xi) & ((1 - phi) ** 2 < 1 - xi)
         quadratic = fa / (fb - fa) * fc / (fb - fc)
         quadratic = quadratic + (c - a) / (b - a) * fa / (fc - fa) * fb / (fc - fb)
-        # At first there are two points alone.
+        # At first there are only two points.
         part = jnp.where(c == b, linear, jnp.where(may_be_quadratic, quadratic, 0.5))
         part = jnp.where((part >= 0) & (part <= 1), part, 0.5)
         places = jnp.where(self.crossed, a + part * (b - a), jnp.inf)
