@@ -60,7 +60,7 @@ def by_both(function, args, monkeypatch):
 
 
 @pytest.mark.parametrize("name", long_but(QUICK, GALLERY))
-def test_an_ensemble_in_lanes_is_that_of_xla(name, monkeypatch):
+def test_ensemble_by_native_engine_equals_xla(name, monkeypatch):
     num_steps = 20
     function = program(GALLERY[name], "end", 2, num_steps)
     args = ensemble(GALLERY[name], 9, num_steps)
@@ -75,7 +75,7 @@ def test_an_ensemble_in_lanes_is_that_of_xla(name, monkeypatch):
 @pytest.mark.parametrize(
     "kind", ["rows", "dense", "jvp", long("checkpoints"), "reversible"]
 )
-def test_output_and_derivatives_in_lanes_are_those_of_xla(kind, monkeypatch):
+def test_output_and_derivatives_by_native_engine_equal_xla(kind, monkeypatch):
     function = program(PARTICLE, kind, 2, 10)
     args = ensemble(PARTICLE, 5, 10)
     (lanes, _), (expected, counts) = by_both(function, args, monkeypatch)
@@ -100,7 +100,7 @@ def ten_steps(name):
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, 1e200, 1e308, -0.0])
 @pytest.mark.parametrize("name", ["NonholonomicParticle", "ChaplyginSleigh"])
-def test_a_wild_member_changes_no_other(name, value):
+def test_member_that_fails_in_an_ensemble_does_not_change_others(name, value):
     """Of 11 members, which fill a vector and a part of one, some are wild."""
     run, wild = ten_steps(name), [1, 4, 10]
     y0, dt = ensemble(GALLERY[name], 11, 10)
@@ -114,7 +114,7 @@ def test_a_wild_member_changes_no_other(name, value):
 
 
 @pytest.mark.parametrize("members", [1, 7, 8, 9, 1000])
-def test_ensembles_of_any_size_end_as_their_members_do(members):
+def test_ensemble_of_any_size_equals_its_members(members):
     @jax.jit
     @jax.vmap
     def run(dt):
