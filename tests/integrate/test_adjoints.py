@@ -1,4 +1,4 @@
-"""The three ways to differentiate in reverse, forward mode, and second derivatives."""
+"""The three adjoints in reverse mode, forward mode, and second derivatives."""
 
 from typing import Any
 
@@ -30,12 +30,12 @@ def largest(tree):
 
 
 def difference(got, expected):
-    """Relative to the largest number of all."""
+    """Assert agreement relative to the largest number of all."""
     return largest(jax.tree.map(jnp.subtract, got, expected)) / largest(expected)
 
 
 def assert_adjoints_agree(loss, given, adjoints):
-    """Of the gradients by `adjoints`, and of forward mode with them."""
+    """Assert that gradients by `adjoints` and forward mode agree."""
     along = direction(given)
 
     @jax.jit

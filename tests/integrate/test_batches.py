@@ -1,4 +1,4 @@
-"""Batches, ensembles, and what is compiled once."""
+"""Batches and ensembles, and programs that are compiled once."""
 
 from typing import Any
 

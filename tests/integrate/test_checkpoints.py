@@ -1,4 +1,4 @@
-"""Runs that go on from a checkpoint: the bits of one piece, and what is refused."""
+"""Runs that continue bit for bit from a checkpoint, and refused checkpoints."""
 
 from functools import partial
 from typing import Any

@@ -1,4 +1,4 @@
-"""Gradients where a trajectory fails: of its lane alone, and of no other."""
+"""Gradients of failed trajectories: NaN for the failed member, and for no other."""
 
 import jax
 import jax.numpy as jnp

@@ -1,4 +1,4 @@
-"""Gradients of runs in all that is given, by any way, against differences."""
+"""Gradients of runs in all arguments against finite differences."""
 
 import equinox as eqx
 import jax
@@ -34,7 +34,7 @@ GIVEN = {
 
 
 def driven(given, closure, saveat):
-    """A run in which everything plays a part, not all of it in plain sight."""
+    """A run that depends on all arguments and on arrays in closures."""
     scale, args = given["fn"], given["args"]
     # The masses are leaves of the system; over all else the functions close.
     leaves = Driven(given["leaf"], given["closed over"])
@@ -69,7 +69,7 @@ def driven(given, closure, saveat):
 
 
 def samples(given):
-    """Two in one step, and the ends."""
+    """Samples: two in one step, and both ends."""
     sol = driven(
         given, "symmetric", lambda ts, fn: SaveAt(t0=True, ts=ts, t1=True, fn=fn)
     )
@@ -77,13 +77,13 @@ def samples(given):
 
 
 def thinned_nodes(given):
-    """Each 67th and the last."""
+    """Every 67th state and the last one."""
     sol = driven(given, "consistent", lambda ts, fn: SaveAt(steps=67, t1=True, fn=fn))
     return scalar((sol.ts, sol.ys))
 
 
 def dense_output(given):
-    """In the middle of two steps, and at the end."""
+    """Dense output in the middle of two steps, and at the end."""
     sol = driven(given, "symmetric", lambda ts, fn: SaveAt(t1=True, dense=True, fn=fn))
     between = jax.vmap(sol.evaluate)(given["ts"][1:])
     return scalar((sol.ys, between, sol.evaluate(sol.t1)))
@@ -95,7 +95,7 @@ def test_gradient_in_all_arguments_matches_finite_differences(loss):
 
 
 def momenta(matrix, q):
-    """A metric on momenta that varies."""
+    """A kinetic energy of the momenta that depends on the position."""
     return matrix + 0.2 * jnp.outer(jnp.sin(q), jnp.sin(q))
 
 

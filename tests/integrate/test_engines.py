@@ -1,4 +1,4 @@
-"""Ensembles in lanes are those of XLA to round-off, whatever their members do."""
+"""Ensembles by the native engine equal XLA to round-off, whatever their members do."""
 
 from functools import lru_cache
 
@@ -43,7 +43,7 @@ def ensemble(example, members, num_steps):
 
 
 def by_both(function, args, monkeypatch):
-    """What members give in lanes, and by XLA, of one program that is traced once."""
+    """The results of one traced program by the native engine and by XLA."""
     program, shapes = jax.make_jaxpr(jax.vmap(function), return_shape=True)(*args)
     found = []
     for engine in ("lanes", "xla"):
@@ -85,7 +85,7 @@ def test_output_and_derivatives_by_native_engine_equal_xla(kind, monkeypatch):
 
 @lru_cache
 def ten_steps(name):
-    """The states at the end of each member of an ensemble, and how they ran."""
+    """The last state and the statistics of each member of an ensemble."""
 
     @jax.jit
     @jax.vmap
@@ -101,7 +101,7 @@ def ten_steps(name):
 @pytest.mark.parametrize("value", [np.nan, np.inf, 1e200, 1e308, -0.0])
 @pytest.mark.parametrize("name", ["NonholonomicParticle", "ChaplyginSleigh"])
 def test_member_that_fails_in_an_ensemble_does_not_change_others(name, value):
-    """Of 11 members, which fill a vector and a part of one, some are wild."""
+    """The 11 members fill one vector register and a part of another; some diverge."""
     run, wild = ten_steps(name), [1, 4, 10]
     y0, dt = ensemble(GALLERY[name], 11, 10)
     expected = run(y0, dt)

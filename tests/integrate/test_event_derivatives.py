@@ -1,4 +1,4 @@
-"""Derivatives of times and places of events, by every adjoint, and of batches."""
+"""Derivatives of event times and states by every adjoint, and in batches."""
 
 from typing import Any
 
@@ -28,7 +28,7 @@ GIVEN = {
 
 
 def times_places_and_rows(given, on_group, adjoint):
-    """All that a run reports in which one tip of the rod touches the floor twice."""
+    """The output of a run in which one tip of the rod touches the floor twice."""
     dt = given["dt"]
     args = given["q"], given["v"], given["restitution"]
     options = {"saveat": SaveAt(t0=True, steps=True), "adjoint": adjoint}
@@ -58,7 +58,7 @@ def test_event_gradients_match_finite_differences(on_group):
 
 @pytest.mark.long
 def test_event_derivatives_of_members_on_a_group_match_single_runs():
-    """In forward mode, by blocks, of the same start with two restitutions."""
+    """Forward mode with checkpoints, for one start with two restitutions."""
     along = direction(GIVEN)
 
     def value(given):
@@ -130,7 +130,7 @@ def test_event_second_derivatives_match_closed_forms():
 
 @pytest.mark.parametrize("adjoint", [DIRECT, REVERSIBLE])
 def test_event_next_to_a_node_has_its_derivative(adjoint):
-    """That of the time x/v at which a free motion comes to x, just after a node."""
+    """The time x/v at which a free motion reaches x, just after a node."""
     free, place = nhjax.LagrangianSystem(lambda t, q, v, args: 0.5 * v @ v), 0.5 + 1e-12
 
     def time(v):
@@ -148,7 +148,7 @@ def test_event_next_to_a_node_has_its_derivative(adjoint):
 
 
 def test_event_at_a_vanishing_multiplier_has_exact_gradient():
-    """That of (2 cos α + ω²/g) / 3 in g."""
+    """The exact place is (2 cos α + ω²/g) / 3; differentiate in g."""
     place = jax.jit(jax.grad(lambda gravity: slide(4, 0.1, gravity).ys.q[-1, 2]))
     expected = -(SLIDE.rate**2) / 3
     np.testing.assert_allclose(place(jnp.asarray(1.0)), expected, rtol=0, atol=2e-8)

@@ -44,7 +44,7 @@ def test_event_with_gauss_method_ends_the_run():
 
 
 def test_event_reset_of_hamiltonian_system_sets_momentum():
-    """A ball of mass 2 keeps half of it, and has v = 1/2 after its first impact."""
+    """A ball of mass 2 keeps half its momentum: v = 1/2 after the first impact."""
     system = nhjax.HamiltonianSystem(lambda t, q, p, args: 0.25 * p @ p + 2 * q[0])
     y0 = nhjax.initial_state(system, jnp.array([0.5]), p=jnp.zeros(1))
     event = Event(BOUNCE.cond_fn, reset=lambda t, y, args: (y.q, -0.5 * y.p))

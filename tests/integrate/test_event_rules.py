@@ -1,4 +1,4 @@
-"""Which zeros are events, which comes first, and what is told where something fails."""
+"""Which zeros are events, which event fires first, and how failures are reported."""
 
 from typing import Any
 
@@ -53,7 +53,7 @@ def test_event_pair_in_one_step_fires_the_first():
 
 
 def test_event_without_action_does_not_change_the_run():
-    """Those in the other direction are not met; the last one ends the run."""
+    """Zeros in the other direction do not fire; the last event ends the run."""
     watched = [at(x, terminate=False) for x in (0.7, 0.3, 1.0)]
     away = at(2.2, terminate=False, direction=False)
     saveat = SaveAt(t0=True, steps=True)
@@ -68,7 +68,7 @@ def test_event_without_action_does_not_change_the_run():
 
 
 def test_event_condition_zero_at_start_does_not_fire():
-    """By a motion that comes back there it is met at its return."""
+    """A motion that comes back to the surface fires the event when it returns."""
     assert reported(run(at(0.0)))[1] == []
     y0 = nhjax.initial_state(BALL, jnp.zeros(1), jnp.ones(1))
     sol = run(bounce(), dt=1.5, system=BALL, y0=y0)
@@ -111,7 +111,7 @@ def test_event_condition_without_slope_fires_with_nan_derivative():
 
 @pytest.mark.parametrize("dt", [0.31, 5.1])
 def test_event_resets_within_one_step_all_fire(dt):
-    """A ball falls from 1/2 in unit time, and comes back every two."""
+    """A ball falls from 1/2 in time 1, and comes back every 2."""
     sol = run(bounce(), dt=dt, num_steps=round(10.2 / dt), system=BALL, y0=FALL)
     times, _ = reported(sol)
     np.testing.assert_allclose(times, np.arange(1, 10, 2), rtol=1e-14)
@@ -143,7 +143,7 @@ def test_event_pair_at_one_time_fires_both():
 
 
 def test_event_pair_at_the_last_node_fires_both():
-    """The row of the node has the state after both."""
+    """The row of the node has the state after both resets."""
 
     def wall(i):
         def reset(t, y, args):
@@ -159,7 +159,7 @@ def test_event_pair_at_the_last_node_fires_both():
 
 
 def test_event_condition_with_infinite_rate_keeps_its_sign():
-    """That of the square root of time at its start."""
+    """The square root of time has an infinite rate at the start."""
     sol = run(Event(lambda t, y, args: 0.5 - jnp.sqrt(t)))
     np.testing.assert_allclose(sol.t1, 0.25, rtol=1e-15)
 
@@ -183,7 +183,7 @@ def test_event_accumulation_fails_with_too_many_events():
 
 @pytest.mark.parametrize("floor", [0.0, 1 / 3])
 def test_event_of_a_bouncing_ball_is_never_missed_by_round_off(floor):
-    """Its bounces accumulate, and its speed is below the round-off of places."""
+    """The bounces accumulate until the speed is below the round-off of positions."""
     event = Event(
         lambda t, y, args: y.q[0] - args,
         direction=False,

@@ -1,4 +1,4 @@
-"""Runs that are exported, serialised, and run by a process that has no nhjax."""
+"""Runs that are exported, serialised, and called in a process without nhjax."""
 
 import subprocess
 import sys

@@ -1,4 +1,4 @@
-"""A run that fails names its lane and step, and leaves the others as they are."""
+"""A failed run names its member and step, and does not change other members."""
 
 import equinox as eqx
 import jax
@@ -23,7 +23,7 @@ APPELL = Appell()
 @eqx.filter_jit
 @jax.vmap
 def fall(speed) -> nhjax.Solution:
-    """Particles of Appell's: those that rise come to an apex where D2Φ vanishes."""
+    """Appell's particles: the rising ones reach an apex where D2Φ vanishes."""
     v = speed * jnp.array([0.3, 0.4, 1.0])
     y0 = nhjax.initial_state(APPELL.system, APPELL.q0, v)
     return run(

@@ -1,4 +1,4 @@
-"""Gradients of whole runs of the gallery against differences."""
+"""Gradients of whole runs of the gallery against finite differences."""
 
 import jax
 import jax.numpy as jnp

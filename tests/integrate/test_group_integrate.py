@@ -1,4 +1,4 @@
-"""The time loop on groups: batches, dense output, precision, what a step is not."""
+"""The time loop on groups: batches, dense output, precision, and symmetry of steps."""
 
 import dataclasses
 from functools import partial

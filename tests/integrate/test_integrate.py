@@ -160,7 +160,7 @@ def test_tqdm_progress_meter_shows_one_bar_and_closes_it(capfd):
 
 
 class Recorder(nhjax.AbstractProgressMeter):
-    """A meter of a user's own."""
+    """A progress meter of a user."""
 
     def update(self, done: int, total: int) -> None:
         recorded.append((done, total))

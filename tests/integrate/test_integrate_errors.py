@@ -1,4 +1,4 @@
-"""Mistakes in the arguments of a run that tracing finds."""
+"""Errors in the arguments of a run that are found when tracing."""
 
 import jax
 import jax.numpy as jnp

@@ -23,7 +23,7 @@ def lagrangian(t, q, v, args):
 
 
 def rods(order):
-    """The chain's constraints, in an order of the user's own."""
+    """The constraints of the chain, in an order that the user chose."""
 
     def holonomic(t, q, args):
         places = q.reshape(-1, 2)
@@ -39,7 +39,7 @@ def chain(order=None):
 
 
 def dense_chain():
-    """The same chain, written so that its structure cannot be seen."""
+    """The same chain, written so that its sparsity cannot be detected."""
     plain = rods(np.arange(LINKS))
     return nhjax.LagrangianSystem(
         lagrangian, holonomic=lambda t, q, args: plain(t, q.at[0].add(0.0), args)

@@ -1,4 +1,4 @@
-"""Runs of any length by one compiled program, where nothing saved depends on it."""
+"""Runs of any length by one compiled program, if the output does not depend on it."""
 
 from typing import Any
 
@@ -46,7 +46,7 @@ def run(num_steps: Any, y0: Any = None, **others: Any) -> nhjax.Solution:
 
 
 def static(num_steps: int, **others: Any) -> nhjax.Solution:
-    """As under the user's own `jit`, where an int stays known."""
+    """A run under the user's own `jit`, where an int stays static."""
     return jax.jit(lambda y0: run(num_steps, y0, **others))(PARTICLE.initial_state())
 
 
@@ -142,7 +142,7 @@ def end(dt, num_steps, adjoint):
 
 @pytest.fixture(scope="module")
 def pushed():
-    """A rate by forward mode through a run of a length that is known."""
+    """The derivative by forward mode of a run with a static length."""
     return jax.jvp(lambda x: end(x, 8, ADJOINTS[0]), (0.1,), (1.0,))
 
 

@@ -1,4 +1,4 @@
-"""Mistakes in a run that values decide, under jit and vmap, and along the way."""
+"""Errors that depend on values, under jit and vmap, and during a run."""
 
 import jax
 import jax.numpy as jnp
@@ -100,7 +100,7 @@ def test_integrate_with_valid_values_under_jit_runs(compiled, y0):
 
 
 def fall(speed, **others):
-    """A particle of Appell's; rising, it comes to the apex where D2Φ vanishes."""
+    """Appell's particle, which rises to the apex where D2Φ vanishes."""
     appell = Appell()
     y0 = nhjax.initial_state(
         appell.system, appell.q0, speed * jnp.asarray([0.3, 0.4, 1])

@@ -1,4 +1,4 @@
-"""What a run saves: the ends, steps, samples, and functions of the state."""
+"""The output of a run: both ends, steps, samples, and functions of the state."""
 
 import re
 

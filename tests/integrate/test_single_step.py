@@ -1,4 +1,4 @@
-"""One step, as users of their own time loops take it."""
+"""Single steps, for users with time loops of their own."""
 
 import itertools
 

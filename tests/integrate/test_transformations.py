@@ -60,7 +60,7 @@ def test_gradients_of_a_batch_equal_single_runs(axes, single):
 
 
 def test_gradients_of_a_jitted_batch_with_unbatched_results_equal_single_runs():
-    """The times of nodes are those of all lanes, whichever of them failed."""
+    """The times of nodes are not batched, whichever member failed."""
 
     def ends(mass, q):
         example = eqx.tree_at(lambda e: e.mass, PARTICLE, mass)

@@ -1,4 +1,4 @@
-"""What was accepted without a word, or failed from deep inside, names its argument."""
+"""Errors for objects of wrong types name the argument."""
 
 from functools import partial
 from typing import Any
