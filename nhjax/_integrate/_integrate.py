@@ -92,34 +92,6 @@ from ._stepper import (
 )
 
 
-class TimeGrid(eqx.Module):
-    """The nodes t_k = t0 + k dt of a run, for k = 0, ..., num_steps."""
-
-    t0: FloatScalar
-    dt: FloatScalar
-    num_steps: int | IntScalar
-
-
-class RunOptions(eqx.Module):
-    """The user's options that contain functions: outputs, invariants and events.
-
-    The fields are the arguments of `integrate` of the same names. `events` is the
-    argument `event` as a tuple.
-    """
-
-    saveat: SaveAt
-    invariants: str | Callable[..., Any] | None
-    events: tuple[Event, ...] | None
-
-
-class SolverOptions(eqx.Module):
-    """The options for how steps are solved, differentiated and reported."""
-
-    stage_solver: AbstractStageSolver
-    adjoint: AbstractAdjoint
-    meter: AbstractProgressMeter
-
-
 METHODS = LobattoIIIAB, Gauss, PartitionedRungeKutta
 
 # A call outside of transformations warns if the estimated error of a step, relative to
@@ -257,7 +229,7 @@ def integrate(
     check_type("progress_meter", progress_meter, AbstractProgressMeter)
     throw = check_flag("throw", throw)
     needed_by = _what_needs_the_length(saveat, progress_meter)
-    num_steps = check_num_steps(num_steps, needed_by)
+    num_steps = _check_num_steps(num_steps, needed_by)
     args = parameters(args)
     state = check_start(system, y0, args)
     t0, dt, checks = _times(y0, state, t0, dt, num_steps)
@@ -273,14 +245,14 @@ def integrate(
         valid = hold(*checks)
     # Outside of transformations, `num_steps` is traced if possible, so that changing it
     # does not recompile.
-    if not isinstance(num_steps, int) or (needed_by is None and not is_tracing()):
+    if not isinstance(num_steps, int) or (needed_by is None and not _is_tracing()):
         num_steps = jnp.asarray(num_steps, jnp.int32)
     grid = TimeGrid(t0, dt, num_steps)
     options = RunOptions(saveat, invariants, events)
     solver_options = SolverOptions(stage_solver, adjoint, progress_meter)
     sol = run(system, method, y0, grid, args, options, solver_options)
     used_newton = not is_simplified_alone(stage_solver)
-    if not is_tracing() and leaves_steps_to_newton(stage_solver) and is_unsolved(sol):
+    if not _is_tracing() and leaves_steps_to_newton(stage_solver) and is_unsolved(sol):
         used_newton = True
         warnings.warn(_TAKEN_OVER.format(int(sol.stats["failed_step"])), stacklevel=2)
         # The meter has already shown the run.
@@ -294,6 +266,73 @@ def integrate(
         sol = raise_failures(sol, dt, used_newton)
     _warn_of_errors(sol, dt)
     return sol
+
+
+def step(
+    system: AbstractMechanicalSystem,
+    method: AbstractMethod,
+    t: FloatScalarLike,
+    dt: FloatScalarLike,
+    y: State,
+    args: Args = None,
+    *,
+    stage_solver: AbstractStageSolver = SimplifiedNewton(),
+    throw: bool = True,
+    invariants: Literal["energy"] | PhaseFunction | None = None,
+) -> State:
+    """Take one step of size `dt`, from the state `y` at `t` to the state at `t + dt`.
+
+    The step solves the discrete equations of the paper (its four summaries), and its
+    result equals the result of `integrate` with `num_steps=1` bit for bit. Use it for
+    control loops, environments and other time loops that `integrate` does not offer. It
+    works under `jit`, `vmap`, `grad`, `jvp`, `hessian` and inside `jax.lax.scan`. Over
+    many steps `integrate` is faster, and its compensated sums lose less to round-off.
+
+    **Arguments:**
+
+    - `system`, `method`: as for `nhjax.integrate`.
+    - `t`: the time of `y`.
+    - `dt`: the step size, a scalar, in units of time; negative to go back.
+    - `y`: a consistent state, from `nhjax.initial_state`, a `Solution` or an earlier
+        step.
+    - `args`: passed on to the functions of the system, for instance controls that are
+        constant during the step.
+    - `stage_solver`: `nhjax.SimplifiedNewton()` by default, or `nhjax.Newton()`.
+    - `throw`: raise an error if the step cannot be solved. Otherwise all numbers of the
+        returned state are NaN.
+    - `invariants`: quantities that the step conserves, as for `nhjax.integrate`.
+
+    **Returns:** the `State` at `t + dt`.
+
+    **Raises:** as `nhjax.integrate` does.
+
+    !!! example
+
+        >>> import nhjax
+        >>> disc = nhjax.systems.VerticalRollingDisc()
+        >>> y, method = disc.initial_state(), nhjax.LobattoIIIAB(3)
+        >>> y = nhjax.step(disc.system, method, t=0.0, dt=0.1, y=y)
+        >>> y.q.shape
+        (4,)
+    """
+    check_type("y", y, State, "Make one with nhjax.initial_state.")
+    t = real_scalar("t", t, jnp.result_type(float))
+    sol = integrate(
+        system,
+        method,
+        y,
+        dt=dt,
+        num_steps=1,
+        t0=t,
+        args=args,
+        stage_solver=stage_solver,
+        throw=throw,
+        invariants=invariants,
+    )
+    end = jax.tree.map(lambda x: x[0], sol.ys)
+    if throw:
+        return end
+    return nan_unless(sol.result == RESULTS.successful, end)
 
 
 def _warn_of_errors(sol: Solution, dt: FloatScalar) -> None:
@@ -314,7 +353,7 @@ def _require_constraints(
     args: Args,
 ) -> None:
     """Raise for dependent constraints if they made a run fail at its start."""
-    if not is_tracing() and is_singular_from_the_start(sol):
+    if not _is_tracing() and is_singular_from_the_start(sol):
         require_independent(system, t0, y0, args)
 
 
@@ -340,9 +379,9 @@ def _times(
         finite("dt", dt),
         finite("t0", t0),
         Check(known != 0, _zero_step),
-        *countable(num_steps),
+        *_countable(num_steps),
         *countable_from(y0, num_steps),
-        advancing(t0, dt),
+        _advancing(t0, dt),
     ]
     return t0, dt, checks
 
@@ -370,6 +409,152 @@ def _what_needs_the_length(saveat: SaveAt, meter: AbstractProgressMeter) -> str 
     return next((name for name, needed in needs.items() if needed), None)
 
 
+def _check_num_steps(num_steps: Any, needed_by: str | None) -> int | IntScalar:
+    """Return `num_steps` as an int >= 1, or as an array if no option needs its value.
+
+    **Arguments:**
+
+    - `num_steps`: the argument of the user.
+    - `needed_by`: the name of an option that needs the number of steps when tracing,
+        for instance because the shape of its output depends on it; None for none.
+    """
+    if isinstance(num_steps, jax.Array | np.ndarray):
+        return _traced_count(num_steps, needed_by)
+    if isinstance(num_steps, bool) or not isinstance(num_steps, int | np.integer):
+        raise TypeError(
+            "`num_steps` must be an int, or an integer array of shape (), got "
+            f"{num_steps!r} of type {type(num_steps).__name__}."
+        )
+    _require_count(int(num_steps))
+    return int(num_steps)
+
+
+def _traced_count(num_steps: Array | np.ndarray, needed_by: str | None) -> IntScalar:
+    if not jnp.issubdtype(num_steps.dtype, jnp.integer):
+        raise TypeError(
+            "`num_steps` must be an int, or an integer array of shape (), got "
+            f"{num_steps!r} of dtype {num_steps.dtype}."
+        )
+    if num_steps.shape != ():
+        raise ShapeError(
+            f"`num_steps` has shape {num_steps.shape}, but a scalar is needed; for "
+            "runs of several lengths use `jax.vmap`."
+        )
+    if needed_by is not None:
+        raise TypeError(
+            f"`num_steps` must be an int known when tracing (under `jax.jit` a static "
+            f"argument), because {needed_by} depends on it; got {num_steps!r} of type "
+            f"{type(num_steps).__name__}."
+        )
+    if not is_traced(num_steps):
+        _require_count(int(num_steps))
+    return jnp.asarray(num_steps)
+
+
+def _require_count(num_steps: int) -> None:
+    if not 1 <= num_steps <= MOST_STEPS:
+        raise _count_error(num_steps)
+
+
+def _count_error(num_steps: Any) -> ValueError:
+    return ValueError(f"`num_steps` must be in 1..2^31 - 1, got {num_steps}.")
+
+
+def _countable(num_steps: int | IntScalar) -> list[Check]:
+    """Return the check that a traced number of steps is in its range.
+
+    The list is empty for a concrete number, which `_check_num_steps` has checked.
+    """
+    if isinstance(num_steps, int) or not is_traced(num_steps):
+        return []
+    ok = num_steps >= 1
+    if jnp.iinfo(num_steps.dtype).max > MOST_STEPS:
+        ok = ok & (num_steps <= MOST_STEPS)
+    return [Check(ok, _count_error, (num_steps,))]
+
+
+def _advancing(t0: FloatScalar, dt: FloatScalar) -> Check:
+    """Return the check that t0 + dt differs from t0, so that time advances."""
+    # Concrete values are compared on the host with NumPy, which is ten times faster.
+    numpy: Any = jnp if is_traced(t0, dt) else np
+    first, h = numpy.asarray(t0), numpy.asarray(dt)
+    # Infinite numbers have a check of their own.
+    with np.errstate(over="ignore", invalid="ignore"):
+        ok = first + h != first
+    return Check(ok, _standstill_error, (first, h))
+
+
+def _standstill_error(first: Any, h: Any) -> ValueError:
+    return ValueError(
+        f"`dt` = {h} is below the round-off of the time `t0` = {first} in {h.dtype}: "
+        "t0 + dt equals t0, and time would not advance. Measure time from a later "
+        "origin, or take larger steps."
+    )
+
+
+def _check_saved(
+    fn: Callable[[Any, Any, Any], PyTree[Array]], t: FloatScalar, y: Any, args: Args
+) -> None:
+    """Raise a `TypeError` unless `SaveAt(fn=...)` returns a tree of arrays."""
+    with naming("SaveAt: fn(t, y, args)", fn, args):
+        leaves = jax.tree.leaves(eqx.filter_eval_shape(fn, t, y, args))
+    wrong = [
+        leaf
+        for leaf in leaves
+        if not (isinstance(leaf, jax.ShapeDtypeStruct) or eqx.is_array_like(leaf))
+    ]
+    if leaves and not wrong:
+        return
+    got = "nothing: does it lack a `return`?"
+    if wrong:
+        got = f"{reprlib.repr(wrong[0])} of type {type(wrong[0]).__name__}."
+    raise TypeError(
+        f"SaveAt: `fn(t, y, args)` must return an array, or a tree of arrays, got {got}"
+    )
+
+
+# JAX has an opaque trace state, which can only be compared with another one. In
+# releases of JAX in which this function is not public, `_is_tracing` is always True.
+_trace_state = getattr(jax.extend.core, "get_opaque_trace_state", lambda **_: object())
+with jax.ensure_compile_time_eval():
+    # This is the state outside of all transformations, even if this module is imported
+    # inside one.
+    _NOT_TRACING = _trace_state(convention="nhjax")
+
+
+def _is_tracing() -> bool:
+    """Return whether this is called inside a transformation such as jit or vmap."""
+    return _trace_state(convention="nhjax") != _NOT_TRACING
+
+
+class TimeGrid(eqx.Module):
+    """The nodes t_k = t0 + k dt of a run, for k = 0, ..., num_steps."""
+
+    t0: FloatScalar
+    dt: FloatScalar
+    num_steps: int | IntScalar
+
+
+class RunOptions(eqx.Module):
+    """The user's options that contain functions: outputs, invariants and events.
+
+    The fields are the arguments of `integrate` of the same names. `events` is the
+    argument `event` as a tuple.
+    """
+
+    saveat: SaveAt
+    invariants: str | Callable[..., Any] | None
+    events: tuple[Event, ...] | None
+
+
+class SolverOptions(eqx.Module):
+    """The options for how steps are solved, differentiated and reported."""
+
+    stage_solver: AbstractStageSolver
+    adjoint: AbstractAdjoint
+    meter: AbstractProgressMeter
+
+
 @tracked_jit("system", "args", "options")
 def run(
     system: AbstractMechanicalSystem,
@@ -383,7 +568,7 @@ def run(
     """Integrate with arguments that have been checked, and return the solution."""
     t0, saveat = grid.t0, options.saveat
     state, origin = start_of(y0, t0, grid.dt)
-    check_saved(saveat.fn, t0, state, args)
+    _check_saved(saveat.fn, t0, state, args)
     # Arrays that the user's functions close over become leaves, for derivatives.
     system = closure_converted(system, t0, state, args)
     # The type checker takes the property `plain` for a field.
@@ -535,188 +720,3 @@ def _sample(
     theta = (t - start) / h
     y = interpolate(run.system, run.method, record, start, h, theta, run.args)
     return loop.saving.saved(t, y, run.args)
-
-
-def step(
-    system: AbstractMechanicalSystem,
-    method: AbstractMethod,
-    t: FloatScalarLike,
-    dt: FloatScalarLike,
-    y: State,
-    args: Args = None,
-    *,
-    stage_solver: AbstractStageSolver = SimplifiedNewton(),
-    throw: bool = True,
-    invariants: Literal["energy"] | PhaseFunction | None = None,
-) -> State:
-    """Take one step of size `dt`, from the state `y` at `t` to the state at `t + dt`.
-
-    The step solves the discrete equations of the paper (its four summaries), and its
-    result equals the result of `integrate` with `num_steps=1` bit for bit. Use it for
-    control loops, environments and other time loops that `integrate` does not offer. It
-    works under `jit`, `vmap`, `grad`, `jvp`, `hessian` and inside `jax.lax.scan`. Over
-    many steps `integrate` is faster, and its compensated sums lose less to round-off.
-
-    **Arguments:**
-
-    - `system`, `method`: as for `nhjax.integrate`.
-    - `t`: the time of `y`.
-    - `dt`: the step size, a scalar, in units of time; negative to go back.
-    - `y`: a consistent state, from `nhjax.initial_state`, a `Solution` or an earlier
-        step.
-    - `args`: passed on to the functions of the system, for instance controls that are
-        constant during the step.
-    - `stage_solver`: `nhjax.SimplifiedNewton()` by default, or `nhjax.Newton()`.
-    - `throw`: raise an error if the step cannot be solved. Otherwise all numbers of the
-        returned state are NaN.
-    - `invariants`: quantities that the step conserves, as for `nhjax.integrate`.
-
-    **Returns:** the `State` at `t + dt`.
-
-    **Raises:** as `nhjax.integrate` does.
-
-    !!! example
-
-        >>> import nhjax
-        >>> disc = nhjax.systems.VerticalRollingDisc()
-        >>> y, method = disc.initial_state(), nhjax.LobattoIIIAB(3)
-        >>> y = nhjax.step(disc.system, method, t=0.0, dt=0.1, y=y)
-        >>> y.q.shape
-        (4,)
-    """
-    check_type("y", y, State, "Make one with nhjax.initial_state.")
-    t = real_scalar("t", t, jnp.result_type(float))
-    sol = integrate(
-        system,
-        method,
-        y,
-        dt=dt,
-        num_steps=1,
-        t0=t,
-        args=args,
-        stage_solver=stage_solver,
-        throw=throw,
-        invariants=invariants,
-    )
-    end = jax.tree.map(lambda x: x[0], sol.ys)
-    if throw:
-        return end
-    return nan_unless(sol.result == RESULTS.successful, end)
-
-
-def check_num_steps(num_steps: Any, needed_by: str | None) -> int | IntScalar:
-    """Return `num_steps` as an int >= 1, or as an array if no option needs its value.
-
-    **Arguments:**
-
-    - `num_steps`: the argument of the user.
-    - `needed_by`: the name of an option that needs the number of steps when tracing,
-        for instance because the shape of its output depends on it; None for none.
-    """
-    if isinstance(num_steps, jax.Array | np.ndarray):
-        return _traced_count(num_steps, needed_by)
-    if isinstance(num_steps, bool) or not isinstance(num_steps, int | np.integer):
-        raise TypeError(
-            "`num_steps` must be an int, or an integer array of shape (), got "
-            f"{num_steps!r} of type {type(num_steps).__name__}."
-        )
-    _require_count(int(num_steps))
-    return int(num_steps)
-
-
-def _traced_count(num_steps: Array | np.ndarray, needed_by: str | None) -> IntScalar:
-    if not jnp.issubdtype(num_steps.dtype, jnp.integer):
-        raise TypeError(
-            "`num_steps` must be an int, or an integer array of shape (), got "
-            f"{num_steps!r} of dtype {num_steps.dtype}."
-        )
-    if num_steps.shape != ():
-        raise ShapeError(
-            f"`num_steps` has shape {num_steps.shape}, but a scalar is needed; for "
-            "runs of several lengths use `jax.vmap`."
-        )
-    if needed_by is not None:
-        raise TypeError(
-            f"`num_steps` must be an int known when tracing (under `jax.jit` a static "
-            f"argument), because {needed_by} depends on it; got {num_steps!r} of type "
-            f"{type(num_steps).__name__}."
-        )
-    if not is_traced(num_steps):
-        _require_count(int(num_steps))
-    return jnp.asarray(num_steps)
-
-
-def _require_count(num_steps: int) -> None:
-    if not 1 <= num_steps <= MOST_STEPS:
-        raise _count_error(num_steps)
-
-
-def _count_error(num_steps: Any) -> ValueError:
-    return ValueError(f"`num_steps` must be in 1..2^31 - 1, got {num_steps}.")
-
-
-def countable(num_steps: int | IntScalar) -> list[Check]:
-    """Return the check that a traced number of steps is in its range.
-
-    The list is empty for a concrete number, which `check_num_steps` has checked.
-    """
-    if isinstance(num_steps, int) or not is_traced(num_steps):
-        return []
-    ok = num_steps >= 1
-    if jnp.iinfo(num_steps.dtype).max > MOST_STEPS:
-        ok = ok & (num_steps <= MOST_STEPS)
-    return [Check(ok, _count_error, (num_steps,))]
-
-
-def advancing(t0: FloatScalar, dt: FloatScalar) -> Check:
-    """Return the check that t0 + dt differs from t0, so that time advances."""
-    # Concrete values are compared on the host with NumPy, which is ten times faster.
-    numpy: Any = jnp if is_traced(t0, dt) else np
-    first, h = numpy.asarray(t0), numpy.asarray(dt)
-    # Infinite numbers have a check of their own.
-    with np.errstate(over="ignore", invalid="ignore"):
-        ok = first + h != first
-    return Check(ok, _standstill_error, (first, h))
-
-
-def _standstill_error(first: Any, h: Any) -> ValueError:
-    return ValueError(
-        f"`dt` = {h} is below the round-off of the time `t0` = {first} in {h.dtype}: "
-        "t0 + dt equals t0, and time would not advance. Measure time from a later "
-        "origin, or take larger steps."
-    )
-
-
-def check_saved(
-    fn: Callable[[Any, Any, Any], PyTree[Array]], t: FloatScalar, y: Any, args: Args
-) -> None:
-    """Raise a `TypeError` unless `SaveAt(fn=...)` returns a tree of arrays."""
-    with naming("SaveAt: fn(t, y, args)", fn, args):
-        leaves = jax.tree.leaves(eqx.filter_eval_shape(fn, t, y, args))
-    wrong = [
-        leaf
-        for leaf in leaves
-        if not (isinstance(leaf, jax.ShapeDtypeStruct) or eqx.is_array_like(leaf))
-    ]
-    if leaves and not wrong:
-        return
-    got = "nothing: does it lack a `return`?"
-    if wrong:
-        got = f"{reprlib.repr(wrong[0])} of type {type(wrong[0]).__name__}."
-    raise TypeError(
-        f"SaveAt: `fn(t, y, args)` must return an array, or a tree of arrays, got {got}"
-    )
-
-
-# JAX has an opaque trace state, which can only be compared with another one. In
-# releases of JAX in which this function is not public, `is_tracing` is always True.
-_trace_state = getattr(jax.extend.core, "get_opaque_trace_state", lambda **_: object())
-with jax.ensure_compile_time_eval():
-    # This is the state outside of all transformations, even if this module is imported
-    # inside one.
-    _NOT_TRACING = _trace_state(convention="nhjax")
-
-
-def is_tracing() -> bool:
-    """Return whether this is called inside a transformation such as jit or vmap."""
-    return _trace_state(convention="nhjax") != _NOT_TRACING

@@ -71,7 +71,7 @@ class TruncationOptions(eqx.Module):
 
 
 @eqx.filter_custom_jvp
-def differentiable_truncated_step(
+def _differentiable_step(
     arguments: StepArguments,
     conditions: Conditions,
     options: TruncationOptions,
@@ -179,16 +179,16 @@ def _values(
     return conditions(t, y, args)
 
 
-@differentiable_truncated_step.def_jvp
-def _differentiable_truncated_step_jvp(primals, tangents):
+@_differentiable_step.def_jvp
+def _step_jvp(primals, tangents):
     arguments, conditions, options, _ = primals
     of_arguments, of_conditions = tangents[:2]
-    step = primitive_truncated_step(*primals)
-    truncates = step.fired >= 0
+    step = truncated_step(*primals)
+    is_truncated = step.fired >= 0
     # The size of a truncated step is a result, not an argument.
     arguments = eqx.tree_at(lambda x: x.h, arguments, step.h)
     rate = of_arguments.h
-    rate = jnp.zeros_like(step.h) if rate is None else jnp.where(truncates, 0, rate)
+    rate = jnp.zeros_like(step.h) if rate is None else jnp.where(is_truncated, 0, rate)
     of_arguments = eqx.tree_at(
         lambda x: x.h, of_arguments, rate, is_leaf=lambda leaf: leaf is None
     )
@@ -218,14 +218,14 @@ def _changes(
     tangents.
     """
     ok = ~options.skip & (step.outcome.result == RESULTS.successful)
-    truncates = ok & (step.fired >= 0)
+    is_truncated = ok & (step.fired >= 0)
     is_size = eqx.tree_at(lambda x: x.h, jax.tree.map(lambda _: False, arguments), True)
     size, rest = eqx.partition(arguments, is_size)
     unit = eqx.tree_at(lambda x: x.h, size, jnp.ones_like(step.h))
     method, stage_solver, x = options.method, options.stage_solver, step.outcome.stages
     change_with = change_of_step(arguments, method, stage_solver, ok, x, fixed)
     change_with_size = change_of_step(
-        arguments, method, stage_solver, truncates, x, rest
+        arguments, method, stage_solver, is_truncated, x, rest
     )
 
     def condition(given, fixed, functions, y):
@@ -235,7 +235,7 @@ def _changes(
     def changes(given, functions, x, y, rates):
         change = change_with(given, x, rates[0])
         by_size = jax.lax.cond(
-            truncates,
+            is_truncated,
             lambda: change_with_size(size, x, unit),
             lambda: jax.tree.map(jnp.zeros_like, change),
         )
@@ -248,10 +248,14 @@ def _changes(
         _, gained = jax.jvp(
             lambda given, functions, y: condition(given, fixed, functions, y),
             (given, functions, y),
-            zero_unless(truncates, (*rates, change[1])),
+            zero_unless(is_truncated, (*rates, change[1])),
         )
-        resolved = ~truncates | (jnp.abs(slope * step.h) > _flat(options.signs, step))
-        dh = -zero_unless(truncates, gained) / jnp.where(truncates & resolved, slope, 1)
+        resolved = ~is_truncated | (
+            jnp.abs(slope * step.h) > _flat(options.signs, step)
+        )
+        dh = -zero_unless(is_truncated, gained) / jnp.where(
+            is_truncated & resolved, slope, 1
+        )
         moved: Any = sum(jnp.sum(x) for x in jax.tree.leaves(rates))
         dh = nan_tangent_unless(resolved, jnp.where(resolved, dh, moved))
         total = jax.tree.map(lambda a, b: a + dh * b, change, by_size)
@@ -267,18 +271,18 @@ def _flat(signs: ConditionSigns, step: TruncatedStep) -> FloatScalar:
     return small * start
 
 
-def primitive_truncated_step(
+def truncated_step(
     arguments: StepArguments,
     conditions: Conditions,
     options: TruncationOptions,
     programs: Programs,
 ) -> TruncatedStep:
-    """Take a step by `differentiable_truncated_step`, in a program traced once.
+    """Take a step by `_differentiable_step`, in a program traced once.
 
     `primitive_step` says why.
     """
     return as_cpu_kernel(
-        differentiable_truncated_step,
+        _differentiable_step,
         arguments,
         conditions,
         options,

@@ -34,7 +34,7 @@ from .._stepper import (
 )
 from ._event import Conditions, ConditionSigns, Event, EventActions, signs_at
 from ._log import EventLog, LogEntry, reported_log
-from ._root import primitive_truncated_step, TruncatedStep, TruncationOptions
+from ._root import truncated_step, TruncatedStep, TruncationOptions
 
 
 class EventLoopState(eqx.Module):
@@ -352,9 +352,7 @@ class EventStepper(AbstractStepper[EventCarry, ReplayedIteration]):
             values_at_end=place.values_at_end,
             known_event=None if replay is None else replay.which,
         )
-        return primitive_truncated_step(
-            arguments, self.conditions, options, plain.programs
-        )
+        return truncated_step(arguments, self.conditions, options, plain.programs)
 
     def blank_result(self, carry: EventCarry) -> StepResult:
         """Return the result of an iteration that did nothing."""
