@@ -65,14 +65,15 @@ class Solution(eqx.Module):
 
     t0: Float[Array, ""]
     t1: Float[Array, ""]
+    # `PyTree` includes None, the empty tree: type checkers do not ask users to test it.
     ts: PyTree[Float[Array, " k"]]
     ys: PyTree[Array]
     stats: dict[str, Any]
     result: RESULTS
     interpolation: DenseInterpolation | None
-    checkpoint: Checkpoint | None = None
+    checkpoint: PyTree[Checkpoint] = None
     coordinates: tuple[str, ...] | None = eqx.field(default=None, static=True)
-    events: EventLog | None = None
+    events: PyTree[EventLog] = None
 
     def evaluate(self, t: FloatScalarLike) -> State:
         """Compute the state at any time of the run, by the collocation polynomials.

@@ -52,7 +52,7 @@ def test_max_iterations_of_a_wrong_value_raises(solver, count):
         ({"ts": [1j]}, nhjax.DTypeError, "`ts` must be real, got dtype complex128"),
         ({"t1": True, "fn": 3}, ValueError, r"`fn`.*\(t, y, args\), got 3"),
         # diffrax takes the end of the run where this takes a flag.
-        ({"t1": 5.0}, ValueError, "`t1` must be True or False, got 5.0; times belong"),
+        ({"t1": 5.0}, ValueError, "`t1` must be True or False, got 5.0. Give times"),
         ({"t0": 0, "t1": True}, ValueError, "`t0` must be True or False, got 0"),
         ({"dense": "yes"}, ValueError, "`dense` must be True or False, got 'yes'"),
     ],
