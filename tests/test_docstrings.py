@@ -58,7 +58,7 @@ def test_there_are_examples():
     tested = {test.name for test in _examples()}
     for module, name in (
         ("_integrate._integrate", "integrate"),
-        ("_integrate._saveat", "SaveAt"),
+        ("_integrate._saving", "SaveAt"),
         ("_initial._initial_state", "initial_state"),
     ):
         assert f"nhjax.{module}.{name}" in tested

@@ -814,7 +814,7 @@ METHODS = [
 
 SAVING = [
     row(
-        "asked to save nothing", SaveAt, ValueError, "nothing is saved", "some of `t0`"
+        "asked to save nothing", SaveAt, ValueError, "nothing is saved", "at least one of `t0`"
     ),
     row(
         "asked to save every minus third step",
@@ -894,7 +894,7 @@ SAVING = [
         lambda: ANY_SAVEAT(t1=5.0),
         ValueError,
         "SaveAt: `t1` must be True or False, got 5.0",
-        "times belong in `ts`",
+        "Give times as `ts`",
     ),
     row(
         "gave the start of the run where a flag belongs",

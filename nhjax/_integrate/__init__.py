@@ -1,4 +1,4 @@
-"""The integration of a system over many steps, its output and its derivatives."""
+"""Integration over many steps: the time loop, events, output and derivatives."""
 
 from ._adjoint import (
     AbstractAdjoint as AbstractAdjoint,
@@ -10,10 +10,9 @@ from ._dataset import (
     named_arrays as named_arrays,
     units_of_coordinates as units_of_coordinates,
 )
-from ._event import Event as Event
-from ._integrate import integrate as integrate
+from ._events import Event as Event, EventLog as EventLog
+from ._integrate import integrate as integrate, step as step
 from ._interpolation import DenseInterpolation as DenseInterpolation
-from ._log import EventLog as EventLog
 from ._progress_meter import (
     AbstractProgressMeter as AbstractProgressMeter,
     NoProgressMeter as NoProgressMeter,
@@ -21,6 +20,5 @@ from ._progress_meter import (
     TqdmProgressMeter as TqdmProgressMeter,
 )
 from ._reversible import ReversibleAdjoint as ReversibleAdjoint
-from ._saveat import SaveAt as SaveAt
+from ._saving import SaveAt as SaveAt
 from ._solution import raise_failures as raise_failures, Solution as Solution
-from ._step import step as step

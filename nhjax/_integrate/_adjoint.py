@@ -1,4 +1,4 @@
-"""The ways in which a run is differentiated in reverse mode, and what each keeps."""
+"""Adjoints: how a run is differentiated in reverse mode, and which data it stores."""
 
 import math
 from abc import abstractmethod
@@ -14,22 +14,22 @@ from jaxtyping import Array, Int
 
 from ._loop import Loop
 from ._saving import Rows
-from ._stepping import Carry
+from ._stepper import AbstractCarry
 
 
-_Run: TypeAlias = tuple[Carry, Rows]
+_Run: TypeAlias = tuple[AbstractCarry, Rows]
 _Advance: TypeAlias = Callable[[_Run, Int[Array, ""]], _Run]
 
 
 class AbstractAdjoint(eqx.Module):
     """The way in which `integrate` is differentiated in reverse mode.
 
-    An adjoint decides what is kept of the steps of a run for the reverse pass, and what
-    is computed again.
+    An adjoint decides which data of the steps are stored for the reverse pass, and
+    which are computed again.
     """
 
     @abstractmethod
-    def run(self, loop: Loop, carry: Carry) -> _Run:
+    def run(self, loop: Loop, carry: AbstractCarry) -> _Run:
         """Run all steps of the loop from `carry`; return its end and all saved rows."""
 
 
@@ -40,22 +40,23 @@ def _advance(loop: Loop, state: _Run, k: Int[Array, ""]) -> _Run:
 
 
 def count(num_steps: int | Int[Array, ""]) -> Any:
-    """Convert a number of steps to int32 for a loop; an int stays known to tracing."""
+    """Convert a number of steps to int32 for a loop. A Python int stays static."""
     return np.int32(num_steps) if isinstance(num_steps, int) else num_steps
 
 
 class DirectAdjoint(AbstractAdjoint):
-    """Keep the stages of every step: memory O(num_steps), the least time.
+    """Store the stages of every step: memory O(num_steps), the shortest time.
 
     Forward mode (`jax.jvp`, `jax.jacfwd`, `jax.linearize`) and second derivatives
     (`jax.hessian`, and either mode over either) work as well. If `num_steps` is an
-    array, there is forward mode alone.
+    array, only forward mode works.
 
     !!! note
 
-        It is not what diffrax calls `DirectAdjoint`, which nests scans and checkpoints
-        up to a largest number of steps, and is advised against there. Here the number
-        of steps is known, this is a plain loop, and it is the default.
+        This differs from the `DirectAdjoint` of diffrax, which nests scans and
+        checkpoints up to a maximum number of steps, and which diffrax advises against.
+        Here the number of steps is known, the loop is a plain one, and this adjoint is
+        the default.
 
     !!! example
 
@@ -68,7 +69,7 @@ class DirectAdjoint(AbstractAdjoint):
         7.0
     """
 
-    def run(self, loop: Loop, carry: Carry) -> _Run:
+    def run(self, loop: Loop, carry: AbstractCarry) -> _Run:
         """Run all steps of the loop from `carry`; return its end and all saved rows."""
         state = (carry, loop.empty_rows(carry))
         end = count(loop.num_iterations)
@@ -78,29 +79,30 @@ class DirectAdjoint(AbstractAdjoint):
 
 
 class RecursiveCheckpointAdjoint(AbstractAdjoint):
-    """Keep some states on the way and recompute the rest: memory O(sqrt(num_steps)).
+    """Store some states on the way, recompute the rest: memory O(sqrt(num_steps)).
 
-    The steps are cut into `checkpoints` blocks, and these again, until a block has no
-    more steps than that; a reverse pass keeps the state at the start of each block of
-    the level that it is in, and the stages of one block of the last level. By default
-    there are two levels. Each level beyond the first costs another forward run: with L
-    levels and num_steps = checkpoints^L memory is O(L checkpoints).
+    The steps are divided into `checkpoints` blocks, and each block again, until a block
+    has at most `checkpoints` steps. The reverse pass stores the state at the start of
+    each block of the level that it is in, and the stages of one block of the last
+    level. By default there are two levels. Each level beyond the first costs another
+    forward run. With L levels and num_steps = checkpoints^L the memory is
+    O(L checkpoints).
 
-    Forward mode, second derivatives and `num_steps` as an array are as with
+    Forward mode, second derivatives and an array `num_steps` work as with
     `DirectAdjoint`.
 
     !!! note
 
-        It is not what diffrax calls `RecursiveCheckpointAdjoint`, whose binomial scheme
-        places checkpoints while the number of steps is not yet known, takes
-        log(max_steps) of them by default, and has reverse mode alone. Here the number
-        of steps is known and blocks are of equal length; `checkpoints` counts those of
-        one level, and the default is faster and needs more memory.
+        This differs from the `RecursiveCheckpointAdjoint` of diffrax. There a binomial
+        scheme places checkpoints while the number of steps is not yet known, takes
+        log(max_steps) of them by default, and allows reverse mode only. Here the number
+        of steps is known and blocks have equal length. `checkpoints` is the number of
+        blocks on one level, and the default is faster and needs more memory.
 
     **Arguments:**
 
-    - `checkpoints`: how many states to keep on each level, an int >= 2;
-        sqrt(num_steps) by default.
+    - `checkpoints`: the number of states to store on each level, an int >= 2. The
+        default is sqrt(num_steps).
 
     !!! example
 
@@ -124,10 +126,10 @@ class RecursiveCheckpointAdjoint(AbstractAdjoint):
                 f"None, got {number!r}."
             )
 
-    def run(self, loop: Loop, carry: Carry) -> _Run:
+    def run(self, loop: Loop, carry: AbstractCarry) -> _Run:
         """Run all steps of the loop from `carry`; return its end and all saved rows."""
         if not isinstance(loop.num_iterations, int):
-            # Blocks serve reverse mode alone, which needs a known number of steps.
+            # Blocks are useful in reverse mode only, which needs a static length.
             return DirectAdjoint().run(loop, carry)
         lengths = self._block_lengths(loop.num_iterations)
         advance: _Advance = partial(_advance, loop)
@@ -149,13 +151,13 @@ class RecursiveCheckpointAdjoint(AbstractAdjoint):
             lengths.append(number)
         lengths.append(steps)
         # Because the lengths were rounded up, whole blocks could lie beyond the end of
-        # the run; the outermost level leaves them out.
+        # the run. The outermost level leaves these out.
         lengths[0] = -(-num_steps // math.prod(lengths[1:]))
         return lengths
 
 
 def _block(advance: _Advance, length: int, stride: int, *, keep_all: bool) -> _Advance:
-    """Make a function that calls `advance` `length` times, `stride` steps apart."""
+    """Return a function that calls `advance` `length` times, `stride` steps apart."""
     one = advance if keep_all else jax.checkpoint(advance, prevent_cse=False)
 
     def block(state, k):
@@ -170,20 +172,20 @@ def _block(advance: _Advance, length: int, stride: int, *, keep_all: bool) -> _A
 
 
 def _idle_after_the_end(loop: Loop) -> _Advance:
-    """Make a variant of `_advance` that does nothing in steps after the end of the run.
+    """Return a variant of `_advance` that is a no-op after the end of the run.
 
-    It is needed where the last block is longer than what is left of the run.
+    It is needed if the last block extends beyond the end of the run.
     """
 
     def advance_or_idle(state, k):
-        # The buffers are written outside of the branches of `jax.lax.cond`, which would
-        # copy them.
+        # The buffers are written outside of `jax.lax.cond`, whose branches would copy
+        # them.
         carry, buffers = state
-        nothing = loop.no_rows(carry)
+        no_rows = loop.no_rows(carry)
         carry, rows = jax.lax.cond(
             k < loop.num_iterations,
             lambda carry: loop.step(carry, k),
-            lambda carry: (carry, nothing),
+            lambda carry: (carry, no_rows),
             carry,
         )
         return carry, loop.write(buffers, rows, k)

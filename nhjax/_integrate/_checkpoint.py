@@ -1,4 +1,4 @@
-"""What a run needs to go on from where another one ended, to the last bit."""
+"""Checkpoints, from which a run continues bit for bit where another one ended."""
 
 from typing import Any, NamedTuple
 
@@ -19,34 +19,37 @@ from .._system import (
     Linearisation,
     State,
 )
-from ._checks import MOST_STEPS
+
+
+# Steps are counted in int32.
+MOST_STEPS = 2**31 - 1
 
 
 class Checkpoint(eqx.Module):
-    """All that a run carries from step to step, to go on from bit for bit.
+    """All data that a run carries from step to step, to continue it bit for bit.
 
-    A `State` alone is not enough for that: q and p are sums with compensation, whose
-    rounding errors are carried along; the times t_k = t0 + k dt are products, of which
-    another origin would give others; and the iteration on a step starts from what the
-    step before has linearised. Ask for one by `SaveAt(checkpoint=True)`, give it to
-    `integrate` in place of a state, and write it to a file by `nhjax.save`.
+    A `State` is not enough for this. The sums q and p are compensated, and their
+    rounding errors are carried along. The times t_k = t0 + k dt are products, which
+    depend on their origin. The iteration of a step starts from the linearisation of the
+    step before. `SaveAt(checkpoint=True)` saves a checkpoint, `integrate` accepts one
+    in place of a state, and `nhjax.save` writes one to a file.
 
-    - `state`: the last state of the run; of one that failed the last good one.
+    - `state`: the last state of the run; if the run failed, the last good state.
     - `q_compensation`, `p_compensation`: the rounding errors of the sums q and p.
     - `linearisation`: the arrays of the linearised equations of motion at the state.
     - `round_off`: the round-off of the system's functions, measured in the first run.
-    - `t0`: the time from which steps are counted, that of the first run.
-    - `dt`: the size of the steps.
-    - `num_steps`: how many steps have been taken since `t0`.
+    - `t0`: the time from which steps are counted, the start of the first run.
+    - `dt`: the step size.
+    - `num_steps`: the number of steps taken since `t0`.
 
     Under `vmap` every array has the batch as its leading axis. Derivatives pass through
     `state`, `t0` and `dt`.
 
-    The same bits follow from the same instructions. A run in one piece is repeated by
-    runs in parts if all of them save checkpoints (but the last need not) and otherwise
-    the same things, with the same releases on the same machine; without that it is
-    repeated up to round-off. Samples by `SaveAt(ts=...)` and dense output count times
-    from the start of their own run.
+    Equal bits need equal instructions. Runs in parts repeat a run in one piece bit for
+    bit if all of them save a checkpoint (the last one need not) and otherwise the same
+    output, with the same releases on the same machine. Otherwise they repeat it up to
+    round-off. Samples by `SaveAt(ts=...)` and dense output count times from the start
+    of their own run.
 
     !!! example
 
@@ -78,9 +81,9 @@ class Checkpoint(eqx.Module):
 
 
 class Origin(NamedTuple):
-    """What the times t_k = t0 + (first_step + k) dt + shift of a run start from.
+    """The origin of the times t_k = t0 + (first_step + k) dt + shift of a run.
 
-    The shift is zero, unless steps have another size than those before a checkpoint.
+    The shift is zero unless the step size differs from that before the checkpoint.
     """
 
     t0: FloatScalar
@@ -91,7 +94,7 @@ class Origin(NamedTuple):
 def start_of(
     y0: State | Checkpoint, t0: FloatScalar, dt: FloatScalar
 ) -> tuple[State, Origin]:
-    """Return the state of `y0`, and what the times of a run start from.
+    """Return the state of `y0` and the origin of the times of a run.
 
     `t0` is the time of the state.
     """
@@ -107,8 +110,8 @@ def time_of(y0: State | Checkpoint, t0: FloatScalarLike | None) -> FloatScalarLi
         return 0.0 if t0 is None else t0
     if t0 is not None:
         raise ValueError(
-            "`t0` is given together with a checkpoint, which has its own time: leave "
-            "`t0` out, or go on from `y0.state` at another time."
+            "`t0` is given together with a checkpoint, which has its own time. Leave "
+            "out `t0`, or start from `y0.state` at another time."
         )
     return y0.t
 
@@ -123,9 +126,9 @@ _ADVICE = (
 def check_start(
     system: AbstractMechanicalSystem, y0: State | Checkpoint, args: Args
 ) -> State:
-    """Return the state of `y0`, a state of this system or a checkpoint of a run of it.
+    """Return the state of `y0`, which is a state or a checkpoint.
 
-    Raise if it is neither, or belongs to another system.
+    Raise if `y0` is neither, or belongs to another system.
     """
     check_type("y0", y0, (State, Checkpoint), _ADVICE)
     if isinstance(y0, State):
@@ -156,13 +159,13 @@ def _check_arrays(name: str, got: PyTree[Array], like: PyTree[Any]) -> None:
     if kinds(got) != kinds(like):
         raise ShapeError(
             f"`y0.{name}` has arrays of (shape, dtype) {kinds(got)}, but "
-            f"{kinds(like)} is needed: the checkpoint belongs to another system, or "
-            "was changed. For many runs use `jax.vmap` over the checkpoint."
+            f"{kinds(like)} is needed: the checkpoint belongs to another system, or it "
+            "was changed. For many runs, use `jax.vmap` over the checkpoint."
         )
 
 
 def countable_from(y0: State | Checkpoint, num_steps: int | Array) -> list[Check]:
-    """Make the check that steps can be counted from the origin to the end of a run."""
+    """Return the check that the count of steps since the origin fits into int32."""
     if isinstance(y0, State):
         return []
     numbers = y0.num_steps, num_steps
@@ -175,16 +178,16 @@ def countable_from(y0: State | Checkpoint, num_steps: int | Array) -> list[Check
 def _too_many(first: np.ndarray, number: np.ndarray) -> ValueError:
     return ValueError(
         f"`y0.num_steps` = {first} and `num_steps` = {number} are more than 2^31 - 1 "
-        "steps together. Go on from `y0.state` at `t0=y0.t` instead."
+        "steps together. Start from `y0.state` at `t0=y0.t` instead."
     )
 
 
 def resumed(y0: Checkpoint, fresh: StepState) -> StepState:
-    """Make the data that the first step of a resumed run starts from.
+    """Return the step state from which a resumed run starts.
 
-    `fresh` are those that a run from the state alone would start from. Its
-    linearisation replaces that of the checkpoint where their matrices differ by more
-    than eps^(1/4), as they may if the run goes on with another system or other args.
+    `fresh` is the step state of a run from `y0.state`. Its linearisation replaces the
+    one of the checkpoint if their matrices differ by more than eps^(1/4), which happens
+    if the run continues with another system or other args.
     """
     new, structure = jax.tree.flatten(fresh.lin)
     _check_arrays("linearisation", y0.linearisation, new)
@@ -195,7 +198,7 @@ def resumed(y0: Checkpoint, fresh: StepState) -> StepState:
 
 
 def _agree(old: Linearisation, new: Linearisation) -> BoolScalar:
-    """Tell whether the matrices of two linearisations agree up to eps^(1/4)."""
+    """Return whether the matrices of two linearisations agree up to eps^(1/4)."""
     pairs = [
         pair
         for name in ("metric_inverse", "jacobian", "reaction", "compliance_inverse")
@@ -205,8 +208,8 @@ def _agree(old: Linearisation, new: Linearisation) -> BoolScalar:
             strict=True,
         )
     ]
-    # An inverse is known to fewer digits the worse its condition. Within this bound the
-    # Jacobian serves as well as a fresh one.
+    # An ill-conditioned inverse has fewer correct digits. Within this bound the
+    # Jacobian of the checkpoint is as good as a fresh one.
     small = float(jnp.finfo(pairs[0][0].dtype).eps) ** 0.25
     close = [max_norm(x - y) <= small * (max_norm(x) + max_norm(y)) for x, y in pairs]
     return jnp.all(jnp.stack(close))

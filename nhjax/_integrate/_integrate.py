@@ -1,11 +1,25 @@
-import warnings
-from collections.abc import Sequence
-from dataclasses import replace
-from typing import Literal
+"""The functions `integrate` and `step`: checks, the compiled run, and its solution.
 
+`integrate` checks its arguments and calls `run`, which is compiled. `run` builds the
+stepper, what it saves and the time loop, lets the adjoint run the loop, and makes the
+solution of its end.
+"""
+
+import reprlib
+import warnings
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from functools import partial
+from typing import Any, Literal
+
+import equinox as eqx
+import jax
+import jax.extend
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Int, PyTree
 
+from .._compile import as_cpu_kernel, TraceCache, tracked_jit
 from .._custom_types import (
     Args,
     BoolScalar,
@@ -14,20 +28,26 @@ from .._custom_types import (
     IntScalar,
     PhaseFunction,
 )
-from .._errors import Check, hold, is_traced, require
+from .._errors import Check, hold, is_traced, naming, require, ShapeError
 from .._method import AbstractMethod, Gauss, LobattoIIIAB, PartitionedRungeKutta
+from .._numerics import ClosureConverted, nan_unless
 from .._results import RESULTS
 from .._step import (
     AbstractStageSolver,
     is_simplified_alone,
     leaves_steps_to_newton,
+    RoundOff,
     SimplifiedNewton,
+    StepRecord,
 )
 from .._system import (
     AbstractMechanicalSystem,
     check_flag,
     check_type,
+    closure_converted,
     finite,
+    function_noise,
+    FunctionNoise,
     HamiltonianSystem,
     LagrangianSystem,
     parameters,
@@ -36,38 +56,58 @@ from .._system import (
     State,
 )
 from ._adjoint import AbstractAdjoint, DirectAdjoint
-from ._checkpoint import check_start, Checkpoint, countable_from, time_of
-from ._checks import advancing, check_num_steps, countable, is_tracing
-from ._event import checked_events, Event
-from ._interpolation import require_collocation
-from ._options import Means, Options, TimeGrid
+from ._checkpoint import (
+    check_start,
+    Checkpoint,
+    countable_from,
+    MOST_STEPS,
+    start_of,
+    time_of,
+)
+from ._conservation import kept_invariants
+from ._events import checked_events, Event, EventStepper
+from ._interpolation import (
+    DenseInterpolation,
+    interpolate,
+    require_collocation,
+    step_index,
+)
+from ._loop import Loop
 from ._progress_meter import AbstractProgressMeter, NoProgressMeter
-from ._run import run
-from ._saveat import SaveAt
-from ._solution import (
-    is_singular_from_the_start,
-    is_unsolved,
-    raise_failures,
-    Solution,
+from ._saving import (
+    record_places,
+    Rows,
+    SaveAt,
+    Saving,
+    stack_saved,
+    static_length,
+)
+from ._solution import is_singular_from_the_start, is_unsolved, raise_failures, Solution
+from ._stepper import (
+    AbstractCarry,
+    AbstractStepper,
+    PlainStepper,
+    reported_statistics,
+    RunEnd,
 )
 
 
 METHODS = LobattoIIIAB, Gauss, PartitionedRungeKutta
 
-# The estimated error of a step, relative to the change in it, of which a plain call
-# warns. For steps that are ever larger the estimate tends to one.
-_NOTHING_IS_RIGHT = 0.9
+# A call outside of transformations warns if the estimated error of a step, relative to
+# the change of the state in it, exceeds this. For large steps it tends to one.
+_TOO_LARGE_ERROR = 0.9
 
 _TOO_LARGE = (
     "`dt` = {:.6g} is too large: the error of a step is estimated to be as large as "
     'the change of the state in it (`sol.stats["max_error_estimate"]` is {:.2g}). The '
-    "equations of each step are solved, but the trajectory means nothing. Try `dt` = "
+    "equations of each step are solved, but the trajectory is meaningless. Try `dt` = "
     "{:.6g}."
 )
 _TAKEN_OVER = (
     "`SimplifiedNewton` did not solve step {} of this run, which is therefore repeated "
     "with Newton's method for such steps. This compiles a second program. To compile "
-    "one alone, pass `stage_solver=nhjax.SimplifiedNewton(fallback=True)` or "
+    "only one, pass `stage_solver=nhjax.SimplifiedNewton(fallback=True)` or "
     "`nhjax.Newton()`, or take a smaller `dt`."
 )
 
@@ -92,67 +132,67 @@ def integrate(
     """Integrate a mechanical system over `num_steps` steps of size `dt`.
 
     Each step solves the discrete equations of the paper (its four summaries) to
-    round-off, so that the constraints on velocities and positions hold at every node to
-    round-off as well; q and p are summed with compensation, and elements of a group
-    stay on it. It works under `jit`, `vmap`, `grad`, `jvp` and `hessian`, with respect
-    to `y0`, `args`, `dt`, `t0` and the array leaves of `system`; stage equations are
-    differentiated by the implicit function theorem. Perturb a state through
-    `initial_state`: the equations of a step read q and p, and only the first multiplier
-    v too.
+    round-off. So the constraints on velocities and positions hold at every node to
+    round-off as well. The sums q and p are compensated, and elements of a group stay on
+    the group.
+
+    `integrate` works under `jit`, `vmap`, `grad`, `jvp` and `hessian`, with respect to
+    `y0`, `args`, `dt`, `t0` and the array leaves of `system`. Stage equations are
+    differentiated by the implicit function theorem. Use `initial_state` to perturb a
+    state: the equations of a step read q and p, and read v only for the first
+    multiplier.
 
     **Arguments:**
 
     - `system`: the mechanical system.
     - `method`: such as `nhjax.LobattoIIIAB(stages=3)`; `Gauss` only without
         constraints.
-    - `y0`: a consistent state, from `nhjax.initial_state` or an earlier `Solution`. Its
-        multiplier matters to the propagated closure alone. Or the `Checkpoint` of an
-        earlier run, to go on bit for bit as if that run had been longer.
+    - `y0`: a consistent state, from `nhjax.initial_state` or an earlier `Solution`.
+        Only the propagated closure uses its multiplier. Or the `Checkpoint` of an
+        earlier run, which then continues bit for bit as if it had been longer.
     - `dt`: the step size, a scalar, in units of time; negative to go back.
-    - `num_steps`: how many steps, an int >= 1; see below for arrays.
-    - `t0`: the time of `y0`, 0 by default; a checkpoint has its own.
+    - `num_steps`: the number of steps, an int >= 1; see below for arrays.
+    - `t0`: the time of `y0`, 0 by default. A checkpoint has its own time.
     - `args`: passed on to the functions of the system. Arrays and floats in it are
-        traced, so that other values recompile nothing; anything else is static.
+        traced, so that other values do not recompile. Anything else is static.
 
     **Other arguments:**
 
-    - `saveat`: what to save, the final state by default; see `nhjax.SaveAt`.
+    - `saveat`: the output to save, the final state by default; see `nhjax.SaveAt`.
     - `stage_solver`: how the equations of a step are solved,
         `nhjax.SimplifiedNewton()` by default, or `nhjax.Newton()`.
-    - `adjoint`: what reverse mode keeps of the trajectory: `nhjax.DirectAdjoint()` by
-        default, `nhjax.RecursiveCheckpointAdjoint()`, or `nhjax.ReversibleAdjoint()`.
-    - `throw`: raise if a step cannot be solved. Otherwise the trajectory stays at its
-        last good state from there on, and `result` and `stats` say so; its derivatives
-        are NaN (zero where nothing depends on it). Other members of a batch are not
-        touched.
+    - `adjoint`: which data reverse mode stores: `nhjax.DirectAdjoint()` by default,
+        `nhjax.RecursiveCheckpointAdjoint()`, or `nhjax.ReversibleAdjoint()`.
+    - `throw`: raise an error if a step cannot be solved. Otherwise the trajectory stays
+        at its last good state, `result` and `stats` report the failure, and derivatives
+        are NaN (zero for a zero cotangent). Other members of a batch are not affected.
     - `progress_meter`: such as `nhjax.TqdmProgressMeter()`.
-    - `invariants`: what the steps keep at its value in `y0` to round-off: `"energy"`,
-        or a function of (t, q, v, args), or of (t, q, p, args) of a Hamiltonian system,
-        of shape () or (k,), that the system conserves. `docs/invariants.md` says how,
-        what it costs and what it does at rest.
-    - `event`: an `nhjax.Event`, or a sequence of them, of which the first in time wins:
-        zeros of functions of the state, where the run ends or the state is reset.
+    - `invariants`: quantities that the steps conserve to round-off at their values in
+        `y0`: `"energy"`, or a function of (t, q, v, args), for a Hamiltonian system of
+        (t, q, p, args), of shape () or (k,). The system itself must conserve them.
+        `docs/invariants.md` describes the method, its cost and its behaviour at rest.
+    - `event`: an `nhjax.Event`, or a sequence of them: zeros of functions of the state,
+        where the run ends or the state is reset. The first event in time happens first.
 
     **Returns:** a `Solution`.
 
-    **Raises:** `IntegrationError` as described (under `jit` its message comes in an
-    error of JAX, a `JaxRuntimeError` or a `ValueError`), `ShapeError`, `DTypeError`,
-    `NonFiniteError`, `TypeError` and `ValueError` for arguments that cannot be right;
+    **Raises:** `IntegrationError` as described (under `jit` its message is in an error
+    of JAX, a `JaxRuntimeError` or a `ValueError`); `ShapeError`, `DTypeError`,
+    `NonFiniteError`, `TypeError` and `ValueError` for invalid arguments;
     `DependentConstraintsError` with the names of constraints that depend on each other
     in `y0`; a `ValueError` that names the failing hypothesis (H1, H2, H3) if the method
     cannot integrate constrained systems.
 
     !!! note
 
-        If what is saved has the same shape for any number of steps (`SaveAt` with `t0`,
-        `t1` and `fn` alone) and there is no progress meter, another `num_steps`
-        recompiles nothing in a plain call. Under `jit` an int is static; an integer
-        array is traced, and under `vmap` each member may have its own. Reverse mode
-        needs an int, or `ReversibleAdjoint`.
+        If the output has the same shape for any number of steps (`SaveAt` with only
+        `t0`, `t1` and `fn`) and there is no progress meter, then outside of
+        transformations another `num_steps` does not recompile. Under `jit` an int is
+        static. An integer array is traced, and under `vmap` each member may have its
+        own. Reverse mode needs an int, or `ReversibleAdjoint`.
 
-        With `steps`, `ts` or `dense` another `num_steps` recompiles everything. For
-        runs of many lengths compile a chunk that leads from state to state, and join
-        what it saves:
+        With `steps`, `ts` or `dense`, another `num_steps` recompiles. For runs of many
+        lengths, compile a chunk that leads from state to state, and join the outputs:
 
             @jax.jit
             def chunk(y, t):
@@ -164,10 +204,11 @@ def integrate(
 
     !!! note
 
-        Globals and variables of enclosing functions that the functions of `system` and
-        `saveat` read are compiled in. A plain call traces them anew if one of them has
-        changed; see `nhjax.LagrangianSystem` for what is tracked, and for the cure
-        under a `jax.jit` of your own.
+        The functions of `system` and `saveat` may read globals and variables of
+        enclosing functions, which become constants of the compiled program. Outside of
+        transformations, a call traces the functions again if one of these has changed.
+        `nhjax.LagrangianSystem` says what is tracked, and what to do under a `jax.jit`
+        of your own.
 
     !!! example
 
@@ -187,7 +228,7 @@ def integrate(
     check_type("progress_meter", progress_meter, AbstractProgressMeter)
     throw = check_flag("throw", throw)
     needed_by = _what_needs_the_length(saveat, progress_meter)
-    num_steps = check_num_steps(num_steps, needed_by)
+    num_steps = _check_num_steps(num_steps, needed_by)
     args = parameters(args)
     state = check_start(system, y0, args)
     t0, dt, checks = _times(y0, state, t0, dt, num_steps)
@@ -196,25 +237,27 @@ def integrate(
     checks += saveat.checks(t0, dt, num_steps)
     saveat, valid = saveat.within(dt), None
     if throw:
-        # All on dt, which is always used: jit drops a check of what is not.
+        # All checks go through dt, which is always used: jit drops checks of unused
+        # values.
         dt = require(dt, *checks)
     else:
         valid = hold(*checks)
-    # A plain call has no use for a length that is known, but for one that changes.
-    if not isinstance(num_steps, int) or (needed_by is None and not is_tracing()):
+    # Outside of transformations, `num_steps` is traced if possible, so that changing it
+    # does not recompile.
+    if not isinstance(num_steps, int) or (needed_by is None and not _is_tracing()):
         num_steps = jnp.asarray(num_steps, jnp.int32)
     grid = TimeGrid(t0, dt, num_steps)
-    options = Options(saveat, invariants, events)
-    means = Means(stage_solver, adjoint, progress_meter)
-    sol = run(system, method, y0, grid, args, options, means)
+    options = RunOptions(saveat, invariants, events)
+    solver_options = SolverOptions(stage_solver, adjoint, progress_meter)
+    sol = run(system, method, y0, grid, args, options, solver_options)
     used_newton = not is_simplified_alone(stage_solver)
-    if not is_tracing() and leaves_steps_to_newton(stage_solver) and is_unsolved(sol):
+    if not _is_tracing() and leaves_steps_to_newton(stage_solver) and is_unsolved(sol):
         used_newton = True
         warnings.warn(_TAKEN_OVER.format(int(sol.stats["failed_step"])), stacklevel=2)
-        # Without the meter, which has shown its run already.
+        # The meter has already shown the run.
         solver = replace(stage_solver, fallback=True)
-        means = Means(solver, adjoint, NoProgressMeter())
-        sol = run(system, method, y0, grid, args, options, means)
+        solver_options = SolverOptions(solver, adjoint, NoProgressMeter())
+        sol = run(system, method, y0, grid, args, options, solver_options)
     if valid is not None:
         sol = _invalid_unless(valid, sol)
     if throw:
@@ -224,12 +267,80 @@ def integrate(
     return sol
 
 
+def step(
+    system: AbstractMechanicalSystem,
+    method: AbstractMethod,
+    t: FloatScalarLike,
+    dt: FloatScalarLike,
+    y: State,
+    args: Args = None,
+    *,
+    stage_solver: AbstractStageSolver = SimplifiedNewton(),
+    throw: bool = True,
+    invariants: Literal["energy"] | PhaseFunction | None = None,
+) -> State:
+    """Take one step of size `dt`, from the state `y` at `t` to the state at `t + dt`.
+
+    The step solves the discrete equations of the paper (its four summaries), and its
+    result equals the result of `integrate` with `num_steps=1` bit for bit. Use it for
+    control loops, environments and other time loops that `integrate` does not offer. It
+    works under `jit`, `vmap`, `grad`, `jvp`, `hessian` and inside `jax.lax.scan`. Over
+    many steps `integrate` is faster, and its compensated sums lose less to round-off.
+
+    **Arguments:**
+
+    - `system`, `method`: as for `nhjax.integrate`.
+    - `t`: the time of `y`.
+    - `dt`: the step size, a scalar, in units of time; negative to go back.
+    - `y`: a consistent state, from `nhjax.initial_state`, a `Solution` or an earlier
+        step.
+    - `args`: passed on to the functions of the system, for instance controls that are
+        constant during the step.
+    - `stage_solver`: `nhjax.SimplifiedNewton()` by default, or `nhjax.Newton()`.
+    - `throw`: raise an error if the step cannot be solved. Otherwise all numbers of the
+        returned state are NaN.
+    - `invariants`: quantities that the step conserves, as for `nhjax.integrate`.
+
+    **Returns:** the `State` at `t + dt`.
+
+    **Raises:** as `nhjax.integrate` does.
+
+    !!! example
+
+        >>> import nhjax
+        >>> disc = nhjax.systems.VerticalRollingDisc()
+        >>> y, method = disc.initial_state(), nhjax.LobattoIIIAB(3)
+        >>> y = nhjax.step(disc.system, method, t=0.0, dt=0.1, y=y)
+        >>> y.q.shape
+        (4,)
+    """
+    call = "Call it as `step(system, method, t, dt, y, args)`."
+    check_type("y", y, State, f"Make one with nhjax.initial_state. {call}")
+    t = real_scalar("t", t, jnp.result_type(float))
+    sol = integrate(
+        system,
+        method,
+        y,
+        dt=dt,
+        num_steps=1,
+        t0=t,
+        args=args,
+        stage_solver=stage_solver,
+        throw=throw,
+        invariants=invariants,
+    )
+    end = jax.tree.map(lambda x: x[0], sol.ys)
+    if throw:
+        return end
+    return nan_unless(sol.result == RESULTS.successful, end)
+
+
 def _warn_of_errors(sol: Solution, dt: FloatScalar) -> None:
-    """Warn, in a plain call, of steps that are so large that nothing is right."""
+    """Warn, outside of transformations, if the steps are far too large."""
     estimate = sol.stats.get("max_error_estimate")
     if estimate is None or is_traced(estimate, dt):
         return
-    if float(estimate) > _NOTHING_IS_RIGHT:
+    if float(estimate) > _TOO_LARGE_ERROR:
         size = float(dt)
         warnings.warn(_TOO_LARGE.format(size, float(estimate), size / 4), stacklevel=3)
 
@@ -241,13 +352,13 @@ def _require_constraints(
     y0: State,
     args: Args,
 ) -> None:
-    """Raise for constraints that are dependent, if a plain run failed for them."""
-    if not is_tracing() and is_singular_from_the_start(sol):
+    """Raise for dependent constraints if they made a run fail at its start."""
+    if not _is_tracing() and is_singular_from_the_start(sol):
         require_independent(system, t0, y0, args)
 
 
 def _invalid_unless(valid: BoolScalar, sol: Solution) -> Solution:
-    """Give a run of arguments that were not valid the result that says so."""
+    """Return the solution, with `invalid_argument` unless its arguments are valid."""
     result = RESULTS.where(valid, sol.result, RESULTS.invalid_argument)
     failed_step = jnp.where(valid, sol.stats["failed_step"], 0)
     return replace(sol, result=result, stats=sol.stats | {"failed_step": failed_step})
@@ -268,15 +379,15 @@ def _times(
         finite("dt", dt),
         finite("t0", t0),
         Check(known != 0, _zero_step),
-        *countable(num_steps),
+        *_countable(num_steps),
         *countable_from(y0, num_steps),
-        advancing(t0, dt),
+        _advancing(t0, dt),
     ]
     return t0, dt, checks
 
 
 def _check_method(method: AbstractMethod, y0: State, saveat: SaveAt) -> None:
-    """Raise unless the method can integrate with constraints and save what is asked."""
+    """Raise unless the method supports the constraints and the output."""
     if y0.multiplier.shape[0] > 0:
         method.require_constraint_hypotheses()
     if saveat.dense or saveat.ts is not None:
@@ -288,7 +399,7 @@ def _zero_step() -> ValueError:
 
 
 def _what_needs_the_length(saveat: SaveAt, meter: AbstractProgressMeter) -> str | None:
-    """Name the first option that needs `num_steps` when tracing; None if none does."""
+    """Return the first option that needs `num_steps` when tracing, or None."""
     needs = {
         "the output of `SaveAt(steps=...)`": bool(saveat.steps),
         "the output of `SaveAt(dense=True)`": saveat.dense,
@@ -296,3 +407,316 @@ def _what_needs_the_length(saveat: SaveAt, meter: AbstractProgressMeter) -> str 
         "the `progress_meter`": not meter.silent,
     }
     return next((name for name, needed in needs.items() if needed), None)
+
+
+def _check_num_steps(num_steps: Any, needed_by: str | None) -> int | IntScalar:
+    """Return `num_steps` as an int >= 1, or as an array if no option needs its value.
+
+    **Arguments:**
+
+    - `num_steps`: the argument of the user.
+    - `needed_by`: the name of an option that needs the number of steps when tracing,
+        for instance because the shape of its output depends on it; None for none.
+    """
+    if isinstance(num_steps, jax.Array | np.ndarray):
+        return _traced_count(num_steps, needed_by)
+    if isinstance(num_steps, bool) or not isinstance(num_steps, int | np.integer):
+        raise TypeError(
+            "`num_steps` must be an int, or an integer array of shape (), got "
+            f"{num_steps!r} of type {type(num_steps).__name__}."
+        )
+    _require_count(int(num_steps))
+    return int(num_steps)
+
+
+def _traced_count(num_steps: Array | np.ndarray, needed_by: str | None) -> IntScalar:
+    if not jnp.issubdtype(num_steps.dtype, jnp.integer):
+        raise TypeError(
+            "`num_steps` must be an int, or an integer array of shape (), got "
+            f"{num_steps!r} of dtype {num_steps.dtype}."
+        )
+    if num_steps.shape != ():
+        raise ShapeError(
+            f"`num_steps` has shape {num_steps.shape}, but a scalar is needed; for "
+            "runs of several lengths use `jax.vmap`."
+        )
+    if needed_by is not None:
+        raise TypeError(
+            f"`num_steps` must be an int known when tracing (under `jax.jit` a static "
+            f"argument), because {needed_by} depends on it; got {num_steps!r} of type "
+            f"{type(num_steps).__name__}."
+        )
+    if not is_traced(num_steps):
+        _require_count(int(num_steps))
+    return jnp.asarray(num_steps)
+
+
+def _require_count(num_steps: int) -> None:
+    if not 1 <= num_steps <= MOST_STEPS:
+        raise _count_error(num_steps)
+
+
+def _count_error(num_steps: Any) -> ValueError:
+    return ValueError(f"`num_steps` must be in 1..2^31 - 1, got {num_steps}.")
+
+
+def _countable(num_steps: int | IntScalar) -> list[Check]:
+    """Return the check that a traced number of steps is in its range.
+
+    The list is empty for a concrete number, which `_check_num_steps` has checked.
+    """
+    if isinstance(num_steps, int) or not is_traced(num_steps):
+        return []
+    ok = num_steps >= 1
+    if jnp.iinfo(num_steps.dtype).max > MOST_STEPS:
+        ok = ok & (num_steps <= MOST_STEPS)
+    return [Check(ok, _count_error, (num_steps,))]
+
+
+def _advancing(t0: FloatScalar, dt: FloatScalar) -> Check:
+    """Return the check that t0 + dt differs from t0, so that time advances."""
+    # Concrete values are compared on the host with NumPy, which is ten times faster.
+    numpy: Any = jnp if is_traced(t0, dt) else np
+    first, h = numpy.asarray(t0), numpy.asarray(dt)
+    # Infinite numbers have a check of their own.
+    with np.errstate(over="ignore", invalid="ignore"):
+        ok = first + h != first
+    return Check(ok, _standstill_error, (first, h))
+
+
+def _standstill_error(first: Any, h: Any) -> ValueError:
+    return ValueError(
+        f"`dt` = {h} is below the round-off of the time `t0` = {first} in {h.dtype}: "
+        "t0 + dt equals t0, and time would not advance. Measure time from a later "
+        "origin, or take larger steps."
+    )
+
+
+def _check_saved(
+    fn: Callable[[Any, Any, Any], PyTree[Array]], t: FloatScalar, y: Any, args: Args
+) -> None:
+    """Raise a `TypeError` unless `SaveAt(fn=...)` returns a tree of arrays."""
+    with naming("SaveAt: fn(t, y, args)", fn, args):
+        leaves = jax.tree.leaves(eqx.filter_eval_shape(fn, t, y, args))
+    wrong = [
+        leaf
+        for leaf in leaves
+        if not (isinstance(leaf, jax.ShapeDtypeStruct) or eqx.is_array_like(leaf))
+    ]
+    if leaves and not wrong:
+        return
+    got = "nothing: does it lack a `return`?"
+    if wrong:
+        got = f"{reprlib.repr(wrong[0])} of type {type(wrong[0]).__name__}."
+    raise TypeError(
+        f"SaveAt: `fn(t, y, args)` must return an array, or a tree of arrays, got {got}"
+    )
+
+
+# JAX has an opaque trace state, which can only be compared with another one. In
+# releases of JAX in which this function is not public, `_is_tracing` is always True.
+_trace_state = getattr(jax.extend.core, "get_opaque_trace_state", lambda **_: object())
+with jax.ensure_compile_time_eval():
+    # This is the state outside of all transformations, even if this module is imported
+    # inside one.
+    _NOT_TRACING = _trace_state(convention="nhjax")
+
+
+def _is_tracing() -> bool:
+    """Return whether this is called inside a transformation such as jit or vmap."""
+    return _trace_state(convention="nhjax") != _NOT_TRACING
+
+
+class TimeGrid(eqx.Module):
+    """The nodes t_k = t0 + k dt of a run, for k = 0, ..., num_steps."""
+
+    t0: FloatScalar
+    dt: FloatScalar
+    num_steps: int | IntScalar
+
+
+class RunOptions(eqx.Module):
+    """The user's options that contain functions: outputs, invariants and events.
+
+    The fields are the arguments of `integrate` of the same names. `events` is the
+    argument `event` as a tuple.
+    """
+
+    saveat: SaveAt
+    invariants: str | Callable[..., Any] | None
+    events: tuple[Event, ...] | None
+
+
+class SolverOptions(eqx.Module):
+    """The options for how steps are solved, differentiated and reported."""
+
+    stage_solver: AbstractStageSolver
+    adjoint: AbstractAdjoint
+    meter: AbstractProgressMeter
+
+
+@tracked_jit("system", "args", "options")
+def run(
+    system: AbstractMechanicalSystem,
+    method: AbstractMethod,
+    y0: State | Checkpoint,
+    grid: TimeGrid,
+    args: Args,
+    options: RunOptions,
+    solver_options: SolverOptions,
+) -> Solution:
+    """Integrate with arguments that have been checked, and return the solution."""
+    t0, saveat = grid.t0, options.saveat
+    state, origin = start_of(y0, t0, grid.dt)
+    _check_saved(saveat.fn, t0, state, args)
+    # Arrays that the user's functions close over become leaves, for derivatives.
+    system = closure_converted(system, t0, state, args)
+    # The type checker takes the property `plain` for a field.
+    plain = PlainStepper(  # pyright: ignore[reportCallIssue]
+        system=system,
+        method=method,
+        stage_solver=solver_options.stage_solver,
+        origin=origin,
+        dt=grid.dt,
+        args=args,
+        invariants=kept_invariants(options.invariants, system, t0, state, args),
+        programs=TraceCache(),
+        round_off=None,
+        num_steps=grid.num_steps,
+    )
+    sampled = _sampled_steps(saveat, grid)
+    places = record_places(saveat.dense, sampled, grid.num_steps)
+    stepper: AbstractStepper[Any, Any] = plain
+    if options.events is not None:
+        stepper = EventStepper.of(options.events, plain, state)
+    fn = ClosureConverted(saveat.fn, t0, state, args)
+    saving = Saving.of(saveat, fn, grid.num_steps, places, stepper.log_length)
+    loop = Loop(stepper, saving, solver_options.meter)
+    adjoint = solver_options.adjoint
+    round_off, start, carry, rows = _all_steps(adjoint, loop, y0, saveat.checkpoint)
+    given = (system, y0, t0, grid.dt, args), options.events
+    end = loop.stepper.finish(carry, (rows.saved, rows.record), rows.log, given)
+    ts, ys = _output(saveat, loop, grid, start, end, sampled)
+    interpolation, checkpoint, records = None, None, end.rows[1]
+    if saveat.dense and records is not None:
+        interpolation = _interpolation(plain, grid, records)
+    if saveat.checkpoint:
+        checkpoint = plain.checkpoint(round_off, carry, end.state)
+    return Solution(
+        t0=t0,
+        t1=end.t,
+        ts=ts,
+        ys=ys,
+        stats=reported_statistics(carry.stats, method),
+        result=carry.result,
+        interpolation=interpolation,
+        checkpoint=checkpoint,
+        coordinates=system.coordinates,
+        events=end.log,
+    )
+
+
+def _sampled_steps(saveat: SaveAt, grid: TimeGrid) -> Int[Array, " k"] | None:
+    """Find the steps in which the times of `SaveAt(ts=...)` lie; None without these."""
+    if saveat.ts is None:
+        return None
+    length = static_length(grid.num_steps)
+    return jax.vmap(lambda t: step_index(t, grid.t0, grid.dt, length))(saveat.ts)
+
+
+def _all_steps(
+    adjoint: AbstractAdjoint, loop: Loop, y0: State | Checkpoint, checkpoint: bool
+) -> tuple[RoundOff, State, AbstractCarry, Rows]:
+    """Take all steps.
+
+    Return the measured round-off, the first state, the last carry and the saved rows.
+    """
+
+    def start(loop: Loop, y0: State | Checkpoint, noise: FunctionNoise | None):
+        first = loop.stepper.init(y0, noise)
+        plain = loop.stepper.plain
+        return plain.round_off_at(y0, first.step_state, noise), first
+
+    def steps(loop: Loop, round_off: RoundOff, first: AbstractCarry):
+        loop = loop.with_round_off(round_off)
+        run = adjoint.run(loop, loop.moving(first))
+        return round_off, first.step_state.state, *run
+
+    def whole(loop: Loop, y0: State, noise: FunctionNoise):
+        return steps(loop, *start(loop, y0, noise))
+
+    noise = None
+    if isinstance(y0, State):
+        # The noise has a kernel of its own: a loop over steps is compiled to faster
+        # code without another loop before it, and in a batch of runs from one state
+        # this kernel is not batched.
+        plain = loop.stepper.plain
+        u = plain.system.fibre_coordinate(y0)
+        given = plain.time(0), y0.q, u, y0.multiplier, plain.args
+        given = plain.system, *given
+        noise = as_cpu_kernel(function_noise, *given, is_brief=True)
+        if not checkpoint:
+            return as_cpu_kernel(whole, loop, y0, noise)
+    # A compiler that knows the start of a loop, such as zeros in its matrices, rounds
+    # differently in the loop. The barrier hides the start, so that a resumed run takes
+    # its steps by the same instructions.
+    first = as_cpu_kernel(start, loop, y0, noise)
+    given, rest = eqx.partition((loop, first), eqx.is_array)
+    loop, first = eqx.combine(jax.lax.optimization_barrier(given), rest)
+    return as_cpu_kernel(steps, loop, *first)
+
+
+def _output(
+    saveat: SaveAt,
+    loop: Loop,
+    grid: TimeGrid,
+    start: State,
+    end: RunEnd[Any, Any],
+    sampled: Int[Array, " k"] | None,
+) -> tuple[PyTree[Array], PyTree[Array]]:
+    """Join what was saved at the start, on the way and at the end: times and values."""
+    saving, args, ts = loop.saving, loop.stepper.plain.args, saveat.ts
+    saved, records = end.rows
+    pieces = []
+    if saveat.t0:
+        pieces.append(_one(saving.saved(grid.t0, start, args)))
+    if saveat.steps:
+        pieces.append(jax.tree.map(lambda x: x[:-1], saved))
+    if ts is not None and sampled is not None and saving.record_slots is not None:
+        row = saving.record_slots[sampled]
+        records = jax.tree.map(lambda x: x[row], records)
+        pieces.append(jax.vmap(partial(_sample, loop))(ts, sampled, records))
+    if saveat.saves_end(grid.num_steps):
+        pieces.append(_one(saving.saved(end.t, end.state, args)))
+    return stack_saved(pieces) if pieces else (None, None)
+
+
+def _interpolation(
+    stepper: PlainStepper, grid: TimeGrid, records: StepRecord
+) -> DenseInterpolation:
+    """Return the dense output, from the records of all steps."""
+    return DenseInterpolation(
+        system=stepper.system,
+        method=stepper.method,
+        num_steps=static_length(grid.num_steps),
+        t0=grid.t0,
+        dt=grid.dt,
+        records=jax.tree.map(lambda x: x[:-1], records),
+        args=stepper.args,
+    )
+
+
+def _one(saved: PyTree[Array]) -> PyTree[Array]:
+    """Return an entry of the output with a time axis of length one."""
+    return jax.tree.map(lambda x: x[None], saved)
+
+
+def _sample(
+    loop: Loop, t: FloatScalar, k: Int[Array, ""], record: StepRecord
+) -> PyTree[Array]:
+    """Compute the output at a time t inside step k."""
+    run = loop.stepper.plain
+    start, h = run.time(k), run.dt
+    theta = (t - start) / h
+    y = interpolate(run.system, run.method, record, start, h, theta, run.args)
+    return loop.saving.saved(t, y, run.args)

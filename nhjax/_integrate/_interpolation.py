@@ -1,3 +1,5 @@
+"""Dense output: the collocation polynomials of the steps."""
+
 from typing import Any
 
 import equinox as eqx
@@ -54,8 +56,8 @@ def interpolate(
 class DenseInterpolation(eqx.Module):
     """The collocation polynomials of a whole trajectory, one for each of its steps.
 
-    They are defined on [t0, t0 + num_steps dt]. `integrate` makes an instance if it is
-    called with `SaveAt(dense=True)`; users evaluate it through `Solution.evaluate`.
+    They are defined on [t0, t0 + num_steps dt]. `integrate` returns an instance with
+    `SaveAt(dense=True)`; users evaluate it through `Solution.evaluate`.
     """
 
     method: AbstractMethod = eqx.field(static=True)
@@ -63,9 +65,9 @@ class DenseInterpolation(eqx.Module):
     t0: FloatScalar
     dt: FloatScalar
     records: StepRecord
-    # The system and args are kept as a list of their arrays, a tuple of their other
+    # The system and args are stored as a list of their arrays, a tuple of their other
     # leaves and the structure of the tree, because `jax.jit` and `jax.vmap` cannot
-    # return a leaf that is a function.
+    # return functions.
     _arrays: list[Array]
     _rest: tuple[Any, ...] = eqx.field(static=True)
     _treedef: Any = eqx.field(static=True)
@@ -97,7 +99,7 @@ class DenseInterpolation(eqx.Module):
         batch = self.records.force.shape[:-3]
         if batch:
             raise ValueError(
-                f"This solution is a batch of shape {batch}: evaluate each lane, "
+                f"This solution is a batch of shape {batch}: evaluate each member, "
                 "`jax.vmap(lambda sol: sol.evaluate(t))(sol)`."
             )
         t = real_scalar("t", t, self.t0.dtype)
@@ -119,10 +121,12 @@ def _outside(
 def step_position(
     t: Float[Array, "*k"], t0: FloatScalar, dt: FloatScalar, num_steps: int
 ) -> tuple[Float[Array, "*k"], Bool[Array, "*k"]]:
-    """Convert times to units of steps; tell which lie in the run, up to round-off."""
+    """Return times in units of steps, and which of them lie in the run.
+
+    Times outside of the run by round-off count as inside.
+    """
     position = (t - t0) / dt
-    # The times themselves are rounded, by an error in proportion to the largest of
-    # them.
+    # Times have rounding errors proportional to the largest of them.
     steps = num_steps + jnp.abs(t0 / dt)
     slack = jnp.maximum(1e-6, 8 * jnp.finfo(t.dtype).eps * steps)
     return position, (position >= -slack) & (position <= num_steps + slack)

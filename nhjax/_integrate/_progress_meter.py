@@ -1,3 +1,5 @@
+"""Progress meters, which show on the host how many steps of a run are done."""
+
 import sys
 from abc import abstractmethod
 from typing import Any
@@ -11,8 +13,8 @@ from jaxtyping import Array, Int
 class AbstractProgressMeter(eqx.Module):
     """A progress meter, which shows how many steps of a run are done.
 
-    It is called on the host from inside the compiled time loop. A meter of one's own is
-    a subclass with `update`.
+    The compiled time loop calls it on the host. For a meter of your own, write a
+    subclass with `update`.
     """
 
     @abstractmethod
@@ -24,20 +26,20 @@ class AbstractProgressMeter(eqx.Module):
         """
 
     def close(self) -> None:
-        """Put away what is open, such as the bar of a run that was interrupted."""
+        """Close open resources, such as the bar of a run that was interrupted."""
         return
 
     @property
     def silent(self) -> bool:
-        """Tell whether the meter shows nothing, so that the loop need not call it."""
+        """Return whether the meter shows nothing, so that the loop need not call it."""
         return False
 
     def report(self, k: Int[Array, ""], num_steps: int) -> None:
         """Report from inside a traced loop that step `k` is complete."""
         if self.silent:
             return
-        # There are about a hundred calls a run: each one leaves the compiled program,
-        # which costs time.
+        # Each call leaves the compiled program, which is expensive, so there are only
+        # about a hundred calls per run.
         every = max(1, num_steps // 100)
         done = k + 1
 
@@ -66,7 +68,7 @@ class NoProgressMeter(AbstractProgressMeter):
         return True
 
     def update(self, done: int, total: int) -> None:
-        """Do nothing, whatever has been done."""
+        """Do nothing."""
 
 
 class TextProgressMeter(AbstractProgressMeter):
@@ -80,8 +82,8 @@ class TextProgressMeter(AbstractProgressMeter):
     """
 
     def update(self, done: int, total: int) -> None:
-        """Print how many steps are done if another tenth of the run is complete."""
-        # Reports come a hundredth of the run apart, not at each step.
+        """Print the number of complete steps, after each tenth of the run."""
+        # Reports come after each hundredth of the run, not after each step.
         tenth, apart = max(1, total // 10), max(1, total // 100)
         if done == total or (done >= tenth and done % tenth < apart):
             print(f"{done} of {total} steps", flush=True)
@@ -117,7 +119,7 @@ class TqdmProgressMeter(AbstractProgressMeter):
         """Move the bar to `done` steps, and close it at the end of the run."""
         bar = self._open.bars.get(total)
         if bar is None:
-            # What was done before the bar opened does not count for its speed.
+            # Steps before the bar opened must not count for its speed.
             bar = self._open.bars[total] = tqdm.tqdm(
                 total=total,
                 initial=done,
@@ -132,7 +134,7 @@ class TqdmProgressMeter(AbstractProgressMeter):
             del self._open.bars[total]
 
     def close(self) -> None:
-        """Leave open bars as they stand."""
+        """Close the open bars as they are."""
         for bar in self._open.bars.values():
             bar.close()
         self._open.bars.clear()
@@ -142,7 +144,7 @@ class _Open:
     """The open bars of a meter, by the number of steps of their runs.
 
     They are state on the host. All instances are equal and have the same hash, so that
-    `jax.jit` does not compile a program anew for each of them.
+    `jax.jit` does not recompile a program for each of them.
     """
 
     def __init__(self):

@@ -1,3 +1,5 @@
+"""The reversible adjoint: the backward pass retraces the run from its end."""
+
 from dataclasses import replace
 from typing import Any
 
@@ -14,23 +16,22 @@ from ._adjoint import AbstractAdjoint, count, DirectAdjoint
 from ._loop import Loop
 from ._progress_meter import NoProgressMeter
 from ._saving import Rows
-from ._stepping import Carry
-from ._way_back import way_back
+from ._stepper import AbstractCarry
 
 
 class ReversibleAdjoint(AbstractAdjoint):
-    """Keep the end of the run alone and retrace the steps from there: memory O(1).
+    """Store only the end of the run and retrace the steps from there: memory O(1).
 
-    A symmetric step of -h leads back to where a step of h came from. With the
-    consistent closure, and on a group with the chart at the start of a step, it leads
-    back up to a small error only, and the step is inverted by an iteration that starts
-    from the step of -h.
+    If the method is symmetric, a step of -h leads back to the start of a step of h.
+    With the consistent closure, and on a group with the chart at the start of a step,
+    it leads back only up to a small error. An iteration that starts from the step of -h
+    then inverts the step.
 
-    The states that are retraced differ by round-off from those of the run. Where the
-    motion is attracted to some set, as that of a sleigh is, it is repelled in reversed
-    time, and the differences grow as fast as the motion decays; prefer
-    `RecursiveCheckpointAdjoint` there. This adjoint allows reverse mode and forward
-    over reverse mode alone: `jax.jvp` needs one of the other two adjoints. It gives
+    The retraced states differ from the states of the run by round-off. If the motion is
+    attracted to a set, as the motion of a sleigh is, it is repelled in reversed time,
+    and the differences grow as fast as the motion decays. In that case prefer
+    `RecursiveCheckpointAdjoint`. This adjoint allows reverse mode and forward over
+    reverse mode only: `jax.jvp` needs one of the other two adjoints. It computes
     gradients also if `num_steps` is an array.
 
     !!! example
@@ -45,23 +46,22 @@ class ReversibleAdjoint(AbstractAdjoint):
         7.0
     """
 
-    def run(self, loop: Loop, carry: Carry) -> tuple[Carry, Rows]:
+    def run(self, loop: Loop, carry: AbstractCarry) -> tuple[AbstractCarry, Rows]:
         """Run all steps of the loop from `carry`; return its end and all saved rows."""
         return _run((loop, carry))
 
 
 @eqx.filter_custom_vjp
-def _run(arguments: tuple[Loop, Carry]) -> tuple[Carry, Rows]:
+def _run(arguments: tuple[Loop, AbstractCarry]) -> tuple[AbstractCarry, Rows]:
     return DirectAdjoint().run(*arguments)
 
 
 @_run.def_fwd
 def _run_fwd(perturbed, arguments):
     del perturbed
-    # A call of `_run` would refuse forward mode over this reverse mode.
+    # Calling `_run` here would rule out forward mode over this reverse mode.
     carry, rows = DirectAdjoint().run(*arguments)
-    # The backward pass needs the shapes of the buffers alone, so these are not kept,
-    # but for the log of events.
+    # The backward pass needs only the shapes of the buffers, and the log.
     shapes = jax.eval_shape(lambda: rows)
     return (carry, rows), (carry, shapes, rows.log)
 
@@ -71,56 +71,50 @@ def _run_bwd(residuals, cotangents, perturbed, arguments):
     del perturbed
     (end, shapes, log), (loop, start) = residuals, arguments
     meter = eqx.filter(loop.meter, eqx.is_inexact_array)
-    loop = replace(loop, meter=NoProgressMeter())  # the forward pass has shown all
+    # The forward pass has shown the progress already.
+    loop, stepper = replace(loop, meter=NoProgressMeter()), loop.stepper
     of_end, row_cotangents = cotangents
-    way = way_back(loop, start, end, log)
-    cotangent = _filled(way.differentiable_part(of_end), way.differentiable_part(end))
+    reverse = stepper.reverse_replay(start, end, log)
+    cotangent = _filled(stepper.differentiable(of_end), stepper.differentiable(end))
     row_cotangents = _filled(row_cotangents, shapes)
     parameters, fixed = eqx.partition(loop, eqx.is_inexact_array)
-    nothing = jax.tree.map(jnp.zeros_like, parameters)
+    zeros = jax.tree.map(jnp.zeros_like, parameters)
 
-    def retrace(state, k):
-        place, step_state, cotangent, total = state
-        place, step_state = way.back(place, step_state, k)
+    def back(state, k):
+        replay, step_state, cotangent, total = state
+        replay, step_state = reverse.back(replay, step_state, k)
+        before = reverse.carry_before(replay, step_state, k)
 
         def forward(parameters, part):
             loop = eqx.combine(parameters, fixed)
-            carry, rows = way.rerun(loop, place, step_state, part, k)
-            return way.differentiable_part(carry), eqx.filter(
-                rows, eqx.is_inexact_array
-            )
+            carry = eqx.tree_at(stepper.differentiable, before, part)
+            carry, rows = loop.step(carry, k, replay)
+            return stepper.differentiable(carry), eqx.filter(rows, eqx.is_inexact_array)
 
-        part = way.differentiable_part_at(place, step_state)
-        _, pullback = jax.vjp(forward, parameters, part)
-        row = eqx.filter(way.rows(row_cotangents, place, k), eqx.is_inexact_array)
-        change, cotangent = pullback((cotangent, row))
-        return place, step_state, cotangent, jax.tree.map(jnp.add, total, change)
+        _, pullback = jax.vjp(forward, parameters, stepper.differentiable(before))
+        rows = loop.saving.read(row_cotangents, *reverse.places(replay, k))
+        rows = eqx.filter(rows, eqx.is_inexact_array)
+        change, cotangent = pullback((cotangent, rows))
+        return replay, step_state, cotangent, jax.tree.map(jnp.add, total, change)
 
-    last, state = (
-        count(loop.num_iterations) - np.int32(1),
-        (way.place_at_end, end.step_state, cotangent, nothing),
-    )
+    last = count(loop.num_iterations) - np.int32(1)
     _, first, cotangents, total = jax.lax.fori_loop(
         np.int32(0),
         count(loop.num_iterations),
-        lambda i, state: retrace(state, last - i),
-        state,
+        lambda i, state: back(state, last - i),
+        (reverse.after_end, end.step_state, cotangent, zeros),
     )
     total, cotangents = _if_retraced(
-        way.went_well,
-        loop.stepping.system,
+        stepper.succeeded(end),
+        stepper.plain.system,
         first.state,
         start.step_state.state,
         (cotangent, row_cotangents),
         (total, cotangents),
     )
-    cotangent = cotangents if loop.events is None else cotangents[0]
     of_start = jax.tree.map(lambda _: None, eqx.filter(start, eqx.is_inexact_array))
     of_start = eqx.tree_at(
-        lambda carry: carry.step_state.state,
-        of_start,
-        cotangent,
-        is_leaf=lambda leaf: leaf is None,
+        stepper.differentiable, of_start, cotangents, is_leaf=lambda leaf: leaf is None
     )
     return replace(total, meter=jax.tree.map(lambda _: None, meter)), of_start
 
@@ -135,8 +129,8 @@ def _if_retraced(
 ) -> PyTree[Array]:
     """Return the gradient, or NaN if the run failed or could not be retraced.
 
-    A run counts as retraced if the state that was `reached` agrees with the `start`.
-    The gradient is zero where all cotangents are, since then nothing depends on it.
+    A run counts as retraced if the state that was `reached` agrees with the `start`. If
+    all cotangents are zero, the gradient is zero in any case.
     """
     manifold = system.manifold_of(start.q)
     xi = manifold.local(manifold.compose(manifold.inverse(start.q), reached.q))
@@ -144,20 +138,20 @@ def _if_retraced(
     retraced = (max_norm(xi) <= small * (1 + max_norm(*jax.tree.leaves(start.q)))) & (
         relative(max_norm(reached.p - start.p), max_norm(start.p)) <= small
     )
-    asked = [jnp.any(leaf != 0) for leaf in jax.tree.leaves(cotangents)]
-    asked = jnp.any(jnp.stack(asked))
+    nonzero = [jnp.any(leaf != 0) for leaf in jax.tree.leaves(cotangents)]
+    any_nonzero = jnp.any(jnp.stack(nonzero))
 
-    def judged(x):
+    def nan_unless_retraced(x):
         x = jnp.where(successful & retraced, x, jnp.nan)
-        return jnp.where(asked, x, 0)
+        return jnp.where(any_nonzero, x, 0)
 
-    return jax.tree.map(judged, gradient)
+    return jax.tree.map(nan_unless_retraced, gradient)
 
 
 def _filled(cotangents: PyTree[Any], like: PyTree[Any]) -> PyTree[Any]:
-    """Fill in zeros for missing cotangents of arrays of inexact numbers.
+    """Replace missing cotangents of floating-point arrays by zeros.
 
-    The missing cotangents of other arrays, such as integers, stay None.
+    Missing cotangents of other arrays, such as integers, stay None.
     """
 
     def fill(cotangent, x):

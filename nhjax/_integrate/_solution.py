@@ -1,3 +1,5 @@
+"""The solution of a run, and the errors that it raises."""
+
 from collections.abc import Mapping, Sequence
 from functools import partial
 from typing import Any, NamedTuple
@@ -10,50 +12,52 @@ from .._custom_types import FloatScalarLike
 from .._errors import IntegrationError, is_traced, lane_name, raise_where
 from .._results import EVENT_OCCURRED, FALLBACK, JUMPS, messages, RESULTS
 from .._system import State
+from ._checkpoint import Checkpoint
 from ._dataset import to_dataset
+from ._events import EventLog
 from ._interpolation import DenseInterpolation
 
 
 class Solution(eqx.Module):
-    """The outcome of `nhjax.integrate`: what was saved, and how the run went.
+    """The result of `nhjax.integrate`: the saved output, and how the run went.
 
     - `t0`, `t1`: the first and the last time of the run.
     - `ts`: the times at which output was saved, of shape (k,); None if only dense
-        output or a checkpoint was.
-    - `ys`: the saved states, a `State` with a leading axis of length k, or what
-        `SaveAt(fn=...)` returned, stacked along such an axis; None where `ts` is.
+        output or a checkpoint was saved.
+    - `ys`: the saved states, a `State` with a leading axis of length k, or the values
+        of `SaveAt(fn=...)`, stacked along such an axis; None if `ts` is None.
     - `stats`: a dictionary of numbers about the run:
-        `num_steps` (how many steps were completed),
-        `num_iterations` (how many iterations the stage solver made in all),
-        `num_newton_steps` (how many steps the stage solver's own iteration did not
-        solve, so that Newton's method had to),
-        `num_redundant` (how many redundant constraints follow from others at the start;
-        if any do, reactions are not unique),
+        `num_steps` (the number of completed steps),
+        `num_iterations` (the total number of iterations of the stage solver),
+        `num_newton_steps` (the number of steps for which the stage solver's own
+        iteration failed, and which Newton's method solved),
+        `num_redundant` (the number of redundant constraints at the start; if there are
+        any, the reactions are not unique),
         `max_residual` (the largest residual of the stage equations, relative to the
         momenta),
-        `max_constraint_violation` (the largest |Φ| at the nodes, the initial state
-        included),
+        `max_constraint_violation` (the largest |Φ| at the nodes, including the initial
+        state),
         `max_multiplier_defect` (the largest |Λ^s - λ_c|, the distance of the last stage
         multiplier of a step from the continuous multiplier),
-        `max_invariant_error` (with `invariants` alone: the largest |I - I_0| of a
-        function that is kept, relative to the size of its terms),
+        `max_invariant_error` (only with `invariants`: the largest |I - I_0| of a
+        conserved function, relative to the size of its terms),
         `max_error_estimate` (the largest estimated error of a step, relative to the
-        change of the state in it, where 1 means that nothing of the step is right; not
-        of a method with one node),
-        `failed_step` (the index of the step that failed, -1 if none did), and
+        change of the state in the step; a value of 1 means that the step is entirely
+        wrong; missing for methods with one node),
+        `failed_step` (the index of the step that failed, -1 for none), and
         `worst_coordinate` (the index of the coordinate whose momentum equations had
-        the largest residual in the step that failed, or one that is not a number; -1
-        if none failed).
+        the largest residual, or a residual that is not a number, in the step that
+        failed; -1 if no step failed).
     - `result`: a member of `nhjax.RESULTS`, which says how the run ended.
     - `interpolation`: the collocation polynomials, with `SaveAt(dense=True)`; None
-        without.
-    - `checkpoint`: what a later run needs to go on bit for bit, with
-        `SaveAt(checkpoint=True)`; None without.
-    - `coordinates`: the names of the coordinates, if the system has them.
-    - `events`: the events of a run that was given an `event`, an `nhjax.EventLog`; None
-        without. Then `stats` has `num_events`, too, and `num_steps` is the number of
-        nodes that were reached. After an event that ends the run all entries of `ts`
-        and `ys` are those of the event, and so is `t1`.
+        otherwise.
+    - `checkpoint`: the `nhjax.Checkpoint` from which a later run continues bit for bit,
+        with `SaveAt(checkpoint=True)`; None otherwise.
+    - `coordinates`: the names of the coordinates, if the system has names.
+    - `events`: an `nhjax.EventLog` of the events of the run if `event` was given; None
+        otherwise. Then `stats` also has `num_events`, and `num_steps` is the number of
+        nodes that were reached. After an event that ends the run, all entries of `ts`
+        and `ys`, and `t1`, are those of the event.
 
     Under `vmap` every array has the batch as its leading axis; a member of the batch is
     called a lane.
@@ -61,17 +65,15 @@ class Solution(eqx.Module):
 
     t0: Float[Array, ""]
     t1: Float[Array, ""]
-    # None, the empty tree, if nothing was saved.
+    # `PyTree` includes None, the empty tree: type checkers do not ask users to test it.
     ts: PyTree[Float[Array, " k"]]
     ys: PyTree[Array]
     stats: dict[str, Any]
     result: RESULTS
     interpolation: DenseInterpolation | None
-    # A `Checkpoint`, or None.
-    checkpoint: Any = None
+    checkpoint: PyTree[Checkpoint] = None
     coordinates: tuple[str, ...] | None = eqx.field(default=None, static=True)
-    # An EventLog, or None, the empty tree, if the run was given no event.
-    events: Any = None
+    events: PyTree[EventLog] = None
 
     def evaluate(self, t: FloatScalarLike) -> State:
         """Compute the state at any time of the run, by the collocation polynomials.
@@ -82,8 +84,8 @@ class Solution(eqx.Module):
         The multiplier λ(t) is the continuous multiplier at that state; with the
         propagated closure it is the polynomial through the stage multipliers Λ^i.
         At the ends of the steps the result is the state that `integrate` computed.
-        Inside a step the error is O(h^s) in q, v and p, and one order better in p and v
-        if no force depends on the velocity.
+        Inside a step the error is O(h^s) in q, v and p. If no force depends on the
+        velocity, it is one order better in p and v.
 
         **Arguments:**
 
@@ -106,8 +108,8 @@ class Solution(eqx.Module):
         """
         if self.interpolation is None:
             raise ValueError(
-                "Dense output was not saved: pass `saveat=nhjax.SaveAt(dense=True)` to "
-                "`integrate` to be able to evaluate the solution between steps."
+                "Dense output was not saved. To evaluate the solution between steps, "
+                "pass `saveat=nhjax.SaveAt(dense=True)` to `integrate`."
             )
         return self.interpolation.evaluate(t)
 
@@ -117,26 +119,30 @@ class Solution(eqx.Module):
         coordinates: Sequence[str] | None = None,
         units: Mapping[str, str] | None = None,
     ) -> Any:
-        """Make an `xarray.Dataset` of what was saved, with named axes.
+        """Return the saved output as an `xarray.Dataset` with named axes.
 
-        Its variables are `q`, `v`, `p` and `multiplier`, with the dimensions `time`,
-        `coordinate` and `constraint`; on a group whose elements have more numbers than
-        it has dimensions `q_0` takes the place of the second, and on a product of
-        groups `q0`, `q1`, ... are the parts. What `SaveAt(fn=...)` returned is named by
-        the paths in its tree, and `value` if it is one array. Beside them are the
-        `stats` as `stats_num_steps` and so on, and `result`, the name of a member of
-        `nhjax.RESULTS`; of a run with events `event_t` and `event_which` too, along
-        `event`. For a batch `trajectory` comes first (of a batch of batches
-        `trajectory_0`, `trajectory_1`); if its members have different times, `time` has
-        no labels, and the times are in `t`.
+        The variables are `q`, `v`, `p` and `multiplier`, with the dimensions `time`,
+        `coordinate` and `constraint`. If the elements of a group have more numbers than
+        the group has dimensions, `q` has the dimension `q_0` instead of `coordinate`.
+        On a product of groups the parts of `q` are `q0`, `q1`, and so on. Values of
+        `SaveAt(fn=...)` are named by their paths in the tree; a single array is named
+        `value`.
+
+        The `stats` are variables such as `stats_num_steps`, and `result` is the name of
+        a member of `nhjax.RESULTS`. A run with events has `event_t` and `event_which`
+        along `event`. A batch has the first dimension `trajectory` (a batch of batches
+        `trajectory_0`, `trajectory_1`). If its members have different times, `time` has
+        no labels, and the variable `t` has the times.
 
         **Arguments:**
 
-        - `coordinates`: the names of the n coordinates; those of the system by default.
-        - `units`: units by the name of a variable, of `time`, or of a coordinate. The
-            former go to the attribute `units`, the latter along the coordinates as
-            `coordinate_unit`, and divided by that of `time` as `velocity_unit`. A
-            momentum has no unit that follows from these.
+        - `coordinates`: the names of the n coordinates. The default is the names in the
+            system.
+        - `units`: units by the name of a variable, of `time`, or of a coordinate. Units
+            of variables and of `time` become the attribute `units`. Units of
+            coordinates become the labels `coordinate_unit`, and divided by the unit of
+            `time` the labels `velocity_unit`. The unit of a momentum does not follow
+            from these.
 
         **Returns:** an `xarray.Dataset`.
 
@@ -160,21 +166,21 @@ class Solution(eqx.Module):
     def failures(self) -> list[tuple[int | tuple[int, ...] | None, int, str]]:
         """List the runs that failed, each as (lane, step, reason).
 
-        `step` is the index of the step that could not be taken, and `reason` the
-        message of its `RESULTS`. `lane` is None for a solution without a batch, an
-        index for a batch, and a tuple of indices for a batch of batches.
+        `step` is the index of the step that failed, and `reason` is the message of its
+        `RESULTS`. `lane` is None for a solution without a batch, an index for a batch,
+        and a tuple of indices for a batch of batches.
         """
         outcome = _outcome(self)
         if is_traced(*outcome):
             raise RuntimeError(
-                "Solution.failures() needs a computed solution, outside jit and vmap; "
-                "inside them use `sol.result` and `sol.stats['failed_step']`."
+                "Solution.failures() needs a computed solution, outside jit and vmap. "
+                "Inside them, use `sol.result` and `sol.stats['failed_step']`."
             )
         return _failures(outcome)
 
 
 class _Outcome(NamedTuple):
-    """How runs ended: codes of `RESULTS`, and where."""
+    """How runs ended: the codes of `RESULTS`, failed steps and worst coordinates."""
 
     codes: Any
     steps: Any
@@ -187,7 +193,7 @@ def _outcome(sol: Solution) -> _Outcome:
 
 
 def is_unsolved(sol: Solution) -> bool:
-    """Tell whether a run without a batch ended because a step could not be solved."""
+    """Return whether a run without a batch ended because a step was not solved."""
     unsolved = (
         RESULTS.nonlinear_divergence,
         RESULTS.nonlinear_max_iterations,
@@ -197,7 +203,7 @@ def is_unsolved(sol: Solution) -> bool:
 
 
 def is_singular_from_the_start(sol: Solution) -> bool:
-    """Tell whether the multipliers of a run without a batch were never determined."""
+    """Return whether a run without a batch failed at step 0 by a singular matrix."""
     singular = bool(sol.result == RESULTS.singular_stage_matrix)
     return singular and int(sol.stats["failed_step"]) == 0
 
@@ -207,8 +213,8 @@ def raise_failures(
 ) -> Solution:
     """Return `sol`, or raise an `IntegrationError` with lane, step and reason.
 
-    With the size `dt` of the steps, the message says which to try. It recommends
-    Newton's method unless the run has `used_newton` already.
+    With the step size `dt`, the message suggests another one. It recommends Newton's
+    method unless the run has already `used_newton`.
     """
     outcome = _outcome(sol)
     bad = outcome.codes != messages().index("")
@@ -238,7 +244,7 @@ def _failures(
     texts, failures = messages(), []
     for index in np.ndindex(codes.shape):
         message, coordinate = texts[int(codes[index])], int(coordinates[index])
-        # Other failures are not those of single equations.
+        # Other failures are not due to a single equation.
         if "stage equations" in message and coordinate >= 0:
             message += (
                 " The largest residual, or one that is not a number, was that of "

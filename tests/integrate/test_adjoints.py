@@ -1,4 +1,4 @@
-"""The three ways to differentiate in reverse, forward mode, and second derivatives."""
+"""The three adjoints in reverse mode, forward mode, and second derivatives."""
 
 from typing import Any
 
@@ -30,12 +30,12 @@ def largest(tree):
 
 
 def difference(got, expected):
-    """Relative to the largest number of all."""
+    """Assert agreement relative to the largest number of all."""
     return largest(jax.tree.map(jnp.subtract, got, expected)) / largest(expected)
 
 
 def assert_adjoints_agree(loss, given, adjoints):
-    """Of the gradients by `adjoints`, and of forward mode with them."""
+    """Assert that gradients by `adjoints` and forward mode agree."""
     along = direction(given)
 
     @jax.jit
@@ -103,7 +103,7 @@ def driven(given, adjoint, method, num_steps=10, samples=False, **options):
     ],
     ids=["samples", "Newton", "propagated"],
 )
-def test_the_adjoints_agree(method, options):
+def test_adjoints_of_a_run_give_equal_gradients(method, options):
     assert_adjoints_agree(
         lambda given, adjoint: driven(given, adjoint, method, **options),
         GIVEN,
@@ -111,7 +111,7 @@ def test_the_adjoints_agree(method, options):
     )
 
 
-def test_the_adjoints_agree_on_a_group():
+def test_adjoints_on_a_group_give_equal_gradients():
     suslov = systems.Suslov()
     parameters, fixed = eqx.partition(suslov.system, eqx.is_inexact_array)
     given = (parameters, jnp.zeros(3), suslov.initial_state().p, jnp.asarray(0.1))
@@ -150,7 +150,9 @@ def swing(dt, num_steps, adjoint, saveat: Any = None):
 
 
 @pytest.mark.parametrize(("num_steps", "checkpoints"), [(1, None), (11, 2), (11, 21)])
-def test_blocks_of_any_length_give_the_same_gradient(num_steps, checkpoints):
+def test_checkpoint_adjoint_with_any_block_length_gives_the_same_gradient(
+    num_steps, checkpoints
+):
     adjoint = nhjax.RecursiveCheckpointAdjoint(checkpoints)
 
     @jax.jit
@@ -202,7 +204,7 @@ ORDERS = {
     ],
     ids=["direct", "direct in reverse", "blocks", "reversible"],
 )
-def test_second_derivatives(adjoint, order):
+def test_hessian_by_each_adjoint_matches_finite_differences(adjoint, order):
     x, along = jnp.array([0.3, 0.1, -0.2]), jnp.array([1.0, -0.7, 0.5])
 
     def f(x):
@@ -218,18 +220,18 @@ def test_second_derivatives(adjoint, order):
 
 
 @pytest.mark.parametrize("adjoint", [nhjax.DirectAdjoint, 3])
-def test_an_adjoint_must_be_one(adjoint):
+def test_adjoint_of_a_wrong_type_raises(adjoint):
     with pytest.raises(TypeError, match="`adjoint` must be an"):
         swing(0.1, 2, adjoint)
 
 
 @pytest.mark.parametrize("checkpoints", [0, -1, 2.5, True, "3"])
-def test_the_number_of_checkpoints_must_be_one(checkpoints):
+def test_number_of_checkpoints_out_of_range_raises(checkpoints):
     with pytest.raises(ValueError, match="`checkpoints` must be an int >= 2"):
         nhjax.RecursiveCheckpointAdjoint(checkpoints)
 
 
-def test_the_reversible_adjoint_has_no_forward_mode():
+def test_reversible_adjoint_in_forward_mode_raises():
     with pytest.raises(TypeError, match=r"forward|jvp"):
         jax.jvp(lambda dt: swing(dt, 2, REVERSIBLE), (0.1,), (1.0,))
 
@@ -238,7 +240,7 @@ def test_the_reversible_adjoint_has_no_forward_mode():
 
 
 @pytest.mark.long
-def test_memory_grows_as_each_adjoint_promises():
+def test_memory_of_each_adjoint_grows_as_documented():
     example = systems.NonholonomicParticle()
     y0 = example.initial_state()
 

@@ -1,4 +1,4 @@
-"""Batches, ensembles, and what is compiled once."""
+"""Batches and ensembles, and programs that are compiled once."""
 
 from typing import Any
 
@@ -55,7 +55,7 @@ def driven_single():
 @pytest.mark.parametrize(
     "names", [["q"], ["dt", "t0"], ["mass", "friction"], list(LANES)]
 )
-def test_a_batch_is_its_lanes(names, driven_single):
+def test_batch_under_vmap_equals_single_runs(names, driven_single):
     first = {name: values[0] for name, values in LANES.items()}
     axes = [0 if name in names else None for name in LANES]
     given = [LANES[name] if name in names else first[name] for name in LANES]
@@ -70,7 +70,7 @@ def test_a_batch_is_its_lanes(names, driven_single):
         assert int(stats["num_steps"]) == 8
 
 
-def test_an_ensemble_is_its_members():
+def test_ensemble_of_runs_equals_single_runs():
     chaotic = ChaoticSystem()
 
     def member(q, v):
@@ -86,7 +86,7 @@ def test_an_ensemble_is_its_members():
     assert_trees_close(batch, expected, rtol=1e-13, atol=1e-13)
 
 
-def test_solutions_pass_through_jit():
+def test_solution_returned_from_jit_is_unchanged():
     # Functions are no leaves that a jitted function may return.
     sol = jax.jit(lambda dt: run(dt=dt, saveat=SaveAt(dense=True)))(DT)
     again = eqx.filter_jit(lambda sol, t: sol.evaluate(t))(sol, 0.55)
@@ -133,7 +133,7 @@ OTHER_VALUES = {
 }
 
 
-def test_other_values_recompile_nothing():
+def test_run_with_other_values_does_not_recompile():
     first = counted_run()
     count = len(traces)
     assert count > 0
@@ -144,7 +144,7 @@ def test_other_values_recompile_nothing():
             assert jnp.any(other.q != first.q), name
 
 
-def test_other_values_retrace_nothing_under_jit():
+def test_run_with_other_values_under_jit_does_not_retrace():
     program = jax.jit(counted_run)
     program(**dict.fromkeys(OTHER_VALUES, 1.0))
     count = len(traces)

@@ -1,4 +1,4 @@
-"""Runs that go on from a checkpoint: the bits of one piece, and what is refused."""
+"""Runs that continue bit for bit from a checkpoint, and refused checkpoints."""
 
 from functools import partial
 from typing import Any
@@ -34,7 +34,9 @@ def bytes_of(tree):
 
 @pytest.mark.parametrize("name", CASES)
 @pytest.mark.parametrize("num_steps", [100_000])
-def test_a_run_in_two_parts_has_the_same_bytes_as_in_one(name, num_steps, tmp_path):
+def test_checkpoint_between_two_runs_repeats_one_run_bit_for_bit(
+    name, num_steps, tmp_path
+):
     run, y0 = run_of(name, saveat=CHECKPOINT)
     whole = run(y0, num_steps=num_steps).checkpoint
     nhjax.save(tmp_path / "run.npz", run(y0, num_steps=40_003).checkpoint)
@@ -45,7 +47,7 @@ def test_a_run_in_two_parts_has_the_same_bytes_as_in_one(name, num_steps, tmp_pa
     assert int(whole.num_steps) == num_steps
 
 
-def test_a_state_alone_does_not_repeat_the_bytes():
+def test_state_without_checkpoint_does_not_repeat_a_run_bit_for_bit():
     run, y0 = run_of("driven", saveat=SaveAt(t1=True, checkpoint=True))
     whole, half = run(y0, num_steps=2000), run(y0, num_steps=1000)
     state = half.checkpoint.state
@@ -54,7 +56,7 @@ def test_a_state_alone_does_not_repeat_the_bytes():
     np.testing.assert_allclose(rest.ys.q, whole.ys.q, rtol=0, atol=1e-9)
 
 
-def test_what_steps_save_is_that_of_one_piece():
+def test_checkpoint_between_two_runs_saves_the_same_steps():
     run, y0 = run_of("driven", saveat=SaveAt(steps=3, checkpoint=True))
     whole, half = run(y0, num_steps=60), run(y0, num_steps=30)
     rest = run(half.checkpoint, num_steps=30)
@@ -64,7 +66,7 @@ def test_what_steps_save_is_that_of_one_piece():
     assert bytes_of(joined) == bytes_of((whole.ts, whole.ys))
 
 
-def test_members_of_a_batch_go_on_with_lengths_of_their_own():
+def test_checkpoint_of_a_batch_continues_with_different_lengths():
     run, y0 = run_of("particle", saveat=CHECKPOINT)
     several = jax.tree.map(lambda x: jnp.stack([x] * 3), y0)
     counts = jnp.array([3, 5, 8])
@@ -77,7 +79,7 @@ def test_members_of_a_batch_go_on_with_lengths_of_their_own():
     np.testing.assert_allclose(whole.t, [1.0] * 3, rtol=1e-15)
 
 
-def test_derivatives_pass_through_a_checkpoint():
+def test_checkpoint_between_two_runs_has_the_gradient_of_one_run():
     run, y0 = run_of("driven")
 
     def end(y):
@@ -98,7 +100,7 @@ def test_derivatives_pass_through_a_checkpoint():
         np.testing.assert_allclose(x, y, rtol=1e-10, atol=1e-12)
 
 
-def test_steps_of_another_size_and_other_args_start_at_the_same_time():
+def test_checkpoint_with_other_dt_or_args_starts_at_its_time():
     run, y0 = run_of("driven")
     half = run(y0, num_steps=10, saveat=CHECKPOINT).checkpoint
     other = {"dt": 0.05, "num_steps": 20, "args": jax.tree.map(lambda x: x + 0.5, ARGS)}
@@ -114,7 +116,7 @@ def test_steps_of_another_size_and_other_args_start_at_the_same_time():
     np.testing.assert_allclose(last.t, 2.0, rtol=1e-14)
 
 
-def test_a_failed_run_can_be_gone_on_with():
+def test_checkpoint_of_a_failed_run_can_be_resumed():
     run, y0 = run_of("driven", saveat=SaveAt(steps=True, checkpoint=True))
     hasty = nhjax.Newton(max_iterations=2)
     sol = run(y0, num_steps=5, stage_solver=hasty, throw=False)
@@ -164,6 +166,6 @@ def _no_flag():
         (_no_flag, "`checkpoint` must be True or False"),
     ],
 )
-def test_a_checkpoint_that_does_not_fit_is_refused(wrong, message):
+def test_checkpoint_of_another_system_raises(wrong, message):
     with pytest.raises((ValueError, TypeError), match=message):
         wrong()

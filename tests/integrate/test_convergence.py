@@ -103,7 +103,7 @@ some_methods = pytest.mark.parametrize(
 @every_closure
 @every_part
 @pytest.mark.parametrize("quantity", ["q", "v", "p", "continuous"])
-def test_state_and_continuous_multiplier_are_of_order_2s_minus_2(
+def test_state_and_continuous_multiplier_converge_with_order_2s_minus_2(
     quantity, part, closure, stages
 ):
     counts = STATE_COUNTS[stages]
@@ -113,7 +113,7 @@ def test_state_and_continuous_multiplier_are_of_order_2s_minus_2(
 
 @every_stages
 @every_part
-def test_propagated_multiplier_is_of_order_s_or_s_minus_1(part, stages):
+def test_propagated_multiplier_converges_with_order_s_or_s_minus_1(part, stages):
     # The corollary on the global error: R_A(∞) = (-1)^(s-1).
     counts = MULTIPLIER_COUNTS[stages]
     errors = solved_errors(part, stages, "propagated")
@@ -125,7 +125,9 @@ def test_propagated_multiplier_is_of_order_s_or_s_minus_1(part, stages):
 @every_stages
 @pytest.mark.parametrize("closure", ["consistent", "symmetric"])
 @every_part
-def test_multiplier_of_the_other_closures_is_of_order_2s_minus_2(part, closure, stages):
+def test_multiplier_of_other_closures_converges_with_order_2s_minus_2(
+    part, closure, stages
+):
     counts = STATE_COUNTS[stages]
     errors = solved_errors(part, stages, closure)
     assert nhjax.LobattoIIIAB(stages, closure).multiplier_order == 2 * stages - 2
@@ -197,7 +199,7 @@ every_friction = pytest.mark.parametrize("friction", PENDULUM_COUNTS)
 
 @pytest.mark.parametrize("stages", [1, 2, 3, 4])
 @every_friction
-def test_gauss_without_constraints_is_of_order_2s(friction, stages):
+def test_gauss_without_constraints_converges_with_order_2s(friction, stages):
     y0, acceleration, args = pendulum_problem(friction)
     method = nhjax.Gauss(stages)
     assert method.order == 2 * stages
@@ -209,7 +211,7 @@ def test_gauss_without_constraints_is_of_order_2s(friction, stages):
 
 @pytest.mark.parametrize("stages", [2, 3, 4, 5])
 @every_friction
-def test_lobatto_without_constraints_is_of_order_2s_minus_2(friction, stages):
+def test_lobatto_without_constraints_converges_with_order_2s_minus_2(friction, stages):
     y0, acceleration, args = pendulum_problem(friction)
     method = nhjax.LobattoIIIAB(stages)
     assert method.order == 2 * stages - 2
@@ -220,7 +222,9 @@ def test_lobatto_without_constraints_is_of_order_2s_minus_2(friction, stages):
 
 
 @some_methods
-def test_order_with_a_rheonomic_affine_constraint_and_friction(stages, closure):
+def test_lobatto_with_affine_rheonomic_constraint_and_friction_keeps_order(
+    stages, closure
+):
     system, y0, args = helpers.problem("driven")
     mechanics = paper.Driven(FIELD, FRICTION)
     method = nhjax.LobattoIIIAB(stages, closure)
@@ -245,7 +249,7 @@ def spring_appell_lagrangian(t, q, v, args):
 
 
 @some_methods
-def test_order_with_a_constraint_nonlinear_in_the_velocities(stages, closure):
+def test_lobatto_with_constraint_nonlinear_in_velocities_keeps_order(stages, closure):
     appell = helpers.GALLERY["Appell"]
     system = nhjax.LagrangianSystem(
         spring_appell_lagrangian, nonholonomic=appell.constraint

@@ -51,7 +51,7 @@ def order(error):
 
 
 @pytest.mark.parametrize("stages", [2, 3, 4, 5])
-def test_orders_without_forces_that_depend_on_the_velocity(stages):
+def test_dense_output_without_velocity_forces_has_expected_orders(stages):
     q, v, multiplier = PARTICLE.exact(T)
     problem = PARTICLE.system, PARTICLE.initial_state(), None
     expected = {"q": q, "v": v, "p": v, "multiplier": multiplier}
@@ -65,7 +65,7 @@ def test_orders_without_forces_that_depend_on_the_velocity(stages):
 
 
 @pytest.mark.parametrize("stages", [3, 4])
-def test_orders_in_general(stages):
+def test_dense_output_with_velocity_forces_has_expected_orders(stages):
     system, y0, args = problem = helpers.problem("driven")
     reference = nhjax.integrate(
         system, nhjax.LobattoIIIAB(6), y0, dt=T / 40, num_steps=40, args=args
@@ -77,7 +77,7 @@ def test_orders_in_general(stages):
 
 
 @pytest.mark.parametrize(("stages", "expected"), [(3, 2), (4, 4), (5, 4)])
-def test_orders_of_the_propagated_multiplier(stages, expected):
+def test_dense_output_of_propagated_multiplier_has_expected_orders(stages, expected):
     # s for even s, s - 1 for odd s, as at the nodes.
     _, _, multiplier = PARTICLE.exact(T)
     problem = PARTICLE.system, PARTICLE.initial_state(), None
@@ -98,7 +98,7 @@ def sol():
     )
 
 
-def test_continuity_at_the_nodes(sol):
+def test_dense_output_at_the_nodes_is_continuous(sol):
     evaluate = jax.jit(jax.vmap(lambda t: sol.evaluate(t)))
     inner, near = sol.ts[1:-1], 1e-13
     for shift in (-near, 0.0, near):
@@ -111,7 +111,7 @@ def test_continuity_at_the_nodes(sol):
         )
 
 
-def test_evaluation_one_by_one_in_a_batch_and_compiled(sol):
+def test_dense_output_under_vmap_and_jit_equals_single_evaluations(sol):
     ts = jnp.linspace(-0.5, 0.5, 7)
     batch = jax.vmap(sol.evaluate)(ts)
     compiled = eqx.filter_jit(sol.evaluate)
@@ -128,7 +128,7 @@ def test_evaluation_one_by_one_in_a_batch_and_compiled(sol):
             )
 
 
-def test_the_parts_of_a_state_agree(sol):
+def test_dense_output_between_nodes_is_a_consistent_state(sol):
     t = jnp.asarray(0.234)
     state, rate = jax.jvp(sol.evaluate, (t,), (jnp.ones_like(t),))
     np.testing.assert_allclose(state.p, PARTICLE.system.momentum(t, state.q, state.v))
@@ -143,14 +143,14 @@ def test_the_parts_of_a_state_agree(sol):
     assert 1e-12 < violation < 1e-5
 
 
-def test_an_integer_time(sol):
+def test_dense_output_at_an_integer_time_is_evaluated(sol):
     assert sol.evaluate(0).q.dtype == jnp.float64
     np.testing.assert_array_equal(sol.evaluate(0).q, sol.evaluate(0.0).q)
 
 
 @pytest.mark.filterwarnings("ignore:.SimplifiedNewton. did not solve")
 @pytest.mark.parametrize("closure", [long("propagated"), "symmetric"])
-def test_a_failed_trajectory_stays_at_its_last_good_state(closure):
+def test_dense_output_after_a_failure_stays_at_last_good_state(closure):
     # It rises to an apex where D2Φ vanishes.
     appell = Appell(v0=(0.15, 0.2, 0.5))
 

@@ -1,4 +1,4 @@
-"""Gradients where a trajectory fails: of its lane alone, and of no other."""
+"""Gradients of failed trajectories: NaN for the failed member, and for no other."""
 
 import jax
 import jax.numpy as jnp
@@ -65,7 +65,7 @@ LOSSY = nhjax.LagrangianSystem(
 
 
 @pytest.mark.parametrize("name", ADJOINTS)
-def test_lanes_whose_start_or_functions_fail(name):
+def test_gradient_of_members_that_fail_is_nan_for_them_only(name):
     def loss(x):
         shift, wall, mass, change, off = x
         q, v = jnp.array([0.2, 0.5, 0.1]), jnp.array([1.0, 0.6, 0.5])
@@ -102,7 +102,7 @@ def test_lanes_whose_start_or_functions_fail(name):
 
 
 @pytest.mark.parametrize("name", ADJOINTS)
-def test_a_lane_that_leaves_the_chart(name):
+def test_gradient_of_a_member_that_leaves_the_chart_is_nan_for_it_only(name):
     system = nhjax.LagrangianSystem(
         lambda t, q, v, args: 0.5 * v @ v + 0.1 * jnp.cos(q[0]), manifold=nhjax.SO2()
     )
@@ -142,7 +142,7 @@ def give_up(dt, adjoint):
 
 @pytest.mark.parametrize("name", ADJOINTS)
 @pytest.mark.parametrize("compiled", [False, True], ids=["eager", "jit"])
-def test_a_gradient_of_a_run_that_throws_is_an_error(name, compiled):
+def test_gradient_of_a_run_that_throws_raises(name, compiled):
     gradient = jax.grad(lambda dt: give_up(dt, ADJOINTS[name]))
     gradient = jax.jit(gradient) if compiled else gradient
     error = jax.errors.JaxRuntimeError if compiled else Exception

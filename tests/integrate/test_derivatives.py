@@ -1,4 +1,4 @@
-"""Gradients of runs in all that is given, by any way, against differences."""
+"""Gradients of runs in all arguments against finite differences."""
 
 import equinox as eqx
 import jax
@@ -34,7 +34,7 @@ GIVEN = {
 
 
 def driven(given, closure, saveat):
-    """A run in which everything plays a part, not all of it in plain sight."""
+    """A run that depends on all arguments and on arrays in closures."""
     scale, args = given["fn"], given["args"]
     # The masses are leaves of the system; over all else the functions close.
     leaves = Driven(given["leaf"], given["closed over"])
@@ -69,7 +69,7 @@ def driven(given, closure, saveat):
 
 
 def samples(given):
-    """Two in one step, and the ends."""
+    """Samples: two in one step, and both ends."""
     sol = driven(
         given, "symmetric", lambda ts, fn: SaveAt(t0=True, ts=ts, t1=True, fn=fn)
     )
@@ -77,29 +77,29 @@ def samples(given):
 
 
 def thinned_nodes(given):
-    """Each 67th and the last."""
+    """Every 67th state and the last one."""
     sol = driven(given, "consistent", lambda ts, fn: SaveAt(steps=67, t1=True, fn=fn))
     return scalar((sol.ts, sol.ys))
 
 
 def dense_output(given):
-    """In the middle of two steps, and at the end."""
+    """Dense output in the middle of two steps, and at the end."""
     sol = driven(given, "symmetric", lambda ts, fn: SaveAt(t1=True, dense=True, fn=fn))
     between = jax.vmap(sol.evaluate)(given["ts"][1:])
     return scalar((sol.ys, between, sol.evaluate(sol.t1)))
 
 
 @pytest.mark.parametrize("loss", [long(samples), thinned_nodes, long(dense_output)])
-def test_the_gradient_in_all_that_is_given(loss):
+def test_gradient_in_all_arguments_matches_finite_differences(loss):
     assert_gradient(loss, GIVEN, epsilon=3e-5)
 
 
 def momenta(matrix, q):
-    """A metric on momenta that varies."""
+    """A kinetic energy of the momenta that depends on the position."""
     return matrix + 0.2 * jnp.outer(jnp.sin(q), jnp.sin(q))
 
 
-def test_the_gradient_of_a_hamiltonian_system_given_velocities():
+def test_gradient_of_hamiltonian_system_from_velocities_matches_finite_differences():
     metric = jnp.eye(3) + 0.1 * jnp.cos(np.add.outer(np.arange(3.0), np.arange(3.0)))
     given = {
         "q": jnp.array([0.5, -0.3, 0.2]),
@@ -128,7 +128,7 @@ def test_the_gradient_of_a_hamiltonian_system_given_velocities():
     assert_gradient(loss, given)
 
 
-def test_the_gradient_of_a_hamiltonian_system_on_a_group():
+def test_gradient_of_hamiltonian_system_on_a_group_matches_finite_differences():
     suslov = systems.Suslov()
     given = {
         "inverse": jnp.linalg.inv(
@@ -156,7 +156,7 @@ def test_the_gradient_of_a_hamiltonian_system_on_a_group():
 # Initial states -----------------------------------------------------------------------
 
 
-def test_the_gradient_of_an_initial_state_given_momenta():
+def test_gradient_of_initial_state_from_momenta_matches_finite_differences():
     sleigh = systems.ChaplyginSleigh()
     given, joined = split(sleigh)
     given["p"] = jnp.array([0.2, 0.5, 0.4])
@@ -173,7 +173,7 @@ def test_the_gradient_of_an_initial_state_given_momenta():
 @pytest.mark.parametrize(
     "example", [systems.Appell(), systems.RodSleigh()], ids=["nonlinear", "holonomic"]
 )
-def test_the_gradient_of_a_projected_initial_state(example):
+def test_gradient_of_projected_initial_state_matches_finite_differences(example):
     # Far from the constraints, so that the projection has something to do.
     example = eqx.tree_at(
         lambda e: (e.q0, e.v0), example, (1.1 * example.q0 + 0.05, example.v0 + 0.1)
@@ -189,7 +189,7 @@ def test_the_gradient_of_a_projected_initial_state(example):
     assert_gradient(loss, given, epsilon=3e-4, rtol=1e-10)
 
 
-def test_the_gradient_of_a_consistent_state_of_explicit_parts():
+def test_gradient_of_state_from_explicit_parts_matches_finite_differences():
     # y0 by its parts, as they come from an earlier solution.
     system, y0, args = helpers.problem("driven")
     method = LobattoIIIAB(2, "propagated")
@@ -206,7 +206,7 @@ def test_the_gradient_of_a_consistent_state_of_explicit_parts():
 # float32 ------------------------------------------------------------------------------
 
 
-def test_single_precision():
+def test_gradient_in_single_precision_is_accurate():
     particle = systems.NonholonomicParticle()
 
     def loss(dt, dtype):

@@ -1,4 +1,4 @@
-"""Ensembles in lanes are those of XLA to round-off, whatever their members do."""
+"""Ensembles by the native engine equal XLA to round-off, whatever their members do."""
 
 from functools import lru_cache
 
@@ -43,7 +43,7 @@ def ensemble(example, members, num_steps):
 
 
 def by_both(function, args, monkeypatch):
-    """What members give in lanes, and by XLA, of one program that is traced once."""
+    """The results of one traced program by the native engine and by XLA."""
     program, shapes = jax.make_jaxpr(jax.vmap(function), return_shape=True)(*args)
     found = []
     for engine in ("lanes", "xla"):
@@ -60,7 +60,7 @@ def by_both(function, args, monkeypatch):
 
 
 @pytest.mark.parametrize("name", long_but(QUICK, GALLERY))
-def test_an_ensemble_in_lanes_is_that_of_xla(name, monkeypatch):
+def test_ensemble_by_native_engine_equals_xla(name, monkeypatch):
     num_steps = 20
     function = program(GALLERY[name], "end", 2, num_steps)
     args = ensemble(GALLERY[name], 9, num_steps)
@@ -75,7 +75,7 @@ def test_an_ensemble_in_lanes_is_that_of_xla(name, monkeypatch):
 @pytest.mark.parametrize(
     "kind", ["rows", "dense", "jvp", long("checkpoints"), "reversible"]
 )
-def test_output_and_derivatives_in_lanes_are_those_of_xla(kind, monkeypatch):
+def test_output_and_derivatives_by_native_engine_equal_xla(kind, monkeypatch):
     function = program(PARTICLE, kind, 2, 10)
     args = ensemble(PARTICLE, 5, 10)
     (lanes, _), (expected, counts) = by_both(function, args, monkeypatch)
@@ -85,7 +85,7 @@ def test_output_and_derivatives_in_lanes_are_those_of_xla(kind, monkeypatch):
 
 @lru_cache
 def ten_steps(name):
-    """The states at the end of each member of an ensemble, and how they ran."""
+    """The last state and the statistics of each member of an ensemble."""
 
     @jax.jit
     @jax.vmap
@@ -100,8 +100,8 @@ def ten_steps(name):
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, 1e200, 1e308, -0.0])
 @pytest.mark.parametrize("name", ["NonholonomicParticle", "ChaplyginSleigh"])
-def test_a_wild_member_changes_no_other(name, value):
-    """Of 11 members, which fill a vector and a part of one, some are wild."""
+def test_member_that_fails_in_an_ensemble_does_not_change_others(name, value):
+    """The 11 members fill one vector register and a part of another; some diverge."""
     run, wild = ten_steps(name), [1, 4, 10]
     y0, dt = ensemble(GALLERY[name], 11, 10)
     expected = run(y0, dt)
@@ -114,7 +114,7 @@ def test_a_wild_member_changes_no_other(name, value):
 
 
 @pytest.mark.parametrize("members", [1, 7, 8, 9, 1000])
-def test_ensembles_of_any_size_end_as_their_members_do(members):
+def test_ensemble_of_any_size_equals_its_members(members):
     @jax.jit
     @jax.vmap
     def run(dt):

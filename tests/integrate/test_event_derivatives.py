@@ -1,4 +1,4 @@
-"""Derivatives of times and places of events, by every adjoint, and of batches."""
+"""Derivatives of event times and states by every adjoint, and in batches."""
 
 from typing import Any
 
@@ -28,7 +28,7 @@ GIVEN = {
 
 
 def times_places_and_rows(given, on_group, adjoint):
-    """All that a run reports in which one tip of the rod touches the floor twice."""
+    """The output of a run in which one tip of the rod touches the floor twice."""
     dt = given["dt"]
     args = given["q"], given["v"], given["restitution"]
     options = {"saveat": SaveAt(t0=True, steps=True), "adjoint": adjoint}
@@ -38,7 +38,7 @@ def times_places_and_rows(given, on_group, adjoint):
 
 
 @pytest.mark.parametrize("on_group", [False, long(True)])
-def test_gradients_are_those_of_differences(on_group):
+def test_event_gradients_match_finite_differences(on_group):
     along = direction(GIVEN)
     adjoints = [DIRECT, REVERSIBLE] if on_group else [DIRECT, CHECKPOINTS, REVERSIBLE]
 
@@ -57,8 +57,8 @@ def test_gradients_are_those_of_differences(on_group):
 
 
 @pytest.mark.long
-def test_members_on_a_group_have_rates_of_their_own():
-    """In forward mode, by blocks, of the same start with two restitutions."""
+def test_event_derivatives_of_members_on_a_group_match_single_runs():
+    """Forward mode with checkpoints, for one start with two restitutions."""
     along = direction(GIVEN)
 
     def value(given):
@@ -78,7 +78,7 @@ def test_members_on_a_group_have_rates_of_their_own():
 
 
 @pytest.mark.long
-def test_second_derivatives_are_those_of_closed_forms():
+def test_event_second_derivatives_match_closed_forms():
     """Of a ball that falls from the height 1/2 at the time g^(-1/2), and rises half.
 
     Half of its speed is left, so that its height at t = 1.5 is, with T = g^(-1/2),
@@ -129,8 +129,8 @@ def test_second_derivatives_are_those_of_closed_forms():
 
 
 @pytest.mark.parametrize("adjoint", [DIRECT, REVERSIBLE])
-def test_an_event_next_to_a_node_has_its_derivative(adjoint):
-    """That of the time x/v at which a free motion comes to x, just after a node."""
+def test_event_next_to_a_node_has_its_derivative(adjoint):
+    """The time x/v at which a free motion reaches x, just after a node."""
     free, place = nhjax.LagrangianSystem(lambda t, q, v, args: 0.5 * v @ v), 0.5 + 1e-12
 
     def time(v):
@@ -147,14 +147,14 @@ def test_an_event_next_to_a_node_has_its_derivative(adjoint):
     np.testing.assert_allclose(jax.grad(time)(jnp.ones(())), -place, rtol=1e-12)
 
 
-def test_a_place_where_a_multiplier_vanishes_has_the_exact_gradient():
-    """That of (2 cos α + ω²/g) / 3 in g."""
+def test_event_at_a_vanishing_multiplier_has_exact_gradient():
+    """The exact place is (2 cos α + ω²/g) / 3; differentiate in g."""
     place = jax.jit(jax.grad(lambda gravity: slide(4, 0.1, gravity).ys.q[-1, 2]))
     expected = -(SLIDE.rate**2) / 3
     np.testing.assert_allclose(place(jnp.asarray(1.0)), expected, rtol=0, atol=2e-8)
 
 
-def test_members_of_a_batch_have_events_of_their_own():
+def test_event_gradients_in_a_batch_equal_single_runs():
     """100 oscillators x = cos(ωt) end where x = 0, t = π/(2ω); one never does."""
     system = nhjax.LagrangianSystem(
         lambda t, q, v, args: 0.5 * (v @ v - args**2 * (q @ q))

@@ -25,7 +25,7 @@ def run(y0=FALL, num_steps=12, **options):
     return nhjax.integrate(BALL, METHOD, y0, num_steps=num_steps, **options)
 
 
-def test_a_run_from_a_checkpoint_meets_the_events_of_one_in_one_piece():
+def test_event_run_from_a_checkpoint_has_the_events_of_one_run():
     first = nhjax.integrate(
         BALL, METHOD, FALL, dt=0.3, num_steps=2, saveat=SaveAt(checkpoint=True)
     )
@@ -34,7 +34,7 @@ def test_a_run_from_a_checkpoint_meets_the_events_of_one_in_one_piece():
     np.testing.assert_allclose(sol.ys.q, run().ys.q, rtol=1e-15)
 
 
-def test_a_gauss_method_ends_at_events():
+def test_event_with_gauss_method_ends_the_run():
     sol = nhjax.integrate(
         BALL, nhjax.Gauss(2), FALL, dt=0.3, num_steps=12, event=BOUNCE
     )
@@ -43,8 +43,8 @@ def test_a_gauss_method_ends_at_events():
     np.testing.assert_allclose(sol.ys.q[0], 0.6 - 0.18, rtol=1e-14)
 
 
-def test_a_hamiltonian_system_is_reset_by_its_momentum():
-    """A ball of mass 2 keeps half of it, and has v = 1/2 after its first impact."""
+def test_event_reset_of_hamiltonian_system_sets_momentum():
+    """A ball of mass 2 keeps half its momentum: v = 1/2 after the first impact."""
     system = nhjax.HamiltonianSystem(lambda t, q, p, args: 0.25 * p @ p + 2 * q[0])
     y0 = nhjax.initial_state(system, jnp.array([0.5]), p=jnp.zeros(1))
     event = Event(BOUNCE.cond_fn, reset=lambda t, y, args: (y.q, -0.5 * y.p))
@@ -64,7 +64,7 @@ class Recorder(nhjax.AbstractProgressMeter):
 seen: list[tuple[int, int]] = []
 
 
-def test_a_meter_counts_the_steps_of_a_batch_once():
+def test_event_run_in_a_batch_reports_progress_once():
     seen.clear()
 
     def end(height):
@@ -78,7 +78,7 @@ def test_a_meter_counts_the_steps_of_a_batch_once():
     assert seen == [(done, 400) for done in (1, *range(4, 401, 4))]
 
 
-def test_events_are_written_to_files_and_data_sets(tmp_path):
+def test_event_log_in_files_and_datasets_is_complete(tmp_path):
     sol = run(saveat=SaveAt(steps=True))
     nhjax.save(tmp_path / "run.npz", sol)
     got = nhjax.load(tmp_path / "run.npz")

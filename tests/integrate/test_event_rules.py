@@ -1,4 +1,4 @@
-"""Which zeros are events, which comes first, and what is told where something fails."""
+"""Which zeros are events, which event fires first, and how failures are reported."""
 
 from typing import Any
 
@@ -44,7 +44,7 @@ def reported(sol):
     return sol.events.ts[:num], list(map(int, sol.events.which[:num]))
 
 
-def test_of_two_events_in_a_step_the_first_wins():
+def test_event_pair_in_one_step_fires_the_first():
     sol = run([at(0.7), at(0.3)])
     np.testing.assert_allclose(sol.t1, 0.3, rtol=1e-15)
     np.testing.assert_allclose(sol.ys.q[0], 0.3, rtol=1e-15)
@@ -52,8 +52,8 @@ def test_of_two_events_in_a_step_the_first_wins():
     assert sol.result == RESULTS.event_occurred
 
 
-def test_events_that_are_watched_change_nothing():
-    """Those in the other direction are not met; the last one ends the run."""
+def test_event_without_action_does_not_change_the_run():
+    """Zeros in the other direction do not fire; the last event ends the run."""
     watched = [at(x, terminate=False) for x in (0.7, 0.3, 1.0)]
     away = at(2.2, terminate=False, direction=False)
     saveat = SaveAt(t0=True, steps=True)
@@ -67,15 +67,15 @@ def test_events_that_are_watched_change_nothing():
     assert int(sol.stats["num_events"]) == 4
 
 
-def test_a_zero_at_the_start_is_left_not_met():
-    """By a motion that comes back there it is met at its return."""
+def test_event_condition_zero_at_start_does_not_fire():
+    """A motion that comes back to the surface fires the event when it returns."""
     assert reported(run(at(0.0)))[1] == []
     y0 = nhjax.initial_state(BALL, jnp.zeros(1), jnp.ones(1))
     sol = run(bounce(), dt=1.5, system=BALL, y0=y0)
     np.testing.assert_allclose(reported(sol)[0], [2.0, 4.0], rtol=1e-15)
 
 
-def test_an_event_that_is_never_met_leaves_the_run_as_it_is():
+def test_event_that_never_fires_does_not_change_the_run():
     sol = run([at(5.0), bounce()], num_steps=4)
     plain = nhjax.integrate(FREE, METHOD, GO, dt=1.0, num_steps=4)
     for x, y in zip(jax.tree.leaves(sol.ys), jax.tree.leaves(plain.ys), strict=True):
@@ -86,13 +86,13 @@ def test_an_event_that_is_never_met_leaves_the_run_as_it_is():
     assert sol.t1 == 4.0
 
 
-def test_a_touch_without_a_change_of_sign_is_not_met():
+def test_event_condition_without_sign_change_does_not_fire():
     sol = run(Event(lambda t, y, args: (y.q[0] - 0.5) ** 2))
     assert reported(sol)[1] == []
     assert sol.result == RESULTS.successful
 
 
-def test_a_zero_without_a_slope_is_met_and_has_no_derivative():
+def test_event_condition_without_slope_fires_with_nan_derivative():
     def time(place, weight=1.0):
         event = Event(lambda t, y, args: (y.q[0] - args) ** 3)
         return weight * run(event, args=place).t1
@@ -110,8 +110,8 @@ def test_a_zero_without_a_slope_is_met_and_has_no_derivative():
 
 
 @pytest.mark.parametrize("dt", [0.31, 5.1])
-def test_bounces_follow_each_other_within_a_step_or_not(dt):
-    """A ball falls from 1/2 in unit time, and comes back every two."""
+def test_event_resets_within_one_step_all_fire(dt):
+    """A ball falls from 1/2 in time 1, and comes back every 2."""
     sol = run(bounce(), dt=dt, num_steps=round(10.2 / dt), system=BALL, y0=FALL)
     times, _ = reported(sol)
     np.testing.assert_allclose(times, np.arange(1, 10, 2), rtol=1e-14)
@@ -121,7 +121,7 @@ def test_bounces_follow_each_other_within_a_step_or_not(dt):
     assert int(sol.stats["worst_coordinate"]) == -1
 
 
-def test_an_event_at_a_node_is_met_once():
+def test_event_at_a_node_fires_once():
     saveat = SaveAt(t0=True, steps=True)
     event = at(1.0, reset=lambda t, y, args: (y.q, -y.v))
     sol = run(event, saveat=saveat, num_steps=4)
@@ -129,7 +129,7 @@ def test_an_event_at_a_node_is_met_once():
     np.testing.assert_allclose(sol.ys.q[:, 0], [0.0, 1.0, 0.0, -1.0, -2.0], atol=1e-15)
 
 
-def test_two_events_at_one_time_are_both_met():
+def test_event_pair_at_one_time_fires_both():
     def wall(i):
         def reset(t, y, args):
             return y.q, y.v.at[i].multiply(-1.0)
@@ -142,8 +142,8 @@ def test_two_events_at_one_time_are_both_met():
     np.testing.assert_allclose(sol.ys.q[0], -0.7, rtol=1e-14)
 
 
-def test_two_events_at_the_last_node_are_both_met():
-    """The row of the node has the state after both."""
+def test_event_pair_at_the_last_node_fires_both():
+    """The row of the node has the state after both resets."""
 
     def wall(i):
         def reset(t, y, args):
@@ -158,18 +158,18 @@ def test_two_events_at_the_last_node_are_both_met():
     np.testing.assert_array_equal(sol.ys.v, [[1.0, 1.0], [-1.0, -1.0]])
 
 
-def test_an_infinite_rate_makes_nothing_zero_that_is_not():
-    """That of the square root of time at its start."""
+def test_event_condition_with_infinite_rate_keeps_its_sign():
+    """The square root of time has an infinite rate at the start."""
     sol = run(Event(lambda t, y, args: 0.5 - jnp.sqrt(t)))
     np.testing.assert_allclose(sol.t1, 0.25, rtol=1e-15)
 
 
-def test_time_runs_backwards_to_events_too():
+def test_event_with_negative_dt_fires():
     sol = run(at(-0.4, direction=False), dt=-0.25)
     np.testing.assert_allclose(sol.t1, -0.4, rtol=1e-15)
 
 
-def test_events_that_accumulate_end_in_a_failure_that_says_so():
+def test_event_accumulation_fails_with_too_many_events():
     sol = run(bounce(0.5), dt=0.3, num_steps=12, system=BALL, y0=FALL, throw=False)
     assert sol.result == RESULTS.too_many_events
     assert int(sol.events.num) == 32
@@ -182,8 +182,8 @@ def test_events_that_accumulate_end_in_a_failure_that_says_so():
 
 
 @pytest.mark.parametrize("floor", [0.0, 1 / 3])
-def test_a_ball_never_falls_through_a_floor_by_round_off(floor):
-    """Its bounces accumulate, and its speed is below the round-off of places."""
+def test_event_of_a_bouncing_ball_is_never_missed_by_round_off(floor):
+    """The bounces accumulate until the speed is below the round-off of positions."""
     event = Event(
         lambda t, y, args: y.q[0] - args,
         direction=False,
@@ -198,7 +198,7 @@ def test_a_ball_never_falls_through_a_floor_by_round_off(floor):
     np.testing.assert_allclose(sol.ys.q[0], floor, rtol=1e-15, atol=1e-30)
 
 
-def test_a_condition_that_is_not_a_number_is_told():
+def test_event_condition_not_finite_fails_with_its_result():
     event = Event(lambda t, y, args: jnp.log(1.5 - y.q[0]) - 9.0)
     sol = run(event, throw=False)
     assert sol.result == RESULTS.nonfinite_event
@@ -210,7 +210,7 @@ def test_a_condition_that_is_not_a_number_is_told():
             run(wrong)
 
 
-def test_a_reset_that_breaks_a_constraint_is_told():
+def test_event_reset_that_violates_a_constraint_fails():
     disc = nhjax.systems.VerticalRollingDisc()
     y0 = disc.initial_state()
     event = Event(
@@ -255,7 +255,7 @@ WRONG = {
 
 
 @pytest.mark.parametrize("message", WRONG)
-def test_functions_that_return_something_else_are_refused(message):
+def test_event_function_with_wrong_output_raises(message):
     with pytest.raises((nhjax.ShapeError, nhjax.DTypeError, TypeError)) as error:
         run([at(0.7), WRONG[message]])
     assert "vent 1" in str(error.value)
@@ -266,17 +266,20 @@ def test_functions_that_return_something_else_are_refused(message):
     ("options", "advice"),
     [
         ({"saveat": SaveAt(ts=[0.5])}, "Save at `steps`"),
-        ({"saveat": SaveAt(t1=True, checkpoint=True)}, "Go on from its last state"),
+        (
+            {"saveat": SaveAt(t1=True, checkpoint=True)},
+            "Start another run from the last state",
+        ),
     ],
 )
-def test_what_goes_without_events_alone_is_refused_by_name(options, advice):
+def test_event_with_unsupported_option_raises(options, advice):
     with pytest.raises(ValueError, match=f"together with `event`.*{advice}"):
         run(at(0.5), **options)
 
 
 @pytest.mark.usefixtures("optimised_kernels")
 @pytest.mark.long
-def test_runs_with_events_in_lanes_are_those_of_xla(monkeypatch):
+def test_event_runs_by_native_engine_equal_xla(monkeypatch):
     """Values and gradients of nine members with up to six bounces."""
 
     def value(speed, restitution):

@@ -1,4 +1,4 @@
-"""Events against motions in closed form: where runs end, and how they go on."""
+"""Events against motions in closed form: where runs end, and how they continue."""
 
 import jax
 import jax.numpy as jnp
@@ -15,8 +15,8 @@ LATCH = Latch()
 
 
 @pytest.mark.parametrize("on_group", [False, True])
-def test_a_rod_bounces_as_in_closed_form(on_group):
-    """On R^3 its flight is that of any method, and dt as long as a flight."""
+def test_event_resets_of_a_bouncing_rod_match_closed_form(on_group):
+    """On R^3 every method integrates the flight exactly; dt is as long as a flight."""
     method, dt, num_steps = (
         (LobattoIIIAB(6), 0.05, 60) if on_group else (LobattoIIIAB(2), 0.6, 5)
     )
@@ -41,8 +41,8 @@ def test_a_rod_bounces_as_in_closed_form(on_group):
     assert sol.ts.shape == sol.ys.q.shape[:1]
 
 
-def test_a_joint_latches_as_in_closed_form():
-    """The run ends where the rotors meet, and another system goes on from there."""
+def test_event_reset_of_a_latching_joint_matches_closed_form():
+    """The run ends where the rotors meet, and continues there with another system."""
     inertias = jnp.array([LATCH.first, LATCH.second])
 
     def lagrangian(t, q, v, args):
@@ -84,8 +84,8 @@ def test_a_joint_latches_as_in_closed_form():
 
 @pytest.mark.parametrize("closure", ["symmetric", "propagated"])
 @pytest.mark.parametrize("stages", [long(2), 3])
-def test_a_multiplier_vanishes_at_the_order_of_the_method(stages, closure):
-    """A particle leaves a sphere where cos θ = 2/3, if it starts from rest on top."""
+def test_event_at_a_vanishing_multiplier_converges_with_method_order(stages, closure):
+    """A particle that starts from rest on top leaves a sphere where cos θ = 2/3."""
     steps = [0.1, 0.05]
     sols = [slide(stages, dt, closure=closure) for dt in steps]
     errors = [abs(float(sol.t1) - SLIDE.time) for sol in sols]
@@ -96,7 +96,7 @@ def test_a_multiplier_vanishes_at_the_order_of_the_method(stages, closure):
         assert float(sol.stats["max_constraint_violation"]) < 1e-15
 
 
-def test_a_nonholonomic_motion_meets_a_plane_where_the_exact_one_does():
+def test_event_of_nonholonomic_motion_at_a_plane_matches_exact_time():
     particle = systems.NonholonomicParticle()
     event = Event(lambda t, y, args: y.q[0] - args)
     sol = nhjax.integrate(

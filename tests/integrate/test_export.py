@@ -1,4 +1,4 @@
-"""Runs that are exported, serialised, and run by a process that has no nhjax."""
+"""Runs that are exported, serialised, and called in a process without nhjax."""
 
 import subprocess
 import sys
@@ -38,9 +38,7 @@ def end_of_run(q, p, dt):
 
 
 @pytest.mark.long
-def test_exported_run_and_its_gradient_are_the_same_in_another_process(
-    tmp_path, monkeypatch
-):
+def test_exported_run_in_another_process_gives_equal_results(tmp_path, monkeypatch):
     y0 = DISC.initial_state()
     given = y0.q, y0.p, jnp.asarray(0.1)
     exported = export.export(jax.jit(end_of_run))(*given)
@@ -60,7 +58,7 @@ def test_exported_run_and_its_gradient_are_the_same_in_another_process(
         np.testing.assert_allclose(got, expected, rtol=1e-13, atol=1e-15)
 
 
-def test_program_of_run_that_does_not_throw_has_no_callback():
+def test_exported_run_without_throw_has_no_callback():
     y0 = DISC.initial_state()
 
     def run(y, dt, **options):
@@ -77,7 +75,7 @@ def test_program_of_run_that_does_not_throw_has_no_callback():
 @pytest.mark.parametrize(
     "change", [{"dt": 0.0}, {"dt": jnp.nan}, {"t0": 1e18}, {"num_steps": 0}]
 )
-def test_invalid_argument_without_throw_is_a_result(change):
+def test_run_with_invalid_argument_without_throw_returns_its_result(change):
     y0 = DISC.initial_state()
 
     def run(dt, t0, num_steps):
@@ -101,7 +99,7 @@ def test_invalid_argument_without_throw_is_a_result(change):
     assert bool(good.result == RESULTS.successful)
 
 
-def test_samples_outside_of_a_run_without_throw_are_a_result():
+def test_samples_outside_the_run_without_throw_return_their_result():
     y0 = DISC.initial_state()
 
     def run(ts):
@@ -121,7 +119,7 @@ def test_samples_outside_of_a_run_without_throw_are_a_result():
 
 
 @pytest.mark.parametrize("ts", [jnp.linspace(0.0, 0.3, 4), np.array([0.1]), [0.0, 0.2]])
-def test_known_times_of_samples_are_checked_inside_of_jit(ts):
+def test_samples_with_concrete_times_under_jit_are_checked(ts):
     y0 = DISC.initial_state()
 
     def run(dt, ts):

@@ -1,4 +1,4 @@
-"""A run that fails names its lane and step, and leaves the others as they are."""
+"""A failed run names its member and step, and does not change other members."""
 
 import equinox as eqx
 import jax
@@ -23,7 +23,7 @@ APPELL = Appell()
 @eqx.filter_jit
 @jax.vmap
 def fall(speed) -> nhjax.Solution:
-    """Particles of Appell's: those that rise come to an apex where D2Φ vanishes."""
+    """Appell's particles: the rising ones reach an apex where D2Φ vanishes."""
     v = speed * jnp.array([0.3, 0.4, 1.0])
     y0 = nhjax.initial_state(APPELL.system, APPELL.q0, v)
     return run(
@@ -41,7 +41,7 @@ def falls():
     return failing, fall(jnp.array([-1.0, -0.7, -0.5, -0.2]))
 
 
-def test_a_failing_lane_leaves_the_others_untouched(falls):
+def test_failure_of_a_member_does_not_change_others(falls):
     failing, benign = falls
     assert benign.failures() == []
     good = jnp.array([0, 2])
@@ -52,7 +52,7 @@ def test_a_failing_lane_leaves_the_others_untouched(falls):
         )
 
 
-def test_a_failure_is_reported_with_lane_and_step(falls):
+def test_failure_in_a_batch_names_member_and_step(falls):
     failing, _ = falls
     (first, k1, reason), (second, k2, _) = failing.failures()
     assert (first, second) == (1, 3)
@@ -69,7 +69,7 @@ def test_a_failure_is_reported_with_lane_and_step(falls):
         assert jnp.all(jnp.isfinite(value))
 
 
-def test_a_failed_lane_stays_at_its_last_good_state(falls):
+def test_failure_of_a_member_keeps_its_last_good_state(falls):
     failing, _ = falls
     for lane, k, _ in failing.failures():
         states = jax.tree.map(lambda x, lane=lane: np.asarray(x[lane]), failing.ys)
@@ -87,7 +87,7 @@ def test_a_failed_lane_stays_at_its_last_good_state(falls):
         np.testing.assert_allclose(last.multiplier, multiplier, rtol=1e-11)
 
 
-def test_a_lane_without_a_number_fails_alone():
+def test_failure_by_nan_affects_one_member_only():
     y0 = PARTICLE.initial_state()
 
     def one(factor):
@@ -101,7 +101,7 @@ def test_a_lane_without_a_number_fails_alone():
     assert jnp.all(jnp.isfinite(sol.ys.q[0]))
 
 
-def test_a_solver_that_gives_up():
+def test_failure_by_max_iterations_returns_its_result():
     solver = nhjax.SimplifiedNewton(max_iterations=2, fallback=False)
     saveat = SaveAt(t0=True, t1=True)
     sol = run(stage_solver=solver, throw=False, num_steps=2, saveat=saveat)
@@ -115,7 +115,7 @@ def test_a_solver_that_gives_up():
     np.testing.assert_allclose(last.multiplier, start.multiplier, rtol=1e-14)
 
 
-def test_a_failure_names_the_coordinate_and_a_step_to_try():
+def test_failure_message_names_coordinate_and_smaller_dt():
     # Three oscillators that know nothing of each other, the second one very stiff.
     stiffness = jnp.asarray([1.0, 1e9, 2.0])
 

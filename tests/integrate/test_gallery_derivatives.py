@@ -1,4 +1,4 @@
-"""Gradients of whole runs of the gallery against differences."""
+"""Gradients of whole runs of the gallery against finite differences."""
 
 import jax
 import jax.numpy as jnp
@@ -131,7 +131,9 @@ QUICK = (
         ],
     ),
 )
-def test_the_gradient_of_systems_of_the_gallery(name, stages, closure):
+def test_gradient_of_each_gallery_system_matches_finite_differences(
+    name, stages, closure
+):
     # The sleigh amplifies rounding errors of propagated multipliers; with a force of
     # this sign its gradient is large beside them.
     turning = -0.05 if name == "attracting and linear" else 0.05
@@ -139,7 +141,7 @@ def test_the_gradient_of_systems_of_the_gallery(name, stages, closure):
     assert_gradients_of_examples(BESIDE[name], method, turning)
 
 
-def test_every_system_of_the_gallery_is_differentiated():
+def test_gradient_tests_cover_every_gallery_system():
     kinds = {
         value
         for name, value in vars(systems).items()

@@ -55,21 +55,21 @@ def relative_violation(name, sol):
 
 @every_closure
 @pytest.mark.parametrize("name", CONSTRAINED)
-def test_constraints_hold_at_every_node(name, closure):
+def test_constraints_at_every_node_hold_to_round_off(name, closure):
     sol = recorded(name, 3, closure, "simplified")
     assert np.max(relative_violation(name, sol)) <= 1e-14
 
 
 @every_closure
 @every_number_of_stages
-def test_constraints_hold_at_every_node_for_any_number_of_stages(stages, closure):
+def test_constraints_with_any_number_of_stages_hold_to_round_off(stages, closure):
     sol = recorded("side by side", stages, closure, "simplified")
     assert np.max(relative_violation("side by side", sol)) <= 1e-14
 
 
 @every_closure
 @pytest.mark.parametrize("name", CONSTRAINED)
-def test_stats_report_the_largest_violation(name, closure):
+def test_constraint_violation_in_stats_is_the_largest(name, closure):
     sol = recorded(name, 3, closure, "simplified")
     found = np.asarray(violations(name, sol.ts, sol.ys)[0])
     largest = np.max(np.abs(found[1:]))
@@ -118,19 +118,19 @@ def assert_returns(name, stages, closure):
 
 @symmetric_closures
 @pytest.mark.parametrize("name", EVERYTHING)
-def test_a_step_of_minus_h_undoes_a_step_of_h(name, closure):
+def test_symmetric_step_of_minus_h_undoes_step_of_h(name, closure):
     assert_returns(name, 3, closure)
 
 
 @symmetric_closures
 @every_number_of_stages
-def test_a_step_of_minus_h_undoes_a_step_of_h_for_any_number_of_stages(stages, closure):
+def test_symmetric_step_with_any_number_of_stages_is_undone_by_minus_h(stages, closure):
     assert_returns("side by side", stages, closure)
 
 
 # At s = 3 Appell's motion is integrated exactly, and the oscillator has no multiplier.
 @pytest.mark.parametrize("name", [name for name in CONSTRAINED if name != "Appell"])
-def test_the_consistent_closure_is_not_symmetric(name):
+def test_consistent_closure_of_a_step_is_not_symmetric(name):
     distance = there_and_back(name, 3, "consistent", helpers.RECORDED_STEPS)
     assert distance["q"] > 1e-10
 
@@ -155,18 +155,18 @@ def sleigh_energy_error(closure):
 
 
 @pytest.mark.parametrize("closure", ["consistent", "symmetric"])
-def test_energy_of_the_sleigh_stays_where_it_was(closure):
+def test_energy_of_the_sleigh_over_a_long_run_stays_bounded(closure):
     assert np.max(sleigh_energy_error(closure)) <= 1e-10
 
 
-def test_a_propagated_multiplier_spoils_the_energy_of_the_sleigh():
+def test_energy_of_the_sleigh_with_propagated_closure_drifts():
     # The motion is attracting; the propagated multiplier carries a mode that grows.
     error = sleigh_energy_error("propagated")
     assert np.max(error[:100]) <= 1e-9
     assert np.max(error) > 1e-3
 
 
-def test_two_stage_lobatto_on_the_oscillator_is_periodic():
+def test_lobatto_with_two_stages_on_the_oscillator_is_periodic():
     # With h = 2 sin(π/N) the discrete orbit closes after exactly N steps.
     oscillator, count = nhjax.systems.HarmonicOscillator(), 4000
     y0 = oscillator.initial_state()
@@ -205,7 +205,7 @@ def long_run(name, closure, solver):
         ("chaotic", "consistent"),
     ],
 )
-def test_both_solvers_give_the_same_trajectory_to_round_off(name, closure):
+def test_trajectories_of_both_stage_solvers_agree_to_round_off(name, closure):
     runs = [long_run(name, closure, solver).ys for solver in helpers.SOLVERS]
     fields = ["q", "v", "p"]
     # On the sleigh the propagated multiplier amplifies round-off: see above.
@@ -280,14 +280,14 @@ def test_energy_error_of_the_cvt_in_the_first_and_last_fifth(
     np.testing.assert_allclose(found, [first, last], rtol=0.1)
 
 
-def test_three_propagated_stages_make_the_energy_of_the_cvt_drift_linearly():
+def test_energy_of_the_cvt_with_three_propagated_stages_drifts_linearly():
     error, _, _ = cvt_errors("high", 3, "propagated")
     by_fifth = largest_by_fifth(error)
     np.testing.assert_allclose(by_fifth / by_fifth[0], [1, 2, 3, 4, 5], rtol=0.1)
 
 
 @pytest.mark.parametrize("regime", ["low", "high"])
-def test_four_propagated_stages_make_no_drift(regime):
+def test_energy_of_the_cvt_with_four_propagated_stages_does_not_drift(regime):
     error, _, _ = cvt_errors(regime, 4, "propagated")
     by_fifth = largest_by_fifth(error)
     np.testing.assert_allclose(by_fifth / by_fifth[0], 1, rtol=0.1)

@@ -107,7 +107,7 @@ def assert_finest_order(order, errors, quantity):
     ),
 )
 @pytest.mark.parametrize("part", range(2), ids=ON_GROUPS)
-def test_state_on_a_group_is_of_order_2s_minus_2(part, retraction, stages):
+def test_state_on_a_group_converges_with_order_2s_minus_2(part, retraction, stages):
     errors = errors_on_groups(retraction, stages, "symmetric")[part]
     for quantity in errors[COUNTS[stages][0]]:
         assert_finest_order(2 * stages - 2, errors, quantity)
@@ -116,7 +116,9 @@ def test_state_on_a_group_is_of_order_2s_minus_2(part, retraction, stages):
 # The closures do not know of the retraction: one for each is enough.
 @every_stages
 @pytest.mark.parametrize("part", range(2), ids=ON_GROUPS)
-def test_propagated_multiplier_on_a_group_is_of_order_s_or_s_minus_1(part, stages):
+def test_propagated_multiplier_on_a_group_converges_with_order_s_or_s_minus_1(
+    part, stages
+):
     errors = errors_on_groups("cayley", stages, "propagated")[part]
     for quantity in ("q", "v"):
         assert_finest_order(2 * stages - 2, errors, quantity)
@@ -153,7 +155,7 @@ COUNTS_BY_ORDER = {2: (32, 64), 4: (16, 32), 6: (16, 24)}
     ids=["Gauss(1)", "Gauss(2)", "Lobatto(2)", "Lobatto(3)", "Lobatto(4)"],
 )
 @every_retraction
-def test_free_rigid_body_is_of_the_order_of_the_method(method, retraction):
+def test_free_rigid_body_on_a_group_converges_with_method_order(method, retraction):
     body = systems.FreeRigidBody(v0=(0.5, 1.5, 0.8), retraction=RETRACTIONS[retraction])
     errors = errors_of(body, method, COUNTS_BY_ORDER[method.order])
     for quantity in ("q", "v"):
@@ -161,7 +163,7 @@ def test_free_rigid_body_is_of_the_order_of_the_method(method, retraction):
 
 
 @pytest.mark.parametrize("stages", [long(2), 3, long(4)])
-def test_ball_on_a_product_of_groups_is_of_order_2s_minus_2(stages):
+def test_ball_on_a_product_of_groups_converges_with_order_2s_minus_2(stages):
     ball = systems.TurntableBall.rolling((0.3, -0.2), (0.5, 0.3))
     method = nhjax.LobattoIIIAB(stages)
     # It turns by up to a radian in a step of the counts that suit the others.
@@ -192,7 +194,7 @@ def top_oracle(count):
     [long(2, "cayley"), long(3, "cayley"), long(4, "cayley"), (3, "exponential")],
 )
 @pytest.mark.parametrize("kind", ["on SO(3)", "on SE(3) with a fixed point"])
-def test_heavy_top_is_of_order_2s_minus_2(kind, retraction, stages):
+def test_heavy_top_on_a_group_converges_with_order_2s_minus_2(kind, retraction, stages):
     top = tops(retraction)[0 if kind == "on SO(3)" else 1]
     counts = {2: (64, 128, 256), 3: (32, 64, 128), 4: (24, 32, 48)}[stages]
     method = nhjax.LobattoIIIAB(stages)
@@ -230,7 +232,9 @@ def holonomic_errors(stages, closure):
     [(0, ("q", "v", "continuous")), (1, ("q", "v", "multiplier"))],
     ids=["with a nonholonomic one", "alone"],
 )
-def test_holonomic_constraints_keep_order_2s_minus_2(part, quantities, closure, stages):
+def test_holonomic_constraints_on_a_group_keep_order_2s_minus_2(
+    part, quantities, closure, stages
+):
     errors = holonomic_errors(stages, closure)[part]
     for quantity in quantities:
         assert_finest_order(2 * stages - 2, errors, quantity)

@@ -1,4 +1,4 @@
-"""The time loop on groups: batches, dense output, precision, what a step is not."""
+"""The time loop on groups: batches, dense output, precision, and symmetry of steps."""
 
 import dataclasses
 from functools import partial
@@ -29,7 +29,7 @@ def run(example, method=METHOD, y0=None, **options):
     return nhjax.integrate(example.system, method, y0, **options)
 
 
-def test_a_batch_on_a_product_of_groups_equals_the_loop():
+def test_batch_on_a_product_of_groups_equals_single_runs():
     def one(spin):
         ball = systems.TurntableBall.rolling((0.3, -0.2), (0.2, 0.1), spin)
         return run(ball, y0=ball.initial_state(), dt=0.1, num_steps=10, saveat=EVERY).ys
@@ -43,7 +43,7 @@ def test_a_batch_on_a_product_of_groups_equals_the_loop():
         assert largest(difference) < 1e-14
 
 
-def test_dense_output_on_a_group():
+def test_dense_output_on_a_group_matches_nodes_and_exact_motion():
     sol = run(BALL, dt=0.1, num_steps=5, saveat=dataclasses.replace(EVERY, dense=True))
     nodes = jax.vmap(sol.evaluate)(sol.ts)
     np.testing.assert_allclose(nodes.q[1], sol.ys.q[1], atol=1e-14)
@@ -55,7 +55,7 @@ def test_dense_output_on_a_group():
     assert abs(float(jnp.linalg.norm(inside.q[0])) - 1) < 1e-15
 
 
-def test_samples_on_a_group_are_those_of_dense_output():
+def test_samples_on_a_group_equal_dense_output():
     ts = jnp.array([0.0, 0.17, 0.5])
     sampled = run(BALL, dt=0.1, num_steps=5, saveat=SaveAt(ts=ts))
     dense = run(BALL, dt=0.1, num_steps=5, saveat=SaveAt(dense=True))
@@ -96,7 +96,7 @@ def there_and_back(system, method, y0):
     return largest((change.q, change.v))
 
 
-def test_a_step_back_does_not_retrace_a_step_in_the_chart_at_its_start():
+def test_step_back_in_the_chart_at_its_start_does_not_undo_a_step():
     # Measured: 2e-5 (Cayley, s = 2).
     suslov, y0 = systems.Suslov(), systems.Suslov().initial_state()
     errors = [
@@ -112,7 +112,7 @@ def test_a_step_back_does_not_retrace_a_step_in_the_chart_at_its_start():
     [(nhjax.Cayley(), 2), long(nhjax.Exponential(), 3), long(nhjax.Cayley(), 4)],
     ids=str,
 )
-def test_a_step_back_retraces_a_step_in_the_chart_in_its_middle(retraction, stages):
+def test_step_back_in_the_chart_in_its_middle_undoes_a_step(retraction, stages):
     beside = SideBySide(
         tuple(
             kind(retraction=retraction)
@@ -162,7 +162,7 @@ def heisenberg_lagrangian(t, q, v, args):
     ("stages", "group"),
     [(2, Heisenberg()), (3, Heisenberg()), (3, HeisenbergBySecondKind())],
 )
-def test_a_users_own_group_is_integrated(stages, group):
+def test_group_of_a_user_is_integrated(stages, group):
     """Geodesics of the Heisenberg group: v₃ is constant, (v₁, v₂) turn at its rate."""
     system = nhjax.LagrangianSystem(heisenberg_lagrangian, manifold=group)
     v0 = jnp.array([0.3, 0.4, 0.8])
@@ -189,7 +189,7 @@ def test_a_users_own_group_is_integrated(stages, group):
 @pytest.mark.parametrize(
     "solver", [nhjax.SimplifiedNewton(), nhjax.Newton()], ids=["simplified", "newton"]
 )
-def test_a_product_of_vector_spaces_is_the_vector_space(solver):
+def test_group_product_of_vector_spaces_equals_the_vector_space(solver):
     particle = systems.NonholonomicParticle()
     product = nhjax.ProductGroup(nhjax.Euclidean(2), nhjax.Euclidean(1))
 

@@ -18,7 +18,7 @@ from oracles.particle_run import assert_trees_close, DT, PARTICLE, run, STEPS
 # Time ---------------------------------------------------------------------------------
 
 
-def test_a_run_in_explicit_time_goes_on_where_it_stopped():
+def test_run_with_explicit_time_continues_from_its_end():
     system, y0, args = helpers.problem("driven")
     method = nhjax.LobattoIIIAB(3)
 
@@ -49,7 +49,7 @@ def test_a_run_in_explicit_time_goes_on_where_it_stopped():
 
 
 @pytest.mark.parametrize("closure", helpers.CLOSURES)
-def test_two_runs_in_a_row_are_one(closure):
+def test_run_in_two_parts_equals_one_run(closure):
     method = nhjax.LobattoIIIAB(3, closure)
     whole = run(method=method, num_steps=100)
     half = run(method=method, num_steps=50)
@@ -63,7 +63,7 @@ def test_two_runs_in_a_row_are_one(closure):
 # Reports ------------------------------------------------------------------------------
 
 
-def test_stats():
+def test_stats_of_a_run_count_steps_and_iterations():
     sol = run(
         method=nhjax.LobattoIIIAB(3, "propagated"), saveat=SaveAt(t0=True, steps=True)
     )
@@ -100,7 +100,7 @@ def test_stats():
     assert sol.failures() == []
 
 
-def test_stats_count_the_start():
+def test_stats_of_a_run_include_the_initial_state():
     # A start off the constraints, by less than what is refused.
     y0 = PARTICLE.initial_state()
     y0 = eqx.tree_at(lambda y: y.q, y0, y0.q.at[1].add(1e-6))
@@ -160,7 +160,7 @@ def test_tqdm_progress_meter_shows_one_bar_and_closes_it(capfd):
 
 
 class Recorder(nhjax.AbstractProgressMeter):
-    """A meter of a user's own."""
+    """A progress meter of a user."""
 
     def update(self, done: int, total: int) -> None:
         recorded.append((done, total))
@@ -169,7 +169,7 @@ class Recorder(nhjax.AbstractProgressMeter):
 recorded: list[tuple[int, int]] = []
 
 
-def test_a_meter_is_called_once_a_step_whatever_the_batch():
+def test_progress_meter_in_a_batch_is_called_once_per_step():
     dts = jnp.array([0.1, 0.05])
     expected = [(k, STEPS) for k in range(1, STEPS + 1)]
     for saveat in (SaveAt(steps=7), SaveAt(ts=[0.1, 0.11, 0.7])):
@@ -182,7 +182,7 @@ def test_a_meter_is_called_once_a_step_whatever_the_batch():
         assert recorded == expected
 
 
-def test_a_meter_is_called_a_hundred_times_in_a_long_run():
+def test_progress_meter_in_a_long_run_is_called_a_hundred_times():
     oscillator = HarmonicOscillator()
     recorded.clear()
     run(
@@ -199,7 +199,7 @@ def test_a_meter_is_called_a_hundred_times_in_a_long_run():
 
 
 @pytest.mark.parametrize("closure", helpers.CLOSURES)
-def test_single_precision(closure):
+def test_run_in_single_precision_keeps_its_dtype(closure):
     y0 = PARTICLE.initial_state(jnp.float32)
     sol = run(y0=y0, method=nhjax.LobattoIIIAB(4, closure))
     for leaf in jax.tree.leaves((sol.t0, sol.t1, sol.ts, sol.ys, sol.stats)):
@@ -214,7 +214,7 @@ def test_single_precision(closure):
     np.testing.assert_allclose(sol.ys.multiplier[0], multiplier, atol=1e-4)
 
 
-def test_single_precision_between_steps():
+def test_dense_output_in_single_precision_keeps_its_dtype():
     y0 = PARTICLE.initial_state(jnp.float32)
     sol = run(y0=y0, saveat=SaveAt(ts=[0.52, 1.0, 1.23], t0=True, dense=True))
     state = sol.evaluate(1.23)
@@ -226,7 +226,7 @@ def test_single_precision_between_steps():
     )
 
 
-def test_single_precision_knows_the_end_of_a_long_run():
+def test_dense_output_in_single_precision_reaches_the_end_of_a_long_run():
     # t1 is rounded to 1e-7 of itself, far more than a fixed part of a step.
     oscillator = HarmonicOscillator()
     y0 = oscillator.initial_state(jnp.float32)
@@ -244,7 +244,7 @@ def test_single_precision_knows_the_end_of_a_long_run():
 
 
 @pytest.mark.parametrize("closure", ["consistent", "symmetric"])
-def test_closures_without_memory_ignore_and_correct_a_stale_multiplier(closure):
+def test_closures_other_than_propagated_ignore_a_stale_multiplier(closure):
     sleigh = nhjax.systems.ChaplyginSleigh()
     y0 = sleigh.initial_state()
     stale = eqx.tree_at(lambda y: y.multiplier, y0, y0.multiplier + 5)

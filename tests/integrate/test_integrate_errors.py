@@ -1,4 +1,4 @@
-"""Mistakes in the arguments of a run that tracing finds."""
+"""Errors in the arguments of a run that are found when tracing."""
 
 import jax
 import jax.numpy as jnp
@@ -27,7 +27,7 @@ def y0():
 
 @pytest.mark.parametrize("solver", [nhjax.Newton, nhjax.SimplifiedNewton])
 @pytest.mark.parametrize("count", [0, 2.5])
-def test_max_iterations(solver, count):
+def test_max_iterations_of_a_wrong_value_raises(solver, count):
     with pytest.raises(ValueError, match=f"{solver.__name__}: `max_iterations`.*got"):
         solver(max_iterations=count)
 
@@ -35,7 +35,7 @@ def test_max_iterations(solver, count):
 # integrate: what tracing finds --------------------------------------------------------
 
 
-def test_samples_need_a_collocation_method():
+def test_samples_without_collocation_method_raise():
     y0 = nhjax.initial_state(FREE, Q, V)
     with pytest.raises(ValueError, match=r"C\(q\) for q >= stages = 4.*q = 1\. Use Lo"):
         run(y0, FREE, EXPLICIT_RK4, saveat=SaveAt(ts=[0.1]))
@@ -61,18 +61,18 @@ def test_samples_need_a_collocation_method():
         ("multiplier", jnp.full(1, jnp.nan), nhjax.NonFiniteError, r"`y0.mult.*\[nan"),
     ],
 )
-def test_integrate_refuses_states(part, value, exception, message, y0):
+def test_integrate_with_wrong_state_raises(part, value, exception, message, y0):
     with pytest.raises(exception, match=message):
         run(changed(y0, **{part: value}))
 
 
-def test_a_batch_of_states_without_vmap(y0):
+def test_integrate_with_a_batch_of_states_raises(y0):
     batch = jax.tree.map(lambda x: jnp.stack([x, x]), y0)
     with pytest.raises(nhjax.ShapeError, match=r"`y0.q`.*\(2, 3\).*`jax.vmap` over"):
         run(batch)
 
 
-def test_states_of_another_system(y0):
+def test_integrate_with_state_of_another_system_raises(y0):
     oscillator = HarmonicOscillator(q0=(1.0, 0.0, 0.0), v0=(0.0, 1.0, 0.0))
     with pytest.raises(nhjax.ShapeError, match=r"`y0.multiplier`.*\(1,\).*\(0,\)"):
         run(y0, oscillator.system)
@@ -90,19 +90,19 @@ INCONSISTENT = {
 
 
 @pytest.mark.parametrize("change", INCONSISTENT.values(), ids=INCONSISTENT.keys())
-def test_inconsistent_initial_states(change, y0):
+def test_integrate_with_inconsistent_state_raises(change, y0):
     with pytest.raises(nhjax.IntegrationError, match="step 0: The initial state viola"):
         run(change(y0))
 
 
-def test_small_perturbations_are_no_inconsistency(y0):
+def test_integrate_with_slightly_perturbed_state_runs(y0):
     # Differences for a derivative take the states off the constraint.
     sol = run(changed(y0, q=y0.q.at[1].add(1e-5)))
     assert sol.result == nhjax.RESULTS.successful
     np.testing.assert_allclose(sol.stats["max_constraint_violation"], 4e-6, rtol=1e-9)
 
 
-def test_a_start_at_another_time():
+def test_integrate_with_state_of_another_time_raises():
     system = nhjax.LagrangianSystem(
         kinetic, nonholonomic=lambda t, q, v, args: v[0] - jnp.cos(t)
     )

@@ -23,7 +23,7 @@ def lagrangian(t, q, v, args):
 
 
 def rods(order):
-    """The chain's constraints, in an order of the user's own."""
+    """The constraints of the chain, in an order that the user chose."""
 
     def holonomic(t, q, args):
         places = q.reshape(-1, 2)
@@ -39,7 +39,7 @@ def chain(order=None):
 
 
 def dense_chain():
-    """The same chain, written so that its structure cannot be seen."""
+    """The same chain, written so that its sparsity cannot be detected."""
     plain = rods(np.arange(LINKS))
     return nhjax.LagrangianSystem(
         lagrangian, holonomic=lambda t, q, args: plain(t, q.at[0].add(0.0), args)
@@ -58,7 +58,7 @@ def is_sparse(system):
     return isinstance(lin.jacobian, SparseMatrix)
 
 
-def test_the_linearisation_is_that_of_dense_matrices():
+def test_sparse_linearisation_of_a_chain_equals_dense():
     order = np.random.default_rng(1).permutation(LINKS)
     y, t = STATE, jnp.zeros(())
     v = jnp.asarray(np.random.default_rng(2).standard_normal(2 * LINKS))
@@ -81,7 +81,7 @@ def runs(system, num_steps=10):
     return nhjax.integrate(system, THREE, STATE, dt=0.02, num_steps=num_steps)
 
 
-def test_steps_are_those_of_dense_matrices():
+def test_sparse_steps_of_a_chain_equal_dense():
     assert is_sparse(chain())
     assert not is_sparse(dense_chain())
     sparse, dense = runs(chain()), runs(dense_chain())
@@ -105,7 +105,7 @@ def angles_rate(t, x):
     return np.concatenate([omega, acceleration])
 
 
-def test_the_motion_is_that_of_the_equations_in_angles():
+def test_sparse_motion_of_a_chain_matches_equations_in_angles():
     counts, duration = (8, 16, 32), 0.4
     start = np.concatenate([ANGLES, np.zeros(LINKS)])
     end = solve_ivp(
@@ -125,7 +125,7 @@ def test_the_motion_is_that_of_the_equations_in_angles():
     orders.assert_order(4, counts, errors, orders.SCIPY_FLOOR)
 
 
-def test_derivatives_are_those_of_differences():
+def test_sparse_derivatives_of_a_chain_match_finite_differences():
     def loss(x):
         y = nhjax.State(STATE.q, STATE.v, STATE.p, STATE.multiplier)
         method = nhjax.LobattoIIIAB(2)

@@ -21,7 +21,7 @@ def unicycle():
 
 
 @pytest.mark.parametrize("problem", [unicycle, disc_with_a_heading_on_a_circle])
-def test_a_million_turns_ago_makes_no_difference(problem):
+def test_angle_after_a_million_turns_does_not_change_the_motion(problem):
     system, q0, v0 = problem()
 
     @jax.jit

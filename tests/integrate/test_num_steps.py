@@ -1,4 +1,4 @@
-"""Runs of any length by one compiled program, where nothing saved depends on it."""
+"""Runs of any length by one compiled program, if the output does not depend on it."""
 
 from typing import Any
 
@@ -46,7 +46,7 @@ def run(num_steps: Any, y0: Any = None, **others: Any) -> nhjax.Solution:
 
 
 def static(num_steps: int, **others: Any) -> nhjax.Solution:
-    """As under the user's own `jit`, where an int stays known."""
+    """A run under the user's own `jit`, where an int stays static."""
     return jax.jit(lambda y0: run(num_steps, y0, **others))(PARTICLE.initial_state())
 
 
@@ -63,7 +63,7 @@ def norms(t, y, args):
     ids=["end", "both ends", "function"],
 )
 @pytest.mark.parametrize("adjoint", ADJOINTS, ids=lambda x: type(x).__name__)
-def test_another_length_retraces_nothing(saveat, adjoint):
+def test_num_steps_of_another_value_does_not_retrace(saveat, adjoint):
     run(3, saveat=saveat, adjoint=adjoint)
     count = len(traces)
     ends = [run(n, saveat=saveat, adjoint=adjoint).t1 for n in (1, 7, 20)]
@@ -72,7 +72,7 @@ def test_another_length_retraces_nothing(saveat, adjoint):
 
 
 @pytest.mark.parametrize("num_steps", [1, 2, 33])
-def test_the_numbers_are_those_of_a_known_length(num_steps):
+def test_num_steps_traced_gives_results_of_static(num_steps):
     got, expected = run(num_steps), static(num_steps)
     assert_trees_equal(
         (got.ys, got.ts, got.t1), (expected.ys, expected.ts, expected.t1)
@@ -80,7 +80,7 @@ def test_the_numbers_are_those_of_a_known_length(num_steps):
     assert_trees_equal(got.stats, expected.stats)
 
 
-def test_an_array_is_a_length_under_jit():
+def test_num_steps_as_array_under_jit_is_accepted():
     program = jax.jit(lambda n: run(n))
     first = program(3)
     count = len(traces)
@@ -91,7 +91,7 @@ def test_an_array_is_a_length_under_jit():
         assert_trees_equal(run(length).ys, run(20).ys)
 
 
-def test_members_of_a_batch_have_lengths_of_their_own():
+def test_num_steps_under_vmap_may_differ_by_member():
     lengths = jnp.array([5, 1, 20])
     batch = jax.jit(jax.vmap(lambda n: run(n)))(lengths)
     np.testing.assert_array_equal(batch.stats["num_steps"], lengths)
@@ -100,7 +100,7 @@ def test_members_of_a_batch_have_lengths_of_their_own():
         assert_trees_equal(member, run(length).ys)
 
 
-def test_a_batch_in_step_has_lengths_of_its_own(monkeypatch):
+def test_num_steps_under_vmap_by_xla_may_differ_by_member(monkeypatch):
     monkeypatch.setenv("NHJAX_ENGINE", "xla")
     batch = jax.jit(jax.vmap(lambda n: run(n)))(jnp.array([5, 20]))
     for lane, length in enumerate((5, 20)):
@@ -108,7 +108,7 @@ def test_a_batch_in_step_has_lengths_of_its_own(monkeypatch):
 
 
 @pytest.mark.parametrize("engine", ["lanes", "kernels"])
-def test_a_run_whose_length_is_traced_is_compiled_as_a_whole(monkeypatch, engine):
+def test_num_steps_traced_compiles_one_kernel(monkeypatch, engine):
     monkeypatch.setenv("NHJAX_ENGINE", engine)
     y0 = PARTICLE.initial_state()
     # The first kernel measures round-off.
@@ -116,7 +116,7 @@ def test_a_run_whose_length_is_traced_is_compiled_as_a_whole(monkeypatch, engine
     assert use.engine == engine
 
 
-def test_a_chunk_from_state_to_state_saves_at_any_number_of_them():
+def test_num_steps_in_chunks_saves_any_number_of_states():
     @jax.jit
     def chunk(y0, t0):
         sol = run(4, y0, t0=t0, saveat=SaveAt(steps=True))
@@ -142,7 +142,7 @@ def end(dt, num_steps, adjoint):
 
 @pytest.fixture(scope="module")
 def pushed():
-    """A rate by forward mode through a run of a length that is known."""
+    """The derivative by forward mode of a run with a static length."""
     return jax.jvp(lambda x: end(x, 8, ADJOINTS[0]), (0.1,), (1.0,))
 
 
@@ -153,19 +153,19 @@ def reversible():
 
 
 @pytest.mark.parametrize("adjoint", ADJOINTS[:2], ids=["direct", "checkpoints"])
-def test_forward_mode_of_a_traced_length(adjoint, pushed):
+def test_num_steps_traced_in_forward_mode_has_derivatives(adjoint, pushed):
     got = jax.jit(lambda n: jax.jvp(lambda x: end(x, n, adjoint), (0.1,), (1.0,)))(8)
     np.testing.assert_allclose(got, pushed, rtol=1e-12)
 
 
-def test_the_reversible_adjoint_has_gradients_of_a_traced_length(reversible):
+def test_num_steps_traced_with_reversible_adjoint_has_gradients(reversible):
     for num_steps in (1, 8):
         expected = jax.grad(lambda x, n=num_steps: end(x, n, ADJOINTS[0]))(0.1)
         got = reversible(0.1, num_steps)
         np.testing.assert_allclose(got, expected, rtol=1e-11)
 
 
-def test_gradients_of_members_of_several_lengths(reversible):
+def test_num_steps_under_vmap_has_gradients_of_single_runs(reversible):
     lengths = jnp.array([3, 8])
     gradient = jax.vmap(lambda n: jax.grad(end)(0.1, n, REVERSIBLE))
     got = jax.jit(gradient)(lengths)
@@ -175,7 +175,7 @@ def test_gradients_of_members_of_several_lengths(reversible):
 
 
 @pytest.mark.parametrize("adjoint", ADJOINTS[:2], ids=["direct", "checkpoints"])
-def test_reverse_mode_of_a_traced_length_is_refused(adjoint):
+def test_num_steps_traced_in_reverse_mode_raises(adjoint):
     with pytest.raises(ValueError, match="Reverse-mode differentiation does not work"):
         jax.jit(jax.grad(end), static_argnums=2)(0.1, 8, adjoint)
 
@@ -185,7 +185,7 @@ def test_reverse_mode_of_a_traced_length_is_refused(adjoint):
     [*map(long, ADJOINTS[:-1]), ADJOINTS[-1]],
     ids=lambda x: type(x).__name__,
 )
-def test_an_int_stays_known_inside_a_gradient(adjoint):
+def test_num_steps_as_int_inside_a_gradient_stays_static(adjoint):
     assert np.isfinite(jax.grad(end)(0.1, 4, adjoint))
 
     # Also where a function alone knows what is differentiated.
@@ -213,7 +213,7 @@ def test_an_int_stays_known_inside_a_gradient(adjoint):
         ({"progress_meter": nhjax.TextProgressMeter()}, "`progress_meter` depends on"),
     ],
 )
-def test_a_length_on_which_the_output_depends_must_be_known(options, reason):
+def test_num_steps_traced_with_output_of_its_length_raises(options, reason):
     for number in (jnp.asarray(4), np.asarray(4)):
         with pytest.raises(TypeError, match=f"known when tracing.*because.*{reason}"):
             run(number, **options)
@@ -233,12 +233,12 @@ def test_a_length_on_which_the_output_depends_must_be_known(options, reason):
         ("4", TypeError, "must be an int, or an integer array.*got '4' of type str"),
     ],
 )
-def test_lengths_that_are_none(num_steps, exception, message):
+def test_num_steps_of_a_wrong_value_raises(num_steps, exception, message):
     with pytest.raises(exception, match=f"`num_steps` .*{message}"):
         run(num_steps)
 
 
 @pytest.mark.parametrize("num_steps", [0, -1, 2**31])
-def test_lengths_that_are_none_at_run_time(num_steps):
+def test_num_steps_of_a_wrong_value_under_jit_raises(num_steps):
     with pytest.raises((RuntimeError, ValueError), match="`num_steps` must be in 1"):
         jax.block_until_ready(jax.jit(lambda n: run(n).ys.q)(num_steps))

@@ -1,4 +1,4 @@
-"""Redundant constraints: the motion of the independent ones, reactions by a choice."""
+"""Redundant constraints: the motion of independent ones, and chosen reactions."""
 
 from typing import Any, Literal
 
@@ -300,7 +300,7 @@ def test_a_rate_that_is_a_constraint_again_changes_nothing(form, closure):
 
 
 def sphere_with_a_blade(t, x):
-    """The rates of (q, v), with both reactions from the accelerations' constraints."""
+    """The rates of (q, v), with reactions from the constraints on accelerations."""
     q, v = x[:3], x[3:]
     rows = np.array([[1.0, -0.3 * q[2], 0.0], q])
     load = np.array([0.0, 0.0, -1.0])

@@ -1,4 +1,4 @@
-"""Mistakes in a run that values decide, under jit and vmap, and along the way."""
+"""Errors that depend on values, under jit and vmap, and during a run."""
 
 import jax
 import jax.numpy as jnp
@@ -66,7 +66,7 @@ def compiled(y0):
 
 
 @at_run_time
-def test_integrate_refuses_values_under_jit(case, compiled):
+def test_integrate_with_wrong_values_under_jit_raises(case, compiled):
     wrong, message = case
     single, _, good = compiled
     with pytest.raises(RuntimeError, match=message):
@@ -74,7 +74,7 @@ def test_integrate_refuses_values_under_jit(case, compiled):
 
 
 @at_run_time
-def test_integrate_refuses_one_lane_under_vmap(case, compiled):
+def test_integrate_with_one_wrong_member_under_vmap_raises(case, compiled):
     wrong, message = case
     _, batch, good = compiled
     bad = good | jax.tree.map(jnp.asarray, wrong)
@@ -87,7 +87,7 @@ def test_integrate_refuses_one_lane_under_vmap(case, compiled):
         jax.block_until_ready(batch(lanes))
 
 
-def test_integrate_accepts_the_others(compiled, y0):
+def test_integrate_with_valid_values_under_jit_runs(compiled, y0):
     single, batch, good = compiled
     expected = sampled(y0, **GIVEN)
     assert jnp.all(jnp.isfinite(expected))
@@ -100,7 +100,7 @@ def test_integrate_accepts_the_others(compiled, y0):
 
 
 def fall(speed, **others):
-    """A particle of Appell's; rising, it comes to the apex where D2Φ vanishes."""
+    """Appell's particle, which rises to the apex where D2Φ vanishes."""
     appell = Appell()
     y0 = nhjax.initial_state(
         appell.system, appell.q0, speed * jnp.asarray([0.3, 0.4, 1])
@@ -111,7 +111,7 @@ def fall(speed, **others):
 
 
 @pytest.mark.filterwarnings("ignore:.SimplifiedNewton. did not solve")
-def test_a_failure_names_step_and_reason():
+def test_failure_of_a_run_names_step_and_reason():
     with pytest.raises(
         nhjax.IntegrationError,
         match=r"^Integration failed in step 1[0-2]: .* With `throw=False` the part",
@@ -119,12 +119,12 @@ def test_a_failure_names_step_and_reason():
         fall(jnp.asarray(0.5))
 
 
-def test_a_failure_names_step_and_reason_under_jit():
+def test_failure_under_jit_names_step_and_reason():
     with pytest.raises(RuntimeError, match=r"Integration failed in step 1[0-2]: "):
         jax.block_until_ready(jax.jit(lambda v: fall(v).ys.q)(0.5))
 
 
-def test_a_failure_names_the_lane_under_vmap():
+def test_failure_under_vmap_names_the_member():
     speeds = jnp.array([-1.0, 0.5, -0.5, 0.25])
     message = r"Integration failed in lane 1, step 1[0-2] \(1 more lanes failed\): "
     with pytest.raises(RuntimeError, match=message):
@@ -136,7 +136,7 @@ def test_a_failure_names_the_lane_under_vmap():
         jax.block_until_ready(jax.jit(jax.vmap(jax.vmap(fall)))(speeds.reshape(2, 2)))
 
 
-def test_every_part_of_the_solution_waits_for_the_verdict():
+def test_failure_under_jit_raises_whatever_part_of_the_solution_is_used():
     with pytest.raises(RuntimeError, match=r"Integration failed in step 1[0-2]"):
         jax.block_until_ready(jax.jit(lambda v: fall(v).t1)(0.5))
 
@@ -150,7 +150,7 @@ def test_a_failure_under_vmap_is_told_once(transform, caplog):
     assert told.count("Integration failed in lane 1") == 1
 
 
-def test_failures_need_a_computed_solution():
+def test_failures_of_a_traced_solution_raises():
     with pytest.raises(RuntimeError, match=r"outside jit and vmap.*`sol.result`"):
         jax.jit(lambda v: fall(v, throw=False).failures())(0.5)
 
@@ -175,17 +175,17 @@ def dense(y0):
         (0.1j, nhjax.DTypeError, "`t` must be a real number, got 0.1j"),
     ],
 )
-def test_evaluate_refuses(t, exception, message, dense):
+def test_evaluate_at_wrong_times_raises(t, exception, message, dense):
     with pytest.raises(exception, match=message):
         dense.evaluate(t)
 
 
-def test_evaluate_without_dense_output(y0):
+def test_evaluate_without_dense_output_raises(y0):
     with pytest.raises(ValueError, match=r"pass `saveat=nhjax.SaveAt\(dense=True\)`"):
         run(y0).evaluate(0.1)
 
 
-def test_evaluate_outside_under_jit_and_vmap(dense):
+def test_evaluate_outside_the_run_under_jit_and_vmap_raises(dense):
     outside = r"`t` = 0\.5 lies outside the run, from 0\.0 to 0\.4"
     with pytest.raises(RuntimeError, match=outside):
         jax.block_until_ready(jax.jit(lambda t: dense.evaluate(t))(0.5))
@@ -193,7 +193,7 @@ def test_evaluate_outside_under_jit_and_vmap(dense):
         jax.block_until_ready(jax.vmap(dense.evaluate)(jnp.array([0.1, 0.5])))
 
 
-def test_evaluate_of_a_batch(y0):
+def test_evaluate_of_a_batch_without_vmap_raises(y0):
     batch = jax.vmap(lambda dt: run(y0, dt=dt, saveat=SaveAt(dense=True)))(
         jnp.array([0.1, 0.2])
     )

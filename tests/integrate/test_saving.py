@@ -1,4 +1,4 @@
-"""What a run saves: the ends, steps, samples, and functions of the state."""
+"""The output of a run: both ends, steps, samples, and functions of the state."""
 
 import re
 
@@ -47,7 +47,7 @@ def dense():
         (SaveAt(t0=True, steps=7, dense=True), [0, 7, 14]),
     ],
 )
-def test_saved_nodes_are_those_of_the_full_output(saveat, nodes, full):
+def test_saved_every_kth_step_equals_full_output(saveat, nodes, full):
     sol = run(saveat=saveat)
     assert_trees_equal(
         (sol.ts, sol.ys),
@@ -58,7 +58,7 @@ def test_saved_nodes_are_those_of_the_full_output(saveat, nodes, full):
         assert saveat.num_saved(STEPS) == len(nodes)
 
 
-def test_the_full_output_starts_at_y0_and_ends_at_t1(full):
+def test_saved_full_output_starts_at_y0_and_ends_at_t1(full):
     y0 = PARTICLE.initial_state()
     assert_trees_equal(jax.tree.map(lambda x: x[0], full.ys), y0)
     np.testing.assert_array_equal(full.ts, DT * np.arange(STEPS + 1))
@@ -68,7 +68,7 @@ def test_the_full_output_starts_at_y0_and_ends_at_t1(full):
     assert full.interpolation is None
 
 
-def test_dense_output_alone_saves_no_states(dense):
+def test_saved_dense_output_alone_has_no_states(dense):
     assert dense.ts is None
     assert dense.ys is None
 
@@ -76,7 +76,7 @@ def test_dense_output_alone_saves_no_states(dense):
 TIMES = [0.0, 0.03, 0.1, 0.1, 0.15, 0.7, 1.2345, 1.99, 2.0]
 
 
-def test_samples_are_those_of_the_dense_output(dense, full):
+def test_saved_samples_equal_dense_output(dense, full):
     sol = run(saveat=SaveAt(ts=TIMES))
     np.testing.assert_array_equal(sol.ts, TIMES)
     expected = jax.vmap(dense.evaluate)(jnp.asarray(TIMES))
@@ -91,7 +91,7 @@ def test_samples_are_those_of_the_dense_output(dense, full):
     assert_trees_equal(sol.stats, full.stats)
 
 
-def test_samples_between_both_ends(full):
+def test_saved_samples_with_both_ends_are_in_order(full):
     for is_dense in (False, True):
         saveat = SaveAt(t0=True, t1=True, ts=[0.25, 0.5], dense=is_dense)
         sol = run(saveat=saveat)
@@ -104,14 +104,14 @@ def test_samples_between_both_ends(full):
         np.testing.assert_allclose(sol.ys.q[2], full.ys.q[5], rtol=1e-14)
 
 
-def test_samples_may_be_integers_and_of_another_precision():
+def test_saved_samples_at_integer_or_other_precision_times_keep_dtype():
     sol = run(saveat=SaveAt(ts=np.array([0, 1, 2])))
     assert sol.ts.dtype == jnp.float64
     again = run(saveat=SaveAt(ts=np.array([0.0, 1.0, 2.0], np.float32)))
     assert_trees_equal(sol.ys, again.ys)
 
 
-def test_samples_backwards(full):
+def test_saved_samples_with_negative_dt_equal_dense_output(full):
     ts = [2.0, 1.5, 0.31, 0.0]
     end = jax.tree.map(lambda x: x[-1], full.ys)
     sol = run(y0=end, t0=full.t1, dt=-DT, saveat=SaveAt(ts=ts))
@@ -123,7 +123,7 @@ def test_samples_backwards(full):
     assert_trees_close(there, nodes, rtol=1e-12, atol=1e-13)
 
 
-def test_a_function_of_the_state(full):
+def test_saved_function_of_the_state_equals_its_values(full):
     system = PARTICLE.system
 
     def fn(t, y, args):
@@ -150,7 +150,7 @@ def test_a_function_of_the_state(full):
     ],
     ids=["t1", "steps with t1", "steps with a rest", "ts"],
 )
-def test_thinned_output_needs_no_buffer_of_the_length_of_the_run(saveat):
+def test_saved_every_kth_step_needs_no_full_buffer(saveat):
     steps = 1000
 
     def program(y0):

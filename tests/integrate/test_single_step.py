@@ -1,4 +1,4 @@
-"""One step, as users of their own time loops take it."""
+"""Single steps, for users with time loops of their own."""
 
 import itertools
 
@@ -38,7 +38,7 @@ def hamiltonian_pendulum():
         ("on a group", LobattoIIIAB(3, chart="start")),
     ],
 )
-def test_a_step_is_that_of_integrate_bit_for_bit(name, method):
+def test_step_outside_jit_equals_integrate_bit_for_bit(name, method):
     if name == "Hamiltonian":
         system, y0 = hamiltonian_pendulum()
     else:
@@ -65,7 +65,7 @@ def test_a_step_is_that_of_integrate_bit_for_bit(name, method):
         (np.zeros(2), "state", nhjax.ShapeError, r"`t` has shape \(2,\), but a scalar"),
     ],
 )
-def test_wrong_arguments_are_named_as_those_of_a_step(t, y, error, message):
+def test_step_with_wrong_arguments_names_them(t, y, error, message):
     example, method = SYSTEMS["nonholonomic"], LobattoIIIAB(2)
     y0 = example.initial_state()
     sol = nhjax.integrate(
@@ -82,7 +82,7 @@ def test_wrong_arguments_are_named_as_those_of_a_step(t, y, error, message):
 
 
 @pytest.mark.parametrize("name", SYSTEMS)
-def test_a_compiled_step_is_that_of_compiled_integrate_bit_for_bit(name):
+def test_step_under_jit_equals_integrate_under_jit_bit_for_bit(name):
     system, y0 = SYSTEMS[name].system, SYSTEMS[name].initial_state()
     method = LobattoIIIAB(2)
 
@@ -108,7 +108,7 @@ def height_by_integrate(system, method, y, g, num_steps):
     return sol.ys.q[0, 2]
 
 
-def test_a_scan_over_steps_has_the_gradient_of_integrate():
+def test_step_in_a_scan_has_the_gradient_of_integrate():
     system = nhjax.LagrangianSystem(
         lambda t, q, v, g: 0.5 * v @ v - g * q[2] * (1 + 0.1 * jnp.sin(t)),
         holonomic=lambda t, q, g: q @ q - 1.0,
@@ -128,7 +128,7 @@ def test_a_scan_over_steps_has_the_gradient_of_integrate():
     assert abs(values[0][1]) > 1e-2
 
 
-def test_forward_and_reverse_mode_agree():
+def test_step_in_forward_and_reverse_mode_has_equal_derivatives():
     particle = SYSTEMS["nonholonomic"]
     system, y0 = particle.system, particle.initial_state()
 
@@ -139,7 +139,7 @@ def test_forward_and_reverse_mode_agree():
     np.testing.assert_allclose(forward, reverse, rtol=1e-12)
 
 
-def test_members_of_a_batch_step_on_their_own():
+def test_step_under_vmap_equals_single_steps():
     system, y0 = SYSTEMS["nonholonomic"].system, SYSTEMS["nonholonomic"].initial_state()
     sizes = jnp.array([0.05, 0.1, -0.1])
     method = LobattoIIIAB(2)
@@ -150,7 +150,7 @@ def test_members_of_a_batch_step_on_their_own():
 
 
 @pytest.mark.filterwarnings("ignore:.SimplifiedNewton. did not solve")
-def test_a_step_that_cannot_be_solved_raises_or_is_no_number():
+def test_step_that_cannot_be_solved_raises_or_is_nan():
     pendulum = SYSTEMS["holonomic"]
     system, y0 = pendulum.system, pendulum.initial_state()
     # Two radians' worth of free flight and more: the sphere is not reached.
@@ -165,7 +165,7 @@ def test_a_step_that_cannot_be_solved_raises_or_is_no_number():
         assert jnp.all(jnp.isnan(leaf[1]))
 
 
-def test_steps_of_controls_that_change():
+def test_step_with_feedback_control_reaches_the_target():
     # Between steps the control is what the user makes of the state.
     system = nhjax.LagrangianSystem(
         lambda t, q, v, u: 0.5 * v @ v, force=lambda t, q, v, u: u
@@ -178,7 +178,7 @@ def test_steps_of_controls_that_change():
     assert abs(float(y.q[0])) < 0.05
 
 
-def test_a_state_that_is_bad_does_not_end_the_others():
+def test_step_with_one_bad_member_does_not_change_others():
     particle = SYSTEMS["nonholonomic"]
     system, good = particle.system, particle.initial_state()
     q = jnp.stack([good.q, good.q, good.q])

@@ -48,7 +48,7 @@ LANES = (
 
 
 @pytest.mark.parametrize("axes", [long((0, None, None, None)), (None, 0, 0, 0)])
-def test_gradients_of_a_batch_are_those_of_its_lanes(axes, single):
+def test_gradients_of_a_batch_equal_single_runs(axes, single):
     given = [x if axis == 0 else x[0] for x, axis in zip(LANES, axes, strict=True)]
     batch = jax.jit(
         jax.vmap(jax.grad(particle_run, argnums=(0, 1, 2, 3)), in_axes=axes)
@@ -59,8 +59,8 @@ def test_gradients_of_a_batch_are_those_of_its_lanes(axes, single):
             np.testing.assert_allclose(got[k], expected, rtol=1e-12, atol=1e-13)
 
 
-def test_gradients_of_a_batch_compiled_within_where_some_results_are_of_no_lane():
-    """The times of nodes are those of all lanes, whichever of them failed."""
+def test_gradients_of_a_jitted_batch_with_unbatched_results_equal_single_runs():
+    """The times of nodes are not batched, whichever member failed."""
 
     def ends(mass, q):
         example = eqx.tree_at(lambda e: e.mass, PARTICLE, mass)
@@ -89,7 +89,7 @@ def test_gradients_of_a_batch_compiled_within_where_some_results_are_of_no_lane(
     np.testing.assert_allclose(got, jnp.stack(expected), rtol=1e-12)
 
 
-def test_gradients_of_an_ensemble_are_those_of_its_members():
+def test_gradients_of_an_ensemble_equal_single_runs():
     chaotic = systems.ChaoticSystem()
 
     def end(q, v):
@@ -167,7 +167,7 @@ for adjoint in (nhjax.DirectAdjoint(), nhjax.ReversibleAdjoint()):
 
 
 @pytest.mark.long
-def test_shards_are_what_one_device_computes():
+def test_shards_on_several_devices_equal_one_device():
     flags = os.environ.get("XLA_FLAGS", "")
     flags = f"{flags} --xla_force_host_platform_device_count=4"
     environment = os.environ | {"XLA_FLAGS": flags, "JAX_PLATFORMS": "cpu"}

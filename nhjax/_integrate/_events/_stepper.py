@@ -1,0 +1,586 @@
+"""The stepper of runs with events: each iteration ends at a node or at an event.
+
+An iteration takes the rest of a step. If there is an event in it, the iteration is
+discarded, and the next one takes the same step again, truncated at the event. So each
+event may take two additional iterations, and an event that ends the run takes one.
+"""
+
+from dataclasses import replace
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from ..._custom_types import BoolScalar, FloatScalar, IntScalar
+from ..._numerics import nan_gradient_unless, tree_where
+from ..._results import RESULTS
+from ..._step import first_step_state, RoundOff, StepArguments, StepState
+from ..._system import FunctionNoise, State
+from .._checkpoint import Checkpoint
+from .._stepper import (
+    AbstractCarry,
+    AbstractReverseReplay,
+    AbstractStepper,
+    PlainStepper,
+    Rows,
+    RunEnd,
+    Statistics,
+    step_back,
+    StepInterval,
+    StepResult,
+    updated_statistics,
+)
+from ._event import Conditions, ConditionSigns, Event, EventActions, signs_at
+from ._log import EventLog, LogEntry, reported_log
+from ._root import truncated_step, TruncatedStep, TruncationOptions
+
+
+class EventLoopState(eqx.Module):
+    """The place that a run with events has come to.
+
+    Derivatives pass through `offset` alone.
+
+    - `node`, `offset`: the time is t_k + offset with k = `node`.
+    - `row`: the number of output rows that are filled. It equals `node` until the run
+        ends. After that every iteration fills one more.
+    - `num_iterations`: the number of iterations before the end of the run.
+    - `num_events`, `last_event`: the number of events, and the index of the last one.
+    - `truncates`: whether the next step is to be truncated, since an event is in it.
+    - `values_at_end`: in that case the conditions at the end of the whole step.
+    - `signs`: the signs of the conditions.
+    - `pending`: the conditions that the last reset has carried across zero.
+    """
+
+    node: Int[Array, ""]
+    offset: FloatScalar
+    row: Int[Array, ""]
+    num_iterations: Int[Array, ""]
+    num_events: Int[Array, ""]
+    last_event: Int[Array, ""]
+    truncates: Bool[Array, ""]
+    values_at_end: Float[Array, " e"]
+    signs: ConditionSigns
+    pending: Bool[Array, " e"]
+
+
+class EventCarry(AbstractCarry):
+    """The carry of a run with events.
+
+    Derivatives pass through `step_state` and through the time in `place`.
+    """
+
+    step_state: StepState
+    result: RESULTS
+    stats: Statistics
+    place: EventLoopState
+
+
+class ReplayedIteration(eqx.Module):
+    """What a reverse replay knows about an iteration besides its state.
+
+    - `node`, `offset`, `num_events`: where it started, as in `EventLoopState`.
+    - `row`: the number of output rows that were filled before.
+    - `which`: the index of the event that it ended at, -1 for none.
+    - `size`: the size of the step.
+    - `scale`: the size of the condition of that event in the step.
+    - `is_active`: whether it took a step or met an event without one. Otherwise it did
+        nothing.
+    - `was_truncated`: whether the iteration before it was discarded, because there is
+        an event in the step.
+    """
+
+    node: Int[Array, ""]
+    offset: FloatScalar
+    num_events: Int[Array, ""]
+    row: Int[Array, ""]
+    which: Int[Array, ""]
+    size: FloatScalar
+    scale: FloatScalar
+    is_active: Bool[Array, ""]
+    was_truncated: Bool[Array, ""]
+
+
+class AttemptedStep(NamedTuple):
+    """The step of an iteration, before the action of its event.
+
+    - `is_alive`: whether the run had not ended before.
+    - `is_taken`: whether a step was taken from the time `t`. An event that is pending
+        happens without a step.
+    - `step`: that step.
+    - `is_discarded`: whether the step is discarded, since an event was found in it.
+    - `is_kept`: whether the step, of the given `size`, is kept. It led to the state
+        that is `reached`.
+    - `which`: the index of the event at its end, -1 if it ended at a node.
+    - `values_at_end`: if the step is truncated, the conditions at the end of the whole
+        step.
+    - `meets`, `fires`: whether there is an event, and whether there is room for it.
+    """
+
+    is_alive: BoolScalar
+    is_taken: BoolScalar
+    t: FloatScalar
+    step: TruncatedStep
+    is_discarded: BoolScalar
+    is_kept: BoolScalar
+    which: Int[Array, ""]
+    values_at_end: Float[Array, " e"]
+    meets: BoolScalar
+    fires: BoolScalar
+    size: FloatScalar
+    reached: StepState
+
+    @property
+    def reaches_node(self) -> BoolScalar:
+        """Return whether the step led to the next node."""
+        return self.is_kept & ~self.meets
+
+    @property
+    def value(self) -> FloatScalar:
+        """Return the value of the condition at the event if it is round-off, or 0."""
+        value, at_end = self.step.values[self.which], self.values_at_end[self.which]
+        small = float(jnp.finfo(value.dtype).eps) ** 0.5
+        is_small = self.is_kept & (jnp.abs(value) <= small * jnp.abs(at_end))
+        return jnp.where(is_small, value, 0)
+
+
+class EventStepper(AbstractStepper[EventCarry, ReplayedIteration]):
+    """Steps from node to node that are truncated at events.
+
+    `plain` takes the single steps.
+    """
+
+    plain: PlainStepper
+    conditions: Conditions
+    actions: EventActions
+
+    @classmethod
+    def of(
+        cls, events: tuple[Event, ...], plain: PlainStepper, y: State
+    ) -> "EventStepper":
+        """Return the stepper for the user's events in a run that starts at y.
+
+        **Raises:** `TypeError`, `ShapeError` or `DTypeError` for a function of an event
+        that returns something wrong.
+        """
+        given = plain.time(0), y, plain.args
+        conditions = Conditions.of(events, *given)
+        return cls(plain, conditions, EventActions.of(events, plain.system, *given))
+
+    @property
+    def num_iterations(self) -> int | IntScalar:
+        """Return the number of iterations within which the run is certain to end."""
+        actions = self.actions
+        goes_on = not all(actions.terminates)
+        extra = 2 * actions.max_events if goes_on else 0
+        return self.plain.num_steps + extra + 1
+
+    @property
+    def log_length(self) -> int:
+        """Return the number of events for which the log has room.
+
+        If events only end the run, no log is kept on the way: `finish` makes it.
+        """
+        return 0 if self.actions.only_end else self.actions.max_events
+
+    def with_round_off(self, round_off: RoundOff) -> "EventStepper":
+        """Return the same stepper with the measured round-off of the system."""
+        return replace(self, plain=self.plain.with_round_off(round_off))
+
+    def time(self, place: EventLoopState) -> FloatScalar:
+        """Compute the time that a run has come to."""
+        return self.plain.time(place.node) + place.offset
+
+    def init(self, y0: State | Checkpoint, noise: FunctionNoise | None) -> EventCarry:
+        """Return the carry before the first iteration."""
+        carry = self.plain.init(y0, noise)
+        t = self.plain.time(0)
+        signs, known = signs_at(self.conditions, self.plain, t, carry.step_state)
+        unknown = (carry.result == RESULTS.successful) & ~known
+        result = RESULTS.where(unknown, RESULTS.nonfinite_event, carry.result)
+        zero = jnp.zeros((), jnp.int32)
+        failed = jnp.where(unknown, zero, carry.stats["failed_step"])
+        stats = carry.stats | {"failed_step": failed, "num_events": zero}
+        place = EventLoopState(
+            node=zero,
+            offset=jnp.zeros_like(t),
+            row=zero,
+            num_iterations=zero,
+            num_events=zero,
+            last_event=-jnp.ones_like(zero),
+            truncates=jnp.zeros((), bool),
+            values_at_end=signs.value,
+            signs=signs,
+            pending=jnp.zeros(signs.sign.shape, bool),
+        )
+        return EventCarry(carry.step_state, result, stats, place)
+
+    def advance(
+        self,
+        carry: EventCarry,
+        i: Int[Array, ""],
+        replay: ReplayedIteration | None = None,
+    ) -> tuple[EventCarry, StepResult]:
+        """Advance to the next node or event. A run that has ended stays where it is.
+
+        With `replay` the step has the size and the event that are known.
+        """
+        before, num_steps = carry.place, self.plain.num_steps
+        attempt = self._attempt(carry, replay)
+        step = attempt.step
+        outcome = self.actions.apply(
+            self.conditions,
+            self.plain,
+            fires=attempt.fires,
+            which=attempt.which,
+            t=attempt.t + attempt.size,
+            step_state=attempt.reached,
+            value=attempt.value,
+            signs=before.signs,
+            pending=before.pending,
+        )
+        result = RESULTS.where(attempt.is_taken, step.outcome.result, carry.result)
+        result = RESULTS.where(attempt.meets, RESULTS.too_many_events, result)
+        result = RESULTS.where(attempt.fires, outcome.result, result)
+        ends = attempt.is_alive & (result != RESULTS.successful)
+        after = _place_after(self.plain.dt, before, attempt, outcome.pending, ends)
+        has_ended = carry.result != RESULTS.successful
+        fills = (after.node > before.node) | ends | has_ended
+        signs = before.signs.after_step(attempt.reaches_node, step.values)
+        after = replace(
+            after,
+            row=jnp.minimum(before.row + fills.astype(jnp.int32), num_steps),
+            signs=jax.lax.stop_gradient(
+                tree_where(attempt.fires, outcome.signs, signs)
+            ),
+            pending=jnp.where(attempt.fires, outcome.pending, before.pending),
+        )
+        entry = LogEntry(
+            t=attempt.t + attempt.size,
+            which=attempt.which,
+            before=attempt.reached.state,
+            after=outcome.step_state.state,
+            # With `jax.disable_jit` the index of a loop is a Python int.
+            iteration=jnp.asarray(i, jnp.int32),
+            node=before.node,
+            offset=before.offset,
+            size=attempt.size,
+            scale=before.signs.scale(attempt.size)[attempt.which],
+            node_after=after.node,
+            offset_after=after.offset,
+        )
+        max_events = self.actions.max_events
+        slot = jnp.where(attempt.fires, before.num_events, max_events)
+        failed = ends & (result != RESULTS.event_occurred)
+        stats = _statistics_after(carry, attempt, after, ends, failed)
+        row = jnp.where(fills, before.row, num_steps)
+        carry = EventCarry(outcome.step_state, result, stats, after)
+        t = self.plain.time(row + 1)
+        t = jnp.where(result == RESULTS.event_occurred, self.time(after), t)
+        offered = StepResult(t, step.outcome.record, attempt.is_kept, row)
+        return carry, self._with_log(offered, entry, slot)
+
+    def _with_log(
+        self, result: StepResult, entry: LogEntry, slot: Int[Array, ""]
+    ) -> StepResult:
+        if not self.log_length:
+            return result
+        return result._replace(log_entry=entry, log_slot=slot)
+
+    def _attempt(
+        self, carry: EventCarry, replay: ReplayedIteration | None
+    ) -> AttemptedStep:
+        """Take the rest of a step, or as far as the event that is known to be in it."""
+        before, plain = carry.place, self.plain
+        alive = (carry.result == RESULTS.successful) & (before.node < plain.num_steps)
+        at_once = jnp.any(before.pending)
+        is_taken = alive & ~at_once
+        t, h = self.time(before), plain.dt - before.offset
+        if replay is not None:
+            h = jnp.where(replay.which >= 0, replay.size, h)
+        step = self._step(carry, t, h, ~is_taken, replay)
+        solved = is_taken & (step.outcome.result == RESULTS.successful)
+        is_discarded = solved & (step.fired < 0) & jnp.any(step.crossed)
+        if replay is not None:
+            is_discarded = jnp.zeros_like(is_discarded)
+        is_kept = solved & ~is_discarded
+        first_pending = jnp.argmax(before.pending).astype(jnp.int32)
+        which = jnp.where(at_once, first_pending, step.fired)
+        meets = (is_kept | (alive & at_once)) & (which >= 0)
+        reached = tree_where(is_kept, step.outcome.step_state, carry.step_state)
+        size = jnp.where(is_kept, step.h, 0)
+        # Without this an event could be met again and again at the same time.
+        at_last = (before.num_events > 0) & before.signs.at_zero[which]
+        small = 16 * float(jnp.finfo(t.dtype).eps) * jnp.abs(plain.dt)
+        again = is_kept & at_last & (jnp.abs(size) <= small)
+        has_room = before.num_events < self.actions.max_events
+        return AttemptedStep(
+            is_alive=alive,
+            is_taken=is_taken,
+            t=t,
+            step=step,
+            is_discarded=is_discarded,
+            is_kept=is_kept,
+            which=which,
+            values_at_end=before.values_at_end,
+            meets=meets,
+            fires=meets & ~again & has_room,
+            size=size,
+            reached=reached.differentiated_in_state(),
+        )
+
+    def _step(
+        self,
+        carry: EventCarry,
+        t: FloatScalar,
+        h: FloatScalar,
+        skip: BoolScalar,
+        replay: ReplayedIteration | None,
+    ) -> TruncatedStep:
+        """Take a step of size h from t, truncated at its first event if it has one."""
+        plain, place = self.plain, carry.place
+        start = carry.step_state.differentiated_in_state()
+        given = plain.args, plain.invariants, plain.round_off
+        arguments = StepArguments(plain.system, t, h, start, *given)
+        options = TruncationOptions(
+            method=plain.method,
+            stage_solver=plain.stage_solver,
+            skip=skip,
+            signs=place.signs,
+            truncates=place.truncates & ~skip,
+            values_at_end=place.values_at_end,
+            known_event=None if replay is None else replay.which,
+        )
+        return truncated_step(arguments, self.conditions, options, plain.programs)
+
+    def blank_result(self, carry: EventCarry) -> StepResult:
+        """Return the result of an iteration that did nothing."""
+        t, y, zero = (
+            self.plain.time(0),
+            carry.step_state.state,
+            jnp.zeros((), jnp.int32),
+        )
+        entry = LogEntry(t, zero, y, y, zero, zero, t, t, t, zero, t)
+        blank = self.plain.blank_result(carry)._replace(row=zero)
+        return self._with_log(blank, entry, zero)
+
+    def succeeded(self, carry: EventCarry) -> BoolScalar:
+        """Return whether the run reached its last node, or an event that ends it."""
+        ended = carry.result == RESULTS.event_occurred
+        return ended | (carry.result == RESULTS.successful)
+
+    def finish(
+        self, carry: EventCarry, rows: Rows, log: LogEntry | None, given: Any
+    ) -> RunEnd[Rows, EventLog]:
+        """Return the end of the run, at the last node or at an event that ends it."""
+        t1 = jnp.where(
+            carry.result == RESULTS.event_occurred,
+            self.time(carry.place),
+            self.plain.time(self.plain.num_steps),
+        )
+        found = carry.step_state.state, rows, log, t1
+        found = nan_gradient_unless(self.succeeded(carry), found, given)
+        state, rows, log, t1 = found
+        if log is None:
+            log = _log_at_end(carry.place, t1, state)
+        return RunEnd(state, t1, rows, reported_log(log, carry.place.num_events))
+
+    def differentiable(self, carry: EventCarry) -> tuple[State, FloatScalar]:
+        """Return the state and the time since the last node, or their cotangents."""
+        return carry.step_state.state, carry.place.offset
+
+    def reverse_replay(
+        self, start: EventCarry, end: EventCarry, log: LogEntry | None
+    ) -> "EventReverseReplay":
+        """Return the replay of a run, with the events in its log."""
+        if log is None:
+            t, y = self.time(end.place), end.step_state.state
+            log = _log_at_end(end.place, t, y)
+        return EventReverseReplay(self, start, end, log)
+
+
+def _place_after(
+    dt: FloatScalar,
+    before: EventLoopState,
+    attempt: AttemptedStep,
+    pending: Bool[Array, " e"],
+    ends: BoolScalar,
+) -> EventLoopState:
+    """Return the place after an iteration, with the signs and rows from before it.
+
+    The events that are `pending` come before a node at the same time.
+    """
+    here = before.offset + attempt.size
+    # A rest of a step that is only round-off is left out.
+    small = 4 * float(jnp.finfo(dt.dtype).eps)
+    at_end = attempt.fires & ~ends & (jnp.abs(dt - here) <= small * jnp.abs(dt))
+    at_end = at_end & ~jnp.any(pending)
+    offset = jnp.where(attempt.fires, here, before.offset)
+    offset = jnp.where(at_end, here - dt, jnp.where(attempt.reaches_node, 0, offset))
+    return replace(
+        before,
+        node=before.node + (attempt.reaches_node | at_end).astype(jnp.int32),
+        offset=offset,
+        num_iterations=before.num_iterations + attempt.is_alive.astype(jnp.int32),
+        num_events=before.num_events + attempt.fires.astype(jnp.int32),
+        last_event=jnp.where(attempt.fires, attempt.which, before.last_event),
+        truncates=attempt.is_discarded,
+        values_at_end=jax.lax.stop_gradient(attempt.step.values),
+    )
+
+
+def _statistics_after(
+    carry: EventCarry,
+    attempt: AttemptedStep,
+    after: EventLoopState,
+    ends: BoolScalar,
+    failed: BoolScalar,
+) -> Statistics:
+    """Return the statistics after an iteration, with which the run may end."""
+    node, outcome = carry.place.node, attempt.step.outcome
+    taken, kept = attempt.is_taken, attempt.is_kept
+    stats = updated_statistics(carry.stats, outcome, taken, kept, node)
+    for name in ("failed_step", "worst_coordinate"):
+        # A step that is discarded has not failed.
+        stats[name] = jnp.where(ends, stats[name], carry.stats[name])
+    stats["failed_step"] = jnp.where(failed, node, stats["failed_step"])
+    stats |= {"num_steps": after.node, "num_events": after.num_events}
+    return jax.lax.stop_gradient(stats)
+
+
+def _log_at_end(place: EventLoopState, t: FloatScalar, y: State) -> LogEntry:
+    """Return the log of a run that ended at its first event, if there was one."""
+    node, offset = place.node, place.offset
+    entry = LogEntry(
+        t=t,
+        which=place.last_event,
+        before=y,
+        after=y,
+        iteration=place.num_iterations - 1,
+        node=node,
+        offset=jnp.zeros_like(offset),
+        size=offset,
+        scale=place.signs.scale(offset)[place.last_event],
+        node_after=node,
+        offset_after=offset,
+    )
+    # A log has one row more than it has room for.
+    return jax.tree.map(lambda x: jnp.stack([x, x]), entry)
+
+
+class EventReverseReplay(AbstractReverseReplay[EventCarry, ReplayedIteration]):
+    """The replay of a run with events, whose log has the states before them."""
+
+    stepper: EventStepper
+    start: EventCarry
+    end: EventCarry
+    log: LogEntry
+
+    @property
+    def after_end(self) -> ReplayedIteration:
+        """Return the place at the end of the run, as that of an idle iteration."""
+        end = self.end.place
+        never = jnp.zeros((), bool)
+        return ReplayedIteration(
+            node=end.node,
+            offset=end.offset,
+            num_events=end.num_events,
+            row=end.row,
+            which=-jnp.ones_like(end.node),
+            size=jnp.zeros_like(end.offset),
+            scale=jnp.zeros_like(end.offset),
+            is_active=never,
+            was_truncated=never,
+        )
+
+    @property
+    def _ended(self) -> BoolScalar:
+        return self.end.result == RESULTS.event_occurred
+
+    def back(
+        self, following: ReplayedIteration, step_state: StepState, i: Int[Array, ""]
+    ) -> tuple[ReplayedIteration, StepState]:
+        """Find what iteration i did and the state it started from."""
+        plain, end = self.stepper.plain, self.end.place
+        i = i.astype(jnp.int32)
+        last = jnp.maximum(following.num_events - 1, 0)
+        entry = jax.tree.map(lambda x: x[last], self.log)
+        active = (i < end.num_iterations) & ~following.was_truncated
+        at_event = active & (following.num_events > 0) & (entry.iteration == i)
+        # The rest of a step after its last event is a step of another iteration.
+        is_rest = (following.num_events > 0) & (entry.node_after == following.node - 1)
+        offset = jnp.where(is_rest, entry.offset_after, 0)
+        offset = jnp.where(at_event, entry.offset, offset)
+        offset = jnp.where(active, offset, following.offset)
+        node = jnp.where(at_event, entry.node, following.node - 1)
+        node = jnp.where(active, node, following.node)
+        size = jnp.where(at_event, entry.size, plain.dt - offset)
+        start = plain.time(node) + offset
+
+        def before_event() -> StepState:
+            t, system, method = start + size, plain.system, plain.method
+            return first_step_state(system, method, t, entry.before, plain.args)
+
+        step_state = jax.lax.cond(at_event, before_event, lambda: step_state)
+        interval = StepInterval(start, start + size, size)
+        step_state = jax.lax.cond(
+            active & (size != 0),
+            lambda: step_back(plain, step_state, interval),
+            lambda: step_state,
+        )
+        # After its end, a run fills one row in each iteration until all are filled.
+        filled = jnp.where(self._ended, end.node + 1, end.row) + i - end.num_iterations
+        no_row = jnp.asarray(plain.num_steps, jnp.int32)
+        filled = jnp.where(i < end.num_iterations, no_row, jnp.minimum(filled, end.row))
+        replayed = ReplayedIteration(
+            node=node,
+            offset=offset,
+            num_events=following.num_events - at_event.astype(jnp.int32),
+            row=jnp.where(active, node, filled),
+            which=jnp.where(at_event, entry.which, -1),
+            size=size,
+            scale=entry.scale,
+            is_active=active,
+            was_truncated=at_event & (size != 0),
+        )
+        return replayed, step_state
+
+    def carry_before(
+        self, replay: ReplayedIteration, step_state: StepState, i: Int[Array, ""]
+    ) -> EventCarry:
+        """Return the carry before iteration i, as far as the iteration reads it."""
+        # Constants come back as arrays of NumPy.
+        start = jax.tree.map(jnp.asarray, self.start.place)
+        numbers = jnp.arange(start.pending.shape[0], dtype=jnp.int32)
+        is_one = numbers == replay.which
+        scales = jnp.broadcast_to(replay.scale, start.values_at_end.shape)
+        at_zero = jnp.zeros(scales.shape, bool)
+        place = EventLoopState(
+            node=replay.node,
+            offset=replay.offset,
+            row=replay.row,
+            num_iterations=i.astype(jnp.int32),
+            num_events=replay.num_events,
+            last_event=start.last_event,
+            truncates=start.truncates,
+            values_at_end=start.values_at_end,
+            signs=ConditionSigns(start.signs.sign, scales, at_zero),
+            pending=is_one & (replay.size == 0),
+        )
+        # An iteration that did nothing is repeated as one after the end of the run.
+        ended = RESULTS.event_occurred
+        result = RESULTS.where(replay.is_active, RESULTS.successful, ended)
+        return EventCarry(step_state, result, self.start.stats, place)
+
+    def places(
+        self, replay: ReplayedIteration, i: Int[Array, ""]
+    ) -> tuple[Int[Array, ""], Int[Array, ""]]:
+        """Return the output row that iteration i filled, and its place in the log."""
+        is_event = replay.which >= 0
+        is_last = i.astype(jnp.int32) == self.end.place.num_iterations - 1
+        ends_here = self._ended & is_last
+        slot = jnp.where(is_event, replay.num_events, self.log.t.shape[0] - 1)
+        at_end = self.log.node_after[replay.num_events] > replay.node
+        fills = ~is_event | ends_here | at_end
+        return jnp.where(fills, replay.row, self.stepper.plain.num_steps), slot
