@@ -814,7 +814,11 @@ METHODS = [
 
 SAVING = [
     row(
-        "asked to save nothing", SaveAt, ValueError, "nothing is saved", "at least one of `t0`"
+        "asked to save nothing",
+        SaveAt,
+        ValueError,
+        "nothing is saved",
+        "at least one of `t0`",
     ),
     row(
         "asked to save every minus third step",
