@@ -167,6 +167,24 @@ def circle(arrows: Iterable[tuple[str, str]]) -> list[str] | None:
     return None
 
 
+def num_files(modules: Iterable[str], folder: str) -> int:
+    """The number of files of a room, rooms inside of it included."""
+    return sum(name == folder or name.startswith(f"{folder}.") for name in modules)
+
+
+def num_floors(imports: Iterable[Import], folder: str) -> int:
+    """The length of the longest chain of imports inside a folder, without its door."""
+    leads_to: dict[str, set[str]] = {}
+    for found in imports:
+        if all(x.rpartition(".")[0] == folder for x in found[:2]):
+            leads_to.setdefault(found.importer, set()).add(found.imported)
+
+    def height(module: str) -> int:
+        return 1 + max(map(height, leads_to.get(module, ())), default=0)
+
+    return max(map(height, leads_to), default=1)
+
+
 def purpose(source: str) -> str:
     """The first paragraph of a module's docstring, on one line."""
     text = ast.get_docstring(ast.parse(source)) or ""
@@ -175,9 +193,9 @@ def purpose(source: str) -> str:
 
 def page(sources: Mapping[str, str]) -> str:
     """The text of docs/rooms.md."""
+    imports = read_imports(sources)
     arrows = {
-        (room(found.importer), room(found.imported))
-        for found in between_rooms(read_imports(sources))
+        (room(found.importer), room(found.imported)) for found in between_rooms(imports)
     }
     lines = [
         "# The rooms",
@@ -190,14 +208,17 @@ def page(sources: Mapping[str, str]) -> str:
         "",
         "![The rooms of nhjax and their imports](rooms.png)",
         "",
-        "From the top down:",
+        "From the top down, with the number of files of each room and its floors, the",
+        "length of the longest chain of imports inside it:",
         "",
-        "| room | purpose | imports from |",
-        "| --- | --- | --- |",
+        "| room | purpose | imports from | files | floors |",
+        "| --- | --- | --- | --- | --- |",
     ]
     for name in reversed(ROOMS):
         below = [f"`{other}`" for other in ROOMS if (name, other) in arrows]
-        lines.append(f"| `{name}` | {purpose(sources[name])} | {', '.join(below)} |")
+        cells = [f"`{name}`", purpose(sources[name]), ", ".join(below)]
+        cells += [str(num_files(sources, name)), str(num_floors(imports, name))]
+        lines.append(f"| {' | '.join(cells)} |")
     return "\n".join(lines) + "\n"
 
 

@@ -45,6 +45,27 @@ def test_rooms_are_entered_by_the_door():
     assert around == []
 
 
+# The rooms that are still deeper.
+DEEP = {"_step", "_system"}
+
+
+@pytest.mark.parametrize("room", sorted({*rooms.ROOMS, "_integrate._events"} - DEEP))
+def test_room_has_at_most_five_floors(room):
+    assert rooms.num_floors(IMPORTS, room) <= 5
+
+
+def test_floors_of_made_up_room_are_its_longest_chain_of_imports():
+    found = _made_up(
+        _low="from ._a import x",
+        _low___a="from ._b import x\nfrom ._c import x",
+        _low___b="from ._c import x",
+        _low___c="",
+        _high="from ._low import x",
+    )
+    assert rooms.num_floors(found, "_low") == 3
+    assert rooms.num_floors(found, "_high") == 1
+
+
 @pytest.mark.parametrize("room", rooms.ROOMS)
 def test_a_room_says_what_it_is_for(room):
     assert rooms.purpose(SOURCES[room]).endswith(".")
