@@ -104,9 +104,10 @@ class RESULTS(eqx.Enumeration, metaclass=_Named):
         "from the others."
     )
     inconsistent_start = (
-        "The initial state violates the constraints at `t0`, its q is off the group, "
-        "or its v and p do not belong together. Make `y0` with `nhjax.initial_state`, "
-        "for the system, args and time of the integration."
+        "The initial state violates the constraints at `t0`, its q is not an element "
+        "of the group, or its p is not the momentum of its v. Make `y0` with "
+        "`nhjax.initial_state`, for the system, args and time of the integration; do "
+        "not change a state by hand."
     )
     invalid_argument = (
         "An argument of the run is not valid: `dt` or `t0` is not finite, `dt` is zero "

@@ -238,7 +238,7 @@ VALUES_OF_FUNCTIONS = [
         ),
         DTypeError,
         "returns dtype float32",
-        "constants of another precision inside it?",
+        "write its constants in the precision of the state",
     ),
     row(
         "gave more constraints than coordinates",
@@ -727,7 +727,7 @@ STATES = [
         "gave a quaternion that is not of unit length",
         lambda: start(TURNING, q=2 * QUATERNION),
         ConstraintViolationError,
-        "is no element of the group SO3",
+        "is not an element of the group SO3",
         "or pass `manifold.normalise(q)`",
     ),
     row(
@@ -898,7 +898,7 @@ SAVING = [
         lambda: ANY_SAVEAT(t1=5.0),
         ValueError,
         "SaveAt: `t1` must be True or False, got 5.0",
-        "Give times as `ts`",
+        "Save at given times by `ts`",
     ),
     row(
         "gave the start of the run where a flag belongs",

@@ -185,10 +185,14 @@ def _group_error(case: _Case) -> ConstraintViolationError:
         advice = f"Choose fewer in `keep_q`, which keeps {labels}"
     else:
         where, q, advice = "`q`", case.q, "Pass `project=True`"
+    advice += ", or pass `manifold.normalise(q)`."
+    if case.project and not case.keep[0].indices:
+        advice = (
+            "The projection found no element near it; a quaternion must not be zero."
+        )
     return ConstraintViolationError(
-        f"{where} = {q} is no element of the group {case.group}: it is off by "
-        f"{float(case.found.off_group):.3g}. {advice}, or pass "
-        "`manifold.normalise(q)`."
+        f"{where} = {q} is not an element of the group {case.group}: it is off by "
+        f"{float(case.found.off_group):.3g}. {advice}"
     )
 
 

@@ -301,14 +301,22 @@ def checked_inputs(system, q, v, p, t):
         )
     if (v is None) == (p is None):
         given = "neither" if v is None else "both"
-        raise ValueError(f"Give either `v` or `p`; got {given} of them.")
+        raise ValueError(
+            f"Give either `v` or `p`; got {given} of them. Call it as "
+            "`initial_state(system, q, v, t=..., args=...)`."
+        )
     name, u = ("v", v) if p is None else ("p", p)
     q, u = configuration(q), floating(name, u)
     require_manifold(system, "q", q)
     if system.manifold is None and q.ndim != 1:
+        advice = "For many trajectories use `jax.vmap`."
+        if q.ndim == 0:
+            advice = (
+                "For a single coordinate write `jnp.array([x])`. Call it as "
+                "`initial_state(system, q, v, t=..., args=...)`."
+            )
         raise ShapeError(
-            f"`q` has shape {q.shape}, but a configuration has shape (n,). For many "
-            "trajectories use `jax.vmap`."
+            f"`q` has shape {q.shape}, but a configuration has shape (n,). {advice}"
         )
     manifold = system.manifold_of(q)
     q = manifold.check(q)

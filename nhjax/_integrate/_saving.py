@@ -85,9 +85,14 @@ class SaveAt(eqx.Module):
         flags = {"t0": t0, "t1": t1, "dense": dense, "checkpoint": checkpoint}
         for name, flag in flags.items():
             if not isinstance(flag, bool):
+                advice = ""
+                if name in ("t0", "t1"):
+                    advice = (
+                        " Save at given times by `ts`. A run starts at the `t0` of "
+                        "`integrate`, and ends after `num_steps` steps of `dt`."
+                    )
                 raise ValueError(
-                    f"SaveAt: `{name}` must be True or False, got {flag!r}. Give times "
-                    "as `ts`, and the start and end of the run to `integrate`."
+                    f"SaveAt: `{name}` must be True or False, got {flag!r}.{advice}"
                 )
         if not isinstance(steps, int | np.integer) or steps < 0:
             raise ValueError(

@@ -264,7 +264,7 @@ def _failure_message(
     if dt is not None and "smaller `dt`" in reason:
         smooth = "if all forces are smooth, " if JUMPS in reason else ""
         reason += f" `dt` is {dt:.6g}: {smooth}try {0.5 * dt:.6g}."
-    return (
-        f"Integration failed in {where}step {k}{others}: {reason} "
-        "With `throw=False` the part before the failure is returned."
-    )
+    message = f"Integration failed in {where}step {k}{others}: {reason}"
+    if k > 0:
+        message += " With `throw=False` the part before the failure is returned."
+    return message

@@ -262,17 +262,26 @@ def transpose(
     return lambda covector: pullback(covector)[0]
 
 
-def check_shape(q: Element, shape: tuple[int, ...], group: str, name: str) -> Element:
-    """Return `q`, or raise a `ShapeError` if it is not one array of this shape."""
+def check_shape(
+    q: Element, shape: tuple[int, ...], group: str, name: str, numbers: str = ""
+) -> Element:
+    """Return `q`, or raise a `ShapeError` if it is not one array of this shape.
+
+    The message names the `numbers` of which an element consists.
+    """
+    if numbers:
+        numbers = f", {numbers}"
     if isinstance(q, (tuple, list, dict)):
         raise ShapeError(
             f"`{name}` is {eqx.tree_pformat(q)}, but the manifold {group} needs an "
-            f"array of shape {shape}."
+            f"array of shape {shape}{numbers}."
         )
     if jnp.shape(q) != shape:
+        is_batch = jnp.ndim(q) > len(shape)
+        advice = " For many trajectories use `jax.vmap`." if is_batch else ""
         raise ShapeError(
             f"`{name}` has shape {jnp.shape(q)}, but the manifold {group} needs shape "
-            f"{shape}. For many trajectories use `jax.vmap`."
+            f"{shape}{numbers}.{advice}"
         )
     return q
 

@@ -77,7 +77,7 @@ class SO2(AbstractLieGroup):
 
     def check(self, q: Angle, name: str = "q") -> Angle:
         """Return `q`, or raise a `ShapeError` if it is not of shape (1,)."""
-        return check_shape(q, (1,), "SO2", name)
+        return check_shape(q, (1,), "SO2", name, "an angle")
 
     def in_chart(self, xi: Rate) -> BoolScalar:
         """Return whether the rotation is inside the chart, if the chart has an end."""
@@ -194,7 +194,7 @@ class SE2(AbstractMotionGroup):
 
     def check(self, q: Pose, name: str = "q") -> Pose:
         """Return `q`, or raise a `ShapeError` if it is not of shape (3,)."""
-        return check_shape(q, (3,), "SE2", name)
+        return check_shape(q, (3,), "SE2", name, "(x, y, angle)")
 
     def in_chart(self, xi: Twist) -> BoolScalar:
         """Return whether the rotation of τ(ξ) is inside the chart."""

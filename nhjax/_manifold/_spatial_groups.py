@@ -186,7 +186,8 @@ class SO3(AbstractMotionGroup):
 
     def check(self, q: Quaternion, name: str = "q") -> Quaternion:
         """Return `q`, or raise a `ShapeError` if it is not of shape (4,)."""
-        return check_shape(q, (4,), "SO3", name)
+        numbers = "a unit quaternion (w, x, y, z)"
+        return check_shape(q, (4,), "SO3", name, numbers)
 
     def in_chart(self, xi: Vector3) -> BoolScalar:
         """Return whether the rotation τ(ω) is inside the chart."""
@@ -323,7 +324,8 @@ class SE3(AbstractMotionGroup):
 
     def check(self, q: Pose, name: str = "q") -> Pose:
         """Return `q`, or raise a `ShapeError` if it is not of shape (7,)."""
-        return check_shape(q, (7,), "SE3", name)
+        numbers = "a unit quaternion (w, x, y, z) and a position"
+        return check_shape(q, (7,), "SE3", name, numbers)
 
     def in_chart(self, xi: Twist) -> BoolScalar:
         """Return whether the rotation of τ(ξ) is inside the chart."""

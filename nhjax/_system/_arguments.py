@@ -38,9 +38,10 @@ def check_type(name: str, x: object, kind: Kind, advice: str = "") -> None:
 def check_flag(name: str, x: object) -> bool:
     """Return `x` as a bool, or raise a `TypeError` if it is anything else."""
     if not isinstance(x, bool | np.bool_):
+        known = ", known when tracing" if is_traced(x) else ""
         raise TypeError(
-            f"`{name}` must be True or False, known when tracing, got "
-            f"{reprlib.repr(x)} of type {type(x).__name__}."
+            f"`{name}` must be True or False{known}, got {reprlib.repr(x)} of type "
+            f"{type(x).__name__}."
         )
     return bool(x)
 
@@ -53,7 +54,7 @@ def dtype_advice(dtype: Any) -> str:
         return "write 1.0 for 1."
     if jnp.issubdtype(dtype, jnp.complexfloating):
         return "take its real part."
-    return "constants of another precision inside it?"
+    return "write its constants in the precision of the state."
 
 
 def no_array(x: Any) -> str:
@@ -75,9 +76,14 @@ def floating(name: str, x: Any) -> Array:
             f"{type(x).__name__}."
         ) from None
     if array.dtype not in (jnp.float32, jnp.float64):
+        advice = f"convert it with `jnp.asarray({name}, float)`."
+        if jnp.issubdtype(array.dtype, jnp.integer):
+            advice = f"write 1.0 for 1, or {advice}"
+        elif jnp.issubdtype(array.dtype, jnp.complexfloating):
+            advice = f"if its imaginary part is zero, give `{name}.real`."
         raise DTypeError(
             f"`{name}` has dtype {array.dtype}, but float32 or float64 is needed: "
-            f"write 1.0 for 1, or convert with `jnp.asarray({name}, float)`."
+            f"{advice}"
         )
     return array
 

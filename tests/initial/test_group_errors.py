@@ -30,7 +30,7 @@ def started(system, q=IDENTITY, v=SPIN, **options):
 def test_an_element_off_the_group_is_refused():
     with pytest.raises(
         nhjax.ConstraintViolationError,
-        match=r"`q` = \[1\.1 .*no element of the group SO3.*off by 0\.1.*normalise",
+        match=r"`q` = \[1\.1 .*not an element of the group SO3.*off by 0\.1.*normalise",
     ):
         started(BODY.system, 1.1 * IDENTITY)
 
@@ -38,7 +38,8 @@ def test_an_element_off_the_group_is_refused():
 def test_an_element_off_the_group_is_refused_under_jit():
     start = jax.jit(lambda q: started(BODY.system, q))
     with pytest.raises(
-        RuntimeError, match=r"`q` = \[1\.1 .*no element of the group SO3.*off by 0\.1"
+        RuntimeError,
+        match=r"`q` = \[1\.1 .*not an element of the group SO3.*off by 0\.1",
     ):
         jax.block_until_ready(start(1.1 * IDENTITY))
 
@@ -51,7 +52,9 @@ def test_projection_returns_to_the_group():
 def test_integration_does_not_start_off_the_group():
     y0 = started(BODY.system)
     y0 = nhjax.State(1.1 * y0.q, y0.v, y0.p, y0.multiplier)
-    with pytest.raises(nhjax.IntegrationError, match=r"step 0: .*q is off the group"):
+    with pytest.raises(
+        nhjax.IntegrationError, match=r"step 0: .*q is not an element of"
+    ):
         nhjax.integrate(BODY.system, METHOD, y0, dt=0.1, num_steps=1)
 
 

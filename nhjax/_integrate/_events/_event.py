@@ -479,5 +479,5 @@ def _check_part(called: str, name: str, got: Any, like: Any) -> None:
         if x.dtype != y.dtype:
             raise DTypeError(
                 f"{called} returned a `{name}` of dtype {x.dtype}, but `y` has "
-                f"{y.dtype}: constants of another precision inside it?"
+                f"{y.dtype}: write its constants in the precision of the state."
             )
