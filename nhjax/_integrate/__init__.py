@@ -1,4 +1,9 @@
-"""Integration over many steps: the time loop, events, output and derivatives."""
+"""Integration over many steps: the time loop, events, output and derivatives.
+
+`_integrate` checks the arguments and compiles the run, `_loop` iterates, `_stepper`
+takes the steps, `_events` wraps the plain stepper, and `_adjoint` and `_reversible`
+differentiate the loop.
+"""
 
 from ._adjoint import (
     AbstractAdjoint as AbstractAdjoint,

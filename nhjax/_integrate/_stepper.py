@@ -155,7 +155,10 @@ class AbstractStepper(eqx.Module, Generic[C, R]):
 
     @abstractmethod
     def differentiable(self, carry: C) -> PyTree[Array]:
-        """Return the nodes of a carry, or of its cotangent, that have derivatives."""
+        """Return the parts of a carry, or of its cotangent, that have derivatives.
+
+        It serves as the `where` of `equinox.tree_at`, too.
+        """
 
     @abstractmethod
     def reverse_replay(
@@ -203,6 +206,7 @@ class PlainCarry(AbstractCarry):
 class PlainStepper(AbstractStepper[PlainCarry, None]):
     """One step of the method per iteration, from node to node.
 
+    - `args`: the same in all steps; the loop, the output and the events read them here.
     - `programs`: the traced program of a step, shared by all derivatives of the run.
     - `origin`: where times and steps are counted from. The first step of the run has
         the number `origin.first_step`.
@@ -471,7 +475,8 @@ def _is_undone_by_negative_step(stepper: PlainStepper, step_state: StepState) ->
     is_flat = system.manifold_of(step_state.state.q).is_flat
     if not is_flat and method.chart != "middle":
         return False
-    if system.nonholonomic is not None and method.closure == "consistent":
+    is_symmetric = method.closure in ("propagated", "symmetric")
+    if system.nonholonomic is not None and not is_symmetric:
         return False
     return method.is_symmetric
 

@@ -204,6 +204,9 @@ class ClosureConverted(eqx.Module):
     class derivatives reach the closed-over arrays too. It does what
     `equinox.filter_closure_convert` does, but takes arrays of any sharding, as there
     are inside and outside of `jax.shard_map`.
+
+    Call it with trees of the structure of `example`. Leaves that are not arrays keep
+    the values that they have in `example`.
     """
 
     consts: list[Array]

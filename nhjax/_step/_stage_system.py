@@ -35,9 +35,11 @@ class StageSystem(eqx.Module):
     ones at the positions Q^i, i >= 2, and their tangency at the end. The constraints at
     the first node hold by hypothesis H1; the last node is the end of the step by H3.
     Of redundant constraints as many are kept as are independent; see `Redundancy`.
-    The three closures differ in the constant matrices of `method.closure_weights`
-    alone. To keep invariants, momenta receive impulses at both ends of the step; see
-    `ImpulseWeights`.
+    A closure of the multiplier enters in three places: by the constant matrices of
+    `method.closure_weights`; by the multiplier that a state carries, Λ^s for the
+    propagated closure and λ_c for the others (`end_state`, `first_step_state`); and, if
+    it uses λ_c at the end, by two more unknowns and equations (`symmetric`). To keep
+    invariants, momenta receive impulses at both ends of the step; see `ImpulseWeights`.
     """
 
     system: AbstractMechanicalSystem

@@ -47,7 +47,9 @@ class StepState(eqx.Module):
     """The data that is carried from step to step: a state, and what is known there.
 
     The compensations are the rounding errors of the running sums q and p. The
-    linearisation `lin` gives the Jacobian of the next step and the multiplier λ_c.
+    linearisation `lin` gives the Jacobian of the next step and the multiplier λ_c. It
+    belongs to the system and the args with which it was made; `first_step_state` makes
+    one for others.
     """
 
     state: State

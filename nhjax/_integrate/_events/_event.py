@@ -332,7 +332,7 @@ class EventOutcome(NamedTuple):
 
 
 class EventActions(eqx.Module):
-    """The action of each event: a reset of the state, the end of the run, or none.
+    """The action of each event: first its reset, if any, then the end, if it is one.
 
     `max_events` is the number of events that the run has room for.
     """
@@ -386,8 +386,10 @@ class EventActions(eqx.Module):
     ) -> EventOutcome:
         """Apply the action of event `which` if it `fires`; otherwise do nothing.
 
-        The condition of the event has this `value`, zero up to round-off. The step that
-        led here started with these `signs` and `pending` conditions.
+        The condition of the event has this `value`, zero up to round-off: after a
+        reset, values of this size count as zero, so that the event does not occur
+        again at once. The step that led here started with these `signs` and `pending`
+        conditions.
         """
         ends = jnp.asarray(self.terminates)[which]
         result = RESULTS.where(ends, RESULTS.event_occurred, RESULTS.successful)

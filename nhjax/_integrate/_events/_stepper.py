@@ -501,7 +501,13 @@ class EventReverseReplay(AbstractReverseReplay[EventCarry, ReplayedIteration]):
     def back(
         self, following: ReplayedIteration, step_state: StepState, i: Int[Array, ""]
     ) -> tuple[ReplayedIteration, StepState]:
-        """Find what iteration i did and the state it started from."""
+        """Find what iteration i did and the state it started from.
+
+        Iterations are undone last to first, and `following` says where the next one
+        started. If the last entry of the log that is left has the number of this
+        iteration, it ended at that event, and the step back starts from the state
+        `before` the reset.
+        """
         plain, end = self.stepper.plain, self.end.place
         i = i.astype(jnp.int32)
         last = jnp.maximum(following.num_events - 1, 0)
