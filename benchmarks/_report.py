@@ -1,5 +1,6 @@
 """Where the benchmarks put what they measured."""
 
+import argparse
 import datetime
 import json
 import math
@@ -58,8 +59,20 @@ def write(name: str, title: str, text: str, data: dict[str, Any]) -> None:
     )
 
 
+def add_keep(parser: argparse.ArgumentParser) -> None:
+    """Add the option `--keep`, for which `with_saved` reads the saved table."""
+    parser.add_argument(
+        "--keep",
+        action="store_true",
+        help="keep the rows of the saved table that are not measured now",
+    )
+
+
 def with_saved(name: str, rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Add rows to a saved table, in place of those of the same system and stages."""
+    """Return the rows of a saved table, with new rows for the systems and stages.
+
+    A new row replaces the saved rows of its system and number of stages.
+    """
     measured = {(row["system"], row["stages"]) for row in rows}
     saved = json.loads((RESULTS / f"{name}.json").read_text())["rows"]
     others = [row for row in saved if (row["system"], row["stages"]) not in measured]

@@ -42,7 +42,7 @@ from nhjax._system import position_scale, violation_scale
 from . import near_rest
 from ._examples import of_the_gallery
 from ._random_systems import random_systems
-from ._report import markdown_table, number, with_saved, write
+from ._report import add_keep, markdown_table, number, with_saved, write
 
 
 SMALLEST, LARGEST, SIZES = 0.004, 4.0, 10
@@ -349,11 +349,7 @@ def main() -> None:
     parser.add_argument("--stages", type=int, nargs="+", default=[2, 3, 4, 5, 6])
     parser.add_argument("--num-steps", type=int, default=200, help="of each size")
     parser.add_argument("--starts", type=int, default=3000, help="of steep systems")
-    parser.add_argument(
-        "--keep",
-        action="store_true",
-        help="keep the rows of the saved table that are not measured now",
-    )
+    add_keep(parser)
     options = parser.parse_args()
     jax.config.update("jax_enable_x64", True)
     # The programs run for seconds and would be optimised for minutes.

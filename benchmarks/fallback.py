@@ -101,7 +101,7 @@ def main() -> None:
     header += ["step [µs]", "with fallback [µs]", "ratio"]
     parts = [(__doc__ or "").strip(), summary, markdown_table(header, rows)]
     text = "\n\n".join(parts)
-    write("fallback", "What the fallback costs", text, {"rows": data})
+    write("fallback", "Cost of the fallback to Newton's method", text, {"rows": data})
 
 
 if __name__ == "__main__":

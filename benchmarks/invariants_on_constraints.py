@@ -1,5 +1,7 @@
-"""What it costs to keep functions that are conserved on constraints alone, and
-energies whose mass matrix is indefinite.
+"""Cost and accuracy of kept invariants in two difficult cases.
+
+The first case is a function that is conserved only where the constraints hold, the
+second an energy with an indefinite mass matrix.
 
 - A particle with the constraint ż = y ẋ keeps its energy, and the same function with
   y ẋ in the place of ż: the sweeps and the time of a step, for starts at several y.

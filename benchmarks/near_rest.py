@@ -48,7 +48,7 @@ from nhjax._system import function_noise
 from nhjax.systems._base import AbstractExample
 
 from ._high_precision import evaluate, to_float
-from ._report import markdown_table, number, with_saved, write
+from ._report import add_keep, markdown_table, number, with_saved, write
 
 
 SCALES = 1e-8, 1e-6, 1e-4, 1e-2, 1.0
@@ -306,11 +306,7 @@ def main() -> None:
     parser.add_argument("--systems", nargs="+", help="names of systems")
     parser.add_argument("--stages", type=int, nargs="+", default=[2, 3, 4, 5, 6])
     parser.add_argument("--judged", type=int, default=1, help="steps of each kind")
-    parser.add_argument(
-        "--keep",
-        action="store_true",
-        help="keep the rows of the saved table that are not measured now",
-    )
+    add_keep(parser)
     options = parser.parse_args()
     jax.config.update("jax_enable_x64", True)
     # The programs run for seconds and would be optimised for minutes.

@@ -182,14 +182,18 @@ def _group_error(case: _Case) -> ConstraintViolationError:
     if case.keep[0].indices:
         where, q = "`q` with its kept numbers", case.found.state.q
         labels = enumerated(list(case.keep[0].labels))
-        advice = f"Choose fewer in `keep_q`, which keeps {labels}"
-    else:
-        where, q, advice = "`q`", case.q, "Pass `project=True`"
-    advice += ", or pass `manifold.normalise(q)`."
-    if case.project and not case.keep[0].indices:
+        advice = (
+            f"Choose fewer in `keep_q`, which keeps {labels}, or pass "
+            "`manifold.normalise(q)`."
+        )
+    elif case.project:
+        where, q = "`q`", case.q
         advice = (
             "The projection found no element near it; a quaternion must not be zero."
         )
+    else:
+        where, q = "`q`", case.q
+        advice = "Pass `project=True`, or pass `manifold.normalise(q)`."
     return ConstraintViolationError(
         f"{where} = {q} is not an element of the group {case.group}: it is off by "
         f"{float(case.found.off_group):.3g}. {advice}"

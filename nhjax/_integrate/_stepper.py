@@ -475,8 +475,8 @@ def _is_undone_by_negative_step(stepper: PlainStepper, step_state: StepState) ->
     is_flat = system.manifold_of(step_state.state.q).is_flat
     if not is_flat and method.chart != "middle":
         return False
-    is_symmetric = method.closure in ("propagated", "symmetric")
-    if system.nonholonomic is not None and not is_symmetric:
+    has_symmetric_closure = method.closure in ("propagated", "symmetric")
+    if system.nonholonomic is not None and not has_symmetric_closure:
         return False
     return method.is_symmetric
 
