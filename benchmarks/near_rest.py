@@ -41,9 +41,9 @@ from nhjax._step import (
     step,
     StepArguments,
 )
+from nhjax._step._equations import Stages
 from nhjax._step._stage_iteration import increment_size, stage_residual
 from nhjax._step._step import equations_of_step
-from nhjax._step._unknowns import Stages
 from nhjax._system import function_noise
 from nhjax.systems._base import AbstractExample
 

@@ -1,7 +1,7 @@
 """One step of a method: its stage equations, their solvers, its end and derivative."""
 
 from .._numerics import Solved as Solved
-from ._curved_chart import chart_of_step as chart_of_step
+from ._chart import chart_of_step as chart_of_step
 from ._derivative import (
     change_of_step as change_of_step,
     primitive_step as primitive_step,

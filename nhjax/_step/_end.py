@@ -6,10 +6,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, PyTree
 
 from .._system import State
+from ._equations import end_impulse, StageForces, Stages, StageSystem, start_impulse
 from ._record import StepRecord
-from ._stage_equations import end_impulse, start_impulse
-from ._stage_system import StageSystem
-from ._unknowns import StageForces, Stages
 
 
 def end_state(

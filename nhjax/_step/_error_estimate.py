@@ -8,8 +8,7 @@ from .._custom_types import FloatScalar
 from .._method import AbstractMethod
 from .._numerics import matvec, max_norm, NOISE_UNITS, relative, small_einsum
 from .._system import Linearisation
-from ._stage_system import StageSystem
-from ._unknowns import Stages
+from ._equations import Stages, StageSystem
 
 
 def error_ratios(

@@ -17,6 +17,14 @@ from .._numerics import (
     WeightedTranspose,
 )
 from .._system import Linearisation
+from ._equations import (
+    constraint_jacobian,
+    constraint_values,
+    impulse_weights,
+    sparse_constraint_jacobian,
+    Stages,
+    StageSystem,
+)
 from ._first_order import (
     first_order_terms,
     FirstOrderTerms,
@@ -25,14 +33,6 @@ from ._first_order import (
 )
 from ._jacobian_choice import JacobianName, takes_first_order_terms
 from ._leading_structure import LeadingStructure, Responses
-from ._stage_equations import (
-    constraint_jacobian,
-    constraint_values,
-    impulse_weights,
-    sparse_constraint_jacobian,
-)
-from ._stage_system import StageSystem
-from ._unknowns import Stages
 
 
 def leading_structure(

@@ -10,9 +10,7 @@ from jaxtyping import Array, Float
 from .._custom_types import FloatScalar
 from .._numerics import full_jacobian, small_einsum
 from .._system import Linearisation, total_force
-from ._positions import in_nodes, in_stages
-from ._stage_system import StageSystem
-from ._unknowns import Stages
+from ._equations import in_nodes, in_stages, Stages, StageSystem
 
 
 class FirstOrderTerms(eqx.Module):

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 
 from .._numerics import dependence, full_jacobian, SparseMatrix
 from .._system import Linearisation, total_force
-from ._stage_system import StageSystem
+from ._equations import StageSystem
 
 
 # What of the Jacobian simplified Newton inverts; None means what pays.

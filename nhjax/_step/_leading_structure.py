@@ -14,11 +14,9 @@ from .._numerics import (
     WeightedTranspose,
 )
 from .._system import Linearisation
+from ._equations import stage_velocities, Stages, StageSystem
 from ._first_order import FirstOrderTerms
 from ._invariants import ImpulseWeights
-from ._stage_equations import stage_velocities
-from ._stage_system import StageSystem
-from ._unknowns import Stages
 
 
 class Responses(NamedTuple):

@@ -23,6 +23,7 @@ from .._numerics import (
     uneven_perturbations,
 )
 from .._system import all_finite, check_flag, Linearisation
+from ._equations import nudged, Stages, StageSystem
 from ._factorisation import leading_structure
 from ._jacobian_choice import JacobianName
 from ._round_off import PART
@@ -35,9 +36,7 @@ from ._stage_iteration import (
     sizes,
     stage_residual,
 )
-from ._stage_system import nudged, StageSystem
 from ._tolerance import check_tolerance, tolerance_array
-from ._unknowns import Stages
 
 
 # One iteration on the stages of a step. The equations are an argument, so that the

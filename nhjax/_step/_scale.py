@@ -10,9 +10,7 @@ from .._custom_types import FloatScalar
 from .._manifold import unframed
 from .._numerics import absolute, matvec, max_norm, uneven_perturbations
 from .._system import Linearisation, position_scale
-from ._stage_equations import impulse_weights
-from ._stage_system import StageSystem
-from ._unknowns import Stages
+from ._equations import impulse_weights, Stages, StageSystem
 
 
 class Scale(NamedTuple):

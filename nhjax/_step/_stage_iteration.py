@@ -12,8 +12,7 @@ from jaxtyping import Array, Float
 from .._custom_types import BoolScalar, FloatScalar
 from .._numerics import frozen, matvec, max_norm, Sizes, unit
 from .._system import Linearisation
-from ._leading_structure import LeadingStructure
-from ._stage_equations import (
+from ._equations import (
     constraint_values,
     end_residual,
     impulse_weights,
@@ -22,9 +21,11 @@ from ._stage_equations import (
     node_residual,
     stage_forces,
     stage_velocities,
+    StageForces,
+    Stages,
+    StageSystem,
 )
-from ._stage_system import StageSystem
-from ._unknowns import StageForces, Stages
+from ._leading_structure import LeadingStructure
 
 
 class Evaluation(NamedTuple):

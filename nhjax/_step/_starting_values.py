@@ -5,8 +5,7 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from .._system import Linearisation
-from ._stage_system import StageSystem
-from ._unknowns import Stages
+from ._equations import Stages, StageSystem
 
 
 def starting_values(stages: StageSystem, u: Array, lin: Linearisation) -> Stages:

@@ -31,16 +31,14 @@ from .._system import (
     State,
 )
 from ._end import end_state, step_record
+from ._equations import end_impulse, in_chart, Stages, StageSystem, start_impulse
 from ._error_estimate import error_ratios
 from ._invariants import Invariants, StartImpulses
 from ._newton import AbstractStageSolver
 from ._record import StepRecord
 from ._round_off import RoundOff
-from ._stage_equations import end_impulse, in_chart, start_impulse
 from ._stage_iteration import Evaluation
-from ._stage_system import StageSystem
 from ._starting_values import starting_values
-from ._unknowns import Stages
 
 
 class StepState(eqx.Module):

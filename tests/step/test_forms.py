@@ -9,14 +9,14 @@ from jax.flatten_util import ravel_pytree
 
 import nhjax
 from nhjax._step import first_step_state
-from nhjax._step._positions import end_position
-from nhjax._step._stage_equations import (
+from nhjax._step._equations import (
+    end_position,
     holonomic_constraint,
     node_residual,
     stage_forces,
     stage_velocities,
+    StageSystem,
 )
-from nhjax._step._stage_system import StageSystem
 from nhjax._step._starting_values import starting_values
 from oracles.forms import (
     free_forms,

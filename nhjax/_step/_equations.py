@@ -1,0 +1,536 @@
+"""The equations of one step: their unknowns, their data and their residuals."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any, NamedTuple, TypeVar
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, PyTree
+
+from .._custom_types import Args, BoolScalar, FloatScalar
+from .._manifold import AbstractLieGroup, unframed
+from .._method import AbstractMethod
+from .._numerics import (
+    max_norm,
+    Pattern,
+    small_einsum,
+    sparse_jacobian,
+    SparseMatrix,
+    uneven_perturbations,
+)
+from .._system import (
+    AbstractMechanicalSystem,
+    Linearisation,
+    motion_residual,
+    State,
+    total_force,
+    with_frames,
+)
+from ._chart import AbstractChart, chart_of_step
+from ._invariants import ImpulseWeights, moving_part, StartImpulses
+from ._redundancy import Redundancy
+from ._round_off import RoundOff
+
+
+T = TypeVar("T")
+
+
+class Stages(eqx.Module):
+    """The unknowns of one step: stage velocities, node coordinates and multipliers.
+
+    Unknowns that a system or a closure does not have are arrays without entries.
+
+    - `velocity`: H^1..H^s, the stage velocities in the chart (V^i on R^n).
+    - `momentum`: the stage momenta in the body frame, of a Hamiltonian system; those of
+        a Lagrangian one follow from the velocities.
+    - `node_fibre_coordinate`: u^2..u^s (v or p) at the nodes, the last of them at the
+        end of the step; without nonholonomic constraints only u_{k+1}.
+    - `closure`: y, which gives the nonholonomic multipliers
+        Λ = (start) λ_k + (end) λ_{k+1} + E y.
+    - `holonomic`: the holonomic multipliers Λ^1..Λ^s.
+    - `end_acceleration`, `end_multiplier`: u̇ and λ_c at the end of the step, unknowns
+        of the symmetric closure alone.
+    - `impulse`: ε, the impulses at the ends of the step along ∂I/∂v of the invariants
+        I that the run keeps; None if it keeps none.
+    """
+
+    velocity: Float[Array, "s n"]
+    momentum: Float[Array, "s p"]
+    node_fibre_coordinate: Float[Array, "r n"]
+    closure: Float[Array, "c m"]
+    holonomic: Float[Array, "s k"]
+    end_acceleration: Float[Array, " a"]
+    end_multiplier: Float[Array, " e"]
+    # None, the empty tree, if no invariants are kept.
+    impulse: PyTree[Float[Array, " i"]] = None
+
+
+class StageForces(NamedTuple):
+    """The forces, multipliers and momenta at the stages i = 1..s, with residuals."""
+
+    force: Float[Array, "s n"]  # n^i, the force W^i carried to the origin of the chart
+    multiplier: Float[Array, "s l"]  # Λ^i
+    residual: Float[Array, "s n"]  # Π^i - base - h Σ â_ij F^j
+    momentum: Float[Array, "s n"]  # Π^i, by whose size residuals are judged
+
+
+class StageSystem(eqx.Module):
+    """The discrete equations of one step from (q_k, p_k, λ_k).
+
+    These are the paper's four Summaries in the unknowns of `Stages`, in the chart of
+    the method. With w^i the body force at stage i (reactions included), y^i the
+    coordinates of the stage, n^i = Ad^*_{τ(y^i)⁻¹} w^i, F^i the same force in the chart
+    and M the momentum μ_k carried to its origin, they read
+
+    Π^i = base + h Σ â_ij F^j,    μ^i = Ad^*_{τ(y^i)} (M + h Σ a_ij n^j),
+
+    together with the nonholonomic constraints at the nodes (q^i, μ^i), the holonomic
+    ones at the positions Q^i, i >= 2, and their tangency at the end. The constraints at
+    the first node hold by hypothesis H1; the last node is the end of the step by H3.
+    Of redundant constraints as many are kept as are independent; see `Redundancy`.
+    A closure of the multiplier enters in three places: by the constant matrices of
+    `method.closure_weights`; by the multiplier that a state carries, Λ^s for the
+    propagated closure and λ_c for the others (`end_state`, `first_step_state`); and, if
+    it uses λ_c at the end, by two more unknowns and equations (`symmetric`). To keep
+    invariants, momenta receive impulses at both ends of the step; see `ImpulseWeights`.
+    """
+
+    system: AbstractMechanicalSystem
+    method: AbstractMethod = eqx.field(static=True)
+    t: FloatScalar
+    h: FloatScalar
+    q: PyTree[Array]
+    p: Float[Array, " n"]
+    multiplier: Float[Array, " l"]
+    args: Args
+    redundancy: Redundancy | None = None
+    kept: StartImpulses | None = None
+    round_off: RoundOff | None = None
+
+    @classmethod
+    def at(
+        cls,
+        system: AbstractMechanicalSystem,
+        method: AbstractMethod,
+        t: FloatScalar,
+        h: FloatScalar,
+        y: State,
+        args: Args,
+        lin: Linearisation,
+        kept: StartImpulses | None = None,
+        round_off: RoundOff | None = None,
+    ) -> "StageSystem":
+        """Make the equations of a step of size h from the state y at t."""
+        system, q = with_frames(system, y.q)
+        given = t, h, q, y.p, y.multiplier, args
+        stages = cls(system, method, *given, kept=kept, round_off=round_off)
+        if system.constraints != "redundant" or not stages.constrained:
+            return stages
+        redundancy = Redundancy.at(lin, stages.num_nonholonomic)
+        return replace(stages, redundancy=redundancy)
+
+    @property
+    def num_holonomic(self) -> int:
+        """Return k, the number of holonomic constraints."""
+        if self.system.holonomic is None:
+            return 0
+        return jax.eval_shape(
+            lambda t, q: self.system.position_constraint(t, q, self.args),
+            self.t,
+            self.q,
+        ).shape[0]
+
+    @property
+    def num_nonholonomic(self) -> int:
+        """Return m, the number of nonholonomic constraints."""
+        return self.multiplier.shape[0] - self.num_holonomic
+
+    @property
+    def constrained(self) -> bool:
+        """Tell whether there are constraints, and so multipliers."""
+        return self.multiplier.shape[0] > 0
+
+    @property
+    def symmetric(self) -> bool:
+        """Tell whether the symmetric closure is in use.
+
+        The continuous multiplier at the end of the step is then an unknown.
+        """
+        return self.num_nonholonomic > 0 and self.method.closure == "symmetric"
+
+    @property
+    def hamiltonian(self) -> bool:
+        """Tell whether the system is Hamiltonian.
+
+        The stage momenta are then unknowns, beside the stage velocities.
+        """
+        return self.system.fibre_coordinate_name == "p"
+
+    @property
+    def manifold(self) -> AbstractLieGroup:
+        """Return the configuration space."""
+        return self.system.manifold_of(self.q)
+
+    def chart(self, x: Stages) -> AbstractChart:
+        """Make the chart in which the step is written."""
+        return chart_of_step(
+            self.manifold, self.method.chart, self.q, self.increment(x)
+        )
+
+    def coefficients(self, name: str) -> Array:
+        """Return the array `name` of the method in the working precision."""
+        return jnp.asarray(getattr(self.method, name), self.p.dtype)
+
+    def closure_weights(self, name: str) -> Array:
+        """Return the array `name` of the closure's weights in the working precision."""
+        return jnp.asarray(getattr(self.method.closure_weights, name), self.p.dtype)
+
+    @property
+    def stage_times(self) -> Float[Array, " s"]:
+        """Return the times t_k + h c_i of the stages."""
+        return self.t + self.h * self.coefficients("c")
+
+    @property
+    def node_weights(self) -> Float[Array, "r s"]:
+        """Return `node_rows` in the working precision."""
+        return jnp.asarray(self.node_rows, self.p.dtype)
+
+    @property
+    def node_rows(self) -> np.ndarray:
+        """Return the rows of a_ij for the nodes at which momenta are formed.
+
+        With nonholonomic constraints these are the nodes i >= 2, otherwise only the end
+        of the step, whose row is that of the weights b.
+        """
+        method = self.method
+        return method.a[1:] if self.num_nonholonomic else method.b[None]
+
+    @property
+    def node_times(self) -> Float[Array, " r"]:
+        """Return the times of the nodes at which momenta are formed."""
+        nodes = (
+            self.coefficients("c")[1:]
+            if self.num_nonholonomic
+            else jnp.ones((1,), self.p.dtype)
+        )
+        return self.t + self.h * nodes
+
+    def multipliers(self, x: Stages) -> Float[Array, "s l"]:
+        """Compute the multipliers Λ^1..Λ^s of all constraints at the stages.
+
+        They follow from the unknowns of the closure and the holonomic multipliers.
+        """
+        change = self.multiplier_change(x)
+        if not self.num_nonholonomic:
+            return change
+        return self._padded("start", self.multiplier) + change
+
+    def multiplier_change(self, dx: Stages) -> Float[Array, "s l"]:
+        """Compute the part of the multipliers Λ that is linear in the unknowns."""
+        change = self.free_multipliers(dx.closure, dx.holonomic)
+        if self.symmetric:
+            change = change + self._padded("end", dx.end_multiplier)
+        return change
+
+    def free_multipliers(
+        self, closure: Float[Array, "c m"], holonomic: Float[Array, "s k"]
+    ) -> Float[Array, "s l"]:
+        """Join the nonholonomic multipliers E y and the holonomic multipliers."""
+        if not self.num_nonholonomic:
+            return holonomic
+        kinematic = small_einsum("sr,rm->sm", self.closure_weights("E"), closure)
+        if not self.num_holonomic:
+            return kinematic
+        return jnp.concatenate([kinematic, holonomic], axis=1)
+
+    def _padded(self, weights: str, multiplier: Float[Array, " l"]) -> Array:
+        """Compute what a known multiplier, such as λ_k, adds to Λ.
+
+        Its holonomic part adds nothing.
+        """
+        known = multiplier[: self.num_nonholonomic]
+        part = jnp.outer(self.closure_weights(weights), known)
+        return jnp.pad(part, ((0, 0), (0, self.num_holonomic)))
+
+    def increment(self, x: Stages) -> Float[Array, " n"]:
+        """Compute the increment ξ = h Σ b_j H^j, which takes q_k to q_{k+1}."""
+        # The product is formed as h * (b @ H): coefficients h b_j, rounded once and for
+        # all, would bias every step in the same way.
+        return self.h * small_einsum("s,sn->n", self.coefficients("b"), x.velocity)
+
+
+def stage_velocities(stages: StageSystem, x: Stages) -> Float[Array, "s n"]:
+    """Compute the chart velocities dτ_y⁻¹ D2H(Q^i, P^i) of a Hamiltonian system."""
+    chart, y = in_stages(stages, x)
+    v = jax.vmap(lambda t, q, u: stages.system.velocity(t, q, u, stages.args))(
+        stages.stage_times, stage_positions(stages, chart, y), x.momentum
+    )
+    return chart.chart_velocities(y, v)
+
+
+def stage_forces(stages: StageSystem, x: Stages) -> StageForces:
+    """Compute the forces n^i, multipliers Λ^i and residuals of the stage momenta."""
+    h, a_hat, b = stages.h, stages.coefficients("a_hat"), stages.coefficients("b")
+    multiplier = stages.multipliers(x)
+    chart, y = in_stages(stages, x)
+    q = stage_positions(stages, chart, y)
+    u = x.momentum if stages.hamiltonian else chart.body_velocities(y, x.velocity)
+    force, momentum = jax.vmap(
+        lambda t, q, u, lam: (
+            total_force(stages.system, t, q, u, lam, stages.args),
+            stages.system.momentum(t, q, u, stages.args),
+        )
+    )(stages.stage_times, q, u, multiplier)
+    momentum, chart_force = chart.to_chart(y, x.velocity, momentum, force)
+    transported = chart.to_origin(y, force)
+    base = chart.base_momentum(
+        chart.momentum_at_origin(_start_momentum(stages, x)),
+        h * small_einsum("s,sn->n", b, transported),
+        h * small_einsum("s,sn->n", b, chart_force),
+    )
+    residual = momentum - (
+        base[None] + h * small_einsum("ij,jn->in", a_hat, chart_force)
+    )
+    return StageForces(transported, multiplier, residual, momentum)
+
+
+def node_residual(
+    stages: StageSystem, x: Stages, force: Float[Array, "s n"]
+) -> Float[Array, "r n"]:
+    """Compute the residuals of the momentum equations at the nodes.
+
+    They are p(q^i, u^i) - Ad^*_{τ(y^i)} (M + h Σ a_ij n^j), at the end of the step less
+    the impulse there.
+    """
+    chart, y = in_nodes(stages, x)
+    momentum = jax.vmap(lambda t, q, u: stages.system.momentum(t, q, u, stages.args))(
+        stages.node_times, chart.positions(y), x.node_fibre_coordinate
+    )
+    start = chart.momentum_at_origin(_start_momentum(stages, x))
+    gained = stages.h * small_einsum("ij,jn->in", stages.node_weights, force)
+    residual = momentum - chart.from_origin(y, start[None] + gained)
+    if stages.kept is None:
+        return residual
+    last = residual[-1:] - end_impulse(stages, x)[None]
+    return jnp.concatenate([residual[:-1], last])
+
+
+def constraint_values(stages: StageSystem, x: Stages) -> tuple[Array, Array]:
+    """Compute the nonholonomic constraints at the nodes and the holonomic ones."""
+    none = jnp.zeros((0,), stages.p.dtype)
+    return (
+        node_constraint(stages, x) if stages.num_nonholonomic else none,
+        holonomic_constraint(stages, x) if stages.num_holonomic else none,
+    )
+
+
+def node_constraint(stages: StageSystem, x: Stages) -> Float[Array, "r m"]:
+    """Compute the nonholonomic constraints Φ(q^i, u^i) at the nodes."""
+    chart, y = in_nodes(stages, x)
+    values = jax.vmap(
+        lambda t, q, u: stages.system.kinematic_constraint(t, q, u, stages.args)
+    )(stages.node_times, chart.positions(y), x.node_fibre_coordinate)
+    if stages.redundancy is None:
+        return values
+    return stages.redundancy.reduced(values, stages.h * x.closure, 0)
+
+
+def holonomic_constraint(stages: StageSystem, x: Stages) -> Float[Array, "s k"]:
+    """Compute Γ(Q^i) / h for i >= 2, and the tangency dΓ/dt at the end of the step.
+
+    The division by h makes the values the size of velocities, as the tangency is.
+    """
+    chart, y = in_stages(stages, x)
+    nodes = chart.positions(y[1:])
+    on_positions = jax.vmap(
+        lambda t, q: stages.system.position_constraint(t, q, stages.args)
+    )(stages.stage_times[1:], nodes)
+    end = jax.tree.map(lambda leaf: leaf[-1], nodes)
+    tangency = stages.system.tangency(
+        stages.t + stages.h, end, x.node_fibre_coordinate[-1], stages.args
+    )
+    values = jnp.concatenate([on_positions / stages.h, tangency[None]])
+    if stages.redundancy is None:
+        return values
+    m = stages.num_nonholonomic
+    return stages.redundancy.reduced(values, stages.h * x.holonomic, m)
+
+
+def end_residual(
+    stages: StageSystem, x: Stages
+) -> tuple[Float[Array, " n"], Float[Array, " l"]]:
+    """Compute the residuals of the equations of motion at the end of the step.
+
+    Their root gives the continuous multiplier λ_c there.
+    """
+    on_momentum, hidden = motion_residual(
+        stages.system,
+        stages.t + stages.h,
+        end_position(stages, x),
+        x.node_fibre_coordinate[-1],
+        x.end_acceleration,
+        x.end_multiplier,
+        stages.args,
+    )
+    if stages.redundancy is not None:
+        hidden = stages.redundancy.reduced(hidden[None], x.end_multiplier[None], 0)[0]
+    return on_momentum, hidden
+
+
+def invariant_errors(stages: StageSystem, x: Stages) -> Float[Array, " k"]:
+    """Compute the errors of the invariants at the end of a step."""
+    assert stages.kept is not None
+    return stages.kept.invariants.tangent_error(*_end_point(stages, x))
+
+
+def constraint_jacobian(stages: StageSystem, x: Stages) -> Float[Array, "r l n"]:
+    """Compute B = ∂Φ/∂u of all constraints on velocities at the nodes i >= 2."""
+    return _at_nodes(stages, x, jax.jacrev)
+
+
+def sparse_constraint_jacobian(
+    stages: StageSystem, x: Stages, pattern: Pattern
+) -> SparseMatrix:
+    """Compute B = ∂Φ/∂u at the nodes i >= 2 as a sparse matrix of a known pattern."""
+    return _at_nodes(
+        stages,
+        x,
+        lambda constraint: lambda u: sparse_jacobian(constraint, u, pattern),
+    )
+
+
+def _at_nodes(
+    stages: StageSystem, x: Stages, differentiated: Callable[..., Callable[..., T]]
+) -> T:
+    times, u = stages.stage_times[1:], x.node_fibre_coordinate
+    if not stages.num_nonholonomic:
+        u = jnp.broadcast_to(u, (stages.method.stages - 1, u.shape[1]))
+    chart, y = in_stages(stages, x)
+    nodes = chart.positions(y[1:])
+    return jax.vmap(
+        lambda t, q, u: differentiated(
+            lambda u: stages.system.constraint(t, q, u, stages.args)
+        )(u)
+    )(times, nodes, u)
+
+
+def start_impulse(stages: StageSystem, x: Stages) -> Float[Array, " n"]:
+    """Compute the impulse ε ω_k at the start of a step that keeps invariants."""
+    assert stages.kept is not None
+    return small_einsum("k,kn->n", x.impulse, stages.kept.covectors)
+
+
+def _start_momentum(stages: StageSystem, x: Stages) -> Float[Array, " n"]:
+    """Compute the momentum after the impulse at the start of the step."""
+    return stages.p if stages.kept is None else stages.p + start_impulse(stages, x)
+
+
+def end_impulse(stages: StageSystem, x: Stages) -> Float[Array, " n"]:
+    """Compute the impulse ε ω_{k+1} at the end of the step."""
+    _, covectors = end_slopes(stages, x)
+    return small_einsum("k,kn->n", x.impulse, covectors)
+
+
+def end_slopes(
+    stages: StageSystem, x: Stages
+) -> tuple[Float[Array, "k n"], Float[Array, "k n"]]:
+    """Compute ∂I/∂u and ω of the invariants at the end of a step; see `Directions`."""
+    assert stages.kept is not None
+    found = stages.kept.invariants.directions(*_end_point(stages, x))
+    return found.slopes, found.covectors
+
+
+def impulse_weights(stages: StageSystem, x: Stages) -> ImpulseWeights:
+    """Weigh the equations for the impulses of a step, near the given stages."""
+    assert stages.kept is not None
+    slopes, covectors = end_slopes(stages, x)
+    moving = moving_part(slopes, x.node_fibre_coordinate[-1])
+    given = slopes, covectors, moving, stages.hamiltonian
+    return ImpulseWeights.at(stages.kept, *given)
+
+
+def _end_point(stages: StageSystem, x: Stages) -> tuple[Any, ...]:
+    """Return what functions of the system are given at the end of the step."""
+    assert stages.kept is not None
+    end = stages.chart(x).advance(*stages.kept.position)
+    q = stages.manifold.wrapped(*end)
+    u = x.node_fibre_coordinate[-1]
+    return stages.system, stages.t + stages.h, q, u, stages.args
+
+
+def in_chart(stages: StageSystem, x: Stages) -> BoolScalar:
+    """Tell whether stages, nodes and end lie where the chart is invertible."""
+    chart, y = in_stages(stages, x)
+    return chart.in_domain(jnp.concatenate([y, chart.ends[1][None]]))
+
+
+def in_stages(
+    stages: StageSystem, x: Stages
+) -> tuple[AbstractChart, Float[Array, "s n"]]:
+    """Make the chart and the coordinates y^i of the stages, from h Σ a_ij H^j."""
+    return _in_chart(stages, x, stages.method.a)
+
+
+def in_nodes(
+    stages: StageSystem, x: Stages
+) -> tuple[AbstractChart, Float[Array, "r n"]]:
+    """Make the chart and the coordinates of the nodes with momenta of their own."""
+    return _in_chart(stages, x, stages.node_rows)
+
+
+def _in_chart(
+    stages: StageSystem, x: Stages, rows: np.ndarray
+) -> tuple[AbstractChart, Float[Array, "r n"]]:
+    chart = stages.chart(x)
+    start, end = chart.ends
+    # A node at an end of the step is given the very coordinates that the chart has for
+    # this end, so that the compiler computes once what depends on them.
+    first = 0 if np.any(rows[0]) else 1
+    last = len(rows) - int(np.array_equal(rows[-1], stages.method.b))
+    parts = [start[None]] * first
+    if first < last:
+        inner = jnp.asarray(rows[first:last], stages.p.dtype)
+        increments = stages.h * small_einsum("ij,jn->in", inner, x.velocity)
+        parts.append(chart.coordinates(increments))
+    if last < len(rows):
+        parts.append(end[None])
+    return chart, jnp.concatenate(parts)
+
+
+def stage_positions(
+    stages: StageSystem, chart: AbstractChart, y: Float[Array, "s n"]
+) -> PyTree[Array]:
+    """Compute the positions of the stages, the first of which is q_k if c_1 = 0."""
+    if np.any(stages.method.a[0]):
+        return chart.positions(y)
+    return jax.tree.map(
+        lambda start, others: jnp.concatenate([start[None], others]),
+        stages.q,
+        chart.positions(y[1:]),
+    )
+
+
+def end_position(stages: StageSystem, x: Stages) -> PyTree[Array]:
+    """Compute the configuration q_{k+1} at the end of the step."""
+    chart = stages.chart(x)
+    return chart.position(chart.ends[1])
+
+
+def nudged(stages: StageSystem, nudge: FloatScalar) -> StageSystem:
+    """Return the equations with q_k moved by about `nudge` times its size.
+
+    The change of a solution by this move, divided by `nudge`, estimates its change by
+    the round-off of positions, divided by the unit round-off. The coordinates are moved
+    by different amounts, so that the moves do not cancel in the difference of two.
+    """
+    if stages.manifold.is_flat:
+        moves = uneven_perturbations(stages.q)
+        moved = jax.tree.map(lambda x, dx: x + nudge * dx, stages.q, moves)
+    else:
+        size = max_norm(*jax.tree.leaves(unframed(stages.q)))
+        xi = nudge * uneven_perturbations(jnp.broadcast_to(size, stages.p.shape))
+        moved = stages.manifold.act(stages.q, xi)
+    return replace(stages, q=moved)
