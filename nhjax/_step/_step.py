@@ -1,22 +1,30 @@
-"""One step of a method, and the data that is carried from step to step."""
+"""One step of a method, its derivative, and the data that steps pass on."""
 
+from collections.abc import Callable
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeAlias
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float, Int, PyTree
 
+from .._compile import as_cpu_kernel, TraceCache
 from .._custom_types import Args, BoolScalar, FloatScalar
+from .._manifold import unframed
 from .._method import AbstractMethod
 from .._numerics import (
+    ClosureConverted,
     frozen,
     has_tangent,
     largest_column,
+    matvec,
     max_norm,
+    NOISE_UNITS,
     relative,
     small_einsum,
+    solve_contraction,
     Solved,
     two_sum,
     zero_unless,
@@ -30,15 +38,20 @@ from .._system import (
     linearise,
     State,
 )
-from ._end import end_state, step_record
-from ._equations import end_impulse, in_chart, Stages, StageSystem, start_impulse
-from ._error_estimate import error_ratios
+from ._equations import (
+    end_impulse,
+    end_position,
+    in_chart,
+    stage_forces,
+    StageForces,
+    Stages,
+    StageSystem,
+    start_impulse,
+)
 from ._invariants import Invariants, StartImpulses
-from ._newton import AbstractStageSolver
-from ._record import StepRecord
 from ._round_off import RoundOff
-from ._stage_iteration import Evaluation
-from ._starting_values import starting_values
+from ._solvers import AbstractStageSolver, starting_values
+from ._stage_iteration import Evaluation, unknown_units
 
 
 class StepState(eqx.Module):
@@ -85,6 +98,19 @@ class StepArguments(eqx.Module):
     args: Args
     invariants: Invariants | None = None
     round_off: RoundOff | None = None
+
+
+class StepRecord(eqx.Module):
+    """The data of one step that dense output needs to make its polynomials.
+
+    - `start`: the state at the start of the step.
+    - `velocity`, `force`, `multiplier`: the values at the s stages.
+    """
+
+    start: State
+    velocity: Float[Array, "s n"]
+    force: Float[Array, "s n"]
+    multiplier: Float[Array, "s m"]
 
 
 class StepOutcome(NamedTuple):
@@ -169,18 +195,6 @@ def _continuous_multiplier_jvp(primals, tangents):
     return multiplier, zero_unless(ok, change)
 
 
-def equations_of_step(arguments: StepArguments, method: AbstractMethod) -> StageSystem:
-    """Make the equations of a step, with those of the invariants that it keeps."""
-    system, t, args = arguments.system, arguments.t, arguments.args
-    step_state, invariants = arguments.step_state, arguments.invariants
-    y, lin, kept = step_state.wrapped(system), step_state.lin, None
-    if invariants is not None:
-        position = step_state.state.q, step_state.q_compensation
-        kept = StartImpulses.at(invariants, system, t, y, position, args, lin)
-    given = t, arguments.h, y, args, lin, kept, arguments.round_off
-    return StageSystem.at(system, method, *given)
-
-
 def step(
     arguments: StepArguments,
     method: AbstractMethod,
@@ -240,15 +254,64 @@ def step(
     )
 
 
-def _invariant_error(
-    stages: StageSystem, q: PyTree[Array], u: Float[Array, " n"]
-) -> FloatScalar | None:
-    """Measure the errors of invariants at the end by the sizes of their terms."""
-    if stages.kept is None:
-        return None
-    invariants, t = stages.kept.invariants, stages.t + stages.h
-    error = invariants.error(stages.system, t, q, u, stages.args)
-    return max_norm(relative(error, stages.kept.sizes))
+def equations_of_step(arguments: StepArguments, method: AbstractMethod) -> StageSystem:
+    """Make the equations of a step, with those of the invariants that it keeps."""
+    system, t, args = arguments.system, arguments.t, arguments.args
+    step_state, invariants = arguments.step_state, arguments.invariants
+    y, lin, kept = step_state.wrapped(system), step_state.lin, None
+    if invariants is not None:
+        position = step_state.state.q, step_state.q_compensation
+        kept = StartImpulses.at(invariants, system, t, y, position, args, lin)
+    given = t, arguments.h, y, args, lin, kept, arguments.round_off
+    return StageSystem.at(system, method, *given)
+
+
+def end_state(
+    stages: StageSystem,
+    q: PyTree[Array],
+    u: Float[Array, " n"],
+    p: Float[Array, " n"],
+    last_multiplier: Float[Array, " l"],
+    continuous: Callable[[], Float[Array, " l"]],
+) -> State:
+    """Make the state at the end of a step from its q, u, p and multipliers.
+
+    **Arguments:**
+
+    - `q`, `u`, `p`: the configuration, the fibre coordinate and the momentum, however
+        they were summed.
+    - `last_multiplier`: Λ^s, which the propagated closure carries to the next step.
+    - `continuous`: a function without arguments that returns λ_c(q, u). It is called
+        only if the closure reports the continuous multiplier.
+    """
+    v = stages.system.velocity(stages.t + stages.h, q, u, stages.args)
+    if stages.method.closure != "propagated":
+        return State(q, v, p, continuous())
+    # Only nonholonomic multipliers are carried to the next step, which finds the
+    # holonomic ones anew.
+    m = stages.num_nonholonomic
+    multiplier = last_multiplier[:m]
+    if stages.num_holonomic:
+        multiplier = jnp.concatenate([multiplier, continuous()[m:]])
+    return State(q, v, p, multiplier)
+
+
+def step_record(
+    stages: StageSystem, start: State, x: Stages, forces: StageForces
+) -> StepRecord:
+    """Make the record of a step.
+
+    Impulses are recorded as a constant force over the step, so that the polynomials of
+    dense output lead from the momentum at its start to that at its end.
+    """
+    force = forces.force
+    if stages.kept is not None:
+        chart = stages.chart(x)
+        y = chart.ends[1][None]
+        impulse = chart.momentum_at_origin(start_impulse(stages, x))
+        impulse = impulse + chart.to_origin(y, end_impulse(stages, x)[None])[0]
+        force = force + (impulse / stages.h)[None]
+    return StepRecord(start, x.velocity, force, forces.multiplier)
 
 
 def _result(
@@ -280,3 +343,226 @@ def largest_violation(
     """Compute the largest violation of any constraint at a state."""
     on_positions = system.position_constraint(t, step_state.wrapped(system).q, args)
     return max_norm(step_state.lin.violation, on_positions)
+
+
+def _invariant_error(
+    stages: StageSystem, q: PyTree[Array], u: Float[Array, " n"]
+) -> FloatScalar | None:
+    """Measure the errors of invariants at the end by the sizes of their terms."""
+    if stages.kept is None:
+        return None
+    invariants, t = stages.kept.invariants, stages.t + stages.h
+    error = invariants.error(stages.system, t, q, u, stages.args)
+    return max_norm(relative(error, stages.kept.sizes))
+
+
+def error_ratios(
+    stages: StageSystem,
+    x: Stages,
+    force: Float[Array, "s n"],
+    u: Float[Array, " n"],
+    lin: Linearisation,
+) -> Float[Array, "2"] | None:
+    """Compare two quadratures of a step, in positions and in fibre coordinates.
+
+    The state changes by h Σ b_j (H^j, N⁻¹ n^j), with the velocities H^j and the forces
+    n^j of the stages. A second quadrature, which leaves out the last node, differs from
+    it by the same sum with the weights `method.embedded_difference`. The ratios are
+    those of this difference to the change of the state, in positions, divided by h, and
+    in fibre coordinates; see `estimated_error`.
+
+    **Arguments:**
+
+    - `x`, `force`: the solved stages and their forces n^j.
+    - `u`: the fibre coordinate at the end of the step.
+    - `lin`: the linearisation at the start of the step.
+
+    **Returns:** the two ratios, or None for a method with one node, which has no second
+    quadrature.
+    """
+    method, h = stages.method, stages.h
+    difference = method.embedded_difference
+    if difference is None:
+        return None
+
+    def change(weights: Float[Array, " s"]) -> tuple[Array, Array]:
+        moved = small_einsum("s,sn->n", weights, x.velocity)
+        if stages.hamiltonian:
+            moved = matvec(lin.metric_inverse, moved)
+        gained = h * small_einsum("s,sn->n", weights, force)
+        return moved, matvec(lin.momentum_inverse, gained)
+
+    # A change that is round-off tells nothing of the error.
+    size = max_norm(u)
+    if stages.round_off is not None:
+        size = jnp.maximum(size, stages.round_off.size(jnp.abs(h)))
+    floor = NOISE_UNITS * float(jnp.finfo(u.dtype).eps) * size
+    whole = max_norm(*change(stages.coefficients("b"))) + floor
+    moved, gained = change(jnp.asarray(difference, u.dtype))
+    if stages.constrained:
+        # The part that violates the constraints is left out, since the step satisfies
+        # them: multipliers of single stages may be wrong where their sum is right.
+        excess = matvec(lin.compliance_inverse, matvec(lin.jacobian, gained))
+        gained = gained - matvec(lin.reaction, excess)
+    return relative(jnp.stack([max_norm(moved), max_norm(gained)]), whole)
+
+
+def estimated_error(ratios: Float[Array, "2"], method: AbstractMethod) -> FloatScalar:
+    """Estimate the error of a step, relative to the change of the state in it.
+
+    With s different nodes the `error_ratios` are O(h^{s-1}) in positions and O(h^s) in
+    fibre coordinates. The relative error of a step is O(h^p), with the order p of the
+    method. The estimate is the larger of the two ratios, each raised to the power that
+    makes it O(h^p). It tends to one for steps in which nothing is resolved. It grows
+    with the ratios, so that the largest of many steps follows from the largest ratios.
+    """
+    nodes = len(np.unique(method.c))
+    in_position, in_fibre = ratios
+    return jnp.maximum(
+        in_position ** (method.order / (nodes - 1)),
+        in_fibre ** (method.order / nodes),
+    )
+
+
+def primitive_step(
+    arguments: StepArguments,
+    method: AbstractMethod,
+    stage_solver: AbstractStageSolver,
+    skip: BoolScalar,
+    programs: TraceCache,
+) -> StepOutcome:
+    """Take one step by `differentiable_step`, in a program that is traced once."""
+    # When JAX splits a scan into a known and a linear part, it drops the derivative
+    # rules of functions, but not those of primitives. Without its rule a step could be
+    # differentiated in reverse mode only once, and not again.
+    return as_cpu_kernel(
+        differentiable_step,
+        arguments,
+        method,
+        stage_solver,
+        skip,
+        programs,
+        programs=programs,
+    )
+
+
+@eqx.filter_custom_jvp
+def differentiable_step(
+    arguments: StepArguments,
+    method: AbstractMethod,
+    stage_solver: AbstractStageSolver,
+    skip: BoolScalar,
+    programs: TraceCache,
+) -> StepOutcome:
+    """Take one step as `step` does, with a derivative that skips the iterations.
+
+    Let G(x; θ) be the Newton iteration of the stage solver on the stages x, with its
+    Jacobian frozen, and θ the arguments of the step. The solution is a fixed point, so
+    that
+
+    dx = ∂G/∂x dx + ∂G/∂θ dθ,
+
+    and the end of the step follows from x and θ. All derivatives are zero where the
+    step failed.
+    """
+    del programs
+    return step(arguments, method, stage_solver, skip)
+
+
+@differentiable_step.def_jvp
+def _differentiable_step_jvp(primals, tangents):
+    arguments, method, stage_solver, skip, _ = primals
+    # The program that the derivative was asked of is found again.
+    outcome = primitive_step(*primals)
+    x, ok = outcome.stages, ~skip & (outcome.result == RESULTS.successful)
+    perturbed, fixed = eqx.partition(arguments, has_tangent(tangents[0]))
+    change = change_of_step(arguments, method, stage_solver, ok, x, fixed)
+    # By the checkpoint nothing but states and stages is kept for a reverse pass.
+    change = jax.checkpoint(change, prevent_cse=False)
+    return outcome, tangent_of_outcome(outcome, change(perturbed, x, tangents[0]))
+
+
+Changes: TypeAlias = tuple[Stages, State, StepRecord]
+
+
+def change_of_step(
+    arguments: StepArguments,
+    method: AbstractMethod,
+    stage_solver: AbstractStageSolver,
+    ok: BoolScalar,
+    x: Stages,
+    fixed: StepArguments,
+) -> Callable[[StepArguments, Stages, StepArguments], Changes]:
+    """Make the function (perturbed, x, rates) of the changes of a solved step.
+
+    It computes how the stages x, the state at the end and the record of the step
+    change if the `perturbed` part of its arguments changes at `rates`; the other part
+    is `fixed`. The changes are zero unless the step is `ok`.
+    """
+    stages = equations_of_step(arguments, method)
+    at, lin, solved = frozen((stages, arguments.step_state.lin, x))
+    frozen_newton_map = stage_solver.frozen_newton_map(at, lin, solved)
+
+    def change(perturbed, x, rates):
+        rates = zero_unless(ok, rates)
+
+        def sweep(perturbed, x):
+            arguments = eqx.combine(perturbed, fixed)
+            return frozen_newton_map(equations_of_step(arguments, method), x)
+
+        # The program of a sweep is made once, and differentiated twice.
+        corrected = ClosureConverted(sweep, perturbed, x)
+        end = ClosureConverted(
+            lambda perturbed, x: _end(eqx.combine(perturbed, fixed), method, x),
+            perturbed,
+            x,
+        )
+        _, b = jax.jvp(lambda theta: corrected(theta, x), (perturbed,), (rates,))
+        _, contraction = jax.linearize(lambda x: corrected(perturbed, x), x)
+        # This iteration starts from zero, while that of the step starts from a good
+        # guess, so that it is allowed twice as many iterations.
+        limit = 2 * stage_solver.max_iterations
+        units = unknown_units(at, lin)
+        dx = solve_contraction(contraction, b, units, max_iterations=limit)
+        _, dend = jax.jvp(end, (perturbed, x), (rates, zero_unless(ok, dx)))
+        return zero_unless(ok, (dx, *dend))
+
+    return change
+
+
+def tangent_of_outcome(outcome: StepOutcome, changes: Changes) -> StepOutcome:
+    """Make the tangent of an outcome from the changes of its stages and its end."""
+    none = jax.tree.map(lambda _: None, outcome)
+    return eqx.tree_at(
+        lambda outcome: (outcome.stages, outcome.step_state.state, outcome.record),
+        none,
+        changes,
+        is_leaf=lambda leaf: leaf is None,
+    )
+
+
+def _end(
+    arguments: StepArguments, method: AbstractMethod, x: Stages
+) -> tuple[State, StepRecord]:
+    """Compute the state at the end of a step and its record, given the stages alone.
+
+    This is the end of `step` without its compensated sums, whose compensation has no
+    derivative, and with p from the fibre coordinate found at the end; the results agree
+    to round-off.
+    """
+    system, args, start = arguments.system, arguments.args, arguments.step_state.state
+    stages = equations_of_step(arguments, method)
+    t, u = arguments.t + arguments.h, x.node_fibre_coordinate[-1]
+    q = unframed(end_position(stages, x))
+    p = system.momentum(t, q, u, args)
+
+    def continuous():
+        # With the symmetric closure this multiplier is one of the unknowns of the step,
+        # but of redundant constraints it is not the one of the least norm there.
+        if stages.symmetric and system.constraints != "redundant":
+            return x.end_multiplier
+        return linearise(system, t, q, u, args, may_be_sparse=True).multiplier
+
+    end = end_state(stages, q, u, p, stages.multipliers(x)[-1], continuous)
+    forces = stage_forces(stages, x)
+    return end, step_record(stages, start, x, forces)

@@ -12,8 +12,8 @@ import nhjax
 from nhjax import systems
 from nhjax._step import first_step_state
 from nhjax._step._factorisation import leading_structure
+from nhjax._step._solvers import starting_values
 from nhjax._step._stage_iteration import corrected
-from nhjax._step._starting_values import starting_values
 from nhjax._step._step import equations_of_step, StepArguments
 from oracles.forms import in_space
 from oracles.long import long

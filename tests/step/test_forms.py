@@ -17,7 +17,7 @@ from nhjax._step._equations import (
     stage_velocities,
     StageSystem,
 )
-from nhjax._step._starting_values import starting_values
+from nhjax._step._solvers import starting_values
 from oracles.forms import (
     free_forms,
     GAUSS,

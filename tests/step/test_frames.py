@@ -11,7 +11,7 @@ import nhjax
 from nhjax._compile import as_cpu_kernel
 from nhjax._manifold import unframed
 from nhjax._step._equations import end_position, StageSystem
-from nhjax._step._starting_values import starting_values
+from nhjax._step._solvers import starting_values
 from nhjax._step._step import equations_of_step, first_step_state, StepArguments
 from oracles.group_problems import RETRACTIONS
 from oracles.long import long

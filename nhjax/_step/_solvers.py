@@ -1,18 +1,25 @@
-"""The two solvers of the stage equations, simplified Newton and Newton's method."""
+"""The solvers of the stage equations, simplified Newton and Newton's method.
+
+Both start from values of first order in h and stop by the sizes of their increments,
+relative to a scale of the step.
+"""
 
 from abc import abstractmethod
 from collections.abc import Callable
-from typing import TypeAlias
+from typing import Any, NamedTuple, TypeAlias
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.flatten_util import ravel_pytree
-from jaxtyping import Array
+from jaxtyping import Array, Float, PyTree
 
-from .._custom_types import FloatScalarLike
-from .._errors import check_choice
+from .._custom_types import FloatScalar, FloatScalarLike
+from .._errors import check_choice, is_traced
+from .._manifold import unframed
 from .._numerics import (
+    absolute,
     iterate,
     jacobian_and_value,
     matvec,
@@ -22,12 +29,11 @@ from .._numerics import (
     Solved,
     uneven_perturbations,
 )
-from .._system import all_finite, check_flag, Linearisation
-from ._equations import nudged, Stages, StageSystem
+from .._system import all_finite, check_flag, Linearisation, position_scale, real_scalar
+from ._equations import impulse_weights, nudged, Stages, StageSystem
 from ._factorisation import leading_structure
 from ._jacobian_choice import JacobianName
 from ._round_off import PART
-from ._scale import fibre_coordinate_scale, Scale
 from ._stage_iteration import (
     corrected,
     Evaluation,
@@ -36,7 +42,6 @@ from ._stage_iteration import (
     sizes,
     stage_residual,
 )
-from ._tolerance import check_tolerance, tolerance_array
 
 
 # One iteration on the stages of a step. The equations are an argument, so that the
@@ -46,6 +51,28 @@ FrozenNewtonMap: TypeAlias = Callable[[StageSystem, Stages], Stages]
 
 # Stages with a larger residual than this, relative to the momenta, are no solution.
 _GROSS = 1e-6
+
+
+def check_tolerance(tolerance: Any) -> None:
+    """Raise a `ValueError` unless the `tolerance` of a solver is finite and >= 0."""
+    if is_traced(tolerance):
+        return
+    if not np.all(np.isfinite(tolerance) & (np.asarray(tolerance) >= 0)):
+        raise ValueError(
+            f"`tolerance` must be finite and >= 0, got {tolerance}; 0 iterates to "
+            "round-off."
+        )
+
+
+def tolerance_array(tolerance: FloatScalarLike) -> FloatScalarLike:
+    """Convert the `tolerance` of a solver to an array.
+
+    A number becomes an array of NumPy on the host: the default solver is made when
+    nhjax is imported, which must not start JAX's backends, nor choose a precision.
+    """
+    if isinstance(tolerance, int | float) and not isinstance(tolerance, bool):
+        return np.asarray(float(tolerance))
+    return real_scalar("tolerance", tolerance, jnp.result_type(float))
 
 
 class AbstractStageSolver(eqx.Module):
@@ -78,26 +105,6 @@ class AbstractStageSolver(eqx.Module):
         solution `x`, and the derivatives of the solution follow from it by the implicit
         function theorem.
         """
-
-
-def _iterated(
-    stage_solver: AbstractStageSolver,
-    sweep: Callable[[Stages], tuple[Stages, Sizes, Evaluation]],
-    x0: Stages,
-    scale: Scale,
-    skip: Array,
-) -> Solved[Stages, Evaluation]:
-    """Run the iteration on the stages of a solver, whose own sweep is an argument."""
-    return iterate(
-        sweep,
-        x0,
-        scale.size,
-        max_iterations=stage_solver.max_iterations,
-        tolerance=stage_solver.tolerance,
-        round_off=scale.round_off,
-        noise_units=NOISE_UNITS,
-        skip=skip,
-    )
 
 
 class SimplifiedNewton(AbstractStageSolver):
@@ -303,3 +310,137 @@ class Newton(AbstractStageSolver):
             return unravel(ravel_pytree(x)[0] - jacobian_inverse @ residual)
 
         return corrected
+
+
+class Scale(NamedTuple):
+    """The size of the fibre coordinates of a step, and what adds to their round-off.
+
+    Both are in units of fibre coordinates: the round-off of these is about the unit
+    round-off times the sum of the two.
+    """
+
+    size: FloatScalar
+    round_off: FloatScalar
+
+
+def _iterated(
+    stage_solver: AbstractStageSolver,
+    sweep: Callable[[Stages], tuple[Stages, Sizes, Evaluation]],
+    x0: Stages,
+    scale: Scale,
+    skip: Array,
+) -> Solved[Stages, Evaluation]:
+    """Run the iteration on the stages of a solver, whose own sweep is an argument."""
+    return iterate(
+        sweep,
+        x0,
+        scale.size,
+        max_iterations=stage_solver.max_iterations,
+        tolerance=stage_solver.tolerance,
+        round_off=scale.round_off,
+        noise_units=NOISE_UNITS,
+        skip=skip,
+    )
+
+
+def starting_values(stages: StageSystem, u: Array, lin: Linearisation) -> Stages:
+    """Compute the stages to first order in h, from acceleration and λ_c at the start.
+
+    The values do not depend on the step before, so that a step is a function of its
+    state alone.
+    """
+    m, s = stages.num_nonholonomic, stages.method.stages
+    push = stages.h * lin.acceleration
+    stage_times = jnp.sum(stages.coefficients("a_hat"), axis=1)
+    node_times = jnp.sum(stages.node_weights, axis=1)
+    # The unknown ν of the symmetric closure vanishes with h, and starts from zero; all
+    # other unknowns of a closure are multipliers.
+    free = (jnp.arange(s - 1) >= int(stages.symmetric)).astype(u.dtype)
+    nothing = jnp.zeros((0,), u.dtype)
+    in_stages = u[None] + jnp.outer(stage_times, push)
+    velocity, momentum, kept = in_stages, jnp.zeros((s, 0), u.dtype), stages.kept
+    if stages.hamiltonian:
+        velocity, momentum = (
+            _starting_velocities(stages, u, lin, stage_times),
+            in_stages,
+        )
+    return Stages(
+        velocity=velocity,
+        momentum=momentum,
+        node_fibre_coordinate=u[None] + jnp.outer(node_times, push),
+        closure=jnp.outer(free, lin.multiplier[:m]),
+        holonomic=jnp.outer(jnp.ones((s,), u.dtype), lin.multiplier[m:]),
+        end_acceleration=lin.acceleration if stages.symmetric else nothing,
+        end_multiplier=lin.multiplier if stages.symmetric else nothing,
+        impulse=None if kept is None else jnp.zeros_like(kept.sizes),
+    )
+
+
+def _starting_velocities(stages: StageSystem, u, lin: Linearisation, times) -> Array:
+    v = stages.system.velocity(stages.t, stages.q, u, stages.args)
+    _, rate = jax.jvp(
+        lambda t, xi, u: stages.system.velocity(
+            t, stages.manifold.act(stages.q, xi), u, stages.args
+        ),
+        (stages.t, jnp.zeros_like(u), u),
+        (jnp.ones_like(stages.t), v, lin.acceleration),
+    )
+    return v[None] + jnp.outer(times, stages.h * rate)
+
+
+def fibre_coordinate_scale(
+    stages: StageSystem, x0: Stages, lin: Linearisation
+) -> Scale:
+    """Estimate the size of the fibre coordinates of a step and their round-off.
+
+    The size is that of the coordinates at the starting values x0, plus that of the
+    terms that cancel in them, the forces and reactions over the step. For a system at
+    rest these terms are all there is. Round-off of the positions adds to it, in so far
+    as velocities feel it: through holonomic constraints, whose round-off is divided by
+    h, and through nonholonomic ones, which matters where a coordinate has grown large,
+    as the heading of a car after many turns. With invariants the round-off of these is
+    added, as far as impulses have it. Last comes the measured round-off of the
+    functions of the system.
+    """
+    h = jnp.abs(stages.h)
+    rate = max_norm(lin.acceleration)
+    if stages.constrained:
+        rate = rate + max_norm(matvec(absolute(lin.reaction), jnp.abs(lin.multiplier)))
+    size = h * rate + max_norm(
+        x0.node_fibre_coordinate, x0.momentum if stages.hamiltonian else x0.velocity
+    )
+    round_off = jnp.zeros_like(size)
+    m, k = stages.num_nonholonomic, stages.num_holonomic
+    t, q, args = stages.t, unframed(stages.q), stages.args
+
+    if k:
+        sizes = position_scale(stages.system, t, q, args, lin)
+        correction = lin.largest_correction(jnp.pad(sizes, (m, 0)))
+        round_off = round_off + correction / h
+    if m:
+        sizes = jnp.pad(_kinematic_scale(stages, q, x0), (0, k))
+        round_off = round_off + lin.largest_correction(sizes)
+    if stages.kept is not None:
+        round_off = round_off + impulse_weights(stages, x0).noise
+    if stages.round_off is not None:
+        round_off = jnp.maximum(round_off, stages.round_off.size(h))
+    return Scale(size, round_off)
+
+
+def _kinematic_scale(
+    stages: StageSystem, q: PyTree[Array], x0: Stages
+) -> Float[Array, " m"]:
+    """Estimate how far nonholonomic constraints move if positions move by their size.
+
+    One direction of the moves is enough for an estimate: to take each number by itself
+    would cost as many derivatives as there are coordinates.
+    """
+    system, t, args = stages.system, stages.t, stages.args
+    u = x0.momentum[0] if stages.hamiltonian else x0.velocity[0]
+    change = jax.jvp(
+        lambda q: system.kinematic_constraint(t, q, u, args),
+        (q,),
+        (uneven_perturbations(q),),
+    )[1]
+    # Where a constraint has no finite slope this tells nothing of its round-off.
+    return jnp.where(jnp.isfinite(change), jnp.abs(change), 0)
