@@ -1,8 +1,15 @@
-"""Derivatives by the implicit function theorem, also where they are not defined."""
+"""The derivatives of what is computed by iterations or is not defined everywhere.
 
+`AbstractImplicitFunction` has the one rule of derivatives of all steps: they follow
+from the solution by the implicit function theorem, not from the iterations. Below it
+are the linear and nonlinear solves that such functions use, and the helpers that
+change the tangents of trees: to zero, to NaN, or to tangents that JAX can see.
+"""
+
+from abc import abstractmethod
 from collections.abc import Callable
 from functools import partial
-from typing import Any, TypeVar
+from typing import Any, Generic, TypeVar
 
 import equinox as eqx
 import jax
@@ -11,7 +18,7 @@ import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, PyTree
 
-from .._compile import cse_dce
+from .._compile import as_cpu_kernel, cse_dce, TraceCache
 from .._custom_types import BoolScalar, FloatScalar
 from ._contraction import with_small_products
 from ._iteration import dense_increment, iterate, Sizes, Solved
@@ -20,12 +27,96 @@ from ._max_norm import max_norm, unit
 
 # Terms of the Neumann series below this many units of round-off are left out.
 _UNITS_LEFT = 256
-# If the terms of the series stop falling above this many units of round-off, it does
-# not converge: the derivative is NaN then, rather than a wrong number.
+# If the terms of the series stop falling above this many units of round-off, the series
+# does not converge. The derivative is then NaN rather than a wrong number.
 _NOISIEST = 1e4
 
 T = TypeVar("T")
 X = TypeVar("X", bound=PyTree[Array])
+Arguments = TypeVar("Arguments")
+Solution = TypeVar("Solution")
+
+
+class AbstractImplicitFunction(eqx.Module, Generic[Arguments, Solution]):
+    """A function whose value solves equations, with derivatives from these equations.
+
+    Call it with its arguments, a tree. It is differentiable with respect to them, but
+    not to its own fields. JAX never differentiates `solve`: derivatives of every order
+    are those of `tangent`.
+
+    - `programs`: a cache of traced programs; None if the function is part of a larger
+        program. With a cache, the rule of derivatives finds the program of `solve` that
+        is already traced instead of tracing it again.
+    """
+
+    programs: eqx.AbstractVar[TraceCache | None]
+
+    @abstractmethod
+    def solve(self, arguments: Arguments) -> Solution:
+        """Compute the solution, by iterations of any kind."""
+
+    @abstractmethod
+    def tangent(
+        self, arguments: Arguments, rates: Arguments, solution: Solution
+    ) -> Solution:
+        """Compute the tangent of the solution for arguments that change at `rates`.
+
+        Where a leaf of `rates` is None, the argument does not change. Leaves of the
+        result may be None, which stands for zero too.
+        """
+
+    def __call__(self, arguments: Arguments) -> Solution:
+        """Compute the solution; it can be differentiated with respect to `arguments`.
+
+        With a cache, the function is one primitive of JAX. When JAX splits a scan into
+        a known and a linear part, it drops the derivative rules of functions, but not
+        the rules of primitives. Without its rule, a step could be differentiated in
+        reverse mode only once.
+        """
+        if self.programs is None:
+            return _solution(arguments, self)
+        return as_cpu_kernel(_solution, arguments, self, programs=self.programs)
+
+
+@eqx.filter_custom_jvp
+def _solution(
+    arguments: Arguments, function: AbstractImplicitFunction[Arguments, Solution]
+) -> Solution:
+    return function.solve(arguments)
+
+
+@_solution.def_jvp
+def _solution_jvp(primals, tangents):
+    arguments, function = primals
+    solution = function(arguments)
+    return solution, function.tangent(arguments, tangents[0], solution)
+
+
+def fixed_point_tangent(
+    iteration: Callable[[T, X], X],
+    parameters: T,
+    rates: T,
+    x: X,
+    units: list[FloatScalar],
+    *,
+    max_iterations: int,
+) -> X:
+    """Compute how a fixed point x = G(θ, x) changes with the parameters θ.
+
+    The change solves dx = ∂G/∂x dx + ∂G/∂θ dθ, by `solve_contraction`.
+
+    **Arguments:**
+
+    - `iteration`: G, which contracts in x near the fixed point.
+    - `parameters`, `rates`: θ and its tangent dθ.
+    - `x`: the fixed point.
+    - `units`, `max_iterations`: as for `solve_contraction`.
+    """
+    # The iteration is traced once, and differentiated twice.
+    iteration = ClosureConverted(iteration, parameters, x)
+    _, b = jax.jvp(lambda theta: iteration(theta, x), (parameters,), (rates,))
+    _, contraction = jax.linearize(lambda x: iteration(parameters, x), x)
+    return solve_contraction(contraction, b, units, max_iterations=max_iterations)
 
 
 def solve_contraction(
@@ -160,43 +251,6 @@ def root(
     return Solved(unravel(x), None, converged > 0, exhausted > 0, num_iterations)
 
 
-def moving_with(tree: X, parameters: PyTree[Any]) -> X:
-    """Return the same values, with tangents wherever any parameter has one.
-
-    JAX traces the body of a loop once more if a part of the carry that had no
-    derivative at the start has one after a round. What starts a loop is given a
-    derivative of zeros by this function, so that one trace is enough.
-    """
-    parameters = jax.tree.leaves(eqx.filter(parameters, eqx.is_inexact_array))
-    moving, fixed = eqx.partition(tree, eqx.is_inexact_array)
-    leaves, structure = jax.tree.flatten(moving)
-    if not leaves or not parameters:
-        return tree
-    return eqx.combine(
-        jax.tree.unflatten(structure, _moving(leaves, parameters)), fixed
-    )
-
-
-@eqx.filter_custom_jvp
-def _moving(leaves: list[Array], parameters: list[Array]) -> list[Array]:
-    del parameters
-    return leaves
-
-
-@_moving.def_jvp
-def _moving_jvp(primals, tangents):
-    (leaves, _), (rates, others) = primals, tangents
-    given = jax.tree.leaves((rates, others))
-    if not given:
-        return leaves, rates
-    # A sum of no terms: JAX takes what depends on no tangent for no derivative at all.
-    nothing = jnp.sum(jnp.ravel(given[0])[:0])
-    return leaves, [
-        jnp.zeros_like(x) + nothing.astype(x.dtype) if rate is None else rate
-        for x, rate in zip(leaves, rates, strict=True)
-    ]
-
-
 class ClosureConverted(eqx.Module):
     """A function with the arrays that it closes over, which are among its leaves.
 
@@ -237,6 +291,50 @@ def has_tangent(tangents: PyTree[Any]) -> PyTree[bool]:
     )
 
 
+def moving_with(tree: X, parameters: PyTree[Any]) -> X:
+    """Return the same values, with tangents wherever any parameter has one.
+
+    JAX traces the body of a loop once more if a part of the carry that had no
+    derivative at the start has one after a round. What starts a loop is given a
+    derivative of zeros by this function, so that one trace is enough.
+    """
+    parameters = jax.tree.leaves(eqx.filter(parameters, eqx.is_inexact_array))
+    moving, fixed = eqx.partition(tree, eqx.is_inexact_array)
+    leaves, structure = jax.tree.flatten(moving)
+    if not leaves or not parameters:
+        return tree
+    return eqx.combine(
+        jax.tree.unflatten(structure, _moving(leaves, parameters)), fixed
+    )
+
+
+@eqx.filter_custom_jvp
+def _moving(leaves: list[Array], parameters: list[Array]) -> list[Array]:
+    del parameters
+    return leaves
+
+
+@_moving.def_jvp
+def _moving_jvp(primals, tangents):
+    (leaves, _), (rates, others) = primals, tangents
+    given = jax.tree.leaves((rates, others))
+    if not given:
+        return leaves, rates
+    # A sum of no terms: JAX takes what depends on no tangent for no derivative at all.
+    nothing = jnp.sum(jnp.ravel(given[0])[:0])
+    return leaves, [
+        jnp.zeros_like(x) + nothing.astype(x.dtype) if rate is None else rate
+        for x, rate in zip(leaves, rates, strict=True)
+    ]
+
+
+def frozen(tree: T) -> T:
+    """Stop derivatives through the arrays of a tree, and keep its other leaves."""
+    return jax.tree.map(
+        lambda x: jax.lax.stop_gradient(x) if eqx.is_array(x) else x, tree
+    )
+
+
 def tree_where(ok: BoolScalar, tree: X, other: X) -> X:
     """Take the numbers of a tree where `ok` is true, those of another elsewhere."""
     return jax.tree.map(lambda x, y: jnp.where(ok, x, y), tree, other)
@@ -252,8 +350,55 @@ def nan_unless(ok: BoolScalar, tree: X) -> X:
     return jax.tree.map(lambda x: jnp.where(ok, x, jnp.nan), tree)
 
 
-def frozen(tree: T) -> T:
-    """Stop derivatives through the arrays of a tree, and keep its other leaves."""
+def nan_gradient_unless(ok: BoolScalar, tree: X, parameters: PyTree[Any]) -> X:
+    """Return the same values, with derivatives that are NaN where `ok` is false.
+
+    This holds for the derivatives with respect to all `parameters`, whether or not the
+    values depend on them. A zero cotangent stays zero, so that a loss that leaves out a
+    failed lane has a derivative. The rule is written as a linear equation, because JAX
+    transposes the rule of forward mode to that of reverse mode, and this rule is not
+    linear.
+    """
+    parameters = eqx.filter(parameters, eqx.is_inexact_array)
     return jax.tree.map(
-        lambda x: jax.lax.stop_gradient(x) if eqx.is_array(x) else x, tree
+        lambda x: (
+            _identity(x, ok, parameters) if jnp.issubdtype(x.dtype, jnp.inexact) else x
+        ),
+        tree,
+    )
+
+
+@eqx.filter_custom_jvp
+def _identity(x: Array, ok: BoolScalar, parameters: PyTree[Array]) -> Array:
+    # From this function JAX decides whether x is batched under `vmap`. The derivative
+    # of x is batched wherever `ok` or a parameter is, so that x must seem to depend on
+    # them. The function compiles to nothing.
+    for leaf in jax.tree.leaves(parameters):
+        ok = ok | jnp.any(leaf == 0)
+    return jnp.where(ok, x, x)
+
+
+@_identity.def_jvp
+def _identity_jvp(primals, tangents):
+    (x, ok, _), (dx, _, rates) = primals, tangents
+
+    change = sum(jnp.sum(rate) for rate in jax.tree.leaves(rates))
+    if dx is None and not jax.tree.leaves(rates):
+        return _identity(*primals), None
+    dx = jnp.zeros_like(x) if dx is None else dx
+    dx = dx + jnp.where(ok, 0, change).astype(x.dtype)
+    return _identity(*primals), nan_tangent_unless(ok, dx)
+
+
+def nan_tangent_unless(ok: BoolScalar, dx: Array) -> Array:
+    """Return a tangent, or NaN where `ok` is false and it is not zero.
+
+    It is linear for JAX, and its transpose does the same to a cotangent.
+    """
+
+    def pass_on(_, b):
+        return jnp.where(ok | (b == 0), b, jnp.nan)
+
+    return jax.lax.custom_linear_solve(
+        lambda x: x, dx, solve=pass_on, transpose_solve=pass_on
     )

@@ -20,11 +20,10 @@ from ._solvers import (
 )
 from ._stage_iteration import stage_residual as stage_residual
 from ._step import (
-    change_of_step as change_of_step,
     estimated_error as estimated_error,
     first_step_state as first_step_state,
+    ImplicitStep as ImplicitStep,
     largest_violation as largest_violation,
-    primitive_step as primitive_step,
     step as step,
     StepArguments as StepArguments,
     StepOutcome as StepOutcome,

@@ -10,12 +10,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, PyTree
 
-from .._compile import as_cpu_kernel, TraceCache
+from .._compile import TraceCache
 from .._custom_types import Args, BoolScalar, FloatScalar
 from .._manifold import unframed
 from .._method import AbstractMethod
 from .._numerics import (
+    AbstractImplicitFunction,
     ClosureConverted,
+    fixed_point_tangent,
     frozen,
     has_tangent,
     largest_column,
@@ -24,7 +26,6 @@ from .._numerics import (
     NOISE_UNITS,
     relative,
     small_einsum,
-    solve_contraction,
     Solved,
     two_sum,
     zero_unless,
@@ -160,7 +161,7 @@ def first_step_state(
     """
     u = system.fibre_coordinate(y0)
     lin = linearise(system, t, y0.q, u, args, may_be_sparse=True)
-    multiplier = _continuous_multiplier(
+    multiplier = _ContinuousMultiplier()(
         (system, t, y0.q, system.fibre_coordinate(y0), args)
     )
     carried = method.closure == "propagated"
@@ -172,27 +173,32 @@ def first_step_state(
     )
 
 
-@eqx.filter_custom_jvp
-def _continuous_multiplier(arguments: tuple[Any, ...]) -> Float[Array, " l"]:
-    return linearise(*arguments, may_be_sparse=True).multiplier
+class _ContinuousMultiplier(AbstractImplicitFunction[Any, Float[Array, " l"]]):
+    """The continuous multiplier λ_c as a function of (system, t, q, u, args).
 
+    Its derivative is zero where the multiplier is not finite. NaN times zero is NaN, so
+    a member that failed would otherwise spoil the derivative of a sum that leaves it
+    out.
+    """
 
-@_continuous_multiplier.def_jvp
-def _continuous_multiplier_jvp(primals, tangents):
-    # The derivative is set to zero where the multiplier is not finite: NaN times zero
-    # would be NaN even for a lane on which nothing depends.
-    (arguments,), (rates,) = primals, tangents
-    multiplier = _continuous_multiplier(arguments)
-    ok = jnp.all(jnp.isfinite(multiplier))
-    perturbed, fixed = eqx.partition(arguments, has_tangent(rates))
-    _, change = jax.jvp(
-        lambda perturbed: (
-            linearise(*eqx.combine(perturbed, fixed), may_be_sparse=True).multiplier
-        ),
-        (perturbed,),
-        (zero_unless(ok, rates),),
-    )
-    return multiplier, zero_unless(ok, change)
+    programs: None = None
+
+    def solve(self, arguments: Any) -> Float[Array, " l"]:
+        """Compute the multiplier from the linearised system."""
+        return linearise(*arguments, may_be_sparse=True).multiplier
+
+    def tangent(
+        self, arguments: Any, rates: Any, solution: Float[Array, " l"]
+    ) -> Float[Array, " l"]:
+        """Differentiate the linearised system."""
+        ok = jnp.all(jnp.isfinite(solution))
+        perturbed, fixed = eqx.partition(arguments, has_tangent(rates))
+        _, change = jax.jvp(
+            lambda perturbed: self.solve(eqx.combine(perturbed, fixed)),
+            (perturbed,),
+            (zero_unless(ok, rates),),
+        )
+        return zero_unless(ok, change)
 
 
 def step(
@@ -424,114 +430,89 @@ def estimated_error(ratios: Float[Array, "2"], method: AbstractMethod) -> FloatS
     )
 
 
-def primitive_step(
-    arguments: StepArguments,
-    method: AbstractMethod,
-    stage_solver: AbstractStageSolver,
-    skip: BoolScalar,
-    programs: TraceCache,
-) -> StepOutcome:
-    """Take one step by `differentiable_step`, in a program that is traced once."""
-    # When JAX splits a scan into a known and a linear part, it drops the derivative
-    # rules of functions, but not those of primitives. Without its rule a step could be
-    # differentiated in reverse mode only once, and not again.
-    return as_cpu_kernel(
-        differentiable_step,
-        arguments,
-        method,
-        stage_solver,
-        skip,
-        programs,
-        programs=programs,
-    )
+Changes: TypeAlias = tuple[Stages, State, StepRecord]
 
 
-@eqx.filter_custom_jvp
-def differentiable_step(
-    arguments: StepArguments,
-    method: AbstractMethod,
-    stage_solver: AbstractStageSolver,
-    skip: BoolScalar,
-    programs: TraceCache,
-) -> StepOutcome:
-    """Take one step as `step` does, with a derivative that skips the iterations.
+class ImplicitStep(AbstractImplicitFunction[StepArguments, StepOutcome]):
+    """A step as a differentiable function of its arguments.
 
-    Let G(x; θ) be the Newton iteration of the stage solver on the stages x, with its
-    Jacobian frozen, and θ the arguments of the step. The solution is a fixed point, so
-    that
+    Let G(θ, x) be the Newton iteration of the stage solver on the stages x, with its
+    Jacobian fixed, and θ the arguments of the step. The solution is a fixed point of G,
+    so that
 
     dx = ∂G/∂x dx + ∂G/∂θ dθ,
 
     and the end of the step follows from x and θ. All derivatives are zero where the
     step failed.
+
+    - `method`, `stage_solver`: as for `step`.
+    - `skip`: where true, nothing is solved, and the outcome is to be discarded.
     """
-    del programs
-    return step(arguments, method, stage_solver, skip)
 
+    method: AbstractMethod = eqx.field(static=True)
+    stage_solver: AbstractStageSolver
+    skip: BoolScalar
+    programs: TraceCache = eqx.field(static=True)
 
-@differentiable_step.def_jvp
-def _differentiable_step_jvp(primals, tangents):
-    arguments, method, stage_solver, skip, _ = primals
-    # The program that the derivative was asked of is found again.
-    outcome = primitive_step(*primals)
-    x, ok = outcome.stages, ~skip & (outcome.result == RESULTS.successful)
-    perturbed, fixed = eqx.partition(arguments, has_tangent(tangents[0]))
-    change = change_of_step(arguments, method, stage_solver, ok, x, fixed)
-    # By the checkpoint nothing but states and stages is kept for a reverse pass.
-    change = jax.checkpoint(change, prevent_cse=False)
-    return outcome, tangent_of_outcome(outcome, change(perturbed, x, tangents[0]))
+    def solve(self, arguments: StepArguments) -> StepOutcome:
+        """Take the step."""
+        return step(arguments, self.method, self.stage_solver, self.skip)
 
+    def tangent(
+        self, arguments: StepArguments, rates: StepArguments, solution: StepOutcome
+    ) -> StepOutcome:
+        """Compute the tangents of the stages, the state at the end and the record."""
+        x, ok = solution.stages, ~self.skip & (solution.result == RESULTS.successful)
+        perturbed, fixed = eqx.partition(arguments, has_tangent(rates))
+        changes = self.changes(arguments, fixed, x, ok)
+        # With `jax.checkpoint`, reverse mode stores only states and stages.
+        changes = jax.checkpoint(changes, prevent_cse=False)
+        return tangent_of_outcome(solution, changes(perturbed, x, rates))
 
-Changes: TypeAlias = tuple[Stages, State, StepRecord]
+    def changes(
+        self,
+        arguments: StepArguments,
+        fixed: StepArguments,
+        x: Stages,
+        ok: BoolScalar,
+    ) -> Callable[[StepArguments, Stages, StepArguments], Changes]:
+        """Return the function (perturbed, x, rates) -> the changes of a solved step.
 
+        The `perturbed` part of the arguments changes at `rates`, and the other part is
+        `fixed`. The function computes the changes of the stages x, of the state at the
+        end and of the record of the step. They are zero unless the step is `ok`.
+        """
+        stages = equations_of_step(arguments, self.method)
+        at, lin, solved = frozen((stages, arguments.step_state.lin, x))
+        frozen_newton_map = self.stage_solver.frozen_newton_map(at, lin, solved)
+        # The solver started from a good guess. This iteration starts from zero, so it
+        # may take twice as many iterations.
+        limit = 2 * self.stage_solver.max_iterations
 
-def change_of_step(
-    arguments: StepArguments,
-    method: AbstractMethod,
-    stage_solver: AbstractStageSolver,
-    ok: BoolScalar,
-    x: Stages,
-    fixed: StepArguments,
-) -> Callable[[StepArguments, Stages, StepArguments], Changes]:
-    """Make the function (perturbed, x, rates) of the changes of a solved step.
-
-    It computes how the stages x, the state at the end and the record of the step
-    change if the `perturbed` part of its arguments changes at `rates`; the other part
-    is `fixed`. The changes are zero unless the step is `ok`.
-    """
-    stages = equations_of_step(arguments, method)
-    at, lin, solved = frozen((stages, arguments.step_state.lin, x))
-    frozen_newton_map = stage_solver.frozen_newton_map(at, lin, solved)
-
-    def change(perturbed, x, rates):
-        rates = zero_unless(ok, rates)
-
-        def sweep(perturbed, x):
+        def iteration(perturbed, x):
             arguments = eqx.combine(perturbed, fixed)
-            return frozen_newton_map(equations_of_step(arguments, method), x)
+            return frozen_newton_map(equations_of_step(arguments, self.method), x)
 
-        # The program of a sweep is made once, and differentiated twice.
-        corrected = ClosureConverted(sweep, perturbed, x)
-        end = ClosureConverted(
-            lambda perturbed, x: _end(eqx.combine(perturbed, fixed), method, x),
-            perturbed,
-            x,
-        )
-        _, b = jax.jvp(lambda theta: corrected(theta, x), (perturbed,), (rates,))
-        _, contraction = jax.linearize(lambda x: corrected(perturbed, x), x)
-        # This iteration starts from zero, while that of the step starts from a good
-        # guess, so that it is allowed twice as many iterations.
-        limit = 2 * stage_solver.max_iterations
-        units = unknown_units(at, lin)
-        dx = solve_contraction(contraction, b, units, max_iterations=limit)
-        _, dend = jax.jvp(end, (perturbed, x), (rates, zero_unless(ok, dx)))
-        return zero_unless(ok, (dx, *dend))
+        def end(perturbed, x):
+            return _end(eqx.combine(perturbed, fixed), self.method, x)
 
-    return change
+        def changes(perturbed, x, rates):
+            rates, units = zero_unless(ok, rates), unknown_units(at, lin)
+            dx = fixed_point_tangent(
+                iteration, perturbed, rates, x, units, max_iterations=limit
+            )
+            _, dend = jax.jvp(
+                ClosureConverted(end, perturbed, x),
+                (perturbed, x),
+                (rates, zero_unless(ok, dx)),
+            )
+            return zero_unless(ok, (dx, *dend))
+
+        return changes
 
 
 def tangent_of_outcome(outcome: StepOutcome, changes: Changes) -> StepOutcome:
-    """Make the tangent of an outcome from the changes of its stages and its end."""
+    """Return the tangent of an outcome, given the changes of its stages and its end."""
     none = jax.tree.map(lambda _: None, outcome)
     return eqx.tree_at(
         lambda outcome: (outcome.stages, outcome.step_state.state, outcome.record),
