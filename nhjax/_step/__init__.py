@@ -1,4 +1,4 @@
-"""One step of a method: its stage equations, their solvers, its end and derivative."""
+"""One step of a method: its equations, their solvers, its end and its derivative."""
 
 from .._numerics import Solved as Solved
 from ._chart import chart_of_step as chart_of_step

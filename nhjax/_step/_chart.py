@@ -28,18 +28,18 @@ Vectors: TypeAlias = Float[Array, "r n"]
 class AbstractChart(eqx.Module):
     """The chart y -> g_o τ(y) of a manifold around its origin g_o, for one step.
 
-    Its methods carry velocities and covectors at g_o τ(y) to the chart and back (paper,
-    section 6). Where the origin lies depends on the chart, and on the increment ξ of
-    the step.
+    The methods carry velocities and covectors from g_o τ(y) to the chart and back
+    (paper, section 6). The origin depends on the kind of chart and on the increment ξ
+    of the step.
     """
 
     manifold: eqx.AbstractVar[AbstractLieGroup]
 
     @abstractmethod
     def coordinates(self, increment: Vectors) -> Vectors:
-        """Compute the coordinates y of the points that increments Ξ from g_k lead to.
+        """Compute the coordinates y of the points that increments Ξ reach from g_k.
 
-        The increment ξ itself leads to the end of the step.
+        The increment ξ reaches the end of the step.
         """
 
     @property
@@ -72,7 +72,7 @@ class AbstractChart(eqx.Module):
     def to_chart(
         self, y: Vectors, velocity: Vectors, momentum: Vectors, force: Vectors
     ) -> tuple[Vectors, Vectors]:
-        """Compute (Π, F), the momenta and forces with respect to the coordinates y.
+        """Compute (Π, F), the momenta and forces conjugate to the coordinates y.
 
         They are Π = dτ_y^* μ and F = dτ_y^* w + (ddτ_y)^*(H, Π) for body momenta μ and
         body forces w. The second term of F is the derivative of ⟨μ, dτ_y H⟩ along y.
@@ -100,17 +100,17 @@ class AbstractChart(eqx.Module):
 
         - `momentum`: μ_k, carried to the origin.
         - `transported`: h Σ b_j n^j, the sum of the forces carried to the origin.
-        - `chart_force`: h Σ b_j F^j, that of the forces in the chart.
+        - `chart_force`: h Σ b_j F^j, the sum of the forces in the chart.
         """
 
     @abstractmethod
     def advance(
         self, start: PyTree[Array], compensation: PyTree[Array]
     ) -> tuple[PyTree[Array], PyTree[Array]]:
-        """Compute the end g_{k+1} of the step and the rounding error of the sum.
+        """Compute the end g_{k+1} of the step as a compensated sum.
 
-        A compensated sum is a number and the rounding error it has accumulated. The
-        `start` is g_k as it was before it was wrapped; see `AbstractLieGroup.wrapped`.
+        A compensated sum is a pair: a number and its accumulated rounding error. The
+        `start` is g_k before wrapping; see `AbstractLieGroup.wrapped`.
         """
 
     @abstractmethod
@@ -121,14 +121,14 @@ class AbstractChart(eqx.Module):
 
     @abstractmethod
     def in_domain(self, y: Vectors) -> BoolScalar:
-        """Tell whether all y lie where the retraction τ is invertible."""
+        """Return whether all y lie where the retraction τ is invertible."""
 
 
 class FlatChart(AbstractChart):
     """The chart of a vector space, on which dτ and Ad^* are the identity.
 
-    Its methods return what they were given, so that the compiled program of a step is
-    that of the paper's equations on a vector space.
+    Most methods return an argument unchanged. A step on a vector space therefore costs
+    no more than the paper's equations for vector spaces.
     """
 
     manifold: AbstractLieGroup
@@ -178,7 +178,7 @@ class FlatChart(AbstractChart):
     def base_momentum(
         self, momentum: Vector, transported: Vector, chart_force: Vector
     ) -> Vector:
-        """Return μ_k, because the two sums are the same here and cancel."""
+        """Return μ_k, because the two sums are equal on a vector space and cancel."""
         return momentum
 
     def advance(
@@ -199,7 +199,7 @@ class FlatChart(AbstractChart):
 
 
 class AbstractCurvedChart(AbstractChart):
-    """A chart y -> g_o τ(y) of a Lie group by its retraction τ, wherever g_o lies."""
+    """A chart y -> g_o τ(y) of a Lie group with the retraction τ, for any origin."""
 
     def body_velocities(self, y: Vectors, velocity: Vectors) -> Vectors:
         """Compute the body velocities dτ_y H of the chart velocities H."""
@@ -212,7 +212,7 @@ class AbstractCurvedChart(AbstractChart):
     def to_chart(
         self, y: Vectors, velocity: Vectors, momentum: Vectors, force: Vectors
     ) -> tuple[Vectors, Vectors]:
-        """Compute (Π, F), the momenta and forces with respect to the coordinates y."""
+        """Compute (Π, F), the momenta and forces conjugate to the coordinates y."""
 
         def one(y, velocity, momentum, force):
             _, pullback = jax.vjp(self.manifold.dtau, y, velocity)
@@ -230,7 +230,7 @@ class AbstractCurvedChart(AbstractChart):
         return jax.vmap(self.manifold.to_end)(y, covector)
 
     def in_domain(self, y: Vectors) -> BoolScalar:
-        """Tell whether all y lie where the retraction τ is invertible."""
+        """Return whether all y lie where the retraction τ is invertible."""
         return jnp.all(jax.vmap(self.manifold.in_chart)(y))
 
     def _carried(
@@ -238,15 +238,15 @@ class AbstractCurvedChart(AbstractChart):
     ) -> tuple[Vector, Vector]:
         """Apply Ad^*_{τ(y)} to a compensated sum; return a compensated sum.
 
-        The rounding errors of plain products with Ad^* would add up over the steps, as
-        those of plain sums do.
+        The rounding errors of plain products with Ad^* would accumulate over the steps,
+        like the rounding errors of plain sums.
         """
         change = self.manifold.to_end_change(y, momentum)
         return two_sum(momentum, change + self.manifold.to_end(y, compensation))
 
 
 class StartChart(AbstractCurvedChart):
-    """The chart around the start g_k of the step, that of the paper."""
+    """The chart around the start g_k of the step, which the paper uses."""
 
     manifold: AbstractLieGroup
     start: PyTree[Array]
@@ -267,7 +267,7 @@ class StartChart(AbstractCurvedChart):
         return increment
 
     def momentum_at_origin(self, momentum: Vector) -> Vector:
-        """Return the momentum μ_k, which is given at the origin."""
+        """Return μ_k unchanged, because the origin is the start of the step."""
         return momentum
 
     def base_momentum(
@@ -295,10 +295,10 @@ class StartChart(AbstractCurvedChart):
 
 
 class MiddleChart(AbstractCurvedChart):
-    """The chart in whose coordinates a step leads from -ξ/2 to ξ/2.
+    """The chart in which a step goes from the coordinates -ξ/2 to ξ/2.
 
-    Its origin is g_o = g_k τ(-ξ/2)⁻¹, and the end of the step is g_o τ(ξ/2). Seen from
-    the end, a step back has the same chart, so that symmetric methods stay symmetric.
+    Its origin is g_o = g_k τ(-ξ/2)⁻¹, and the end of the step is g_o τ(ξ/2). The step
+    back from the end has the same chart, so that symmetric methods stay symmetric.
     """
 
     manifold: AbstractLieGroup
@@ -332,7 +332,7 @@ class MiddleChart(AbstractCurvedChart):
     ) -> Vector:
         """Compute ½ (dτ_{-ξ/2}^* μ_k + dτ_{ξ/2}^* μ_{k+1} - h Σ b_j F^j).
 
-        Both ends enter alike. With the momentum M at the origin these are
+        Both ends enter in the same way. With the momentum M at the origin,
         μ_k = Ad^*_{τ(-ξ/2)} M and μ_{k+1} = Ad^*_{τ(ξ/2)} (M + h Σ b_j n^j).
         """
         start = self.manifold.right_dtau_dual(-self._half, momentum)
@@ -362,11 +362,11 @@ _CURVED = {"start": StartChart, "middle": MiddleChart}
 def chart_of_step(
     manifold: AbstractLieGroup, chart: str, start: PyTree[Array], increment: Vector
 ) -> AbstractChart:
-    """Make the chart of a step from g_k.
+    """Build the chart of a step from g_k.
 
     **Arguments:**
 
-    - `chart`: where the origin of the chart lies, the field `chart` of the method.
+    - `chart`: the place of the origin, which is the field `chart` of the method.
     - `start`: g_k.
     - `increment`: ξ = h Σ b_j H^j, the increment of the whole step.
     """

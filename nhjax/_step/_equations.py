@@ -41,20 +41,21 @@ T = TypeVar("T")
 class Stages(eqx.Module):
     """The unknowns of one step: stage velocities, node coordinates and multipliers.
 
-    Unknowns that a system or a closure does not have are arrays without entries.
+    An unknown that the system or the closure of the multiplier does not have is an
+    array without entries.
 
     - `velocity`: H^1..H^s, the stage velocities in the chart (V^i on R^n).
-    - `momentum`: the stage momenta in the body frame, of a Hamiltonian system; those of
-        a Lagrangian one follow from the velocities.
-    - `node_fibre_coordinate`: u^2..u^s (v or p) at the nodes, the last of them at the
-        end of the step; without nonholonomic constraints only u_{k+1}.
-    - `closure`: y, which gives the nonholonomic multipliers
+    - `momentum`: the stage momenta in the body frame, for Hamiltonian systems. For
+        Lagrangian systems they follow from the velocities.
+    - `node_fibre_coordinate`: u^2..u^s (v or p) at the nodes. The last node is the end
+        of the step. Without nonholonomic constraints there is only u_{k+1}.
+    - `closure`: y, the unknowns of the closure. The nonholonomic multipliers are
         Λ = (start) λ_k + (end) λ_{k+1} + E y.
     - `holonomic`: the holonomic multipliers Λ^1..Λ^s.
-    - `end_acceleration`, `end_multiplier`: u̇ and λ_c at the end of the step, unknowns
-        of the symmetric closure alone.
-    - `impulse`: ε, the impulses at the ends of the step along ∂I/∂v of the invariants
-        I that the run keeps; None if it keeps none.
+    - `end_acceleration`, `end_multiplier`: u̇ and λ_c at the end of the step, which only
+        the symmetric closure has.
+    - `impulse`: ε, the impulses at both ends of the step along ∂I/∂v of the invariants
+        I; None if the run keeps no invariants.
     """
 
     velocity: Float[Array, "s n"]
@@ -64,7 +65,7 @@ class Stages(eqx.Module):
     holonomic: Float[Array, "s k"]
     end_acceleration: Float[Array, " a"]
     end_multiplier: Float[Array, " e"]
-    # None, the empty tree, if no invariants are kept.
+    # A `PyTree`, because None is an empty tree.
     impulse: PyTree[Float[Array, " i"]] = None
 
 
@@ -74,28 +75,34 @@ class StageForces(NamedTuple):
     force: Float[Array, "s n"]  # n^i, the force W^i carried to the origin of the chart
     multiplier: Float[Array, "s l"]  # Λ^i
     residual: Float[Array, "s n"]  # Π^i - base - h Σ â_ij F^j
-    momentum: Float[Array, "s n"]  # Π^i, by whose size residuals are judged
+    momentum: Float[Array, "s n"]  # Π^i, the scale of the residuals
 
 
 class StageSystem(eqx.Module):
     """The discrete equations of one step from (q_k, p_k, λ_k).
 
-    These are the paper's four Summaries in the unknowns of `Stages`, in the chart of
-    the method. With w^i the body force at stage i (reactions included), y^i the
-    coordinates of the stage, n^i = Ad^*_{τ(y^i)⁻¹} w^i, F^i the same force in the chart
-    and M the momentum μ_k carried to its origin, they read
+    These are the four Summaries of the paper in the unknowns of `Stages`, in the chart
+    of the method. Let w^i be the body force at stage i, reactions included, and y^i the
+    coordinates of the stage. Let n^i = Ad^*_{τ(y^i)⁻¹} w^i, let F^i be the same force
+    in the chart, and M the momentum μ_k carried to the origin. The equations are
 
     Π^i = base + h Σ â_ij F^j,    μ^i = Ad^*_{τ(y^i)} (M + h Σ a_ij n^j),
 
-    together with the nonholonomic constraints at the nodes (q^i, μ^i), the holonomic
-    ones at the positions Q^i, i >= 2, and their tangency at the end. The constraints at
-    the first node hold by hypothesis H1; the last node is the end of the step by H3.
-    Of redundant constraints as many are kept as are independent; see `Redundancy`.
-    A closure of the multiplier enters in three places: by the constant matrices of
-    `method.closure_weights`; by the multiplier that a state carries, Λ^s for the
-    propagated closure and λ_c for the others (`end_state`, `first_step_state`); and, if
-    it uses λ_c at the end, by two more unknowns and equations (`symmetric`). To keep
-    invariants, momenta receive impulses at both ends of the step; see `ImpulseWeights`.
+    the nonholonomic constraints at the nodes (q^i, μ^i), the holonomic constraints at
+    the positions Q^i, i >= 2, and the time derivative of the holonomic constraints at
+    the end. The constraints at the first node hold by hypothesis H1, and the last node
+    is the end of the step by H3. With redundant constraints, only as many equations as
+    are independent are enforced; see `Redundancy`.
+
+    The closure of the multiplier enters in three places:
+
+    - the constant matrices of `method.closure_weights`;
+    - the multiplier that a state carries, which is Λ^s for the propagated closure and
+        λ_c for the others (`end_state`, `first_step_state`);
+    - two more unknowns and equations if the closure uses λ_c at the end (`symmetric`).
+
+    If the run keeps invariants, the momenta receive impulses at both ends of the step;
+    see `ImpulseWeights`.
     """
 
     system: AbstractMechanicalSystem
@@ -123,7 +130,7 @@ class StageSystem(eqx.Module):
         kept: StartImpulses | None = None,
         round_off: RoundOff | None = None,
     ) -> "StageSystem":
-        """Make the equations of a step of size h from the state y at t."""
+        """Build the equations of a step of size h from the state y at t."""
         system, q = with_frames(system, y.q)
         given = t, h, q, y.p, y.multiplier, args
         stages = cls(system, method, *given, kept=kept, round_off=round_off)
@@ -150,22 +157,22 @@ class StageSystem(eqx.Module):
 
     @property
     def constrained(self) -> bool:
-        """Tell whether there are constraints, and so multipliers."""
+        """Return whether there are constraints, and so multipliers."""
         return self.multiplier.shape[0] > 0
 
     @property
     def symmetric(self) -> bool:
-        """Tell whether the symmetric closure is in use.
+        """Return whether λ_c at the end of the step is an unknown.
 
-        The continuous multiplier at the end of the step is then an unknown.
+        Only the symmetric closure has this unknown.
         """
         return self.num_nonholonomic > 0 and self.method.closure == "symmetric"
 
     @property
     def hamiltonian(self) -> bool:
-        """Tell whether the system is Hamiltonian.
+        """Return whether the system is Hamiltonian.
 
-        The stage momenta are then unknowns, beside the stage velocities.
+        Then the stage momenta are unknowns, in addition to the stage velocities.
         """
         return self.system.fibre_coordinate_name == "p"
 
@@ -175,7 +182,7 @@ class StageSystem(eqx.Module):
         return self.system.manifold_of(self.q)
 
     def chart(self, x: Stages) -> AbstractChart:
-        """Make the chart in which the step is written."""
+        """Build the chart in which the step is written."""
         return chart_of_step(
             self.manifold, self.method.chart, self.q, self.increment(x)
         )
@@ -200,17 +207,17 @@ class StageSystem(eqx.Module):
 
     @property
     def node_rows(self) -> np.ndarray:
-        """Return the rows of a_ij for the nodes at which momenta are formed.
+        """Return the rows of a_ij for the nodes at which momenta are computed.
 
-        With nonholonomic constraints these are the nodes i >= 2, otherwise only the end
-        of the step, whose row is that of the weights b.
+        With nonholonomic constraints these are the nodes i >= 2. Otherwise it is only
+        the end of the step, whose row contains the weights b.
         """
         method = self.method
         return method.a[1:] if self.num_nonholonomic else method.b[None]
 
     @property
     def node_times(self) -> Float[Array, " r"]:
-        """Return the times of the nodes at which momenta are formed."""
+        """Return the times of the nodes at which momenta are computed."""
         nodes = (
             self.coefficients("c")[1:]
             if self.num_nonholonomic
@@ -219,10 +226,7 @@ class StageSystem(eqx.Module):
         return self.t + self.h * nodes
 
     def multipliers(self, x: Stages) -> Float[Array, "s l"]:
-        """Compute the multipliers Λ^1..Λ^s of all constraints at the stages.
-
-        They follow from the unknowns of the closure and the holonomic multipliers.
-        """
+        """Compute the multipliers Λ^1..Λ^s of all constraints at the stages."""
         change = self.multiplier_change(x)
         if not self.num_nonholonomic:
             return change
@@ -247,18 +251,18 @@ class StageSystem(eqx.Module):
         return jnp.concatenate([kinematic, holonomic], axis=1)
 
     def _padded(self, weights: str, multiplier: Float[Array, " l"]) -> Array:
-        """Compute what a known multiplier, such as λ_k, adds to Λ.
+        """Compute the part of Λ that comes from a known multiplier, such as λ_k.
 
-        Its holonomic part adds nothing.
+        The holonomic multipliers do not depend on it.
         """
         known = multiplier[: self.num_nonholonomic]
         part = jnp.outer(self.closure_weights(weights), known)
         return jnp.pad(part, ((0, 0), (0, self.num_holonomic)))
 
     def increment(self, x: Stages) -> Float[Array, " n"]:
-        """Compute the increment ξ = h Σ b_j H^j, which takes q_k to q_{k+1}."""
-        # The product is formed as h * (b @ H): coefficients h b_j, rounded once and for
-        # all, would bias every step in the same way.
+        """Compute the increment ξ = h Σ b_j H^j from q_k to q_{k+1}."""
+        # The product is h * (b @ H). The rounding errors of precomputed coefficients
+        # h b_j would be the same in every step, and add up.
         return self.h * small_einsum("s,sn->n", self.coefficients("b"), x.velocity)
 
 
@@ -302,8 +306,8 @@ def node_residual(
 ) -> Float[Array, "r n"]:
     """Compute the residuals of the momentum equations at the nodes.
 
-    They are p(q^i, u^i) - Ad^*_{τ(y^i)} (M + h Σ a_ij n^j), at the end of the step less
-    the impulse there.
+    They are p(q^i, u^i) - Ad^*_{τ(y^i)} (M + h Σ a_ij n^j). At the end of the step the
+    impulse is subtracted too.
     """
     chart, y = in_nodes(stages, x)
     momentum = jax.vmap(lambda t, q, u: stages.system.momentum(t, q, u, stages.args))(
@@ -319,7 +323,7 @@ def node_residual(
 
 
 def constraint_values(stages: StageSystem, x: Stages) -> tuple[Array, Array]:
-    """Compute the nonholonomic constraints at the nodes and the holonomic ones."""
+    """Compute the values of the nonholonomic and of the holonomic constraints."""
     none = jnp.zeros((0,), stages.p.dtype)
     return (
         node_constraint(stages, x) if stages.num_nonholonomic else none,
@@ -339,9 +343,9 @@ def node_constraint(stages: StageSystem, x: Stages) -> Float[Array, "r m"]:
 
 
 def holonomic_constraint(stages: StageSystem, x: Stages) -> Float[Array, "s k"]:
-    """Compute Γ(Q^i) / h for i >= 2, and the tangency dΓ/dt at the end of the step.
+    """Compute Γ(Q^i) / h for i >= 2, and the rate dΓ/dt at the end of the step.
 
-    The division by h makes the values the size of velocities, as the tangency is.
+    The division by h gives all values the unit of dΓ/dt.
     """
     chart, y = in_stages(stages, x)
     nodes = chart.positions(y[1:])
@@ -364,7 +368,7 @@ def end_residual(
 ) -> tuple[Float[Array, " n"], Float[Array, " l"]]:
     """Compute the residuals of the equations of motion at the end of the step.
 
-    Their root gives the continuous multiplier λ_c there.
+    The continuous multiplier λ_c at the end is their root.
     """
     on_momentum, hidden = motion_residual(
         stages.system,
@@ -387,14 +391,14 @@ def invariant_errors(stages: StageSystem, x: Stages) -> Float[Array, " k"]:
 
 
 def constraint_jacobian(stages: StageSystem, x: Stages) -> Float[Array, "r l n"]:
-    """Compute B = ∂Φ/∂u of all constraints on velocities at the nodes i >= 2."""
+    """Compute B = ∂Φ/∂u at the nodes i >= 2, where Φ are all velocity constraints."""
     return _at_nodes(stages, x, jax.jacrev)
 
 
 def sparse_constraint_jacobian(
     stages: StageSystem, x: Stages, pattern: Pattern
 ) -> SparseMatrix:
-    """Compute B = ∂Φ/∂u at the nodes i >= 2 as a sparse matrix of a known pattern."""
+    """Compute B = ∂Φ/∂u at the nodes i >= 2 as a sparse matrix of known `pattern`."""
     return _at_nodes(
         stages,
         x,
@@ -418,7 +422,7 @@ def _at_nodes(
 
 
 def start_impulse(stages: StageSystem, x: Stages) -> Float[Array, " n"]:
-    """Compute the impulse ε ω_k at the start of a step that keeps invariants."""
+    """Compute the impulse ε ω_k at the start of a step."""
     assert stages.kept is not None
     return small_einsum("k,kn->n", x.impulse, stages.kept.covectors)
 
@@ -444,7 +448,7 @@ def end_slopes(
 
 
 def impulse_weights(stages: StageSystem, x: Stages) -> ImpulseWeights:
-    """Weigh the equations for the impulses of a step, near the given stages."""
+    """Linearise the equations for the impulses of a step, near the given stages."""
     assert stages.kept is not None
     slopes, covectors = end_slopes(stages, x)
     moving = moving_part(slopes, x.node_fibre_coordinate[-1])
@@ -453,7 +457,7 @@ def impulse_weights(stages: StageSystem, x: Stages) -> ImpulseWeights:
 
 
 def _end_point(stages: StageSystem, x: Stages) -> tuple[Any, ...]:
-    """Return what functions of the system are given at the end of the step."""
+    """Return (system, t, q, u, args) at the end of the step."""
     assert stages.kept is not None
     end = stages.chart(x).advance(*stages.kept.position)
     q = stages.manifold.wrapped(*end)
@@ -462,7 +466,7 @@ def _end_point(stages: StageSystem, x: Stages) -> tuple[Any, ...]:
 
 
 def in_chart(stages: StageSystem, x: Stages) -> BoolScalar:
-    """Tell whether stages, nodes and end lie where the chart is invertible."""
+    """Return whether the stages and the end lie where the chart is invertible."""
     chart, y = in_stages(stages, x)
     return chart.in_domain(jnp.concatenate([y, chart.ends[1][None]]))
 
@@ -470,14 +474,14 @@ def in_chart(stages: StageSystem, x: Stages) -> BoolScalar:
 def in_stages(
     stages: StageSystem, x: Stages
 ) -> tuple[AbstractChart, Float[Array, "s n"]]:
-    """Make the chart and the coordinates y^i of the stages, from h Σ a_ij H^j."""
+    """Return the chart and the coordinates y^i of the stages, from h Σ a_ij H^j."""
     return _in_chart(stages, x, stages.method.a)
 
 
 def in_nodes(
     stages: StageSystem, x: Stages
 ) -> tuple[AbstractChart, Float[Array, "r n"]]:
-    """Make the chart and the coordinates of the nodes with momenta of their own."""
+    """Return the chart and the coordinates of the nodes of `node_rows`."""
     return _in_chart(stages, x, stages.node_rows)
 
 
@@ -486,8 +490,8 @@ def _in_chart(
 ) -> tuple[AbstractChart, Float[Array, "r n"]]:
     chart = stages.chart(x)
     start, end = chart.ends
-    # A node at an end of the step is given the very coordinates that the chart has for
-    # this end, so that the compiler computes once what depends on them.
+    # A node at an end of the step uses the same array of coordinates as the chart, so
+    # that the compiler merges the operations on both.
     first = 0 if np.any(rows[0]) else 1
     last = len(rows) - int(np.array_equal(rows[-1], stages.method.b))
     parts = [start[None]] * first
@@ -503,7 +507,7 @@ def _in_chart(
 def stage_positions(
     stages: StageSystem, chart: AbstractChart, y: Float[Array, "s n"]
 ) -> PyTree[Array]:
-    """Compute the positions of the stages, the first of which is q_k if c_1 = 0."""
+    """Compute the positions of the stages. If c_1 = 0, the first one is q_k."""
     if np.any(stages.method.a[0]):
         return chart.positions(y)
     return jax.tree.map(
@@ -522,9 +526,9 @@ def end_position(stages: StageSystem, x: Stages) -> PyTree[Array]:
 def nudged(stages: StageSystem, nudge: FloatScalar) -> StageSystem:
     """Return the equations with q_k moved by about `nudge` times its size.
 
-    The change of a solution by this move, divided by `nudge`, estimates its change by
-    the round-off of positions, divided by the unit round-off. The coordinates are moved
-    by different amounts, so that the moves do not cancel in the difference of two.
+    This move changes the solution. The change per `nudge` estimates the change by the
+    round-off of positions per unit round-off. The coordinates move by different
+    amounts, so that the moves do not cancel in a difference of two coordinates.
     """
     if stages.manifold.is_flat:
         moves = uneven_perturbations(stages.q)

@@ -1,7 +1,7 @@
 """The solvers of the stage equations, simplified Newton and Newton's method.
 
-Both start from values of first order in h and stop by the sizes of their increments,
-relative to a scale of the step.
+Both start from values that are correct to first order in h. They stop when their
+increments are round-off, relative to the scale of the step.
 """
 
 from abc import abstractmethod
@@ -44,12 +44,12 @@ from ._stage_iteration import (
 )
 
 
-# One iteration on the stages of a step. The equations are an argument, so that the
-# iteration can be differentiated with respect to the data in them.
+# An iteration on the stages of a step. The equations are an argument, so that the
+# iteration can be differentiated with respect to their data.
 FrozenNewtonMap: TypeAlias = Callable[[StageSystem, Stages], Stages]
 
 
-# Stages with a larger residual than this, relative to the momenta, are no solution.
+# Stages with a larger residual than this, relative to the momenta, are not a solution.
 _GROSS = 1e-6
 
 
@@ -99,48 +99,52 @@ class AbstractStageSolver(eqx.Module):
     def frozen_newton_map(
         self, stages: StageSystem, lin: Linearisation, x: Stages
     ) -> FrozenNewtonMap:
-        """Make an iteration whose fixed points solve the stage equations.
+        """Build an iteration whose fixed points solve the stage equations.
 
         Its Jacobian is frozen, that is, constant. The iteration contracts at the
-        solution `x`, and the derivatives of the solution follow from it by the implicit
-        function theorem.
+        solution `x`. The derivatives of the solution follow from this iteration by the
+        implicit function theorem.
         """
 
 
 class SimplifiedNewton(AbstractStageSolver):
     """Simplified Newton on the stage equations, with part of their Jacobian.
 
-    The mass matrix M and the Schur complement of the constraints are inverted once a
-    step, at its start; each iteration costs one evaluation of the stage equations and a
-    few small products. With this leading part alone an iteration reduces the error by a
-    factor O(h²) where M is constant, forces do not depend on v and the constraints are
-    linear in v, and by a factor O(h) elsewhere and on Lie groups. With the terms of
-    order h, derivatives of momenta by positions and of forces by velocities at the
-    start of the step, it is O(h²) there too.
+    The solver inverts the mass matrix M and the Schur complement of the constraints
+    once per step, at the start of the step. Each iteration costs one evaluation of the
+    stage equations and a few small products.
 
-    Where this iteration does not converge, Newton's method with the exact Jacobian may.
-    With the fallback it takes over in such a step, and
+    The leading part of the Jacobian contains only these two matrices. With it, an
+    iteration reduces the error by a factor O(h²) on a vector space if M is constant,
+    forces do not depend on v, and the constraints are linear in v. Otherwise the factor
+    is O(h). The terms of order h are the derivatives of momenta with respect to
+    positions, and of forces with respect to velocities, at the start of the step. With
+    these terms the factor is always O(h²).
+
+    If this iteration does not converge, Newton's method with the exact Jacobian may
+    still converge. With the fallback, Newton's method takes over in such a step, and
     `Solution.stats["num_newton_steps"]` counts these steps. A program that contains
-    both methods takes longer to compile, and runs slower even where the fallback is
-    never used. For this reason a plain call of `integrate` first runs without the
-    fallback, and is repeated with it if a step was not solved. In a program of your own
-    (`jax.jit`, `jax.vmap`, `jax.grad`) a step that is not solved ends the run, unless
+    both methods takes longer to compile, and runs slower even if the fallback is never
+    used. For this reason a plain call of `integrate` first runs without the fallback,
+    and repeats the run with it if a step was not solved. In a program of your own
+    (`jax.jit`, `jax.vmap`, `jax.grad`), a step that is not solved ends the run, unless
     you ask for the fallback.
 
     **Arguments:**
 
     - `max_iterations`: the number of iterations after which a step counts as failed.
     - `tolerance`: the size of the increment, relative to the velocities, at which to
-        stop; 0, the default, iterates to round-off. Changing it recompiles nothing.
-    - `fallback`: whether `nhjax.Newton()` takes over a step that is not solved. It is
-        True, False, or None, the default, which means in plain calls alone. Derivatives
-        of a run with the fallback use the exact Jacobian, as those of `nhjax.Newton()`
-        do.
-    - `jacobian`: `"leading"`; `"first_order"`, which has the terms of order h as well;
-        or None, the default, which has them where they pay: with s <= 5 stages, n <= 6
-        coordinates and m constraints with s (s - 1) n m <= 100, all nonholonomic. They
-        are not available for Hamiltonian systems, redundant constraints, and
-        constraints so many that they are kept sparse.
+        stop. The default, 0, iterates to round-off. Changing the tolerance does not
+        recompile.
+    - `fallback`: whether `nhjax.Newton()` takes over a step that is not solved: True,
+        False, or None, the default, which means only in plain calls. Derivatives of a
+        run with the fallback use the exact Jacobian, as with `nhjax.Newton()`.
+    - `jacobian`: `"leading"`; or `"first_order"`, which includes the terms of order h;
+        or None, the default, which includes them if they reduce the run time. This is
+        so with s <= 5 stages, n <= 6 coordinates and m constraints with
+        s (s - 1) n m <= 100, all nonholonomic. The terms are not available for
+        Hamiltonian systems, redundant constraints, and so many constraints that they
+        are stored as sparse matrices.
 
     !!! example
 
@@ -171,11 +175,11 @@ class SimplifiedNewton(AbstractStageSolver):
         structure = leading_structure(stages, x0, lin, self.jacobian)
         scale = fibre_coordinate_scale(stages, x0, lin)
 
-        def sweep(x: Stages):
+        def iteration(x: Stages):
             x_next, evaluation = corrected(stages, structure, x)
             return x_next, sizes(stages, x, x_next, lin), evaluation
 
-        solved = _iterated(self, sweep, x0, scale, skip)
+        solved = _iterated(self, iteration, x0, scale, skip)
         if not self.fallback:
             return solved
         # If the first iterate is not finite, the functions of the system are not finite
@@ -198,10 +202,10 @@ class SimplifiedNewton(AbstractStageSolver):
     def frozen_newton_map(
         self, stages: StageSystem, lin: Linearisation, x: Stages
     ) -> FrozenNewtonMap:
-        """Make the iteration of `solve`, with the constraint Jacobians at the solution.
+        """Build the iteration of `solve` with constraint Jacobians at the solution.
 
-        With the fallback it is the iteration of Newton's method, which contracts also
-        where Newton's method had to take over.
+        With the fallback this is the iteration of Newton's method, which contracts also
+        in steps that Newton's method had to solve.
         """
         if self.fallback:
             return self._newton.frozen_newton_map(stages, lin, x)
@@ -210,22 +214,23 @@ class SimplifiedNewton(AbstractStageSolver):
 
 
 def is_simplified_alone(stage_solver: AbstractStageSolver) -> bool:
-    """Tell whether a run does without Newton's method, unless it is repeated."""
+    """Return whether the solver is simplified Newton without the fallback."""
     return isinstance(stage_solver, SimplifiedNewton) and not stage_solver.fallback
 
 
 def leaves_steps_to_newton(stage_solver: AbstractStageSolver) -> bool:
-    """Tell whether a plain call that fails is to be repeated with the fallback."""
+    """Return whether a plain call that fails is repeated with the fallback."""
     return isinstance(stage_solver, SimplifiedNewton) and stage_solver.fallback is None
 
 
 class Newton(AbstractStageSolver):
     """Newton's method on the stage equations, with their exact dense Jacobian.
 
-    An iteration costs more than one of `SimplifiedNewton`, but the method converges for
-    larger steps and for stiff forces. It also tells increments that are round-off,
-    magnified by stiff forces, from those of an iteration that has not converged. Both
-    solvers give the same trajectory to round-off.
+    An iteration costs more than an iteration of `SimplifiedNewton`, but the method
+    converges for larger steps and for stiff forces. Stiff forces magnify round-off in
+    the increments. This solver distinguishes such increments from the increments of an
+    iteration that has not converged. Both solvers give the same trajectory to
+    round-off.
 
     **Arguments:** `max_iterations` and `tolerance`, as for `SimplifiedNewton`.
 
@@ -257,20 +262,20 @@ class Newton(AbstractStageSolver):
         def residual(z):
             return stage_residual(stages, unravel(z))
 
-        def sweep(x: Stages):
+        def iteration(x: Stages):
             z, _ = ravel_pytree(x)
             jacobian, r, evaluation = jacobian_and_value(residual, z)
             change = stage_residual(moved, x)[0] - r
-            # After a change by a few units of the last digits the equations differ from
-            # what the Jacobian predicts by their round-off.
+            # After a change of x by a few units in the last place, the equations differ
+            # from the prediction of the Jacobian by their round-off.
             near = z + 8 * eps * uneven_perturbations(z)
             missed = residual(near)[0] - r - jacobian @ (near - z)
             rights = jnp.stack([r, change, missed], axis=1)
             dz, *noises = jnp.linalg.solve(jacobian, -rights).T
             x_next = unravel(z + dz)
-            # Two effects move the stages: the round-off of the positions, magnified by
-            # stiff forces, and that of the equations, magnified where these are nearly
-            # dependent.
+            # Two kinds of round-off move the stages: the round-off of the positions,
+            # which stiff forces magnify, and the round-off of the equations, which is
+            # magnified if the equations are nearly dependent.
             by_positions, by_equations = (
                 increment_size(stages, x, unravel(z + noise), lin) for noise in noises
             )
@@ -282,9 +287,9 @@ class Newton(AbstractStageSolver):
             )
             return x_next, found, evaluation
 
-        solved = _iterated(self, sweep, x0, scale, skip)
-        # Where forces grow without bound, increments are small even far from any
-        # solution, so that the residual is checked too.
+        solved = _iterated(self, iteration, x0, scale, skip)
+        # Where forces grow without bound, increments are small even far from a
+        # solution. Therefore the residual is checked too.
         gross = matvec(lin.momentum_inverse, solved.aux.forces.residual)
         found = fibre_coordinate_size(stages, solved.x)
         measure = jnp.maximum(scale.size + scale.round_off, found)
@@ -300,7 +305,7 @@ class Newton(AbstractStageSolver):
     def frozen_newton_map(
         self, stages: StageSystem, lin: Linearisation, x: Stages
     ) -> FrozenNewtonMap:
-        """Make Newton's iteration with its Jacobian fixed, that at the solution."""
+        """Build Newton's iteration with the constant Jacobian at the solution."""
         z, unravel = ravel_pytree(x)
         jacobian = jax.jacfwd(lambda z: stage_residual(stages, unravel(z))[0])(z)
         jacobian_inverse = jnp.linalg.inv(jacobian)
@@ -313,10 +318,10 @@ class Newton(AbstractStageSolver):
 
 
 class Scale(NamedTuple):
-    """The size of the fibre coordinates of a step, and what adds to their round-off.
+    """The size of the fibre coordinates of a step, and their additional round-off.
 
-    Both are in units of fibre coordinates: the round-off of these is about the unit
-    round-off times the sum of the two.
+    Both are in units of fibre coordinates. The round-off of fibre coordinates is about
+    the unit round-off times the sum of the two.
     """
 
     size: FloatScalar
@@ -325,14 +330,14 @@ class Scale(NamedTuple):
 
 def _iterated(
     stage_solver: AbstractStageSolver,
-    sweep: Callable[[Stages], tuple[Stages, Sizes, Evaluation]],
+    iteration: Callable[[Stages], tuple[Stages, Sizes, Evaluation]],
     x0: Stages,
     scale: Scale,
     skip: Array,
 ) -> Solved[Stages, Evaluation]:
-    """Run the iteration on the stages of a solver, whose own sweep is an argument."""
+    """Repeat the `iteration` of a solver until it ends."""
     return iterate(
-        sweep,
+        iteration,
         x0,
         scale.size,
         max_iterations=stage_solver.max_iterations,
@@ -344,19 +349,19 @@ def _iterated(
 
 
 def starting_values(stages: StageSystem, u: Array, lin: Linearisation) -> Stages:
-    """Compute the stages to first order in h, from acceleration and λ_c at the start.
+    """Compute the stages to first order in h, from u̇ and λ_c at the start.
 
-    The values do not depend on the step before, so that a step is a function of its
-    state alone.
+    The values do not depend on the previous step, so that a step is a function of its
+    state only.
     """
     m, s = stages.num_nonholonomic, stages.method.stages
     push = stages.h * lin.acceleration
     stage_times = jnp.sum(stages.coefficients("a_hat"), axis=1)
     node_times = jnp.sum(stages.node_weights, axis=1)
-    # The unknown ν of the symmetric closure vanishes with h, and starts from zero; all
+    # The unknown ν of the symmetric closure vanishes with h, and starts from zero. All
     # other unknowns of a closure are multipliers.
     free = (jnp.arange(s - 1) >= int(stages.symmetric)).astype(u.dtype)
-    nothing = jnp.zeros((0,), u.dtype)
+    empty = jnp.zeros((0,), u.dtype)
     in_stages = u[None] + jnp.outer(stage_times, push)
     velocity, momentum, kept = in_stages, jnp.zeros((s, 0), u.dtype), stages.kept
     if stages.hamiltonian:
@@ -370,8 +375,8 @@ def starting_values(stages: StageSystem, u: Array, lin: Linearisation) -> Stages
         node_fibre_coordinate=u[None] + jnp.outer(node_times, push),
         closure=jnp.outer(free, lin.multiplier[:m]),
         holonomic=jnp.outer(jnp.ones((s,), u.dtype), lin.multiplier[m:]),
-        end_acceleration=lin.acceleration if stages.symmetric else nothing,
-        end_multiplier=lin.multiplier if stages.symmetric else nothing,
+        end_acceleration=lin.acceleration if stages.symmetric else empty,
+        end_multiplier=lin.multiplier if stages.symmetric else empty,
         impulse=None if kept is None else jnp.zeros_like(kept.sizes),
     )
 
@@ -393,14 +398,18 @@ def fibre_coordinate_scale(
 ) -> Scale:
     """Estimate the size of the fibre coordinates of a step and their round-off.
 
-    The size is that of the coordinates at the starting values x0, plus that of the
-    terms that cancel in them, the forces and reactions over the step. For a system at
-    rest these terms are all there is. Round-off of the positions adds to it, in so far
-    as velocities feel it: through holonomic constraints, whose round-off is divided by
-    h, and through nonholonomic ones, which matters where a coordinate has grown large,
-    as the heading of a car after many turns. With invariants the round-off of these is
-    added, as far as impulses have it. Last comes the measured round-off of the
-    functions of the system.
+    The size is the size of the coordinates at the starting values x0 plus the changes
+    by forces and by reactions over the step, which may cancel. For a system at rest
+    only these changes remain.
+
+    The additional round-off has these parts:
+
+    - The round-off of positions, through the constraints. For holonomic constraints it
+        is divided by h. For nonholonomic constraints it matters if a coordinate has
+        grown large, such as the heading of a car after many turns.
+    - The round-off of invariants, through the impulses that keep them.
+
+    It is at least the measured round-off of the functions of the system.
     """
     h = jnp.abs(stages.h)
     rate = max_norm(lin.acceleration)
@@ -430,10 +439,10 @@ def fibre_coordinate_scale(
 def _kinematic_scale(
     stages: StageSystem, q: PyTree[Array], x0: Stages
 ) -> Float[Array, " m"]:
-    """Estimate how far nonholonomic constraints move if positions move by their size.
+    """Estimate the change of nonholonomic constraints if positions move by their size.
 
-    One direction of the moves is enough for an estimate: to take each number by itself
-    would cost as many derivatives as there are coordinates.
+    One direction of the move is enough for an estimate. Moving each coordinate on its
+    own would need one derivative per coordinate.
     """
     system, t, args = stages.system, stages.t, stages.args
     u = x0.momentum[0] if stages.hamiltonian else x0.velocity[0]
@@ -442,5 +451,5 @@ def _kinematic_scale(
         (q,),
         (uneven_perturbations(q),),
     )[1]
-    # Where a constraint has no finite slope this tells nothing of its round-off.
+    # If a constraint has no finite slope, this says nothing about its round-off.
     return jnp.where(jnp.isfinite(change), jnp.abs(change), 0)

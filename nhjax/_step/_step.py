@@ -1,4 +1,8 @@
-"""One step of a method, its derivative, and the data that steps pass on."""
+"""One step of a method, its derivative, and the data that one step passes to the next.
+
+`step` solves the stage equations and computes the state at the end. `ImplicitStep` is
+the same step as a differentiable function.
+"""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -56,12 +60,12 @@ from ._stage_iteration import Evaluation, unknown_units
 
 
 class StepState(eqx.Module):
-    """The data that is carried from step to step: a state, and what is known there.
+    """The data that one step passes to the next: a state, and its linearisation.
 
-    The compensations are the rounding errors of the running sums q and p. The
+    The compensations are the accumulated rounding errors of the sums q and p. The
     linearisation `lin` gives the Jacobian of the next step and the multiplier λ_c. It
-    belongs to the system and the args with which it was made; `first_step_state` makes
-    one for others.
+    is valid only for the system and the args with which it was computed;
+    `first_step_state` computes a new one.
     """
 
     state: State
@@ -70,16 +74,16 @@ class StepState(eqx.Module):
     lin: Linearisation
 
     def wrapped(self, system: AbstractMechanicalSystem) -> State:
-        """Return the state with the angles of the first turn, with all their digits."""
+        """Return the state with its angles reduced to one turn, at full precision."""
         q, manifold = self.state.q, system.manifold_of(self.state.q)
         return replace(self.state, q=manifold.wrapped(q, self.q_compensation))
 
     def differentiated_in_state(self) -> "StepState":
-        """Return the same data, differentiable with respect to the state alone.
+        """Return the same data, differentiable only with respect to the state.
 
-        The derivatives with respect to the other data are zero: rounding errors have
-        none, and the linearisation serves as a Jacobian, on which the end of a step
-        does not depend.
+        Derivatives with respect to the other data are zero. Rounding errors have no
+        derivatives, and the end of a step does not depend on the approximate Jacobian
+        that the linearisation gives.
         """
         return eqx.tree_at(lambda x: x.state, jax.lax.stop_gradient(self), self.state)
 
@@ -87,9 +91,10 @@ class StepState(eqx.Module):
 class StepArguments(eqx.Module):
     """The arguments of a step with respect to which it can be differentiated.
 
-    Of `step_state` this is the state alone; see `StepState.differentiated_in_state`.
-    Without `invariants` the step keeps none. Without `round_off` the sizes of the
-    unknowns tell how large round-off is.
+    In `step_state` only the state has derivatives; see
+    `StepState.differentiated_in_state`. If `invariants` is None, the step keeps no
+    invariants. If `round_off` is None, round-off is estimated from the sizes of the
+    unknowns.
     """
 
     system: AbstractMechanicalSystem
@@ -102,7 +107,7 @@ class StepArguments(eqx.Module):
 
 
 class StepRecord(eqx.Module):
-    """The data of one step that dense output needs to make its polynomials.
+    """The data of one step from which dense output builds its polynomials.
 
     - `start`: the state at the start of the step.
     - `velocity`, `force`, `multiplier`: the values at the s stages.
@@ -115,12 +120,12 @@ class StepRecord(eqx.Module):
 
 
 class StepOutcome(NamedTuple):
-    """The outcome of a step: the next state or the reason why there is none.
+    """The outcome of a step: the next state, or the reason why it failed.
 
-    - `step_state`: the data to carry to the next step.
+    - `step_state`: the data to pass to the next step.
     - `record`, `stages`: the stages of the step, for dense output and for derivatives.
-    - `result`: whether the step was solved, and otherwise why not.
-    - `num_iterations`: how many iterations the stage solver made.
+    - `result`: whether the step was solved, and otherwise the reason why not.
+    - `num_iterations`: the number of iterations of the stage solver.
     - `residual`: the residual of the stage equations, relative to the momenta.
     - `worst_coordinate`: the index of the coordinate whose equations have the largest
         residual.
@@ -128,9 +133,9 @@ class StepOutcome(NamedTuple):
     - `multiplier_defect`: the distance |Λ^s - λ_c| at the end.
     - `newton`: whether Newton's method took over from simplified Newton.
     - `invariant_error`: the largest error of an invariant at the end, relative to the
-        size of its terms; None if the run keeps none.
-    - `error_ratios`: what tells how large the error of the step is; None for a method
-        with one node.
+        size of its terms; None if the run keeps no invariants.
+    - `error_ratios`: two numbers from which `estimated_error` estimates the error of
+        the step; None for a method with one node.
     """
 
     step_state: StepState
@@ -154,10 +159,10 @@ def first_step_state(
     y0: State,
     args: Args,
 ) -> StepState:
-    """Make the data that the first step starts from, given a consistent state.
+    """Build the data that the first step starts from, given a consistent state.
 
-    With closures that do not carry the multiplier from step to step, the first state
-    already has the continuous multiplier λ_c.
+    If the closure does not carry the multiplier from step to step, the multiplier of
+    the first state is the continuous multiplier λ_c.
     """
     u = system.fibre_coordinate(y0)
     lin = linearise(system, t, y0.q, u, args, may_be_sparse=True)
@@ -176,9 +181,9 @@ def first_step_state(
 class _ContinuousMultiplier(AbstractImplicitFunction[Any, Float[Array, " l"]]):
     """The continuous multiplier λ_c as a function of (system, t, q, u, args).
 
-    Its derivative is zero where the multiplier is not finite. NaN times zero is NaN, so
-    a member that failed would otherwise spoil the derivative of a sum that leaves it
-    out.
+    Its derivative is zero where the multiplier is not finite. Otherwise a member that
+    failed would make the derivative of a sum that leaves it out NaN, because NaN times
+    zero is NaN.
     """
 
     programs: None = None
@@ -209,7 +214,8 @@ def step(
 ) -> StepOutcome:
     """Take one step of size h, from (q_k, p_k, λ_k) to (q_{k+1}, p_{k+1}, λ_{k+1}).
 
-    Where `skip` is true nothing is solved, and the outcome is to be discarded.
+    Where `skip` is true, no iterations are made, and the caller must discard the
+    outcome.
     """
     system, args, step_state = arguments.system, arguments.args, arguments.step_state
     t, h, keeps_invariants = arguments.t, arguments.h, arguments.invariants is not None
@@ -261,7 +267,7 @@ def step(
 
 
 def equations_of_step(arguments: StepArguments, method: AbstractMethod) -> StageSystem:
-    """Make the equations of a step, with those of the invariants that it keeps."""
+    """Build the equations of a step, including the equations of kept invariants."""
     system, t, args = arguments.system, arguments.t, arguments.args
     step_state, invariants = arguments.step_state, arguments.invariants
     y, lin, kept = step_state.wrapped(system), step_state.lin, None
@@ -280,21 +286,20 @@ def end_state(
     last_multiplier: Float[Array, " l"],
     continuous: Callable[[], Float[Array, " l"]],
 ) -> State:
-    """Make the state at the end of a step from its q, u, p and multipliers.
+    """Build the state at the end of a step from its q, u, p and multipliers.
 
     **Arguments:**
 
-    - `q`, `u`, `p`: the configuration, the fibre coordinate and the momentum, however
-        they were summed.
+    - `q`, `u`, `p`: the configuration, the fibre coordinate and the momentum.
     - `last_multiplier`: Λ^s, which the propagated closure carries to the next step.
     - `continuous`: a function without arguments that returns λ_c(q, u). It is called
-        only if the closure reports the continuous multiplier.
+        only if a part of λ_c is needed.
     """
     v = stages.system.velocity(stages.t + stages.h, q, u, stages.args)
     if stages.method.closure != "propagated":
         return State(q, v, p, continuous())
-    # Only nonholonomic multipliers are carried to the next step, which finds the
-    # holonomic ones anew.
+    # Only nonholonomic multipliers are carried to the next step. The next step computes
+    # the holonomic multipliers again.
     m = stages.num_nonholonomic
     multiplier = last_multiplier[:m]
     if stages.num_holonomic:
@@ -305,10 +310,10 @@ def end_state(
 def step_record(
     stages: StageSystem, start: State, x: Stages, forces: StageForces
 ) -> StepRecord:
-    """Make the record of a step.
+    """Build the record of a step.
 
-    Impulses are recorded as a constant force over the step, so that the polynomials of
-    dense output lead from the momentum at its start to that at its end.
+    Impulses are recorded as a constant force over the step. With this force, the
+    polynomial of the momentum in dense output ends at the momentum of the next state.
     """
     force = forces.force
     if stages.kept is not None:
@@ -337,8 +342,8 @@ def _result(
     converged = RESULTS.where(finite, RESULTS.successful, RESULTS.nonfinite_state)
     result = RESULTS.where(solved.converged, converged, failed)
     result = RESULTS.where(is_in_chart, result, RESULTS.left_chart)
-    # A singular M or C at the end of the step is reported now and not in the next step,
-    # because λ_c does not exist there.
+    # If M or C is singular at the end of the step, λ_c does not exist there. Therefore
+    # this step reports it, and not the next step.
     singular = lin.is_singular | (solved.converged & step_state.lin.is_singular)
     return RESULTS.where(singular, RESULTS.singular_stage_matrix, result)
 
@@ -354,7 +359,7 @@ def largest_violation(
 def _invariant_error(
     stages: StageSystem, q: PyTree[Array], u: Float[Array, " n"]
 ) -> FloatScalar | None:
-    """Measure the errors of invariants at the end by the sizes of their terms."""
+    """Compute the largest error of an invariant relative to the size of its terms."""
     if stages.kept is None:
         return None
     invariants, t = stages.kept.invariants, stages.t + stages.h
@@ -372,10 +377,11 @@ def error_ratios(
     """Compare two quadratures of a step, in positions and in fibre coordinates.
 
     The state changes by h Σ b_j (H^j, N⁻¹ n^j), with the velocities H^j and the forces
-    n^j of the stages. A second quadrature, which leaves out the last node, differs from
-    it by the same sum with the weights `method.embedded_difference`. The ratios are
-    those of this difference to the change of the state, in positions, divided by h, and
-    in fibre coordinates; see `estimated_error`.
+    n^j of the stages. A second quadrature leaves out the last node. The difference of
+    the two is the same sum with the weights `method.embedded_difference`. The first
+    ratio divides the difference in positions per h by the change of the state. The
+    second ratio divides the difference in fibre coordinates by it. See
+    `estimated_error`.
 
     **Arguments:**
 
@@ -398,7 +404,8 @@ def error_ratios(
         gained = h * small_einsum("s,sn->n", weights, force)
         return moved, matvec(lin.momentum_inverse, gained)
 
-    # A change that is round-off tells nothing of the error.
+    # The floor is the round-off of u, because a difference of this size says nothing
+    # about the error.
     size = max_norm(u)
     if stages.round_off is not None:
         size = jnp.maximum(size, stages.round_off.size(jnp.abs(h)))
@@ -406,8 +413,9 @@ def error_ratios(
     whole = max_norm(*change(stages.coefficients("b"))) + floor
     moved, gained = change(jnp.asarray(difference, u.dtype))
     if stages.constrained:
-        # The part that violates the constraints is left out, since the step satisfies
-        # them: multipliers of single stages may be wrong where their sum is right.
+        # Multipliers of single stages may be wrong although their sum is right.
+        # Therefore the part of the difference that violates the constraints is left
+        # out; the step satisfies the constraints.
         excess = matvec(lin.compliance_inverse, matvec(lin.jacobian, gained))
         gained = gained - matvec(lin.reaction, excess)
     return relative(jnp.stack([max_norm(moved), max_norm(gained)]), whole)
@@ -418,9 +426,10 @@ def estimated_error(ratios: Float[Array, "2"], method: AbstractMethod) -> FloatS
 
     With s different nodes the `error_ratios` are O(h^{s-1}) in positions and O(h^s) in
     fibre coordinates. The relative error of a step is O(h^p), with the order p of the
-    method. The estimate is the larger of the two ratios, each raised to the power that
-    makes it O(h^p). It tends to one for steps in which nothing is resolved. It grows
-    with the ratios, so that the largest of many steps follows from the largest ratios.
+    method. Each ratio is raised to the power that makes it O(h^p), and the estimate is
+    the larger of the two results. If a step does not resolve the motion, the estimate
+    is about one. The estimate increases with the ratios, so that the largest estimate
+    of many steps follows from the largest ratios.
     """
     nodes = len(np.unique(method.c))
     in_position, in_fibre = ratios
@@ -445,8 +454,7 @@ class ImplicitStep(AbstractImplicitFunction[StepArguments, StepOutcome]):
     and the end of the step follows from x and θ. All derivatives are zero where the
     step failed.
 
-    - `method`, `stage_solver`: as for `step`.
-    - `skip`: where true, nothing is solved, and the outcome is to be discarded.
+    - `method`, `stage_solver`, `skip`: as for `step`.
     """
 
     method: AbstractMethod = eqx.field(static=True)
@@ -525,11 +533,11 @@ def tangent_of_outcome(outcome: StepOutcome, changes: Changes) -> StepOutcome:
 def _end(
     arguments: StepArguments, method: AbstractMethod, x: Stages
 ) -> tuple[State, StepRecord]:
-    """Compute the state at the end of a step and its record, given the stages alone.
+    """Compute the state at the end of a step and its record, given only the stages.
 
-    This is the end of `step` without its compensated sums, whose compensation has no
-    derivative, and with p from the fibre coordinate found at the end; the results agree
-    to round-off.
+    `step` computes the same end up to round-off. Here p follows from the fibre
+    coordinate at the end, and there are no compensated sums, because the compensation
+    has no derivative.
     """
     system, args, start = arguments.system, arguments.args, arguments.step_state.state
     stages = equations_of_step(arguments, method)
@@ -538,8 +546,8 @@ def _end(
     p = system.momentum(t, q, u, args)
 
     def continuous():
-        # With the symmetric closure this multiplier is one of the unknowns of the step,
-        # but of redundant constraints it is not the one of the least norm there.
+        # With the symmetric closure, λ_c is an unknown of the step. But with redundant
+        # constraints, that unknown is not the multiplier of least norm.
         if stages.symmetric and system.constraints != "redundant":
             return x.end_multiplier
         return linearise(system, t, q, u, args, may_be_sparse=True).multiplier
