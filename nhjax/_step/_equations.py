@@ -30,7 +30,7 @@ from .._system import (
     with_frames,
 )
 from ._chart import AbstractChart, chart_of_step
-from ._invariants import ImpulseWeights, moving_part, StartImpulses
+from ._invariants import InvariantCorrection, InvariantsAtStart, moving_part
 from ._redundancy import Redundancy
 from ._round_off import RoundOff
 
@@ -38,7 +38,7 @@ from ._round_off import RoundOff
 T = TypeVar("T")
 
 
-class Stages(eqx.Module):
+class StageUnknowns(eqx.Module):
     """The unknowns of one step: stage velocities, node coordinates and multipliers.
 
     An unknown that the system or the closure of the multiplier does not have is an
@@ -78,11 +78,11 @@ class StageForces(NamedTuple):
     momentum: Float[Array, "s n"]  # Π^i, the scale of the residuals
 
 
-class StageSystem(eqx.Module):
+class StageEquations(eqx.Module):
     """The discrete equations of one step from (q_k, p_k, λ_k).
 
-    These are the four Summaries of the paper in the unknowns of `Stages`, in the chart
-    of the method. Let w^i be the body force at stage i, reactions included, and y^i the
+    These are the four Summaries of the paper, for the `StageUnknowns` in the chart of
+    the method. Let w^i be the body force at stage i, reactions included, and y^i the
     coordinates of the stage. Let n^i = Ad^*_{τ(y^i)⁻¹} w^i, let F^i be the same force
     in the chart, and M the momentum μ_k carried to the origin. The equations are
 
@@ -99,10 +99,11 @@ class StageSystem(eqx.Module):
     - the constant matrices of `method.closure_weights`;
     - the multiplier that a state carries, which is Λ^s for the propagated closure and
         λ_c for the others (`end_state`, `first_step_state`);
-    - two more unknowns and equations if the closure uses λ_c at the end (`symmetric`).
+    - two more unknowns and equations if the closure uses λ_c at the end
+        (`end_multiplier_is_unknown`).
 
     If the run keeps invariants, the momenta receive impulses at both ends of the step;
-    see `ImpulseWeights`.
+    see `InvariantCorrection`.
     """
 
     system: AbstractMechanicalSystem
@@ -114,7 +115,7 @@ class StageSystem(eqx.Module):
     multiplier: Float[Array, " l"]
     args: Args
     redundancy: Redundancy | None = None
-    kept: StartImpulses | None = None
+    invariants: InvariantsAtStart | None = None
     round_off: RoundOff | None = None
 
     @classmethod
@@ -127,13 +128,13 @@ class StageSystem(eqx.Module):
         y: State,
         args: Args,
         lin: Linearisation,
-        kept: StartImpulses | None = None,
+        invariants: InvariantsAtStart | None = None,
         round_off: RoundOff | None = None,
-    ) -> "StageSystem":
+    ) -> "StageEquations":
         """Build the equations of a step of size h from the state y at t."""
         system, q = with_frames(system, y.q)
         given = t, h, q, y.p, y.multiplier, args
-        stages = cls(system, method, *given, kept=kept, round_off=round_off)
+        stages = cls(system, method, *given, invariants=invariants, round_off=round_off)
         if system.constraints != "redundant" or not stages.constrained:
             return stages
         redundancy = Redundancy.at(lin, stages.num_nonholonomic)
@@ -161,7 +162,7 @@ class StageSystem(eqx.Module):
         return self.multiplier.shape[0] > 0
 
     @property
-    def symmetric(self) -> bool:
+    def end_multiplier_is_unknown(self) -> bool:
         """Return whether λ_c at the end of the step is an unknown.
 
         Only the symmetric closure has this unknown.
@@ -181,7 +182,7 @@ class StageSystem(eqx.Module):
         """Return the configuration space."""
         return self.system.manifold_of(self.q)
 
-    def chart(self, x: Stages) -> AbstractChart:
+    def chart(self, x: StageUnknowns) -> AbstractChart:
         """Build the chart in which the step is written."""
         return chart_of_step(
             self.manifold, self.method.chart, self.q, self.increment(x)
@@ -225,17 +226,17 @@ class StageSystem(eqx.Module):
         )
         return self.t + self.h * nodes
 
-    def multipliers(self, x: Stages) -> Float[Array, "s l"]:
+    def multipliers(self, x: StageUnknowns) -> Float[Array, "s l"]:
         """Compute the multipliers Λ^1..Λ^s of all constraints at the stages."""
         change = self.multiplier_change(x)
         if not self.num_nonholonomic:
             return change
         return self._padded("start", self.multiplier) + change
 
-    def multiplier_change(self, dx: Stages) -> Float[Array, "s l"]:
+    def multiplier_change(self, dx: StageUnknowns) -> Float[Array, "s l"]:
         """Compute the part of the multipliers Λ that is linear in the unknowns."""
         change = self.free_multipliers(dx.closure, dx.holonomic)
-        if self.symmetric:
+        if self.end_multiplier_is_unknown:
             change = change + self._padded("end", dx.end_multiplier)
         return change
 
@@ -259,27 +260,27 @@ class StageSystem(eqx.Module):
         part = jnp.outer(self.closure_weights(weights), known)
         return jnp.pad(part, ((0, 0), (0, self.num_holonomic)))
 
-    def increment(self, x: Stages) -> Float[Array, " n"]:
+    def increment(self, x: StageUnknowns) -> Float[Array, " n"]:
         """Compute the increment ξ = h Σ b_j H^j from q_k to q_{k+1}."""
         # The product is h * (b @ H). The rounding errors of precomputed coefficients
         # h b_j would be the same in every step, and add up.
         return self.h * small_einsum("s,sn->n", self.coefficients("b"), x.velocity)
 
 
-def stage_velocities(stages: StageSystem, x: Stages) -> Float[Array, "s n"]:
+def stage_velocities(stages: StageEquations, x: StageUnknowns) -> Float[Array, "s n"]:
     """Compute the chart velocities dτ_y⁻¹ D2H(Q^i, P^i) of a Hamiltonian system."""
-    chart, y = in_stages(stages, x)
+    chart, y = stage_coordinates(stages, x)
     v = jax.vmap(lambda t, q, u: stages.system.velocity(t, q, u, stages.args))(
         stages.stage_times, stage_positions(stages, chart, y), x.momentum
     )
     return chart.chart_velocities(y, v)
 
 
-def stage_forces(stages: StageSystem, x: Stages) -> StageForces:
+def stage_forces(stages: StageEquations, x: StageUnknowns) -> StageForces:
     """Compute the forces n^i, multipliers Λ^i and residuals of the stage momenta."""
     h, a_hat, b = stages.h, stages.coefficients("a_hat"), stages.coefficients("b")
     multiplier = stages.multipliers(x)
-    chart, y = in_stages(stages, x)
+    chart, y = stage_coordinates(stages, x)
     q = stage_positions(stages, chart, y)
     u = x.momentum if stages.hamiltonian else chart.body_velocities(y, x.velocity)
     force, momentum = jax.vmap(
@@ -302,27 +303,27 @@ def stage_forces(stages: StageSystem, x: Stages) -> StageForces:
 
 
 def node_residual(
-    stages: StageSystem, x: Stages, force: Float[Array, "s n"]
+    stages: StageEquations, x: StageUnknowns, force: Float[Array, "s n"]
 ) -> Float[Array, "r n"]:
     """Compute the residuals of the momentum equations at the nodes.
 
     They are p(q^i, u^i) - Ad^*_{τ(y^i)} (M + h Σ a_ij n^j). At the end of the step the
     impulse is subtracted too.
     """
-    chart, y = in_nodes(stages, x)
+    chart, y = node_coordinates(stages, x)
     momentum = jax.vmap(lambda t, q, u: stages.system.momentum(t, q, u, stages.args))(
         stages.node_times, chart.positions(y), x.node_fibre_coordinate
     )
     start = chart.momentum_at_origin(_start_momentum(stages, x))
     gained = stages.h * small_einsum("ij,jn->in", stages.node_weights, force)
     residual = momentum - chart.from_origin(y, start[None] + gained)
-    if stages.kept is None:
+    if stages.invariants is None:
         return residual
     last = residual[-1:] - end_impulse(stages, x)[None]
     return jnp.concatenate([residual[:-1], last])
 
 
-def constraint_values(stages: StageSystem, x: Stages) -> tuple[Array, Array]:
+def constraint_values(stages: StageEquations, x: StageUnknowns) -> tuple[Array, Array]:
     """Compute the values of the nonholonomic and of the holonomic constraints."""
     none = jnp.zeros((0,), stages.p.dtype)
     return (
@@ -331,9 +332,9 @@ def constraint_values(stages: StageSystem, x: Stages) -> tuple[Array, Array]:
     )
 
 
-def node_constraint(stages: StageSystem, x: Stages) -> Float[Array, "r m"]:
+def node_constraint(stages: StageEquations, x: StageUnknowns) -> Float[Array, "r m"]:
     """Compute the nonholonomic constraints Φ(q^i, u^i) at the nodes."""
-    chart, y = in_nodes(stages, x)
+    chart, y = node_coordinates(stages, x)
     values = jax.vmap(
         lambda t, q, u: stages.system.kinematic_constraint(t, q, u, stages.args)
     )(stages.node_times, chart.positions(y), x.node_fibre_coordinate)
@@ -342,12 +343,14 @@ def node_constraint(stages: StageSystem, x: Stages) -> Float[Array, "r m"]:
     return stages.redundancy.reduced(values, stages.h * x.closure, 0)
 
 
-def holonomic_constraint(stages: StageSystem, x: Stages) -> Float[Array, "s k"]:
+def holonomic_constraint(
+    stages: StageEquations, x: StageUnknowns
+) -> Float[Array, "s k"]:
     """Compute Γ(Q^i) / h for i >= 2, and the rate dΓ/dt at the end of the step.
 
     The division by h gives all values the unit of dΓ/dt.
     """
-    chart, y = in_stages(stages, x)
+    chart, y = stage_coordinates(stages, x)
     nodes = chart.positions(y[1:])
     on_positions = jax.vmap(
         lambda t, q: stages.system.position_constraint(t, q, stages.args)
@@ -364,7 +367,7 @@ def holonomic_constraint(stages: StageSystem, x: Stages) -> Float[Array, "s k"]:
 
 
 def end_residual(
-    stages: StageSystem, x: Stages
+    stages: StageEquations, x: StageUnknowns
 ) -> tuple[Float[Array, " n"], Float[Array, " l"]]:
     """Compute the residuals of the equations of motion at the end of the step.
 
@@ -384,19 +387,21 @@ def end_residual(
     return on_momentum, hidden
 
 
-def invariant_errors(stages: StageSystem, x: Stages) -> Float[Array, " k"]:
+def invariant_errors(stages: StageEquations, x: StageUnknowns) -> Float[Array, " k"]:
     """Compute the errors of the invariants at the end of a step."""
-    assert stages.kept is not None
-    return stages.kept.invariants.tangent_error(*_end_point(stages, x))
+    assert stages.invariants is not None
+    return stages.invariants.functions.tangent_error(*_end_point(stages, x))
 
 
-def constraint_jacobian(stages: StageSystem, x: Stages) -> Float[Array, "r l n"]:
+def constraint_jacobian(
+    stages: StageEquations, x: StageUnknowns
+) -> Float[Array, "r l n"]:
     """Compute B = ∂Φ/∂u at the nodes i >= 2, where Φ are all velocity constraints."""
     return _at_nodes(stages, x, jax.jacrev)
 
 
 def sparse_constraint_jacobian(
-    stages: StageSystem, x: Stages, pattern: Pattern
+    stages: StageEquations, x: StageUnknowns, pattern: Pattern
 ) -> SparseMatrix:
     """Compute B = ∂Φ/∂u at the nodes i >= 2 as a sparse matrix of known `pattern`."""
     return _at_nodes(
@@ -407,12 +412,14 @@ def sparse_constraint_jacobian(
 
 
 def _at_nodes(
-    stages: StageSystem, x: Stages, differentiated: Callable[..., Callable[..., T]]
+    stages: StageEquations,
+    x: StageUnknowns,
+    differentiated: Callable[..., Callable[..., T]],
 ) -> T:
     times, u = stages.stage_times[1:], x.node_fibre_coordinate
     if not stages.num_nonholonomic:
         u = jnp.broadcast_to(u, (stages.method.stages - 1, u.shape[1]))
-    chart, y = in_stages(stages, x)
+    chart, y = stage_coordinates(stages, x)
     nodes = chart.positions(y[1:])
     return jax.vmap(
         lambda t, q, u: differentiated(
@@ -421,72 +428,76 @@ def _at_nodes(
     )(times, nodes, u)
 
 
-def start_impulse(stages: StageSystem, x: Stages) -> Float[Array, " n"]:
+def start_impulse(stages: StageEquations, x: StageUnknowns) -> Float[Array, " n"]:
     """Compute the impulse ε ω_k at the start of a step."""
-    assert stages.kept is not None
-    return small_einsum("k,kn->n", x.impulse, stages.kept.covectors)
+    assert stages.invariants is not None
+    return small_einsum("k,kn->n", x.impulse, stages.invariants.covectors)
 
 
-def _start_momentum(stages: StageSystem, x: Stages) -> Float[Array, " n"]:
+def _start_momentum(stages: StageEquations, x: StageUnknowns) -> Float[Array, " n"]:
     """Compute the momentum after the impulse at the start of the step."""
-    return stages.p if stages.kept is None else stages.p + start_impulse(stages, x)
+    return (
+        stages.p if stages.invariants is None else stages.p + start_impulse(stages, x)
+    )
 
 
-def end_impulse(stages: StageSystem, x: Stages) -> Float[Array, " n"]:
+def end_impulse(stages: StageEquations, x: StageUnknowns) -> Float[Array, " n"]:
     """Compute the impulse ε ω_{k+1} at the end of the step."""
     _, covectors = end_slopes(stages, x)
     return small_einsum("k,kn->n", x.impulse, covectors)
 
 
 def end_slopes(
-    stages: StageSystem, x: Stages
+    stages: StageEquations, x: StageUnknowns
 ) -> tuple[Float[Array, "k n"], Float[Array, "k n"]]:
     """Compute ∂I/∂u and ω of the invariants at the end of a step; see `Directions`."""
-    assert stages.kept is not None
-    found = stages.kept.invariants.directions(*_end_point(stages, x))
+    assert stages.invariants is not None
+    found = stages.invariants.functions.directions(*_end_point(stages, x))
     return found.slopes, found.covectors
 
 
-def impulse_weights(stages: StageSystem, x: Stages) -> ImpulseWeights:
+def invariant_correction(
+    stages: StageEquations, x: StageUnknowns
+) -> InvariantCorrection:
     """Linearise the equations for the impulses of a step, near the given stages."""
-    assert stages.kept is not None
+    assert stages.invariants is not None
     slopes, covectors = end_slopes(stages, x)
     moving = moving_part(slopes, x.node_fibre_coordinate[-1])
     given = slopes, covectors, moving, stages.hamiltonian
-    return ImpulseWeights.at(stages.kept, *given)
+    return InvariantCorrection.at(stages.invariants, *given)
 
 
-def _end_point(stages: StageSystem, x: Stages) -> tuple[Any, ...]:
+def _end_point(stages: StageEquations, x: StageUnknowns) -> tuple[Any, ...]:
     """Return (system, t, q, u, args) at the end of the step."""
-    assert stages.kept is not None
-    end = stages.chart(x).advance(*stages.kept.position)
+    assert stages.invariants is not None
+    end = stages.chart(x).advance(*stages.invariants.position)
     q = stages.manifold.wrapped(*end)
     u = x.node_fibre_coordinate[-1]
     return stages.system, stages.t + stages.h, q, u, stages.args
 
 
-def in_chart(stages: StageSystem, x: Stages) -> BoolScalar:
+def is_in_chart(stages: StageEquations, x: StageUnknowns) -> BoolScalar:
     """Return whether the stages and the end lie where the chart is invertible."""
-    chart, y = in_stages(stages, x)
+    chart, y = stage_coordinates(stages, x)
     return chart.in_domain(jnp.concatenate([y, chart.ends[1][None]]))
 
 
-def in_stages(
-    stages: StageSystem, x: Stages
+def stage_coordinates(
+    stages: StageEquations, x: StageUnknowns
 ) -> tuple[AbstractChart, Float[Array, "s n"]]:
     """Return the chart and the coordinates y^i of the stages, from h Σ a_ij H^j."""
-    return _in_chart(stages, x, stages.method.a)
+    return _coordinates(stages, x, stages.method.a)
 
 
-def in_nodes(
-    stages: StageSystem, x: Stages
+def node_coordinates(
+    stages: StageEquations, x: StageUnknowns
 ) -> tuple[AbstractChart, Float[Array, "r n"]]:
     """Return the chart and the coordinates of the nodes of `node_rows`."""
-    return _in_chart(stages, x, stages.node_rows)
+    return _coordinates(stages, x, stages.node_rows)
 
 
-def _in_chart(
-    stages: StageSystem, x: Stages, rows: np.ndarray
+def _coordinates(
+    stages: StageEquations, x: StageUnknowns, rows: np.ndarray
 ) -> tuple[AbstractChart, Float[Array, "r n"]]:
     chart = stages.chart(x)
     start, end = chart.ends
@@ -505,7 +516,7 @@ def _in_chart(
 
 
 def stage_positions(
-    stages: StageSystem, chart: AbstractChart, y: Float[Array, "s n"]
+    stages: StageEquations, chart: AbstractChart, y: Float[Array, "s n"]
 ) -> PyTree[Array]:
     """Compute the positions of the stages. If c_1 = 0, the first one is q_k."""
     if np.any(stages.method.a[0]):
@@ -517,13 +528,13 @@ def stage_positions(
     )
 
 
-def end_position(stages: StageSystem, x: Stages) -> PyTree[Array]:
+def end_position(stages: StageEquations, x: StageUnknowns) -> PyTree[Array]:
     """Compute the configuration q_{k+1} at the end of the step."""
     chart = stages.chart(x)
     return chart.position(chart.ends[1])
 
 
-def nudged(stages: StageSystem, nudge: FloatScalar) -> StageSystem:
+def with_moved_positions(stages: StageEquations, nudge: FloatScalar) -> StageEquations:
     """Return the equations with q_k moved by about `nudge` times its size.
 
     This move changes the solution. The change per `nudge` estimates the change by the

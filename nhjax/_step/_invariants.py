@@ -188,9 +188,10 @@ class Directions(NamedTuple):
     multipliers: Float[Array, "k l"] | None
 
 
-class StartImpulses(eqx.Module):
+class InvariantsAtStart(eqx.Module):
     """The invariants of a step, with their derivatives and sizes at its start.
 
+    - `functions`: the functions, and the values that are kept.
     - `slopes`, `covectors`: ∂I/∂u and ω = ∂I/∂v at the start.
     - `momentum_inverse`: N⁻¹, which maps momenta to fibre coordinates.
     - `row_sums`: Σ_j |K⁻¹_ij|, the diagonal matrix D with |ω·K⁻¹ω| <= ω·Dω.
@@ -202,7 +203,7 @@ class StartImpulses(eqx.Module):
         the invariants are kept at the rounded position at the end of the step.
     """
 
-    invariants: Invariants
+    functions: Invariants
     slopes: Float[Array, "k n"]
     covectors: Float[Array, "k n"]
     momentum_inverse: Matrix
@@ -214,26 +215,24 @@ class StartImpulses(eqx.Module):
     @classmethod
     def at(
         cls,
-        invariants: Invariants,
+        functions: Invariants,
         system: AbstractMechanicalSystem,
         t: FloatScalar,
         y: State,
         position: tuple[PyTree[Array], PyTree[Array]],
         args: Args,
         lin: Linearisation,
-    ) -> "StartImpulses":
+    ) -> "InvariantsAtStart":
         """Evaluate the invariants at the state y, whose linearisation is `lin`."""
         u = system.fibre_coordinate(y)
-        all_slopes = invariants.slopes(system, t, y.q, u, args)
-        sizes = invariants.sizes(system, t, y.q, u, args, all_slopes)
-        slopes, covectors, _ = invariants.directions(
-            system, t, y.q, u, args, all_slopes
-        )
+        all_slopes = functions.slopes(system, t, y.q, u, args)
+        sizes = functions.sizes(system, t, y.q, u, args, all_slopes)
+        slopes, covectors, _ = functions.directions(system, t, y.q, u, args, all_slopes)
         row_sums = jnp.abs(lin.metric_inverse)
         if row_sums.ndim == 2:
             row_sums = jnp.sum(row_sums, axis=1)
         given = slopes, covectors, lin.momentum_inverse, row_sums
-        return cls(invariants, *given, moving_part(slopes, u), sizes, position)
+        return cls(functions, *given, moving_part(slopes, u), sizes, position)
 
 
 def moving_part(slopes: Float[Array, "k n"], u: Float[Array, " n"]) -> Array:
@@ -241,7 +240,7 @@ def moving_part(slopes: Float[Array, "k n"], u: Float[Array, " n"]) -> Array:
     return jnp.sum(jnp.abs(slopes * u[None]), axis=1)
 
 
-class ImpulseWeights(eqx.Module):
+class InvariantCorrection(eqx.Module):
     """The linearised equations for the impulses ε of a step, near its solution.
 
     To leading order, a change of ε changes the invariants at the end by G δε with
@@ -279,43 +278,44 @@ class ImpulseWeights(eqx.Module):
     @classmethod
     def at(
         cls,
-        given: StartImpulses,
+        at_start: InvariantsAtStart,
         slopes: Float[Array, "k n"],
         covectors: Float[Array, "k n"],
         moving: Float[Array, " k"],
         hamiltonian: bool,
-    ) -> "ImpulseWeights":
+    ) -> "InvariantCorrection":
         """Build the equations from the values at the start and at the end of a step."""
         start, end = (
-            matvec(given.momentum_inverse, x) for x in (given.covectors, covectors)
+            matvec(at_start.momentum_inverse, x)
+            for x in (at_start.covectors, covectors)
         )
-        gram = small_einsum("kn,ln->kl", given.slopes, start)
+        gram = small_einsum("kn,ln->kl", at_start.slopes, start)
         gram = gram + small_einsum("kn,ln->kl", slopes, end)
         eps = float(jnp.finfo(gram.dtype).eps)
         one = jnp.eye(gram.shape[0], dtype=gram.dtype)
         g = jnp.sum(gram * one, axis=1)
-        denominator = unit(g**2 + eps * given.sizes**2)
+        denominator = unit(g**2 + eps * at_start.sizes**2)
         errors, a = g / denominator, g**2 / denominator
         matrix = errors[:, None] * gram + (1 - a)[:, None] * one
         # If one function follows from others, the matrix is singular.
         solved = inverse(matrix + eps**0.5 * one)
         # The ratio of the impulses to those of the definite matrix of the row sums, for
         # the same errors. With one function it is Σ (row sum) ω² / |g|.
-        squares = given.covectors**2 + covectors**2
-        roots = jnp.sqrt(jnp.sum(given.row_sums[None] * squares, axis=1))
+        squares = at_start.covectors**2 + covectors**2
+        roots = jnp.sqrt(jnp.sum(at_start.row_sums[None] * squares, axis=1))
         gain = roots[:, None] * solved * (errors * roots)[None]
-        acts = ~(given.invariants.least_part * max_norm(gain) > 1)
+        acts = ~(at_start.functions.least_part * max_norm(gain) > 1)
         pushes = jnp.abs(jnp.concatenate([start, end], axis=1))
-        terms = jnp.abs(given.slopes * start) + jnp.abs(slopes * end)
+        terms = jnp.abs(at_start.slopes * start) + jnp.abs(slopes * end)
         return cls(
             errors=jnp.where(acts, errors, 0),
             rest=jnp.where(acts, 1 - a, 1),
             inverse=jnp.where(acts, solved, one),
-            limits=_LARGEST_PART * (given.moving + moving) / unit(jnp.sum(terms, 1)),
+            limits=_LARGEST_PART * (at_start.moving + moving) / unit(jnp.sum(terms, 1)),
             start=start,
             end=end,
-            velocity=given.slopes if hamiltonian else start,
-            noise=max_norm(given.sizes * errors * jnp.max(pushes, axis=1)),
+            velocity=at_start.slopes if hamiltonian else start,
+            noise=max_norm(at_start.sizes * errors * jnp.max(pushes, axis=1)),
         )
 
     def change(

@@ -89,8 +89,8 @@ def magnifications(method: AbstractMethod) -> tuple[float, float]:
     The change h N⁻¹ R δΛ is larger, by this factor, than the change that would correct
     the error of a single constraint. The factor is the largest Euclidean norm of a row
     of the inverse of R E for nonholonomic constraints, and of (A Â, b) for holonomic
-    constraints; see `StageSystem`. Pseudo-inverses are used, because a method that is
-    not meant for one of the two kinds can have a singular matrix for it.
+    constraints; see `StageEquations`. Pseudo-inverses are used, because a method that
+    is not meant for one of the two kinds can have a singular matrix for it.
 
     **Returns:** the factor for nonholonomic and the factor for holonomic constraints.
     """

@@ -30,7 +30,12 @@ from .._numerics import (
     uneven_perturbations,
 )
 from .._system import all_finite, check_flag, Linearisation, position_scale, real_scalar
-from ._equations import impulse_weights, nudged, Stages, StageSystem
+from ._equations import (
+    invariant_correction,
+    StageEquations,
+    StageUnknowns,
+    with_moved_positions,
+)
 from ._factorisation import leading_structure
 from ._jacobian_choice import JacobianName
 from ._round_off import PART
@@ -46,7 +51,7 @@ from ._stage_iteration import (
 
 # An iteration on the stages of a step. The equations are an argument, so that the
 # iteration can be differentiated with respect to their data.
-FrozenNewtonMap: TypeAlias = Callable[[StageSystem, Stages], Stages]
+FrozenNewtonMap: TypeAlias = Callable[[StageEquations, StageUnknowns], StageUnknowns]
 
 
 # Stages with a larger residual than this, relative to the momenta, are not a solution.
@@ -91,13 +96,13 @@ class AbstractStageSolver(eqx.Module):
 
     @abstractmethod
     def solve(
-        self, stages: StageSystem, x0: Stages, lin: Linearisation, skip: Array
-    ) -> Solved[Stages, Evaluation]:
+        self, stages: StageEquations, x0: StageUnknowns, lin: Linearisation, skip: Array
+    ) -> Solved[StageUnknowns, Evaluation]:
         """Solve the stage equations from `x0`; do nothing where `skip` is true."""
 
     @abstractmethod
     def frozen_newton_map(
-        self, stages: StageSystem, lin: Linearisation, x: Stages
+        self, stages: StageEquations, lin: Linearisation, x: StageUnknowns
     ) -> FrozenNewtonMap:
         """Build an iteration whose fixed points solve the stage equations.
 
@@ -169,13 +174,13 @@ class SimplifiedNewton(AbstractStageSolver):
             check_flag("fallback", self.fallback)
 
     def solve(
-        self, stages: StageSystem, x0: Stages, lin: Linearisation, skip: Array
-    ) -> Solved[Stages, Evaluation]:
+        self, stages: StageEquations, x0: StageUnknowns, lin: Linearisation, skip: Array
+    ) -> Solved[StageUnknowns, Evaluation]:
         """Solve the stage equations from `x0`; do nothing where `skip` is true."""
         structure = leading_structure(stages, x0, lin, self.jacobian)
         scale = fibre_coordinate_scale(stages, x0, lin)
 
-        def iteration(x: Stages):
+        def iteration(x: StageUnknowns):
             x_next, evaluation = corrected(stages, structure, x)
             return x_next, sizes(stages, x, x_next, lin), evaluation
 
@@ -200,7 +205,7 @@ class SimplifiedNewton(AbstractStageSolver):
         return Newton(tolerance=self.tolerance)
 
     def frozen_newton_map(
-        self, stages: StageSystem, lin: Linearisation, x: Stages
+        self, stages: StageEquations, lin: Linearisation, x: StageUnknowns
     ) -> FrozenNewtonMap:
         """Build the iteration of `solve` with constraint Jacobians at the solution.
 
@@ -249,20 +254,20 @@ class Newton(AbstractStageSolver):
     tolerance: FloatScalarLike = eqx.field(converter=tolerance_array, default=0.0)
 
     def solve(
-        self, stages: StageSystem, x0: Stages, lin: Linearisation, skip: Array
-    ) -> Solved[Stages, Evaluation]:
+        self, stages: StageEquations, x0: StageUnknowns, lin: Linearisation, skip: Array
+    ) -> Solved[StageUnknowns, Evaluation]:
         """Solve the stage equations from `x0`; do nothing where `skip` is true."""
         _, unravel = ravel_pytree(x0)
         scale = fibre_coordinate_scale(stages, x0, lin)
 
         eps = float(jnp.finfo(stages.p.dtype).eps)
         nudge = eps**0.5
-        moved = nudged(stages, jnp.asarray(nudge, stages.p.dtype))
+        moved = with_moved_positions(stages, jnp.asarray(nudge, stages.p.dtype))
 
         def residual(z):
             return stage_residual(stages, unravel(z))
 
-        def iteration(x: Stages):
+        def iteration(x: StageUnknowns):
             z, _ = ravel_pytree(x)
             jacobian, r, evaluation = jacobian_and_value(residual, z)
             change = stage_residual(moved, x)[0] - r
@@ -303,14 +308,14 @@ class Newton(AbstractStageSolver):
         )
 
     def frozen_newton_map(
-        self, stages: StageSystem, lin: Linearisation, x: Stages
+        self, stages: StageEquations, lin: Linearisation, x: StageUnknowns
     ) -> FrozenNewtonMap:
         """Build Newton's iteration with the constant Jacobian at the solution."""
         z, unravel = ravel_pytree(x)
         jacobian = jax.jacfwd(lambda z: stage_residual(stages, unravel(z))[0])(z)
         jacobian_inverse = jnp.linalg.inv(jacobian)
 
-        def corrected(stages: StageSystem, x: Stages) -> Stages:
+        def corrected(stages: StageEquations, x: StageUnknowns) -> StageUnknowns:
             residual, _ = stage_residual(stages, x)
             return unravel(ravel_pytree(x)[0] - jacobian_inverse @ residual)
 
@@ -330,11 +335,11 @@ class Scale(NamedTuple):
 
 def _iterated(
     stage_solver: AbstractStageSolver,
-    iteration: Callable[[Stages], tuple[Stages, Sizes, Evaluation]],
-    x0: Stages,
+    iteration: Callable[[StageUnknowns], tuple[StageUnknowns, Sizes, Evaluation]],
+    x0: StageUnknowns,
     scale: Scale,
     skip: Array,
-) -> Solved[Stages, Evaluation]:
+) -> Solved[StageUnknowns, Evaluation]:
     """Repeat the `iteration` of a solver until it ends."""
     return iterate(
         iteration,
@@ -348,40 +353,43 @@ def _iterated(
     )
 
 
-def starting_values(stages: StageSystem, u: Array, lin: Linearisation) -> Stages:
+def starting_values(
+    stages: StageEquations, u: Array, lin: Linearisation
+) -> StageUnknowns:
     """Compute the stages to first order in h, from u̇ and λ_c at the start.
 
     The values do not depend on the previous step, so that a step is a function of its
     state only.
     """
     m, s = stages.num_nonholonomic, stages.method.stages
+    invariants = stages.invariants
     push = stages.h * lin.acceleration
     stage_times = jnp.sum(stages.coefficients("a_hat"), axis=1)
     node_times = jnp.sum(stages.node_weights, axis=1)
     # The unknown ν of the symmetric closure vanishes with h, and starts from zero. All
     # other unknowns of a closure are multipliers.
-    free = (jnp.arange(s - 1) >= int(stages.symmetric)).astype(u.dtype)
+    free = (jnp.arange(s - 1) >= int(stages.end_multiplier_is_unknown)).astype(u.dtype)
     empty = jnp.zeros((0,), u.dtype)
-    in_stages = u[None] + jnp.outer(stage_times, push)
-    velocity, momentum, kept = in_stages, jnp.zeros((s, 0), u.dtype), stages.kept
+    at_stages = u[None] + jnp.outer(stage_times, push)
+    velocity, momentum = at_stages, jnp.zeros((s, 0), u.dtype)
     if stages.hamiltonian:
-        velocity, momentum = (
-            _starting_velocities(stages, u, lin, stage_times),
-            in_stages,
-        )
-    return Stages(
+        velocity = _starting_velocities(stages, u, lin, stage_times)
+        momentum = at_stages
+    return StageUnknowns(
         velocity=velocity,
         momentum=momentum,
         node_fibre_coordinate=u[None] + jnp.outer(node_times, push),
         closure=jnp.outer(free, lin.multiplier[:m]),
         holonomic=jnp.outer(jnp.ones((s,), u.dtype), lin.multiplier[m:]),
-        end_acceleration=lin.acceleration if stages.symmetric else empty,
-        end_multiplier=lin.multiplier if stages.symmetric else empty,
-        impulse=None if kept is None else jnp.zeros_like(kept.sizes),
+        end_acceleration=lin.acceleration
+        if stages.end_multiplier_is_unknown
+        else empty,
+        end_multiplier=lin.multiplier if stages.end_multiplier_is_unknown else empty,
+        impulse=None if invariants is None else jnp.zeros_like(invariants.sizes),
     )
 
 
-def _starting_velocities(stages: StageSystem, u, lin: Linearisation, times) -> Array:
+def _starting_velocities(stages: StageEquations, u, lin: Linearisation, times) -> Array:
     v = stages.system.velocity(stages.t, stages.q, u, stages.args)
     _, rate = jax.jvp(
         lambda t, xi, u: stages.system.velocity(
@@ -394,7 +402,7 @@ def _starting_velocities(stages: StageSystem, u, lin: Linearisation, times) -> A
 
 
 def fibre_coordinate_scale(
-    stages: StageSystem, x0: Stages, lin: Linearisation
+    stages: StageEquations, x0: StageUnknowns, lin: Linearisation
 ) -> Scale:
     """Estimate the size of the fibre coordinates of a step and their round-off.
 
@@ -429,15 +437,15 @@ def fibre_coordinate_scale(
     if m:
         sizes = jnp.pad(_kinematic_scale(stages, q, x0), (0, k))
         round_off = round_off + lin.largest_correction(sizes)
-    if stages.kept is not None:
-        round_off = round_off + impulse_weights(stages, x0).noise
+    if stages.invariants is not None:
+        round_off = round_off + invariant_correction(stages, x0).noise
     if stages.round_off is not None:
         round_off = jnp.maximum(round_off, stages.round_off.size(h))
     return Scale(size, round_off)
 
 
 def _kinematic_scale(
-    stages: StageSystem, q: PyTree[Array], x0: Stages
+    stages: StageEquations, q: PyTree[Array], x0: StageUnknowns
 ) -> Float[Array, " m"]:
     """Estimate the change of nonholonomic constraints if positions move by their size.
 

@@ -46,14 +46,14 @@ from .._system import (
 from ._equations import (
     end_impulse,
     end_position,
-    in_chart,
+    is_in_chart,
     stage_forces,
+    StageEquations,
     StageForces,
-    Stages,
-    StageSystem,
+    StageUnknowns,
     start_impulse,
 )
-from ._invariants import Invariants, StartImpulses
+from ._invariants import Invariants, InvariantsAtStart
 from ._round_off import RoundOff
 from ._solvers import AbstractStageSolver, starting_values
 from ._stage_iteration import Evaluation, unknown_units
@@ -140,7 +140,7 @@ class StepOutcome(NamedTuple):
 
     step_state: StepState
     record: StepRecord
-    stages: Stages
+    stages: StageUnknowns
     result: RESULTS
     num_iterations: Int[Array, ""]
     residual: FloatScalar
@@ -241,12 +241,12 @@ def step(
     end = end_state(stages, at_end, u, p, last, lambda: lin_next.multiplier)
     next_state = StepState(replace(end, q=q), q_compensation, p_compensation, lin_next)
 
-    result = _result(solved, lin, next_state, in_chart(stages, x))
+    result = _result(solved, lin, next_state, is_in_chart(stages, x))
     if stages.redundancy is not None:
         small = float(jnp.finfo(p.dtype).eps) ** 0.5 + 100 * stage_solver.tolerance
         allowed = None if stages.round_off is None else stages.round_off.violations
-        kept = keeps_constraints(system, lin_next, t + h, end, args, small, allowed)
-        lost = (result == RESULTS.successful) & ~kept
+        holds = keeps_constraints(system, lin_next, t + h, end, args, small, allowed)
+        lost = (result == RESULTS.successful) & ~holds
         result = RESULTS.where(lost, RESULTS.lost_constraints, result)
     residual, worst = largest_column(forces.residual, solved.aux.node_residual)
     scale = max_norm(forces.momentum) + max_norm(h * forces.force)
@@ -266,20 +266,24 @@ def step(
     )
 
 
-def equations_of_step(arguments: StepArguments, method: AbstractMethod) -> StageSystem:
+def equations_of_step(
+    arguments: StepArguments, method: AbstractMethod
+) -> StageEquations:
     """Build the equations of a step, including the equations of kept invariants."""
     system, t, args = arguments.system, arguments.t, arguments.args
-    step_state, invariants = arguments.step_state, arguments.invariants
-    y, lin, kept = step_state.wrapped(system), step_state.lin, None
-    if invariants is not None:
+    step_state, invariants = arguments.step_state, None
+    y, lin = step_state.wrapped(system), step_state.lin
+    if arguments.invariants is not None:
         position = step_state.state.q, step_state.q_compensation
-        kept = StartImpulses.at(invariants, system, t, y, position, args, lin)
-    given = t, arguments.h, y, args, lin, kept, arguments.round_off
-    return StageSystem.at(system, method, *given)
+        invariants = InvariantsAtStart.at(
+            arguments.invariants, system, t, y, position, args, lin
+        )
+    given = t, arguments.h, y, args, lin, invariants, arguments.round_off
+    return StageEquations.at(system, method, *given)
 
 
 def end_state(
-    stages: StageSystem,
+    stages: StageEquations,
     q: PyTree[Array],
     u: Float[Array, " n"],
     p: Float[Array, " n"],
@@ -308,7 +312,7 @@ def end_state(
 
 
 def step_record(
-    stages: StageSystem, start: State, x: Stages, forces: StageForces
+    stages: StageEquations, start: State, x: StageUnknowns, forces: StageForces
 ) -> StepRecord:
     """Build the record of a step.
 
@@ -316,7 +320,7 @@ def step_record(
     polynomial of the momentum in dense output ends at the momentum of the next state.
     """
     force = forces.force
-    if stages.kept is not None:
+    if stages.invariants is not None:
         chart = stages.chart(x)
         y = chart.ends[1][None]
         impulse = chart.momentum_at_origin(start_impulse(stages, x))
@@ -326,7 +330,7 @@ def step_record(
 
 
 def _result(
-    solved: Solved[Stages, Evaluation],
+    solved: Solved[StageUnknowns, Evaluation],
     lin: Linearisation,
     step_state: StepState,
     is_in_chart: BoolScalar,
@@ -357,19 +361,19 @@ def largest_violation(
 
 
 def _invariant_error(
-    stages: StageSystem, q: PyTree[Array], u: Float[Array, " n"]
+    stages: StageEquations, q: PyTree[Array], u: Float[Array, " n"]
 ) -> FloatScalar | None:
     """Compute the largest error of an invariant relative to the size of its terms."""
-    if stages.kept is None:
+    if stages.invariants is None:
         return None
-    invariants, t = stages.kept.invariants, stages.t + stages.h
-    error = invariants.error(stages.system, t, q, u, stages.args)
-    return max_norm(relative(error, stages.kept.sizes))
+    functions, t = stages.invariants.functions, stages.t + stages.h
+    error = functions.error(stages.system, t, q, u, stages.args)
+    return max_norm(relative(error, stages.invariants.sizes))
 
 
 def error_ratios(
-    stages: StageSystem,
-    x: Stages,
+    stages: StageEquations,
+    x: StageUnknowns,
     force: Float[Array, "s n"],
     u: Float[Array, " n"],
     lin: Linearisation,
@@ -439,7 +443,7 @@ def estimated_error(ratios: Float[Array, "2"], method: AbstractMethod) -> FloatS
     )
 
 
-Changes: TypeAlias = tuple[Stages, State, StepRecord]
+Changes: TypeAlias = tuple[StageUnknowns, State, StepRecord]
 
 
 class ImplicitStep(AbstractImplicitFunction[StepArguments, StepOutcome]):
@@ -481,9 +485,9 @@ class ImplicitStep(AbstractImplicitFunction[StepArguments, StepOutcome]):
         self,
         arguments: StepArguments,
         fixed: StepArguments,
-        x: Stages,
+        x: StageUnknowns,
         ok: BoolScalar,
-    ) -> Callable[[StepArguments, Stages, StepArguments], Changes]:
+    ) -> Callable[[StepArguments, StageUnknowns, StepArguments], Changes]:
         """Return the function (perturbed, x, rates) -> the changes of a solved step.
 
         The `perturbed` part of the arguments changes at `rates`, and the other part is
@@ -531,7 +535,7 @@ def tangent_of_outcome(outcome: StepOutcome, changes: Changes) -> StepOutcome:
 
 
 def _end(
-    arguments: StepArguments, method: AbstractMethod, x: Stages
+    arguments: StepArguments, method: AbstractMethod, x: StageUnknowns
 ) -> tuple[State, StepRecord]:
     """Compute the state at the end of a step and its record, given only the stages.
 
@@ -548,7 +552,7 @@ def _end(
     def continuous():
         # With the symmetric closure, λ_c is an unknown of the step. But with redundant
         # constraints, that unknown is not the multiplier of least norm.
-        if stages.symmetric and system.constraints != "redundant":
+        if stages.end_multiplier_is_unknown and system.constraints != "redundant":
             return x.end_multiplier
         return linearise(system, t, q, u, args, may_be_sparse=True).multiplier
 

@@ -15,7 +15,7 @@ from nhjax._step._equations import (
     node_residual,
     stage_forces,
     stage_velocities,
-    StageSystem,
+    StageEquations,
 )
 from nhjax._step._solvers import starting_values
 from oracles.forms import (
@@ -105,7 +105,7 @@ def one_step(system, method, y0):
     def run(y0):
         t, h = jnp.zeros(()), jnp.asarray(STEP)
         lin = first_step_state(system, method, t, y0, None).lin
-        stages = StageSystem(system, method, t, h, y0.q, y0.p, lin.multiplier, None)
+        stages = StageEquations(system, method, t, h, y0.q, y0.p, lin.multiplier, None)
         x0 = starting_values(stages, system.fibre_coordinate(y0), lin)
         solver = nhjax.SimplifiedNewton()
         solved = solver.solve(stages, x0, lin, jnp.asarray(False)).x

@@ -343,7 +343,8 @@ class EventStepper(AbstractStepper[EventCarry, ReplayedIteration]):
         start = carry.step_state.differentiated_in_state()
         given = plain.args, plain.invariants, plain.round_off
         arguments = StepArguments(plain.system, t, h, start, *given)
-        step = ImplicitTruncatedStep(
+        # The type checker takes the property `programs` for a field.
+        step = ImplicitTruncatedStep(  # pyright: ignore[reportCallIssue]
             step=ImplicitStep(
                 method=plain.method,
                 stage_solver=plain.stage_solver,
