@@ -451,7 +451,7 @@ def step_back(
     # that moves y.
     target = step_state.state
     manifold = stepper.system.manifold_of(target.q)
-    propagated = stepper.method.closure == "propagated"
+    propagated = stepper.method.carries_multiplier
 
     def move(z: State):
         y = back_from(eqx.tree_at(lambda x: x.state, step_state, z))
