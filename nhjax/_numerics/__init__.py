@@ -19,14 +19,14 @@ from ._implicit import (
     AbstractImplicitFunction as AbstractImplicitFunction,
     ClosureConverted as ClosureConverted,
     fixed_point_tangent as fixed_point_tangent,
-    frozen as frozen,
     has_tangent as has_tangent,
-    moving_with as moving_with,
     nan_gradient_unless as nan_gradient_unless,
     nan_tangent_unless as nan_tangent_unless,
     nan_unless as nan_unless,
     root as root,
+    stop_gradient as stop_gradient,
     tree_where as tree_where,
+    with_zero_tangents as with_zero_tangents,
     zero_unless as zero_unless,
 )
 from ._index_sets import dependence as dependence

@@ -297,7 +297,7 @@ def has_tangent(tangents: PyTree[Any]) -> PyTree[bool]:
     )
 
 
-def moving_with(tree: X, parameters: PyTree[Any]) -> X:
+def with_zero_tangents(tree: X, parameters: PyTree[Any]) -> X:
     """Return the same tree, with tangents of zeros if any parameter has a tangent.
 
     JAX traces the body of a loop again if a part of the carry has no tangent at first,
@@ -336,7 +336,7 @@ def _with_zero_tangents_jvp(primals, tangents):
     ]
 
 
-def frozen(tree: T) -> T:
+def stop_gradient(tree: T) -> T:
     """Stop derivatives through the arrays of a tree, and keep its other leaves.
 
     `jax.lax.stop_gradient` refuses leaves that are not arrays.

@@ -9,7 +9,7 @@ from jaxtyping import Array, Float
 
 from .._custom_types import FloatScalar
 from .._method import AbstractMethod
-from .._numerics import absolute, frozen, matvec, max_norm
+from .._numerics import absolute, matvec, max_norm, stop_gradient
 from .._system import FunctionNoise, Linearisation
 
 
@@ -62,7 +62,7 @@ def round_off_of_steps(
     `lin` is the linearisation at the state of the noise. The inverse of the matrix of
     the method's coefficients magnifies the round-off of constraints.
     """
-    lin = frozen(lin)
+    lin = stop_gradient(lin)
     inverse = absolute(lin.momentum_inverse)
     by_velocity, by_force = (
         max_norm(matvec(inverse, x)) for x in (noise.momentum, noise.force)

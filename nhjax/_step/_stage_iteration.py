@@ -10,7 +10,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
 from .._custom_types import BoolScalar, FloatScalar
-from .._numerics import frozen, matvec, max_norm, Sizes, unit
+from .._numerics import matvec, max_norm, Sizes, stop_gradient, unit
 from .._system import Linearisation
 from ._equations import (
     constraint_values,
@@ -119,7 +119,7 @@ def stage_residual(
         parts += end_residual(stages, x)
     if stages.invariants is not None:
         # The same equation as that of simplified Newton.
-        weights = frozen(invariant_correction(stages, x))
+        weights = stop_gradient(invariant_correction(stages, x))
         parts.append(-weights.change(x.impulse, invariant_errors(stages, x)))
     return (
         ravel_pytree(parts)[0],

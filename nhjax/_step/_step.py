@@ -22,7 +22,6 @@ from .._numerics import (
     AbstractImplicitFunction,
     ClosureConverted,
     fixed_point_tangent,
-    frozen,
     has_tangent,
     largest_column,
     matvec,
@@ -31,6 +30,7 @@ from .._numerics import (
     relative,
     small_einsum,
     Solved,
+    stop_gradient,
     two_sum,
     zero_unless,
 )
@@ -169,12 +169,12 @@ def first_step_state(
     multiplier = _ContinuousMultiplier()(
         (system, t, y0.q, system.fibre_coordinate(y0), args)
     )
-    carried = method.closure == "propagated"
+    carried = method.carries_multiplier
     return StepState(
         state=State(y0.q, y0.v, y0.p, y0.multiplier if carried else multiplier),
         q_compensation=system.manifold_of(y0.q).no_compensation(y0.q),
         p_compensation=jnp.zeros_like(y0.p),
-        lin=frozen(lin),
+        lin=stop_gradient(lin),
     )
 
 
@@ -300,7 +300,7 @@ def end_state(
         only if a part of λ_c is needed.
     """
     v = stages.system.velocity(stages.t + stages.h, q, u, stages.args)
-    if stages.method.closure != "propagated":
+    if not stages.method.carries_multiplier:
         return State(q, v, p, continuous())
     # Only nonholonomic multipliers are carried to the next step. The next step computes
     # the holonomic multipliers again.
@@ -495,7 +495,7 @@ class ImplicitStep(AbstractImplicitFunction[StepArguments, StepOutcome]):
         end and of the record of the step. They are zero unless the step is `ok`.
         """
         stages = equations_of_step(arguments, self.method)
-        at, lin, solved = frozen((stages, arguments.step_state.lin, x))
+        at, lin, solved = stop_gradient((stages, arguments.step_state.lin, x))
         frozen_newton_map = self.stage_solver.frozen_newton_map(at, lin, solved)
         # The solver started from a good guess. This iteration starts from zero, so it
         # may take twice as many iterations.
