@@ -63,7 +63,7 @@ def contraction(example, method, h):
     ],
     ids=lambda x: x if isinstance(x, str) else type(x).__name__,
 )
-def test_a_sweep_contracts_by_the_square_of_the_step(example, chart):
+def test_first_order_iteration_contracts_by_the_square_of_the_step(example, chart):
     method = nhjax.LobattoIIIAB(3, chart=chart)
     (leading, full), (leading_half, full_half) = contraction(example, method, 0.02)
     # The leading part alone leaves out terms of order h, and shows it.
@@ -85,7 +85,7 @@ def run(example, stages, dt, **solver):
     )(example.initial_state())
 
 
-def test_large_steps_of_a_sleigh_are_solved_that_the_leading_part_does_not_solve():
+def test_first_order_terms_in_large_steps_of_sleigh_solve_what_leading_part_does_not():
     sleigh = systems.ChaplyginSleigh()
     leading = run(sleigh, 5, 0.5, jacobian="leading")
     assert leading.result == nhjax.RESULTS.nonlinear_max_iterations
@@ -105,7 +105,7 @@ def test_large_steps_of_a_sleigh_are_solved_that_the_leading_part_does_not_solve
         np.testing.assert_allclose(one, other, rtol=0, atol=1e-12, err_msg=name)
 
 
-def test_where_the_mass_is_constant_and_forces_do_not_depend_on_v_nothing_is_added():
+def test_first_order_terms_that_vanish_are_left_out():
     particle = systems.NonholonomicParticle()
     default, leading = (
         jax.make_jaxpr(
@@ -159,7 +159,7 @@ def from_outside(v):
     ],
     ids=["reverse mode", "callback", "drag at rest", "steep friction"],
 )
-def test_forces_need_no_finite_slopes(force, like):
+def test_first_order_terms_with_forces_of_infinite_slope_solve_steps(force, like):
     def fall(force, solver):
         system = nhjax.LagrangianSystem(
             lambda t, q, v, args: 0.5 * v @ v - q[0],
@@ -180,7 +180,7 @@ def test_forces_need_no_finite_slopes(force, like):
     np.testing.assert_allclose(sol.ys.v, leading.ys.v, rtol=0, atol=1e-13)
 
 
-def test_terms_that_are_not_available_are_refused():
+def test_first_order_terms_that_are_not_available_raise():
     wrong: Any = "exact"
     with pytest.raises(ValueError, match="jacobian must be one of 'leading'"):
         nhjax.SimplifiedNewton(jacobian=wrong)

@@ -51,7 +51,9 @@ from oracles.long import long
         (in_rotation, "nonholonomic", True, 3),
     ],
 )
-def test_both_forms_take_the_same_steps(build, constraint, in_time, stages):
+def test_steps_of_lagrangian_and_hamiltonian_form_are_equal(
+    build, constraint, in_time, stages
+):
     start = build(constraint, in_time)
     runs = [
         nhjax.integrate(
@@ -160,7 +162,7 @@ def form_defect(start, form, method, tangent=None):
     ],
     ids=str,
 )
-def test_steps_in_space_are_symplectic(method, form):
+def test_steps_on_vector_space_are_symplectic(method, form):
     assert form_defect(in_space(), form, method) <= 1e-12
 
 

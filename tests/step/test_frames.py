@@ -81,7 +81,9 @@ def body(form, retraction):
         long("hamiltonian", "cayley", "middle"),
     ],
 )
-def test_equations_of_a_step_are_the_same_with_frames(form, retraction, chart):
+def test_step_equations_with_frames_are_those_of_plain_positions(
+    form, retraction, chart
+):
     system, y0 = body(form, retraction)
     method, t = nhjax.LobattoIIIAB(3, chart=chart), jnp.asarray(0.0)
     given = first_step_state(system, method, t, y0, None)
@@ -122,7 +124,7 @@ class WithAMomentum(nhjax.LagrangianSystem):
 
 
 @pytest.mark.parametrize("own", ["group", "system"])
-def test_subclasses_of_a_user_are_given_positions_alone(own):
+def test_system_functions_of_a_subclass_with_frames_receive_plain_positions(own):
     kind = WithAMomentum if own == "system" else nhjax.LagrangianSystem
 
     def run(kind, group):

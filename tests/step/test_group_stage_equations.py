@@ -184,7 +184,7 @@ def closure_defects(case, taken):
 
 
 @over(CASES)
-def test_every_equation_of_the_paper_holds_to_round_off(case):
+def test_equations_of_the_paper_on_groups_hold_to_round_off(case):
     for taken in steps_of(case):
         holonomic = taken.stages.holonomic.size > 0
         tolerance = HOLONOMIC_TOLERANCE if holonomic else TOLERANCE
@@ -193,7 +193,7 @@ def test_every_equation_of_the_paper_holds_to_round_off(case):
 
 
 @over(WITH_CLOSURE)
-def test_multipliers_obey_their_closure(case):
+def test_multipliers_of_group_steps_obey_their_closure(case):
     for taken in steps_of(case):
         size = np.max(np.abs(taken.multiplier))
         for relation, defect in closure_defects(case, taken).items():
@@ -202,7 +202,7 @@ def test_multipliers_obey_their_closure(case):
 
 
 @over(CASES)
-def test_fibre_coordinates_belong_together(case):
+def test_velocity_and_momentum_of_group_steps_obey_legendre_transform(case):
     mechanics = case.problem.mechanics
     for taken in steps_of(case):
         elements, momenta = at_nodes(case, taken)
@@ -223,7 +223,7 @@ def test_fibre_coordinates_belong_together(case):
         np.testing.assert_allclose(known, fibre[-len(known) :], rtol=0, atol=atol)
 
 
-def test_every_pair_of_choices_is_tested():
+def test_cases_of_group_steps_contain_every_pair_of_choices():
     choices = {
         "name": BUILDERS,
         "form": FORMS,
@@ -250,14 +250,14 @@ FULL = [
 
 @over(FULL)
 @pytest.mark.parametrize("array", ["H", "Lambda", "Lambda_hol", "g_next", "mu_next"])
-def test_the_residuals_see_an_error_in_each_array(case, array):
+def test_group_residuals_of_a_record_with_an_error_are_above_round_off(case, array):
     g, mu, stages = on_paper(case, steps_of(case)[-1])
     wrong = stages.perturbed(array, 1e-10)
     assert max(residuals(case, g, mu, wrong).values()) > 1e-13
 
 
 @over(FULL)
-def test_the_residuals_see_an_error_in_the_fibre_coordinates_and_at_the_start(case):
+def test_group_residuals_of_a_state_with_an_error_are_above_round_off(case):
     g, mu, stages = on_paper(case, steps_of(case)[-1])
     own = "eta_nodes" if case.form == "lagrangian" else "Pi"
     wrong = stages.perturbed(own, 1e-10)
@@ -268,7 +268,7 @@ def test_the_residuals_see_an_error_in_the_fibre_coordinates_and_at_the_start(ca
 
 
 @over([case for case in CASES if case.name == "Suslov"])
-def test_the_residuals_tell_the_retractions_apart(case):
+def test_group_residuals_with_another_retraction_are_above_round_off(case):
     [other] = set(RETRACTIONS) - {case.retraction}
     found = residuals(
         case._replace(retraction=other), *on_paper(case, steps_of(case)[-1])
@@ -277,14 +277,14 @@ def test_the_residuals_tell_the_retractions_apart(case):
 
 
 @over([case for case in CASES if case.name in ("Suslov", "anisotropic")])
-def test_the_residuals_tell_the_charts_apart(case):
+def test_group_residuals_with_another_chart_are_above_round_off(case):
     [other] = set(CHARTS) - {case.chart}
     found = residuals(case._replace(chart=other), *on_paper(case, steps_of(case)[-1]))
     assert max(found.values()) > 1e-6
 
 
 @over([case for case in WITH_CLOSURE if case.name in ("Suslov", "varying mass")])
-def test_the_defects_tell_the_closures_apart(case):
+def test_multiplier_defects_with_another_closure_are_above_round_off(case):
     taken = steps_of(case)[-1]
     for claimed in CLOSURES:
         found = closure_defects(case._replace(closure=claimed), taken)
