@@ -1,4 +1,4 @@
-"""A step is accepted if its equations are solved, and not because it took long."""
+"""A step is accepted only if its equations are solved."""
 
 import warnings
 from functools import cache
@@ -31,7 +31,7 @@ def double_pendulum():
     system = nhjax.LagrangianSystem(
         lambda t, q, v, args: 0.5 * v @ v - 9.81 * (q[1] + q[3]), holonomic=rods
     )
-    # It may be needed first where a run is traced.
+    # The first use may be inside a traced run.
     with jax.ensure_compile_time_eval():
         start = jnp.array([0.6, -0.8, 1.2, -1.6])
         return system, nhjax.initial_state(system, start, jnp.zeros(4))
@@ -92,7 +92,7 @@ def test_message_of_unsolved_step_under_jit_names_the_fallback():
 
 @pytest.mark.parametrize("solver", [nhjax.SimplifiedNewton(), nhjax.Newton()])
 def test_message_of_step_unsolved_by_newton_does_not_recommend_newton(solver):
-    # Friction that jumps: there is no solution in the step in which the body stops.
+    # With friction that jumps, the step in which the body stops has no solution.
     system = nhjax.LagrangianSystem(
         lambda t, q, v, args: 0.5 * v @ v, force=lambda t, q, v, args: -jnp.sign(v)
     )
@@ -202,7 +202,7 @@ def test_accepted_steps_of_growing_size_are_solved(name, stages):
         assert figures[f"{solver} accepted"] > 100
         assert figures[f"{solver} residual"] <= ALLOWED
         assert figures[f"{solver} violation"] <= ALLOWED
-    # The search goes up to failure.
+    # The search continues until steps fail.
     assert figures["simplified accepted"] < 200
     assert figures["distance"] <= SAME
 

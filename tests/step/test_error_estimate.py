@@ -17,7 +17,7 @@ def particle(potential):
     return nhjax.LagrangianSystem(lambda t, q, v, args: 0.5 * v @ v - potential(q))
 
 
-# A pendulum in a wind, far from rest, so that nothing in a step is symmetric.
+# A pendulum in wind, far from rest, so that a step has no symmetry.
 PENDULUM = particle(lambda q: -jnp.cos(q[0]) + 0.3 * q[0])
 KNIFE = nhjax.LagrangianSystem(
     lambda t, q, v, args: 0.5 * (v[0] ** 2 + v[1] ** 2) + 0.3 * v[2] ** 2 - 2.0 * q[0],
@@ -48,7 +48,7 @@ def start_of(name):
 
 @functools.cache
 def states_of(name):
-    """States along a motion, as the lanes of a batch."""
+    """Return states along a motion, as a batch."""
     system, y0 = start_of(name)
     saveat = nhjax.SaveAt(steps=True)
     return nhjax.integrate(
@@ -87,7 +87,7 @@ def test_error_estimate_of_step_is_near_true_error_and_of_its_order(name, stages
         estimate, error = estimated_and_true(name, LobattoIIIAB(stages), h)
         assert 0.1 < float(jnp.median(estimate / error)) < 30
         largest.append(float(jnp.max(estimate)))
-    # Where motions turn back, a step of an odd number of stages resolves less.
+    # Near turning points, a step with an odd number of stages is less accurate.
     lost = 1.5 if (name, stages) == ("pendulum", 3) else 0.3
     order = np.log2(largest[1] / largest[0])
     assert 2 * stages - 2 - lost < order < 2 * stages - 2 + 0.3
@@ -115,7 +115,7 @@ def test_error_estimate_of_hamiltonian_system_equals_lagrangian_one():
     for system, y0 in starts:
         sol = nhjax.integrate(system, LobattoIIIAB(3), y0, dt=0.3, num_steps=1)
         estimates.append(float(sol.stats["max_error_estimate"]))
-    # The one counts velocities and the other momenta, with a mass of 3.
+    # One estimate uses velocities and the other momenta, with a mass of 3.
     assert 0.1 < estimates[0] / estimates[1] < 10
 
 

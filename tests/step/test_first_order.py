@@ -1,4 +1,4 @@
-"""Terms of order h in the Jacobian of simplified Newton: what they are, and do."""
+"""Terms of order h in the Jacobian of simplified Newton, and their effect."""
 
 from typing import Any
 
@@ -20,10 +20,10 @@ from oracles.long import long
 
 
 def contraction(example, method, h):
-    """The spectral radius of one sweep at the solution, with and without the terms.
+    """Return the spectral radius of an iteration, with and without the terms.
 
-    The derivative of the whole sweep by the unknowns is taken by automatic
-    differentiation, which knows nothing of how the terms were found.
+    Automatic differentiation computes the derivative of the whole iteration with
+    respect to the unknowns, independently of the formulas of the terms.
     """
     system, y0, t = example.system, example.initial_state(), jnp.zeros(())
 
@@ -66,7 +66,7 @@ def contraction(example, method, h):
 def test_first_order_iteration_contracts_by_the_square_of_the_step(example, chart):
     method = nhjax.LobattoIIIAB(3, chart=chart)
     (leading, full), (leading_half, full_half) = contraction(example, method, 0.02)
-    # The leading part alone leaves out terms of order h, and shows it.
+    # The leading part leaves out the terms of order h, so it contracts by O(h).
     assert 1.8 < leading / leading_half < 2.2
     assert 3.6 < full / full_half < 4.4
 
@@ -131,7 +131,7 @@ def test_first_order_terms_that_vanish_are_left_out():
 
 @jax.custom_vjp
 def in_reverse_mode_alone(v):
-    """A force of v with a rule of derivatives for reverse mode alone."""
+    """A force of v with a derivative rule only for reverse mode."""
     return -0.1 * v
 
 
@@ -141,7 +141,7 @@ in_reverse_mode_alone.defvjp(
 
 
 def from_outside(v):
-    """The same force, computed outside of JAX."""
+    """The same force, computed in a callback outside of JAX."""
     shape = jax.ShapeDtypeStruct(v.shape, v.dtype)
     return jax.pure_callback(
         lambda v: -0.1 * np.asarray(v), shape, v, vmap_method="expand_dims"

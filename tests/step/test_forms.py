@@ -69,7 +69,7 @@ def test_steps_of_lagrangian_and_hamiltonian_form_are_equal(
     for name in ("q", "v", "p", "multiplier"):
         one, other = (getattr(run, name) for run in runs)
         np.testing.assert_allclose(one, other, rtol=0, atol=1e-12, err_msg=name)
-    # A multiplier is there, and something happens.
+    # The run has a multiplier that is not zero, and the state changes.
     assert np.all(np.ptp(runs[0].multiplier, axis=0) > 1e-3)
     assert np.ptp(runs[0].p, axis=0).max() > 1e-2
 

@@ -104,7 +104,7 @@ def test_step_equations_with_frames_are_those_of_plain_positions(
 
 
 class TurnsByHand(nhjax.SE2):
-    """A group of a user, whose methods know elements of three numbers alone."""
+    """A user's group, whose methods accept only elements of three numbers."""
 
     def act(self, g, xi):
         return self.compose(g, self.retract(xi))
@@ -117,7 +117,7 @@ class TurnsByHand(nhjax.SE2):
 
 
 class WithAMomentum(nhjax.LagrangianSystem):
-    """A system of a user, with a method that reads a position."""
+    """A user's system, with a method that reads a position."""
 
     def momentum(self, t, q, u, args=None):
         return u * (1 + 0 * q[2])

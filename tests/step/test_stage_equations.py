@@ -64,7 +64,7 @@ def run_of(sol, h=helpers.RECORDED_STEP):
 
 
 def part_of(run, name):
-    """One of the systems side by side."""
+    """Return the part of a run that belongs to one of the systems side by side."""
     sizes = [SIZES.get(part, 3) for part in SIDE_BY_SIDE]
     k = SIDE_BY_SIDE.index(name)
     at = slice(sum(sizes[:k]), sum(sizes[: k + 1]))

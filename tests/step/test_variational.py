@@ -81,7 +81,7 @@ def test_steps_of_heavy_top_keep_vertical_angular_momentum(form, retraction, cha
 @both_ways
 def test_steps_of_free_planar_body_keep_momenta(form, retraction, chart):
     group = nhjax.SE2(RETRACTIONS[retraction])
-    # So slow that the angle θ, and with it R(θ), has enough digits to the end.
+    # The motion is so slow that θ and R(θ) are accurate enough until the end.
     q, v = np.array([0.3, -0.2, 0.4]), np.array([0.05, 0.02, 0.3])
 
     def momentum(q, p):
@@ -93,7 +93,7 @@ def test_steps_of_free_planar_body_keep_momenta(form, retraction, chart):
 
     start = Start(free_forms(group, INERTIA), q, v)
     assert_conserved(start, form, momentum, chart)
-    # Known to the arm times the round-off of the linear one.
+    # Its round-off is the arm times the round-off of the linear momentum.
     about_origin = momenta_along(start, form, angular_momentum, chart)
     assert np.max(np.abs(about_origin - about_origin[0])) <= 1e-13
 
