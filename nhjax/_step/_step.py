@@ -166,12 +166,11 @@ def first_step_state(
     """
     u = system.fibre_coordinate(y0)
     lin = linearise(system, t, y0.q, u, args, may_be_sparse=True)
-    multiplier = _ContinuousMultiplier()(
-        (system, t, y0.q, system.fibre_coordinate(y0), args)
-    )
-    carried = method.carries_multiplier
+    multiplier = y0.multiplier
+    if not method.carries_multiplier:
+        multiplier = _ContinuousMultiplier()((system, t, y0.q, u, args))
     return StepState(
-        state=State(y0.q, y0.v, y0.p, y0.multiplier if carried else multiplier),
+        state=State(y0.q, y0.v, y0.p, multiplier),
         q_compensation=system.manifold_of(y0.q).no_compensation(y0.q),
         p_compensation=jnp.zeros_like(y0.p),
         lin=stop_gradient(lin),
