@@ -11,6 +11,7 @@ from jaxtyping import Array, Float, PyTree
 
 from .._custom_types import BoolScalar, FloatScalar
 from .._numerics import (
+    DenseMatrix,
     frozen,
     inverse,
     least_norm_inverse,
@@ -104,7 +105,7 @@ def project_fibre_coordinate(system, t, q, u, args, kept: Kept, given: Vector):
         return system.constraint(t, q, w, args)
 
     def sizes(jacobian):
-        return max_norm(u), velocity_scale(system, jacobian, t, q, u, args)
+        return max_norm(u), velocity_scale(system, DenseMatrix(jacobian), t, q, u, args)
 
     metric = system.metric(t, q, u, args)
     is_redundant = system.constraints == "redundant"

@@ -1,20 +1,7 @@
 """The numerical building blocks without mechanics: products, norms, iterations."""
 
-from ._block_tridiagonal import (
-    block_tridiagonal_inverse as block_tridiagonal_inverse,
-    BlockTridiagonalInverse as BlockTridiagonalInverse,
-    couplings as couplings,
-)
 from ._compensated import two_sum as two_sum
-from ._contraction import (
-    absolute as absolute,
-    AbstractLinearMap as AbstractLinearMap,
-    inverse as inverse,
-    Matrix as Matrix,
-    matvec as matvec,
-    small_einsum as small_einsum,
-)
-from ._diagonal import full_jacobian as full_jacobian, jacobian as jacobian
+from ._contraction import inverse as inverse, small_einsum as small_einsum
 from ._implicit import (
     ClosureConverted as ClosureConverted,
     frozen as frozen,
@@ -56,20 +43,31 @@ from ._noise import (
     measured_noise as measured_noise,
     NOISE_DEVIATIONS as NOISE_DEVIATIONS,
 )
+from ._operators import (
+    AbstractOperator as AbstractOperator,
+    block_tridiagonal_inverse as block_tridiagonal_inverse,
+    BlockTridiagonalInverse as BlockTridiagonalInverse,
+    compressed_products as compressed_products,
+    DenseMatrix as DenseMatrix,
+    DiagonalMatrix as DiagonalMatrix,
+    full_jacobian as full_jacobian,
+    InverseMatrix as InverseMatrix,
+    JacobianMatrix as JacobianMatrix,
+    Pattern as Pattern,
+    ReactionMatrix as ReactionMatrix,
+    sparse_jacobian as sparse_jacobian,
+    SparseMatrix as SparseMatrix,
+    square_jacobian as square_jacobian,
+    SquareMatrix as SquareMatrix,
+    WeightedTranspose as WeightedTranspose,
+)
 from ._rank import (
     dependent_rows as dependent_rows,
     is_deficient as is_deficient,
-    is_definite as is_definite,
     is_nearly_singular as is_nearly_singular,
     is_without_entries as is_without_entries,
     Rank as Rank,
     reciprocal_condition as reciprocal_condition,
     those_that_count as those_that_count,
-)
-from ._sparse import (
-    Pattern as Pattern,
-    sparse_jacobian as sparse_jacobian,
-    SparseMatrix as SparseMatrix,
-    WeightedTranspose as WeightedTranspose,
 )
 from ._uneven_perturbations import uneven_perturbations as uneven_perturbations

@@ -7,11 +7,9 @@ one kernel with the operations around them, and batches of them run one by one.
 
 import math
 import string
-from abc import abstractmethod
 from collections.abc import Callable
-from typing import Any, TypeAlias
+from typing import Any
 
-import equinox as eqx
 import jax
 import jax.extend
 import jax.numpy as jnp
@@ -27,22 +25,6 @@ LARGEST = math.isqrt(LARGEST_REDUCTION)
 # program that is written out must stay short. From some 10⁵ terms on the library was
 # faster (measured).
 LARGEST_PRODUCT = 2**15
-
-
-class AbstractLinearMap(eqx.Module):
-    """A matrix that is not kept as an array of its entries."""
-
-    @abstractmethod
-    def matvec(self, x: Float[Array, "..."]) -> Float[Array, "..."]:
-        """Multiply the vectors along the last axis of x by the matrix."""
-
-    @abstractmethod
-    def absolute(self) -> "AbstractLinearMap":
-        """Return the matrix of absolute values, or one that serves to estimate it."""
-
-
-# A square matrix, or its diagonal if it has no other entries.
-Matrix: TypeAlias = Float[Array, "n n"] | Float[Array, " n"]
 
 
 def small_einsum(subscripts: str, a: Array, b: Array) -> Array:
@@ -78,29 +60,6 @@ def _small_product(
     return {"first": first, "second": second, "result": result, "by_terms": by_terms}
 
 
-def absolute(matrix: Array | AbstractLinearMap) -> Array | AbstractLinearMap:
-    """Return the matrix of absolute values."""
-    if isinstance(matrix, AbstractLinearMap):
-        return matrix.absolute()
-    return jnp.abs(matrix)
-
-
-def matvec(
-    matrix: Array | AbstractLinearMap, x: Float[Array, "... n"]
-) -> Float[Array, "... k"]:
-    """Multiply the vectors along the last axis of x by a matrix.
-
-    An array of one axis stands for a diagonal matrix. The array x has at most four
-    axes.
-    """
-    if isinstance(matrix, AbstractLinearMap):
-        return matrix.matvec(x)
-    if matrix.ndim == 1:
-        return jnp.expand_dims(matrix, range(x.ndim - 1)) * x
-    rows = "abc"[: x.ndim - 1]
-    return small_einsum(f"kn,{rows}n->{rows}k", matrix, x)
-
-
 def _contract_axes(dimension_numbers, a: Array, b: Array) -> Array:
     """Compute `jax.lax.dot_general` with these dimension numbers by `small_einsum`."""
     (summed_a, summed_b), (batch_a, batch_b) = dimension_numbers
@@ -117,8 +76,11 @@ def _contract_axes(dimension_numbers, a: Array, b: Array) -> Array:
 
 
 @jax.custom_jvp
-def inverse(matrix: Matrix) -> Matrix:
-    """Invert a small matrix; the result is not finite if there is no inverse."""
+def inverse(matrix: Float[Array, "n *n"]) -> Float[Array, "n *n"]:
+    """Invert a small matrix; the result is not finite if there is no inverse.
+
+    An array of one axis is the diagonal of a diagonal matrix, and so is the result.
+    """
     size = matrix.shape[0]
     # A system with one constraint, whose matrix has size 1, is the commonest case.
     if matrix.ndim == 1 or size == 1:

@@ -8,7 +8,6 @@ import numpy as np
 from jaxtyping import Array, Float, PyTree
 
 from .._custom_types import BoolScalar, FloatScalar
-from ._contraction import Matrix
 
 
 class Rank(NamedTuple):
@@ -99,27 +98,6 @@ def is_nearly_singular(
     scales = root[:, None] * root[None, :]
     number = jnp.max(jnp.abs(matrix / scales)) * jnp.max(jnp.abs(inverse * scales))
     return ~(10 * size * jnp.finfo(matrix.dtype).eps * number < 1)
-
-
-def is_definite(matrix: Matrix) -> BoolScalar:
-    """Tell whether a symmetric matrix is positive or negative definite.
-
-    It is if all pivots of the elimination without row exchanges have one sign.
-    """
-    pivots = matrix
-    if matrix.ndim == 2:
-        rows = jnp.arange(matrix.shape[0])
-
-        def eliminate(k, carry):
-            table, pivots = carry
-            column = jax.lax.dynamic_index_in_dim(table, k, keepdims=False)
-            pivot = jax.lax.dynamic_index_in_dim(column, k, keepdims=False)
-            table = table - column[:, None] * (column / pivot)[None]
-            return table, jnp.where(rows == k, pivot, pivots)
-
-        given = matrix, jnp.zeros_like(matrix[0])
-        _, pivots = jax.lax.fori_loop(0, len(rows), eliminate, given)
-    return jnp.all(pivots > 0) | jnp.all(pivots < 0)
 
 
 def dependent_rows(jacobian: np.ndarray) -> list[int]:

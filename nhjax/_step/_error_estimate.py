@@ -6,7 +6,7 @@ from jaxtyping import Array, Float
 
 from .._custom_types import FloatScalar
 from .._method import AbstractMethod
-from .._numerics import matvec, max_norm, NOISE_UNITS, relative, small_einsum
+from .._numerics import max_norm, NOISE_UNITS, relative, small_einsum
 from .._system import Linearisation
 from ._stage_system import StageSystem
 from ._unknowns import Stages
@@ -44,9 +44,9 @@ def error_ratios(
     def change(weights: Float[Array, " s"]) -> tuple[Array, Array]:
         moved = small_einsum("s,sn->n", weights, x.velocity)
         if stages.hamiltonian:
-            moved = matvec(lin.metric_inverse, moved)
+            moved = lin.metric_inverse.matvec(moved)
         gained = h * small_einsum("s,sn->n", weights, force)
-        return moved, matvec(lin.momentum_inverse, gained)
+        return moved, lin.momentum_inverse.matvec(gained)
 
     # A change that is round-off tells nothing of the error.
     size = max_norm(u)
@@ -58,8 +58,8 @@ def error_ratios(
     if stages.constrained:
         # The part that violates the constraints is left out, since the step satisfies
         # them: multipliers of single stages may be wrong where their sum is right.
-        excess = matvec(lin.compliance_inverse, matvec(lin.jacobian, gained))
-        gained = gained - matvec(lin.reaction, excess)
+        excess = lin.compliance_inverse.matvec(lin.jacobian.matvec(gained))
+        gained = gained - lin.reaction.matvec(excess)
     return relative(jnp.stack([max_norm(moved), max_norm(gained)]), whole)
 
 

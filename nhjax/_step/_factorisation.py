@@ -9,18 +9,17 @@ from jaxtyping import Array, Float
 
 from .._numerics import (
     block_tridiagonal_inverse,
-    couplings,
+    compressed_products,
+    DenseMatrix,
+    DiagonalMatrix,
     inverse,
-    matvec,
+    Pattern,
     small_einsum,
-    SparseMatrix,
-    WeightedTranspose,
 )
 from .._system import Linearisation
 from ._first_order import (
     first_order_terms,
     FirstOrderTerms,
-    full_momentum_inverse,
     momenta_of_forces,
 )
 from ._jacobian_choice import JacobianName, takes_first_order_terms
@@ -62,14 +61,14 @@ def _without_impulses(
 ) -> LeadingStructure:
     if not stages.constrained:
         n, nothing = stages.p.shape[0], jnp.zeros((0, 0), stages.p.dtype)
-        reaction = jnp.zeros((stages.method.stages, n, 0), stages.p.dtype)
-        given = lin.momentum_inverse, reaction, reaction, nothing, lin
+        reaction = DenseMatrix(jnp.zeros((stages.method.stages, n, 0), stages.p.dtype))
+        given = lin.momentum_inverse, reaction, reaction, DenseMatrix(nothing), lin
         return LeadingStructure(*given, first_order=terms)
-    if isinstance(lin.jacobian, SparseMatrix):
-        return _sparse(stages, x, lin, lin.jacobian)
+    if lin.jacobian.pattern is not None:
+        return _sparse(stages, x, lin, lin.jacobian.pattern)
     at_nodes = constraint_jacobian(stages, x)
     jacobian = jnp.concatenate([lin.dense[0][None], at_nodes])
-    reaction = jnp.swapaxes(matvec(lin.metric_inverse, jacobian), 1, 2)
+    reaction = DenseMatrix(jacobian).weighted_transpose(lin.metric_inverse).entries
     if terms is not None:
         return _first_order(stages, x, lin, terms, jacobian, reaction)
     rows, redundancy = jacobian[1:], stages.redundancy
@@ -85,15 +84,15 @@ def _without_impulses(
     end = eqx.tree_at(
         lambda z: (z.jacobian, z.reaction, z.compliance_inverse),
         lin,
-        (rows[-1], reaction[-1], inverse(compliance)),
+        tuple(map(DenseMatrix, (rows[-1], reaction[-1], inverse(compliance)))),
     )
     return LeadingStructure(
         momentum_inverse=lin.momentum_inverse,
-        reaction=reaction,
-        velocity_reaction=(
+        reaction=DenseMatrix(reaction),
+        velocity_reaction=DenseMatrix(
             jnp.swapaxes(jacobian, 1, 2) if stages.hamiltonian else reaction
         ),
-        schur_inverse=inverse(schur),
+        schur_inverse=DenseMatrix(inverse(schur)),
         end=end,
     )
 
@@ -109,7 +108,7 @@ def _first_order(
     """Make the leading structure with the terms of order h."""
     momenta = momenta_of_forces(stages, x, _reactions(stages, jacobian))
     on_stages, on_nodes = (
-        jnp.swapaxes(matvec(lin.momentum_inverse, jnp.swapaxes(p, 1, 2)), 1, 2)
+        jnp.swapaxes(lin.momentum_inverse.matvec(jnp.swapaxes(p, 1, 2)), 1, 2)
         for p in momenta
     )
     velocity = terms.of_stages(stages, on_stages)
@@ -126,9 +125,9 @@ def _first_order(
     schur = jax.vmap(push, in_axes=2, out_axes=1)(velocity, at_nodes)
     return LeadingStructure(
         momentum_inverse=lin.momentum_inverse,
-        reaction=reaction,
-        velocity_reaction=reaction,
-        schur_inverse=inverse(schur),
+        reaction=DenseMatrix(reaction),
+        velocity_reaction=DenseMatrix(reaction),
+        schur_inverse=DenseMatrix(inverse(schur)),
         end=_with_inertia_at_end(lin, terms, jacobian[-1]),
         first_order=terms,
         responses=Responses(velocity, at_nodes),
@@ -156,7 +155,7 @@ def _with_inertia_at_end(
 
     Otherwise u̇ and λ_c at the end would converge no faster than without these terms.
     """
-    inverse_at_start = full_momentum_inverse(lin)
+    inverse_at_start = lin.momentum_inverse.as_matrix()
     turned = small_einsum("kl,ln->kn", terms.node_inertia[-1], inverse_at_start)
     at_end = inverse_at_start - turned
     reaction = small_einsum("kn,ln->kl", at_end, jacobian)
@@ -164,18 +163,18 @@ def _with_inertia_at_end(
     return eqx.tree_at(
         lambda z: (z.metric_inverse, z.jacobian, z.reaction, z.compliance_inverse),
         lin,
-        (at_end, jacobian, reaction, compliance_inverse),
+        tuple(map(DenseMatrix, (at_end, jacobian, reaction, compliance_inverse))),
     )
 
 
 def _sparse(
-    stages: StageSystem, x: Stages, lin: Linearisation, start: SparseMatrix
+    stages: StageSystem, x: Stages, lin: Linearisation, pattern: Pattern
 ) -> LeadingStructure:
     """Make the leading structure for constraints that share few coordinates."""
-    pattern = start.pattern
     nodes = sparse_constraint_jacobian(stages, x, pattern)
-    rows = SparseMatrix(jnp.concatenate([start.values[None], nodes.values]), pattern)
-    products = couplings(rows[1:], rows, lin.metric_inverse)
+    rows = nodes.stacked_after(lin.jacobian)
+    reaction = rows.weighted_transpose(lin.metric_inverse)
+    products = compressed_products(rows[1:], reaction)
     a, a_hat, b = (stages.coefficients(name) for name in ("a", "a_hat", "b"))
     if stages.num_nonholonomic:
         weights = a[1:, :, None] * stages.closure_weights("E")[None]
@@ -185,7 +184,6 @@ def _sparse(
         on_positions = weights[:, :, None, None, None] * products
         tangency = b[:, None, None, None] * products[-1]
         schur = jnp.concatenate([on_positions, tangency[None]])
-    reaction = WeightedTranspose(lin.metric_inverse, rows)
     end = eqx.tree_at(
         lambda z: (z.jacobian, z.reaction, z.compliance_inverse),
         lin,
@@ -197,8 +195,8 @@ def _sparse(
     )
     velocity_reaction = reaction
     if stages.hamiltonian:
-        ones = jnp.ones_like(lin.metric_inverse)
-        velocity_reaction = WeightedTranspose(ones, rows)
+        ones = DiagonalMatrix(jnp.ones_like(stages.p))
+        velocity_reaction = rows.weighted_transpose(ones)
     return LeadingStructure(
         momentum_inverse=lin.momentum_inverse,
         reaction=reaction,

@@ -96,12 +96,6 @@ def _times(
     return small_einsum(f"{own}kn,in{rest}->ik{rest}", matrix, z)
 
 
-def full_momentum_inverse(lin: Linearisation) -> Float[Array, "n n"]:
-    """Return N⁻¹ as a matrix, also where only its diagonal is kept."""
-    inverse = lin.momentum_inverse
-    return jnp.diag(inverse) if inverse.ndim == 1 else inverse
-
-
 def first_order_terms(
     stages: StageSystem, x: Stages, lin: Linearisation
 ) -> FirstOrderTerms:
@@ -110,7 +104,7 @@ def first_order_terms(
     # The starting values begin at u_k.
     first = jnp.sum(stages.coefficients("a_hat"), axis=1)[0]
     u = x.velocity[0] - first * h * lin.acceleration
-    inverse = full_momentum_inverse(lin)
+    inverse = lin.momentum_inverse.as_matrix()
 
     def scaled(matrix):
         return small_einsum("kl,ln->kn", inverse, matrix)

@@ -11,10 +11,9 @@ from jaxtyping import Array, Float, PyTree
 from .._custom_types import Args, FloatScalar
 from .._numerics import (
     inverse,
-    Matrix,
-    matvec,
     max_norm,
     small_einsum,
+    SquareMatrix,
     unit,
 )
 from .._system import (
@@ -201,7 +200,7 @@ class StartImpulses(eqx.Module):
     invariants: Invariants
     slopes: Float[Array, "k n"]
     covectors: Float[Array, "k n"]
-    momentum_inverse: Matrix
+    momentum_inverse: SquareMatrix
     row_sums: Float[Array, " n"]
     moving: Float[Array, " k"]
     sizes: Float[Array, " k"]
@@ -225,9 +224,7 @@ class StartImpulses(eqx.Module):
         slopes, covectors, _ = invariants.directions(
             system, t, y.q, u, args, all_slopes
         )
-        row_sums = jnp.abs(lin.metric_inverse)
-        if row_sums.ndim == 2:
-            row_sums = jnp.sum(row_sums, axis=1)
+        row_sums = lin.metric_inverse.absolute_row_sums()
         given = slopes, covectors, lin.momentum_inverse, row_sums
         return cls(invariants, *given, moving_part(slopes, u), sizes, position)
 
@@ -282,7 +279,7 @@ class ImpulseWeights(eqx.Module):
     ) -> "ImpulseWeights":
         """Make the weights from what is given at the start and known at the end."""
         start, end = (
-            matvec(given.momentum_inverse, x) for x in (given.covectors, covectors)
+            given.momentum_inverse.matvec(x) for x in (given.covectors, covectors)
         )
         gram = small_einsum("kn,ln->kl", given.slopes, start)
         gram = gram + small_einsum("kn,ln->kl", slopes, end)
@@ -318,5 +315,5 @@ class ImpulseWeights(eqx.Module):
     ) -> Float[Array, " k"]:
         """Compute the change of ε that makes the linearised equations hold."""
         residual = self.errors * error + self.rest * impulse
-        wanted = impulse - matvec(self.inverse, residual)
+        wanted = impulse - small_einsum("kl,l->k", self.inverse, residual)
         return jnp.clip(wanted, -self.limits, self.limits) - impulse

@@ -5,7 +5,7 @@ from typing import Literal, TypeAlias
 import jax
 import jax.numpy as jnp
 
-from .._numerics import dependence, full_jacobian, SparseMatrix
+from .._numerics import dependence, full_jacobian
 from .._system import Linearisation, total_force
 from ._stage_system import StageSystem
 
@@ -30,7 +30,7 @@ def takes_first_order_terms(
     if jacobian == "leading":
         return False
     has_them = not stages.hamiltonian
-    has_them &= stages.redundancy is None and not isinstance(lin.jacobian, SparseMatrix)
+    has_them &= stages.redundancy is None and not lin.is_sparse
     if jacobian == "first_order":
         if not has_them:
             raise ValueError(

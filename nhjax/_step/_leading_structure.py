@@ -2,17 +2,10 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from .._numerics import (
-    BlockTridiagonalInverse,
-    Matrix,
-    matvec,
-    small_einsum,
-    WeightedTranspose,
-)
+from .._numerics import InverseMatrix, ReactionMatrix, small_einsum, SquareMatrix
 from .._system import Linearisation
 from ._first_order import FirstOrderTerms
 from ._invariants import ImpulseWeights
@@ -52,10 +45,10 @@ class LeadingStructure(eqx.Module):
     the multipliers are the `responses`, in which these terms are too.
     """
 
-    momentum_inverse: Matrix
-    reaction: Float[Array, "s n l"] | WeightedTranspose
-    velocity_reaction: Float[Array, "s n l"] | WeightedTranspose
-    schur_inverse: Float[Array, "c c"] | BlockTridiagonalInverse
+    momentum_inverse: SquareMatrix
+    reaction: ReactionMatrix
+    velocity_reaction: ReactionMatrix
+    schur_inverse: InverseMatrix
     end: Linearisation
     impulses: ImpulseWeights | None = None
     first_order: FirstOrderTerms | None = None
@@ -65,7 +58,7 @@ class LeadingStructure(eqx.Module):
         self, stages: StageSystem, x: Stages, residual: Float[Array, "s n"]
     ) -> Stages:
         """Compute u - N⁻¹ r_u for the stages, and the velocities that belong to it."""
-        change = matvec(self.momentum_inverse, residual)
+        change = self.momentum_inverse.matvec(residual)
         if self.first_order is not None:
             change = self.first_order.of_stages(stages, change)
         if not stages.hamiltonian:
@@ -85,7 +78,7 @@ class LeadingStructure(eqx.Module):
         The residual knows the new stage velocities by the positions alone, and not yet
         their `change` by the forces.
         """
-        du = -matvec(self.momentum_inverse, residual)
+        du = -self.momentum_inverse.matvec(residual)
         if self.first_order is not None:
             du = self.first_order.of_nodes(du)
             du = du + self.first_order.by_force(stages, change)
@@ -101,7 +94,7 @@ class LeadingStructure(eqx.Module):
     ) -> Stages:
         """Change the free multipliers so that the linearised constraints hold."""
         residual = jnp.concatenate([kinematic.reshape(-1), holonomic.reshape(-1)])
-        change = -matvec(self.schur_inverse, residual)
+        change = -self.schur_inverse.matvec(residual)
         h_dy = change[: x.closure.size].reshape(x.closure.shape)
         h_dholonomic = change[x.closure.size :].reshape(x.holonomic.shape)
         if self.responses is not None:
@@ -116,11 +109,11 @@ class LeadingStructure(eqx.Module):
             )
         h_dlambda = stages.free_multipliers(h_dy, h_dholonomic)
         # This is h K⁻¹ Bᵀ δΛ; a division by h is needed for the multipliers alone.
-        push = _pushed(self.reaction, h_dlambda)
+        push = self.reaction.matvec(h_dlambda)
         a_hat, momentum = stages.coefficients("a_hat"), x.momentum
         velocity_push = push
         if stages.hamiltonian:
-            velocity_push = _pushed(self.velocity_reaction, h_dlambda)
+            velocity_push = self.velocity_reaction.matvec(h_dlambda)
             momentum = momentum + small_einsum("ij,jn->in", a_hat, push)
         return Stages(
             velocity=x.velocity + small_einsum("ij,jn->in", a_hat, velocity_push),
@@ -153,11 +146,9 @@ class LeadingStructure(eqx.Module):
             stages.closure_weights, ("response", "stage_response")
         )
 
-        def pushed(u: Array, reaction: Array | WeightedTranspose) -> Array:
-            last = reaction[-1]
-            if isinstance(last, jax.Array):
-                last = last[:, : stages.num_nonholonomic]
-            return u + jnp.outer(on_stages, stages.h * matvec(last, dlam_closure))
+        def pushed(u: Array, reaction: ReactionMatrix) -> Array:
+            last = reaction[-1].first_columns(stages.num_nonholonomic)
+            return u + jnp.outer(on_stages, stages.h * last.matvec(dlam_closure))
 
         momentum = x.momentum
         if stages.hamiltonian:
@@ -208,11 +199,3 @@ class LeadingStructure(eqx.Module):
             ),
             impulse=x.impulse + change,
         )
-
-
-def _pushed(
-    reaction: Float[Array, "s n l"] | WeightedTranspose, multiplier: Float[Array, "s l"]
-) -> Float[Array, "s n"]:
-    if isinstance(reaction, WeightedTranspose):
-        return reaction.matvec(multiplier)
-    return small_einsum("jnm,jm->jn", reaction, multiplier)

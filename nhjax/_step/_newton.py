@@ -15,7 +15,6 @@ from .._errors import check_choice
 from .._numerics import (
     iterate,
     jacobian_and_value,
-    matvec,
     max_norm,
     NOISE_UNITS,
     Sizes,
@@ -279,7 +278,7 @@ class Newton(AbstractStageSolver):
         solved = _iterated(self, sweep, x0, scale, skip)
         # Where forces grow without bound, increments are small even far from any
         # solution, so that the residual is checked too.
-        gross = matvec(lin.momentum_inverse, solved.aux.forces.residual)
+        gross = lin.momentum_inverse.matvec(solved.aux.forces.residual)
         found = fibre_coordinate_size(stages, solved.x)
         measure = jnp.maximum(scale.size + scale.round_off, found)
         allowed = 1e3 * jnp.asarray(self.tolerance, measure.dtype)

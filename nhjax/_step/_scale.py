@@ -8,7 +8,7 @@ from jaxtyping import Array, Float, PyTree
 
 from .._custom_types import FloatScalar
 from .._manifold import unframed
-from .._numerics import absolute, matvec, max_norm, uneven_perturbations
+from .._numerics import max_norm, uneven_perturbations
 from .._system import Linearisation, position_scale
 from ._stage_equations import impulse_weights
 from ._stage_system import StageSystem
@@ -43,7 +43,7 @@ def fibre_coordinate_scale(
     h = jnp.abs(stages.h)
     rate = max_norm(lin.acceleration)
     if stages.constrained:
-        rate = rate + max_norm(matvec(absolute(lin.reaction), jnp.abs(lin.multiplier)))
+        rate = rate + max_norm(lin.reaction.absolute().matvec(jnp.abs(lin.multiplier)))
     size = h * rate + max_norm(
         x0.node_fibre_coordinate, x0.momentum if stages.hamiltonian else x0.velocity
     )

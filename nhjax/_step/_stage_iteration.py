@@ -1,16 +1,14 @@
 """The residual of all stage equations, and a sweep of simplified Newton over them."""
 
 import dataclasses
-import math
 from typing import NamedTuple
 
-import jax
 import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
 from .._custom_types import BoolScalar, FloatScalar
-from .._numerics import frozen, matvec, max_norm, Sizes, unit
+from .._numerics import frozen, max_norm, Sizes, unit
 from .._system import Linearisation
 from ._leading_structure import LeadingStructure
 from ._stage_equations import (
@@ -156,20 +154,16 @@ def increment_size(
         x_next.velocity - x.velocity,
     ]
     if stages.hamiltonian:
-        changes[1] = matvec(lin.metric_inverse, changes[1])
+        changes[1] = lin.metric_inverse.matvec(changes[1])
         changes.append(x_next.momentum - x.momentum)
     if stages.constrained:
         # Multipliers count by their effect h N⁻¹ R δΛ on u, separately from the changes
         # of u itself: Λ can still be wrong where the stages and nodes happen to be
         # right.
         before, after = map(stages.multiplier_change, (x, x_next))
-        reaction = lin.reaction
-        if before.shape[1] == 1 and isinstance(reaction, jax.Array):
-            # With one constraint the largest entry of the column decides, and it is the
-            # same for all iterates.
-            reaction = max_norm(reaction).reshape(1, 1)
-        change = matvec(reaction, after - before)
-        changes.append(stages.h * change)
+        # With one constraint this is a number that is the same for all iterates.
+        reaction = lin.reaction.max_norm_equivalent()
+        changes.append(stages.h * reaction.matvec(after - before))
     size = max_norm(*changes)
     if stages.manifold.is_flat:
         return size
@@ -185,10 +179,12 @@ def unknown_units(stages: StageSystem, lin: Linearisation) -> list[FloatScalar]:
     """
     h = jnp.abs(stages.h)
     one = jnp.ones_like(h)
-    velocity = 1 / unit(max_norm(lin.metric_inverse)) if stages.hamiltonian else one
-    # Of a sparse matrix this is the product of its largest factors.
-    sizes_of_reaction = map(max_norm, jax.tree.leaves(lin.reaction))
-    multiplier = 1 / unit(h * math.prod(sizes_of_reaction))
+    velocity = (
+        1 / unit(lin.metric_inverse.largest_entry_bound())
+        if stages.hamiltonian
+        else one
+    )
+    multiplier = 1 / unit(h * lin.reaction.largest_entry_bound())
     sizes = {
         "velocity": velocity,
         "momentum": one,
@@ -199,7 +195,7 @@ def unknown_units(stages: StageSystem, lin: Linearisation) -> list[FloatScalar]:
         "end_multiplier": multiplier,
     }
     if stages.kept is not None:
-        largest = max_norm(matvec(lin.momentum_inverse, stages.kept.covectors))
+        largest = max_norm(lin.momentum_inverse.matvec(stages.kept.covectors))
         sizes["impulse"] = 1 / unit(largest)
     names = [field.name for field in dataclasses.fields(Stages)]
     return [sizes[name] for name in names if name in sizes]

@@ -12,7 +12,7 @@ from .._custom_types import (
     PositionFunction,
 )
 from .._manifold import AbstractLieGroup
-from .._numerics import inverse, jacobian, matvec
+from .._numerics import square_jacobian
 from ._abstract import AbstractMechanicalSystem
 from ._state import check_time_and_state, State
 
@@ -127,9 +127,8 @@ class HamiltonianSystem(AbstractMechanicalSystem):
         args: Args = None,
     ) -> Float[Array, " n"]:
         """Compute ♭_H D2Ψ = (D2D2H)⁻¹ D2Ψ from a constraint's derivative D2Ψ."""
-        return matvec(
-            inverse(jacobian(lambda u: self.velocity(t, q, u, args), u)), derivative
-        )
+        metric = square_jacobian(lambda u: self.velocity(t, q, u, args), u)
+        return metric.inverse().matvec(derivative)
 
     def energy(self, t: FloatScalarLike, y: State, args: Args = None) -> FloatScalar:
         """Compute the energy H(t, q, p) of a state.

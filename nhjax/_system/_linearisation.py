@@ -9,22 +9,18 @@ from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from .._custom_types import Args, FloatScalar, FloatScalarLike
 from .._numerics import (
-    absolute,
-    block_tridiagonal_inverse,
-    BlockTridiagonalInverse,
-    couplings,
-    inverse,
-    is_nearly_singular,
-    jacobian,
+    DenseMatrix,
+    DiagonalMatrix,
+    InverseMatrix,
+    JacobianMatrix,
     least_norm_inverse,
     least_norm_inverse_by_blocks,
-    Matrix,
-    matvec,
     max_norm,
+    ReactionMatrix,
     small_einsum,
     sparse_jacobian,
-    SparseMatrix,
-    WeightedTranspose,
+    square_jacobian,
+    SquareMatrix,
 )
 from ._abstract import AbstractMechanicalSystem
 from ._state import check_time_and_state, State
@@ -50,11 +46,10 @@ class Linearisation(eqx.Module):
     constraints, each of which shares coordinates with few others, are kept sparse.
     """
 
-    metric_inverse: Matrix  # K⁻¹
-    jacobian: Float[Array, "l n"] | SparseMatrix  # B
-    reaction: Float[Array, "n l"] | WeightedTranspose  # N⁻¹ R
-    # C⁻¹, or of the least norm
-    compliance_inverse: Float[Array, "l l"] | BlockTridiagonalInverse
+    metric_inverse: SquareMatrix  # K⁻¹
+    jacobian: JacobianMatrix  # B
+    reaction: ReactionMatrix  # N⁻¹ R
+    compliance_inverse: InverseMatrix  # C⁻¹, or its least-norm substitute
     acceleration: Float[Array, " n"]  # u̇
     multiplier: Float[Array, " l"]
     violation: Float[Array, " l"]
@@ -62,35 +57,36 @@ class Linearisation(eqx.Module):
     is_redundant: bool = eqx.field(static=True)
 
     @property
-    def momentum_inverse(self) -> Matrix:
-        """Return N⁻¹, the inverse mass matrix or, for a Hamiltonian system, identity.
-
-        A vector stands for the diagonal matrix with these entries.
-        """
+    def momentum_inverse(self) -> SquareMatrix:
+        """Return N⁻¹: the inverse mass matrix, or one for a Hamiltonian system."""
         if self.fibre_coordinate_name == "v":
             return self.metric_inverse
-        return jnp.ones_like(self.acceleration)
+        return DiagonalMatrix(jnp.ones_like(self.acceleration))
+
+    @property
+    def is_sparse(self) -> bool:
+        """Return whether the matrices of the constraints are stored as sparse ones."""
+        return self.jacobian.pattern is not None
 
     @property
     def dense(self) -> tuple[Array, Array, Array]:
-        """Return B, N⁻¹ R and C⁻¹ as arrays, of a linearisation that is not sparse."""
-        assert not isinstance(self.jacobian, SparseMatrix)
-        assert not isinstance(self.reaction, WeightedTranspose)
-        assert not isinstance(self.compliance_inverse, BlockTridiagonalInverse)
-        return self.jacobian, self.reaction, self.compliance_inverse
+        """Return B, N⁻¹ R and C⁻¹ as arrays with all entries."""
+        matrices = self.jacobian, self.reaction, self.compliance_inverse
+        jacobian, reaction, inverse = (matrix.as_matrix() for matrix in matrices)
+        return jacobian, reaction, inverse
 
     @property
     def is_singular(self) -> Bool[Array, ""]:
-        """Tell whether the metric K or the compatibility matrix C is singular."""
-        inverses = [self.metric_inverse, *jax.tree.leaves(self.compliance_inverse)]
+        """Return whether the mass matrix K or the matrix C is singular."""
+        inverses = jax.tree.leaves((self.metric_inverse, self.compliance_inverse))
         return ~reduce(jnp.logical_and, [jnp.all(jnp.isfinite(x)) for x in inverses])
 
     @property
     def is_unique(self) -> Bool[Array, " l"]:
-        """Tell which multipliers are unique; of redundant constraints not all are."""
+        """Return which multipliers are unique; not all are if some are redundant."""
         if not self.is_redundant:
             return jnp.ones(self.violation.shape, bool)
-        # It projects onto what the derivatives of the constraints can reach.
+        # The product C C⁻ projects onto the range of C.
         jacobian, reaction, _ = self.dense
         compliance = small_einsum("kn,nl->kl", jacobian, reaction)
         kept = small_einsum("kl,lm->km", compliance, least_norm_inverse(compliance))
@@ -110,30 +106,22 @@ class Linearisation(eqx.Module):
     @property
     def determines_multipliers(self) -> Bool[Array, ""]:
         """Tell whether C can be inverted in the working precision."""
-        if isinstance(self.jacobian, SparseMatrix):
-            assert isinstance(self.compliance_inverse, BlockTridiagonalInverse)
-            squares = SparseMatrix(self.jacobian.values**2, self.jacobian.pattern)
-            sizes = jnp.abs(matvec(squares, self.metric_inverse))
-            eps = float(jnp.finfo(sizes.dtype).eps)
-            number = 1 / (10 * sizes.shape[0] * eps)
-            return ~self.compliance_inverse.exceeds(sizes, number)
-        jacobian, reaction, inverse = self.dense
-        compliance = small_einsum("kn,nl->kl", jacobian, reaction)
-        return ~is_nearly_singular(compliance, inverse)
+        factors = self.jacobian, self.reaction
+        return ~self.compliance_inverse.is_nearly_singular(*factors)
 
     def solve(
         self, momentum_residual: Float[Array, " n"], hidden_residual: Float[Array, " l"]
     ) -> tuple[Float[Array, " n"], Float[Array, " l"]]:
         """Find (u̇, λ) with N u̇ - R λ and B u̇ equal to the two given residuals."""
-        free = matvec(self.momentum_inverse, momentum_residual)
-        hidden = hidden_residual - matvec(self.jacobian, free)
-        multiplier = matvec(self.compliance_inverse, hidden)
-        return free + matvec(self.reaction, multiplier), multiplier
+        free = self.momentum_inverse.matvec(momentum_residual)
+        hidden = hidden_residual - self.jacobian.matvec(free)
+        multiplier = self.compliance_inverse.matvec(hidden)
+        return free + self.reaction.matvec(multiplier), multiplier
 
     def largest_correction(self, sizes: Float[Array, " l"]) -> FloatScalar:
         """Bound the change of u that makes up for violations of the given sizes."""
-        multipliers = matvec(absolute(self.compliance_inverse), sizes)
-        return max_norm(matvec(absolute(self.reaction), multipliers))
+        multipliers = self.compliance_inverse.absolute().matvec(sizes)
+        return max_norm(self.reaction.absolute().matvec(multipliers))
 
 
 def _momentum_and_constraint(
@@ -199,10 +187,10 @@ def motion_residual(
 class ConstraintMatrices(NamedTuple):
     """The matrices of `Linearisation` that need no solution of the equations."""
 
-    metric_inverse: Matrix  # K⁻¹
-    jacobian: Float[Array, "l n"] | SparseMatrix  # B
-    reaction: Float[Array, "n l"] | WeightedTranspose  # K⁻¹ Bᵀ
-    compliance_inverse: Float[Array, "l l"] | BlockTridiagonalInverse  # C⁻¹
+    metric_inverse: SquareMatrix  # K⁻¹
+    jacobian: JacobianMatrix  # B
+    reaction: ReactionMatrix  # K⁻¹ Bᵀ
+    compliance_inverse: InverseMatrix  # C⁻¹
 
     def tangent_part(
         self, slope: Float[Array, " n"]
@@ -211,11 +199,9 @@ class ConstraintMatrices(NamedTuple):
 
         Return s - Bᵀ μ and the multipliers μ = C⁻¹ B K⁻¹ s.
         """
-        pushed = matvec(self.jacobian, matvec(self.metric_inverse, slope))
-        multiplier = matvec(self.compliance_inverse, pushed)
-        if isinstance(self.jacobian, SparseMatrix):
-            return slope - self.jacobian.rmatvec(multiplier), multiplier
-        return slope - small_einsum("ln,l->n", self.jacobian, multiplier), multiplier
+        pushed = self.jacobian.matvec(self.metric_inverse.matvec(slope))
+        multiplier = self.compliance_inverse.matvec(pushed)
+        return slope - self.jacobian.rmatvec(multiplier), multiplier
 
 
 def constraint_matrices(
@@ -232,27 +218,24 @@ def constraint_matrices(
 
     With `may_be_sparse` the matrices of many constraints are sparse where that pays.
     """
-    metric = jacobian(lambda u: system.fibre_derivative(t, q, u, args), u)
-    metric_inverse = inverse(metric)
+    metric = square_jacobian(lambda u: system.fibre_derivative(t, q, u, args), u)
+    metric_inverse = metric.inverse()
     pattern = None
-    if may_be_sparse and num_constraints >= FEWEST_SPARSE and metric.ndim == 1:
+    if may_be_sparse and num_constraints >= FEWEST_SPARSE and metric.is_diagonal:
         pattern = constraint_pattern(system, t, q, u, args)
     if pattern is None:
-        slopes = jax.jacrev(system.constraint, argnums=2)(t, q, u, args)
-        reaction = matvec(metric_inverse, slopes).T
-        compliance = small_einsum("kn,nl->kl", slopes, reaction)
-        if system.constraints == "redundant":
-            k = jax.eval_shape(lambda: system.position_constraint(t, q, args)).size
-            m = slopes.shape[0] - k
-            compliance_inverse = least_norm_inverse_by_blocks(compliance, m)
-        else:
-            compliance_inverse = inverse(compliance)
+        slopes = DenseMatrix(jax.jacrev(system.constraint, argnums=2)(t, q, u, args))
     else:
         slopes = sparse_jacobian(lambda u: system.constraint(t, q, u, args), u, pattern)
-        reaction = WeightedTranspose(metric_inverse, slopes)
-        rows = SparseMatrix(slopes.values[None], pattern)
-        products = couplings(rows, rows, metric_inverse)
-        compliance_inverse = block_tridiagonal_inverse(products, pattern)
+    reaction = slopes.weighted_transpose(metric_inverse)
+    if system.constraints == "redundant":
+        k = jax.eval_shape(lambda: system.position_constraint(t, q, args)).size
+        compliance = small_einsum("kn,nl->kl", slopes.as_matrix(), reaction.as_matrix())
+        compliance_inverse = DenseMatrix(
+            least_norm_inverse_by_blocks(compliance, num_constraints - k)
+        )
+    else:
+        compliance_inverse = slopes.inverse_of_product(reaction)
     return ConstraintMatrices(metric_inverse, slopes, reaction, compliance_inverse)
 
 

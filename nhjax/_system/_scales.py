@@ -11,10 +11,10 @@ from .._custom_types import Args, BoolScalar, FloatScalar, FloatScalarLike
 from .._manifold import AbstractLieGroup
 from .._numerics import (
     frozen,
+    JacobianMatrix,
     max_norm,
     measured_noise,
     NOISE_DEVIATIONS,
-    SparseMatrix,
     unit,
 )
 from ._abstract import AbstractMechanicalSystem
@@ -42,7 +42,7 @@ def violation_scale(
 
 def velocity_scale(
     system: AbstractMechanicalSystem,
-    jacobian: Float[Array, "l n"] | SparseMatrix,
+    jacobian: JacobianMatrix,
     t: FloatScalar,
     q: PyTree[Array],
     u: Float[Array, " n"],
@@ -50,8 +50,7 @@ def velocity_scale(
 ) -> Float[Array, " l"]:
     """Estimate the sizes of the terms of Φ from its Jacobian ∂Φ/∂u alone."""
     affine = _finite_or_zero(system.constraint(t, q, jnp.zeros_like(u), args))
-    slopes = _row_sums(jacobian)
-    return slopes * unit(max_norm(u)) + affine
+    return jacobian.absolute_row_sums() * unit(max_norm(u)) + affine
 
 
 def position_scale(
@@ -74,12 +73,8 @@ def position_scale(
     if system.holonomic is None:
         return constant
     size = unit(max_norm(*jax.tree.leaves(q)))
-    if (
-        lin is not None
-        and isinstance(lin.jacobian, SparseMatrix)
-        and lin.fibre_coordinate_name == "v"
-    ):
-        return _row_sums(lin.jacobian) * size + constant
+    if lin is not None and lin.is_sparse and lin.fibre_coordinate_name == "v":
+        return lin.jacobian.absolute_row_sums() * size + constant
     slopes = jax.tree.map(
         lambda slope: jnp.sum(jnp.abs(slope), axis=tuple(range(1, slope.ndim))),
         jax.jacrev(gamma)(q),
@@ -110,12 +105,6 @@ def keeps_constraints(
     return jnp.all(jnp.abs(lin.violation) <= on_velocities) & jnp.all(
         jnp.abs(positions) <= on_positions
     )
-
-
-def _row_sums(matrix: Float[Array, "l n"] | SparseMatrix) -> Float[Array, " l"]:
-    if isinstance(matrix, SparseMatrix):
-        return jnp.sum(jnp.abs(matrix.values), axis=0)
-    return jnp.sum(jnp.abs(matrix), axis=1)
 
 
 def _finite_or_zero(x: Array) -> Array:
