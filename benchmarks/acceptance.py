@@ -33,7 +33,7 @@ from nhjax import systems
 from nhjax._method import AbstractMethod
 from nhjax._numerics import max_norm
 from nhjax._step import step, StepOutcome, StepState
-from nhjax._step._stage_iteration import stage_residual
+from nhjax._step._jacobian import stage_residual
 from nhjax._step._stage_system import nudged, StageSystem
 from nhjax._step._step import equations_of_step
 from nhjax._step._unknowns import Stages

@@ -26,8 +26,8 @@ from jax.flatten_util import ravel_pytree
 import nhjax
 from nhjax import systems
 from nhjax._numerics import iterate, NOISE_UNITS
+from nhjax._step._jacobian import update_norms
 from nhjax._step._scale import fibre_coordinate_scale
-from nhjax._step._stage_iteration import sizes
 
 from ._report import markdown_table, write
 
@@ -69,7 +69,7 @@ class ExactAtStart(nhjax.AbstractStageSolver):
         def sweep(x):
             residual, evaluation = nhjax.stage_residual(stages, x)
             x_next = unravel(ravel_pytree(x)[0] - jacobian_inverse @ residual)
-            return x_next, sizes(stages, x, x_next, lin), evaluation
+            return x_next, update_norms(stages, x, x_next, lin), evaluation
 
         scale = fibre_coordinate_scale(stages, x0, lin)
         return iterate(

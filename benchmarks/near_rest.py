@@ -41,7 +41,7 @@ from nhjax._step import (
     step,
     StepArguments,
 )
-from nhjax._step._stage_iteration import increment_size, stage_residual
+from nhjax._step._jacobian import increment_size, stage_residual
 from nhjax._step._step import equations_of_step
 from nhjax._step._unknowns import Stages
 from nhjax._system import function_noise

@@ -13,6 +13,7 @@ from ._invariants import (
     Invariants as Invariants,
     LEAST_PART as LEAST_PART,
 )
+from ._jacobian import stage_residual as stage_residual
 from ._newton import (
     AbstractStageSolver as AbstractStageSolver,
     is_simplified_alone as is_simplified_alone,
@@ -25,7 +26,6 @@ from ._round_off import (
     round_off_of_steps as round_off_of_steps,
     RoundOff as RoundOff,
 )
-from ._stage_iteration import stage_residual as stage_residual
 from ._step import (
     first_step_state as first_step_state,
     largest_violation as largest_violation,

@@ -20,11 +20,11 @@ from .._numerics import (
 from .._results import RESULTS
 from .._system import linearise, State
 from ._end import end_state, step_record
+from ._jacobian import unknown_units
 from ._newton import AbstractStageSolver
 from ._positions import end_position
 from ._record import StepRecord
 from ._stage_equations import stage_forces
-from ._stage_iteration import unknown_units
 from ._step import equations_of_step, step, StepArguments, StepOutcome
 from ._unknowns import Stages
 

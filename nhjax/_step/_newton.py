@@ -22,18 +22,18 @@ from .._numerics import (
     uneven_perturbations,
 )
 from .._system import all_finite, check_flag, Linearisation
-from ._factorisation import leading_structure
-from ._jacobian_choice import JacobianName
-from ._round_off import PART
-from ._scale import fibre_coordinate_scale, Scale
-from ._stage_iteration import (
-    corrected,
+from ._first_order import JacobianName
+from ._jacobian import (
     Evaluation,
+    factorise_stage_jacobian,
     fibre_coordinate_size,
     increment_size,
-    sizes,
+    simplified_newton_update,
     stage_residual,
+    update_norms,
 )
+from ._round_off import PART
+from ._scale import fibre_coordinate_scale, Scale
 from ._stage_system import nudged, StageSystem
 from ._tolerance import check_tolerance, tolerance_array
 from ._unknowns import Stages
@@ -161,12 +161,12 @@ class SimplifiedNewton(AbstractStageSolver):
         self, stages: StageSystem, x0: Stages, lin: Linearisation, skip: Array
     ) -> Solved[Stages, Evaluation]:
         """Solve the stage equations from `x0`; do nothing where `skip` is true."""
-        structure = leading_structure(stages, x0, lin, self.jacobian)
+        factors = factorise_stage_jacobian(stages, x0, lin, self.jacobian)
         scale = fibre_coordinate_scale(stages, x0, lin)
 
         def sweep(x: Stages):
-            x_next, evaluation = corrected(stages, structure, x)
-            return x_next, sizes(stages, x, x_next, lin), evaluation
+            x_next, evaluation = simplified_newton_update(stages, factors, x)
+            return x_next, update_norms(stages, x, x_next, lin), evaluation
 
         solved = _iterated(self, sweep, x0, scale, skip)
         if not self.fallback:
@@ -198,8 +198,8 @@ class SimplifiedNewton(AbstractStageSolver):
         """
         if self.fallback:
             return self._newton.frozen_newton_map(stages, lin, x)
-        structure = leading_structure(stages, x, lin, self.jacobian)
-        return lambda stages, x: corrected(stages, structure, x)[0]
+        factors = factorise_stage_jacobian(stages, x, lin, self.jacobian)
+        return lambda stages, x: simplified_newton_update(stages, factors, x)[0]
 
 
 def is_simplified_alone(stage_solver: AbstractStageSolver) -> bool:
@@ -298,8 +298,8 @@ class Newton(AbstractStageSolver):
         jacobian = jax.jacfwd(lambda z: stage_residual(stages, unravel(z))[0])(z)
         jacobian_inverse = jnp.linalg.inv(jacobian)
 
-        def corrected(stages: StageSystem, x: Stages) -> Stages:
+        def update(stages: StageSystem, x: Stages) -> Stages:
             residual, _ = stage_residual(stages, x)
             return unravel(ravel_pytree(x)[0] - jacobian_inverse @ residual)
 
-        return corrected
+        return update

@@ -33,11 +33,11 @@ from .._system import (
 from ._end import end_state, step_record
 from ._error_estimate import error_ratios
 from ._invariants import Invariants, StartImpulses
+from ._jacobian import Evaluation
 from ._newton import AbstractStageSolver
 from ._record import StepRecord
 from ._round_off import RoundOff
 from ._stage_equations import end_impulse, in_chart, start_impulse
-from ._stage_iteration import Evaluation
 from ._stage_system import StageSystem
 from ._starting_values import starting_values
 from ._unknowns import Stages
