@@ -21,14 +21,6 @@ from ._iteration import (
     Sizes as Sizes,
     Solved as Solved,
 )
-from ._least_norm import (
-    least_norm_inverse as least_norm_inverse,
-    least_norm_inverse_by_blocks as least_norm_inverse_by_blocks,
-    least_norm_solve as least_norm_solve,
-    NEARLY_DEPENDENT as NEARLY_DEPENDENT,
-    rank_of_gram as rank_of_gram,
-    reciprocal_condition_of_range as reciprocal_condition_of_range,
-)
 from ._max_norm import (
     largest_column as largest_column,
     max_norm as max_norm,
@@ -66,8 +58,14 @@ from ._rank import (
     is_deficient as is_deficient,
     is_nearly_singular as is_nearly_singular,
     is_without_entries as is_without_entries,
+    least_norm_inverse as least_norm_inverse,
+    least_norm_inverse_by_blocks as least_norm_inverse_by_blocks,
+    least_norm_solve as least_norm_solve,
+    NEARLY_DEPENDENT as NEARLY_DEPENDENT,
     Rank as Rank,
+    rank_of_gram as rank_of_gram,
     reciprocal_condition as reciprocal_condition,
+    reciprocal_condition_of_range as reciprocal_condition_of_range,
     those_that_count as those_that_count,
 )
 from ._uneven_perturbations import uneven_perturbations as uneven_perturbations
