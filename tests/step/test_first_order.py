@@ -1,4 +1,4 @@
-"""Terms of order h in the Jacobian of simplified Newton: what they are, and do."""
+"""The terms of order h in the Jacobian of simplified Newton, and their effect."""
 
 from typing import Any
 
@@ -19,10 +19,10 @@ from oracles.long import long
 
 
 def contraction(example, method, h):
-    """The spectral radius of one sweep at the solution, with and without the terms.
+    """Compute the spectral radius of an iteration, with and without the terms.
 
-    The derivative of the whole sweep by the unknowns is taken by automatic
-    differentiation, which knows nothing of how the terms were found.
+    It is the derivative of the iteration by the unknowns at the solution, by automatic
+    differentiation, which does not depend on how the terms were derived.
     """
     system, y0, t = example.system, example.initial_state(), jnp.zeros(())
 
@@ -64,10 +64,10 @@ def contraction(example, method, h):
     ],
     ids=lambda x: x if isinstance(x, str) else type(x).__name__,
 )
-def test_a_sweep_contracts_by_the_square_of_the_step(example, chart):
+def test_first_order_iteration_contracts_by_square_of_step(example, chart):
     method = nhjax.LobattoIIIAB(3, chart=chart)
     (leading, full), (leading_half, full_half) = contraction(example, method, 0.02)
-    # The leading part alone leaves out terms of order h, and shows it.
+    # Without the terms of order h the iteration contracts by O(h).
     assert 1.8 < leading / leading_half < 2.2
     assert 3.6 < full / full_half < 4.4
 
@@ -86,7 +86,7 @@ def run(example, stages, dt, **solver):
     )(example.initial_state())
 
 
-def test_large_steps_of_a_sleigh_are_solved_that_the_leading_part_does_not_solve():
+def test_first_order_jacobian_solves_large_steps_that_leading_does_not():
     sleigh = systems.ChaplyginSleigh()
     leading = run(sleigh, 5, 0.5, jacobian="leading")
     assert leading.result == nhjax.RESULTS.nonlinear_max_iterations
@@ -106,7 +106,7 @@ def test_large_steps_of_a_sleigh_are_solved_that_the_leading_part_does_not_solve
         np.testing.assert_allclose(one, other, rtol=0, atol=1e-12, err_msg=name)
 
 
-def test_where_the_mass_is_constant_and_forces_do_not_depend_on_v_nothing_is_added():
+def test_first_order_terms_that_vanish_are_not_in_the_program():
     particle = systems.NonholonomicParticle()
     default, leading = (
         jax.make_jaxpr(
@@ -132,7 +132,7 @@ def test_where_the_mass_is_constant_and_forces_do_not_depend_on_v_nothing_is_add
 
 @jax.custom_vjp
 def in_reverse_mode_alone(v):
-    """A force of v with a rule of derivatives for reverse mode alone."""
+    """Compute a force of v that has a derivative rule for reverse mode alone."""
     return -0.1 * v
 
 
@@ -142,7 +142,7 @@ in_reverse_mode_alone.defvjp(
 
 
 def from_outside(v):
-    """The same force, computed outside of JAX."""
+    """Compute the same force outside JAX."""
     shape = jax.ShapeDtypeStruct(v.shape, v.dtype)
     return jax.pure_callback(
         lambda v: -0.1 * np.asarray(v), shape, v, vmap_method="expand_dims"
@@ -154,13 +154,13 @@ def from_outside(v):
     [
         (in_reverse_mode_alone, lambda v: -0.1 * v),
         (from_outside, lambda v: -0.1 * v),
-        # Their slopes at rest are not finite, or too large for a series.
+        # The slopes at rest of these forces are not finite, or too large for a series.
         (lambda v: -jnp.linalg.norm(v) * v, lambda v: -jnp.abs(v) * v),
         (lambda v: -0.5 * jnp.tanh(v / 0.01), lambda v: -0.5 * jnp.tanh(v / 0.01)),
     ],
     ids=["reverse mode", "callback", "drag at rest", "steep friction"],
 )
-def test_forces_need_no_finite_slopes(force, like):
+def test_first_order_terms_of_forces_without_finite_slopes_are_omitted(force, like):
     def fall(force, solver):
         system = nhjax.LagrangianSystem(
             lambda t, q, v, args: 0.5 * v @ v - q[0],
@@ -181,7 +181,7 @@ def test_forces_need_no_finite_slopes(force, like):
     np.testing.assert_allclose(sol.ys.v, leading.ys.v, rtol=0, atol=1e-13)
 
 
-def test_terms_that_are_not_available_are_refused():
+def test_first_order_jacobian_of_hamiltonian_system_raises():
     wrong: Any = "exact"
     with pytest.raises(ValueError, match="jacobian must be one of 'leading'"):
         nhjax.SimplifiedNewton(jacobian=wrong)
