@@ -6,16 +6,16 @@ from .._compile import as_cpu_kernel, tracked_jit
 from .._custom_types import Args, BoolScalar, FloatScalar, FloatScalarLike
 from .._errors import DTypeError, require, ShapeError
 from .._numerics import (
+    active_ranks,
     frozen,
+    has_zero_row,
     inverse,
-    is_without_entries,
     max_norm,
     nan_unless,
     Rank,
     rank_of_gram,
     reciprocal_condition,
     root,
-    those_that_count,
     tree_where,
 )
 from .._system import (
@@ -195,9 +195,7 @@ def _solve(system, t, q, v, p, args, project: bool, keep: tuple[Kept, Kept]) -> 
     system, args, t, q, u, lin, starts = frozen((system, args, t, q, u, lin, starts))
     here = Rank(lin.dense[0], q, projected)
     ranks = (
-        [here]
-        if system.constraints == "redundant"
-        else those_that_count([*starts, here])
+        [here] if system.constraints == "redundant" else active_ranks([*starts, here])
     )
     positions = system.position_constraint(t, q, args)
     deficient, compatibility = _ranks_judged(system, lin, ranks)
@@ -266,12 +264,12 @@ def _ranks_judged(
     their ranks are deficient only where a constraint has no derivatives at all.
     """
     jacobian, reaction, _ = lin.dense
-    compliance = jacobian @ reaction
+    delassus = jacobian @ reaction
     if system.constraints != "redundant":
-        return [rank.deficient for rank in ranks], reciprocal_condition(compliance)
+        return [rank.deficient for rank in ranks], reciprocal_condition(delassus)
     rank = rank_of_gram(jacobian @ jacobian.T)
-    full = (rank_of_gram(compliance) == rank).astype(compliance.dtype)
-    return [rank.counts & is_without_entries(rank.jacobian) for rank in ranks], full
+    full = (rank_of_gram(delassus) == rank).astype(delassus.dtype)
+    return [rank.is_active & has_zero_row(rank.jacobian) for rank in ranks], full
 
 
 def _inverse_legendre(

@@ -243,14 +243,14 @@ def _nearest(
     size, terms = sizes(jacobian)
     # The round-off of the constraint moves y too. If y is zero, nothing else does.
     reaction = inverse(metric) @ jacobian.T
-    compliance = jacobian @ reaction
+    delassus = jacobian @ reaction
     if idle is not None:
-        compliance = compliance + jnp.diag(idle)
+        delassus = delassus + jnp.diag(idle)
     invert, solve = inverse, jnp.linalg.solve
     if is_redundant:
         invert = partial(least_norm_inverse, negligible=NEARLY_DEPENDENT**2)
         solve = least_norm_solve
-    response = reaction @ invert(compliance)
+    response = reaction @ invert(delassus)
     scale = size + max_norm(jnp.abs(response) @ terms)
 
     def stationarity(z):

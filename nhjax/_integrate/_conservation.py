@@ -15,8 +15,8 @@ from .._custom_types import Args, BoolScalar, FloatScalar
 from .._errors import DTypeError, naming, ShapeError
 from .._numerics import (
     ClosureConverted,
-    dependence,
     frozen,
+    jacobian_sparsity,
     max_norm,
     square_jacobian,
 )
@@ -86,8 +86,10 @@ def _noise_and_least_part(
     # A mass matrix that is indefinite at one state is so at all states of a motion: an
     # eigenvalue that changes its sign makes it singular, and a singular one ends a run.
     t, q, u = frozen((t, q, u))
-    metric = square_jacobian(lambda u: system.fibre_derivative(t, q, u, args), u)
-    return noise, jnp.where(metric.is_definite(), 0, LEAST_PART).astype(value.dtype)
+    fibre_hessian = square_jacobian(lambda u: system.fibre_derivative(t, q, u, args), u)
+    return noise, jnp.where(fibre_hessian.is_definite(), 0, LEAST_PART).astype(
+        value.dtype
+    )
 
 
 def _check_function(
@@ -142,7 +144,7 @@ def _require_conserved_energy(
 def _depends_on_time(function: Callable[..., Any], t: FloatScalar, *rest: Any) -> bool:
     """Tell whether the program of a function contains its first argument."""
     time = jnp.reshape(t, (1,))
-    found = dependence(lambda t: jnp.atleast_1d(function(t[0], *rest)), time)
+    found = jacobian_sparsity(lambda t: jnp.atleast_1d(function(t[0], *rest)), time)
     return bool(np.any(found))
 
 
@@ -175,7 +177,7 @@ def conserves(
 
         def nearer(_, u):
             lin = linearise(system, t, q, u, args)
-            excess = lin.compliance_inverse.matvec(lin.violation)
+            excess = lin.delassus_inverse.matvec(lin.violation)
             return u - lin.reaction.matvec(excess)
 
         u = jax.lax.fori_loop(0, _ITERATIONS, nearer, u0 + w * (1 + jnp.abs(u0)))

@@ -13,19 +13,19 @@ from ._implicit import (
     tree_where as tree_where,
     zero_unless as zero_unless,
 )
-from ._index_sets import dependence as dependence
+from ._index_sets import jacobian_sparsity as jacobian_sparsity
 from ._iteration import (
     iterate as iterate,
     jacobian_and_value as jacobian_and_value,
     NOISE_UNITS as NOISE_UNITS,
-    Sizes as Sizes,
     Solved as Solved,
+    UpdateNorms as UpdateNorms,
 )
 from ._max_norm import (
     largest_column as largest_column,
     max_norm as max_norm,
+    nonzero_or_one as nonzero_or_one,
     relative as relative,
-    unit as unit,
 )
 from ._no_gradient import (
     nan_gradient_unless as nan_gradient_unless,
@@ -54,10 +54,11 @@ from ._operators import (
     WeightedTranspose as WeightedTranspose,
 )
 from ._rank import (
+    active_ranks as active_ranks,
     dependent_rows as dependent_rows,
+    has_zero_row as has_zero_row,
     is_deficient as is_deficient,
     is_nearly_singular as is_nearly_singular,
-    is_without_entries as is_without_entries,
     least_norm_inverse as least_norm_inverse,
     least_norm_inverse_by_blocks as least_norm_inverse_by_blocks,
     least_norm_solve as least_norm_solve,
@@ -66,6 +67,5 @@ from ._rank import (
     rank_of_gram as rank_of_gram,
     reciprocal_condition as reciprocal_condition,
     reciprocal_condition_of_range as reciprocal_condition_of_range,
-    those_that_count as those_that_count,
 )
 from ._uneven_perturbations import uneven_perturbations as uneven_perturbations

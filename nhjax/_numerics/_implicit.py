@@ -14,8 +14,8 @@ from jaxtyping import Array, PyTree
 from .._compile import cse_dce
 from .._custom_types import BoolScalar, FloatScalar
 from ._contraction import with_small_products
-from ._iteration import dense_increment, iterate, Sizes, Solved
-from ._max_norm import max_norm, unit
+from ._iteration import dense_increment, iterate, Solved, UpdateNorms
+from ._max_norm import max_norm, nonzero_or_one
 
 
 # Terms of the Neumann series below this many units of round-off are left out.
@@ -66,15 +66,15 @@ def solve_contraction(
             pairs = zip(weights, x, strict=True)
             return max_norm(*(weight * leaf for weight, leaf in pairs))
 
-        def sweep(x):
+        def iteration(x):
             increment = _minus(b, matvec(x))
             x = [x + dx for x, dx in zip(x, increment, strict=True)]
-            return x, Sizes(size(increment), size(x)), None
+            return x, UpdateNorms(size(increment), size(x)), None
 
         scale = size(b)
         tolerance = _UNITS_LEFT * float(jnp.finfo(scale.dtype).eps)
         solved = iterate(
-            sweep,
+            iteration,
             b,
             scale,
             max_iterations=max_iterations,
@@ -84,7 +84,7 @@ def solve_contraction(
         return nan_unless(solved.converged, solved.x)
 
     pairs = zip(given, units, strict=True)
-    scales = [unit(jax.lax.stop_gradient(one)) for x, one in pairs if x.size]
+    scales = [nonzero_or_one(jax.lax.stop_gradient(one)) for x, one in pairs if x.size]
     x = jax.lax.custom_linear_solve(
         operator,
         _mixed(_not_empty(b)),
@@ -136,15 +136,15 @@ def root(
     def flat_residual(x):
         return ravel_pytree(residual(unravel(x)))[0]
 
-    def sweep(x):
+    def iteration(x):
         dx, _ = dense_increment(lambda z: (flat_residual(z), None), x, solve)
         # The part that is not judged must be finite all the same.
         rest = jnp.where(jnp.all(jnp.isfinite(dx)), 0, jnp.inf).astype(dx.dtype)
         size = rest + max_norm(*jax.tree.leaves(judged(unravel(dx))))
-        return x + dx, Sizes(size), None
+        return x + dx, UpdateNorms(size), None
 
     def newton(_, x):
-        solved = iterate(sweep, x, scale, max_iterations=max_iterations)
+        solved = iterate(iteration, x, scale, max_iterations=max_iterations)
         # The outcome is converted to floats, because `custom_root` takes the tangents
         # of `aux` for floats.
         outcome = (solved.converged, solved.exhausted, solved.num_iterations)

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from .._custom_types import BoolScalar, FloatScalar, FloatScalarLike
-from ._max_norm import unit
+from ._max_norm import nonzero_or_one
 
 
 X = TypeVar("X")
@@ -32,7 +32,7 @@ _HOPELESS = 1e6
 _LARGEST_NOISE = 1e5
 
 
-class Sizes(NamedTuple):
+class UpdateNorms(NamedTuple):
     """The sizes of an increment and of the iterate that it leads to, in the same unit.
 
     `noise`, where it is known, is the change of the iterate if the data of the problem
@@ -47,7 +47,7 @@ class Sizes(NamedTuple):
 class Solved(NamedTuple, Generic[X, Aux]):
     """The outcome of an iteration: its last iterate, and whether it has converged.
 
-    `aux` is what the last sweep evaluated. An iteration that has not converged is
+    `aux` is what the last iteration evaluated. An iteration that has not converged is
     `exhausted` if it was given up after the largest number of iterations; otherwise it
     has diverged.
     """
@@ -90,7 +90,7 @@ class _Progress(NamedTuple):
 
 
 def iterate(
-    sweep: Callable[[X], tuple[X, Sizes, Aux]],
+    iteration: Callable[[X], tuple[X, UpdateNorms, Aux]],
     x: X,
     scale: FloatScalar,
     *,
@@ -100,14 +100,14 @@ def iterate(
     noise_units: float | None = None,
     skip: Bool[Array, ""] | bool = False,
 ) -> Solved[X, Aux]:
-    """Repeat `sweep` until its increments no longer fall.
+    """Repeat `iteration` until its increments no longer fall.
 
-    `sweep(x)` returns the next iterate, the sizes of the increment and of the iterate,
-    and whatever was evaluated at x. Increments are measured relative to `scale`, the
-    size of x, or relative to the size of the iterate if that is larger, because x may
-    start from zero. If both are zero, increments are measured relative to the first
-    one, which is measured as it is. The round-off of x is proportional to the same size
-    or, where data are larger than x, to `scale` plus `round_off`.
+    `iteration(x)` returns the next iterate, the sizes of the increment and of the
+    iterate, and whatever was evaluated at x. Increments are measured relative to
+    `scale`, the size of x, or relative to the size of the iterate if that is larger,
+    because x may start from zero. If both are zero, increments are measured relative to
+    the first one, which is measured as it is. The round-off of x is proportional to the
+    same size or, where data are larger than x, to `scale` plus `round_off`.
 
     An increment below the unit round-off or `tolerance` ends the iteration. Small
     increments that have stopped falling end it too, because they are round-off. How
@@ -119,10 +119,10 @@ def iterate(
     so fast that nothing but noise can slow them down. An increment that is not finite,
     or far larger than the first one and the iterate, ends the iteration as well.
     """
-    # The sweep is traced once, for the shapes and for the loop: to trace it is most of
-    # the work of tracing a step.
-    sweep = jax.jit(sweep, inline=True)
-    aux_shape = jax.eval_shape(sweep, x)[2]
+    # The iteration is traced once, for the shapes and for the loop: to trace it is most
+    # of the work of tracing a step.
+    iteration = jax.jit(iteration, inline=True)
+    aux_shape = jax.eval_shape(iteration, x)[2]
     aux = jax.tree.map(lambda s: jnp.zeros(s.shape, s.dtype), aux_shape)
     dtype = jnp.result_type(*[leaf.dtype for leaf in jax.tree.leaves(x)])
     eps = float(jnp.finfo(dtype).eps)
@@ -140,7 +140,7 @@ def iterate(
 
     def body(carry):
         x, _, progress = carry
-        x_next, sizes, aux = sweep(x)
+        x_next, sizes, aux = iteration(x)
         return x_next, aux, _progress(rules, progress, sizes)
 
     zero = jnp.zeros((), jnp.int32)
@@ -155,7 +155,7 @@ def iterate(
     return Solved(x, aux, progress.converged, progress.exhausted, progress.iterations)
 
 
-def _progress(rules: _Rules, before: _Progress, sizes: Sizes) -> _Progress:
+def _progress(rules: _Rules, before: _Progress, sizes: UpdateNorms) -> _Progress:
     """Update the progress of an iteration by an increment; decide whether it ends."""
     increment = sizes.increment
     first = jnp.where(before.iterations == 0, increment, before.first)
@@ -185,7 +185,7 @@ def _progress(rules: _Rules, before: _Progress, sizes: Sizes) -> _Progress:
     bounded = increment < _HOPELESS * (measure + first)
     exhausted = bounded & ~converged & (count >= rules.max_iterations)
     return _Progress(
-        first=unit(first),
+        first=nonzero_or_one(first),
         smallest=jnp.minimum(increment, before.smallest),
         believed=believed,
         iterations=count,

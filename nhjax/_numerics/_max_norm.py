@@ -50,8 +50,8 @@ def largest_column(*arrays: Float[Array, "_ n"]) -> tuple[FloatScalar, Int[Array
     return value, column
 
 
-def unit(scale: FloatScalarLike | Float[Array, "*k"]) -> Float[Array, "*k"]:
-    """Return the unit in which sizes are measured: the scale, or one if it is zero."""
+def nonzero_or_one(scale: FloatScalarLike | Float[Array, "*k"]) -> Float[Array, "*k"]:
+    """Return the scale, or one where it is zero, as a unit of sizes."""
     return jnp.where(scale > 0, scale, 1)
 
 
@@ -59,4 +59,4 @@ def relative(
     size: Float[Array, "*k"], scale: FloatScalarLike | Float[Array, "*k"]
 ) -> Float[Array, "*k"]:
     """Divide a size by the scale that it is measured in, or by one if that is zero."""
-    return size / unit(scale)
+    return size / nonzero_or_one(scale)

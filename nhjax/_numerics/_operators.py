@@ -28,7 +28,7 @@ from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from .._custom_types import BoolScalar, FloatScalar
 from ._contraction import inverse, small_einsum
-from ._index_sets import dependence
+from ._index_sets import jacobian_sparsity
 from ._max_norm import max_norm
 from ._rank import is_nearly_singular
 
@@ -425,7 +425,7 @@ def square_jacobian(
     def push(du):
         return jax.jvp(function, (u,), (du,))[1]
 
-    found = dependence(function, u)
+    found = jacobian_sparsity(function, u)
     if found.shape == (u.shape[0],) * 2 and not np.any(
         found & ~np.eye(len(u), dtype=bool)
     ):

@@ -24,23 +24,23 @@ from .._custom_types import BoolScalar, FloatScalar
 class Rank(NamedTuple):
     """The derivatives of constraints at a configuration, which must have full rank.
 
-    The `jacobian` has k rows of DΓ, or m + k rows of D2Φ and DΓ. `counts` says whether
-    its rank matters. At the starting values of Newton's method it matters only if the
-    method fails; otherwise the method has moved to another configuration.
+    The `jacobian` has k rows of DΓ, or m + k rows of D2Φ and DΓ. Its rank matters only
+    if `is_active`. The rank at the starting values of Newton's method is active only if
+    the method fails; otherwise the method has moved to another configuration.
     """
 
     jacobian: Float[Array, "l n"]
     q: PyTree[Array]
-    counts: BoolScalar
+    is_active: BoolScalar
 
     @property
     def deficient(self) -> BoolScalar:
         """Return whether the rank matters and is not full."""
-        return self.counts & is_deficient(self.jacobian)
+        return self.is_active & is_deficient(self.jacobian)
 
 
-def those_that_count(ranks: list[Rank]) -> list[Rank]:
-    """Keep at most one matrix of each shape, namely the one whose rank matters.
+def active_ranks(ranks: list[Rank]) -> list[Rank]:
+    """Keep at most one matrix of each shape, namely the active one.
 
     Singular values are more expensive than all else here, so that they are computed for
     as few matrices as possible.
@@ -50,7 +50,7 @@ def those_that_count(ranks: list[Rank]) -> list[Rank]:
         other = merged.setdefault(rank.jacobian.shape, rank)
         if other is not rank:
             merged[rank.jacobian.shape] = jax.tree.map(
-                lambda x, y, counts=rank.counts: jnp.where(counts, x, y), rank, other
+                lambda x, y, active=rank.is_active: jnp.where(active, x, y), rank, other
             )
     return list(merged.values())
 
@@ -87,7 +87,7 @@ def is_deficient(matrix: Float[Array, "k l"]) -> BoolScalar:
     return reciprocal_condition(matrix) <= 10 * matrix.shape[1] * eps
 
 
-def is_without_entries(matrix: Float[Array, "k l"]) -> BoolScalar:
+def has_zero_row(matrix: Float[Array, "k l"]) -> BoolScalar:
     """Return whether some row is zero."""
     return jnp.any(jnp.all(matrix == 0, axis=1))
 

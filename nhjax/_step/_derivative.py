@@ -89,12 +89,12 @@ def change_of_step(
     def change(perturbed, x, rates):
         rates = zero_unless(ok, rates)
 
-        def sweep(perturbed, x):
+        def iteration(perturbed, x):
             arguments = eqx.combine(perturbed, fixed)
             return frozen_newton_map(equations_of_step(arguments, method), x)
 
-        # The program of a sweep is made once, and differentiated twice.
-        corrected = ClosureConverted(sweep, perturbed, x)
+        # The iteration is traced once and differentiated twice.
+        corrected = ClosureConverted(iteration, perturbed, x)
         end = ClosureConverted(
             lambda perturbed, x: _end(eqx.combine(perturbed, fixed), method, x),
             perturbed,

@@ -12,9 +12,9 @@ from .._custom_types import Args, FloatScalar
 from .._numerics import (
     inverse,
     max_norm,
+    nonzero_or_one,
     small_einsum,
     SquareMatrix,
-    unit,
 )
 from .._system import (
     AbstractMechanicalSystem,
@@ -224,7 +224,7 @@ class StartImpulses(eqx.Module):
         slopes, covectors, _ = invariants.directions(
             system, t, y.q, u, args, all_slopes
         )
-        row_sums = lin.metric_inverse.absolute_row_sums()
+        row_sums = lin.fibre_hessian_inverse.absolute_row_sums()
         given = slopes, covectors, lin.momentum_inverse, row_sums
         return cls(invariants, *given, moving_part(slopes, u), sizes, position)
 
@@ -286,7 +286,7 @@ class ImpulseWeights(eqx.Module):
         eps = float(jnp.finfo(gram.dtype).eps)
         one = jnp.eye(gram.shape[0], dtype=gram.dtype)
         g = jnp.sum(gram * one, axis=1)
-        denominator = unit(g**2 + eps * given.sizes**2)
+        denominator = nonzero_or_one(g**2 + eps * given.sizes**2)
         errors, a = g / denominator, g**2 / denominator
         matrix = errors[:, None] * gram + (1 - a)[:, None] * one
         # Functions of which some follow from others have a singular matrix.
@@ -303,7 +303,9 @@ class ImpulseWeights(eqx.Module):
             errors=jnp.where(acts, errors, 0),
             rest=jnp.where(acts, 1 - a, 1),
             inverse=jnp.where(acts, solved, one),
-            limits=_LARGEST_PART * (given.moving + moving) / unit(jnp.sum(terms, 1)),
+            limits=_LARGEST_PART
+            * (given.moving + moving)
+            / nonzero_or_one(jnp.sum(terms, 1)),
             start=start,
             end=end,
             velocity=given.slopes if hamiltonian else start,

@@ -17,9 +17,9 @@ from .._numerics import (
     jacobian_and_value,
     max_norm,
     NOISE_UNITS,
-    Sizes,
     Solved,
     uneven_perturbations,
+    UpdateNorms,
 )
 from .._system import all_finite, check_flag, Linearisation
 from ._first_order import JacobianName
@@ -82,14 +82,14 @@ class AbstractStageSolver(eqx.Module):
 
 def _iterated(
     stage_solver: AbstractStageSolver,
-    sweep: Callable[[Stages], tuple[Stages, Sizes, Evaluation]],
+    iteration: Callable[[Stages], tuple[Stages, UpdateNorms, Evaluation]],
     x0: Stages,
     scale: Scale,
     skip: Array,
 ) -> Solved[Stages, Evaluation]:
-    """Run the iteration on the stages of a solver, whose own sweep is an argument."""
+    """Repeat the `iteration` of a stage solver with the options of this solver."""
     return iterate(
-        sweep,
+        iteration,
         x0,
         scale.size,
         max_iterations=stage_solver.max_iterations,
@@ -164,11 +164,11 @@ class SimplifiedNewton(AbstractStageSolver):
         factors = factorise_stage_jacobian(stages, x0, lin, self.jacobian)
         scale = fibre_coordinate_scale(stages, x0, lin)
 
-        def sweep(x: Stages):
+        def iteration(x: Stages):
             x_next, evaluation = simplified_newton_update(stages, factors, x)
             return x_next, update_norms(stages, x, x_next, lin), evaluation
 
-        solved = _iterated(self, sweep, x0, scale, skip)
+        solved = _iterated(self, iteration, x0, scale, skip)
         if not self.fallback:
             return solved
         # If the first iterate is not finite, the functions of the system are not finite
@@ -250,7 +250,7 @@ class Newton(AbstractStageSolver):
         def residual(z):
             return stage_residual(stages, unravel(z))
 
-        def sweep(x: Stages):
+        def iteration(x: Stages):
             z, _ = ravel_pytree(x)
             jacobian, r, evaluation = jacobian_and_value(residual, z)
             change = stage_residual(moved, x)[0] - r
@@ -268,14 +268,14 @@ class Newton(AbstractStageSolver):
                 increment_size(stages, x, unravel(z + noise), lin) for noise in noises
             )
             noise = jnp.maximum(by_positions / nudge, PART * by_equations / eps)
-            found = Sizes(
+            found = UpdateNorms(
                 increment_size(stages, x, x_next, lin),
                 fibre_coordinate_size(stages, x_next),
                 noise,
             )
             return x_next, found, evaluation
 
-        solved = _iterated(self, sweep, x0, scale, skip)
+        solved = _iterated(self, iteration, x0, scale, skip)
         # Where forces grow without bound, increments are small even far from any
         # solution, so that the residual is checked too.
         gross = lin.momentum_inverse.matvec(solved.aux.forces.residual)

@@ -87,9 +87,9 @@ def node_constraint(stages: StageSystem, x: Stages) -> Float[Array, "r m"]:
 
 
 def holonomic_constraint(stages: StageSystem, x: Stages) -> Float[Array, "s k"]:
-    """Compute Γ(Q^i) / h for i >= 2, and the tangency dΓ/dt at the end of the step.
+    """Compute Γ(Q^i) / h for i >= 2, and the rate dΓ/dt at the end of the step.
 
-    The division by h makes the values the size of velocities, as the tangency is.
+    The division by h makes the values the size of velocities, like the rate.
     """
     chart, y = in_stages(stages, x)
     nodes = chart.positions(y[1:])
@@ -97,10 +97,10 @@ def holonomic_constraint(stages: StageSystem, x: Stages) -> Float[Array, "s k"]:
         lambda t, q: stages.system.position_constraint(t, q, stages.args)
     )(stages.stage_times[1:], nodes)
     end = jax.tree.map(lambda leaf: leaf[-1], nodes)
-    tangency = stages.system.tangency(
+    rate = stages.system.holonomic_rate(
         stages.t + stages.h, end, x.node_fibre_coordinate[-1], stages.args
     )
-    values = jnp.concatenate([on_positions / stages.h, tangency[None]])
+    values = jnp.concatenate([on_positions / stages.h, rate[None]])
     if stages.redundancy is None:
         return values
     m = stages.num_nonholonomic

@@ -32,7 +32,7 @@ class StageSystem(eqx.Module):
     Π^i = base + h Σ â_ij F^j,    μ^i = Ad^*_{τ(y^i)} (M + h Σ a_ij n^j),
 
     together with the nonholonomic constraints at the nodes (q^i, μ^i), the holonomic
-    ones at the positions Q^i, i >= 2, and their tangency at the end. The constraints at
+    ones at the positions Q^i, i >= 2, and their rates at the end. The constraints at
     the first node hold by hypothesis H1; the last node is the end of the step by H3.
     Of redundant constraints as many are kept as are independent; see `Redundancy`.
     A closure of the multiplier enters in three places: by the constant matrices of

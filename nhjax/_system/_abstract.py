@@ -162,7 +162,7 @@ class AbstractMechanicalSystem(eqx.Module):
             return jnp.zeros((0,), u.dtype)
         return jnp.atleast_1d(self.call("nonholonomic", t, q, u, args))
 
-    def tangency(
+    def holonomic_rate(
         self,
         t: FloatScalarLike,
         q: PyTree[Array],
@@ -190,15 +190,18 @@ class AbstractMechanicalSystem(eqx.Module):
         """Compute all constraints on velocities, of shape (l,) with l = m + k.
 
         The m nonholonomic constraints come first, then the rates dΓ/dt of the k
-        holonomic ones (their tangency). By Chetaev's rule the reaction of a holonomic
-        constraint is that of its tangency: these rows determine all multipliers.
+        holonomic ones (their rates). By Chetaev's rule the reaction of a holonomic
+        constraint is that of its rate: these rows determine all multipliers.
         """
         if self.holonomic is None:
             return self.kinematic_constraint(t, q, u, args)
         if self.nonholonomic is None:
-            return self.tangency(t, q, u, args)
+            return self.holonomic_rate(t, q, u, args)
         return jnp.concatenate(
-            [self.kinematic_constraint(t, q, u, args), self.tangency(t, q, u, args)]
+            [
+                self.kinematic_constraint(t, q, u, args),
+                self.holonomic_rate(t, q, u, args),
+            ]
         )
 
     def reaction(

@@ -6,7 +6,7 @@ from jaxtyping import Array, Float
 
 from .._custom_types import Args, FloatScalar
 from .._errors import DependentConstraintsError
-from .._numerics import dependent_rows, is_deficient, is_without_entries
+from .._numerics import dependent_rows, has_zero_row, is_deficient
 from ._abstract import AbstractMechanicalSystem
 from ._state import State
 
@@ -89,7 +89,7 @@ def require_independent(
     u = system.fibre_coordinate(y)
     jacobian = jax.jacrev(system.constraint, argnums=2)(t, y.q, u, args)
     is_redundant = system.constraints == "redundant"
-    lacking = is_without_entries if is_redundant else is_deficient
+    lacking = has_zero_row if is_redundant else is_deficient
     if jacobian.shape[0] == 0 or not lacking(jacobian):
         return
     k = system.position_constraint(t, y.q, args).shape[0]

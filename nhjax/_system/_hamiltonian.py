@@ -127,8 +127,8 @@ class HamiltonianSystem(AbstractMechanicalSystem):
         args: Args = None,
     ) -> Float[Array, " n"]:
         """Compute ♭_H D2Ψ = (D2D2H)⁻¹ D2Ψ from a constraint's derivative D2Ψ."""
-        metric = square_jacobian(lambda u: self.velocity(t, q, u, args), u)
-        return metric.inverse().matvec(derivative)
+        fibre_hessian = square_jacobian(lambda u: self.velocity(t, q, u, args), u)
+        return fibre_hessian.inverse().matvec(derivative)
 
     def energy(self, t: FloatScalarLike, y: State, args: Args = None) -> FloatScalar:
         """Compute the energy H(t, q, p) of a state.

@@ -3,7 +3,7 @@
 from jaxtyping import Array, Float, PyTree
 
 from .._custom_types import Args, FloatScalar
-from .._numerics import dependence, Pattern
+from .._numerics import jacobian_sparsity, Pattern
 from ._abstract import AbstractMechanicalSystem
 
 
@@ -29,6 +29,6 @@ def constraint_pattern(
     kinds = [system.nonholonomic, system.holonomic]
     if system.constraints == "redundant" or None not in kinds:
         return None
-    entries = dependence(lambda u: system.constraint(t, q, u, args), u)
+    entries = jacobian_sparsity(lambda u: system.constraint(t, q, u, args), u)
     pattern = Pattern(entries)
     return pattern if pattern.group <= _LARGEST_BLOCK * len(entries) else None
