@@ -12,8 +12,8 @@ from .._numerics import (
     inverse,
     max_norm,
     nan_unless,
-    Rank,
     rank_of_gram,
+    RankCondition,
     reciprocal_condition,
     root,
     tree_where,
@@ -169,7 +169,7 @@ def _solve(system, t, q, v, p, args, project: bool, keep: tuple[Kept, Kept]) -> 
             start = q
             nearest = project_position(system, t, q, guess, args, keep_q, given_q)
             q, projected, fixed_q = nearest.x, nearest.found, nearest.fixed
-            starts.append(Rank(nearest.jacobian, start, ~projected))
+            starts.append(RankCondition(nearest.jacobian, start, ~projected))
         if keep_q.indices:
             q = keep_q.restored(q, given_q)
             off_group = manifold.distance_to_group(frozen(q))
@@ -178,7 +178,7 @@ def _solve(system, t, q, v, p, args, project: bool, keep: tuple[Kept, Kept]) -> 
         u, legendre_solved = _inverse_legendre(system, t, q, given, args)
     if project and (system.nonholonomic is not None or system.holonomic is not None):
         nearest = project_fibre_coordinate(system, t, q, u, args, keep_u, given)
-        starts.append(Rank(nearest.jacobian, q, projected & ~nearest.found))
+        starts.append(RankCondition(nearest.jacobian, q, projected & ~nearest.found))
         u, projected = nearest.x, projected & nearest.found
         fixed_u = nearest.fixed
     lin, found_v, found_p = as_cpu_kernel(_motion, system, t, q, u, args)
@@ -193,7 +193,7 @@ def _solve(system, t, q, v, p, args, project: bool, keep: tuple[Kept, Kept]) -> 
     state = State(q, found_v, found_p, lin.multiplier)
     # The numbers by which the state is judged lead to no derivative.
     system, args, t, q, u, lin, starts = frozen((system, args, t, q, u, lin, starts))
-    here = Rank(lin.dense[0], q, projected)
+    here = RankCondition(lin.dense[0], q, projected)
     ranks = (
         [here] if system.constraints == "redundant" else active_ranks([*starts, here])
     )
@@ -255,7 +255,7 @@ def _motion(
 
 
 def _ranks_judged(
-    system: AbstractMechanicalSystem, lin: Linearisation, ranks: list[Rank]
+    system: AbstractMechanicalSystem, lin: Linearisation, ranks: list[RankCondition]
 ) -> tuple[list[BoolScalar], FloatScalar]:
     """Judge the ranks of constraint derivatives, and the condition number of C.
 

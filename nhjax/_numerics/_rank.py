@@ -1,10 +1,10 @@
 """The rank of small matrices, and inverses of matrices without full rank.
 
-Constraints are independent if the rows of their Jacobian B are. `Rank` collects the
-Jacobians whose rank must be full, `reciprocal_condition` measures how close the rows
-are to being dependent, and `dependent_rows` lists the rows for an error message. Where
-redundant constraints are allowed, `least_norm_inverse` replaces the inverse of
-C = B K⁻¹ Bᵀ: it solves C x = b with the least norm of x.
+Constraints are independent if the rows of their Jacobian B are. A `RankCondition` is a
+Jacobian whose rank must be full, `reciprocal_condition` measures how close the rows are
+to being dependent, and `dependent_rows` lists the rows for an error message. Where
+redundant constraints are allowed, `least_norm_inverse` replaces the inverse of C = B
+K⁻¹ Bᵀ: it solves C x = b with the least norm of x.
 """
 
 from typing import NamedTuple
@@ -21,7 +21,7 @@ from .._custom_types import BoolScalar, FloatScalar
 # The rank of Jacobians.
 
 
-class Rank(NamedTuple):
+class RankCondition(NamedTuple):
     """The derivatives of constraints at a configuration, which must have full rank.
 
     The `jacobian` has k rows of DΓ, or m + k rows of D2Φ and DΓ. Its rank matters only
@@ -39,13 +39,13 @@ class Rank(NamedTuple):
         return self.is_active & is_deficient(self.jacobian)
 
 
-def active_ranks(ranks: list[Rank]) -> list[Rank]:
+def active_ranks(ranks: list[RankCondition]) -> list[RankCondition]:
     """Keep at most one matrix of each shape, namely the active one.
 
     Singular values are more expensive than all else here, so that they are computed for
     as few matrices as possible.
     """
-    merged: dict[tuple[int, ...], Rank] = {}
+    merged: dict[tuple[int, ...], RankCondition] = {}
     for rank in ranks:
         other = merged.setdefault(rank.jacobian.shape, rank)
         if other is not rank:

@@ -33,9 +33,9 @@ from .._numerics import (
     InverseMatrix,
     max_norm,
     nonzero_or_one,
-    Pattern,
     ReactionMatrix,
     small_einsum,
+    SparsityPattern,
     SquareMatrix,
     UpdateNorms,
 )
@@ -391,7 +391,7 @@ def _schur_complement(
 
 
 def _sparse_factors(
-    stages: StageSystem, x: Stages, lin: Linearisation, pattern: Pattern
+    stages: StageSystem, x: Stages, lin: Linearisation, pattern: SparsityPattern
 ) -> StageJacobianFactors:
     """Compute the factors for constraints each of which uses few coordinates."""
     nodes = sparse_constraint_jacobian(stages, x, pattern)

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from .._custom_types import BoolScalar
-from .._numerics import Pattern, small_einsum, sparse_jacobian, SparseMatrix
+from .._numerics import small_einsum, sparse_jacobian, SparseMatrix, SparsityPattern
 from .._system import motion_residual, total_force
 from ._invariants import ImpulseWeights, moving_part
 from ._positions import end_position, in_nodes, in_stages, stage_positions
@@ -122,7 +122,7 @@ def constraint_jacobian(stages: StageSystem, x: Stages) -> Float[Array, "r l n"]
 
 
 def sparse_constraint_jacobian(
-    stages: StageSystem, x: Stages, pattern: Pattern
+    stages: StageSystem, x: Stages, pattern: SparsityPattern
 ) -> SparseMatrix:
     """Compute B = ∂Φ/∂u at the nodes i >= 2 as a sparse matrix of a known pattern."""
     return _at_nodes(

@@ -3,7 +3,7 @@
 from jaxtyping import Array, Float, PyTree
 
 from .._custom_types import Args, FloatScalar
-from .._numerics import jacobian_sparsity, Pattern
+from .._numerics import jacobian_sparsity, SparsityPattern
 from ._abstract import AbstractMechanicalSystem
 
 
@@ -20,7 +20,7 @@ def constraint_pattern(
     q: PyTree[Array],
     u: Float[Array, " n"],
     args: Args,
-) -> Pattern | None:
+) -> SparsityPattern | None:
     """Find the places of the entries of B = ∂Φ/∂u; None if B is to be dense.
 
     That is where constraints are redundant, or of both kinds, or each shares
@@ -30,5 +30,5 @@ def constraint_pattern(
     if system.constraints == "redundant" or None not in kinds:
         return None
     entries = jacobian_sparsity(lambda u: system.constraint(t, q, u, args), u)
-    pattern = Pattern(entries)
+    pattern = SparsityPattern(entries)
     return pattern if pattern.group <= _LARGEST_BLOCK * len(entries) else None
