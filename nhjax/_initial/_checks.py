@@ -26,8 +26,7 @@ from .._system import (
     Linearisation,
     State,
 )
-from ._keep import Kept
-from ._projection import Fixed
+from ._projection import Fixed, Kept
 
 
 class Found(NamedTuple):

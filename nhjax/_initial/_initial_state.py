@@ -41,8 +41,13 @@ from .._system import (
     violation_scale,
 )
 from ._checks import Found, judged
-from ._keep import checked_keep, Chosen, Kept
-from ._projection import project_fibre_coordinate, project_position
+from ._projection import (
+    checked_keep,
+    Chosen,
+    Kept,
+    project_fibre_coordinate,
+    project_position,
+)
 
 
 def initial_state(
