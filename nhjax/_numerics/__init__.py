@@ -5,7 +5,6 @@ from ._block_tridiagonal import (
     BlockTridiagonalInverse as BlockTridiagonalInverse,
     couplings as couplings,
 )
-from ._compensated import two_sum as two_sum
 from ._contraction import (
     absolute as absolute,
     AbstractLinearMap as AbstractLinearMap,
@@ -15,6 +14,16 @@ from ._contraction import (
     small_einsum as small_einsum,
 )
 from ._diagonal import full_jacobian as full_jacobian, jacobian as jacobian
+from ._floating_point import (
+    largest_column as largest_column,
+    max_norm as max_norm,
+    measured_noise as measured_noise,
+    NOISE_DEVIATIONS as NOISE_DEVIATIONS,
+    relative as relative,
+    two_sum as two_sum,
+    uneven_perturbations as uneven_perturbations,
+    unit as unit,
+)
 from ._implicit import (
     ClosureConverted as ClosureConverted,
     frozen as frozen,
@@ -26,7 +35,6 @@ from ._implicit import (
     tree_where as tree_where,
     zero_unless as zero_unless,
 )
-from ._index_sets import dependence as dependence
 from ._iteration import (
     iterate as iterate,
     jacobian_and_value as jacobian_and_value,
@@ -42,19 +50,9 @@ from ._least_norm import (
     rank_of_gram as rank_of_gram,
     reciprocal_condition_of_range as reciprocal_condition_of_range,
 )
-from ._max_norm import (
-    largest_column as largest_column,
-    max_norm as max_norm,
-    relative as relative,
-    unit as unit,
-)
 from ._no_gradient import (
     nan_gradient_unless as nan_gradient_unless,
     nan_tangent_unless as nan_tangent_unless,
-)
-from ._noise import (
-    measured_noise as measured_noise,
-    NOISE_DEVIATIONS as NOISE_DEVIATIONS,
 )
 from ._rank import (
     dependent_rows as dependent_rows,
@@ -72,4 +70,4 @@ from ._sparse import (
     SparseMatrix as SparseMatrix,
     WeightedTranspose as WeightedTranspose,
 )
-from ._uneven_perturbations import uneven_perturbations as uneven_perturbations
+from ._sparsity import dependence as dependence

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from .._custom_types import BoolScalar, FloatScalar, FloatScalarLike
-from ._max_norm import unit
+from ._floating_point import unit
 
 
 X = TypeVar("X")

@@ -1,12 +1,96 @@
-"""The round-off of a function near a point, measured by differences of high order."""
+"""The sizes of arrays, and the round-off of sums and of functions."""
 
 import math
 from collections.abc import Callable
+from functools import reduce
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, PyTree
+from jax.flatten_util import ravel_pytree
+from jaxtyping import Array, Float, Int, PyTree
+
+from .._custom_types import FloatScalar, FloatScalarLike
+
+
+def max_norm(*arrays: Array) -> FloatScalar:
+    """Compute max |x| over one or more arrays; NaN if a number is, 0 if all are empty.
+
+    The maximum is taken over the bit patterns, since numbers that are not negative are
+    ordered as their bit patterns are, with NaN above infinity. A maximum of floats that
+    propagates NaN takes five instructions that wait for each other, one of integers
+    takes two: with maxima of floats, the sizes took a third of the time of an iteration
+    on the stages.
+    """
+    dtype = jnp.result_type(*arrays)
+    largest = [jnp.max(_pattern(x.astype(dtype)), initial=0) for x in arrays]
+    return jax.lax.bitcast_convert_type(reduce(jnp.maximum, largest), dtype)
+
+
+def _pattern(x: Array) -> Array:
+    bits = {2: jnp.int16, 4: jnp.int32, 8: jnp.int64}[x.dtype.itemsize]
+    return jax.lax.bitcast_convert_type(jnp.abs(x), bits)
+
+
+def largest_column(*arrays: Float[Array, "_ n"]) -> tuple[FloatScalar, Int[Array, ""]]:
+    """Compute max |x| over matrices of n columns, and the column in which it is.
+
+    The last bits of each pattern are replaced by the number of its column, so that one
+    maximum finds both; the value is rounded down by as many bits. A search for the
+    column after the maximum took a tenth of the time of a step. Of numbers some of
+    which are NaN, the column is that of a NaN.
+    """
+    columns = arrays[0].shape[1]
+    mask = (1 << max(columns - 1, 0).bit_length()) - 1
+
+    def marked(x):
+        pattern = _pattern(x)
+        numbers = jnp.arange(columns, dtype=pattern.dtype)[None]
+        return jnp.max((pattern & ~mask) | numbers, initial=0)
+
+    largest = reduce(jnp.maximum, map(marked, arrays))
+    value = jax.lax.bitcast_convert_type(largest & ~mask, arrays[0].dtype)
+    column = (largest & mask).astype(jnp.int32)
+    return value, column
+
+
+def unit(scale: FloatScalarLike | Float[Array, "*k"]) -> Float[Array, "*k"]:
+    """Return the unit in which sizes are measured: the scale, or one if it is zero."""
+    return jnp.where(scale > 0, scale, 1)
+
+
+def relative(
+    size: Float[Array, "*k"], scale: FloatScalarLike | Float[Array, "*k"]
+) -> Float[Array, "*k"]:
+    """Divide a size by the scale that it is measured in, or by one if that is zero."""
+    return size / unit(scale)
+
+
+def two_sum(
+    a: Float[Array, "*n"], b: Float[Array, "*n"]
+) -> tuple[Float[Array, "*n"], Float[Array, "*n"]]:
+    """Compute the rounded sum a + b and its exact rounding error (Knuth's TwoSum).
+
+    Adding the error to the next increment makes the sum of many small increments
+    accurate to about one rounding (Hairer, Lubich, Wanner, GNI, section VIII.5).
+    """
+    total = a + b
+    b_in_total = total - a
+    error = (a - (total - b_in_total)) + (b - b_in_total)
+    return total, error
+
+
+def uneven_perturbations(q: PyTree[Array]) -> PyTree[Array]:
+    """Return a perturbation of each number in q, of half its size to its size.
+
+    The moves differ and have both signs, so that they hardly cancel in differences and
+    sums of a few numbers. Multiples of the golden ratio, less their whole parts, differ
+    from one another as much as they can.
+    """
+    numbers, unravel = ravel_pytree(q)
+    k = np.arange(numbers.size)
+    weights = (-1.0) ** k * (1 - 0.5 * (0.618 * k % 1))
+    return unravel(jnp.abs(numbers) * jnp.asarray(weights, numbers.dtype))
 
 
 # A value is not told from round-off up to so many standard deviations of its noise.
