@@ -30,6 +30,7 @@ from ._arguments import (
     check_coordinates,
     check_manifold,
     check_signature,
+    check_third_argument,
     check_type,
 )
 
@@ -89,10 +90,12 @@ class AbstractMechanicalSystem(eqx.Module):
     fibre_coordinate_name: eqx.AbstractClassVar[Literal["v", "p"]]
 
     def __check_init__(self):
+        owner, letter = type(self).__name__, self.fibre_coordinate_name
         for name, arguments in self.signatures().items():
             function = getattr(self, name)
             if function is not None or name == self.generator:
-                check_signature(type(self).__name__, name, function, arguments)
+                check_signature(owner, name, function, arguments)
+                check_third_argument(owner, name, function, arguments, letter)
         check_constraints(self)
         check_manifold(self)
         check_coordinates(self)
