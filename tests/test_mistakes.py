@@ -352,7 +352,7 @@ VALUES_OF_FUNCTIONS = [
         lambda: start(system_with(lagrangian=lambda t, q, v, args: v[0] ** 2 - q @ q)),
         IrregularLagrangianError,
         "the mass matrix D2D2L is singular",
-        "Give every coordinate a kinetic energy, or remove those without",
+        "Give every coordinate a kinetic energy, or remove the coordinates without one",
     ),
     row(
         "gave a kinetic energy with a sign that cancels the constraint",
@@ -661,7 +661,7 @@ STATES = [
         lambda: start(q=Y0, v=None),
         TypeError,
         "`q` must be a configuration, got an nhjax.State",
-        "give `y.q` and `y.v`",
+        "pass `y.q` and `y.v`",
     ),
     row(
         "gave a tuple of arrays to a system on R^n",
@@ -700,13 +700,13 @@ STATES = [
         "gave neither velocity nor momentum",
         lambda: start(v=None),
         ValueError,
-        "Give either `v` or `p`; got neither of them",
+        "Give either `v` or `p`, got neither of them",
     ),
     row(
         "gave velocity and momentum",
         lambda: start(p=V),
         ValueError,
-        "Give either `v` or `p`; got both of them",
+        "Give either `v` or `p`, got both of them",
     ),
     row(
         "gave the Lagrangian in place of the system",
@@ -764,7 +764,7 @@ STATES = [
         lambda: start(TURNING, q=2 * QUATERNION),
         ConstraintViolationError,
         "is not an element of the group SO3",
-        "or pass `manifold.normalise(q)`",
+        "or `manifold.normalise(q)` as `q`",
     ),
     row(
         "gave one array to a product of groups",

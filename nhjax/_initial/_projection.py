@@ -32,16 +32,16 @@ from .._system import AbstractMechanicalSystem, position_scale, velocity_scale
 
 
 T = TypeVar("T", bound=PyTree[Array])
-# The components that a user chooses: an index or a name, or several of them.
+# The components that a user chooses: an index, a name, or several of them.
 Chosen: TypeAlias = int | str | Iterable[int | str] | None
 
 
 class Kept(NamedTuple):
-    """The components of q, v or p that a projection leaves as they were given.
+    """The components of q, v or p that a projection does not change.
 
-    - `letter`: the argument whose components they are: "q", "v" or "p".
-    - `indices`: their places among all numbers of that argument.
-    - `labels`: what messages call them, such as "v[2]".
+    - `letter`: the argument that has these components: "q", "v" or "p".
+    - `indices`: the indices of the components among all numbers of the argument.
+    - `labels`: the names of the components in messages, such as "v[2]".
     """
 
     letter: str
@@ -54,7 +54,7 @@ class Kept(NamedTuple):
         return f"keep_{self.letter}"
 
     def restored(self, tree: T, given: T) -> T:
-        """Return a tree whose kept numbers are the ones of `given`, bit for bit."""
+        """Return `tree` with its kept numbers replaced by those of `given`."""
         if not self.indices:
             return tree
         is_kept = np.zeros(sum(x.size for x in jax.tree.leaves(tree)), bool)
@@ -94,7 +94,7 @@ def checked_keep(
     if chosen[other] is not None:
         raise ValueError(
             f"`keep_{other}` chooses components of `{other}`, but `{letter}` is given: "
-            f"use `keep_{letter}`, or give `{other}` in place of `{letter}`."
+            f"use `keep_{letter}`, or give `{other}` instead of `{letter}`."
         )
     dimension = system.manifold_of(q).dim
     of_q = _kept(system, "q", chosen["q"], _labels(q), dimension)
@@ -104,14 +104,14 @@ def checked_keep(
         if kept.indices and not project:
             raise ValueError(
                 f"`{kept.argument}` chooses what a projection keeps, but `project` is "
-                f"False, by which all of `{kept.letter}` is kept: pass `project=True`, "
+                f"False, so that all of `{kept.letter}` is kept: pass `project=True`, "
                 f"or leave `{kept.argument}` out."
             )
     return of_q, of_u
 
 
 def _labels(q: PyTree[Array]) -> list[str]:
-    """Write the places of all numbers of q, such as "q[1][0]" in a tuple."""
+    """Return a label for each number of q, such as "q[1][0]" in a tuple."""
     found = []
     for path, leaf in jax.tree_util.tree_leaves_with_path(q):
         where = "q" + jax.tree_util.keystr(path)
@@ -144,12 +144,12 @@ def _kept(
 
 
 def _entries(name: str, given: Any) -> list[Any]:
-    """List what an argument chooses, which is one index or name or several."""
+    """List the indices or names that an argument chooses."""
     if is_traced(*jax.tree.leaves(given)):
         raise TypeError(
-            f"`{name}` is a traced array, but must be known when tracing: which "
-            "components are kept decides the program. Pass a tuple of ints, and keep "
-            "it out of the arguments of `jax.jit` and `jax.vmap`."
+            f"`{name}` is a traced array, but must be known when tracing: the program "
+            "depends on which components are kept. Pass a tuple of ints, and not as an "
+            "argument of `jax.jit` or `jax.vmap`."
         )
     is_one = isinstance(given, str) or getattr(given, "ndim", None) == 0
     if is_one or not isinstance(given, Iterable):
@@ -169,14 +169,14 @@ def _wrong_kind(name: str, x: Any) -> str:
 def _index(
     system: AbstractMechanicalSystem, name: str, x: Any, size: int, dimension: int
 ) -> int:
-    """Return the index that an index or a name stands for, or raise."""
+    """Return the nonnegative index of a component given by index or name."""
     letter = name[-1]
     if isinstance(x, str):
         return _index_of_name(system, name, x, size, dimension)
     if isinstance(x, bool) or getattr(x, "dtype", None) == np.bool_:
         raise TypeError(
-            f"`{name}` must be indices or names of components, and not bools; of a "
-            "mask, `numpy.flatnonzero(mask)` has the indices."
+            f"`{name}` must be indices or names of components, not bools. For a mask, "
+            "pass `numpy.flatnonzero(mask)`."
         )
     try:
         index = operator.index(x)
@@ -184,8 +184,8 @@ def _index(
         raise TypeError(_wrong_kind(name, x)) from None
     if not -size <= index < size:
         raise ValueError(
-            f"`{name}` has the index {index}, but `{letter}` has {size} numbers: 0 to "
-            f"{size - 1}."
+            f"`{name}` has the index {index}, but `{letter}` has {size} numbers: pass "
+            f"0 to {size - 1}."
         )
     return index % size
 
@@ -196,8 +196,8 @@ def _index_of_name(
     names, letter = system.coordinates, name[-1]
     if names is None:
         raise ValueError(
-            f"`{name}` has the name {x!r}, but the system has no names: give indices, "
-            f"or give the system names, `{type(system).__name__}(..., "
+            f"`{name}` has the name {x!r}, but the system has no names: pass indices, "
+            f"or name the coordinates, `{type(system).__name__}(..., "
             "coordinates=(...))`."
         )
     if len(names) != dimension:
@@ -222,13 +222,13 @@ Vector = Float[Array, " n"]
 
 
 class Fixed(NamedTuple):
-    """The combinations of constraints that kept components do not allow to change.
+    """The combinations of constraints that the kept components determine.
 
-    A row of them belongs to a constraint, divided by the size of its derivatives.
+    Each row belongs to a constraint, divided by the size of its derivatives.
 
     - `sizes`: the sizes of the derivatives of the constraints.
-    - `projector`: the projector onto the combinations that do not change, to first
-        order, however the other components change.
+    - `projector`: the projector onto the combinations that are constant, to first
+        order, when the other components change.
     - `slopes`: the derivatives of the constraints along the kept components.
     """
 
@@ -241,10 +241,10 @@ class Nearest(NamedTuple):
     """The result of a search for the nearest point on a constraint.
 
     - `x`: the point at which the search ended, a vector or an element of the group.
-    - `found`: whether it is a solution.
-    - `jacobian`: the Jacobian of the constraint where the search started.
-    - `fixed`: the combinations of constraints that kept components fix; None if no
-        components are kept.
+    - `found`: whether the search converged.
+    - `jacobian`: the Jacobian of the constraint at the start of the search.
+    - `fixed`: the combinations of constraints that the kept components determine; None
+        if no components are kept.
     """
 
     x: PyTree[Array]
@@ -256,8 +256,8 @@ class Nearest(NamedTuple):
 def project_position(system, t, q, u, args, kept: Kept, given: PyTree[Array]):
     """Project q onto Γ = 0: find the stationary point of ½ ξᵀ M ξ on Γ(t, q τ(ξ)) = 0.
 
-    M is the mass matrix at (t, q, u). The numbers of q τ(ξ) that are `kept` have the
-    values that they have in `given`. The `x` of the result is q τ(ξ).
+    M is the mass matrix at (t, q, u). The `kept` numbers of q τ(ξ) are equal to those
+    of `given`. The `x` of the result is q τ(ξ).
     """
     manifold = system.manifold_of(q)
     mass = system.metric(t, q, u, args)
@@ -280,7 +280,8 @@ def project_position(system, t, q, u, args, kept: Kept, given: PyTree[Array]):
         return nearest._replace(x=manifold.act(q, nearest.x))
     terms = jnp.full(len(kept.indices), max_norm(*jax.tree.leaves(q)))
     nearest = _nearest_keeping(mass, gamma, held, zero, sizes, terms, is_redundant)
-    # A condition such as w = 1 on a quaternion has no derivative where it holds.
+    # A condition such as w = 1 on a unit quaternion has zero derivative where it holds,
+    # so that convergence of the search does not imply it.
     moved = manifold.act(q, nearest.x)
     size = max_norm(*jax.tree.leaves(frozen((q, moved))))
     off = max_norm(frozen(held(nearest.x)))
@@ -289,10 +290,10 @@ def project_position(system, t, q, u, args, kept: Kept, given: PyTree[Array]):
 
 
 def project_fibre_coordinate(system, t, q, u, args, kept: Kept, given: Vector):
-    """Project u onto Φ = 0: find the stationary point w of ½ (w-u)ᵀ K (w-u) there.
+    """Project u: find the stationary point w of ½ (w-u)ᵀ K (w-u) on Φ(t, q, w) = 0.
 
-    The constraint is Φ(t, q, w) = 0, and K the metric on the fibre at (t, q, u). The
-    `kept` components of v or p, whichever was given, have the values of `given`.
+    K is the metric on the fibre at (t, q, u). The `kept` components of v or p,
+    whichever the user gave, are equal to those of `given`.
     """
 
     def phi(w):
@@ -335,19 +336,20 @@ def _nearest_keeping(
     terms_of_held: Float[Array, " k"],
     is_redundant: bool,
 ) -> Nearest:
-    """Do what `_nearest` does, and keep `held(y) = 0` as well.
+    """Find the nearest point as `_nearest` does, subject also to `held(y) = 0`.
 
     A combination of constraints is left out of the equations if its derivatives vanish
-    in all directions in which `held` does not change. The kept values then decide
-    whether it vanishes. The caller must judge all constraints at the result, at which
-    such a combination may be violated.
+    in all directions in which `held` is constant, because the kept values determine it.
+    Such a combination may be violated at the result: the caller must check all
+    constraints there.
 
-    `terms_of_held` has the sizes of the terms of `held`.
+    `terms_of_held` has the sizes of the terms of `held`, to which their round-off is
+    proportional.
     """
     jacobian = jax.jacrev(constraint)(x)
     size, terms = sizes(jacobian)
     small = float(jnp.finfo(x.dtype).eps) ** 0.75
-    # The units of single components are taken out by the metric.
+    # Scaling by the metric makes the ranks independent of the units of components.
     units = jnp.sqrt(jnp.abs(jnp.diagonal(metric)))
     units = jnp.where(units > 0, units, 1)
     by_units = jacobian / units[None], jax.jacrev(held)(x) / units[None]
@@ -389,10 +391,10 @@ def _row_sizes(matrix: Float[Array, "l n"]) -> Float[Array, " l"]:
 def _left_basis(
     matrix: Float[Array, "l n"], negligible: float
 ) -> tuple[Float[Array, "l l"], Float[Array, " l"]]:
-    """Find orthonormal combinations of rows, and which are active: one, or else zero.
+    """Find orthonormal combinations of rows, and which of them are active.
 
-    The combinations, which are the columns of the result, are active unless they are
-    negligible.
+    The combinations are the columns of the first result. The second result is one for
+    active combinations, whose singular value exceeds `negligible`, and otherwise zero.
     """
     missing = jnp.zeros(max(matrix.shape[0] - matrix.shape[1], 0), matrix.dtype)
     left, singular, _ = jnp.linalg.svd(matrix)
@@ -403,9 +405,9 @@ def _left_basis(
 def _active(
     basis: Float[Array, "l l"], active: Float[Array, " l"], sizes: Float[Array, " l"]
 ) -> Float[Array, "l l"]:
-    """Return the matrix that makes the active combinations of rows of these sizes.
+    """Return the matrix that forms the active combinations of rows of these sizes.
 
-    Where all combinations are active the rows stay as they are.
+    It is the identity if all combinations are active.
     """
     combinations = active[:, None] * basis.T / sizes[None]
     same = jnp.eye(basis.shape[0], dtype=basis.dtype)
@@ -425,17 +427,17 @@ def _nearest(
     **Arguments:**
 
     - `metric`: the matrix K.
-    - `constraint`: the function that is to vanish.
+    - `constraint`: the function that must vanish.
     - `x`: the point from which the search starts.
-    - `sizes`: called as `sizes(jacobian)`, the sizes of y and of the terms of the
-        constraint, to which their round-off is proportional.
-    - `is_redundant`: whether constraints may follow from each other.
+    - `sizes`: called as `sizes(jacobian)`; returns the sizes of y and of the terms of
+        the constraint, to which their round-off is proportional.
+    - `is_redundant`: whether constraints may be dependent.
     - `idle`: one for rows of the constraint that are zero everywhere, and zero for the
         others. The multipliers of idle rows are zero.
     """
     jacobian = jax.jacrev(constraint)(x)
     size, terms = sizes(jacobian)
-    # The round-off of the constraint moves y too. If y is zero, nothing else does.
+    # Round-off of the constraint changes y too; it is the only round-off if y is zero.
     reaction = inverse(metric) @ jacobian.T
     compliance = jacobian @ reaction
     if idle is not None:

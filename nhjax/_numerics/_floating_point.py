@@ -16,11 +16,11 @@ from .._custom_types import FloatScalar, FloatScalarLike
 def max_norm(*arrays: Array) -> FloatScalar:
     """Compute max |x| over one or more arrays; NaN if a number is, 0 if all are empty.
 
-    The maximum is taken over the bit patterns, since numbers that are not negative are
-    ordered as their bit patterns are, with NaN above infinity. A maximum of floats that
-    propagates NaN takes five instructions that wait for each other, one of integers
-    takes two: with maxima of floats, the sizes took a third of the time of an iteration
-    on the stages.
+    The maximum is taken over the bit patterns, which have the same order as the
+    nonnegative numbers, with NaN above infinity. A maximum of floats that propagates
+    NaN takes five dependent instructions, and a maximum of integers takes two. With
+    maxima of floats, these norms took a third of the time of an iteration on the
+    stages.
     """
     dtype = jnp.result_type(*arrays)
     largest = [jnp.max(_pattern(x.astype(dtype)), initial=0) for x in arrays]
@@ -33,12 +33,12 @@ def _pattern(x: Array) -> Array:
 
 
 def largest_column(*arrays: Float[Array, "_ n"]) -> tuple[FloatScalar, Int[Array, ""]]:
-    """Compute max |x| over matrices of n columns, and the column in which it is.
+    """Compute max |x| over matrices of n columns, and the column that contains it.
 
-    The last bits of each pattern are replaced by the number of its column, so that one
-    maximum finds both; the value is rounded down by as many bits. A search for the
-    column after the maximum took a tenth of the time of a step. Of numbers some of
-    which are NaN, the column is that of a NaN.
+    The last bits of each bit pattern are replaced by the index of its column, so that
+    one maximum finds both; the value loses these bits. A search for the column after
+    the maximum took a tenth of the time of a step. If some numbers are NaN, the column
+    is one that contains NaN.
     """
     columns = arrays[0].shape[1]
     mask = (1 << max(columns - 1, 0).bit_length()) - 1
@@ -55,14 +55,14 @@ def largest_column(*arrays: Float[Array, "_ n"]) -> tuple[FloatScalar, Int[Array
 
 
 def unit(scale: FloatScalarLike | Float[Array, "*k"]) -> Float[Array, "*k"]:
-    """Return the unit in which sizes are measured: the scale, or one if it is zero."""
+    """Return the scale, or one where the scale is zero."""
     return jnp.where(scale > 0, scale, 1)
 
 
 def relative(
     size: Float[Array, "*k"], scale: FloatScalarLike | Float[Array, "*k"]
 ) -> Float[Array, "*k"]:
-    """Divide a size by the scale that it is measured in, or by one if that is zero."""
+    """Divide a size by its scale, or by one where the scale is zero."""
     return size / unit(scale)
 
 
@@ -83,9 +83,10 @@ def two_sum(
 def uneven_perturbations(q: PyTree[Array]) -> PyTree[Array]:
     """Return a perturbation of each number in q, of half its size to its size.
 
-    The moves differ and have both signs, so that they hardly cancel in differences and
-    sums of a few numbers. Multiples of the golden ratio, less their whole parts, differ
-    from one another as much as they can.
+    The perturbations differ and have both signs, so that they hardly cancel in
+    differences and sums of a few numbers. A relative perturbation is 1 - x/2 or its
+    negative; the x are the fractional parts of multiples of the golden ratio, which are
+    spread evenly over [0, 1).
     """
     numbers, unravel = ravel_pytree(q)
     k = np.arange(numbers.size)
@@ -93,7 +94,7 @@ def uneven_perturbations(q: PyTree[Array]) -> PyTree[Array]:
     return unravel(jnp.abs(numbers) * jnp.asarray(weights, numbers.dtype))
 
 
-# A value is not told from round-off up to so many standard deviations of its noise.
+# Values of up to this many standard deviations of noise may be round-off.
 NOISE_DEVIATIONS = 100
 
 # The points of one difference lie on a ray that starts at the point of interest.
@@ -102,7 +103,7 @@ _NUM_POINTS = 6
 _DISTANCES = 0.85, 0.68, 0.5
 # Two rays for each distance, since one difference may be small by chance.
 _NUM_RAYS = 2
-# A function counts as smooth if its fifth difference is less than this part of the
+# A function counts as smooth if its fifth difference is less than this fraction of its
 # fourth.
 _SMOOTH = 1 / 30
 
@@ -115,29 +116,29 @@ def measured_noise(
     """Estimate the round-off of a function, for each number that it returns.
 
     Values at points that are close to each other differ by a smooth change and by
-    round-off. A difference of fifth order removes the smooth change, so that round-off
-    is left (Moré and Wild, Estimating computational noise, SIAM J. Sci. Comput. 33,
-    2011). Such a measurement includes constants inside the function, cancellation, the
-    rounding of arguments and its magnification by steep functions.
+    round-off. A difference of fifth order removes the smooth change and leaves the
+    round-off (Moré and Wild, Estimating computational noise, SIAM J. Sci. Comput. 33,
+    2011). Such a measurement includes the effect of constants in the function, of
+    cancellation, and of the rounding of arguments, magnified by steep functions.
 
-    Points that are very close may not differ at all beside a constant inside the
-    function, and those farther away may differ by more than round-off. Of three
-    distances (5e-14, 2e-11 and 1e-8 in double precision) the largest result is
-    returned, up to the first at which the differences fall with their order as those of
-    a smooth function do. The points lie on rays from the point of interest, so that a
-    kink or a jump at this point, as that of friction at rest, is not taken for
-    round-off.
+    Very small displacements may be lost next to a constant in the function, and values
+    at larger displacements may differ by more than round-off. The function is measured
+    at three distances (5e-14, 2e-11 and 1e-8 in double precision). The largest result
+    is returned, up to the first distance at which the differences decrease with their
+    order, as for a smooth function. The points lie on rays from the point of interest,
+    so that a kink or a jump at this point, such as friction at rest, is not mistaken
+    for round-off.
 
     **Arguments:**
 
     - `function`: a function of a displacement from the point of interest, of shape
         (k,), in units of positions and velocities.
     - `size`: the number k.
-    - `like`: arrays of the shapes and the type of what the function returns, or
-        `jax.ShapeDtypeStruct`s.
+    - `like`: a tree of arrays or `jax.ShapeDtypeStruct`s with the structure, the shapes
+        and the dtype of the value of the function.
 
-    **Returns:** estimates of the standard deviation of round-off, as a tree of the same
-    structure as the function returns. Numbers that are not finite count as zero.
+    **Returns:** estimates of the standard deviation of round-off, as a tree like
+    `like`. Differences that are not finite count as zero.
     """
     dtype = jax.tree.leaves(like)[0].dtype
     eps = float(jnp.finfo(dtype).eps)
@@ -145,15 +146,15 @@ def measured_noise(
     shape = len(_DISTANCES), _NUM_RAYS, size
     rays = rng.uniform(0.5, 1.5, shape) * rng.choice([-1.0, 1.0], shape)
     rays *= np.reshape([eps**power for power in _DISTANCES], (-1, 1, 1))
-    # One row for each point of a ray: its distance, and its weights in a fourth and a
-    # fifth difference.
+    # One row for each point of a ray: its distance, and its weights in the fourth and
+    # in the fifth difference.
     numbers = np.arange(1.0, _NUM_POINTS + 1)
     columns = numbers, np.append(_weights(4), 0.0), _weights(5)
     points = jnp.asarray(np.stack(columns, axis=1), dtype)
     rays = jnp.asarray(rays.reshape(-1, size), dtype)
     lengths = [math.prod(x.shape) for x in jax.tree.leaves(like)]
 
-    # A loop of `while` contains the function once; a short `scan` may be unrolled.
+    # A `while` loop contains the function once; XLA may unroll a short `scan`.
     def on_ray(_, ray):
         def add(carry):
             k, total = carry
@@ -179,6 +180,6 @@ def measured_noise(
 
 
 def _weights(order: int) -> np.ndarray:
-    """Return the weights of a difference, under which noise keeps its deviation."""
+    """Return the weights of a difference, normalised to keep the deviation of noise."""
     weights = np.array([(-1.0) ** k * math.comb(order, k) for k in range(order + 1)])
     return weights / np.linalg.norm(weights)

@@ -37,7 +37,7 @@ def require_manifold(
 def require_names(
     system: AbstractMechanicalSystem, name: str, manifold: AbstractLieGroup
 ) -> None:
-    """Raise a `ShapeError` unless there is one name for each coordinate, or none."""
+    """Raise a `ShapeError` unless the system names all of its coordinates, or none."""
     names = system.coordinates
     if names is not None and len(names) != manifold.dim:
         raise ShapeError(
@@ -97,9 +97,9 @@ def check_functions(
 def check_state(
     system: AbstractMechanicalSystem, y: State, args: Args, called: str = "y0"
 ) -> None:
-    """Raise unless the shapes and dtypes of `y` are those of a state of `system`.
+    """Raise unless `y` has the shapes and dtypes of a state of `system`.
 
-    Messages call it `called`.
+    `called` is the name of `y` in messages.
     """
     parts = {name: getattr(y, name) for name in ("p", "v", "q", "multiplier")}
     for name, x in parts.items():
@@ -147,7 +147,7 @@ def check_state(
             "with this system."
         )
     for name, x in parts.items():
-        # The integration itself reports traced parts that are not finite, lane by lane.
+        # For traced parts the integration reports each member that is not finite.
         if not is_traced(*jax.tree.leaves(x)):
             require(x, finite(f"{called}.{name}", x))
 
@@ -168,12 +168,12 @@ def dependence_error(
     letter: str,
     where: str,
 ) -> DependentConstraintsError:
-    """Make the error that names the constraints which depend on each other.
+    """Create the error that names the constraints which depend on each other.
 
     **Arguments:**
 
-    - `jacobian`: the derivatives of all constraints, those of holonomic ones last, or
-        of holonomic constraints alone.
+    - `jacobian`: the derivatives of all constraints, with the holonomic constraints
+        last, or of the holonomic constraints alone.
     - `num_holonomic`: the number k of holonomic constraints.
     - `letter`: the letter of nonholonomic constraints, Φ or Ψ.
     - `where`: the state, as text.
@@ -189,14 +189,14 @@ def dependence_error(
         )
     elif zero:
         advice = (
-            f"{names[zero[0]]} has no gradient there; a constraint must have one "
-            "where it vanishes."
+            f"{names[zero[0]]} has no gradient there; rewrite it so that its gradient "
+            "is nonzero where it vanishes."
         )
     elif _rank(rows[:m]) + _rank(rows[m:]) > _rank(rows):
         advice = (
-            "A nonholonomic one of them follows from holonomic ones, which say more: "
-            "the rate of a constraint on positions is kept with it. Remove it, start "
-            "from a state at which it does not follow, or give the system "
+            "One of these nonholonomic constraints follows from holonomic ones: a "
+            "holonomic constraint enforces its rate too. Remove it, start from a state "
+            "at which it does not follow, or give the system "
             '`constraints="redundant"`.'
         )
     else:
@@ -205,11 +205,11 @@ def dependence_error(
             'independent, or give the system `constraints="redundant"`.'
         )
     derivatives = " and ".join([f"D2{letter}"] * (m > 0) + ["DΓ"] * (k > 0))
-    have = "have" if m > 0 and k > 0 else "has"
+    do = "do" if m > 0 and k > 0 else "does"
     which = dependent_names(jacobian, k)
     return DependentConstraintsError(
-        f"The constraints are dependent: {derivatives} {have} not full rank at {where} "
-        f"(the paper's admissibility condition fails for {which}). {advice}"
+        f"The constraints are dependent: {derivatives} {do} not have full rank at "
+        f"{where} (the paper's admissibility condition fails for {which}). {advice}"
     )
 
 

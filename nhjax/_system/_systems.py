@@ -46,7 +46,7 @@ class State(eqx.Module):
         holonomic ones. The reaction on the system is λᵀ D2Φ + νᵀ L_q^* DΓ, with ♭_H D2Ψ
         in place of D2Φ for a Hamiltonian system.
 
-    Make one with `nhjax.initial_state`, which sees to it that the four agree.
+    Create one with `nhjax.initial_state`, which makes the four parts consistent.
     """
 
     q: PyTree[Array]
@@ -56,7 +56,7 @@ class State(eqx.Module):
 
 
 def check_time_and_state(function: str, t: Any, y: Any, first: str = "") -> None:
-    """Raise if `y` is not one `State`, or if `t` is a `State`."""
+    """Raise unless `y` is a `State` at one time and `t` is not a `State`."""
     advice = f"Call it as `{function}({first}t, y, args)`."
     if isinstance(t, State):
         raise TypeError(f"`t` must be a time, got an nhjax.State. {advice}")
@@ -71,10 +71,10 @@ def check_time_and_state(function: str, t: Any, y: Any, first: str = "") -> None
 class AbstractMechanicalSystem(eqx.Module):
     """A mechanical system with constraints, written on TQ or on T*Q.
 
-    The two kinds differ in the fibre coordinate u, the velocity of a Lagrangian and the
-    momentum of a Hamiltonian system. In terms of (t, q, u) both are `velocity`,
-    `momentum`, `free_force`, `constraint` and the metric K, which turns constraint
-    derivatives into reactions. The equations of a step are written in these alone.
+    The two kinds differ in the fibre coordinate u, which is the velocity of a
+    Lagrangian and the momentum of a Hamiltonian system. Both kinds provide the
+    functions `velocity`, `momentum`, `free_force`, `constraint` and `metric` of
+    (t, q, u). The equations of a step use only these functions.
     """
 
     nonholonomic: eqx.AbstractVar[PhaseFunction | None]
@@ -84,8 +84,7 @@ class AbstractMechanicalSystem(eqx.Module):
     constraints: eqx.AbstractVar[Literal["independent", "redundant"]]
     coordinates: eqx.AbstractVar[tuple[str, ...] | None]
 
-    # The name of the function L or H that generates the motion, and the letter of the
-    # fibre coordinate.
+    # The name of the function L or H, and the letter of the fibre coordinate.
     generator: eqx.AbstractClassVar[Literal["lagrangian", "hamiltonian"]]
     fibre_coordinate_name: eqx.AbstractClassVar[Literal["v", "p"]]
 
@@ -116,13 +115,13 @@ class AbstractMechanicalSystem(eqx.Module):
     def metric(
         self, t: FloatScalarLike, q: PyTree[Array], u: Float[Array, " n"], args: Args
     ) -> Float[Array, "n n"]:
-        """Compute the metric K on the fibre, which is D2D2L or D2D2H."""
+        """Compute the metric K on the fibre: the Hessian D2D2L or D2D2H."""
 
     @abstractmethod
     def free_force(
         self, t: FloatScalarLike, q: PyTree[Array], u: Float[Array, " n"], args: Args
     ) -> Float[Array, " n"]:
-        """Compute the force on the system without the reaction of the constraints."""
+        """Compute the force on the system without the constraint reactions."""
 
     @abstractmethod
     def flat(
@@ -133,7 +132,7 @@ class AbstractMechanicalSystem(eqx.Module):
         derivative: Float[Array, " n"],
         args: Args,
     ) -> Float[Array, " n"]:
-        """Turn a constraint's derivative in u into a force: D2Φ itself, or ♭_H D2Ψ."""
+        """Convert a constraint's derivative in u to a covector: D2Φ, or ♭_H D2Ψ."""
 
     @abstractmethod
     def energy(self, t: FloatScalarLike, y: State, args: Args = None) -> FloatScalar:
@@ -153,7 +152,7 @@ class AbstractMechanicalSystem(eqx.Module):
     def functions(
         self, t: Any, q: PyTree[Any], u: Any, args: Args
     ) -> dict[str, tuple[Callable[..., Any], tuple[Any, ...]]]:
-        """Map the name of each function of the system to its `call` and arguments."""
+        """Map the name of each function to a callable and its arguments."""
         values = {"t": t, "q": q, self.fibre_coordinate_name: u, "args": args}
         return {
             name: (partial(self.call, name), tuple(values[x] for x in arguments))
@@ -162,9 +161,9 @@ class AbstractMechanicalSystem(eqx.Module):
         }
 
     def call(self, name: str, *arguments: Any) -> Any:
-        """Call a function of the system; errors that it raises get a note.
+        """Call a function of the system, and add a note to an error that it raises.
 
-        The note names the function, which JAX and Python cannot know.
+        The note says which function of the system raised the error.
         """
         function = getattr(self, name)
         called = f"{name}({', '.join(self.signatures()[name])})"
@@ -234,8 +233,8 @@ class AbstractMechanicalSystem(eqx.Module):
         """Compute all constraints on velocities, of shape (l,) with l = m + k.
 
         The m nonholonomic constraints come first, then the rates dΓ/dt of the k
-        holonomic ones (their tangency). By Chetaev's rule the reaction of a holonomic
-        constraint is that of its tangency: these rows determine all multipliers.
+        holonomic constraints. By Chetaev's rule a holonomic constraint and its rate
+        have the same reaction, so that these rows determine all multipliers.
         """
         if self.holonomic is None:
             return self.kinematic_constraint(t, q, u, args)
@@ -275,8 +274,9 @@ class AbstractMechanicalSystem(eqx.Module):
     ) -> Float[Array, " c"]:
         """Compute all constraint functions at a state, of shape (m + 2k,).
 
-        They are the m nonholonomic constraints, the time derivatives of the k holonomic
-        ones and these themselves. All of them vanish at a consistent state.
+        The order is: the m nonholonomic constraints, the time derivatives of the k
+        holonomic constraints, and the k holonomic constraints themselves. All of them
+        vanish at a consistent state.
         """
         check_time_and_state("constraint_violation", t, y)
         on_velocities = self.constraint(t, y.q, self.fibre_coordinate(y), args)
@@ -293,18 +293,19 @@ class LagrangianSystem(AbstractMechanicalSystem):
 
     Φ(t, q, v) = 0,    Γ(t, q) = 0,    q̇ = q v,
 
-    which on R^n is the familiar d/dt D2L = D1L + F + λᵀ D2Φ + νᵀ DΓ with q̇ = v. All
-    derivatives are taken by automatic differentiation. Array leaves of the functions
-    (if they are `equinox.Module`s) are parameters that gradients reach. A system holds
-    functions, so that a function that is given one as an argument is compiled by
-    `equinox.filter_jit`: `jax.jit` takes arrays alone.
+    which on R^n is the familiar d/dt D2L = D1L + F + λᵀ D2Φ + νᵀ DΓ with q̇ = v.
+    Automatic differentiation computes all derivatives. If a function is an
+    `equinox.Module`, its array leaves are parameters of the system, and gradients with
+    respect to the system include them. A system contains functions, which `jax.jit`
+    does not accept as arguments: compile functions that take a system with
+    `equinox.filter_jit`.
 
-    Values that the functions read beside their arguments (globals, variables of
+    Values that the functions read besides their arguments (globals, variables of
     enclosing functions, attributes of objects) are compiled in. `integrate` and
-    `initial_state` compare them from call to call and compile anew if one has changed.
-    A `jax.jit` of your own does not do so: pass a value that is to change as `args`, or
-    as an array field of an `equinox.Module`, for which nothing is ever compiled anew.
-    `docs/systems.md` has the details.
+    `initial_state` compare them from call to call and compile again if one has changed.
+    A `jax.jit` of your own does not: pass values that change in `args`, or as array
+    fields of an `equinox.Module`. Changes of these never recompile. `docs/systems.md`
+    has the details.
 
     **Arguments:**
 
@@ -315,13 +316,14 @@ class LagrangianSystem(AbstractMechanicalSystem):
     - `holonomic`: Γ, called as `holonomic(t, q, args)`, of shape () or (k,).
     - `force`: an external covector F, called as `force(t, q, v, args)`, of shape (n,);
         on a group in left-trivialised components.
-    - `manifold`: the configuration manifold; R^n with the n of the state if left out.
-    - `constraints`: `"independent"`, by which dependent constraints are refused, or
-        `"redundant"`, by which some may follow from others, nonholonomic ones from
-        holonomic ones too. Of all multipliers with the same reaction the result is then
-        the one with the least Σ |λ_a B_a|², the sizes of the reactions of single
-        constraints in the metric M⁻¹, and none of a nonholonomic one that follows; it
-        marks reactions as not unique. `docs/systems.md` has the details.
+    - `manifold`: the configuration manifold; by default R^n with the n of the state.
+    - `constraints`: `"independent"` refuses dependent constraints. `"redundant"` allows
+        constraints that follow from others, also nonholonomic constraints that follow
+        from holonomic ones. Many multipliers then have the same reaction. The result
+        has the multipliers with the least Σ |λ_a B_a|², where |λ_a B_a| is the size of
+        the reaction of one constraint in the metric M⁻¹, and zero for a nonholonomic
+        constraint that follows from holonomic ones. Reactions are marked as not unique.
+        `docs/systems.md` has the details.
     - `coordinates`: a tuple of the names of the n coordinates, for
         `Solution.to_xarray` and for `keep_q`, `keep_v` and `keep_p` of `initial_state`;
         None by default.
@@ -438,10 +440,10 @@ class HamiltonianSystem(AbstractMechanicalSystem):
 
     Ψ(t, q, p) = 0,    Γ(t, q) = 0,
 
-    where ♭_H = (D2D2H)⁻¹ turns velocities into momenta. It is integrated by the paper's
-    Hamiltonian equations, with the stage momenta as unknowns, so that no Legendre
-    transform has to be inverted. Values that the functions read beside their arguments
-    are compiled in, as for a `LagrangianSystem`.
+    where ♭_H = (D2D2H)⁻¹ maps velocities to momenta. The paper's Hamiltonian equations
+    are integrated, with the stage momenta as unknowns, so that no Legendre transform
+    has to be inverted. Values that the functions read besides their arguments are
+    compiled in, as for a `LagrangianSystem`.
 
     **Arguments:**
 
@@ -450,13 +452,14 @@ class HamiltonianSystem(AbstractMechanicalSystem):
     - `nonholonomic`: Ψ, called as `nonholonomic(t, q, p, args)`, of shape () or (m,).
     - `holonomic`: Γ, called as `holonomic(t, q, args)`, of shape () or (k,).
     - `force`: an external covector F, called as `force(t, q, p, args)`, of shape (n,).
-    - `manifold`: the configuration manifold; R^n with the n of the state if left out.
-    - `constraints`: `"independent"`, by which dependent constraints are refused, or
-        `"redundant"`, by which some may follow from others, nonholonomic ones from
-        holonomic ones too. Of all multipliers with the same reaction the result is then
-        the one with the least Σ |λ_a B_a|², the sizes of the reactions of single
-        constraints in the metric M⁻¹, and none of a nonholonomic one that follows; it
-        marks reactions as not unique. `docs/systems.md` has the details.
+    - `manifold`: the configuration manifold; by default R^n with the n of the state.
+    - `constraints`: `"independent"` refuses dependent constraints. `"redundant"` allows
+        constraints that follow from others, also nonholonomic constraints that follow
+        from holonomic ones. Many multipliers then have the same reaction. The result
+        has the multipliers with the least Σ |λ_a B_a|², where |λ_a B_a| is the size of
+        the reaction of one constraint in the metric M⁻¹, and zero for a nonholonomic
+        constraint that follows from holonomic ones. Reactions are marked as not unique.
+        `docs/systems.md` has the details.
     - `coordinates`: a tuple of the names of the n coordinates, for
         `Solution.to_xarray` and for `keep_q`, `keep_v` and `keep_p` of `initial_state`;
         None by default.
@@ -558,7 +561,7 @@ S = TypeVar("S", bound=AbstractMechanicalSystem)
 def closure_converted(system: S, t: FloatScalar, y: State, args: Args) -> S:
     """Return the system with the arrays that its functions close over as leaves.
 
-    A step can be differentiated with respect to leaves of its arguments alone.
+    The derivative rules of a step reach only the leaves of its arguments.
     """
     functions = system.functions(t, y.q, system.fibre_coordinate(y), args)
     return eqx.tree_at(
@@ -569,14 +572,14 @@ def closure_converted(system: S, t: FloatScalar, y: State, args: Args) -> S:
 
 
 def with_frames(system: S, q: PyTree[Array]) -> tuple[S, PyTree[Array]]:
-    """Return the system in the same configuration, given with its frames.
+    """Return the system and the configuration q with precomputed frames.
 
-    The methods of the system then need no trigonometric functions to turn vectors
-    between the frames of the body and of the plane, and may be given positions both
-    with frames and without. Its functions are called with positions alone. Where the
-    manifold has no frames nothing changes.
+    A frame holds the sine and cosine of an angle. With it, the methods of the system
+    rotate vectors between body and plane without trigonometric functions. They accept
+    positions with and without frames; the user's functions receive positions without.
+    On a manifold without frames the system and q are returned unchanged.
     """
-    # A subclass may have methods of its own, which know nothing of frames.
+    # The methods of a subclass may not support frames.
     if type(system) not in (LagrangianSystem, HamiltonianSystem):
         return system, q
     position = framed(system.manifold_of(q), q)
@@ -593,7 +596,7 @@ def with_frames(system: S, q: PyTree[Array]) -> tuple[S, PyTree[Array]]:
 
 
 class _OfPosition(eqx.Module):
-    """A function of (t, q, args) or (t, q, u, args), for a q that may have frames."""
+    """A function of (t, q, args) or (t, q, u, args) that accepts q with frames."""
 
     function: PhaseFunction | PositionFunction
 
