@@ -146,10 +146,10 @@ def test_initial_state_with_wrong_values_under_jit_is_refused(case, started):
 @by_value
 def test_initial_state_with_one_wrong_member_under_vmap_is_refused(case, started):
     wrong, exception, message = case
-    message = f"{exception.__name__}: lane 1: .*{message}"
-    lanes = jax.tree.map(lambda *x: jnp.stack(x), GOOD, GOOD | wrong, GOOD)
+    message = f"{exception.__name__}: member 1: .*{message}"
+    members = jax.tree.map(lambda *x: jnp.stack(x), GOOD, GOOD | wrong, GOOD)
     with pytest.raises(RuntimeError, match=message):
-        jax.block_until_ready(started[1](lanes))
+        jax.block_until_ready(started[1](members))
 
 
 def test_error_of_compiled_initial_state_has_few_lines(started, caplog):
