@@ -1256,7 +1256,7 @@ RUNS = [
         ),
         ValueError,
         "the system has a `force`, which may do work, so that its energy is not",
-        "If it conserves something else, give that as a function",
+        "If it conserves another quantity, pass that as a function",
     ),
     row(
         "asked to keep the energy of a system that depends on time",
