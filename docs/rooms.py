@@ -54,7 +54,7 @@ ROOMS = tuple(room for floor in FLOORS for room in floor)
 
 
 class Import(NamedTuple):
-    """One module of the package that reads from another, and at which line."""
+    """An import of one module of the package by another, with its line."""
 
     importer: str
     imported: str
@@ -62,9 +62,9 @@ class Import(NamedTuple):
 
 
 def read_sources(package: Path = PACKAGE) -> dict[str, str]:
-    """The text of each module, by its dotted name without that of the package.
+    """The text of each module, by its dotted name inside the package.
 
-    A room that is a folder goes by its own name; the package itself is "".
+    A folder has its own name, and the package itself the name "".
     """
     sources = {}
     for path in sorted(package.rglob("*.py")):
@@ -76,7 +76,7 @@ def read_sources(package: Path = PACKAGE) -> dict[str, str]:
 
 
 def read_imports(sources: Mapping[str, str], name: str = "nhjax") -> list[Import]:
-    """Every import of a module of the package by another, functions' own included."""
+    """Every import of a module of the package by another, also inside functions."""
     folders = {module.rpartition(".")[0] for module in sources} | {""}
     found = []
     for module, text in sources.items():
@@ -96,7 +96,7 @@ def read_imports(sources: Mapping[str, str], name: str = "nhjax") -> list[Import
 def _targets(
     node: ast.Import | ast.ImportFrom, here: list[str], name: str
 ) -> Iterator[list[str]]:
-    """What a statement imports, as paths from the top of the package."""
+    """The names that a statement imports, as paths from the top of the package."""
     if isinstance(node, ast.Import):
         for alias in node.names:
             parts = alias.name.split(".")
@@ -115,7 +115,7 @@ def _targets(
 
 
 def _module_of(target: list[str], sources: Mapping[str, str]) -> str | None:
-    """The module that a path leads to; what follows it is a name inside."""
+    """The module at the start of a path; the rest of the path is a name inside it."""
     for length in range(len(target), -1, -1):
         module = ".".join(target[:length])
         if module in sources:
@@ -129,10 +129,10 @@ def room(module: str) -> str:
 
 
 def between_rooms(imports: Iterable[Import]) -> list[Import]:
-    """The imports that lead from a room to another.
+    """The imports that lead from one room to another.
 
-    The package's own `__init__`, which gathers the public names, is no room. It stands
-    above all but the command line.
+    The package's own `__init__`, which collects the public names, is not a room. It is
+    above all rooms except the command line.
     """
     return [
         found
@@ -182,12 +182,12 @@ def circle(arrows: Iterable[tuple[str, str]]) -> list[str] | None:
 
 
 def num_files(modules: Iterable[str], folder: str) -> int:
-    """The number of files of a room, rooms inside of it included."""
+    """The number of files of a room, including rooms inside it."""
     return sum(name == folder or name.startswith(f"{folder}.") for name in modules)
 
 
 def num_floors(imports: Iterable[Import], folder: str) -> int:
-    """The length of the longest chain of imports inside a folder, without its door."""
+    """The longest chain of imports inside a folder, without its `__init__`."""
     leads_to: dict[str, set[str]] = {}
     for found in imports:
         if all(x.rpartition(".")[0] == folder for x in found[:2]):
@@ -381,16 +381,16 @@ def page(sources: Mapping[str, str]) -> str:
     lines = [
         "# The rooms",
         "",
-        "The package is made of rooms, each a folder or a file with one purpose. A",
-        "room imports only from rooms below it, and from a folder only what its",
-        "`__init__` names. `tests/test_rooms.py` reads the imports and fails on an",
+        "The package consists of rooms. A room is a folder or a file with one purpose.",
+        "It imports only from rooms below it, and from a folder only the names in its",
+        "`__init__`. `tests/test_rooms.py` reads the imports and fails on an",
         "arrow that points up. `python docs/rooms.py` draws the picture from the",
         "imports and writes this page. Grey arrows lead to the ground floor.",
         "",
         "![The rooms of nhjax and their imports](rooms.png)",
         "",
-        "From the top down, with the number of files of each room and its floors, the",
-        "length of the longest chain of imports inside it:",
+        "From the top down. The floors of a room are the length of the longest chain",
+        "of imports inside it:",
         "",
         "| room | purpose | imports from | files | floors |",
         "| --- | --- | --- | --- | --- |",
@@ -418,7 +418,7 @@ def page(sources: Mapping[str, str]) -> str:
 
 
 def draw(sources: Mapping[str, str]) -> Figure:
-    """The picture of the rooms, each on a level of its own and arrows pointing down."""
+    """The picture of the rooms, each on its own level, with arrows that point down."""
     figure = Figure(figsize=(9, 10), layout="constrained")
     ax = figure.subplots()
     box = {"boxstyle": "round,pad=0.4", "facecolor": "#eef3f8", "edgecolor": "#4a6a8a"}
@@ -468,7 +468,7 @@ _PLACES = {name: (_COLUMNS[name], height) for height, name in enumerate(ROOMS)}
 def _arrow(
     ax: Axes, start: tuple[float, float], end: tuple[float, float], *, light: bool
 ) -> None:
-    """A curve that leaves a room at its bottom and comes to another at its top."""
+    """A curve from the bottom of a room to the top of another."""
     (x0, y0), (x1, y1) = (start[0], start[1] - 0.24), (end[0], end[1] + 0.26)
     pull = 0.45 * (y0 - y1)
     path = MplPath(
