@@ -514,6 +514,10 @@ def _measure(given: argparse.Namespace) -> None:
     found = deepest_stacks(nhjax)
     figures = measured(tree, found)
     name = given.record or "this checkout"
+    if given.record:
+        recorded = recorded_figures() | {given.record: figures}
+        text = json.dumps(recorded, indent=2) + "\n"
+        (DOCS / "rooms.json").write_text(text, encoding="utf-8")
     if given.json:
         print(json.dumps(figures, indent=2))
     else:
@@ -522,10 +526,6 @@ def _measure(given: argparse.Namespace) -> None:
         for name, stack in found.items():
             print(f"\n{name}:")
             print("\n".join(f"  {file}: {function}" for file, function in stack.frames))
-    if given.record:
-        recorded = recorded_figures() | {given.record: figures}
-        text = json.dumps(recorded, indent=2) + "\n"
-        (DOCS / "rooms.json").write_text(text, encoding="utf-8")
 
 
 if __name__ == "__main__":

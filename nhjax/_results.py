@@ -86,8 +86,8 @@ class RESULTS(eqx.Enumeration, metaclass=_Named):
         '`constraints="redundant"` of a system permits.'
     )
     nonfinite_state = (
-        "The state became infinite or NaN, or was so at the start. Check `y0` and the "
-        "functions of the system along the trajectory, or try a smaller `dt`."
+        "The state became infinite or NaN, or was so from the start. Check `y0` and "
+        "the functions of the system along the trajectory, or try a smaller `dt`."
     )
     left_chart = (
         "A step turned so far that it left the chart of the retraction (a rotation "
