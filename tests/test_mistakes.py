@@ -1218,7 +1218,7 @@ RUNS = [
         lambda: run(nhjax.State(Y0.q, 2 * Y0.v + 1, Y0.p, Y0.multiplier)),
         IntegrationError,
         "step 0: The initial state violates the constraints",
-        "Make `y0` with `nhjax.initial_state`",
+        "Create `y0` with `nhjax.initial_state`",
     ),
     row(
         "gave one step its arguments in the order of `integrate`",
