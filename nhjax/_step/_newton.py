@@ -2,6 +2,7 @@
 
 from abc import abstractmethod
 from collections.abc import Callable
+from dataclasses import replace
 from typing import TypeAlias
 
 import equinox as eqx
@@ -245,21 +246,28 @@ class Newton(AbstractStageSolver):
         scale = fibre_coordinate_scale(stages, x0, lin)
 
         eps = float(jnp.finfo(stages.p.dtype).eps)
-        nudge = eps**0.5
-        moved = nudged(stages, jnp.asarray(nudge, stages.p.dtype))
+        zero = jnp.zeros((), stages.p.dtype)
+        _, position_rate = jax.jvp(
+            lambda nudge: nudged(stages, nudge).q, (zero,), (jnp.ones_like(zero),)
+        )
 
-        def residual(z):
-            return stage_residual(stages, unravel(z))
+        def residual(z_and_nudge):
+            z, nudge = z_and_nudge[:-1], z_and_nudge[-1]
+            q = jax.tree.map(lambda q, dq: q + nudge * dq, stages.q, position_rate)
+            return stage_residual(replace(stages, q=q), unravel(z))
 
         def sweep(x: Stages):
             z, _ = ravel_pytree(x)
-            jacobian, r, evaluation = jacobian_and_value(residual, z)
-            change = stage_residual(moved, x)[0] - r
+            # The last column is the derivative with respect to a move of the positions.
+            # It costs less than a second evaluation at moved positions.
+            jacobian, r, evaluation = jacobian_and_value(residual, jnp.append(z, zero))
+            jacobian, by_move = jacobian[:, :-1], jacobian[:, -1]
             # After a change by a few units of the last digits the equations differ from
             # what the Jacobian predicts by their round-off.
             near = z + 8 * eps * uneven_perturbations(z)
-            missed = residual(near)[0] - r - jacobian @ (near - z)
-            rights = jnp.stack([r, change, missed], axis=1)
+            missed = stage_residual(stages, unravel(near))[0] - r
+            missed = missed - matvec(jacobian, near - z)
+            rights = jnp.stack([r, by_move, missed], axis=1)
             dz, *noises = jnp.linalg.solve(jacobian, -rights).T
             x_next = unravel(z + dz)
             # Two effects move the stages: the round-off of the positions, magnified by
@@ -268,7 +276,7 @@ class Newton(AbstractStageSolver):
             by_positions, by_equations = (
                 increment_size(stages, x, unravel(z + noise), lin) for noise in noises
             )
-            noise = jnp.maximum(by_positions / nudge, PART * by_equations / eps)
+            noise = jnp.maximum(by_positions, PART * by_equations / eps)
             found = Sizes(
                 increment_size(stages, x, x_next, lin),
                 fibre_coordinate_size(stages, x_next),
