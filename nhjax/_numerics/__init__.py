@@ -1,75 +1,68 @@
 """The numerical building blocks without mechanics: products, norms, iterations."""
 
-from ._block_tridiagonal import (
-    block_tridiagonal_inverse as block_tridiagonal_inverse,
-    BlockTridiagonalInverse as BlockTridiagonalInverse,
-    couplings as couplings,
+from ._contraction import inverse as inverse, small_einsum as small_einsum
+from ._floating_point import (
+    largest_column as largest_column,
+    max_norm as max_norm,
+    measured_noise as measured_noise,
+    NOISE_DEVIATIONS as NOISE_DEVIATIONS,
+    nonzero_or_one as nonzero_or_one,
+    relative as relative,
+    two_sum as two_sum,
+    uneven_perturbations as uneven_perturbations,
 )
-from ._compensated import two_sum as two_sum
-from ._contraction import (
-    absolute as absolute,
-    AbstractLinearMap as AbstractLinearMap,
-    inverse as inverse,
-    Matrix as Matrix,
-    matvec as matvec,
-    small_einsum as small_einsum,
-)
-from ._diagonal import full_jacobian as full_jacobian, jacobian as jacobian
 from ._implicit import (
+    AbstractImplicitFunction as AbstractImplicitFunction,
     ClosureConverted as ClosureConverted,
-    frozen as frozen,
+    fixed_point_tangent as fixed_point_tangent,
     has_tangent as has_tangent,
-    moving_with as moving_with,
+    nan_gradient_unless as nan_gradient_unless,
+    nan_tangent_unless as nan_tangent_unless,
     nan_unless as nan_unless,
     root as root,
-    solve_contraction as solve_contraction,
+    stop_gradient as stop_gradient,
     tree_where as tree_where,
+    with_zero_tangents as with_zero_tangents,
     zero_unless as zero_unless,
 )
-from ._index_sets import dependence as dependence
 from ._iteration import (
     iterate as iterate,
     jacobian_and_value as jacobian_and_value,
     NOISE_UNITS as NOISE_UNITS,
-    Sizes as Sizes,
     Solved as Solved,
+    UpdateNorms as UpdateNorms,
 )
-from ._least_norm import (
+from ._operators import (
+    AbstractOperator as AbstractOperator,
+    block_tridiagonal_inverse as block_tridiagonal_inverse,
+    BlockTridiagonalInverse as BlockTridiagonalInverse,
+    compressed_products as compressed_products,
+    DenseMatrix as DenseMatrix,
+    DiagonalMatrix as DiagonalMatrix,
+    full_jacobian as full_jacobian,
+    InverseMatrix as InverseMatrix,
+    JacobianMatrix as JacobianMatrix,
+    ReactionMatrix as ReactionMatrix,
+    sparse_jacobian as sparse_jacobian,
+    SparseMatrix as SparseMatrix,
+    SparsityPattern as SparsityPattern,
+    square_jacobian as square_jacobian,
+    SquareMatrix as SquareMatrix,
+    WeightedTranspose as WeightedTranspose,
+)
+from ._rank import (
+    active_ranks as active_ranks,
+    dependent_rows as dependent_rows,
+    has_zero_row as has_zero_row,
+    is_deficient as is_deficient,
+    is_nearly_singular as is_nearly_singular,
     least_norm_inverse as least_norm_inverse,
     least_norm_inverse_by_blocks as least_norm_inverse_by_blocks,
     least_norm_solve as least_norm_solve,
     NEARLY_DEPENDENT as NEARLY_DEPENDENT,
     rank_of_gram as rank_of_gram,
+    RankCondition as RankCondition,
+    reciprocal_condition as reciprocal_condition,
     reciprocal_condition_of_range as reciprocal_condition_of_range,
 )
-from ._max_norm import (
-    largest_column as largest_column,
-    max_norm as max_norm,
-    relative as relative,
-    unit as unit,
-)
-from ._no_gradient import (
-    nan_gradient_unless as nan_gradient_unless,
-    nan_tangent_unless as nan_tangent_unless,
-)
-from ._noise import (
-    measured_noise as measured_noise,
-    NOISE_DEVIATIONS as NOISE_DEVIATIONS,
-)
-from ._rank import (
-    dependent_rows as dependent_rows,
-    is_deficient as is_deficient,
-    is_definite as is_definite,
-    is_nearly_singular as is_nearly_singular,
-    is_without_entries as is_without_entries,
-    Rank as Rank,
-    reciprocal_condition as reciprocal_condition,
-    those_that_count as those_that_count,
-)
-from ._sparse import (
-    Pattern as Pattern,
-    sparse_jacobian as sparse_jacobian,
-    SparseMatrix as SparseMatrix,
-    WeightedTranspose as WeightedTranspose,
-)
-from ._uneven_perturbations import uneven_perturbations as uneven_perturbations
+from ._sparsity import jacobian_sparsity as jacobian_sparsity

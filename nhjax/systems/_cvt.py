@@ -4,8 +4,8 @@ import math
 
 import equinox as eqx
 import jax.numpy as jnp
+import scipy
 from jaxtyping import Array, ArrayLike
-from scipy.special import ellipj, ellipkinc
 
 from .._custom_types import Args, FloatScalarLike
 from ._base import AbstractConstrainedExample, coordinates, parameter
@@ -17,9 +17,9 @@ class ContinuouslyVariableTransmission(AbstractConstrainedExample):
     L = ½ (ẋ² + ẏ² + ż²) - ½ (x² + z² - 2 cos y + ε sin 2y),
     Φ = ż + sin(y) ẋ,  q = (x, y, z), in dimensionless units.
 
-    The driver y is a pendulum that the passenger (x, z) does not act on. Their
+    The passenger (x, z) does not act on the driver y, which is a pendulum. Their
     energies E_d = ½ ẏ² - cos y + ½ ε sin 2y and E_p = ½ (ẋ² + ż² + x² + z²) are
-    conserved one by one.
+    conserved separately.
 
     **Parameters:** `epsilon` ε >= 0, the perturbation of the pendulum [1]. `low` and
     `high` give the two sets of initial data: an oscillating driver (E_d = 4/5,
@@ -99,13 +99,15 @@ class ContinuouslyVariableTransmission(AbstractConstrainedExample):
         half -= turns * math.pi
         if modulus_squared < 1:
             phase = math.atan2(math.sin(half), rate)
-            start = ellipkinc(phase, modulus_squared)
-            sn, cn, dn, _ = ellipj(t + start, modulus_squared)
+            start = scipy.special.ellipkinc(phase, modulus_squared)
+            sn, cn, dn, _ = scipy.special.ellipj(t + start, modulus_squared)
             half, rate = math.atan2(modulus * sn, dn), modulus * cn
         else:
             direction = math.copysign(1.0, rate)
-            start = ellipkinc(direction * half, 1 / modulus_squared)
-            _, _, dn, am = ellipj(modulus * t + start, 1 / modulus_squared)
+            start = scipy.special.ellipkinc(direction * half, 1 / modulus_squared)
+            _, _, dn, am = scipy.special.ellipj(
+                modulus * t + start, 1 / modulus_squared
+            )
             half, rate = direction * am, direction * modulus * dn
         return float(2 * (half + turns * math.pi)), float(2 * rate)
 

@@ -11,8 +11,8 @@ import scipy.special
 from nhjax.lanes import _coefficients
 from nhjax.lanes._elementary_functions import definitions, SUPPORTED
 from nhjax.lanes._writer import symbol
-from oracles import approximations, ulps
-from oracles.native_lanes import Native
+from support import approximations, ulps
+from support.native_lanes import Native
 
 
 OPS = sorted(SUPPORTED)
@@ -114,7 +114,7 @@ def _specials(dtype):
 @pytest.mark.parametrize("width", WIDTHS)
 @pytest.mark.parametrize("dtype", DTYPES)
 @pytest.mark.parametrize("op", OPS)
-def test_elementary_function_at_special_values_is_that_of_c(op, dtype, width, native):
+def test_elementary_function_at_special_values_equals_c(op, dtype, width, native):
     values = _specials(DTYPES[dtype])
     given = [values]
     if op in ulps.BINARY:

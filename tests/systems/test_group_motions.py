@@ -23,13 +23,13 @@ from nhjax.systems import (
     UnicycleInCoordinates,
     Veselova,
 )
-from oracles.group_gallery import (
+from support.group_gallery import (
     assert_close,
     GALLERY,
     SOLVED,
     TILTED,
 )
-from oracles.group_oracle import (
+from support.group_oracle import (
     acceleration_and_multiplier,
     oracle,
     rotated,
@@ -266,7 +266,7 @@ def test_suslov_ends_in_a_steady_rotation():
         (lambda: RodSleigh(mass2=0.0), r"`mass2` must be positive, got 0"),
     ],
 )
-def test_a_bad_parameter_is_named(build, message):
+def test_parameter_out_of_range_is_named(build, message):
     with pytest.raises(ValueError, match=message):
         build()
 

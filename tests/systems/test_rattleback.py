@@ -12,8 +12,14 @@ from scipy.interpolate import make_interp_spline
 
 import nhjax
 from nhjax.systems import Rattleback
-from oracles.machines import accelerations, assert_orders, drifts, runs_of_both, stack
-from oracles.rolling_bodies import (
+from support.machines import (
+    accelerations,
+    assert_orders,
+    drifts,
+    runs_of_three_stages,
+    stack,
+)
+from support.rolling_bodies import (
     assert_newton_and_euler,
     ellipsoid,
     errors_of,
@@ -52,8 +58,8 @@ COUNTS = (100, 200, 400)
 
 
 @pytest.fixture(scope="module")
-def runs_of():
-    return runs_of_both(STONES["default"], COUNTS, DURATION)
+def found():
+    return runs_of_three_stages(STONES["default"], COUNTS, DURATION)
 
 
 @pytest.fixture(scope="module")
@@ -103,7 +109,7 @@ def test_tilts_are_the_papers_angles():
     np.testing.assert_allclose(up, expected, rtol=0, atol=1e-15)
 
 
-def test_a_stone_at_rest_rocks_as_its_radii_of_curvature_say():
+def test_rattleback_at_rest_rocks_at_frequency_of_its_radii_of_curvature():
     a, b, c, h, m, g, e = 0.2, 0.03, 0.02, 0.01, 1.0, 9.81, 1e-5
     rocking = []
     for turn in (*np.eye(2), *-np.eye(2)):
@@ -120,18 +126,16 @@ def test_a_stone_at_rest_rocks_as_its_radii_of_curvature_say():
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("stages", [2, 3])
-def test_order_is_that_of_the_method(runs_of, errors_at, stages):
-    assert_orders(runs_of[stages], 2 * stages - 2, errors_at, floor=1e-11)
+def test_run_converges_with_method_order(found, errors_at):
+    assert_orders(found, 4, errors_at, floor=1e-11)
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("stages", [2, 3])
-def test_constraints_hold_to_round_off_and_energy_stays(runs_of, stages):
-    assert np.max(runs_of[stages].violation) < 1e-13
-    drift = drifts(STONES["default"], runs_of[stages])["energy"]
+def test_constraints_hold_to_round_off_and_energy_stays(found):
+    assert np.max(found.violation) < 1e-13
+    drift = drifts(STONES["default"], found)["energy"]
     # Of 0.02 J of the spin; the coarsest runs take four times the duration.
-    largest = {2: (2e-3, 2e-4, 1e-5), 3: (5e-4, 2e-7, 5e-9)}[stages]
+    largest = (5e-4, 2e-7, 5e-9)
     assert np.all(drift < largest), drift
 
 
@@ -186,7 +190,7 @@ def spins(first_reversal):
 
 
 @pytest.mark.long
-def test_spin_reverses_when_the_equations_of_the_paper_say(first_reversal, spins):
+def test_spin_reverses_at_the_time_of_the_papers_equations(first_reversal, spins):
     _, v, _ = spins
     end, state, afterwards = first_reversal
     assert end == pytest.approx(2.38, abs=0.01)
@@ -196,13 +200,13 @@ def test_spin_reverses_when_the_equations_of_the_paper_say(first_reversal, spins
 
 
 @pytest.mark.long
-def test_a_spin_in_the_other_sense_does_not_reverse(spins):
+def test_spin_in_the_other_sense_does_not_reverse(spins):
     _, v, _ = spins
     assert np.all(v[1, :, 5] < -4.0)
 
 
 @pytest.mark.long
-def test_damping_takes_the_energy_that_its_power_says(spins):
+def test_energy_lost_by_damping_equals_its_power(spins):
     for ts, v, energy in zip(*spins, strict=True):
         power = -DAMPING * np.sum(v[:, 3:] ** 2, axis=1)
         work = make_interp_spline(ts, power, k=7).integrate(ts[0], ts[-1])
@@ -229,7 +233,7 @@ def test_points_are_on_the_stone_and_on_the_plane():
     assert np.min(heights) > 0
 
 
-def test_system_computes_in_the_precision_of_the_state():
+def test_system_computes_in_precision_of_the_state():
     stone = STONES["damped"]
     y0 = stone.initial_state(jnp.float32)
     assert y0.q.dtype == y0.v.dtype == y0.multiplier.dtype == jnp.float32
@@ -254,6 +258,6 @@ def test_system_computes_in_the_precision_of_the_state():
         ),
     ],
 )
-def test_a_bad_parameter_is_named(build, message):
+def test_parameter_out_of_range_is_named(build, message):
     with pytest.raises(ValueError, match=message):
         build()

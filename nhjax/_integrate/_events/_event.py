@@ -124,7 +124,7 @@ def _as_events(event: Any) -> tuple[Event, ...] | None:
     events = tuple(event) if isinstance(event, list | tuple) else event
     if not isinstance(events, tuple):
         events = (events,)
-    advice = "Such as nhjax.Event(cond_fn), or a sequence of them."
+    advice = "For example, pass nhjax.Event(cond_fn), or a sequence of events."
     for one in events:
         check_type("event", one, Event, advice)
     return events or None
@@ -309,7 +309,7 @@ def with_continuous_multiplier(
 
     Only the propagated closure leaves another multiplier in the states of a run.
     """
-    if method.closure != "propagated":
+    if not method.carries_multiplier:
         return y
     u = system.fibre_coordinate(y)
     lin = linearise(system, t, y.q, u, args, may_be_sparse=True)

@@ -1,0 +1,28 @@
+"""Every feature in brief, as a program of its own: each prints its name if it holds."""
+
+import jax
+
+
+jax.config.update("jax_enable_x64", True)
+
+from support import (  # noqa: E402
+    features_of_derivatives,
+    features_of_runs,
+    features_of_systems,
+)
+from support.user_features import FEATURES  # noqa: E402
+
+
+__all__ = ["features_of_derivatives", "features_of_runs", "features_of_systems"]
+
+
+if __name__ == "__main__":
+    for name, function in FEATURES.items():
+        try:
+            function()
+        # Whatever is wrong with a feature, the others are tried too; the test of this
+        # one fails, since its name does not stand alone on a line.
+        except Exception as error:
+            print(f"{name}: {type(error).__name__}: {error}".replace("\n", " "))
+        else:
+            print(name, flush=True)

@@ -1,0 +1,115 @@
+"""Derivatives in brief, and the programs that are compiled, as users run them."""
+
+import os
+
+import jax
+import jax.numpy as jnp
+
+import nhjax
+from nhjax import SaveAt, systems
+from support.user_features import (
+    close,
+    DT,
+    feature,
+    of_dt,
+    PARTICLE,
+    run,
+    TWO,
+)
+
+
+@feature
+def two_functions_that_are_kept_and_their_gradient():
+    cvt = systems.ContinuouslyVariableTransmission.low()
+
+    def energies(t, q, v, args):
+        return jnp.stack([cvt.driver_energy(q, v), cvt.passenger_energy(q, v)])
+
+    def loss(dt):
+        sol = run(cvt, TWO, dt=dt, invariants=energies)
+        y = jax.tree.map(lambda x: x[-1], sol.ys)
+        return jnp.sum(jnp.sin(y.q)) + energies(1.0, y.q, y.v, None) @ jnp.ones(2)
+
+    gradient = jax.jit(jax.grad(loss))(DT)
+    close(gradient, (loss(DT + 1e-5) - loss(DT - 1e-5)) / 2e-5, 1e-7)
+
+
+@feature
+def gradients_and_forward_mode():
+    loss = of_dt(nhjax.DirectAdjoint())
+    gradient = jax.jit(jax.grad(loss))(DT)
+    _, rate = jax.jit(lambda x: jax.jvp(loss, (x,), (1.0,)))(DT)
+    close(gradient, rate, 1e-11)
+    close(gradient, (loss(DT + 1e-5) - loss(DT - 1e-5)) / 2e-5, 1e-7)
+
+
+@feature
+def gradients_of_a_batch_by_the_reversible_adjoint():
+    loss, dts = of_dt(nhjax.ReversibleAdjoint()), jnp.array([DT, 0.5 * DT])
+    batch = jax.jit(jax.vmap(jax.grad(loss)))(dts)
+    expected = [(loss(dt + 1e-5) - loss(dt - 1e-5)) / 2e-5 for dt in dts]
+    close(batch, jnp.stack(expected), 1e-7)
+
+
+@feature
+def gradients_of_an_ensemble_in_its_projected_starts():
+    """Of 40 members, by every engine.
+
+    Kernels whose parameters turn out to be unused or constant abort XLA's compiler.
+    """
+    sleigh = systems.RodSleigh()
+
+    def loss(q):
+        y0 = nhjax.initial_state(sleigh.system, q, sleigh.v0, project=True)
+        sol = run(sleigh, TWO, y0=y0, saveat=SaveAt(steps=True))
+        return jnp.sum(sol.ys.q)
+
+    starts = sleigh.q0 + 1e-3 * jnp.arange(40.0)[:, None]
+    many = {}
+    for engine in ("kernels", "lanes"):
+        os.environ["NHJAX_ENGINE"] = engine
+        many[engine] = jax.jit(jax.vmap(jax.grad(loss)))(starts)
+        jax.clear_caches()
+    del os.environ["NHJAX_ENGINE"]
+    close(many["kernels"], many["lanes"])
+    assert jnp.all(jnp.ptp(many["lanes"], axis=0) > 0)
+
+
+@feature
+def gradients_on_a_group_by_checkpoints():
+    suslov, adjoint = systems.Suslov(), nhjax.RecursiveCheckpointAdjoint()
+
+    def loss(dt):
+        return jnp.sum(jnp.sin(run(suslov, TWO, dt=dt, adjoint=adjoint).ys.q))
+
+    gradient = jax.jit(jax.grad(loss))(DT)
+    close(gradient, (loss(DT + 1e-5) - loss(DT - 1e-5)) / 2e-5, 1e-7)
+
+
+@feature
+def second_derivatives():
+    slope = jax.grad(of_dt())
+    second = jax.jit(jax.hessian(of_dt()))(DT)
+    close(second, (slope(DT + 1e-5) - slope(DT - 1e-5)) / 2e-5, 1e-6)
+
+
+@feature
+def one_kernel_in_the_compiled_program():
+    """All steps are one operation of the program that XLA has compiled, by default.
+
+    The round-off of the system is measured by another one, before them.
+    """
+    y0 = PARTICLE.initial_state()
+    compiled = {}
+    for engine in ("lanes", "kernels"):
+        os.environ["NHJAX_ENGINE"] = engine
+        function = jax.jit(lambda y0: run(y0=y0).ys.q)
+        _, use = nhjax.engines(function, y0)
+        compiled[use.engine] = function.lower(y0).compile().as_text()
+        jax.clear_caches()
+    del os.environ["NHJAX_ENGINE"]
+    assert 'xla_cpu_small_call="true"' in compiled["kernels"]
+    # Where there is no compiler of ours, XLA's takes both.
+    if "lanes" in compiled:
+        assert compiled["lanes"].count('custom_call_target="nhjax_lanes_') == 2
+        assert " while(" not in compiled["lanes"]
