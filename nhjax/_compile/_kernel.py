@@ -79,32 +79,23 @@ def as_cpu_kernel(
         return function(*args)
     dynamic, static = eqx.partition(args, eqx.is_array)
     leaves, treedef = jax.tree.flatten(dynamic)
-    if programs is None:
-        traced = _traced(function, static, treedef, leaves)
-    else:
-        others, structure = jax.tree.flatten(static)
-        key = function, treedef, structure, *others, *map(jax.typeof, leaves)
-        traced = programs.find(key)
-        if traced is None:
-            traced = _traced(function, static, treedef, leaves)
+    others, structure = jax.tree.flatten(static)
+    key = function, treedef, structure, *others, *map(jax.typeof, leaves)
+    traced = None if programs is None else programs.find(key)
+    if traced is None:
+        kept = []
+
+        def flat(*leaves):
+            args = eqx.combine(jax.tree.unflatten(treedef, leaves), static)
+            arrays, rest = eqx.partition(function(*args), eqx.is_array)
+            kept.append((jax.tree.structure(arrays), rest))
+            return jax.tree.leaves(arrays)
+
+        traced = _Traced(cse_dce(jax.make_jaxpr(flat)(*leaves)), *kept[0])
+        if programs is not None:
             programs.keep(key, traced)
     out = run_program(traced.program, leaves, is_brief)
     return eqx.combine(jax.tree.unflatten(traced.structure, out), traced.rest)
-
-
-def _traced(
-    function: Callable[..., Any], static: Any, treedef: Any, leaves: list[Any]
-) -> _Traced:
-    kept = []
-
-    def flat(*leaves):
-        args = eqx.combine(jax.tree.unflatten(treedef, leaves), static)
-        arrays, rest = eqx.partition(function(*args), eqx.is_array)
-        kept.append((jax.tree.structure(arrays), rest))
-        return jax.tree.leaves(arrays)
-
-    program = cse_dce(jax.make_jaxpr(flat)(*leaves))
-    return _Traced(program, *kept[0])
 
 
 def call(flat: Callable[..., list[Any]], leaves: list[Any]) -> list[Any]:

@@ -18,7 +18,7 @@ from ._stepper import AbstractCarry
 
 
 _Run: TypeAlias = tuple[AbstractCarry, Rows]
-_Advance: TypeAlias = Callable[[_Run, Int[Array, ""]], _Run]
+_Advance: TypeAlias = Callable[[Int[Array, ""], _Run], _Run]
 
 
 class AbstractAdjoint(eqx.Module):
@@ -33,7 +33,7 @@ class AbstractAdjoint(eqx.Module):
         """Run all steps of the loop from `carry`; return its end and all saved rows."""
 
 
-def _advance(loop: Loop, state: _Run, k: Int[Array, ""]) -> _Run:
+def _advance(loop: Loop, k: Int[Array, ""], state: _Run) -> _Run:
     carry, buffers = state
     carry, rows = loop.step(carry, k)
     return carry, loop.write(buffers, rows, k)
@@ -73,9 +73,7 @@ class DirectAdjoint(AbstractAdjoint):
         """Run all steps of the loop from `carry`; return its end and all saved rows."""
         state = (carry, loop.empty_rows(carry))
         end = count(loop.num_iterations)
-        return jax.lax.fori_loop(
-            np.int32(0), end, lambda k, state: _advance(loop, state, k), state
-        )
+        return jax.lax.fori_loop(np.int32(0), end, partial(_advance, loop), state)
 
 
 class RecursiveCheckpointAdjoint(AbstractAdjoint):
@@ -139,7 +137,7 @@ class RecursiveCheckpointAdjoint(AbstractAdjoint):
             stride = math.prod(lengths[len(lengths) - level :])
             advance = _block(advance, length, stride, keep_all=level == 0)
         state = (carry, loop.empty_rows(carry))
-        return advance(state, jnp.zeros((), jnp.int32))
+        return advance(jnp.zeros((), jnp.int32), state)
 
     def _block_lengths(self, num_steps: int) -> list[int]:
         """List the number of blocks on each level, the outermost level first."""
@@ -160,11 +158,11 @@ def _block(advance: _Advance, length: int, stride: int, *, keep_all: bool) -> _A
     """Return a function that calls `advance` `length` times, `stride` steps apart."""
     one = advance if keep_all else jax.checkpoint(advance, prevent_cse=False)
 
-    def block(state, k):
+    def block(k, state):
         return jax.lax.fori_loop(
             np.int32(0),
             count(length),
-            lambda i, state: one(state, k + np.int32(stride) * i),
+            lambda i, state: one(k + np.int32(stride) * i, state),
             state,
         )
 
@@ -177,7 +175,7 @@ def _idle_after_the_end(loop: Loop) -> _Advance:
     It is needed if the last block extends beyond the end of the run.
     """
 
-    def advance_or_idle(state, k):
+    def advance_or_idle(k, state):
         # The buffers are written outside of `jax.lax.cond`, whose branches would copy
         # them.
         carry, buffers = state

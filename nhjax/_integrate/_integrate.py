@@ -641,13 +641,11 @@ def _all_steps(
         plain = loop.stepper.plain
         return plain.round_off_at(y0, first.step_state, noise), first
 
-    def steps(loop: Loop, round_off: RoundOff, first: AbstractCarry):
+    def steps(loop: Loop, started: tuple[RoundOff, AbstractCarry] | None, *given: Any):
+        round_off, first = start(loop, *given) if started is None else started
         loop = loop.with_round_off(round_off)
         run = adjoint.run(loop, loop.moving(first))
         return round_off, first.step_state.state, *run
-
-    def whole(loop: Loop, y0: State, noise: FunctionNoise):
-        return steps(loop, *start(loop, y0, noise))
 
     noise = None
     if isinstance(y0, State):
@@ -660,14 +658,14 @@ def _all_steps(
         given = plain.system, *given
         noise = as_cpu_kernel(function_noise, *given, is_brief=True)
         if not checkpoint:
-            return as_cpu_kernel(whole, loop, y0, noise)
+            return as_cpu_kernel(steps, loop, None, y0, noise)
     # A compiler that knows the start of a loop, such as zeros in its matrices, rounds
     # differently in the loop. The barrier hides the start, so that a resumed run takes
     # its steps by the same instructions.
-    first = as_cpu_kernel(start, loop, y0, noise)
-    given, rest = eqx.partition((loop, first), eqx.is_array)
-    loop, first = eqx.combine(jax.lax.optimization_barrier(given), rest)
-    return as_cpu_kernel(steps, loop, *first)
+    started = as_cpu_kernel(start, loop, y0, noise)
+    given, rest = eqx.partition((loop, started), eqx.is_array)
+    loop, started = eqx.combine(jax.lax.optimization_barrier(given), rest)
+    return as_cpu_kernel(steps, loop, started)
 
 
 def _output(
