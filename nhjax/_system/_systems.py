@@ -8,6 +8,7 @@ Everything above this room uses the common interface, `AbstractMechanicalSystem`
 from abc import abstractmethod
 from collections.abc import Callable
 from functools import partial
+from types import BuiltinFunctionType, FunctionType
 from typing import Any, ClassVar, Literal, TypeVar
 
 import equinox as eqx
@@ -68,6 +69,37 @@ def check_time_and_state(function: str, t: Any, y: Any, first: str = "") -> None
         )
 
 
+class StaticFunction(eqx.Module):
+    """A Python function as a part of the structure of a pytree, not as a leaf.
+
+    The leaves of a system are then arrays alone, so that `jax.jit`, `jax.vmap` and
+    `jax.grad` accept a system as an argument.
+    """
+
+    function: Callable[..., Any] = eqx.field(static=True)
+
+    def __call__(self, *arguments: Any) -> Any:
+        """Call the function."""
+        return self.function(*arguments)
+
+
+_PYTHON_FUNCTIONS = (FunctionType, BuiltinFunctionType, type(jax.jit(lambda: None)))
+
+
+def static_function(function: Any) -> Any:
+    """Convert a Python function, whose arrays are constants, to a `StaticFunction`.
+
+    Other callables, such as `equinox.Module`s, stay as they are: their arrays are
+    parameters.
+    """
+    is_plain = isinstance(function, _PYTHON_FUNCTIONS)
+    return StaticFunction(function) if is_plain else function
+
+
+def _as_given(function: Any) -> Any:
+    return function.function if isinstance(function, StaticFunction) else function
+
+
 class AbstractMechanicalSystem(eqx.Module):
     """A mechanical system with constraints, written on TQ or on T*Q.
 
@@ -91,7 +123,7 @@ class AbstractMechanicalSystem(eqx.Module):
     def __check_init__(self):
         owner, letter = type(self).__name__, self.fibre_coordinate_name
         for name, arguments in self.signatures().items():
-            function = getattr(self, name)
+            function = _as_given(getattr(self, name))
             if function is not None or name == self.generator:
                 check_signature(owner, name, function, arguments)
                 check_third_argument(owner, name, function, arguments, letter)
@@ -165,7 +197,7 @@ class AbstractMechanicalSystem(eqx.Module):
 
         The note says which function of the system raised the error.
         """
-        function = getattr(self, name)
+        function = _as_given(getattr(self, name))
         called = f"{name}({', '.join(self.signatures()[name])})"
         with naming(called, function, arguments[-1]):
             return function(*arguments)
@@ -299,9 +331,9 @@ class LagrangianSystem(AbstractMechanicalSystem):
     which on R^n is the familiar d/dt D2L = D1L + F + λᵀ D2Φ + νᵀ DΓ with q̇ = v.
     Automatic differentiation computes all derivatives. If a function is an
     `equinox.Module`, its array leaves are parameters of the system, and gradients with
-    respect to the system include them. A system contains functions, which `jax.jit`
-    does not accept as arguments: compile functions that take a system with
-    `equinox.filter_jit`.
+    respect to the system include them. A system can be an argument of `jax.jit`,
+    `jax.vmap` and `jax.grad`: Python functions are a part of its structure, and another
+    function recompiles.
 
     Values that the functions read besides their arguments (globals, variables of
     enclosing functions, attributes of objects) are compiled in. `integrate` and
@@ -339,10 +371,16 @@ class LagrangianSystem(AbstractMechanicalSystem):
         ...     lambda t, q, v, args: 0.5 * v @ v, nonholonomic=blade)
     """
 
-    lagrangian: PhaseFunction
-    nonholonomic: PhaseFunction | None = eqx.field(default=None, kw_only=True)
-    holonomic: PositionFunction | None = eqx.field(default=None, kw_only=True)
-    force: PhaseFunction | None = eqx.field(default=None, kw_only=True)
+    lagrangian: PhaseFunction = eqx.field(converter=static_function)
+    nonholonomic: PhaseFunction | None = eqx.field(
+        default=None, kw_only=True, converter=static_function
+    )
+    holonomic: PositionFunction | None = eqx.field(
+        default=None, kw_only=True, converter=static_function
+    )
+    force: PhaseFunction | None = eqx.field(
+        default=None, kw_only=True, converter=static_function
+    )
     manifold: AbstractLieGroup | None = eqx.field(default=None, kw_only=True)
     constraints: Literal["independent", "redundant"] = eqx.field(
         default="independent", kw_only=True, static=True
@@ -477,10 +515,16 @@ class HamiltonianSystem(AbstractMechanicalSystem):
         0.5
     """
 
-    hamiltonian: PhaseFunction
-    nonholonomic: PhaseFunction | None = eqx.field(default=None, kw_only=True)
-    holonomic: PositionFunction | None = eqx.field(default=None, kw_only=True)
-    force: PhaseFunction | None = eqx.field(default=None, kw_only=True)
+    hamiltonian: PhaseFunction = eqx.field(converter=static_function)
+    nonholonomic: PhaseFunction | None = eqx.field(
+        default=None, kw_only=True, converter=static_function
+    )
+    holonomic: PositionFunction | None = eqx.field(
+        default=None, kw_only=True, converter=static_function
+    )
+    force: PhaseFunction | None = eqx.field(
+        default=None, kw_only=True, converter=static_function
+    )
     manifold: AbstractLieGroup | None = eqx.field(default=None, kw_only=True)
     constraints: Literal["independent", "redundant"] = eqx.field(
         default="independent", kw_only=True, static=True
