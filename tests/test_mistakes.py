@@ -143,7 +143,7 @@ SYSTEMS = [
         lambda: HamiltonianSystem(
             lambda t, q, p, args: 0.5 * p @ p, nonholonomic=lambda t, q, v, args: v[0]
         ),
-        TypeError,
+        UserWarning,
         "HamiltonianSystem: `nonholonomic` must take (t, q, p, args)",
         "`<lambda>(t, q, v, args)` takes v",
         "nhjax passes the momentum p as the third argument",
@@ -152,10 +152,17 @@ SYSTEMS = [
     row(
         "took the momentum in a function of a Lagrangian system",
         lambda: system_with(force=lambda t, q, p, args: -p),
-        TypeError,
+        UserWarning,
         "LagrangianSystem: `force` must take (t, q, v, args)",
         "nhjax passes the velocity v as the third argument",
         "Write the function in terms of v",
+    ),
+    row(
+        "wrote a Hamiltonian in terms of the velocity",
+        lambda: HamiltonianSystem(lambda t, q, v, args: 0.5 * v @ v),
+        TypeError,
+        "HamiltonianSystem: `hamiltonian` must take (t, q, p, args)",
+        "nhjax passes the momentum p as the third argument",
     ),
     row(
         "gave a list of functions as constraints",

@@ -2,6 +2,7 @@
 
 import inspect
 import reprlib
+import warnings
 from collections.abc import Callable
 from types import MethodType
 from typing import Any, TypeAlias
@@ -229,10 +230,13 @@ def check_signature(
 def check_third_argument(
     owner: str, name: str, function: Any, arguments: tuple[str, ...], letter: str
 ) -> None:
-    """Raise a `TypeError` if a function of a system takes a variable it never gets.
+    """Raise or warn if a function of a system takes a variable that it never gets.
 
     The functions of a Lagrangian system receive v, and those of a Hamiltonian system p.
     Holonomic constraints receive neither. `letter` is "v" or "p".
+
+    Constraints and forces only lead to a warning: where the momentum equals the
+    velocity, one function can serve both kinds of systems.
     """
     signature = _signature(function)
     given = [] if signature is None else _positional_names(signature)[2:3]
@@ -241,17 +245,21 @@ def check_third_argument(
         remedy = "Pass a constraint on velocities as `nonholonomic`."
     elif letter == "v":
         refused, passed = {"p"}, "the velocity v"
-        remedy = "Write the function in terms of v."
+        remedy = "Write the function in terms of v, and name the argument v."
     else:
         refused, passed = {"v"}, "the momentum p"
-        remedy = "Write the function in terms of p."
+        remedy = "Write the function in terms of p, and name the argument p."
     if refused.isdisjoint(given):
         return
-    raise TypeError(
+    message = (
         f"{owner}: `{name}` must take ({', '.join(arguments)}), but "
         f"`{_name(function)}{signature}` takes {given[0]}: nhjax passes {passed} as "
         f"the third argument. {remedy}"
     )
+    if name in ("nonholonomic", "force"):
+        warnings.warn(message, stacklevel=2)
+    else:
+        raise TypeError(message)
 
 
 def check_constraints(owner: Any) -> None:
