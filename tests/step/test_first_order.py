@@ -15,8 +15,8 @@ from nhjax._step._factorisation import leading_structure
 from nhjax._step._stage_iteration import corrected
 from nhjax._step._starting_values import starting_values
 from nhjax._step._step import equations_of_step, StepArguments
-from oracles.forms import in_space
-from oracles.long import long
+from support.forms import in_space
+from support.long import long
 
 
 def contraction(example, method, h):

@@ -18,7 +18,7 @@ from nhjax._step._stage_equations import (
 )
 from nhjax._step._stage_system import StageSystem
 from nhjax._step._starting_values import starting_values
-from oracles.forms import (
+from support.forms import (
     free_forms,
     GAUSS,
     in_rotation,
@@ -27,14 +27,14 @@ from oracles.forms import (
     Start,
     STEP,
 )
-from oracles.group_problems import (
+from support.group_problems import (
     FORMS,
     INERTIA,
     problem,
     QUATERNION,
     RETRACTIONS,
 )
-from oracles.long import long
+from support.long import long
 
 
 @pytest.mark.parametrize(

@@ -14,8 +14,8 @@ from nhjax._step._positions import end_position
 from nhjax._step._stage_system import StageSystem
 from nhjax._step._starting_values import starting_values
 from nhjax._step._step import equations_of_step, first_step_state, StepArguments
-from oracles.group_problems import RETRACTIONS
-from oracles.long import long
+from support.group_problems import RETRACTIONS
+from support.long import long
 
 
 # A body in the plane, and a wheel on its axle.
