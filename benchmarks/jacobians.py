@@ -26,7 +26,7 @@ from jax.flatten_util import ravel_pytree
 import nhjax
 from nhjax import systems
 from nhjax._numerics import iterate, NOISE_UNITS
-from nhjax._step._scale import fibre_coordinate_scale
+from nhjax._step._solvers import fibre_coordinate_scale
 from nhjax._step._stage_iteration import sizes
 
 from ._report import markdown_table, write

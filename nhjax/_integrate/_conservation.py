@@ -16,11 +16,11 @@ from .._errors import DTypeError, naming, ShapeError
 from .._numerics import (
     ClosureConverted,
     dependence,
-    frozen,
     is_definite,
     jacobian,
     matvec,
     max_norm,
+    stop_gradient,
 )
 from .._step import invariant_values, Invariants, LEAST_PART
 from .._system import (
@@ -79,7 +79,7 @@ def kept_invariants(
 def _noise_and_least_part(
     function, system, t, q, u, args, value
 ) -> tuple[Float[Array, " k"], FloatScalar]:
-    function, system, args = frozen((function, system, args))
+    function, system, args = stop_gradient((function, system, args))
     noise = noise_near(
         lambda t, q, u: invariant_values(function, system, t, q, u, args),
         system.manifold_of(q),
@@ -87,7 +87,7 @@ def _noise_and_least_part(
     )
     # A mass matrix that is indefinite at one state is so at all states of a motion: an
     # eigenvalue that changes its sign makes it singular, and a singular one ends a run.
-    t, q, u = frozen((t, q, u))
+    t, q, u = stop_gradient((t, q, u))
     metric = jacobian(lambda u: system.fibre_derivative(t, q, u, args), u)
     return noise, jnp.where(is_definite(metric), 0, LEAST_PART).astype(value.dtype)
 

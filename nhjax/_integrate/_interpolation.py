@@ -46,7 +46,7 @@ def interpolate(
             lambda u: system.momentum(time, q, u, args) - p, start.v, max_norm(start.v)
         ).x
     v = system.velocity(time, q, u, args)
-    if method.closure == "propagated":
+    if method.carries_multiplier:
         multiplier = method.basis(theta) @ record.multiplier
     else:
         multiplier = linearise(system, time, q, u, args, may_be_sparse=True).multiplier

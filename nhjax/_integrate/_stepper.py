@@ -25,9 +25,9 @@ from .._step import (
     AbstractStageSolver,
     estimated_error,
     first_step_state,
+    ImplicitStep,
     Invariants,
     largest_violation,
-    primitive_step,
     round_off_of_steps,
     RoundOff,
     StepArguments,
@@ -312,8 +312,13 @@ class PlainStepper(AbstractStepper[PlainCarry, None]):
         start = step_state.differentiated_in_state()
         given = self.system, t, h, start, self.args, self.invariants, self.round_off
         arguments = StepArguments(*given)
-        method, stage_solver = self.method, self.stage_solver
-        return primitive_step(arguments, method, stage_solver, skip, self.programs)
+        step = ImplicitStep(
+            method=self.method,
+            stage_solver=self.stage_solver,
+            skip=skip,
+            programs=self.programs,
+        )
+        return step(arguments)
 
     def advance(
         self, carry: PlainCarry, i: Int[Array, ""], replay: None = None
@@ -446,7 +451,7 @@ def step_back(
     # that moves y.
     target = step_state.state
     manifold = stepper.system.manifold_of(target.q)
-    propagated = stepper.method.closure == "propagated"
+    propagated = stepper.method.carries_multiplier
 
     def move(z: State):
         y = back_from(eqx.tree_at(lambda x: x.state, step_state, z))

@@ -176,7 +176,7 @@ class AbstractMethod(eqx.Module):
         **Raises:** `ValueError`, as `require_constraint_hypotheses` does.
         """
         self.require_constraint_hypotheses()
-        if self.closure != "propagated":
+        if not self.carries_multiplier:
             return self.constrained_order
         accumulates = abs(self.stability_at_infinity - 1) <= _UNIT_TOLERANCE
         order = min(self.orders.C, self.orders.mixed) - int(accumulates)
@@ -202,6 +202,15 @@ class AbstractMethod(eqx.Module):
         difference = np.zeros(self.stages)
         difference[first] = last * weights / weights[-1]
         return difference
+
+    @property
+    def carries_multiplier(self) -> bool:
+        """Return whether a step passes its last multiplier Λ^s to the next step.
+
+        Only the propagated closure does. The states of a run then have this multiplier,
+        and with the other closures the continuous multiplier.
+        """
+        return self.closure == "propagated"
 
     @property
     def closure_weights(self) -> ClosureWeights:
@@ -255,7 +264,7 @@ class AbstractMethod(eqx.Module):
             if not holds:
                 self._reject(f"hypothesis {_STATEMENTS[name]} fails; use LobattoIIIAB")
         size = abs(self.stability_at_infinity)
-        if self.closure == "propagated" and size > 1 + _UNIT_TOLERANCE:
+        if self.carries_multiplier and size > 1 + _UNIT_TOLERANCE:
             self._reject(
                 "closure='propagated' multiplies an error in the multiplier by R_A(∞) "
                 f"in each step and needs |R_A(∞)| <= 1, but it is {size:.6g}; "

@@ -16,14 +16,17 @@ from ._contraction import (
 )
 from ._diagonal import full_jacobian as full_jacobian, jacobian as jacobian
 from ._implicit import (
+    AbstractImplicitFunction as AbstractImplicitFunction,
     ClosureConverted as ClosureConverted,
-    frozen as frozen,
+    fixed_point_tangent as fixed_point_tangent,
     has_tangent as has_tangent,
-    moving_with as moving_with,
+    nan_gradient_unless as nan_gradient_unless,
+    nan_tangent_unless as nan_tangent_unless,
     nan_unless as nan_unless,
     root as root,
-    solve_contraction as solve_contraction,
+    stop_gradient as stop_gradient,
     tree_where as tree_where,
+    with_zero_tangents as with_zero_tangents,
     zero_unless as zero_unless,
 )
 from ._index_sets import dependence as dependence
@@ -47,10 +50,6 @@ from ._max_norm import (
     max_norm as max_norm,
     relative as relative,
     unit as unit,
-)
-from ._no_gradient import (
-    nan_gradient_unless as nan_gradient_unless,
-    nan_tangent_unless as nan_tangent_unless,
 )
 from ._noise import (
     measured_noise as measured_noise,

@@ -1,8 +1,15 @@
-"""Derivatives by the implicit function theorem, also where they are not defined."""
+"""The derivatives of what is computed by iterations or is not defined everywhere.
 
+`AbstractImplicitFunction` has the one rule of derivatives of all steps: they follow
+from the solution by the implicit function theorem, not from the iterations. Below it
+are the linear and nonlinear solves that such functions use, and the helpers that
+change the tangents of trees: to zero, to NaN, or to tangents that JAX can see.
+"""
+
+from abc import abstractmethod
 from collections.abc import Callable
 from functools import partial
-from typing import Any, TypeVar
+from typing import Any, Generic, TypeVar
 
 import equinox as eqx
 import jax
@@ -11,7 +18,7 @@ import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, PyTree
 
-from .._compile import cse_dce
+from .._compile import as_cpu_kernel, cse_dce, TraceCache
 from .._custom_types import BoolScalar, FloatScalar
 from ._contraction import with_small_products
 from ._iteration import dense_increment, iterate, Sizes, Solved
@@ -20,12 +27,96 @@ from ._max_norm import max_norm, unit
 
 # Terms of the Neumann series below this many units of round-off are left out.
 _UNITS_LEFT = 256
-# If the terms of the series stop falling above this many units of round-off, it does
-# not converge: the derivative is NaN then, rather than a wrong number.
+# If the terms of the series stop falling above this many units of round-off, the series
+# does not converge. The derivative is then NaN rather than a wrong number.
 _NOISIEST = 1e4
 
 T = TypeVar("T")
 X = TypeVar("X", bound=PyTree[Array])
+Arguments = TypeVar("Arguments")
+Solution = TypeVar("Solution")
+
+
+class AbstractImplicitFunction(eqx.Module, Generic[Arguments, Solution]):
+    """A function whose value solves equations, with derivatives from these equations.
+
+    Call it with its arguments, a tree. It is differentiable with respect to them, but
+    not to its own fields. JAX never differentiates `solve`: derivatives of every order
+    are those of `tangent`.
+
+    - `programs`: a cache of traced programs; None if the function is part of a larger
+        program. With a cache, the rule of derivatives finds the program of `solve` that
+        is already traced instead of tracing it again.
+    """
+
+    programs: eqx.AbstractVar[TraceCache | None]
+
+    @abstractmethod
+    def solve(self, arguments: Arguments) -> Solution:
+        """Compute the solution, by iterations of any kind."""
+
+    @abstractmethod
+    def tangent(
+        self, arguments: Arguments, rates: Arguments, solution: Solution
+    ) -> Solution:
+        """Compute the tangent of the solution for arguments that change at `rates`.
+
+        Where a leaf of `rates` is None, the argument does not change. Leaves of the
+        result may be None, which stands for zero too.
+        """
+
+    def __call__(self, arguments: Arguments) -> Solution:
+        """Compute the solution; it can be differentiated with respect to `arguments`.
+
+        With a cache, the function is one primitive of JAX. When JAX splits a scan into
+        a known and a linear part, it drops the derivative rules of functions, but not
+        the rules of primitives. Without its rule, a step could be differentiated in
+        reverse mode only once.
+        """
+        if self.programs is None:
+            return _solution(arguments, self)
+        return as_cpu_kernel(_solution, arguments, self, programs=self.programs)
+
+
+@eqx.filter_custom_jvp
+def _solution(
+    arguments: Arguments, function: AbstractImplicitFunction[Arguments, Solution]
+) -> Solution:
+    return function.solve(arguments)
+
+
+@_solution.def_jvp
+def _solution_jvp(primals, tangents):
+    arguments, function = primals
+    solution = function(arguments)
+    return solution, function.tangent(arguments, tangents[0], solution)
+
+
+def fixed_point_tangent(
+    iteration: Callable[[T, X], X],
+    parameters: T,
+    rates: T,
+    x: X,
+    units: list[FloatScalar],
+    *,
+    max_iterations: int,
+) -> X:
+    """Compute how a fixed point x = G(θ, x) changes with the parameters θ.
+
+    The change solves dx = ∂G/∂x dx + ∂G/∂θ dθ, by `solve_contraction`.
+
+    **Arguments:**
+
+    - `iteration`: G, which contracts in x near the fixed point.
+    - `parameters`, `rates`: θ and its tangent dθ.
+    - `x`: the fixed point.
+    - `units`, `max_iterations`: as for `solve_contraction`.
+    """
+    # The iteration is traced once, and differentiated twice.
+    iteration = ClosureConverted(iteration, parameters, x)
+    _, b = jax.jvp(lambda theta: iteration(theta, x), (parameters,), (rates,))
+    _, contraction = jax.linearize(lambda x: iteration(parameters, x), x)
+    return solve_contraction(contraction, b, units, max_iterations=max_iterations)
 
 
 def solve_contraction(
@@ -35,19 +126,20 @@ def solve_contraction(
     *,
     max_iterations: int,
 ) -> X:
-    """Solve x = G x + b for a linear G that contracts; x is NaN if it does not.
+    """Solve x = G x + b for a linear contraction G; x is NaN if G does not contract.
 
-    Both x and the solution of the transposed equation are sums of the Neumann series,
-    taken until its terms are below 256 units of round-off. The terms that are left out
-    sum up to ρ / (1 - ρ) times that bound where G contracts by ρ. If x -> G x + b is a
-    linearised simplified Newton iteration, the sum is iterative refinement with the
-    factors of that iteration, and takes about as many evaluations as the nonlinear
-    iteration did. Derivatives of every order follow from the equation, not from the
-    iterations.
+    Both x and the solution of the transposed equation are sums of the Neumann series.
+    The sum ends when its terms are below 256 units of round-off. If G contracts by a
+    factor ρ, the remaining terms sum up to ρ / (1 - ρ) times that bound.
 
-    Terms are judged by their largest number, in the `units` of the leaves of x. The
-    unknowns of the transposed equation have the inverse units, so that products of the
-    two have none.
+    If x -> G x + b is a linearised simplified Newton iteration, the sum is iterative
+    refinement with the factors of that iteration. It takes about as many evaluations as
+    the nonlinear iteration did. Derivatives of every order follow from the equation,
+    not from the iterations.
+
+    The size of a term is its largest entry, divided by the `units` of the leaves of x.
+    The unknowns of the transposed equation have the inverse units, so that a product of
+    both has no unit.
     """
     given, treedef = jax.tree.flatten(b)
 
@@ -66,7 +158,7 @@ def solve_contraction(
             pairs = zip(weights, x, strict=True)
             return max_norm(*(weight * leaf for weight, leaf in pairs))
 
-        def sweep(x):
+        def iteration(x):
             increment = _minus(b, matvec(x))
             x = [x + dx for x, dx in zip(x, increment, strict=True)]
             return x, Sizes(size(increment), size(x)), None
@@ -74,7 +166,7 @@ def solve_contraction(
         scale = size(b)
         tolerance = _UNITS_LEFT * float(jnp.finfo(scale.dtype).eps)
         solved = iterate(
-            sweep,
+            iteration,
             b,
             scale,
             max_iterations=max_iterations,
@@ -87,11 +179,11 @@ def solve_contraction(
     scales = [unit(jax.lax.stop_gradient(one)) for x, one in pairs if x.size]
     x = jax.lax.custom_linear_solve(
         operator,
-        _mixed(_not_empty(b)),
+        _depending_on_all(_not_empty(b)),
         solve=partial(refine, [1 / one for one in scales]),
         transpose_solve=partial(refine, scales),
     )
-    return full(_mixed(x))
+    return full(_depending_on_all(x))
 
 
 def _not_empty(tree: PyTree[Array]) -> list[Array]:
@@ -103,14 +195,14 @@ def _minus(xs: list[Array], ys: list[Array]) -> list[Array]:
     return [x - y for x, y in zip(xs, ys, strict=True)]
 
 
-def _mixed(xs: list[Array]) -> list[Array]:
-    """Return the same arrays, each of which depends on all of them.
+def _depending_on_all(xs: list[Array]) -> list[Array]:
+    """Return the same arrays, such that each of them depends on all of them.
 
-    So either all of them are constant for differentiation or none is: a linear equation
-    of which some parts are constant could not be transposed.
+    Then differentiation takes either all of them for constants or none. JAX cannot
+    transpose a linear equation if it takes only a part of b for constant.
     """
-    nothing = 0 * sum(x.reshape(-1)[0] for x in xs)
-    return [x + nothing for x in xs]
+    zero = 0 * sum(x.reshape(-1)[0] for x in xs)
+    return [x + zero for x in xs]
 
 
 def root(
@@ -124,11 +216,17 @@ def root(
 ) -> Solved[X, None]:
     """Find a root of `residual` near `x0`, to round-off, by Newton's method.
 
-    The iteration ends by the size of the `judged` part of its increments. `scale` is
-    the size to which the round-off of that part is proportional, which is larger than
-    the size of x0 if x is an increment to something larger. Multipliers, which have
-    units of their own and follow from the rest, need not be judged. Increments, and the
-    derivative of the root, are found by `solve(jacobian, b)`, a dense solve by default.
+    The derivative of the root follows from the implicit function theorem.
+
+    **Arguments:**
+
+    - `scale`: the size to which the round-off of x is proportional. It is larger than
+        the size of x0 if x is an increment to a larger number.
+    - `judged`: selects the part of an increment whose size ends the iteration.
+        Multipliers have other units and follow from the rest, so they can be left out.
+    - `solve`: called as `solve(jacobian, b)` for the increments and for the derivative
+        of the root; a dense solve by default.
+    - `max_iterations`: the largest number of iterations.
     """
     flat, unravel = ravel_pytree(x0)
     scale = jax.lax.stop_gradient(scale)
@@ -136,17 +234,16 @@ def root(
     def flat_residual(x):
         return ravel_pytree(residual(unravel(x)))[0]
 
-    def sweep(x):
+    def iteration(x):
         dx, _ = dense_increment(lambda z: (flat_residual(z), None), x, solve)
-        # The part that is not judged must be finite all the same.
+        # The part that is not judged must be finite too.
         rest = jnp.where(jnp.all(jnp.isfinite(dx)), 0, jnp.inf).astype(dx.dtype)
         size = rest + max_norm(*jax.tree.leaves(judged(unravel(dx))))
         return x + dx, Sizes(size), None
 
     def newton(_, x):
-        solved = iterate(sweep, x, scale, max_iterations=max_iterations)
-        # The outcome is converted to floats, because `custom_root` takes the tangents
-        # of `aux` for floats.
+        solved = iterate(iteration, x, scale, max_iterations=max_iterations)
+        # `custom_root` needs floats in `aux`, because it makes tangents of their dtype.
         outcome = (solved.converged, solved.exhausted, solved.num_iterations)
         return solved.x, jax.tree.map(lambda z: z.astype(x.dtype), outcome)
 
@@ -160,50 +257,13 @@ def root(
     return Solved(unravel(x), None, converged > 0, exhausted > 0, num_iterations)
 
 
-def moving_with(tree: X, parameters: PyTree[Any]) -> X:
-    """Return the same values, with tangents wherever any parameter has one.
-
-    JAX traces the body of a loop once more if a part of the carry that had no
-    derivative at the start has one after a round. What starts a loop is given a
-    derivative of zeros by this function, so that one trace is enough.
-    """
-    parameters = jax.tree.leaves(eqx.filter(parameters, eqx.is_inexact_array))
-    moving, fixed = eqx.partition(tree, eqx.is_inexact_array)
-    leaves, structure = jax.tree.flatten(moving)
-    if not leaves or not parameters:
-        return tree
-    return eqx.combine(
-        jax.tree.unflatten(structure, _moving(leaves, parameters)), fixed
-    )
-
-
-@eqx.filter_custom_jvp
-def _moving(leaves: list[Array], parameters: list[Array]) -> list[Array]:
-    del parameters
-    return leaves
-
-
-@_moving.def_jvp
-def _moving_jvp(primals, tangents):
-    (leaves, _), (rates, others) = primals, tangents
-    given = jax.tree.leaves((rates, others))
-    if not given:
-        return leaves, rates
-    # A sum of no terms: JAX takes what depends on no tangent for no derivative at all.
-    nothing = jnp.sum(jnp.ravel(given[0])[:0])
-    return leaves, [
-        jnp.zeros_like(x) + nothing.astype(x.dtype) if rate is None else rate
-        for x, rate in zip(leaves, rates, strict=True)
-    ]
-
-
 class ClosureConverted(eqx.Module):
-    """A function with the arrays that it closes over, which are among its leaves.
+    """A traced function whose closed-over arrays are leaves.
 
-    Our own rules of differentiation must be given all that is differentiated; with this
-    class derivatives reach the closed-over arrays too. It does what
-    `equinox.filter_closure_convert` does, but takes arrays of any sharding, as there
-    are inside and outside of `jax.shard_map`.
+    A custom rule of derivatives differentiates only with respect to its arguments. If
+    an argument is an instance of this class, derivatives reach the arrays that the
+    function closes over. `equinox.filter_closure_convert` does the same, but it refuses
+    arrays whose sharding differs inside and outside of `jax.shard_map`.
 
     Call it with trees of the structure of `example`. Leaves that are not arrays keep
     the values that they have in `example`.
@@ -231,29 +291,124 @@ class ClosureConverted(eqx.Module):
 
 
 def has_tangent(tangents: PyTree[Any]) -> PyTree[bool]:
-    """Tell which leaves of a tree of tangents are not the `None` of a symbolic zero."""
+    """Return which leaves of a tree of tangents are not None, the symbolic zero."""
     return jax.tree.map(
         lambda leaf: leaf is not None, tangents, is_leaf=lambda leaf: leaf is None
     )
 
 
+def with_zero_tangents(tree: X, parameters: PyTree[Any]) -> X:
+    """Return the same tree, with tangents of zeros if any parameter has a tangent.
+
+    JAX traces the body of a loop again if a part of the carry has no tangent at first,
+    but has one after an iteration. If the initial carry has tangents of zeros, JAX
+    traces the body once.
+    """
+    parameters = jax.tree.leaves(eqx.filter(parameters, eqx.is_inexact_array))
+    inexact, others = eqx.partition(tree, eqx.is_inexact_array)
+    leaves, structure = jax.tree.flatten(inexact)
+    if not leaves or not parameters:
+        return tree
+    return eqx.combine(
+        jax.tree.unflatten(structure, _with_zero_tangents(leaves, parameters)), others
+    )
+
+
+@eqx.filter_custom_jvp
+def _with_zero_tangents(leaves: list[Array], parameters: list[Array]) -> list[Array]:
+    # The parameters are arguments because their tangents start the rule below.
+    del parameters
+    return leaves
+
+
+@_with_zero_tangents.def_jvp
+def _with_zero_tangents_jvp(primals, tangents):
+    (leaves, _), (rates, others) = primals, tangents
+    given = jax.tree.leaves((rates, others))
+    if not given:
+        return leaves, rates
+    # This zero is an empty sum of a tangent. JAX takes zeros that depend on no tangent
+    # for the absence of a tangent.
+    zero = jnp.sum(jnp.ravel(given[0])[:0])
+    return leaves, [
+        jnp.zeros_like(x) + zero.astype(x.dtype) if rate is None else rate
+        for x, rate in zip(leaves, rates, strict=True)
+    ]
+
+
+def stop_gradient(tree: T) -> T:
+    """Stop derivatives through the arrays of a tree, and keep its other leaves.
+
+    `jax.lax.stop_gradient` refuses leaves that are not arrays.
+    """
+    return jax.tree.map(
+        lambda x: jax.lax.stop_gradient(x) if eqx.is_array(x) else x, tree
+    )
+
+
 def tree_where(ok: BoolScalar, tree: X, other: X) -> X:
-    """Take the numbers of a tree where `ok` is true, those of another elsewhere."""
+    """Return the numbers of `tree` where `ok` is true, and of `other` elsewhere."""
     return jax.tree.map(lambda x, y: jnp.where(ok, x, y), tree, other)
 
 
 def zero_unless(ok: BoolScalar, tree: X) -> X:
-    """Replace the numbers of a tree by zeros where `ok` is false; `None` stays."""
+    """Replace the numbers of a tree by zeros where `ok` is false, and keep None."""
     return jax.tree.map(lambda x: jnp.where(ok, x, jnp.zeros_like(x)), tree)
 
 
 def nan_unless(ok: BoolScalar, tree: X) -> X:
-    """Replace the numbers of a tree by NaN where `ok` is false; `None` stays."""
+    """Replace the numbers of a tree by NaN where `ok` is false, and keep None."""
     return jax.tree.map(lambda x: jnp.where(ok, x, jnp.nan), tree)
 
 
-def frozen(tree: T) -> T:
-    """Stop derivatives through the arrays of a tree, and keep its other leaves."""
+def nan_gradient_unless(ok: BoolScalar, tree: X, parameters: PyTree[Any]) -> X:
+    """Return the same values, with derivatives that are NaN where `ok` is false.
+
+    The derivatives with respect to all `parameters` are NaN, whether or not the values
+    depend on them. A cotangent of zero stays zero, so that a loss that leaves out a
+    member that failed has a derivative.
+    """
+    parameters = eqx.filter(parameters, eqx.is_inexact_array)
     return jax.tree.map(
-        lambda x: jax.lax.stop_gradient(x) if eqx.is_array(x) else x, tree
+        lambda x: (
+            _value(x, ok, parameters) if jnp.issubdtype(x.dtype, jnp.inexact) else x
+        ),
+        tree,
+    )
+
+
+@eqx.filter_custom_jvp
+def _value(x: Array, ok: BoolScalar, parameters: PyTree[Array]) -> Array:
+    # Under `vmap`, the result must be batched wherever its derivative is, that is,
+    # wherever `ok` or a parameter is. Therefore it seems to depend on them. The
+    # compiler removes these operations.
+    for leaf in jax.tree.leaves(parameters):
+        ok = ok | jnp.any(leaf == 0)
+    return jnp.where(ok, x, x)
+
+
+@_value.def_jvp
+def _value_jvp(primals, tangents):
+    (x, ok, _), (dx, _, rates) = primals, tangents
+
+    change = sum(jnp.sum(rate) for rate in jax.tree.leaves(rates))
+    if dx is None and not jax.tree.leaves(rates):
+        return _value(*primals), None
+    dx = jnp.zeros_like(x) if dx is None else dx
+    dx = dx + jnp.where(ok, 0, change).astype(x.dtype)
+    return _value(*primals), nan_tangent_unless(ok, dx)
+
+
+def nan_tangent_unless(ok: BoolScalar, dx: Array) -> Array:
+    """Return a tangent, but NaN where `ok` is false and the tangent is not zero.
+
+    This function is not linear. JAX must take it for linear to transpose it, so it is
+    written as a linear solve, whose transpose does the same to a cotangent.
+    """
+
+    def solve(_, b):
+        return jnp.where(ok | (b == 0), b, jnp.nan)
+
+    return jax.lax.custom_linear_solve(
+        lambda x: x, dx, solve=solve, transpose_solve=solve
     )

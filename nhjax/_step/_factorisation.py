@@ -17,6 +17,14 @@ from .._numerics import (
     WeightedTranspose,
 )
 from .._system import Linearisation
+from ._equations import (
+    constraint_jacobian,
+    constraint_values,
+    invariant_correction,
+    sparse_constraint_jacobian,
+    StageEquations,
+    StageUnknowns,
+)
 from ._first_order import (
     first_order_terms,
     FirstOrderTerms,
@@ -25,19 +33,11 @@ from ._first_order import (
 )
 from ._jacobian_choice import JacobianName, takes_first_order_terms
 from ._leading_structure import LeadingStructure, Responses
-from ._stage_equations import (
-    constraint_jacobian,
-    constraint_values,
-    impulse_weights,
-    sparse_constraint_jacobian,
-)
-from ._stage_system import StageSystem
-from ._unknowns import Stages
 
 
 def leading_structure(
-    stages: StageSystem,
-    x: Stages,
+    stages: StageEquations,
+    x: StageUnknowns,
     lin: Linearisation,
     jacobian: JacobianName,
 ) -> LeadingStructure:
@@ -49,14 +49,14 @@ def leading_structure(
     if takes_first_order_terms(stages, lin, jacobian):
         terms = first_order_terms(stages, x, lin)
     structure = _without_impulses(stages, x, lin, terms)
-    if stages.kept is None:
+    if stages.invariants is None:
         return structure
-    return replace(structure, impulses=impulse_weights(stages, x))
+    return replace(structure, impulses=invariant_correction(stages, x))
 
 
 def _without_impulses(
-    stages: StageSystem,
-    x: Stages,
+    stages: StageEquations,
+    x: StageUnknowns,
     lin: Linearisation,
     terms: FirstOrderTerms | None,
 ) -> LeadingStructure:
@@ -99,8 +99,8 @@ def _without_impulses(
 
 
 def _first_order(
-    stages: StageSystem,
-    x: Stages,
+    stages: StageEquations,
+    x: StageUnknowns,
     lin: Linearisation,
     terms: FirstOrderTerms,
     jacobian: Float[Array, "s l n"],
@@ -136,7 +136,7 @@ def _first_order(
 
 
 def _reactions(
-    stages: StageSystem, jacobian: Float[Array, "s l n"]
+    stages: StageEquations, jacobian: Float[Array, "s l n"]
 ) -> Float[Array, "s n c"]:
     """Compute the reactions Bᵀ at the stages to each unknown of the closure, each Λ."""
     m, one = stages.num_nonholonomic, jnp.eye(len(jacobian), dtype=jacobian.dtype)
@@ -169,7 +169,7 @@ def _with_inertia_at_end(
 
 
 def _sparse(
-    stages: StageSystem, x: Stages, lin: Linearisation, start: SparseMatrix
+    stages: StageEquations, x: StageUnknowns, lin: Linearisation, start: SparseMatrix
 ) -> LeadingStructure:
     """Make the leading structure for constraints that share few coordinates."""
     pattern = start.pattern
@@ -208,7 +208,9 @@ def _sparse(
     )
 
 
-def _schur(stages: StageSystem, blocks: Float[Array, "r s l l"]) -> Float[Array, "c c"]:
+def _schur(
+    stages: StageEquations, blocks: Float[Array, "r s l l"]
+) -> Float[Array, "c c"]:
     """Assemble the derivative of the constraints by h δy and h δΛ.
 
     `blocks` are the products B_i K⁻¹ B_jᵀ for i >= 2 and all j.

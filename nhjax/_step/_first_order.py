@@ -10,9 +10,12 @@ from jaxtyping import Array, Float
 from .._custom_types import FloatScalar
 from .._numerics import full_jacobian, small_einsum
 from .._system import Linearisation, total_force
-from ._positions import in_nodes, in_stages
-from ._stage_system import StageSystem
-from ._unknowns import Stages
+from ._equations import (
+    node_coordinates,
+    stage_coordinates,
+    StageEquations,
+    StageUnknowns,
+)
 
 
 class FirstOrderTerms(eqx.Module):
@@ -46,7 +49,7 @@ class FirstOrderTerms(eqx.Module):
     node_force: Float[Array, "n n"]
 
     def of_stages(
-        self, stages: StageSystem, z: Float[Array, "s n *c"]
+        self, stages: StageEquations, z: Float[Array, "s n *c"]
     ) -> Float[Array, "s n *c"]:
         """Solve for changes of stage velocities that change the residuals by N z."""
         a, a_hat, b = (stages.coefficients(name) for name in ("a", "a_hat", "b"))
@@ -64,13 +67,13 @@ class FirstOrderTerms(eqx.Module):
         return z - _times(self.node_inertia, z)
 
     def by_force(
-        self, stages: StageSystem, change: Float[Array, "s n *c"]
+        self, stages: StageEquations, change: Float[Array, "s n *c"]
     ) -> Float[Array, "r n *c"]:
         """Compute the changes of the node velocities by forces, given the stages'."""
         return _times(self.node_force, _weighted(stages.node_weights, change))
 
     def by_position(
-        self, stages: StageSystem, change: Float[Array, "s n *c"]
+        self, stages: StageEquations, change: Float[Array, "s n *c"]
     ) -> Float[Array, "r n *c"]:
         """Compute how positions move the nodes if the stage velocities change."""
         return -_times(self.node_momentum, _weighted(stages.node_weights, change))
@@ -103,7 +106,7 @@ def full_momentum_inverse(lin: Linearisation) -> Float[Array, "n n"]:
 
 
 def first_order_terms(
-    stages: StageSystem, x: Stages, lin: Linearisation
+    stages: StageEquations, x: StageUnknowns, lin: Linearisation
 ) -> FirstOrderTerms:
     """Compute the terms at the start of the step, in the chart of the stages x."""
     h, c = stages.h, stages.coefficients("c")
@@ -124,7 +127,7 @@ def first_order_terms(
         none = jnp.zeros_like(force)
         chart = _ChartSlopes(none, body.momentum, force, force, none)
     else:
-        chart = _in_chart(stages, x, u)
+        chart = _coordinates(stages, x, u)
     coordinates = c - 0.5 if stages.method.chart == "middle" else c
     node_times = c[1:] if stages.num_nonholonomic else c[-1:]
     terms = FirstOrderTerms(
@@ -148,7 +151,7 @@ def _size(matrix: Float[Array, "n n"]) -> FloatScalar:
 
 
 def momenta_of_forces(
-    stages: StageSystem, x: Stages, forces: Float[Array, "s n c"]
+    stages: StageEquations, x: StageUnknowns, forces: Float[Array, "s n c"]
 ) -> tuple[Float[Array, "s n c"], Float[Array, "r n c"]]:
     """Compute the momenta of stages and nodes from forces at the stages, for h = 1.
 
@@ -157,8 +160,8 @@ def momenta_of_forces(
     a_hat, b = stages.coefficients("a_hat"), stages.coefficients("b")
     if stages.manifold.is_flat:
         return _weighted(a_hat, forces), _weighted(stages.node_weights, forces)
-    chart, y = in_stages(stages, x)
-    nodes = in_nodes(stages, x)[1]
+    chart, y = stage_coordinates(stages, x)
+    nodes = node_coordinates(stages, x)[1]
 
     def one(force):
         zero = jnp.zeros_like(force)
@@ -197,7 +200,7 @@ class _ChartSlopes(NamedTuple):
     base: Array
 
 
-def _in_body(stages: StageSystem, u: Array, acceleration: Array) -> _BodySlopes:
+def _in_body(stages: StageEquations, u: Array, acceleration: Array) -> _BodySlopes:
     system, args, manifold = stages.system, stages.args, stages.manifold
     t, zero = stages.t, jnp.zeros_like(u)
 
@@ -216,13 +219,13 @@ def _in_body(stages: StageSystem, u: Array, acceleration: Array) -> _BodySlopes:
     return _BodySlopes(rate, full_jacobian(carried, zero))
 
 
-def _force_slope(stages: StageSystem, x: Stages, u: Array) -> Array:
+def _force_slope(stages: StageEquations, x: StageUnknowns, u: Array) -> Array:
     system, t, q, args = stages.system, stages.t, stages.q, stages.args
     multiplier = stages.multipliers(x)[0]
     return full_jacobian(lambda u: total_force(system, t, q, u, multiplier, args), u)
 
 
-def _in_chart(stages: StageSystem, x: Stages, u: Array) -> _ChartSlopes:
+def _coordinates(stages: StageEquations, x: StageUnknowns, u: Array) -> _ChartSlopes:
     system, args, manifold = stages.system, stages.args, stages.manifold
     t, multiplier, chart = stages.t, stages.multipliers(x)[0], stages.chart(x)
     zero = jnp.zeros_like(u)
@@ -233,8 +236,8 @@ def _in_chart(stages: StageSystem, x: Stages, u: Array) -> _ChartSlopes:
         u = chart.body_velocities(y[None], velocity[None])[0]
         p = system.momentum(t, q, u, args)
         w = total_force(system, t, q, u, multiplier, args)
-        in_chart = chart.to_chart(y[None], velocity[None], p[None], w[None])
-        return in_chart[0][0], in_chart[1][0], w
+        is_in_chart = chart.to_chart(y[None], velocity[None], p[None], w[None])
+        return is_in_chart[0][0], is_in_chart[1][0], w
 
     def inertia(y):
         return full_jacobian(lambda v: pair(y, zero, v)[0], u)

@@ -1,4 +1,4 @@
-"""Functions that a run keeps at their values, and the impulses that keep them."""
+"""Functions that a run keeps at their initial values, by impulses in each step."""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -25,24 +25,24 @@ from .._system import (
 )
 
 
-# Impulses change the part of an invariant that belongs to the motion by no more than
-# this: where hardly any is left, no impulse might make up for the error.
+# An impulse changes an invariant by at most this fraction of its part that belongs to
+# the motion. Near rest this part is small, and no impulse might correct the error.
 _LARGEST_PART = 0.1
-# With an indefinite mass matrix, ω·M⁻¹ω can vanish where ω does not. A step has no
-# impulse where ω·M⁻¹ω is less than this part of its bound Σ_ij |M⁻¹_ij| ω_i². Other
-# impulses are at most 1 / 0.03 times as large as with a definite matrix of this size.
-# With parts from 0.01 to 0.3 the largest errors of motions were the same (measured).
+# With an indefinite mass matrix, ω·M⁻¹ω can vanish although ω does not. If ω·M⁻¹ω is
+# less than this fraction of its bound Σ_ij |M⁻¹_ij| ω_i², a step has no impulse. All
+# other impulses are at most 1 / 0.03 times as large as with a definite matrix of the
+# same size. Fractions from 0.01 to 0.3 gave the same largest errors of motions.
 LEAST_PART = 0.03
 
 
 class Invariants(eqx.Module):
-    """Functions I(t, q, u) of the fibre coordinate u, and the values they are kept at.
+    """Functions I(t, q, u) of the fibre coordinate u, and the values that are kept.
 
-    - `function`: called as `function(t, q, u, args)`, of shape (k,); None stands for
-        the energy of the system.
+    - `function`: called as `function(t, q, u, args)`, returns shape (k,). None stands
+        for the energy of the system.
     - `value`: the k values.
-    - `least_sizes`: the measured round-off of the functions at the start of the run, in
-        units of the unit round-off; it includes constants that cancel.
+    - `least_sizes`: the measured round-off of the functions at the start of the run,
+        divided by the unit round-off. It includes constants that cancel.
     - `least_part`: zero if the mass matrix is definite, otherwise `LEAST_PART`.
     """
 
@@ -59,7 +59,7 @@ class Invariants(eqx.Module):
         u: Float[Array, " n"],
         args: Args,
     ) -> Float[Array, " k"]:
-        """Compute by how much the functions differ from their values."""
+        """Compute the differences between the functions and the values to keep."""
         return invariant_values(self.function, system, t, q, u, args) - self.value
 
     def slopes(
@@ -84,13 +84,15 @@ class Invariants(eqx.Module):
         args: Args,
         slopes: Float[Array, "k n"] | None = None,
     ) -> "Directions":
-        """Compute the directions of the impulses at a state, from ∂I/∂u if it is known.
+        """Compute the directions of the impulses at a state.
 
-        The ∂I/∂v of a function that is conserved on the constraint set alone has a part
-        Bᵀ μ along reactions. An impulse along it would violate the constraints, and the
-        reactions that make up for this would take back what it adds to I. Without that
-        part, B M⁻¹ ω = 0. The ω of the energy, M v, is free of it: where a system
-        conserves its energy, B v = 0.
+        If a function is conserved only on the constraint set, its derivative ∂I/∂v has
+        a part Bᵀ μ along the reactions. An impulse along this part would violate the
+        constraints, and the reactions that restore them would undo its effect on I.
+        Therefore this part is removed, so that B M⁻¹ ω = 0. For the energy, ω = M v has
+        no such part: a system that conserves its energy has B v = 0.
+
+        `slopes` is ∂I/∂u, if it is known.
         """
         if slopes is None:
             slopes = self.slopes(system, t, q, u, args)
@@ -115,11 +117,11 @@ class Invariants(eqx.Module):
         u: Float[Array, " n"],
         args: Args,
     ) -> Float[Array, " k"]:
-        """Compute by how much I - μ·Φ differs from the values of I.
+        """Compute the difference between I - μ·Φ and the values to keep.
 
-        It is I where the constraints hold, and its derivative there is that of
-        `directions`: to leading order, what the constraints still change does not
-        change it.
+        Where the constraints hold, I - μ·Φ = I, and its derivative is `slopes` of
+        `directions`. To leading order, a correction of the constraints does not change
+        it.
         """
         error = self.error(system, t, q, u, args)
         multipliers = self.directions(system, t, q, u, args).multipliers
@@ -139,7 +141,8 @@ class Invariants(eqx.Module):
     ) -> Float[Array, " k"]:
         """Estimate the sizes of the terms of I, to which its round-off is proportional.
 
-        That of positions counts: those of a wheel that rolls on and on grow for ever.
+        Position terms are included: the coordinates of a rolling wheel grow without
+        bound.
         """
         found = jnp.abs(self.value) + moving_part(slopes, u)
         by_position = jax.jacrev(
@@ -163,9 +166,9 @@ def invariant_values(
     """Evaluate the functions of `Invariants`, in shape (k,)."""
     if function is not None:
         return jnp.atleast_1d(function(t, q, u, args))
-    # The energy reads the fibre coordinate alone, whichever of the two it is.
-    nothing = jnp.zeros((0,), u.dtype)
-    return system.energy(t, State(q, u, u, nothing), args)[None]
+    # The energy uses only the fibre coordinate, which is either v or p.
+    no_multiplier = jnp.zeros((0,), u.dtype)
+    return system.energy(t, State(q, u, u, no_multiplier), args)[None]
 
 
 def _is_constrained(system: AbstractMechanicalSystem) -> bool:
@@ -176,8 +179,8 @@ class Directions(NamedTuple):
     """The directions of the impulses that keep invariants, at one state.
 
     - `slopes`: ∂I/∂u - Bᵀ μ, the part of ∂I/∂u that reactions do not change.
-    - `covectors`: ω, the same as covectors: impulses are along them.
-    - `multipliers`: μ = C⁻¹ B M⁻¹ ∂I/∂v; None where μ = 0 is known.
+    - `covectors`: ω, the slopes as covectors, which are the directions.
+    - `multipliers`: μ = C⁻¹ B M⁻¹ ∂I/∂v; None if μ = 0 without computation.
     """
 
     slopes: Float[Array, "k n"]
@@ -185,20 +188,22 @@ class Directions(NamedTuple):
     multipliers: Float[Array, "k l"] | None
 
 
-class StartImpulses(eqx.Module):
-    """The invariants of a step, with what is known of them at its start.
+class InvariantsAtStart(eqx.Module):
+    """The invariants of a step, with their derivatives and sizes at its start.
 
-    - `slopes`, `covectors`: ∂I/∂u and ω = ∂I/∂v there.
-    - `momentum_inverse`: N⁻¹, which turns momenta into fibre coordinates.
+    - `functions`: the functions, and the values that are kept.
+    - `slopes`, `covectors`: ∂I/∂u and ω = ∂I/∂v at the start.
+    - `momentum_inverse`: N⁻¹, which maps momenta to fibre coordinates.
     - `row_sums`: Σ_j |K⁻¹_ij|, the diagonal matrix D with |ω·K⁻¹ω| <= ω·Dω.
-    - `moving`: Σ |u ∂I/∂u| there, of the energy twice the kinetic one as a rule.
-    - `sizes`: the sizes of the terms of the invariants, whose round-off is theirs.
-    - `position`: q_k before it was wrapped and the rounding error that it has
-        accumulated, so that the invariants are kept at the position to which the step
-        will round its end.
+    - `moving`: Σ |u ∂I/∂u| at the start; for the energy usually twice the kinetic
+        energy.
+    - `sizes`: the sizes of the terms of the invariants, to which their round-off is
+        proportional.
+    - `position`: q_k before wrapping, and its accumulated rounding error. With both,
+        the invariants are kept at the rounded position at the end of the step.
     """
 
-    invariants: Invariants
+    functions: Invariants
     slopes: Float[Array, "k n"]
     covectors: Float[Array, "k n"]
     momentum_inverse: Matrix
@@ -210,56 +215,55 @@ class StartImpulses(eqx.Module):
     @classmethod
     def at(
         cls,
-        invariants: Invariants,
+        functions: Invariants,
         system: AbstractMechanicalSystem,
         t: FloatScalar,
         y: State,
         position: tuple[PyTree[Array], PyTree[Array]],
         args: Args,
         lin: Linearisation,
-    ) -> "StartImpulses":
-        """Make the start impulses at the state y, whose linearisation is `lin`."""
+    ) -> "InvariantsAtStart":
+        """Evaluate the invariants at the state y, whose linearisation is `lin`."""
         u = system.fibre_coordinate(y)
-        all_slopes = invariants.slopes(system, t, y.q, u, args)
-        sizes = invariants.sizes(system, t, y.q, u, args, all_slopes)
-        slopes, covectors, _ = invariants.directions(
-            system, t, y.q, u, args, all_slopes
-        )
+        all_slopes = functions.slopes(system, t, y.q, u, args)
+        sizes = functions.sizes(system, t, y.q, u, args, all_slopes)
+        slopes, covectors, _ = functions.directions(system, t, y.q, u, args, all_slopes)
         row_sums = jnp.abs(lin.metric_inverse)
         if row_sums.ndim == 2:
             row_sums = jnp.sum(row_sums, axis=1)
         given = slopes, covectors, lin.momentum_inverse, row_sums
-        return cls(invariants, *given, moving_part(slopes, u), sizes, position)
+        return cls(functions, *given, moving_part(slopes, u), sizes, position)
 
 
 def moving_part(slopes: Float[Array, "k n"], u: Float[Array, " n"]) -> Array:
-    """Measure the part of invariants that belongs to the motion, Σ |u ∂I/∂u|."""
+    """Compute the part of invariants that belongs to the motion, Σ |u ∂I/∂u|."""
     return jnp.sum(jnp.abs(slopes * u[None]), axis=1)
 
 
-class ImpulseWeights(eqx.Module):
+class InvariantCorrection(eqx.Module):
     """The linearised equations for the impulses ε of a step, near its solution.
 
-    To leading order a change of ε changes the invariants at the end by G δε with
-    G = Σ ∂I/∂u N⁻¹ ωᵀ, the sum being over both ends: what an impulse at the start adds
-    to an invariant is still there at the end. Row by row the equation r = 0 for the
-    errors r of the invariants is blended with ε = 0,
+    To leading order, a change of ε changes the invariants at the end by G δε with
+    G = Σ ∂I/∂u N⁻¹ ωᵀ. The sum has a term for each end, because the change of an
+    invariant by an impulse at the start persists until the end. In each row, the
+    equation r = 0 for the errors r of the invariants is blended with ε = 0:
 
-    a r / g + (1 - a) ε = 0,    g = G_ii,    a = g² / (g² + ϵ S²),
+    a r / g + (1 - a) ε = 0,    g = G_ii,    a = g² / (g² + ϵ S²).
 
-    with ϵ the unit round-off and S the size of the terms of I. Where g is not small, a
-    is 1 up to round-off; at rest g vanishes, so that no impulse could keep I.
+    Here ϵ is the unit round-off and S the size of the terms of I. Unless g is small, a
+    is 1 up to round-off. At rest g vanishes, and no impulse can keep I.
 
-    With an indefinite mass matrix G can be singular away from rest too. There, a = 0
+    With an indefinite mass matrix, G can also be singular away from rest. Then a = 0
     for all functions; see `LEAST_PART`.
 
-    - `errors`: a / g, by which errors are multiplied.
+    - `errors`: a / g, the factor of the errors.
     - `rest`: 1 - a.
-    - `inverse`: the inverse of the derivative of the equations by ε.
-    - `limits`: the largest |ε|, by the sum of the |terms| of g, which do not cancel.
-    - `start`, `end`: N⁻¹ ω at both ends, by which u changes with ε.
-    - `velocity`: M⁻¹ ω at the start, by which velocities do.
-    - `noise`: the round-off of u for that of the invariants.
+    - `inverse`: the inverse of the derivative of the equations with respect to ε.
+    - `limits`: the largest |ε|, computed from the absolute values of the terms of g,
+        which cannot cancel.
+    - `start`, `end`: N⁻¹ ω at both ends, the derivative of u with respect to ε.
+    - `velocity`: M⁻¹ ω at the start, the derivative of velocities with respect to ε.
+    - `noise`: the round-off of u that the round-off of the invariants causes.
     """
 
     errors: Float[Array, " k"]
@@ -274,49 +278,50 @@ class ImpulseWeights(eqx.Module):
     @classmethod
     def at(
         cls,
-        given: StartImpulses,
+        at_start: InvariantsAtStart,
         slopes: Float[Array, "k n"],
         covectors: Float[Array, "k n"],
         moving: Float[Array, " k"],
         hamiltonian: bool,
-    ) -> "ImpulseWeights":
-        """Make the weights from what is given at the start and known at the end."""
+    ) -> "InvariantCorrection":
+        """Build the equations from the values at the start and at the end of a step."""
         start, end = (
-            matvec(given.momentum_inverse, x) for x in (given.covectors, covectors)
+            matvec(at_start.momentum_inverse, x)
+            for x in (at_start.covectors, covectors)
         )
-        gram = small_einsum("kn,ln->kl", given.slopes, start)
+        gram = small_einsum("kn,ln->kl", at_start.slopes, start)
         gram = gram + small_einsum("kn,ln->kl", slopes, end)
         eps = float(jnp.finfo(gram.dtype).eps)
         one = jnp.eye(gram.shape[0], dtype=gram.dtype)
         g = jnp.sum(gram * one, axis=1)
-        denominator = unit(g**2 + eps * given.sizes**2)
+        denominator = unit(g**2 + eps * at_start.sizes**2)
         errors, a = g / denominator, g**2 / denominator
         matrix = errors[:, None] * gram + (1 - a)[:, None] * one
-        # Functions of which some follow from others have a singular matrix.
+        # If one function follows from others, the matrix is singular.
         solved = inverse(matrix + eps**0.5 * one)
-        # The impulses for given errors, relative to those of the definite matrix of the
-        # row sums: of one function, Σ (row sum) ω² over |g|.
-        squares = given.covectors**2 + covectors**2
-        roots = jnp.sqrt(jnp.sum(given.row_sums[None] * squares, axis=1))
+        # The ratio of the impulses to those of the definite matrix of the row sums, for
+        # the same errors. With one function it is Σ (row sum) ω² / |g|.
+        squares = at_start.covectors**2 + covectors**2
+        roots = jnp.sqrt(jnp.sum(at_start.row_sums[None] * squares, axis=1))
         gain = roots[:, None] * solved * (errors * roots)[None]
-        acts = ~(given.invariants.least_part * max_norm(gain) > 1)
+        acts = ~(at_start.functions.least_part * max_norm(gain) > 1)
         pushes = jnp.abs(jnp.concatenate([start, end], axis=1))
-        terms = jnp.abs(given.slopes * start) + jnp.abs(slopes * end)
+        terms = jnp.abs(at_start.slopes * start) + jnp.abs(slopes * end)
         return cls(
             errors=jnp.where(acts, errors, 0),
             rest=jnp.where(acts, 1 - a, 1),
             inverse=jnp.where(acts, solved, one),
-            limits=_LARGEST_PART * (given.moving + moving) / unit(jnp.sum(terms, 1)),
+            limits=_LARGEST_PART * (at_start.moving + moving) / unit(jnp.sum(terms, 1)),
             start=start,
             end=end,
-            velocity=given.slopes if hamiltonian else start,
-            noise=max_norm(given.sizes * errors * jnp.max(pushes, axis=1)),
+            velocity=at_start.slopes if hamiltonian else start,
+            noise=max_norm(at_start.sizes * errors * jnp.max(pushes, axis=1)),
         )
 
     def change(
         self, impulse: Float[Array, " k"], error: Float[Array, " k"]
     ) -> Float[Array, " k"]:
-        """Compute the change of ε that makes the linearised equations hold."""
+        """Compute the change of ε that solves the linearised equations."""
         residual = self.errors * error + self.rest * impulse
         wanted = impulse - matvec(self.inverse, residual)
         return jnp.clip(wanted, -self.limits, self.limits) - impulse

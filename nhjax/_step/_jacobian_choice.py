@@ -7,7 +7,7 @@ import jax.numpy as jnp
 
 from .._numerics import dependence, full_jacobian, SparseMatrix
 from .._system import Linearisation, total_force
-from ._stage_system import StageSystem
+from ._equations import StageEquations
 
 
 # What of the Jacobian simplified Newton inverts; None means what pays.
@@ -21,7 +21,7 @@ _MOST_STAGES, _MOST_COORDINATES, _MOST_RESPONSES = 5, 6, 100
 
 
 def takes_first_order_terms(
-    stages: StageSystem, lin: Linearisation, jacobian: JacobianName
+    stages: StageEquations, lin: Linearisation, jacobian: JacobianName
 ) -> bool:
     """Tell whether the Jacobian of simplified Newton has terms of order h.
 
@@ -49,7 +49,7 @@ def takes_first_order_terms(
     return not stages.manifold.is_flat or _has_terms(stages)
 
 
-def _forces_have_slopes(stages: StageSystem) -> bool:
+def _forces_have_slopes(stages: StageEquations) -> bool:
     """Tell whether forces can be differentiated by velocities in forward mode.
 
     Callbacks cannot, nor functions that have a rule for reverse mode alone. Nothing
@@ -69,7 +69,7 @@ def _forces_have_slopes(stages: StageSystem) -> bool:
     return True
 
 
-def _has_terms(stages: StageSystem) -> bool:
+def _has_terms(stages: StageEquations) -> bool:
     # On a vector space they vanish unless momenta depend on positions, or forces on
     # velocities, which the programs of the system tell.
     system, t, args = stages.system, stages.t, stages.args

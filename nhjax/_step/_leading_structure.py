@@ -14,11 +14,9 @@ from .._numerics import (
     WeightedTranspose,
 )
 from .._system import Linearisation
+from ._equations import stage_velocities, StageEquations, StageUnknowns
 from ._first_order import FirstOrderTerms
-from ._invariants import ImpulseWeights
-from ._stage_equations import stage_velocities
-from ._stage_system import StageSystem
-from ._unknowns import Stages
+from ._invariants import InvariantCorrection
 
 
 class Responses(NamedTuple):
@@ -57,13 +55,13 @@ class LeadingStructure(eqx.Module):
     velocity_reaction: Float[Array, "s n l"] | WeightedTranspose
     schur_inverse: Float[Array, "c c"] | BlockTridiagonalInverse
     end: Linearisation
-    impulses: ImpulseWeights | None = None
+    impulses: InvariantCorrection | None = None
     first_order: FirstOrderTerms | None = None
     responses: Responses | None = None
 
     def correct_stages(
-        self, stages: StageSystem, x: Stages, residual: Float[Array, "s n"]
-    ) -> Stages:
+        self, stages: StageEquations, x: StageUnknowns, residual: Float[Array, "s n"]
+    ) -> StageUnknowns:
         """Compute u - N⁻¹ r_u for the stages, and the velocities that belong to it."""
         change = matvec(self.momentum_inverse, residual)
         if self.first_order is not None:
@@ -75,11 +73,11 @@ class LeadingStructure(eqx.Module):
 
     def correct_nodes(
         self,
-        stages: StageSystem,
-        x: Stages,
+        stages: StageEquations,
+        x: StageUnknowns,
         residual: Float[Array, "r n"],
         change: Float[Array, "s n"],
-    ) -> Stages:
+    ) -> StageUnknowns:
         """Compute the fibre coordinates u - N⁻¹ r_v of the nodes.
 
         The residual knows the new stage velocities by the positions alone, and not yet
@@ -94,11 +92,11 @@ class LeadingStructure(eqx.Module):
 
     def correct_multipliers(
         self,
-        stages: StageSystem,
-        x: Stages,
+        stages: StageEquations,
+        x: StageUnknowns,
         kinematic: Float[Array, "r m"] | Float[Array, "0"],
         holonomic: Float[Array, "s k"] | Float[Array, "0"],
-    ) -> Stages:
+    ) -> StageUnknowns:
         """Change the free multipliers so that the linearised constraints hold."""
         residual = jnp.concatenate([kinematic.reshape(-1), holonomic.reshape(-1)])
         change = -matvec(self.schur_inverse, residual)
@@ -122,7 +120,7 @@ class LeadingStructure(eqx.Module):
         if stages.hamiltonian:
             velocity_push = _pushed(self.velocity_reaction, h_dlambda)
             momentum = momentum + small_einsum("ij,jn->in", a_hat, push)
-        return Stages(
+        return StageUnknowns(
             velocity=x.velocity + small_einsum("ij,jn->in", a_hat, velocity_push),
             momentum=momentum,
             node_fibre_coordinate=x.node_fibre_coordinate
@@ -136,10 +134,10 @@ class LeadingStructure(eqx.Module):
 
     def correct_end(
         self,
-        stages: StageSystem,
-        x: Stages,
+        stages: StageEquations,
+        x: StageUnknowns,
         residual: tuple[Float[Array, " n"], Float[Array, " l"]],
-    ) -> Stages:
+    ) -> StageUnknowns:
         """Move the acceleration and λ_c at the end towards those of (q, u) there.
 
         The unknowns of the closure change with λ_c, so that to leading order the nodes
@@ -181,8 +179,8 @@ class LeadingStructure(eqx.Module):
         )
 
     def correct_impulses(
-        self, stages: StageSystem, x: Stages, error: Float[Array, " k"]
-    ) -> Stages:
+        self, stages: StageEquations, x: StageUnknowns, error: Float[Array, " k"]
+    ) -> StageUnknowns:
         """Change ε so that the linearised equations of the invariants hold.
 
         The stages and nodes change with ε, so that to leading order their momentum

@@ -1,4 +1,4 @@
-"""The round-off of the functions of a system, as the equations of a step feel it."""
+"""The effect of the round-off of a system's functions on the equations of a step."""
 
 import functools
 
@@ -9,23 +9,25 @@ from jaxtyping import Array, Float
 
 from .._custom_types import FloatScalar
 from .._method import AbstractMethod
-from .._numerics import absolute, frozen, matvec, max_norm
+from .._numerics import absolute, matvec, max_norm, stop_gradient
 from .._system import FunctionNoise, Linearisation
 
 
 class RoundOff(eqx.Module):
     """The round-off of the functions of a system, as sizes of fibre coordinates.
 
-    A size is the round-off in units of the unit round-off, so that it is comparable to
-    the sizes of the coordinates themselves. It is measured once, at the start of a run:
-    constants inside the functions do not change, and sizes of coordinates are taken
-    into account in each step. The size in a step of length h is
+    A size is a round-off divided by the unit round-off, so that it is comparable to the
+    size of the coordinates. It is measured once, at the start of a run, because
+    constants inside the functions do not change. Each step adds the sizes of its own
+    coordinates. The size in a step of length h is
 
-    `by_velocity` + h `by_force` + `by_position` / h:
+    `by_velocity` + h `by_force` + `by_position` / h.
 
-    momenta and nonholonomic constraints; forces; and holonomic constraints. The
-    `violations` of constraints on velocities and positions that round-off can amount to
-    are in the units of these.
+    - `by_velocity`: from momenta and nonholonomic constraints.
+    - `by_force`: from forces.
+    - `by_position`: from holonomic constraints.
+    - `violations`: the violations of the constraints on velocities and on positions
+        that round-off can cause, in the units of the constraints.
     """
 
     by_velocity: FloatScalar
@@ -35,7 +37,7 @@ class RoundOff(eqx.Module):
 
     @classmethod
     def of_arrays(cls, arrays: tuple[Array, ...]) -> "RoundOff":
-        """Make it from its arrays, in the order of the fields."""
+        """Build an instance from its arrays, in the order of the fields."""
         by_velocity, by_force, by_position, *violations = arrays
         on_velocities, on_positions = violations
         sizes = by_velocity, by_force, by_position
@@ -46,9 +48,9 @@ class RoundOff(eqx.Module):
         return self.by_velocity + h * self.by_force + self.by_position / h
 
 
-# An increment of stages that has stopped falling can be six times as large as the
-# round-off that the functions of a system leave in it. It counts as noise up to 400
-# units of a size, so that a size is this part of the measured round-off.
+# When the increments of the stages stop falling, they can be six times as large as the
+# round-off that the functions of a system cause in them. They count as noise up to 400
+# units of a size. Therefore a size is this fraction of the measured round-off.
 PART = 1 / 8
 
 
@@ -57,10 +59,10 @@ def round_off_of_steps(
 ) -> RoundOff:
     """Compute the round-off of steps from the noise of the functions of a system.
 
-    `lin` is the linearisation at the state. The iteration on the stages magnifies the
-    round-off of constraints by the inverse of the method's coefficients.
+    `lin` is the linearisation at the state of the noise. The inverse of the matrix of
+    the method's coefficients magnifies the round-off of constraints.
     """
-    lin = frozen(lin)
+    lin = stop_gradient(lin)
     inverse = absolute(lin.momentum_inverse)
     by_velocity, by_force = (
         max_norm(matvec(inverse, x)) for x in (noise.momentum, noise.force)
@@ -84,11 +86,13 @@ def round_off_of_steps(
 def magnifications(method: AbstractMethod) -> tuple[float, float]:
     """Compute how much a step magnifies random errors of its constraints.
 
-    The first number is that of nonholonomic constraints, the second that of holonomic
-    ones: h N⁻¹ R δΛ is so much larger than the change that would make up for the error
-    of one constraint. They are largest root sums of squares of rows of the inverses of
-    R E and of (A Â, b); see `StageSystem`. Pseudo-inverses, since a method that is not
-    meant for one kind of constraints may have a singular matrix for it.
+    The change h N⁻¹ R δΛ is larger, by this factor, than the change that would correct
+    the error of a single constraint. The factor is the largest Euclidean norm of a row
+    of the inverse of R E for nonholonomic constraints, and of (A Â, b) for holonomic
+    constraints; see `StageEquations`. Pseudo-inverses are used, because a method that
+    is not meant for one of the two kinds can have a singular matrix for it.
+
+    **Returns:** the factor for nonholonomic and the factor for holonomic constraints.
     """
 
     def largest_row(matrix):

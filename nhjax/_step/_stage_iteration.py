@@ -10,21 +10,22 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
 from .._custom_types import BoolScalar, FloatScalar
-from .._numerics import frozen, matvec, max_norm, Sizes, unit
+from .._numerics import matvec, max_norm, Sizes, stop_gradient, unit
 from .._system import Linearisation
-from ._leading_structure import LeadingStructure
-from ._stage_equations import (
+from ._equations import (
     constraint_values,
     end_residual,
-    impulse_weights,
-    in_chart,
+    invariant_correction,
     invariant_errors,
+    is_in_chart,
     node_residual,
     stage_forces,
     stage_velocities,
+    StageEquations,
+    StageForces,
+    StageUnknowns,
 )
-from ._stage_system import StageSystem
-from ._unknowns import StageForces, Stages
+from ._leading_structure import LeadingStructure
 
 
 class Evaluation(NamedTuple):
@@ -39,8 +40,8 @@ class Evaluation(NamedTuple):
 
 
 def corrected(
-    stages: StageSystem, structure: LeadingStructure, x: Stages
-) -> tuple[Stages, Evaluation]:
+    stages: StageEquations, structure: LeadingStructure, x: StageUnknowns
+) -> tuple[StageUnknowns, Evaluation]:
     """Make a sweep of simplified Newton; return its result and the values at x."""
     # Each residual is evaluated at the newest iterate (Gauss-Seidel): this costs the
     # same as evaluating all of them at the last iterate, and contracts faster.
@@ -49,7 +50,7 @@ def corrected(
     r_nodes = node_residual(stages, x_next, forces.force)
     change = x_next.velocity - x.velocity
     x_next = structure.correct_nodes(stages, x_next, r_nodes, change)
-    if stages.kept is not None:
+    if stages.invariants is not None:
         # Before the constraints, so that these see what impulses change: where a system
         # is nearly at rest, the work of reactions on that is not small beside it.
         error = invariant_errors(stages, x_next)
@@ -59,10 +60,12 @@ def corrected(
     return x_next, Evaluation(forces, r_nodes, jnp.asarray(False))
 
 
-def _constrain(stages: StageSystem, structure: LeadingStructure, x: Stages) -> Stages:
+def _constrain(
+    stages: StageEquations, structure: LeadingStructure, x: StageUnknowns
+) -> StageUnknowns:
     kinematic, holonomic = constraint_values(stages, x)
     x = structure.correct_multipliers(stages, x, kinematic, holonomic)
-    if stages.symmetric:
+    if stages.end_multiplier_is_unknown:
         # λ_c depends on v_{k+1} at zeroth order: it must see the new velocity, or the
         # two errors would feed each other and contract only as the root of the rate.
         x = structure.correct_end(stages, x, end_residual(stages, x))
@@ -70,7 +73,7 @@ def _constrain(stages: StageSystem, structure: LeadingStructure, x: Stages) -> S
 
 
 def stage_residual(
-    stages: StageSystem, x: Stages
+    stages: StageEquations, x: StageUnknowns
 ) -> tuple[Float[Array, " k"], Evaluation]:
     """Evaluate all equations of a step (the paper's four summaries) in one vector.
 
@@ -112,11 +115,11 @@ def stage_residual(
     if stages.hamiltonian:
         parts.append(x.velocity - stage_velocities(stages, x))
     parts += constraint_values(stages, x)
-    if stages.symmetric:
+    if stages.end_multiplier_is_unknown:
         parts += end_residual(stages, x)
-    if stages.kept is not None:
+    if stages.invariants is not None:
         # The same equation as that of simplified Newton.
-        weights = frozen(impulse_weights(stages, x))
+        weights = stop_gradient(invariant_correction(stages, x))
         parts.append(-weights.change(x.impulse, invariant_errors(stages, x)))
     return (
         ravel_pytree(parts)[0],
@@ -124,7 +127,9 @@ def stage_residual(
     )
 
 
-def sizes(stages: StageSystem, x: Stages, x_next: Stages, lin: Linearisation) -> Sizes:
+def sizes(
+    stages: StageEquations, x: StageUnknowns, x_next: StageUnknowns, lin: Linearisation
+) -> Sizes:
     """Measure an increment and the fibre coordinates that it leads to.
 
     Of the coordinates only those at the end of the step are measured: they are enough
@@ -134,7 +139,7 @@ def sizes(stages: StageSystem, x: Stages, x_next: Stages, lin: Linearisation) ->
     return Sizes(increment, max_norm(x_next.node_fibre_coordinate[-1]))
 
 
-def fibre_coordinate_size(stages: StageSystem, x: Stages) -> FloatScalar:
+def fibre_coordinate_size(stages: StageEquations, x: StageUnknowns) -> FloatScalar:
     """Measure the fibre coordinates of the stages and of the nodes; take the smaller.
 
     While an iteration is far from a solution, one of the two can be much larger than
@@ -145,7 +150,7 @@ def fibre_coordinate_size(stages: StageSystem, x: Stages) -> FloatScalar:
 
 
 def increment_size(
-    stages: StageSystem, x: Stages, x_next: Stages, lin: Linearisation
+    stages: StageEquations, x: StageUnknowns, x_next: StageUnknowns, lin: Linearisation
 ) -> FloatScalar:
     """Measure an increment by its largest change of fibre coordinates.
 
@@ -173,11 +178,11 @@ def increment_size(
     size = max_norm(*changes)
     if stages.manifold.is_flat:
         return size
-    return jnp.where(in_chart(stages, x_next), size, jnp.inf)
+    return jnp.where(is_in_chart(stages, x_next), size, jnp.inf)
 
 
-def unknown_units(stages: StageSystem, lin: Linearisation) -> list[FloatScalar]:
-    """Return the size of each field of `Stages` that changes u by one.
+def unknown_units(stages: StageEquations, lin: Linearisation) -> list[FloatScalar]:
+    """Return the size of each field of `StageUnknowns` that changes u by one.
 
     As in `increment_size`, multipliers count by the effect h N⁻¹ R δΛ on u. By their
     own size the round-off of a multiplier, which grows like 1 / h, could not be told
@@ -198,8 +203,8 @@ def unknown_units(stages: StageSystem, lin: Linearisation) -> list[FloatScalar]:
         "end_acceleration": 1 / unit(h),
         "end_multiplier": multiplier,
     }
-    if stages.kept is not None:
-        largest = max_norm(matvec(lin.momentum_inverse, stages.kept.covectors))
+    if stages.invariants is not None:
+        largest = max_norm(matvec(lin.momentum_inverse, stages.invariants.covectors))
         sizes["impulse"] = 1 / unit(largest)
-    names = [field.name for field in dataclasses.fields(Stages)]
+    names = [field.name for field in dataclasses.fields(StageUnknowns)]
     return [sizes[name] for name in names if name in sizes]

@@ -1,23 +1,36 @@
-"""One step of a method, and the data that is carried from step to step."""
+"""One step of a method, its derivative, and the data that one step passes to the next.
 
+`step` solves the stage equations and computes the state at the end. `ImplicitStep` is
+the same step as a differentiable function.
+"""
+
+from collections.abc import Callable
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeAlias
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float, Int, PyTree
 
+from .._compile import TraceCache
 from .._custom_types import Args, BoolScalar, FloatScalar
+from .._manifold import unframed
 from .._method import AbstractMethod
 from .._numerics import (
-    frozen,
+    AbstractImplicitFunction,
+    ClosureConverted,
+    fixed_point_tangent,
     has_tangent,
     largest_column,
+    matvec,
     max_norm,
+    NOISE_UNITS,
     relative,
     small_einsum,
     Solved,
+    stop_gradient,
     two_sum,
     zero_unless,
 )
@@ -30,26 +43,29 @@ from .._system import (
     linearise,
     State,
 )
-from ._end import end_state, step_record
-from ._error_estimate import error_ratios
-from ._invariants import Invariants, StartImpulses
-from ._newton import AbstractStageSolver
-from ._record import StepRecord
+from ._equations import (
+    end_impulse,
+    end_position,
+    is_in_chart,
+    stage_forces,
+    StageEquations,
+    StageForces,
+    StageUnknowns,
+    start_impulse,
+)
+from ._invariants import Invariants, InvariantsAtStart
 from ._round_off import RoundOff
-from ._stage_equations import end_impulse, in_chart, start_impulse
-from ._stage_iteration import Evaluation
-from ._stage_system import StageSystem
-from ._starting_values import starting_values
-from ._unknowns import Stages
+from ._solvers import AbstractStageSolver, starting_values
+from ._stage_iteration import Evaluation, unknown_units
 
 
 class StepState(eqx.Module):
-    """The data that is carried from step to step: a state, and what is known there.
+    """The data that one step passes to the next: a state, and its linearisation.
 
-    The compensations are the rounding errors of the running sums q and p. The
+    The compensations are the accumulated rounding errors of the sums q and p. The
     linearisation `lin` gives the Jacobian of the next step and the multiplier λ_c. It
-    belongs to the system and the args with which it was made; `first_step_state` makes
-    one for others.
+    is valid only for the system and the args with which it was computed;
+    `first_step_state` computes a new one.
     """
 
     state: State
@@ -58,16 +74,16 @@ class StepState(eqx.Module):
     lin: Linearisation
 
     def wrapped(self, system: AbstractMechanicalSystem) -> State:
-        """Return the state with the angles of the first turn, with all their digits."""
+        """Return the state with its angles reduced to one turn, at full precision."""
         q, manifold = self.state.q, system.manifold_of(self.state.q)
         return replace(self.state, q=manifold.wrapped(q, self.q_compensation))
 
     def differentiated_in_state(self) -> "StepState":
-        """Return the same data, differentiable with respect to the state alone.
+        """Return the same data, differentiable only with respect to the state.
 
-        The derivatives with respect to the other data are zero: rounding errors have
-        none, and the linearisation serves as a Jacobian, on which the end of a step
-        does not depend.
+        Derivatives with respect to the other data are zero. Rounding errors have no
+        derivatives, and the end of a step does not depend on the approximate Jacobian
+        that the linearisation gives.
         """
         return eqx.tree_at(lambda x: x.state, jax.lax.stop_gradient(self), self.state)
 
@@ -75,9 +91,10 @@ class StepState(eqx.Module):
 class StepArguments(eqx.Module):
     """The arguments of a step with respect to which it can be differentiated.
 
-    Of `step_state` this is the state alone; see `StepState.differentiated_in_state`.
-    Without `invariants` the step keeps none. Without `round_off` the sizes of the
-    unknowns tell how large round-off is.
+    In `step_state` only the state has derivatives; see
+    `StepState.differentiated_in_state`. If `invariants` is None, the step keeps no
+    invariants. If `round_off` is None, round-off is estimated from the sizes of the
+    unknowns.
     """
 
     system: AbstractMechanicalSystem
@@ -89,13 +106,26 @@ class StepArguments(eqx.Module):
     round_off: RoundOff | None = None
 
 
-class StepOutcome(NamedTuple):
-    """The outcome of a step: the next state or the reason why there is none.
+class StepRecord(eqx.Module):
+    """The data of one step from which dense output builds its polynomials.
 
-    - `step_state`: the data to carry to the next step.
+    - `start`: the state at the start of the step.
+    - `velocity`, `force`, `multiplier`: the values at the s stages.
+    """
+
+    start: State
+    velocity: Float[Array, "s n"]
+    force: Float[Array, "s n"]
+    multiplier: Float[Array, "s m"]
+
+
+class StepOutcome(NamedTuple):
+    """The outcome of a step: the next state, or the reason why it failed.
+
+    - `step_state`: the data to pass to the next step.
     - `record`, `stages`: the stages of the step, for dense output and for derivatives.
-    - `result`: whether the step was solved, and otherwise why not.
-    - `num_iterations`: how many iterations the stage solver made.
+    - `result`: whether the step was solved, and otherwise the reason why not.
+    - `num_iterations`: the number of iterations of the stage solver.
     - `residual`: the residual of the stage equations, relative to the momenta.
     - `worst_coordinate`: the index of the coordinate whose equations have the largest
         residual.
@@ -103,14 +133,14 @@ class StepOutcome(NamedTuple):
     - `multiplier_defect`: the distance |Λ^s - λ_c| at the end.
     - `newton`: whether Newton's method took over from simplified Newton.
     - `invariant_error`: the largest error of an invariant at the end, relative to the
-        size of its terms; None if the run keeps none.
-    - `error_ratios`: what tells how large the error of the step is; None for a method
-        with one node.
+        size of its terms; None if the run keeps no invariants.
+    - `error_ratios`: two numbers from which `estimated_error` estimates the error of
+        the step; None for a method with one node.
     """
 
     step_state: StepState
     record: StepRecord
-    stages: Stages
+    stages: StageUnknowns
     result: RESULTS
     num_iterations: Int[Array, ""]
     residual: FloatScalar
@@ -129,58 +159,50 @@ def first_step_state(
     y0: State,
     args: Args,
 ) -> StepState:
-    """Make the data that the first step starts from, given a consistent state.
+    """Build the data that the first step starts from, given a consistent state.
 
-    With closures that do not carry the multiplier from step to step, the first state
-    already has the continuous multiplier λ_c.
+    If the closure does not carry the multiplier from step to step, the multiplier of
+    the first state is the continuous multiplier λ_c.
     """
     u = system.fibre_coordinate(y0)
     lin = linearise(system, t, y0.q, u, args, may_be_sparse=True)
-    multiplier = _continuous_multiplier(
-        (system, t, y0.q, system.fibre_coordinate(y0), args)
-    )
-    carried = method.closure == "propagated"
+    multiplier = y0.multiplier
+    if not method.carries_multiplier:
+        multiplier = _ContinuousMultiplier()((system, t, y0.q, u, args))
     return StepState(
-        state=State(y0.q, y0.v, y0.p, y0.multiplier if carried else multiplier),
+        state=State(y0.q, y0.v, y0.p, multiplier),
         q_compensation=system.manifold_of(y0.q).no_compensation(y0.q),
         p_compensation=jnp.zeros_like(y0.p),
-        lin=frozen(lin),
+        lin=stop_gradient(lin),
     )
 
 
-@eqx.filter_custom_jvp
-def _continuous_multiplier(arguments: tuple[Any, ...]) -> Float[Array, " l"]:
-    return linearise(*arguments, may_be_sparse=True).multiplier
+class _ContinuousMultiplier(AbstractImplicitFunction[Any, Float[Array, " l"]]):
+    """The continuous multiplier λ_c as a function of (system, t, q, u, args).
 
+    Its derivative is zero where the multiplier is not finite. Otherwise a member that
+    failed would make the derivative of a sum that leaves it out NaN, because NaN times
+    zero is NaN.
+    """
 
-@_continuous_multiplier.def_jvp
-def _continuous_multiplier_jvp(primals, tangents):
-    # The derivative is set to zero where the multiplier is not finite: NaN times zero
-    # would be NaN even for a lane on which nothing depends.
-    (arguments,), (rates,) = primals, tangents
-    multiplier = _continuous_multiplier(arguments)
-    ok = jnp.all(jnp.isfinite(multiplier))
-    perturbed, fixed = eqx.partition(arguments, has_tangent(rates))
-    _, change = jax.jvp(
-        lambda perturbed: (
-            linearise(*eqx.combine(perturbed, fixed), may_be_sparse=True).multiplier
-        ),
-        (perturbed,),
-        (zero_unless(ok, rates),),
-    )
-    return multiplier, zero_unless(ok, change)
+    programs: None = None
 
+    def solve(self, arguments: Any) -> Float[Array, " l"]:
+        """Compute the multiplier from the linearised system."""
+        return linearise(*arguments, may_be_sparse=True).multiplier
 
-def equations_of_step(arguments: StepArguments, method: AbstractMethod) -> StageSystem:
-    """Make the equations of a step, with those of the invariants that it keeps."""
-    system, t, args = arguments.system, arguments.t, arguments.args
-    step_state, invariants = arguments.step_state, arguments.invariants
-    y, lin, kept = step_state.wrapped(system), step_state.lin, None
-    if invariants is not None:
-        position = step_state.state.q, step_state.q_compensation
-        kept = StartImpulses.at(invariants, system, t, y, position, args, lin)
-    given = t, arguments.h, y, args, lin, kept, arguments.round_off
-    return StageSystem.at(system, method, *given)
+    def tangent(
+        self, arguments: Any, rates: Any, solution: Float[Array, " l"]
+    ) -> Float[Array, " l"]:
+        """Differentiate the linearised system."""
+        ok = jnp.all(jnp.isfinite(solution))
+        perturbed, fixed = eqx.partition(arguments, has_tangent(rates))
+        _, change = jax.jvp(
+            lambda perturbed: self.solve(eqx.combine(perturbed, fixed)),
+            (perturbed,),
+            (zero_unless(ok, rates),),
+        )
+        return zero_unless(ok, change)
 
 
 def step(
@@ -191,7 +213,8 @@ def step(
 ) -> StepOutcome:
     """Take one step of size h, from (q_k, p_k, λ_k) to (q_{k+1}, p_{k+1}, λ_{k+1}).
 
-    Where `skip` is true nothing is solved, and the outcome is to be discarded.
+    Where `skip` is true, no iterations are made, and the caller must discard the
+    outcome.
     """
     system, args, step_state = arguments.system, arguments.args, arguments.step_state
     t, h, keeps_invariants = arguments.t, arguments.h, arguments.invariants is not None
@@ -217,12 +240,12 @@ def step(
     end = end_state(stages, at_end, u, p, last, lambda: lin_next.multiplier)
     next_state = StepState(replace(end, q=q), q_compensation, p_compensation, lin_next)
 
-    result = _result(solved, lin, next_state, in_chart(stages, x))
+    result = _result(solved, lin, next_state, is_in_chart(stages, x))
     if stages.redundancy is not None:
         small = float(jnp.finfo(p.dtype).eps) ** 0.5 + 100 * stage_solver.tolerance
         allowed = None if stages.round_off is None else stages.round_off.violations
-        kept = keeps_constraints(system, lin_next, t + h, end, args, small, allowed)
-        lost = (result == RESULTS.successful) & ~kept
+        holds = keeps_constraints(system, lin_next, t + h, end, args, small, allowed)
+        lost = (result == RESULTS.successful) & ~holds
         result = RESULTS.where(lost, RESULTS.lost_constraints, result)
     residual, worst = largest_column(forces.residual, solved.aux.node_residual)
     scale = max_norm(forces.momentum) + max_norm(h * forces.force)
@@ -242,19 +265,71 @@ def step(
     )
 
 
-def _invariant_error(
-    stages: StageSystem, q: PyTree[Array], u: Float[Array, " n"]
-) -> FloatScalar | None:
-    """Measure the errors of invariants at the end by the sizes of their terms."""
-    if stages.kept is None:
-        return None
-    invariants, t = stages.kept.invariants, stages.t + stages.h
-    error = invariants.error(stages.system, t, q, u, stages.args)
-    return max_norm(relative(error, stages.kept.sizes))
+def equations_of_step(
+    arguments: StepArguments, method: AbstractMethod
+) -> StageEquations:
+    """Build the equations of a step, including the equations of kept invariants."""
+    system, t, args = arguments.system, arguments.t, arguments.args
+    step_state, invariants = arguments.step_state, None
+    y, lin = step_state.wrapped(system), step_state.lin
+    if arguments.invariants is not None:
+        position = step_state.state.q, step_state.q_compensation
+        invariants = InvariantsAtStart.at(
+            arguments.invariants, system, t, y, position, args, lin
+        )
+    given = t, arguments.h, y, args, lin, invariants, arguments.round_off
+    return StageEquations.at(system, method, *given)
+
+
+def end_state(
+    stages: StageEquations,
+    q: PyTree[Array],
+    u: Float[Array, " n"],
+    p: Float[Array, " n"],
+    last_multiplier: Float[Array, " l"],
+    continuous: Callable[[], Float[Array, " l"]],
+) -> State:
+    """Build the state at the end of a step from its q, u, p and multipliers.
+
+    **Arguments:**
+
+    - `q`, `u`, `p`: the configuration, the fibre coordinate and the momentum.
+    - `last_multiplier`: Λ^s, which the propagated closure carries to the next step.
+    - `continuous`: a function without arguments that returns λ_c(q, u). It is called
+        only if a part of λ_c is needed.
+    """
+    v = stages.system.velocity(stages.t + stages.h, q, u, stages.args)
+    if not stages.method.carries_multiplier:
+        return State(q, v, p, continuous())
+    # Only nonholonomic multipliers are carried to the next step. The next step computes
+    # the holonomic multipliers again.
+    m = stages.num_nonholonomic
+    multiplier = last_multiplier[:m]
+    if stages.num_holonomic:
+        multiplier = jnp.concatenate([multiplier, continuous()[m:]])
+    return State(q, v, p, multiplier)
+
+
+def step_record(
+    stages: StageEquations, start: State, x: StageUnknowns, forces: StageForces
+) -> StepRecord:
+    """Build the record of a step.
+
+    Impulses are recorded as a constant force over the step. With this force, the
+    polynomial of the momentum in dense output ends at the momentum of the next state.
+    """
+    force = forces.force
+    if stages.invariants is not None:
+        chart = stages.chart(x)
+        y = chart.ends[1][None]
+        impulse = chart.momentum_at_origin(start_impulse(stages, x))
+        impulse = impulse + chart.to_origin(y, end_impulse(stages, x)[None])[0]
+        force = force + (impulse / stages.h)[None]
+    return StepRecord(start, x.velocity, force, forces.multiplier)
 
 
 def _result(
-    solved: Solved[Stages, Evaluation],
+    solved: Solved[StageUnknowns, Evaluation],
     lin: Linearisation,
     step_state: StepState,
     is_in_chart: BoolScalar,
@@ -270,8 +345,8 @@ def _result(
     converged = RESULTS.where(finite, RESULTS.successful, RESULTS.nonfinite_state)
     result = RESULTS.where(solved.converged, converged, failed)
     result = RESULTS.where(is_in_chart, result, RESULTS.left_chart)
-    # A singular M or C at the end of the step is reported now and not in the next step,
-    # because λ_c does not exist there.
+    # If M or C is singular at the end of the step, λ_c does not exist there. Therefore
+    # this step reports it, and not the next step.
     singular = lin.is_singular | (solved.converged & step_state.lin.is_singular)
     return RESULTS.where(singular, RESULTS.singular_stage_matrix, result)
 
@@ -282,3 +357,204 @@ def largest_violation(
     """Compute the largest violation of any constraint at a state."""
     on_positions = system.position_constraint(t, step_state.wrapped(system).q, args)
     return max_norm(step_state.lin.violation, on_positions)
+
+
+def _invariant_error(
+    stages: StageEquations, q: PyTree[Array], u: Float[Array, " n"]
+) -> FloatScalar | None:
+    """Compute the largest error of an invariant relative to the size of its terms."""
+    if stages.invariants is None:
+        return None
+    functions, t = stages.invariants.functions, stages.t + stages.h
+    error = functions.error(stages.system, t, q, u, stages.args)
+    return max_norm(relative(error, stages.invariants.sizes))
+
+
+def error_ratios(
+    stages: StageEquations,
+    x: StageUnknowns,
+    force: Float[Array, "s n"],
+    u: Float[Array, " n"],
+    lin: Linearisation,
+) -> Float[Array, "2"] | None:
+    """Compare two quadratures of a step, in positions and in fibre coordinates.
+
+    The state changes by h Σ b_j (H^j, N⁻¹ n^j), with the velocities H^j and the forces
+    n^j of the stages. A second quadrature leaves out the last node. The difference of
+    the two is the same sum with the weights `method.embedded_difference`. The first
+    ratio divides the difference in positions per h by the change of the state. The
+    second ratio divides the difference in fibre coordinates by it. See
+    `estimated_error`.
+
+    **Arguments:**
+
+    - `x`, `force`: the solved stages and their forces n^j.
+    - `u`: the fibre coordinate at the end of the step.
+    - `lin`: the linearisation at the start of the step.
+
+    **Returns:** the two ratios, or None for a method with one node, which has no second
+    quadrature.
+    """
+    method, h = stages.method, stages.h
+    difference = method.embedded_difference
+    if difference is None:
+        return None
+
+    def change(weights: Float[Array, " s"]) -> tuple[Array, Array]:
+        moved = small_einsum("s,sn->n", weights, x.velocity)
+        if stages.hamiltonian:
+            moved = matvec(lin.metric_inverse, moved)
+        gained = h * small_einsum("s,sn->n", weights, force)
+        return moved, matvec(lin.momentum_inverse, gained)
+
+    # The floor is the round-off of u, because a difference of this size says nothing
+    # about the error.
+    size = max_norm(u)
+    if stages.round_off is not None:
+        size = jnp.maximum(size, stages.round_off.size(jnp.abs(h)))
+    floor = NOISE_UNITS * float(jnp.finfo(u.dtype).eps) * size
+    whole = max_norm(*change(stages.coefficients("b"))) + floor
+    moved, gained = change(jnp.asarray(difference, u.dtype))
+    if stages.constrained:
+        # Multipliers of single stages may be wrong although their sum is right.
+        # Therefore the part of the difference that violates the constraints is left
+        # out; the step satisfies the constraints.
+        excess = matvec(lin.compliance_inverse, matvec(lin.jacobian, gained))
+        gained = gained - matvec(lin.reaction, excess)
+    return relative(jnp.stack([max_norm(moved), max_norm(gained)]), whole)
+
+
+def estimated_error(ratios: Float[Array, "2"], method: AbstractMethod) -> FloatScalar:
+    """Estimate the error of a step, relative to the change of the state in it.
+
+    With s different nodes the `error_ratios` are O(h^{s-1}) in positions and O(h^s) in
+    fibre coordinates. The relative error of a step is O(h^p), with the order p of the
+    method. Each ratio is raised to the power that makes it O(h^p), and the estimate is
+    the larger of the two results. If a step does not resolve the motion, the estimate
+    is about one. The estimate increases with the ratios, so that the largest estimate
+    of many steps follows from the largest ratios.
+    """
+    nodes = len(np.unique(method.c))
+    in_position, in_fibre = ratios
+    return jnp.maximum(
+        in_position ** (method.order / (nodes - 1)),
+        in_fibre ** (method.order / nodes),
+    )
+
+
+Changes: TypeAlias = tuple[StageUnknowns, State, StepRecord]
+
+
+class ImplicitStep(AbstractImplicitFunction[StepArguments, StepOutcome]):
+    """A step as a differentiable function of its arguments.
+
+    Let G(θ, x) be the Newton iteration of the stage solver on the stages x, with its
+    Jacobian fixed, and θ the arguments of the step. The solution is a fixed point of G,
+    so that
+
+    dx = ∂G/∂x dx + ∂G/∂θ dθ,
+
+    and the end of the step follows from x and θ. All derivatives are zero where the
+    step failed.
+
+    - `method`, `stage_solver`, `skip`: as for `step`.
+    """
+
+    method: AbstractMethod = eqx.field(static=True)
+    stage_solver: AbstractStageSolver
+    skip: BoolScalar
+    programs: TraceCache = eqx.field(static=True)
+
+    def solve(self, arguments: StepArguments) -> StepOutcome:
+        """Take the step."""
+        return step(arguments, self.method, self.stage_solver, self.skip)
+
+    def tangent(
+        self, arguments: StepArguments, rates: StepArguments, solution: StepOutcome
+    ) -> StepOutcome:
+        """Compute the tangents of the stages, the state at the end and the record."""
+        x, ok = solution.stages, ~self.skip & (solution.result == RESULTS.successful)
+        perturbed, fixed = eqx.partition(arguments, has_tangent(rates))
+        changes = self.changes(arguments, fixed, x, ok)
+        # With `jax.checkpoint`, reverse mode stores only states and stages.
+        changes = jax.checkpoint(changes, prevent_cse=False)
+        return tangent_of_outcome(solution, changes(perturbed, x, rates))
+
+    def changes(
+        self,
+        arguments: StepArguments,
+        fixed: StepArguments,
+        x: StageUnknowns,
+        ok: BoolScalar,
+    ) -> Callable[[StepArguments, StageUnknowns, StepArguments], Changes]:
+        """Return the function (perturbed, x, rates) -> the changes of a solved step.
+
+        The `perturbed` part of the arguments changes at `rates`, and the other part is
+        `fixed`. The function computes the changes of the stages x, of the state at the
+        end and of the record of the step. They are zero unless the step is `ok`.
+        """
+        stages = equations_of_step(arguments, self.method)
+        at, lin, solved = stop_gradient((stages, arguments.step_state.lin, x))
+        frozen_newton_map = self.stage_solver.frozen_newton_map(at, lin, solved)
+        # The solver started from a good guess. This iteration starts from zero, so it
+        # may take twice as many iterations.
+        limit = 2 * self.stage_solver.max_iterations
+
+        def iteration(perturbed, x):
+            arguments = eqx.combine(perturbed, fixed)
+            return frozen_newton_map(equations_of_step(arguments, self.method), x)
+
+        def end(perturbed, x):
+            return _end(eqx.combine(perturbed, fixed), self.method, x)
+
+        def changes(perturbed, x, rates):
+            rates, units = zero_unless(ok, rates), unknown_units(at, lin)
+            dx = fixed_point_tangent(
+                iteration, perturbed, rates, x, units, max_iterations=limit
+            )
+            _, dend = jax.jvp(
+                ClosureConverted(end, perturbed, x),
+                (perturbed, x),
+                (rates, zero_unless(ok, dx)),
+            )
+            return zero_unless(ok, (dx, *dend))
+
+        return changes
+
+
+def tangent_of_outcome(outcome: StepOutcome, changes: Changes) -> StepOutcome:
+    """Return the tangent of an outcome, given the changes of its stages and its end."""
+    none = jax.tree.map(lambda _: None, outcome)
+    return eqx.tree_at(
+        lambda outcome: (outcome.stages, outcome.step_state.state, outcome.record),
+        none,
+        changes,
+        is_leaf=lambda leaf: leaf is None,
+    )
+
+
+def _end(
+    arguments: StepArguments, method: AbstractMethod, x: StageUnknowns
+) -> tuple[State, StepRecord]:
+    """Compute the state at the end of a step and its record, given only the stages.
+
+    `step` computes the same end up to round-off. Here p follows from the fibre
+    coordinate at the end, and there are no compensated sums, because the compensation
+    has no derivative.
+    """
+    system, args, start = arguments.system, arguments.args, arguments.step_state.state
+    stages = equations_of_step(arguments, method)
+    t, u = arguments.t + arguments.h, x.node_fibre_coordinate[-1]
+    q = unframed(end_position(stages, x))
+    p = system.momentum(t, q, u, args)
+
+    def continuous():
+        # With the symmetric closure, λ_c is an unknown of the step. But with redundant
+        # constraints, that unknown is not the multiplier of least norm.
+        if stages.end_multiplier_is_unknown and system.constraints != "redundant":
+            return x.end_multiplier
+        return linearise(system, t, q, u, args, may_be_sparse=True).multiplier
+
+    end = end_state(stages, q, u, p, stages.multipliers(x)[-1], continuous)
+    forces = stage_forces(stages, x)
+    return end, step_record(stages, start, x, forces)

@@ -10,11 +10,11 @@ from jaxtyping import Array, Float, PyTree
 from .._custom_types import Args, BoolScalar, FloatScalar, FloatScalarLike
 from .._manifold import AbstractLieGroup
 from .._numerics import (
-    frozen,
     max_norm,
     measured_noise,
     NOISE_DEVIATIONS,
     SparseMatrix,
+    stop_gradient,
     unit,
 )
 from ._abstract import AbstractMechanicalSystem
@@ -157,7 +157,7 @@ def function_noise(
     """
     # Not as arguments: `args` may hold what is no array.
     positions = jax.eval_shape(lambda: system.position_constraint(t, q, args))
-    system, args = frozen((system, args))
+    system, args = stop_gradient((system, args))
 
     def values(t, q, u):
         return FunctionNoise(
@@ -183,7 +183,7 @@ def noise_near(
 
     `like` has the shapes and the type of what it returns; see `measured_noise`.
     """
-    (t, q, u), n = frozen((t, q, u)), u.shape[0]
+    (t, q, u), n = stop_gradient((t, q, u)), u.shape[0]
     # Steps are taken from angles of the first turn, which have no round-off of others.
     q = manifold.wrapped(q, manifold.no_compensation(q))
     return measured_noise(

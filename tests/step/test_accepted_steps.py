@@ -1,4 +1,4 @@
-"""A step is accepted if its equations are solved, and not because it took long."""
+"""A step is accepted only if its equations are solved."""
 
 import warnings
 from functools import cache
@@ -31,7 +31,7 @@ def double_pendulum():
     system = nhjax.LagrangianSystem(
         lambda t, q, v, args: 0.5 * v @ v - 9.81 * (q[1] + q[3]), holonomic=rods
     )
-    # It may be needed first where a run is traced.
+    # The first use may be inside a traced run.
     with jax.ensure_compile_time_eval():
         start = jnp.array([0.6, -0.8, 1.2, -1.6])
         return system, nhjax.initial_state(system, start, jnp.zeros(4))
@@ -45,7 +45,7 @@ def swing(num_steps=9, **options):
     )
 
 
-def test_a_slow_iteration_is_not_taken_for_a_solution():
+def test_slow_iteration_of_stages_is_not_accepted():
     sol = jax.jit(swing)()
     assert sol.result == RESULTS.nonlinear_max_iterations
     assert float(sol.stats["max_constraint_violation"]) < ROUND_OFF
@@ -54,14 +54,14 @@ def test_a_slow_iteration_is_not_taken_for_a_solution():
         swing(stage_solver=nhjax.SimplifiedNewton(fallback=False), throw=True)
 
 
-def test_a_diverging_iteration_is_told_from_a_slow_one():
+def test_diverging_iteration_of_stages_has_result_of_its_own():
     sol = swing(dt=3.0, stage_solver=nhjax.SimplifiedNewton(fallback=False))
     assert sol.result == RESULTS.nonlinear_divergence
     assert int(sol.stats["num_iterations"]) < 100
 
 
 @pytest.mark.parametrize("compiled", [False, True], ids=["plain", "jit"])
-def test_newtons_method_takes_over_steps_that_need_it(compiled):
+def test_fallback_in_steps_that_need_newton_solves_them(compiled):
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         if compiled:
@@ -82,7 +82,7 @@ def test_newtons_method_takes_over_steps_that_need_it(compiled):
         )
 
 
-def test_message_under_jit_names_the_fallback_that_solves_the_step():
+def test_message_of_unsolved_step_under_jit_names_the_fallback():
     with pytest.raises((RuntimeError, ValueError)) as failure:
         jax.block_until_ready(jax.jit(lambda: swing(throw=True))())
     assert "`stage_solver=nhjax.SimplifiedNewton(fallback=True)`" in str(failure.value)
@@ -91,8 +91,8 @@ def test_message_under_jit_names_the_fallback_that_solves_the_step():
 
 
 @pytest.mark.parametrize("solver", [nhjax.SimplifiedNewton(), nhjax.Newton()])
-def test_message_after_newtons_method_has_failed_does_not_recommend_it(solver):
-    # Friction that jumps: there is no solution in the step in which the body stops.
+def test_message_of_step_unsolved_by_newton_does_not_recommend_newton(solver):
+    # With friction that jumps, the step in which the body stops has no solution.
     system = nhjax.LagrangianSystem(
         lambda t, q, v, args: 0.5 * v @ v, force=lambda t, q, v, args: -jnp.sign(v)
     )
@@ -115,7 +115,7 @@ def test_message_after_newtons_method_has_failed_does_not_recommend_it(solver):
     assert "if all forces are smooth, try 0.015" in message
 
 
-def test_friction_smoothed_as_the_message_says_brings_a_body_to_rest():
+def test_friction_smoothed_as_message_says_brings_body_to_rest():
     system = nhjax.LagrangianSystem(
         lambda t, q, v, args: 0.5 * v @ v,
         force=lambda t, q, v, args: -jnp.tanh(v / 0.01),
@@ -134,11 +134,11 @@ def test_friction_smoothed_as_the_message_says_brings_a_body_to_rest():
     assert abs(float(sol.ys.v[0, 0])) < 1e-10
 
 
-def test_a_plain_call_that_needs_no_newton_step_counts_none():
+def test_num_newton_steps_of_plain_call_without_need_is_zero():
     assert int(swing(dt=0.1).stats["num_newton_steps"]) == 0
 
 
-def test_members_of_a_batch_take_newtons_method_one_by_one():
+def test_fallback_in_a_batch_counts_newton_steps_of_each_member():
     sizes = jnp.array([0.1, 0.5])
     sol = jax.vmap(lambda dt: swing(dt=dt, stage_solver=WITH_NEWTON))(sizes)
     assert [int(x) for x in sol.stats["num_steps"]] == [9, 9]
@@ -147,7 +147,7 @@ def test_members_of_a_batch_take_newtons_method_one_by_one():
     assert int(hard) > 0
 
 
-def test_a_gradient_passes_through_steps_of_newtons_method():
+def test_gradient_through_fallback_steps_is_exact():
     system, y0 = double_pendulum()
 
     def height(dt, solver):
@@ -160,7 +160,7 @@ def test_a_gradient_passes_through_steps_of_newtons_method():
     np.testing.assert_allclose(slopes[0], slopes[1], rtol=1e-8)
 
 
-def test_round_off_that_stiff_forces_magnify_is_no_failure():
+def test_newton_with_round_off_magnified_by_stiff_forces_accepts_steps():
     # Vibrations of 1e-5 about a length of 1, by forces of 1e10 times the length.
     def lagrangian(t, q, v, args):
         return 0.5 * v @ v - 0.5e10 * jnp.sum((q - 1.0) ** 2)
@@ -180,7 +180,7 @@ def test_round_off_that_stiff_forces_magnify_is_no_failure():
         np.testing.assert_allclose(sol.ys.q[0, 0] - 1, 1e-5 * np.cos(phase), atol=1e-6)
 
 
-def test_fallback_must_be_a_flag():
+def test_fallback_that_is_not_a_flag_raises():
     with pytest.raises(TypeError, match="`fallback` must be True or False"):
         nhjax.SimplifiedNewton(fallback="no")  # pyright: ignore[reportArgumentType]
 
@@ -196,19 +196,19 @@ SEARCHED = [
 
 
 @pytest.mark.parametrize(("name", "stages"), SEARCHED)
-def test_no_accepted_step_is_unsolved(name, stages):
+def test_accepted_steps_of_growing_size_are_solved(name, stages):
     figures = measure(name, stages, SYSTEMS[name], num_steps=20)
     for solver in ("simplified", "newton"):
         assert figures[f"{solver} accepted"] > 100
         assert figures[f"{solver} residual"] <= ALLOWED
         assert figures[f"{solver} violation"] <= ALLOWED
-    # The search goes up to failure.
+    # The search continues until steps fail.
     assert figures["simplified accepted"] < 200
     assert figures["distance"] <= SAME
 
 
 @pytest.mark.parametrize("name", ["Morse", long("body, exponential")])
-def test_no_start_leads_to_an_unsolved_step(name):
+def test_accepted_steps_from_random_starts_are_solved(name):
     figures = measure_starts(name, 3, number=1500)
     for solver in ("simplified", "newton"):
         assert figures[f"{solver} accepted"] > 300
@@ -220,7 +220,7 @@ def test_no_start_leads_to_an_unsolved_step(name):
     ("name", "stages"),
     [("KnifeEdge", 2), long("Appell", 3), long("SphericalPendulum", 4)],
 )
-def test_steps_near_rest_are_neither_refused_nor_accepted_wrongly(name, stages):
+def test_accepted_steps_near_rest_are_solved_and_none_is_refused(name, stages):
     rows = list(near_rest.near_rest(name, stages, near_rest.examples()[name], 1))
     assert sum(row["accepted"] for row in rows) > 100
     assert sum(row["accepted judged"] for row in rows) > 0

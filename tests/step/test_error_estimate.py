@@ -17,7 +17,7 @@ def particle(potential):
     return nhjax.LagrangianSystem(lambda t, q, v, args: 0.5 * v @ v - potential(q))
 
 
-# A pendulum in a wind, far from rest, so that nothing in a step is symmetric.
+# A pendulum in wind, far from rest, so that a step has no symmetry.
 PENDULUM = particle(lambda q: -jnp.cos(q[0]) + 0.3 * q[0])
 KNIFE = nhjax.LagrangianSystem(
     lambda t, q, v, args: 0.5 * (v[0] ** 2 + v[1] ** 2) + 0.3 * v[2] ** 2 - 2.0 * q[0],
@@ -48,7 +48,7 @@ def start_of(name):
 
 @functools.cache
 def states_of(name):
-    """States along a motion, as the lanes of a batch."""
+    """Return states along a motion, as a batch."""
     system, y0 = start_of(name)
     saveat = nhjax.SaveAt(steps=True)
     return nhjax.integrate(
@@ -87,7 +87,7 @@ def test_error_estimate_of_step_is_near_true_error_and_of_its_order(name, stages
         estimate, error = estimated_and_true(name, LobattoIIIAB(stages), h)
         assert 0.1 < float(jnp.median(estimate / error)) < 30
         largest.append(float(jnp.max(estimate)))
-    # Where motions turn back, a step of an odd number of stages resolves less.
+    # Near turning points, a step with an odd number of stages is less accurate.
     lost = 1.5 if (name, stages) == ("pendulum", 3) else 0.3
     order = np.log2(largest[1] / largest[0])
     assert 2 * stages - 2 - lost < order < 2 * stages - 2 + 0.3
@@ -102,7 +102,7 @@ def test_error_estimate_of_gauss_method_is_near_true_error_and_of_its_order():
     assert abs(np.log2(largest[1] / largest[0]) - 6) < 0.3
 
 
-def test_error_estimate_of_hamiltonian_system_is_that_of_the_lagrangian_one():
+def test_error_estimate_of_hamiltonian_system_equals_lagrangian_one():
     lagrangian = nhjax.LagrangianSystem(
         lambda t, q, v, args: 1.5 * v @ v + jnp.cos(q[0]) - 0.3 * q[0]
     )
@@ -115,11 +115,11 @@ def test_error_estimate_of_hamiltonian_system_is_that_of_the_lagrangian_one():
     for system, y0 in starts:
         sol = nhjax.integrate(system, LobattoIIIAB(3), y0, dt=0.3, num_steps=1)
         estimates.append(float(sol.stats["max_error_estimate"]))
-    # The one counts velocities and the other momenta, with a mass of 3.
+    # One estimate uses velocities and the other momenta, with a mass of 3.
     assert 0.1 < estimates[0] / estimates[1] < 10
 
 
-def test_error_estimate_does_not_depend_on_units():
+def test_error_estimate_in_other_units_is_the_same():
     estimates = []
     for length, time in ((1.0, 1.0), (1e3, 1e-3), (1e-6, 60.0)):
         system = particle(
@@ -135,14 +135,14 @@ def test_error_estimate_does_not_depend_on_units():
     np.testing.assert_allclose(estimates, estimates[0], rtol=1e-6)
 
 
-def test_method_with_one_node_has_no_error_estimate():
+def test_error_estimate_of_method_with_one_node_is_missing():
     system, y0 = start_of("pendulum")
     sol = nhjax.integrate(system, Gauss(1), y0, dt=0.1, num_steps=2)
     assert "max_error_estimate" not in sol.stats
 
 
 @pytest.mark.parametrize("stages", [2, 3, 4, 5, 6])
-def test_step_of_five_periods_warns_that_nothing_is_right(stages):
+def test_error_estimate_of_step_of_five_periods_warns(stages):
     system = particle(lambda q: 0.5 * q @ q)
     y0 = nhjax.initial_state(system, jnp.ones(1), jnp.zeros(1))
 
@@ -169,7 +169,7 @@ def test_step_of_five_periods_warns_that_nothing_is_right(stages):
         (0.0, 0.0),
     ],
 )
-def test_motion_that_steps_resolve_does_not_warn(stages, force, v):
+def test_error_estimate_of_resolved_motion_does_not_warn(stages, force, v):
     system = nhjax.LagrangianSystem(
         lambda t, q, v, args: 0.5 * v @ v + force * q[0],
         nonholonomic=lambda t, q, v, args: v[1][None],
@@ -181,7 +181,7 @@ def test_motion_that_steps_resolve_does_not_warn(stages, force, v):
     assert float(sol.stats["max_error_estimate"]) < 1e-12
 
 
-def test_machine_at_rest_under_its_weight_does_not_warn():
+def test_error_estimate_of_machine_at_rest_under_its_weight_does_not_warn():
     bicycle = nhjax.systems.WhippleBicycle()
     y0 = bicycle.initial_state()
     y0 = nhjax.initial_state(bicycle.system, y0.q, 0 * y0.v, project=True)

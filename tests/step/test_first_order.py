@@ -1,4 +1,4 @@
-"""Terms of order h in the Jacobian of simplified Newton: what they are, and do."""
+"""Terms of order h in the Jacobian of simplified Newton, and their effect."""
 
 from typing import Any
 
@@ -12,18 +12,18 @@ import nhjax
 from nhjax import systems
 from nhjax._step import first_step_state
 from nhjax._step._factorisation import leading_structure
+from nhjax._step._solvers import starting_values
 from nhjax._step._stage_iteration import corrected
-from nhjax._step._starting_values import starting_values
 from nhjax._step._step import equations_of_step, StepArguments
 from support.forms import in_space
 from support.long import long
 
 
 def contraction(example, method, h):
-    """The spectral radius of one sweep at the solution, with and without the terms.
+    """Return the spectral radius of an iteration, with and without the terms.
 
-    The derivative of the whole sweep by the unknowns is taken by automatic
-    differentiation, which knows nothing of how the terms were found.
+    Automatic differentiation computes the derivative of the whole iteration with
+    respect to the unknowns, independently of the formulas of the terms.
     """
     system, y0, t = example.system, example.initial_state(), jnp.zeros(())
 
@@ -63,10 +63,10 @@ def contraction(example, method, h):
     ],
     ids=lambda x: x if isinstance(x, str) else type(x).__name__,
 )
-def test_a_sweep_contracts_by_the_square_of_the_step(example, chart):
+def test_first_order_iteration_contracts_by_the_square_of_the_step(example, chart):
     method = nhjax.LobattoIIIAB(3, chart=chart)
     (leading, full), (leading_half, full_half) = contraction(example, method, 0.02)
-    # The leading part alone leaves out terms of order h, and shows it.
+    # The leading part leaves out the terms of order h, so it contracts by O(h).
     assert 1.8 < leading / leading_half < 2.2
     assert 3.6 < full / full_half < 4.4
 
@@ -85,7 +85,7 @@ def run(example, stages, dt, **solver):
     )(example.initial_state())
 
 
-def test_large_steps_of_a_sleigh_are_solved_that_the_leading_part_does_not_solve():
+def test_first_order_terms_in_large_steps_of_sleigh_solve_what_leading_part_does_not():
     sleigh = systems.ChaplyginSleigh()
     leading = run(sleigh, 5, 0.5, jacobian="leading")
     assert leading.result == nhjax.RESULTS.nonlinear_max_iterations
@@ -105,7 +105,7 @@ def test_large_steps_of_a_sleigh_are_solved_that_the_leading_part_does_not_solve
         np.testing.assert_allclose(one, other, rtol=0, atol=1e-12, err_msg=name)
 
 
-def test_where_the_mass_is_constant_and_forces_do_not_depend_on_v_nothing_is_added():
+def test_first_order_terms_that_vanish_are_left_out():
     particle = systems.NonholonomicParticle()
     default, leading = (
         jax.make_jaxpr(
@@ -131,7 +131,7 @@ def test_where_the_mass_is_constant_and_forces_do_not_depend_on_v_nothing_is_add
 
 @jax.custom_vjp
 def in_reverse_mode_alone(v):
-    """A force of v with a rule of derivatives for reverse mode alone."""
+    """A force of v with a derivative rule only for reverse mode."""
     return -0.1 * v
 
 
@@ -141,7 +141,7 @@ in_reverse_mode_alone.defvjp(
 
 
 def from_outside(v):
-    """The same force, computed outside of JAX."""
+    """The same force, computed in a callback outside of JAX."""
     shape = jax.ShapeDtypeStruct(v.shape, v.dtype)
     return jax.pure_callback(
         lambda v: -0.1 * np.asarray(v), shape, v, vmap_method="expand_dims"
@@ -159,7 +159,7 @@ def from_outside(v):
     ],
     ids=["reverse mode", "callback", "drag at rest", "steep friction"],
 )
-def test_forces_need_no_finite_slopes(force, like):
+def test_first_order_terms_with_forces_of_infinite_slope_solve_steps(force, like):
     def fall(force, solver):
         system = nhjax.LagrangianSystem(
             lambda t, q, v, args: 0.5 * v @ v - q[0],
@@ -180,7 +180,7 @@ def test_forces_need_no_finite_slopes(force, like):
     np.testing.assert_allclose(sol.ys.v, leading.ys.v, rtol=0, atol=1e-13)
 
 
-def test_terms_that_are_not_available_are_refused():
+def test_first_order_terms_that_are_not_available_raise():
     wrong: Any = "exact"
     with pytest.raises(ValueError, match="jacobian must be one of 'leading'"):
         nhjax.SimplifiedNewton(jacobian=wrong)

@@ -9,15 +9,15 @@ from jax.flatten_util import ravel_pytree
 
 import nhjax
 from nhjax._step import first_step_state
-from nhjax._step._positions import end_position
-from nhjax._step._stage_equations import (
+from nhjax._step._equations import (
+    end_position,
     holonomic_constraint,
     node_residual,
     stage_forces,
     stage_velocities,
+    StageEquations,
 )
-from nhjax._step._stage_system import StageSystem
-from nhjax._step._starting_values import starting_values
+from nhjax._step._solvers import starting_values
 from support.forms import (
     free_forms,
     GAUSS,
@@ -51,7 +51,9 @@ from support.long import long
         (in_rotation, "nonholonomic", True, 3),
     ],
 )
-def test_both_forms_take_the_same_steps(build, constraint, in_time, stages):
+def test_steps_of_lagrangian_and_hamiltonian_form_are_equal(
+    build, constraint, in_time, stages
+):
     start = build(constraint, in_time)
     runs = [
         nhjax.integrate(
@@ -67,7 +69,7 @@ def test_both_forms_take_the_same_steps(build, constraint, in_time, stages):
     for name in ("q", "v", "p", "multiplier"):
         one, other = (getattr(run, name) for run in runs)
         np.testing.assert_allclose(one, other, rtol=0, atol=1e-12, err_msg=name)
-    # A multiplier is there, and something happens.
+    # The run has a multiplier that is not zero, and the state changes.
     assert np.all(np.ptp(runs[0].multiplier, axis=0) > 1e-3)
     assert np.ptp(runs[0].p, axis=0).max() > 1e-2
 
@@ -105,7 +107,7 @@ def one_step(system, method, y0):
     def run(y0):
         t, h = jnp.zeros(()), jnp.asarray(STEP)
         lin = first_step_state(system, method, t, y0, None).lin
-        stages = StageSystem(system, method, t, h, y0.q, y0.p, lin.multiplier, None)
+        stages = StageEquations(system, method, t, h, y0.q, y0.p, lin.multiplier, None)
         x0 = starting_values(stages, system.fibre_coordinate(y0), lin)
         solver = nhjax.SimplifiedNewton()
         solved = solver.solve(stages, x0, lin, jnp.asarray(False)).x
@@ -160,7 +162,7 @@ def form_defect(start, form, method, tangent=None):
     ],
     ids=str,
 )
-def test_steps_in_space_are_symplectic(method, form):
+def test_steps_on_vector_space_are_symplectic(method, form):
     assert form_defect(in_space(), form, method) <= 1e-12
 
 

@@ -10,9 +10,8 @@ import pytest
 import nhjax
 from nhjax._compile import as_cpu_kernel
 from nhjax._manifold import unframed
-from nhjax._step._positions import end_position
-from nhjax._step._stage_system import StageSystem
-from nhjax._step._starting_values import starting_values
+from nhjax._step._equations import end_position, StageEquations
+from nhjax._step._solvers import starting_values
 from nhjax._step._step import equations_of_step, first_step_state, StepArguments
 from support.group_problems import RETRACTIONS
 from support.long import long
@@ -82,14 +81,16 @@ def body(form, retraction):
         long("hamiltonian", "cayley", "middle"),
     ],
 )
-def test_equations_of_a_step_are_the_same_with_frames(form, retraction, chart):
+def test_step_equations_with_frames_are_those_of_plain_positions(
+    form, retraction, chart
+):
     system, y0 = body(form, retraction)
     method, t = nhjax.LobattoIIIAB(3, chart=chart), jnp.asarray(0.0)
     given = first_step_state(system, method, t, y0, None)
     arguments = StepArguments(system, t, jnp.asarray(0.1), given, None)
     stages = equations_of_step(arguments, method)
     plain = replace(stages, system=system, q=unframed(stages.q))
-    assert isinstance(plain, StageSystem)
+    assert isinstance(plain, StageEquations)
     x = starting_values(stages, system.fibre_coordinate(y0), given.lin)
     key = jax.random.key(0)
     x = jax.tree.map(lambda z: z + 0.1 * jax.random.normal(key, z.shape), x)
@@ -103,7 +104,7 @@ def test_equations_of_a_step_are_the_same_with_frames(form, retraction, chart):
 
 
 class TurnsByHand(nhjax.SE2):
-    """A group of a user, whose methods know elements of three numbers alone."""
+    """A user's group, whose methods accept only elements of three numbers."""
 
     def act(self, g, xi):
         return self.compose(g, self.retract(xi))
@@ -116,14 +117,14 @@ class TurnsByHand(nhjax.SE2):
 
 
 class WithAMomentum(nhjax.LagrangianSystem):
-    """A system of a user, with a method that reads a position."""
+    """A user's system, with a method that reads a position."""
 
     def momentum(self, t, q, u, args=None):
         return u * (1 + 0 * q[2])
 
 
 @pytest.mark.parametrize("own", ["group", "system"])
-def test_subclasses_of_a_user_are_given_positions_alone(own):
+def test_system_functions_of_a_subclass_with_frames_receive_plain_positions(own):
     kind = WithAMomentum if own == "system" else nhjax.LagrangianSystem
 
     def run(kind, group):

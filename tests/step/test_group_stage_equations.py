@@ -28,8 +28,8 @@ from support.long import long_but
 
 
 TOLERANCE = 1e-14
-# Holonomic constraints give Λ_hol to the round-off of Φ / h² alone, and the recorded
-# Λ_hol is one iterate older than the recorded H.
+# Λ_hol has the round-off of Φ / h², and the recorded Λ_hol is one iterate older than
+# the recorded H.
 HOLONOMIC_TOLERANCE = 5e-14
 STEP = 0.1
 
@@ -57,26 +57,26 @@ class Case(NamedTuple):
 
 
 def covering_selection():
-    """Every problem in both forms, one with either retraction; the rest takes turns."""
+    """Return every problem in both forms, with alternating retractions and options."""
     rest = list(product(CHARTS, CLOSURES, SOLVERS, (2, 3, 4)))
     for turn, (name, form) in enumerate(product(BUILDERS, FORMS)):
         flat = name in ON_VECTOR_SPACES
         retraction = list(RETRACTIONS)[0 if flat else (turn + turn // 2) % 2]
-        # 7 and 36 are coprime: no combination comes twice, and neighbours differ.
+        # 7 and 36 are coprime, so no combination repeats, and neighbours differ.
         chart, closure, solver, stages = rest[(7 * turn + 1) % len(rest)]
-        if name in ON_SE3:  # where the dense one takes long to compile
+        if name in ON_SE3:  # The dense solver takes long to compile there.
             solver = "simplified"
         yield Case(name, form, retraction, stages, closure, solver, chart)
 
 
 CASES = list(covering_selection())
-# Every problem, with its forms in turns.
+# Every problem, alternating between its two forms.
 QUICK = [case for turn, case in enumerate(CASES) if (turn + turn // 2) % 2 == 0]
 WITH_CLOSURE = [case for case in CASES if case.name not in WITHOUT_CLOSURE]
 
 
 def over(cases):
-    """The cases, of which those of each problem in one of its forms are quick."""
+    """Return the cases; only one form of each problem belongs to the short tests."""
     quick = [case for case in cases if case in QUICK]
     return pytest.mark.parametrize(
         "case", long_but(quick, cases), ids=lambda case: "-".join(map(str, case))
@@ -85,7 +85,7 @@ def over(cases):
 
 @cache
 def steps_of(case):
-    """Three steps, the first from a state that is nothing special either."""
+    """Return three steps; the first one starts from a generic state, too."""
     return solved_steps(
         case.problem.forms[case.form],
         nhjax.LobattoIIIAB(case.stages, case.closure, case.chart),
@@ -96,7 +96,7 @@ def steps_of(case):
 
 
 def split(case, multiplier):
-    """The nonholonomic and the holonomic columns."""
+    """Split multipliers into the nonholonomic and the holonomic columns."""
     mechanics, y0 = case.problem.mechanics, case.problem.y0
     m = len(mechanics.phi(case.problem.element(y0.q), np.asarray(y0.v)))
     return multiplier[..., :m], multiplier[..., m:]
@@ -119,7 +119,7 @@ def at_nodes(case, taken):
 
 
 def node_velocities(case, taken):
-    """η^1..η^s; where the library has no unknowns, from the momenta at the nodes."""
+    """η^1..η^s, from the momenta at the nodes if the step has no such unknowns."""
     velocities = [
         case.problem.mechanics.d2h(g, mu)
         for g, mu in zip(*at_nodes(case, taken), strict=True)
@@ -130,7 +130,7 @@ def node_velocities(case, taken):
 
 
 def on_paper(case, taken):
-    """(g_k, μ_k) and the stages of a step as the oracle has them."""
+    """(g_k, μ_k) and the stages of a step in the notation of the oracle."""
     x, element = taken.stages, case.problem.element
     shared = x.velocity, *split(case, taken.multiplier)
     end = element(taken.end.q), taken.end.p
@@ -150,7 +150,7 @@ def on_paper(case, taken):
 
 
 def residuals(case, g, mu, stages):
-    """The relative residuals of the summary that the case is about."""
+    """The relative residuals of the paper's summary for the case."""
     mechanics = case.problem.mechanics
     where = "residuals" if mechanics.group is None else "group_residuals"
     function = getattr(paper, f"{case.form}_{where}")
@@ -184,7 +184,7 @@ def closure_defects(case, taken):
 
 
 @over(CASES)
-def test_every_equation_of_the_paper_holds_to_round_off(case):
+def test_equations_of_the_paper_on_groups_hold_to_round_off(case):
     for taken in steps_of(case):
         holonomic = taken.stages.holonomic.size > 0
         tolerance = HOLONOMIC_TOLERANCE if holonomic else TOLERANCE
@@ -193,7 +193,7 @@ def test_every_equation_of_the_paper_holds_to_round_off(case):
 
 
 @over(WITH_CLOSURE)
-def test_multipliers_obey_their_closure(case):
+def test_multipliers_of_group_steps_obey_their_closure(case):
     for taken in steps_of(case):
         size = np.max(np.abs(taken.multiplier))
         for relation, defect in closure_defects(case, taken).items():
@@ -202,7 +202,7 @@ def test_multipliers_obey_their_closure(case):
 
 
 @over(CASES)
-def test_fibre_coordinates_belong_together(case):
+def test_velocity_and_momentum_of_group_steps_obey_legendre_transform(case):
     mechanics = case.problem.mechanics
     for taken in steps_of(case):
         elements, momenta = at_nodes(case, taken)
@@ -215,15 +215,15 @@ def test_fibre_coordinates_belong_together(case):
             fibre = np.stack([mechanics.d2h(g, mu) for g, mu in pairs])
         known = taken.stages.node_fibre_coordinate
         # An iteration ends when increments of up to 30 eps no longer fall, relative to
-        # momenta and to what forces add to them in a step. The state is summed from
-        # the forces and does not see the last increment; interior nodes do. With three
-        # releases of JAX the largest difference is 62 eps.
+        # the momenta plus their change by forces in a step. The state is the sum of the
+        # forces and does not contain the last increment, but interior nodes contain it.
+        # With three releases of JAX the largest difference is 62 eps.
         size = np.max(np.abs(fibre)) + STEP * np.max(np.abs(taken.force))
         atol = 100 * np.finfo(float).eps * size
         np.testing.assert_allclose(known, fibre[-len(known) :], rtol=0, atol=atol)
 
 
-def test_every_pair_of_choices_is_tested():
+def test_cases_of_group_steps_contain_every_pair_of_choices():
     choices = {
         "name": BUILDERS,
         "form": FORMS,
@@ -239,7 +239,7 @@ def test_every_pair_of_choices_is_tested():
         assert found == set(product(choices[first], choices[second]))
 
 
-# Whether the oracle would see anything
+# The oracle detects errors
 
 FULL = [
     next(c for c in CASES if c[:2] == (name, form))
@@ -250,14 +250,14 @@ FULL = [
 
 @over(FULL)
 @pytest.mark.parametrize("array", ["H", "Lambda", "Lambda_hol", "g_next", "mu_next"])
-def test_the_residuals_see_an_error_in_each_array(case, array):
+def test_group_residuals_of_a_record_with_an_error_are_above_round_off(case, array):
     g, mu, stages = on_paper(case, steps_of(case)[-1])
     wrong = stages.perturbed(array, 1e-10)
     assert max(residuals(case, g, mu, wrong).values()) > 1e-13
 
 
 @over(FULL)
-def test_the_residuals_see_an_error_in_the_fibre_coordinates_and_at_the_start(case):
+def test_group_residuals_of_a_state_with_an_error_are_above_round_off(case):
     g, mu, stages = on_paper(case, steps_of(case)[-1])
     own = "eta_nodes" if case.form == "lagrangian" else "Pi"
     wrong = stages.perturbed(own, 1e-10)
@@ -268,7 +268,7 @@ def test_the_residuals_see_an_error_in_the_fibre_coordinates_and_at_the_start(ca
 
 
 @over([case for case in CASES if case.name == "Suslov"])
-def test_the_residuals_tell_the_retractions_apart(case):
+def test_group_residuals_with_another_retraction_are_above_round_off(case):
     [other] = set(RETRACTIONS) - {case.retraction}
     found = residuals(
         case._replace(retraction=other), *on_paper(case, steps_of(case)[-1])
@@ -277,14 +277,14 @@ def test_the_residuals_tell_the_retractions_apart(case):
 
 
 @over([case for case in CASES if case.name in ("Suslov", "anisotropic")])
-def test_the_residuals_tell_the_charts_apart(case):
+def test_group_residuals_with_another_chart_are_above_round_off(case):
     [other] = set(CHARTS) - {case.chart}
     found = residuals(case._replace(chart=other), *on_paper(case, steps_of(case)[-1]))
     assert max(found.values()) > 1e-6
 
 
 @over([case for case in WITH_CLOSURE if case.name in ("Suslov", "varying mass")])
-def test_the_defects_tell_the_closures_apart(case):
+def test_multiplier_defects_with_another_closure_are_above_round_off(case):
     taken = steps_of(case)[-1]
     for claimed in CLOSURES:
         found = closure_defects(case._replace(closure=claimed), taken)

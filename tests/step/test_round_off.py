@@ -1,4 +1,4 @@
-"""Solved steps near rest are not refused, and starts with round-off alone are taken."""
+"""Solved steps near rest are accepted, and so are starts with only round-off errors."""
 
 import equinox as eqx
 import jax
@@ -61,12 +61,12 @@ def test_noise_of_function_that_hides_small_changes_beside_a_constant(constant):
         return (constant + dx / constant) ** 2 - constant**2 + dx**2
 
     (noise,) = measured_noise(hides, 1, jnp.zeros(1))
-    # The round-off of numbers of the size of the square of the constant.
+    # This is the round-off of numbers as large as the square of the constant.
     assert 1e-17 * constant**2 < noise < 1e-15 * constant**2
 
 
 def test_noise_of_smooth_function_in_small_units_is_round_off():
-    # A length of 1e-8 units in which the function turns.
+    # The function changes direction within a length of 1e-8 units.
     (noise,) = measured_noise(lambda dx: jnp.sin(0.4 + dx / 1e-8), 1, jnp.zeros(1))
     assert noise < 1e-14
 
@@ -116,7 +116,7 @@ def test_runs_from_states_near_zero_are_not_refused(size, constraints):
         constraints=constraints,
     )
     y0 = nhjax.initial_state(system, jnp.array([size, size, 0.0]), jnp.zeros(3))
-    # Steps so short that velocities stay small.
+    # The steps are so short that velocities stay small.
     sol = nhjax.integrate(
         system, nhjax.LobattoIIIAB(3), y0, dt=1e-8, num_steps=5, throw=False
     )
@@ -161,7 +161,7 @@ def test_energy_with_constants_that_cancel_is_kept_near_rest(speed, dt, solver):
 
 
 def test_condition_that_starts_within_its_round_off_of_zero_starts_at_zero():
-    # The condition is -2e-16 at the start, at rest, from where it rises.
+    # At rest, at the start, the condition is -2e-16; then it increases.
     system = nhjax.LagrangianSystem(lambda t, q, v, args: 0.5 * v @ v + q[0])
     y0 = nhjax.initial_state(system, jnp.array([0.0, 1.5e-8]), jnp.zeros(2))
     event = nhjax.Event(lambda t, y, args: (1.02 + y.q[0]) * jnp.cos(y.q[1]) - 1.02)
@@ -221,6 +221,6 @@ def test_upright_bicycle_falls_from_rest_until_it_lies_at_45_degrees(stages):
     assert float(sol.stats["max_constraint_violation"]) < 1e-13
     end = jax.tree.map(lambda x: x[0], sol.ys)
     gained = system.energy(sol.t1, end, None) - system.energy(0.0, y0, None)
-    # Of a kinetic energy of some 250 J.
+    # The kinetic energy is about 250 J.
     allowed = {2: 1.0, 3: 1e-3, 4: 1e-6, 5: 1e-8, 6: 1e-9}[stages]
     assert abs(float(gained)) < allowed

@@ -64,7 +64,7 @@ def run_of(sol, h=helpers.RECORDED_STEP):
 
 
 def part_of(run, name):
-    """One of the systems side by side."""
+    """Return the part of a run that belongs to one of the systems side by side."""
     sizes = [SIZES.get(part, 3) for part in SIDE_BY_SIDE]
     k = SIDE_BY_SIDE.index(name)
     at = slice(sum(sizes[:k]), sum(sizes[: k + 1]))
@@ -94,7 +94,9 @@ every_solver = pytest.mark.parametrize("solver", SOLVERS)
 @every_closure
 @every_solver
 @pytest.mark.parametrize("stages", [2, 3, long(4), long(5)])
-def test_every_equation_of_the_paper_holds_to_round_off(stages, solver, closure):
+def test_equations_of_the_paper_on_vector_space_hold_to_round_off(
+    stages, solver, closure
+):
     run = run_of(recorded("side by side", stages, closure, solver))
     for name in SIDE_BY_SIDE:
         assert_equations_hold(name, part_of(run, name), closure)
@@ -110,12 +112,12 @@ def test_every_equation_of_the_paper_holds_to_round_off(stages, solver, closure)
         ("driven", "symmetric"),
     ],
 )
-def test_every_equation_of_the_paper_holds_for_a_system_on_its_own(name, closure):
+def test_equations_of_the_paper_for_one_system_alone_hold_to_round_off(name, closure):
     run = run_of(recorded(name, 3, closure, "simplified"))
     assert_equations_hold(name, run, closure)
 
 
-def test_the_equations_hold_backwards_from_a_later_time():
+def test_equations_of_the_paper_for_negative_steps_hold_to_round_off():
     system, y0, args = helpers.problem("driven")
     later = nhjax.initial_state(system, y0.q, y0.v, t=0.7, args=args, project=True)
     sol = helpers.integrate_recorded(
@@ -125,7 +127,7 @@ def test_the_equations_hold_backwards_from_a_later_time():
 
 
 @pytest.mark.long
-def test_the_equations_hold_for_large_steps():
+def test_equations_of_the_paper_for_large_steps_hold_to_round_off():
     start = helpers.problem("side by side")[1]
     sol = helpers.integrate_recorded(
         "side by side", 4, "symmetric", "dense", start, dt=0.4
@@ -138,7 +140,7 @@ def test_the_equations_hold_for_large_steps():
 
 
 @every_closure
-def test_records_start_at_the_saved_nodes(closure):
+def test_step_records_start_at_saved_nodes(closure):
     sol = recorded("sleigh", 3, closure, "simplified")
     assert sol.interpolation is not None
     starts = sol.interpolation.records.start
@@ -149,13 +151,13 @@ def test_records_start_at_the_saved_nodes(closure):
 
 @every_closure
 @pytest.mark.parametrize("array", ["q", "v", "p", "multiplier", "V", "W", "Lambda"])
-def test_the_residuals_see_an_error_in_each_array(array, closure):
+def test_stage_residuals_of_a_record_with_an_error_are_above_round_off(array, closure):
     run = run_of(recorded("particle", 3, closure, "simplified"))
     wrong = run.perturbed(array, 1e-11)
     assert max(paper.residuals(MECHANICS["particle"], wrong, closure).values()) > 1e-13
 
 
-def test_the_residuals_tell_the_closures_apart():
+def test_stage_residuals_with_another_closure_are_above_round_off():
     runs = {c: run_of(recorded("sleigh", 3, c, "simplified")) for c in CLOSURES}
     for taken in CLOSURES:
         for claimed in CLOSURES:
@@ -163,7 +165,7 @@ def test_the_residuals_tell_the_closures_apart():
             assert (max(found.values()) <= TOLERANCE) == (taken == claimed)
 
 
-def test_coefficients_from_the_definitions_are_the_published_ones():
+def test_lobatto_coefficients_from_definitions_equal_published_ones():
     # Hairer, Lubich and Wanner, "Geometric Numerical Integration", tables II.1.1, 1.2.
     a = [[0, 0, 0], [5 / 24, 1 / 3, -1 / 24], [1 / 6, 2 / 3, 1 / 6]]
     a_hat = [[1 / 6, -1 / 6, 0], [1 / 6, 1 / 3, 0], [1 / 6, 5 / 6, 0]]
@@ -175,7 +177,7 @@ def test_coefficients_from_the_definitions_are_the_published_ones():
 
 
 @pytest.mark.parametrize("stages", range(2, 8))
-def test_coefficients_of_the_library_are_those_of_the_definitions(stages):
+def test_lobatto_coefficients_of_library_equal_definitions(stages):
     pair, method = paper.lobatto(stages), nhjax.LobattoIIIAB(stages)
     for name in ("a", "a_hat", "b", "c"):
         np.testing.assert_allclose(

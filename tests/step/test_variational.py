@@ -60,14 +60,16 @@ OMEGA = np.array([0.7, -0.4, 1.3])
 
 
 @both_ways
-def test_a_free_rigid_body_keeps_its_spatial_angular_momentum(form, retraction, chart):
+def test_steps_of_free_rigid_body_keep_spatial_angular_momentum(
+    form, retraction, chart
+):
     group = nhjax.SO3(RETRACTIONS[retraction])
     start = Start(free_forms(group, INERTIA), QUATERNION, OMEGA)
     assert_conserved(start, form, lambda q, p: group.matrix(q) @ p, chart)
 
 
 @crosswise
-def test_a_heavy_top_keeps_its_vertical_angular_momentum(form, retraction, chart):
+def test_steps_of_heavy_top_keep_vertical_angular_momentum(form, retraction, chart):
     group = nhjax.SO3(RETRACTIONS[retraction])
     forms = free_forms(group, INERTIA, lambda q: 0.5 * group.matrix(q)[2, 2])
     start = Start(forms, QUATERNION, OMEGA)
@@ -77,9 +79,9 @@ def test_a_heavy_top_keeps_its_vertical_angular_momentum(form, retraction, chart
 
 
 @both_ways
-def test_a_free_body_in_the_plane_keeps_its_momenta(form, retraction, chart):
+def test_steps_of_free_planar_body_keep_momenta(form, retraction, chart):
     group = nhjax.SE2(RETRACTIONS[retraction])
-    # So slow that the angle θ, and with it R(θ), has enough digits to the end.
+    # The motion is so slow that θ and R(θ) are accurate enough until the end.
     q, v = np.array([0.3, -0.2, 0.4]), np.array([0.05, 0.02, 0.3])
 
     def momentum(q, p):
@@ -91,13 +93,13 @@ def test_a_free_body_in_the_plane_keeps_its_momenta(form, retraction, chart):
 
     start = Start(free_forms(group, INERTIA), q, v)
     assert_conserved(start, form, momentum, chart)
-    # Known to the arm times the round-off of the linear one.
+    # Its round-off is the arm times the round-off of the linear momentum.
     about_origin = momenta_along(start, form, angular_momentum, chart)
     assert np.max(np.abs(about_origin - about_origin[0])) <= 1e-13
 
 
 @crosswise
-def test_a_falling_body_keeps_its_horizontal_momenta(form, retraction, chart):
+def test_steps_of_falling_body_keep_horizontal_momenta(form, retraction, chart):
     group = nhjax.SE3(RETRACTIONS[retraction])
     q = np.append(QUATERNION, [0.1, 0.2, 0.3])
     v = np.append([0.04, -0.03, 0.02], OMEGA)
@@ -110,7 +112,7 @@ def test_a_falling_body_keeps_its_horizontal_momenta(form, retraction, chart):
 
 
 @pytest.mark.parametrize("form", FORMS)
-def test_a_spherical_pendulum_keeps_its_vertical_angular_momentum(form):
+def test_steps_of_spherical_pendulum_keep_vertical_angular_momentum(form):
     pendulum = nhjax.systems.SphericalPendulum()
     q, v = np.asarray(pendulum.q0), np.asarray(pendulum.v0)
     weight = 1.3
@@ -166,7 +168,7 @@ def slopes(function, directions):
         long(4, "lagrangian", "middle"),
     ],
 )
-def test_unconstrained_steps_on_groups_extremise_the_discrete_action(
+def test_steps_on_groups_without_constraints_extremise_discrete_action(
     stages, form, chart
 ):
     top, tableau = problem("heavy top"), paper.lobatto(stages)
@@ -205,7 +207,7 @@ def rattle(q, p, h):
 
 
 @pytest.mark.parametrize("form", ["lagrangian", "hamiltonian"])
-def test_two_stages_with_a_holonomic_constraint_are_rattle(form):
+def test_step_of_two_stages_with_holonomic_constraint_is_rattle(form):
     pendulum = nhjax.systems.SphericalPendulum()
     system = pendulum.system
     if form == "hamiltonian":

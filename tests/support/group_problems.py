@@ -11,7 +11,7 @@ from jaxtyping import Array
 
 import nhjax
 from nhjax._step import first_step_state, step, StepArguments
-from nhjax._step._unknowns import Stages
+from nhjax._step._equations import StageUnknowns
 from nhjax._system import State
 from support import group_mechanics as by_hand
 from support.group_mechanics import MatrixGroup
@@ -330,7 +330,7 @@ class SolvedStep(NamedTuple):
 
     start: State
     end: State
-    stages: Stages
+    stages: StageUnknowns
     force: Array
     multiplier: Array
 

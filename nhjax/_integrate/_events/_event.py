@@ -309,7 +309,7 @@ def with_continuous_multiplier(
 
     Only the propagated closure leaves another multiplier in the states of a run.
     """
-    if method.closure != "propagated":
+    if not method.carries_multiplier:
         return y
     u = system.fibre_coordinate(y)
     lin = linearise(system, t, y.q, u, args, may_be_sparse=True)

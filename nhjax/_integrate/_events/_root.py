@@ -1,25 +1,24 @@
 """A step of a run with events, whole or truncated at the first event."""
 
-from typing import Any, NamedTuple
+from collections.abc import Callable
+from typing import Any, NamedTuple, TypeAlias
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from ..._compile import as_cpu_kernel, TraceCache
+from ..._compile import TraceCache
 from ..._custom_types import BoolScalar, FloatScalar
 from ..._method import AbstractMethod
-from ..._numerics import has_tangent, nan_tangent_unless, zero_unless
-from ..._results import RESULTS
-from ..._step import (
-    AbstractStageSolver,
-    change_of_step,
-    primitive_step,
-    StepArguments,
-    StepOutcome,
-    tangent_of_outcome,
+from ..._numerics import (
+    AbstractImplicitFunction,
+    has_tangent,
+    nan_tangent_unless,
+    zero_unless,
 )
+from ..._results import RESULTS
+from ..._step import ImplicitStep, StepArguments, StepOutcome, tangent_of_outcome
 from ..._system import State
 from ._event import Conditions, ConditionSigns, with_continuous_multiplier
 
@@ -41,70 +40,6 @@ class TruncatedStep(NamedTuple):
     crossed: Bool[Array, " e"]
 
 
-class TruncationOptions(eqx.Module):
-    """How a step is taken, and whether it is truncated.
-
-    - `skip`: whether to do nothing, because the result is discarded.
-    - `signs`: the signs of the conditions at the start of the step.
-    - `truncates`: whether to truncate the step at the first event in it.
-    - `values_at_end`: in that case the conditions at the end of the whole step.
-    - `known_event`: the event at which a step of the given size is known to end, -1 for
-        none; None if the event must be searched for.
-    """
-
-    method: AbstractMethod = eqx.field(static=True)
-    stage_solver: AbstractStageSolver
-    skip: BoolScalar
-    signs: ConditionSigns
-    truncates: BoolScalar
-    values_at_end: Float[Array, " e"]
-    known_event: Int[Array, ""] | None
-
-    def without_start_zero(
-        self, values: Float[Array, " e"], h: FloatScalar
-    ) -> Float[Array, " e"]:
-        """Divide the conditions that are zero at the start by the size of the step.
-
-        This removes the zero at the start and keeps all other zeros.
-        """
-        return jnp.where(self.signs.at_zero, values / jnp.abs(h), values)
-
-
-@eqx.filter_custom_jvp
-def _differentiable_step(
-    arguments: StepArguments,
-    conditions: Conditions,
-    options: TruncationOptions,
-    programs: TraceCache,
-) -> TruncatedStep:
-    """Take a step of size h, or of size θ h if it is truncated at the first event.
-
-    The size θ h of a truncated step is a root of g(t + θ h, y(θ h)), where g is the
-    condition of the event and y the end of the step, so that
-
-    d(θ h) = - (∂g/∂h)⁻¹ dg,
-
-    with dg at fixed size. If g does not change with the size, the derivative is NaN.
-    """
-    h, none = arguments.h, -jnp.ones((), jnp.int32)
-    found = _Found(h, none, RESULTS.successful)
-    if options.known_event is not None:
-        found = found._replace(fired=options.known_event)
-    else:
-        found = jax.lax.cond(
-            options.truncates,
-            lambda: _first(arguments, conditions, options, programs),
-            lambda: found,
-        )
-    step = _trial(arguments, conditions, options, programs, found.h)
-    result = RESULTS.where(
-        found.result == RESULTS.successful, step.outcome.result, found.result
-    )
-    return step._replace(
-        outcome=step.outcome._replace(result=result), fired=found.fired
-    )
-
-
 class _Found(NamedTuple):
     """The size of a truncated step and its event, or why the search failed."""
 
@@ -113,61 +48,200 @@ class _Found(NamedTuple):
     result: RESULTS
 
 
-def _first(
-    arguments: StepArguments,
-    conditions: Conditions,
-    options: TruncationOptions,
-    programs: TraceCache,
-) -> _Found:
-    """Find the first event in a step, by steps of other sizes from the same start."""
-    h, sign = arguments.h, options.signs.sign
-    values_at_end = options.without_start_zero(options.values_at_end, h)
-    one = jnp.ones((), h.dtype)
-    whole = Bracket.open_from(options.signs.value)
-    whole = whole.with_point(
-        one, values_at_end, conditions.crossed(sign, values_at_end)
-    )
+# The arguments of a step, and the conditions of its events.
+Given: TypeAlias = tuple[StepArguments, Conditions]
 
-    def narrower(search: tuple[Bracket, FloatScalar, RESULTS]):
-        bracket, _, _ = search
-        theta = bracket.next_place()
-        step = _trial(arguments, conditions, options, programs, theta * h)
-        values = options.without_start_zero(step.values, step.h)
-        return (
-            bracket.with_point(theta, values, step.crossed),
-            theta,
-            step.outcome.result,
+
+class ImplicitTruncatedStep(AbstractImplicitFunction[Given, TruncatedStep]):
+    """A step of size h, or of size θ h if it is truncated at the first event.
+
+    The size θ h of a truncated step is a root of g(t + θ h, y(θ h)), where g is the
+    condition of the event and y the end of the step, so that
+
+    d(θ h) = - (∂g/∂h)⁻¹ dg,
+
+    with dg at fixed size. If g does not change with the size, the derivative is NaN.
+
+    - `step`: the step of any size.
+    - `signs`: the signs of the conditions at the start of the step.
+    - `truncates`: whether to truncate the step at the first event in it.
+    - `values_at_end`: in that case the conditions at the end of the whole step.
+    - `known_event`: the event at which a step of the given size is known to end, -1 for
+        none; None if the event must be searched for.
+    """
+
+    step: ImplicitStep
+    signs: ConditionSigns
+    truncates: BoolScalar
+    values_at_end: Float[Array, " e"]
+    known_event: Int[Array, ""] | None
+
+    @property
+    def programs(self) -> TraceCache:
+        """Return the cache of the step."""
+        return self.step.programs
+
+    def solve(self, arguments: Given) -> TruncatedStep:
+        """Find the size of the step, and take it."""
+        h, none = arguments[0].h, -jnp.ones((), jnp.int32)
+        found = _Found(h, none, RESULTS.successful)
+        if self.known_event is not None:
+            found = found._replace(fired=self.known_event)
+        else:
+            found = jax.lax.cond(
+                self.truncates, lambda: self._first(arguments), lambda: found
+            )
+        step = self._trial(arguments, found.h)
+        result = RESULTS.where(
+            found.result == RESULTS.successful, step.outcome.result, found.result
+        )
+        return step._replace(
+            outcome=step.outcome._replace(result=result), fired=found.fired
         )
 
-    bracket, last, result = jax.lax.while_loop(
-        lambda search: (search[2] == RESULTS.successful) & ~search[0].found,
-        narrower,
-        (whole, one, RESULTS.successful),
-    )
-    theta = jnp.where(result == RESULTS.successful, bracket.upper, last)
-    return _Found(theta * h, jnp.argmax(bracket.crossed).astype(jnp.int32), result)
+    def _first(self, given: Given) -> _Found:
+        """Find the first event of a step, by steps of other sizes from its start."""
+        arguments, conditions = given
+        h, sign = arguments.h, self.signs.sign
+        values_at_end = self._without_start_zero(self.values_at_end, h)
+        one = jnp.ones((), h.dtype)
+        whole = Bracket.open_from(self.signs.value)
+        whole = whole.with_point(
+            one, values_at_end, conditions.crossed(sign, values_at_end)
+        )
 
+        def narrower(search: tuple[Bracket, FloatScalar, RESULTS]):
+            bracket, _, _ = search
+            theta = bracket.next_place()
+            step = self._trial(given, theta * h)
+            values = self._without_start_zero(step.values, step.h)
+            return (
+                bracket.with_point(theta, values, step.crossed),
+                theta,
+                step.outcome.result,
+            )
 
-def _trial(
-    arguments: StepArguments,
-    conditions: Conditions,
-    options: TruncationOptions,
-    programs: TraceCache,
-    h: FloatScalar,
-) -> TruncatedStep:
-    """Take a step of any size, and compute the conditions at its end."""
-    at, method = eqx.tree_at(lambda x: x.h, arguments, h), options.method
-    stage_solver, skip = options.stage_solver, options.skip
-    outcome = primitive_step(at, method, stage_solver, skip, programs)
-    values = _values(at, conditions, method, outcome.step_state.state)
-    solved = outcome.result == RESULTS.successful
-    unknown = solved & ~jnp.all(jnp.isfinite(values))
-    result = RESULTS.where(unknown, RESULTS.nonfinite_event, outcome.result)
-    crossed = conditions.crossed(
-        options.signs.sign, options.without_start_zero(values, h)
-    )
-    none = -jnp.ones((), jnp.int32)
-    return TruncatedStep(outcome._replace(result=result), h, none, values, crossed)
+        bracket, last, result = jax.lax.while_loop(
+            lambda search: (search[2] == RESULTS.successful) & ~search[0].found,
+            narrower,
+            (whole, one, RESULTS.successful),
+        )
+        theta = jnp.where(result == RESULTS.successful, bracket.upper, last)
+        return _Found(theta * h, jnp.argmax(bracket.crossed).astype(jnp.int32), result)
+
+    def _trial(self, given: Given, h: FloatScalar) -> TruncatedStep:
+        """Take a step of any size, and compute the conditions at its end."""
+        arguments, conditions = given
+        at = eqx.tree_at(lambda x: x.h, arguments, h)
+        outcome = self.step(at)
+        values = _values(at, conditions, self.step.method, outcome.step_state.state)
+        solved = outcome.result == RESULTS.successful
+        unknown = solved & ~jnp.all(jnp.isfinite(values))
+        result = RESULTS.where(unknown, RESULTS.nonfinite_event, outcome.result)
+        crossed = conditions.crossed(
+            self.signs.sign, self._without_start_zero(values, h)
+        )
+        none = -jnp.ones((), jnp.int32)
+        outcome = outcome._replace(result=result)
+        return TruncatedStep(outcome, h, none, values, crossed)
+
+    def _without_start_zero(
+        self, values: Float[Array, " e"], h: FloatScalar
+    ) -> Float[Array, " e"]:
+        """Divide the conditions that are zero at the start by the size of the step.
+
+        This removes the zero at the start and keeps all other zeros.
+        """
+        return jnp.where(self.signs.at_zero, values / jnp.abs(h), values)
+
+    def tangent(
+        self, arguments: Given, rates: Given, solution: TruncatedStep
+    ) -> TruncatedStep:
+        """Compute the tangents of the end of the step and of its size."""
+        (given, conditions), (of_given, of_conditions) = arguments, rates
+        is_truncated = solution.fired >= 0
+        # The size of a truncated step is a result, not an argument.
+        given = eqx.tree_at(lambda x: x.h, given, solution.h)
+        rate = of_given.h
+        if rate is None:
+            rate = jnp.zeros_like(solution.h)
+        else:
+            rate = jnp.where(is_truncated, 0, rate)
+        of_given = eqx.tree_at(
+            lambda x: x.h, of_given, rate, is_leaf=lambda leaf: leaf is None
+        )
+        perturbed, fixed = eqx.partition(given, has_tangent(of_given))
+        functions, others = eqx.partition(conditions, has_tangent(of_conditions))
+        changes = self._changes(given, others, solution, fixed)
+        # With `jax.checkpoint`, reverse mode stores only states and stages.
+        change, dh = jax.checkpoint(changes, prevent_cse=False)(
+            perturbed,
+            functions,
+            solution.outcome.stages,
+            solution.outcome.step_state.state,
+            (of_given, of_conditions),
+        )
+        none = jax.tree.map(lambda _: None, solution)
+        tangent = tangent_of_outcome(solution.outcome, change)
+        return none._replace(outcome=tangent, h=dh)
+
+    def _changes(
+        self,
+        arguments: StepArguments,
+        others: Conditions,
+        step: TruncatedStep,
+        fixed: StepArguments,
+    ) -> Callable[..., Any]:
+        """Return the function that computes the tangents of a step and of its size.
+
+        `others` and `fixed` are the parts of the conditions and of the arguments that
+        have no tangents.
+        """
+        ok = ~self.step.skip & (step.outcome.result == RESULTS.successful)
+        is_truncated = ok & (step.fired >= 0)
+        is_size = eqx.tree_at(
+            lambda x: x.h, jax.tree.map(lambda _: False, arguments), True
+        )
+        size, rest = eqx.partition(arguments, is_size)
+        unit = eqx.tree_at(lambda x: x.h, size, jnp.ones_like(step.h))
+        x = step.outcome.stages
+        change_with = self.step.changes(arguments, fixed, x, ok)
+        change_with_size = self.step.changes(arguments, rest, x, is_truncated)
+
+        def condition(given, fixed, functions, y):
+            at, all_of_them = eqx.combine(given, fixed), eqx.combine(functions, others)
+            return _values(at, all_of_them, self.step.method, y)[step.fired]
+
+        def changes(given, functions, x, y, rates):
+            change = change_with(given, x, rates[0])
+            by_size = jax.lax.cond(
+                is_truncated,
+                lambda: change_with_size(size, x, unit),
+                lambda: jax.tree.map(jnp.zeros_like, change),
+            )
+            _, slope = jax.jvp(
+                lambda size, y: condition(size, rest, functions, y),
+                (size, y),
+                (unit, by_size[1]),
+            )
+            # Without an event, a condition need not have a derivative.
+            _, gained = jax.jvp(
+                lambda given, functions, y: condition(given, fixed, functions, y),
+                (given, functions, y),
+                zero_unless(is_truncated, (*rates, change[1])),
+            )
+            resolved = ~is_truncated | (
+                jnp.abs(slope * step.h) > _flat(self.signs, step)
+            )
+            dh = -zero_unless(is_truncated, gained) / jnp.where(
+                is_truncated & resolved, slope, 1
+            )
+            moved: Any = sum(jnp.sum(x) for x in jax.tree.leaves(rates))
+            dh = nan_tangent_unless(resolved, jnp.where(resolved, dh, moved))
+            total = jax.tree.map(lambda a, b: a + dh * b, change, by_size)
+            return total, rates[0].h + dh
+
+        return changes
 
 
 def _values(
@@ -179,116 +253,11 @@ def _values(
     return conditions(t, y, args)
 
 
-@_differentiable_step.def_jvp
-def _step_jvp(primals, tangents):
-    arguments, conditions, options, _ = primals
-    of_arguments, of_conditions = tangents[:2]
-    step = truncated_step(*primals)
-    is_truncated = step.fired >= 0
-    # The size of a truncated step is a result, not an argument.
-    arguments = eqx.tree_at(lambda x: x.h, arguments, step.h)
-    rate = of_arguments.h
-    rate = jnp.zeros_like(step.h) if rate is None else jnp.where(is_truncated, 0, rate)
-    of_arguments = eqx.tree_at(
-        lambda x: x.h, of_arguments, rate, is_leaf=lambda leaf: leaf is None
-    )
-    given, fixed = eqx.partition(arguments, has_tangent(of_arguments))
-    functions, others = eqx.partition(conditions, has_tangent(of_conditions))
-    changes = _changes(arguments, others, options, step, fixed)
-    rates = of_arguments, of_conditions
-    # With `jax.checkpoint` reverse mode stores only states and stages.
-    change, dh = jax.checkpoint(changes, prevent_cse=False)(
-        given, functions, step.outcome.stages, step.outcome.step_state.state, rates
-    )
-    none = jax.tree.map(lambda _: None, step)
-    tangent = tangent_of_outcome(step.outcome, change)
-    return step, none._replace(outcome=tangent, h=dh)
-
-
-def _changes(
-    arguments: StepArguments,
-    others: Conditions,
-    options: TruncationOptions,
-    step: TruncatedStep,
-    fixed: StepArguments,
-):
-    """Return the function that computes the tangents of a step and of its size.
-
-    `others` and `fixed` are the parts of the conditions and of the arguments without
-    tangents.
-    """
-    ok = ~options.skip & (step.outcome.result == RESULTS.successful)
-    is_truncated = ok & (step.fired >= 0)
-    is_size = eqx.tree_at(lambda x: x.h, jax.tree.map(lambda _: False, arguments), True)
-    size, rest = eqx.partition(arguments, is_size)
-    unit = eqx.tree_at(lambda x: x.h, size, jnp.ones_like(step.h))
-    method, stage_solver, x = options.method, options.stage_solver, step.outcome.stages
-    change_with = change_of_step(arguments, method, stage_solver, ok, x, fixed)
-    change_with_size = change_of_step(
-        arguments, method, stage_solver, is_truncated, x, rest
-    )
-
-    def condition(given, fixed, functions, y):
-        at, all_of_them = eqx.combine(given, fixed), eqx.combine(functions, others)
-        return _values(at, all_of_them, method, y)[step.fired]
-
-    def changes(given, functions, x, y, rates):
-        change = change_with(given, x, rates[0])
-        by_size = jax.lax.cond(
-            is_truncated,
-            lambda: change_with_size(size, x, unit),
-            lambda: jax.tree.map(jnp.zeros_like, change),
-        )
-        _, slope = jax.jvp(
-            lambda size, y: condition(size, rest, functions, y),
-            (size, y),
-            (unit, by_size[1]),
-        )
-        # Without an event, a condition need not have a derivative.
-        _, gained = jax.jvp(
-            lambda given, functions, y: condition(given, fixed, functions, y),
-            (given, functions, y),
-            zero_unless(is_truncated, (*rates, change[1])),
-        )
-        resolved = ~is_truncated | (
-            jnp.abs(slope * step.h) > _flat(options.signs, step)
-        )
-        dh = -zero_unless(is_truncated, gained) / jnp.where(
-            is_truncated & resolved, slope, 1
-        )
-        moved: Any = sum(jnp.sum(x) for x in jax.tree.leaves(rates))
-        dh = nan_tangent_unless(resolved, jnp.where(resolved, dh, moved))
-        total = jax.tree.map(lambda a, b: a + dh * b, change, by_size)
-        return total, rates[0].h + dh
-
-    return changes
-
-
 def _flat(signs: ConditionSigns, step: TruncatedStep) -> FloatScalar:
     """Compute the change over a step below which a condition counts as constant."""
     start = signs.scale(step.h)[step.fired]
     small = float(jnp.finfo(start.dtype).eps) ** 0.5
     return small * start
-
-
-def truncated_step(
-    arguments: StepArguments,
-    conditions: Conditions,
-    options: TruncationOptions,
-    programs: TraceCache,
-) -> TruncatedStep:
-    """Take a step by `_differentiable_step`, in a program traced once.
-
-    `primitive_step` says why.
-    """
-    return as_cpu_kernel(
-        _differentiable_step,
-        arguments,
-        conditions,
-        options,
-        programs,
-        programs=programs,
-    )
 
 
 class Bracket(eqx.Module):

@@ -16,7 +16,7 @@ from jaxtyping import Array, Bool, Float, Int
 from ..._custom_types import BoolScalar, FloatScalar, IntScalar
 from ..._numerics import nan_gradient_unless, tree_where
 from ..._results import RESULTS
-from ..._step import first_step_state, RoundOff, StepArguments, StepState
+from ..._step import first_step_state, ImplicitStep, RoundOff, StepArguments, StepState
 from ..._system import FunctionNoise, State
 from .._checkpoint import Checkpoint
 from .._stepper import (
@@ -34,7 +34,7 @@ from .._stepper import (
 )
 from ._event import Conditions, ConditionSigns, Event, EventActions, signs_at
 from ._log import EventLog, LogEntry, reported_log
-from ._root import truncated_step, TruncatedStep, TruncationOptions
+from ._root import ImplicitTruncatedStep, TruncatedStep
 
 
 class EventLoopState(eqx.Module):
@@ -343,16 +343,20 @@ class EventStepper(AbstractStepper[EventCarry, ReplayedIteration]):
         start = carry.step_state.differentiated_in_state()
         given = plain.args, plain.invariants, plain.round_off
         arguments = StepArguments(plain.system, t, h, start, *given)
-        options = TruncationOptions(
-            method=plain.method,
-            stage_solver=plain.stage_solver,
-            skip=skip,
+        # The type checker takes the property `programs` for a field.
+        step = ImplicitTruncatedStep(  # pyright: ignore[reportCallIssue]
+            step=ImplicitStep(
+                method=plain.method,
+                stage_solver=plain.stage_solver,
+                skip=skip,
+                programs=plain.programs,
+            ),
             signs=place.signs,
             truncates=place.truncates & ~skip,
             values_at_end=place.values_at_end,
             known_event=None if replay is None else replay.which,
         )
-        return truncated_step(arguments, self.conditions, options, plain.programs)
+        return step((arguments, self.conditions))
 
     def blank_result(self, carry: EventCarry) -> StepResult:
         """Return the result of an iteration that did nothing."""

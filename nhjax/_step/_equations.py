@@ -1,0 +1,551 @@
+"""The equations of one step: their unknowns, their data and their residuals."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any, NamedTuple, TypeVar
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, PyTree
+
+from .._custom_types import Args, BoolScalar, FloatScalar
+from .._manifold import AbstractLieGroup, unframed
+from .._method import AbstractMethod
+from .._numerics import (
+    max_norm,
+    Pattern,
+    small_einsum,
+    sparse_jacobian,
+    SparseMatrix,
+    uneven_perturbations,
+)
+from .._system import (
+    AbstractMechanicalSystem,
+    Linearisation,
+    motion_residual,
+    State,
+    total_force,
+    with_frames,
+)
+from ._chart import AbstractChart, chart_of_step
+from ._invariants import InvariantCorrection, InvariantsAtStart, moving_part
+from ._redundancy import Redundancy
+from ._round_off import RoundOff
+
+
+T = TypeVar("T")
+
+
+class StageUnknowns(eqx.Module):
+    """The unknowns of one step: stage velocities, node coordinates and multipliers.
+
+    An unknown that the system or the closure of the multiplier does not have is an
+    array without entries.
+
+    - `velocity`: H^1..H^s, the stage velocities in the chart (V^i on R^n).
+    - `momentum`: the stage momenta in the body frame, for Hamiltonian systems. For
+        Lagrangian systems they follow from the velocities.
+    - `node_fibre_coordinate`: u^2..u^s (v or p) at the nodes. The last node is the end
+        of the step. Without nonholonomic constraints there is only u_{k+1}.
+    - `closure`: y, the unknowns of the closure. The nonholonomic multipliers are
+        Λ = (start) λ_k + (end) λ_{k+1} + E y.
+    - `holonomic`: the holonomic multipliers Λ^1..Λ^s.
+    - `end_acceleration`, `end_multiplier`: u̇ and λ_c at the end of the step, which only
+        the symmetric closure has.
+    - `impulse`: ε, the impulses at both ends of the step along ∂I/∂v of the invariants
+        I; None if the run keeps no invariants.
+    """
+
+    velocity: Float[Array, "s n"]
+    momentum: Float[Array, "s p"]
+    node_fibre_coordinate: Float[Array, "r n"]
+    closure: Float[Array, "c m"]
+    holonomic: Float[Array, "s k"]
+    end_acceleration: Float[Array, " a"]
+    end_multiplier: Float[Array, " e"]
+    # A `PyTree`, because None is an empty tree.
+    impulse: PyTree[Float[Array, " i"]] = None
+
+
+class StageForces(NamedTuple):
+    """The forces, multipliers and momenta at the stages i = 1..s, with residuals."""
+
+    force: Float[Array, "s n"]  # n^i, the force W^i carried to the origin of the chart
+    multiplier: Float[Array, "s l"]  # Λ^i
+    residual: Float[Array, "s n"]  # Π^i - base - h Σ â_ij F^j
+    momentum: Float[Array, "s n"]  # Π^i, the scale of the residuals
+
+
+class StageEquations(eqx.Module):
+    """The discrete equations of one step from (q_k, p_k, λ_k).
+
+    These are the four Summaries of the paper, for the `StageUnknowns` in the chart of
+    the method. Let w^i be the body force at stage i, reactions included, and y^i the
+    coordinates of the stage. Let n^i = Ad^*_{τ(y^i)⁻¹} w^i, let F^i be the same force
+    in the chart, and M the momentum μ_k carried to the origin. The equations are
+
+    Π^i = base + h Σ â_ij F^j,    μ^i = Ad^*_{τ(y^i)} (M + h Σ a_ij n^j),
+
+    the nonholonomic constraints at the nodes (q^i, μ^i), the holonomic constraints at
+    the positions Q^i, i >= 2, and the time derivative of the holonomic constraints at
+    the end. The constraints at the first node hold by hypothesis H1, and the last node
+    is the end of the step by H3. With redundant constraints, only as many equations as
+    are independent are enforced; see `Redundancy`.
+
+    The closure of the multiplier enters in three places:
+
+    - the constant matrices of `method.closure_weights`;
+    - the multiplier that a state carries, which is Λ^s for the propagated closure and
+        λ_c for the others (`end_state`, `first_step_state`);
+    - two more unknowns and equations if the closure uses λ_c at the end
+        (`end_multiplier_is_unknown`).
+
+    If the run keeps invariants, the momenta receive impulses at both ends of the step;
+    see `InvariantCorrection`.
+    """
+
+    system: AbstractMechanicalSystem
+    method: AbstractMethod = eqx.field(static=True)
+    t: FloatScalar
+    h: FloatScalar
+    q: PyTree[Array]
+    p: Float[Array, " n"]
+    multiplier: Float[Array, " l"]
+    args: Args
+    redundancy: Redundancy | None = None
+    invariants: InvariantsAtStart | None = None
+    round_off: RoundOff | None = None
+
+    @classmethod
+    def at(
+        cls,
+        system: AbstractMechanicalSystem,
+        method: AbstractMethod,
+        t: FloatScalar,
+        h: FloatScalar,
+        y: State,
+        args: Args,
+        lin: Linearisation,
+        invariants: InvariantsAtStart | None = None,
+        round_off: RoundOff | None = None,
+    ) -> "StageEquations":
+        """Build the equations of a step of size h from the state y at t."""
+        system, q = with_frames(system, y.q)
+        given = t, h, q, y.p, y.multiplier, args
+        stages = cls(system, method, *given, invariants=invariants, round_off=round_off)
+        if system.constraints != "redundant" or not stages.constrained:
+            return stages
+        redundancy = Redundancy.at(lin, stages.num_nonholonomic)
+        return replace(stages, redundancy=redundancy)
+
+    @property
+    def num_holonomic(self) -> int:
+        """Return k, the number of holonomic constraints."""
+        if self.system.holonomic is None:
+            return 0
+        return jax.eval_shape(
+            lambda t, q: self.system.position_constraint(t, q, self.args),
+            self.t,
+            self.q,
+        ).shape[0]
+
+    @property
+    def num_nonholonomic(self) -> int:
+        """Return m, the number of nonholonomic constraints."""
+        return self.multiplier.shape[0] - self.num_holonomic
+
+    @property
+    def constrained(self) -> bool:
+        """Return whether there are constraints, and so multipliers."""
+        return self.multiplier.shape[0] > 0
+
+    @property
+    def end_multiplier_is_unknown(self) -> bool:
+        """Return whether λ_c at the end of the step is an unknown.
+
+        Only the symmetric closure has this unknown.
+        """
+        return self.num_nonholonomic > 0 and self.method.closure == "symmetric"
+
+    @property
+    def hamiltonian(self) -> bool:
+        """Return whether the system is Hamiltonian.
+
+        Then the stage momenta are unknowns, in addition to the stage velocities.
+        """
+        return self.system.fibre_coordinate_name == "p"
+
+    @property
+    def manifold(self) -> AbstractLieGroup:
+        """Return the configuration space."""
+        return self.system.manifold_of(self.q)
+
+    def chart(self, x: StageUnknowns) -> AbstractChart:
+        """Build the chart in which the step is written."""
+        return chart_of_step(
+            self.manifold, self.method.chart, self.q, self.increment(x)
+        )
+
+    def coefficients(self, name: str) -> Array:
+        """Return the array `name` of the method in the working precision."""
+        return jnp.asarray(getattr(self.method, name), self.p.dtype)
+
+    def closure_weights(self, name: str) -> Array:
+        """Return the array `name` of the closure's weights in the working precision."""
+        return jnp.asarray(getattr(self.method.closure_weights, name), self.p.dtype)
+
+    @property
+    def stage_times(self) -> Float[Array, " s"]:
+        """Return the times t_k + h c_i of the stages."""
+        return self.t + self.h * self.coefficients("c")
+
+    @property
+    def node_weights(self) -> Float[Array, "r s"]:
+        """Return `node_rows` in the working precision."""
+        return jnp.asarray(self.node_rows, self.p.dtype)
+
+    @property
+    def node_rows(self) -> np.ndarray:
+        """Return the rows of a_ij for the nodes at which momenta are computed.
+
+        With nonholonomic constraints these are the nodes i >= 2. Otherwise it is only
+        the end of the step, whose row contains the weights b.
+        """
+        method = self.method
+        return method.a[1:] if self.num_nonholonomic else method.b[None]
+
+    @property
+    def node_times(self) -> Float[Array, " r"]:
+        """Return the times of the nodes at which momenta are computed."""
+        nodes = (
+            self.coefficients("c")[1:]
+            if self.num_nonholonomic
+            else jnp.ones((1,), self.p.dtype)
+        )
+        return self.t + self.h * nodes
+
+    def multipliers(self, x: StageUnknowns) -> Float[Array, "s l"]:
+        """Compute the multipliers Λ^1..Λ^s of all constraints at the stages."""
+        change = self.multiplier_change(x)
+        if not self.num_nonholonomic:
+            return change
+        return self._padded("start", self.multiplier) + change
+
+    def multiplier_change(self, dx: StageUnknowns) -> Float[Array, "s l"]:
+        """Compute the part of the multipliers Λ that is linear in the unknowns."""
+        change = self.free_multipliers(dx.closure, dx.holonomic)
+        if self.end_multiplier_is_unknown:
+            change = change + self._padded("end", dx.end_multiplier)
+        return change
+
+    def free_multipliers(
+        self, closure: Float[Array, "c m"], holonomic: Float[Array, "s k"]
+    ) -> Float[Array, "s l"]:
+        """Join the nonholonomic multipliers E y and the holonomic multipliers."""
+        if not self.num_nonholonomic:
+            return holonomic
+        kinematic = small_einsum("sr,rm->sm", self.closure_weights("E"), closure)
+        if not self.num_holonomic:
+            return kinematic
+        return jnp.concatenate([kinematic, holonomic], axis=1)
+
+    def _padded(self, weights: str, multiplier: Float[Array, " l"]) -> Array:
+        """Compute the part of Λ that comes from a known multiplier, such as λ_k.
+
+        The holonomic multipliers do not depend on it.
+        """
+        known = multiplier[: self.num_nonholonomic]
+        part = jnp.outer(self.closure_weights(weights), known)
+        return jnp.pad(part, ((0, 0), (0, self.num_holonomic)))
+
+    def increment(self, x: StageUnknowns) -> Float[Array, " n"]:
+        """Compute the increment ξ = h Σ b_j H^j from q_k to q_{k+1}."""
+        # The product is h * (b @ H). The rounding errors of precomputed coefficients
+        # h b_j would be the same in every step, and add up.
+        return self.h * small_einsum("s,sn->n", self.coefficients("b"), x.velocity)
+
+
+def stage_velocities(stages: StageEquations, x: StageUnknowns) -> Float[Array, "s n"]:
+    """Compute the chart velocities dτ_y⁻¹ D2H(Q^i, P^i) of a Hamiltonian system."""
+    chart, y = stage_coordinates(stages, x)
+    v = jax.vmap(lambda t, q, u: stages.system.velocity(t, q, u, stages.args))(
+        stages.stage_times, stage_positions(stages, chart, y), x.momentum
+    )
+    return chart.chart_velocities(y, v)
+
+
+def stage_forces(stages: StageEquations, x: StageUnknowns) -> StageForces:
+    """Compute the forces n^i, multipliers Λ^i and residuals of the stage momenta."""
+    h, a_hat, b = stages.h, stages.coefficients("a_hat"), stages.coefficients("b")
+    multiplier = stages.multipliers(x)
+    chart, y = stage_coordinates(stages, x)
+    q = stage_positions(stages, chart, y)
+    u = x.momentum if stages.hamiltonian else chart.body_velocities(y, x.velocity)
+    force, momentum = jax.vmap(
+        lambda t, q, u, lam: (
+            total_force(stages.system, t, q, u, lam, stages.args),
+            stages.system.momentum(t, q, u, stages.args),
+        )
+    )(stages.stage_times, q, u, multiplier)
+    momentum, chart_force = chart.to_chart(y, x.velocity, momentum, force)
+    transported = chart.to_origin(y, force)
+    base = chart.base_momentum(
+        chart.momentum_at_origin(_start_momentum(stages, x)),
+        h * small_einsum("s,sn->n", b, transported),
+        h * small_einsum("s,sn->n", b, chart_force),
+    )
+    residual = momentum - (
+        base[None] + h * small_einsum("ij,jn->in", a_hat, chart_force)
+    )
+    return StageForces(transported, multiplier, residual, momentum)
+
+
+def node_residual(
+    stages: StageEquations, x: StageUnknowns, force: Float[Array, "s n"]
+) -> Float[Array, "r n"]:
+    """Compute the residuals of the momentum equations at the nodes.
+
+    They are p(q^i, u^i) - Ad^*_{τ(y^i)} (M + h Σ a_ij n^j). At the end of the step the
+    impulse is subtracted too.
+    """
+    chart, y = node_coordinates(stages, x)
+    momentum = jax.vmap(lambda t, q, u: stages.system.momentum(t, q, u, stages.args))(
+        stages.node_times, chart.positions(y), x.node_fibre_coordinate
+    )
+    start = chart.momentum_at_origin(_start_momentum(stages, x))
+    gained = stages.h * small_einsum("ij,jn->in", stages.node_weights, force)
+    residual = momentum - chart.from_origin(y, start[None] + gained)
+    if stages.invariants is None:
+        return residual
+    last = residual[-1:] - end_impulse(stages, x)[None]
+    return jnp.concatenate([residual[:-1], last])
+
+
+def constraint_values(stages: StageEquations, x: StageUnknowns) -> tuple[Array, Array]:
+    """Compute the values of the nonholonomic and of the holonomic constraints."""
+    none = jnp.zeros((0,), stages.p.dtype)
+    return (
+        node_constraint(stages, x) if stages.num_nonholonomic else none,
+        holonomic_constraint(stages, x) if stages.num_holonomic else none,
+    )
+
+
+def node_constraint(stages: StageEquations, x: StageUnknowns) -> Float[Array, "r m"]:
+    """Compute the nonholonomic constraints Φ(q^i, u^i) at the nodes."""
+    chart, y = node_coordinates(stages, x)
+    values = jax.vmap(
+        lambda t, q, u: stages.system.kinematic_constraint(t, q, u, stages.args)
+    )(stages.node_times, chart.positions(y), x.node_fibre_coordinate)
+    if stages.redundancy is None:
+        return values
+    return stages.redundancy.reduced(values, stages.h * x.closure, 0)
+
+
+def holonomic_constraint(
+    stages: StageEquations, x: StageUnknowns
+) -> Float[Array, "s k"]:
+    """Compute Γ(Q^i) / h for i >= 2, and the rate dΓ/dt at the end of the step.
+
+    The division by h gives all values the unit of dΓ/dt.
+    """
+    chart, y = stage_coordinates(stages, x)
+    nodes = chart.positions(y[1:])
+    on_positions = jax.vmap(
+        lambda t, q: stages.system.position_constraint(t, q, stages.args)
+    )(stages.stage_times[1:], nodes)
+    end = jax.tree.map(lambda leaf: leaf[-1], nodes)
+    tangency = stages.system.tangency(
+        stages.t + stages.h, end, x.node_fibre_coordinate[-1], stages.args
+    )
+    values = jnp.concatenate([on_positions / stages.h, tangency[None]])
+    if stages.redundancy is None:
+        return values
+    m = stages.num_nonholonomic
+    return stages.redundancy.reduced(values, stages.h * x.holonomic, m)
+
+
+def end_residual(
+    stages: StageEquations, x: StageUnknowns
+) -> tuple[Float[Array, " n"], Float[Array, " l"]]:
+    """Compute the residuals of the equations of motion at the end of the step.
+
+    The continuous multiplier λ_c at the end is their root.
+    """
+    on_momentum, hidden = motion_residual(
+        stages.system,
+        stages.t + stages.h,
+        end_position(stages, x),
+        x.node_fibre_coordinate[-1],
+        x.end_acceleration,
+        x.end_multiplier,
+        stages.args,
+    )
+    if stages.redundancy is not None:
+        hidden = stages.redundancy.reduced(hidden[None], x.end_multiplier[None], 0)[0]
+    return on_momentum, hidden
+
+
+def invariant_errors(stages: StageEquations, x: StageUnknowns) -> Float[Array, " k"]:
+    """Compute the errors of the invariants at the end of a step."""
+    assert stages.invariants is not None
+    return stages.invariants.functions.tangent_error(*_end_point(stages, x))
+
+
+def constraint_jacobian(
+    stages: StageEquations, x: StageUnknowns
+) -> Float[Array, "r l n"]:
+    """Compute B = ∂Φ/∂u at the nodes i >= 2, where Φ are all velocity constraints."""
+    return _at_nodes(stages, x, jax.jacrev)
+
+
+def sparse_constraint_jacobian(
+    stages: StageEquations, x: StageUnknowns, pattern: Pattern
+) -> SparseMatrix:
+    """Compute B = ∂Φ/∂u at the nodes i >= 2 as a sparse matrix of known `pattern`."""
+    return _at_nodes(
+        stages,
+        x,
+        lambda constraint: lambda u: sparse_jacobian(constraint, u, pattern),
+    )
+
+
+def _at_nodes(
+    stages: StageEquations,
+    x: StageUnknowns,
+    differentiated: Callable[..., Callable[..., T]],
+) -> T:
+    times, u = stages.stage_times[1:], x.node_fibre_coordinate
+    if not stages.num_nonholonomic:
+        u = jnp.broadcast_to(u, (stages.method.stages - 1, u.shape[1]))
+    chart, y = stage_coordinates(stages, x)
+    nodes = chart.positions(y[1:])
+    return jax.vmap(
+        lambda t, q, u: differentiated(
+            lambda u: stages.system.constraint(t, q, u, stages.args)
+        )(u)
+    )(times, nodes, u)
+
+
+def start_impulse(stages: StageEquations, x: StageUnknowns) -> Float[Array, " n"]:
+    """Compute the impulse ε ω_k at the start of a step."""
+    assert stages.invariants is not None
+    return small_einsum("k,kn->n", x.impulse, stages.invariants.covectors)
+
+
+def _start_momentum(stages: StageEquations, x: StageUnknowns) -> Float[Array, " n"]:
+    """Compute the momentum after the impulse at the start of the step."""
+    return (
+        stages.p if stages.invariants is None else stages.p + start_impulse(stages, x)
+    )
+
+
+def end_impulse(stages: StageEquations, x: StageUnknowns) -> Float[Array, " n"]:
+    """Compute the impulse ε ω_{k+1} at the end of the step."""
+    _, covectors = end_slopes(stages, x)
+    return small_einsum("k,kn->n", x.impulse, covectors)
+
+
+def end_slopes(
+    stages: StageEquations, x: StageUnknowns
+) -> tuple[Float[Array, "k n"], Float[Array, "k n"]]:
+    """Compute ∂I/∂u and ω of the invariants at the end of a step; see `Directions`."""
+    assert stages.invariants is not None
+    found = stages.invariants.functions.directions(*_end_point(stages, x))
+    return found.slopes, found.covectors
+
+
+def invariant_correction(
+    stages: StageEquations, x: StageUnknowns
+) -> InvariantCorrection:
+    """Linearise the equations for the impulses of a step, near the given stages."""
+    assert stages.invariants is not None
+    slopes, covectors = end_slopes(stages, x)
+    moving = moving_part(slopes, x.node_fibre_coordinate[-1])
+    given = slopes, covectors, moving, stages.hamiltonian
+    return InvariantCorrection.at(stages.invariants, *given)
+
+
+def _end_point(stages: StageEquations, x: StageUnknowns) -> tuple[Any, ...]:
+    """Return (system, t, q, u, args) at the end of the step."""
+    assert stages.invariants is not None
+    end = stages.chart(x).advance(*stages.invariants.position)
+    q = stages.manifold.wrapped(*end)
+    u = x.node_fibre_coordinate[-1]
+    return stages.system, stages.t + stages.h, q, u, stages.args
+
+
+def is_in_chart(stages: StageEquations, x: StageUnknowns) -> BoolScalar:
+    """Return whether the stages and the end lie where the chart is invertible."""
+    chart, y = stage_coordinates(stages, x)
+    return chart.in_domain(jnp.concatenate([y, chart.ends[1][None]]))
+
+
+def stage_coordinates(
+    stages: StageEquations, x: StageUnknowns
+) -> tuple[AbstractChart, Float[Array, "s n"]]:
+    """Return the chart and the coordinates y^i of the stages, from h Σ a_ij H^j."""
+    return _coordinates(stages, x, stages.method.a)
+
+
+def node_coordinates(
+    stages: StageEquations, x: StageUnknowns
+) -> tuple[AbstractChart, Float[Array, "r n"]]:
+    """Return the chart and the coordinates of the nodes of `node_rows`."""
+    return _coordinates(stages, x, stages.node_rows)
+
+
+def _coordinates(
+    stages: StageEquations, x: StageUnknowns, rows: np.ndarray
+) -> tuple[AbstractChart, Float[Array, "r n"]]:
+    chart = stages.chart(x)
+    start, end = chart.ends
+    # A node at an end of the step uses the same array of coordinates as the chart, so
+    # that the compiler merges the operations on both.
+    first = 0 if np.any(rows[0]) else 1
+    last = len(rows) - int(np.array_equal(rows[-1], stages.method.b))
+    parts = [start[None]] * first
+    if first < last:
+        inner = jnp.asarray(rows[first:last], stages.p.dtype)
+        increments = stages.h * small_einsum("ij,jn->in", inner, x.velocity)
+        parts.append(chart.coordinates(increments))
+    if last < len(rows):
+        parts.append(end[None])
+    return chart, jnp.concatenate(parts)
+
+
+def stage_positions(
+    stages: StageEquations, chart: AbstractChart, y: Float[Array, "s n"]
+) -> PyTree[Array]:
+    """Compute the positions of the stages. If c_1 = 0, the first one is q_k."""
+    if np.any(stages.method.a[0]):
+        return chart.positions(y)
+    return jax.tree.map(
+        lambda start, others: jnp.concatenate([start[None], others]),
+        stages.q,
+        chart.positions(y[1:]),
+    )
+
+
+def end_position(stages: StageEquations, x: StageUnknowns) -> PyTree[Array]:
+    """Compute the configuration q_{k+1} at the end of the step."""
+    chart = stages.chart(x)
+    return chart.position(chart.ends[1])
+
+
+def with_moved_positions(stages: StageEquations, nudge: FloatScalar) -> StageEquations:
+    """Return the equations with q_k moved by about `nudge` times its size.
+
+    This move changes the solution. The change per `nudge` estimates the change by the
+    round-off of positions per unit round-off. The coordinates move by different
+    amounts, so that the moves do not cancel in a difference of two coordinates.
+    """
+    if stages.manifold.is_flat:
+        moves = uneven_perturbations(stages.q)
+        moved = jax.tree.map(lambda x, dx: x + nudge * dx, stages.q, moves)
+    else:
+        size = max_norm(*jax.tree.leaves(unframed(stages.q)))
+        xi = nudge * uneven_perturbations(jnp.broadcast_to(size, stages.p.shape))
+        moved = stages.manifold.act(stages.q, xi)
+    return replace(stages, q=moved)

@@ -1,0 +1,463 @@
+"""The solvers of the stage equations, simplified Newton and Newton's method.
+
+Both start from values that are correct to first order in h. They stop when their
+increments are round-off, relative to the scale of the step.
+"""
+
+from abc import abstractmethod
+from collections.abc import Callable
+from typing import Any, NamedTuple, TypeAlias
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.flatten_util import ravel_pytree
+from jaxtyping import Array, Float, PyTree
+
+from .._custom_types import FloatScalar, FloatScalarLike
+from .._errors import check_choice, is_traced
+from .._manifold import unframed
+from .._numerics import (
+    absolute,
+    iterate,
+    jacobian_and_value,
+    matvec,
+    max_norm,
+    NOISE_UNITS,
+    Sizes,
+    Solved,
+    uneven_perturbations,
+)
+from .._system import all_finite, check_flag, Linearisation, position_scale, real_scalar
+from ._equations import (
+    invariant_correction,
+    StageEquations,
+    StageUnknowns,
+    with_moved_positions,
+)
+from ._factorisation import leading_structure
+from ._jacobian_choice import JacobianName
+from ._round_off import PART
+from ._stage_iteration import (
+    corrected,
+    Evaluation,
+    fibre_coordinate_size,
+    increment_size,
+    sizes,
+    stage_residual,
+)
+
+
+# An iteration on the stages of a step. The equations are an argument, so that the
+# iteration can be differentiated with respect to their data.
+FrozenNewtonMap: TypeAlias = Callable[[StageEquations, StageUnknowns], StageUnknowns]
+
+
+# Stages with a larger residual than this, relative to the momenta, are not a solution.
+_GROSS = 1e-6
+
+
+def check_tolerance(tolerance: Any) -> None:
+    """Raise a `ValueError` unless the `tolerance` of a solver is finite and >= 0."""
+    if is_traced(tolerance):
+        return
+    if not np.all(np.isfinite(tolerance) & (np.asarray(tolerance) >= 0)):
+        raise ValueError(
+            f"`tolerance` must be finite and >= 0, got {tolerance}; 0 iterates to "
+            "round-off."
+        )
+
+
+def tolerance_array(tolerance: FloatScalarLike) -> FloatScalarLike:
+    """Convert the `tolerance` of a solver to an array.
+
+    A number becomes an array of NumPy on the host: the default solver is made when
+    nhjax is imported, which must not start JAX's backends, nor choose a precision.
+    """
+    if isinstance(tolerance, int | float) and not isinstance(tolerance, bool):
+        return np.asarray(float(tolerance))
+    return real_scalar("tolerance", tolerance, jnp.result_type(float))
+
+
+class AbstractStageSolver(eqx.Module):
+    """A solver of the stage equations of a step, the option `stage_solver`."""
+
+    max_iterations: eqx.AbstractVar[int]
+    tolerance: eqx.AbstractVar[FloatScalarLike]
+
+    def __check_init__(self):
+        if not isinstance(self.max_iterations, int) or self.max_iterations < 1:
+            raise ValueError(
+                f"{type(self).__name__}: `max_iterations` must be an int >= 1, got "
+                f"{self.max_iterations!r}."
+            )
+        check_tolerance(self.tolerance)
+
+    @abstractmethod
+    def solve(
+        self, stages: StageEquations, x0: StageUnknowns, lin: Linearisation, skip: Array
+    ) -> Solved[StageUnknowns, Evaluation]:
+        """Solve the stage equations from `x0`; do nothing where `skip` is true."""
+
+    @abstractmethod
+    def frozen_newton_map(
+        self, stages: StageEquations, lin: Linearisation, x: StageUnknowns
+    ) -> FrozenNewtonMap:
+        """Build an iteration whose fixed points solve the stage equations.
+
+        Its Jacobian is frozen, that is, constant. The iteration contracts at the
+        solution `x`. The derivatives of the solution follow from this iteration by the
+        implicit function theorem.
+        """
+
+
+class SimplifiedNewton(AbstractStageSolver):
+    """Simplified Newton on the stage equations, with part of their Jacobian.
+
+    The solver inverts the mass matrix M and the Schur complement of the constraints
+    once per step, at the start of the step. Each iteration costs one evaluation of the
+    stage equations and a few small products.
+
+    The leading part of the Jacobian contains only these two matrices. With it, an
+    iteration reduces the error by a factor O(h²) on a vector space if M is constant,
+    forces do not depend on v, and the constraints are linear in v. Otherwise the factor
+    is O(h). The terms of order h are the derivatives of momenta with respect to
+    positions, and of forces with respect to velocities, at the start of the step. With
+    these terms the factor is always O(h²).
+
+    If this iteration does not converge, Newton's method with the exact Jacobian may
+    still converge. With the fallback, Newton's method takes over in such a step, and
+    `Solution.stats["num_newton_steps"]` counts these steps. A program that contains
+    both methods takes longer to compile, and runs slower even if the fallback is never
+    used. For this reason a plain call of `integrate` first runs without the fallback,
+    and repeats the run with it if a step was not solved. In a program of your own
+    (`jax.jit`, `jax.vmap`, `jax.grad`), a step that is not solved ends the run, unless
+    you ask for the fallback.
+
+    **Arguments:**
+
+    - `max_iterations`: the number of iterations after which a step counts as failed.
+    - `tolerance`: the size of the increment, relative to the velocities, at which to
+        stop. The default, 0, iterates to round-off. Changing the tolerance does not
+        recompile.
+    - `fallback`: whether `nhjax.Newton()` takes over a step that is not solved: True,
+        False, or None, the default, which means only in plain calls. Derivatives of a
+        run with the fallback use the exact Jacobian, as with `nhjax.Newton()`.
+    - `jacobian`: `"leading"`; or `"first_order"`, which includes the terms of order h;
+        or None, the default, which includes them if they reduce the run time. This is
+        so with s <= 5 stages, n <= 6 coordinates and m constraints with
+        s (s - 1) n m <= 100, all nonholonomic. The terms are not available for
+        Hamiltonian systems, redundant constraints, and so many constraints that they
+        are stored as sparse matrices.
+
+    !!! example
+
+        >>> import nhjax
+        >>> pendulum = nhjax.systems.SphericalPendulum()
+        >>> sol = nhjax.integrate(pendulum.system, nhjax.LobattoIIIAB(3),
+        ...     pendulum.initial_state(), dt=0.1, num_steps=20,
+        ...     stage_solver=nhjax.SimplifiedNewton(max_iterations=80))
+        >>> int(sol.stats["num_steps"])
+        20
+    """
+
+    max_iterations: int = eqx.field(static=True, default=100)
+    tolerance: FloatScalarLike = eqx.field(converter=tolerance_array, default=0.0)
+    fallback: bool | None = eqx.field(static=True, default=None)
+    jacobian: JacobianName = eqx.field(static=True, default=None)
+
+    def __check_init__(self):
+        if self.jacobian is not None:
+            check_choice("jacobian", self.jacobian, ("leading", "first_order"))
+        if self.fallback is not None:
+            check_flag("fallback", self.fallback)
+
+    def solve(
+        self, stages: StageEquations, x0: StageUnknowns, lin: Linearisation, skip: Array
+    ) -> Solved[StageUnknowns, Evaluation]:
+        """Solve the stage equations from `x0`; do nothing where `skip` is true."""
+        structure = leading_structure(stages, x0, lin, self.jacobian)
+        scale = fibre_coordinate_scale(stages, x0, lin)
+
+        def iteration(x: StageUnknowns):
+            x_next, evaluation = corrected(stages, structure, x)
+            return x_next, sizes(stages, x, x_next, lin), evaluation
+
+        solved = _iterated(self, iteration, x0, scale, skip)
+        if not self.fallback:
+            return solved
+        # If the first iterate is not finite, the functions of the system are not finite
+        # at the state itself, and Newton's method cannot help.
+        hopeless = (solved.num_iterations <= 1) & ~all_finite(solved.x)
+        ends = solved.converged | hopeless
+
+        def by_newton():
+            newton = self._newton.solve(stages, x0, lin, ends)
+            count = solved.num_iterations + newton.num_iterations
+            aux = newton.aux._replace(newton=jnp.ones_like(ends))
+            return newton._replace(num_iterations=count, aux=aux)
+
+        return jax.lax.cond(ends, lambda: solved, by_newton)
+
+    @property
+    def _newton(self) -> "Newton":
+        return Newton(tolerance=self.tolerance)
+
+    def frozen_newton_map(
+        self, stages: StageEquations, lin: Linearisation, x: StageUnknowns
+    ) -> FrozenNewtonMap:
+        """Build the iteration of `solve` with constraint Jacobians at the solution.
+
+        With the fallback this is the iteration of Newton's method, which contracts also
+        in steps that Newton's method had to solve.
+        """
+        if self.fallback:
+            return self._newton.frozen_newton_map(stages, lin, x)
+        structure = leading_structure(stages, x, lin, self.jacobian)
+        return lambda stages, x: corrected(stages, structure, x)[0]
+
+
+def is_simplified_alone(stage_solver: AbstractStageSolver) -> bool:
+    """Return whether the solver is simplified Newton without the fallback."""
+    return isinstance(stage_solver, SimplifiedNewton) and not stage_solver.fallback
+
+
+def leaves_steps_to_newton(stage_solver: AbstractStageSolver) -> bool:
+    """Return whether a plain call that fails is repeated with the fallback."""
+    return isinstance(stage_solver, SimplifiedNewton) and stage_solver.fallback is None
+
+
+class Newton(AbstractStageSolver):
+    """Newton's method on the stage equations, with their exact dense Jacobian.
+
+    An iteration costs more than an iteration of `SimplifiedNewton`, but the method
+    converges for larger steps and for stiff forces. Stiff forces magnify round-off in
+    the increments. This solver distinguishes such increments from the increments of an
+    iteration that has not converged. Both solvers give the same trajectory to
+    round-off.
+
+    **Arguments:** `max_iterations` and `tolerance`, as for `SimplifiedNewton`.
+
+    !!! example
+
+        >>> import nhjax
+        >>> pendulum = nhjax.systems.SphericalPendulum()
+        >>> sol = nhjax.integrate(pendulum.system, nhjax.LobattoIIIAB(3),
+        ...     pendulum.initial_state(), dt=0.1, num_steps=20,
+        ...     stage_solver=nhjax.Newton())
+        >>> int(sol.stats["num_steps"])
+        20
+    """
+
+    max_iterations: int = eqx.field(static=True, default=30)
+    tolerance: FloatScalarLike = eqx.field(converter=tolerance_array, default=0.0)
+
+    def solve(
+        self, stages: StageEquations, x0: StageUnknowns, lin: Linearisation, skip: Array
+    ) -> Solved[StageUnknowns, Evaluation]:
+        """Solve the stage equations from `x0`; do nothing where `skip` is true."""
+        _, unravel = ravel_pytree(x0)
+        scale = fibre_coordinate_scale(stages, x0, lin)
+
+        eps = float(jnp.finfo(stages.p.dtype).eps)
+        nudge = eps**0.5
+        moved = with_moved_positions(stages, jnp.asarray(nudge, stages.p.dtype))
+
+        def residual(z):
+            return stage_residual(stages, unravel(z))
+
+        def iteration(x: StageUnknowns):
+            z, _ = ravel_pytree(x)
+            jacobian, r, evaluation = jacobian_and_value(residual, z)
+            change = stage_residual(moved, x)[0] - r
+            # After a change of x by a few units in the last place, the equations differ
+            # from the prediction of the Jacobian by their round-off.
+            near = z + 8 * eps * uneven_perturbations(z)
+            missed = residual(near)[0] - r - jacobian @ (near - z)
+            rights = jnp.stack([r, change, missed], axis=1)
+            dz, *noises = jnp.linalg.solve(jacobian, -rights).T
+            x_next = unravel(z + dz)
+            # Two kinds of round-off move the stages: the round-off of the positions,
+            # which stiff forces magnify, and the round-off of the equations, which is
+            # magnified if the equations are nearly dependent.
+            by_positions, by_equations = (
+                increment_size(stages, x, unravel(z + noise), lin) for noise in noises
+            )
+            noise = jnp.maximum(by_positions / nudge, PART * by_equations / eps)
+            found = Sizes(
+                increment_size(stages, x, x_next, lin),
+                fibre_coordinate_size(stages, x_next),
+                noise,
+            )
+            return x_next, found, evaluation
+
+        solved = _iterated(self, iteration, x0, scale, skip)
+        # Where forces grow without bound, increments are small even far from a
+        # solution. Therefore the residual is checked too.
+        gross = matvec(lin.momentum_inverse, solved.aux.forces.residual)
+        found = fibre_coordinate_size(stages, solved.x)
+        measure = jnp.maximum(scale.size + scale.round_off, found)
+        allowed = 1e3 * jnp.asarray(self.tolerance, measure.dtype)
+        size = jnp.maximum(scale.size, found)
+        near = jnp.maximum(_GROSS * measure, allowed * size)
+        is_near = skip | (max_norm(gross) <= near)
+        return solved._replace(
+            converged=solved.converged & is_near,
+            exhausted=solved.exhausted | (solved.converged & ~is_near),
+        )
+
+    def frozen_newton_map(
+        self, stages: StageEquations, lin: Linearisation, x: StageUnknowns
+    ) -> FrozenNewtonMap:
+        """Build Newton's iteration with the constant Jacobian at the solution."""
+        z, unravel = ravel_pytree(x)
+        jacobian = jax.jacfwd(lambda z: stage_residual(stages, unravel(z))[0])(z)
+        jacobian_inverse = jnp.linalg.inv(jacobian)
+
+        def corrected(stages: StageEquations, x: StageUnknowns) -> StageUnknowns:
+            residual, _ = stage_residual(stages, x)
+            return unravel(ravel_pytree(x)[0] - jacobian_inverse @ residual)
+
+        return corrected
+
+
+class Scale(NamedTuple):
+    """The size of the fibre coordinates of a step, and their additional round-off.
+
+    Both are in units of fibre coordinates. The round-off of fibre coordinates is about
+    the unit round-off times the sum of the two.
+    """
+
+    size: FloatScalar
+    round_off: FloatScalar
+
+
+def _iterated(
+    stage_solver: AbstractStageSolver,
+    iteration: Callable[[StageUnknowns], tuple[StageUnknowns, Sizes, Evaluation]],
+    x0: StageUnknowns,
+    scale: Scale,
+    skip: Array,
+) -> Solved[StageUnknowns, Evaluation]:
+    """Repeat the `iteration` of a solver until it ends."""
+    return iterate(
+        iteration,
+        x0,
+        scale.size,
+        max_iterations=stage_solver.max_iterations,
+        tolerance=stage_solver.tolerance,
+        round_off=scale.round_off,
+        noise_units=NOISE_UNITS,
+        skip=skip,
+    )
+
+
+def starting_values(
+    stages: StageEquations, u: Array, lin: Linearisation
+) -> StageUnknowns:
+    """Compute the stages to first order in h, from u̇ and λ_c at the start.
+
+    The values do not depend on the previous step, so that a step is a function of its
+    state only.
+    """
+    m, s = stages.num_nonholonomic, stages.method.stages
+    invariants = stages.invariants
+    push = stages.h * lin.acceleration
+    stage_times = jnp.sum(stages.coefficients("a_hat"), axis=1)
+    node_times = jnp.sum(stages.node_weights, axis=1)
+    # The unknown ν of the symmetric closure vanishes with h, and starts from zero. All
+    # other unknowns of a closure are multipliers.
+    free = (jnp.arange(s - 1) >= int(stages.end_multiplier_is_unknown)).astype(u.dtype)
+    empty = jnp.zeros((0,), u.dtype)
+    at_stages = u[None] + jnp.outer(stage_times, push)
+    velocity, momentum = at_stages, jnp.zeros((s, 0), u.dtype)
+    if stages.hamiltonian:
+        velocity = _starting_velocities(stages, u, lin, stage_times)
+        momentum = at_stages
+    return StageUnknowns(
+        velocity=velocity,
+        momentum=momentum,
+        node_fibre_coordinate=u[None] + jnp.outer(node_times, push),
+        closure=jnp.outer(free, lin.multiplier[:m]),
+        holonomic=jnp.outer(jnp.ones((s,), u.dtype), lin.multiplier[m:]),
+        end_acceleration=lin.acceleration
+        if stages.end_multiplier_is_unknown
+        else empty,
+        end_multiplier=lin.multiplier if stages.end_multiplier_is_unknown else empty,
+        impulse=None if invariants is None else jnp.zeros_like(invariants.sizes),
+    )
+
+
+def _starting_velocities(stages: StageEquations, u, lin: Linearisation, times) -> Array:
+    v = stages.system.velocity(stages.t, stages.q, u, stages.args)
+    _, rate = jax.jvp(
+        lambda t, xi, u: stages.system.velocity(
+            t, stages.manifold.act(stages.q, xi), u, stages.args
+        ),
+        (stages.t, jnp.zeros_like(u), u),
+        (jnp.ones_like(stages.t), v, lin.acceleration),
+    )
+    return v[None] + jnp.outer(times, stages.h * rate)
+
+
+def fibre_coordinate_scale(
+    stages: StageEquations, x0: StageUnknowns, lin: Linearisation
+) -> Scale:
+    """Estimate the size of the fibre coordinates of a step and their round-off.
+
+    The size is the size of the coordinates at the starting values x0 plus the changes
+    by forces and by reactions over the step, which may cancel. For a system at rest
+    only these changes remain.
+
+    The additional round-off has these parts:
+
+    - The round-off of positions, through the constraints. For holonomic constraints it
+        is divided by h. For nonholonomic constraints it matters if a coordinate has
+        grown large, such as the heading of a car after many turns.
+    - The round-off of invariants, through the impulses that keep them.
+
+    It is at least the measured round-off of the functions of the system.
+    """
+    h = jnp.abs(stages.h)
+    rate = max_norm(lin.acceleration)
+    if stages.constrained:
+        rate = rate + max_norm(matvec(absolute(lin.reaction), jnp.abs(lin.multiplier)))
+    size = h * rate + max_norm(
+        x0.node_fibre_coordinate, x0.momentum if stages.hamiltonian else x0.velocity
+    )
+    round_off = jnp.zeros_like(size)
+    m, k = stages.num_nonholonomic, stages.num_holonomic
+    t, q, args = stages.t, unframed(stages.q), stages.args
+
+    if k:
+        sizes = position_scale(stages.system, t, q, args, lin)
+        correction = lin.largest_correction(jnp.pad(sizes, (m, 0)))
+        round_off = round_off + correction / h
+    if m:
+        sizes = jnp.pad(_kinematic_scale(stages, q, x0), (0, k))
+        round_off = round_off + lin.largest_correction(sizes)
+    if stages.invariants is not None:
+        round_off = round_off + invariant_correction(stages, x0).noise
+    if stages.round_off is not None:
+        round_off = jnp.maximum(round_off, stages.round_off.size(h))
+    return Scale(size, round_off)
+
+
+def _kinematic_scale(
+    stages: StageEquations, q: PyTree[Array], x0: StageUnknowns
+) -> Float[Array, " m"]:
+    """Estimate the change of nonholonomic constraints if positions move by their size.
+
+    One direction of the move is enough for an estimate. Moving each coordinate on its
+    own would need one derivative per coordinate.
+    """
+    system, t, args = stages.system, stages.t, stages.args
+    u = x0.momentum[0] if stages.hamiltonian else x0.velocity[0]
+    change = jax.jvp(
+        lambda q: system.kinematic_constraint(t, q, u, args),
+        (q,),
+        (uneven_perturbations(q),),
+    )[1]
+    # If a constraint has no finite slope, this says nothing about its round-off.
+    return jnp.where(jnp.isfinite(change), jnp.abs(change), 0)
