@@ -45,7 +45,7 @@ class IrregularLagrangianError(ValueError):
 
 
 class DependentConstraintsError(ValueError):
-    """Raised if the constraints are dependent, that is, D2Φ has not full rank.
+    """Raised if the constraints are dependent, that is, D2Φ does not have full rank.
 
     This is the paper's admissibility condition; with holonomic constraints the rows of
     DΓ count too.

@@ -131,6 +131,42 @@ SYSTEMS = [
         "`holonomic` must take (t, q, args), but `<lambda>(t, q, v, args)` does not",
     ),
     row(
+        "took the velocity instead of args in a holonomic constraint",
+        lambda: system_with(holonomic=lambda t, q, v: q @ q - 1),
+        TypeError,
+        "`holonomic` must take (t, q, args), but `<lambda>(t, q, v)` takes v",
+        "nhjax passes `args` as the third argument",
+        "Pass a constraint on velocities as `nonholonomic`",
+    ),
+    row(
+        "took the velocity in a function of a Hamiltonian system",
+        lambda: HamiltonianSystem(
+            lambda t, q, p, args: 0.5 * p @ p, nonholonomic=lambda t, q, v, args: v[0]
+        ),
+        TypeError,
+        "HamiltonianSystem: `nonholonomic` must take (t, q, p, args)",
+        "`<lambda>(t, q, v, args)` takes v",
+        "nhjax passes the momentum p as the third argument",
+        "Write the function in terms of p",
+    ),
+    row(
+        "took the momentum in a function of a Lagrangian system",
+        lambda: system_with(force=lambda t, q, p, args: -p),
+        TypeError,
+        "LagrangianSystem: `force` must take (t, q, v, args)",
+        "nhjax passes the velocity v as the third argument",
+        "Write the function in terms of v",
+    ),
+    row(
+        "gave a list of functions as constraints",
+        lambda: system_with(
+            nonholonomic=[lambda t, q, v, args: v[0], lambda t, q, v, args: v[1]]
+        ),
+        TypeError,
+        "`nonholonomic` must be one function of (t, q, v, args), got a list of 2",
+        "returns `jnp.hstack([f(t, q, v, args), g(t, q, v, args)])`",
+    ),
+    row(
         "took the time last in the Lagrangian",
         lambda: system_with(lagrangian=lambda q, v, t, args: 0.5 * v @ v),
         TypeError,
@@ -210,14 +246,14 @@ VALUES_OF_FUNCTIONS = [
         lambda: start(system_with(lagrangian=lambda t, q, v, args: None)),
         ShapeError,
         "`lagrangian(t, q, v, args)` must return an array of shape ()",
-        "got nothing: does it lack a `return`?",
+        "got None: is a `return` missing?",
     ),
     row(
         "returned an integer from the Lagrangian",
         lambda: start(system_with(lagrangian=lambda t, q, v, args: jnp.int32(1))),
         DTypeError,
         "`lagrangian(t, q, v, args)` returns dtype int32, but `q` has float64",
-        "write 1.0 for 1",
+        "write 1.0 instead of 1",
     ),
     row(
         "returned a complex number from the Lagrangian",
@@ -268,14 +304,14 @@ VALUES_OF_FUNCTIONS = [
         lambda: start(system_with(nonholonomic=lambda t, q, v, args: [v[0], v[1]])),
         ShapeError,
         "`nonholonomic(t, q, v, args)` must return an array",
-        "got a list of 2: join its parts by `jnp.stack`",
+        "got a list of 2: join its parts with `jnp.stack`",
     ),
     row(
         "compared the two sides of a constraint",
         lambda: start(system_with(nonholonomic=lambda t, q, v, args: v[0] == q[0])),
         DTypeError,
         "`nonholonomic(t, q, v, args)` returns dtype bool",
-        "return the number that is to be zero, `a - b` in place of `a == b`",
+        "return the number that must vanish, `a - b` instead of `a == b`",
     ),
     row(
         "gave a force on one coordinate alone",
@@ -316,7 +352,7 @@ VALUES_OF_FUNCTIONS = [
         lambda: start(system_with(lagrangian=lambda t, q, v, args: v[0] ** 2 - q @ q)),
         IrregularLagrangianError,
         "the mass matrix D2D2L is singular",
-        "Give every coordinate a kinetic energy, or remove those without",
+        "Give every coordinate a kinetic energy, or remove the coordinates without one",
     ),
     row(
         "gave a kinetic energy with a sign that cancels the constraint",
@@ -569,14 +605,14 @@ STATES = [
         lambda: start(q=jnp.array([1, 0, 0])),
         DTypeError,
         "`q` has dtype int64",
-        "write 1.0 for 1",
+        "write 1.0 instead of 1",
     ),
     row(
         "gave integers as velocity, in a list",
         lambda: start(v=[1, 0, 0]),
         DTypeError,
         "`v` has dtype int64",
-        "write 1.0 for 1",
+        "write 1.0 instead of 1",
     ),
     row(
         "gave velocities of single precision to positions of double",
@@ -625,7 +661,7 @@ STATES = [
         lambda: start(q=Y0, v=None),
         TypeError,
         "`q` must be a configuration, got an nhjax.State",
-        "give `y.q` and `y.v`",
+        "pass `y.q` and `y.v`",
     ),
     row(
         "gave a tuple of arrays to a system on R^n",
@@ -664,13 +700,13 @@ STATES = [
         "gave neither velocity nor momentum",
         lambda: start(v=None),
         ValueError,
-        "Give either `v` or `p`; got neither of them",
+        "Give either `v` or `p`, got neither of them",
     ),
     row(
         "gave velocity and momentum",
         lambda: start(p=V),
         ValueError,
-        "Give either `v` or `p`; got both of them",
+        "Give either `v` or `p`, got both of them",
     ),
     row(
         "gave the Lagrangian in place of the system",
@@ -728,7 +764,7 @@ STATES = [
         lambda: start(TURNING, q=2 * QUATERNION),
         ConstraintViolationError,
         "is not an element of the group SO3",
-        "or pass `manifold.normalise(q)`",
+        "or `manifold.normalise(q)` as `q`",
     ),
     row(
         "gave one array to a product of groups",
@@ -935,7 +971,7 @@ SAVING = [
         lambda: run(Y0, saveat=SaveAt(t1=True, fn=lambda t, y, args: None)),
         TypeError,
         "SaveAt: `fn(t, y, args)` must return an array",
-        "got nothing: does it lack a `return`?",
+        "got None: is a `return` missing?",
     ),
 ]
 
@@ -1451,7 +1487,7 @@ ENSEMBLES = [
         lambda: nhjax.ensemble(lambda x: None, MEMBERS),
         TypeError,
         "`run` must return arrays for each member",
-        "got nothing: does it lack a `return`?",
+        "got None: is a `return` missing?",
     ),
     row(
         "gave the name of a reduction",

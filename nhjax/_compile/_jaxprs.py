@@ -23,7 +23,7 @@ from jaxtyping import PyTree
 # kernel. Calls into libraries (products of matrices, factorisations, transforms),
 # sorting, scattering and callbacks are not in the lists.
 #
-# These operations act element by element, which `_index_sets` relies on: no other may
+# These operations act element by element, which `_sparsity` relies on: no other may
 # be listed here.
 ELEMENTWISE = """
     abs acos acosh add add_any and asin asinh atan atan2 atanh

@@ -1,4 +1,4 @@
-"""Checks of an initial state once it has been computed, with their messages."""
+"""Checks of a computed initial state, with their error messages."""
 
 from typing import NamedTuple
 
@@ -26,24 +26,24 @@ from .._system import (
     Linearisation,
     State,
 )
-from ._keep import Kept
-from ._projection import Fixed
+from ._projection import Fixed, Kept
 
 
 class Found(NamedTuple):
-    """A state that was computed, and the numbers by which it is judged.
+    """A computed initial state, and the numbers that the checks need.
 
     - `lin`: the linearisation of the equations of motion at the state.
     - `off_group`: the distance of the given q to the group.
     - `regularity`, `compatibility`: the reciprocal condition numbers of the metric on
         the fibre and of the compatibility matrix.
-    - `ranks`, `deficient`: the derivatives that must have full rank, and which lack it;
-        redundant constraints must only have derivatives.
+    - `ranks`, `deficient`: the constraint derivatives whose rank is checked, and
+        whether each lacks full rank. Redundant constraints lack it only where a row is
+        zero.
     - `allowed`, `allowed_positions`, `allowed_off_group`: the bounds on violations.
-    - `legendre_solved`: whether the Legendre transform could be inverted.
+    - `legendre_solved`: whether the Legendre transform was inverted.
     - `projected`: whether the projection onto the constraints has converged.
     - `fixed_positions`, `fixed_velocities`: the combinations of constraints that kept
-        components fix; None where nothing is kept.
+        components determine; None if no components are kept.
     """
 
     state: State
@@ -102,7 +102,7 @@ _WORDS = {
 
 
 class _Case(NamedTuple):
-    """A state and what it was made from, as the messages of errors need them."""
+    """A computed state with the user's input, for error messages."""
 
     found: Found
     q: PyTree[Array]
@@ -115,7 +115,7 @@ class _Case(NamedTuple):
 
     @property
     def where(self) -> str:
-        # The message shows what the user gave, which the user recognises.
+        # The message shows the values that the user passed.
         return f"q = {self.q}, {self.given_name} = {self.given}"
 
     @property
@@ -134,7 +134,7 @@ class _Case(NamedTuple):
         return f"{self.words.constraint} = {found.lin.violation}{positions}"
 
 
-def judged(
+def list_checks(
     system: AbstractMechanicalSystem,
     found: Found,
     q: PyTree[Array],
@@ -143,7 +143,7 @@ def judged(
     project: bool,
     keep: tuple[Kept, Kept],
 ) -> list[Check]:
-    """List the conditions on a state, each with the exception for where it fails."""
+    """List the conditions on an initial state, each with its exception."""
     state, lin = found.state, found.lin
     singular = 10 * state.v.shape[0] * jnp.finfo(state.v.dtype).eps
     name, given = ("p", p) if v is None else ("v", v)
@@ -151,8 +151,8 @@ def judged(
     case = (_Case(found, q, name, given, project, words, group, keep),)
     return [
         Check(found.off_group <= found.allowed_off_group, _group_error, case),
-        # The negated "<=" lets NaN pass, which ">" would not: a matrix that is not
-        # finite is reported by another check, and not as singular.
+        # The negated "<=" lets NaN pass, since another check reports a matrix that is
+        # not finite.
         Check(~(found.regularity <= singular), _regularity_error, case),
         Check(found.legendre_solved, _legendre_error, case),
         *[
@@ -183,17 +183,17 @@ def _group_error(case: _Case) -> ConstraintViolationError:
         where, q = "`q` with its kept numbers", case.found.state.q
         labels = enumerated(list(case.keep[0].labels))
         advice = (
-            f"Choose fewer in `keep_q`, which keeps {labels}, or pass "
-            "`manifold.normalise(q)`."
+            f"Keep fewer components than {labels} in `keep_q`, or pass "
+            "`manifold.normalise(q)` as `q`."
         )
     elif case.project:
         where, q = "`q`", case.q
         advice = (
-            "The projection found no element near it; a quaternion must not be zero."
+            "The projection found no element near it: a quaternion must not be zero."
         )
     else:
         where, q = "`q`", case.q
-        advice = "Pass `project=True`, or pass `manifold.normalise(q)`."
+        advice = "Pass `project=True`, or `manifold.normalise(q)` as `q`."
     return ConstraintViolationError(
         f"{where} = {q} is not an element of the group {case.group}: it is off by "
         f"{float(case.found.off_group):.3g}. {advice}"
@@ -205,7 +205,7 @@ def _regularity_error(case: _Case) -> IrregularLagrangianError:
         f"The {case.words.generator} is not regular: the {case.words.hessian} is "
         f"singular at {case.where} (reciprocal condition number "
         f"{float(case.found.regularity):.1e}). Give every coordinate a kinetic energy, "
-        "or remove those without."
+        "or remove the coordinates without one."
     )
 
 
@@ -220,7 +220,8 @@ def _projection_error(case: _Case) -> NewtonError:
     return NewtonError(
         f"The state could not be projected onto the constraints from {case.where}: "
         f"Newton's method stopped at q = {case.found.state.q}, {case.reached} with "
-        f"{case.violations}. Start nearer to them{_or_keep_fewer(*case.keep)}."
+        f"{case.violations}. Start nearer to the constraints"
+        f"{_or_keep_fewer(*case.keep)}."
     )
 
 
@@ -241,8 +242,8 @@ def _compatibility_error(case: _Case) -> IncompatibleConstraintsError:
         f"The constraints are not compatible with the {case.words.generator}: C = D2Φ "
         f"M⁻¹ D2Φᵀ is singular at {case.where} (the paper's compatibility condition "
         f"fails for {which}; reciprocal condition number "
-        f"{float(case.found.compatibility):.1e}). Nothing determines "
-        "these multipliers."
+        f"{float(case.found.compatibility):.1e}). These multipliers "
+        "are not determined: remove or change the constraints."
     )
 
 
@@ -250,8 +251,8 @@ def _force_error(case: _Case) -> NonFiniteError:
     words, lin = case.words, case.found.lin
     return NonFiniteError(
         f"The forces {words.force}, or the derivatives of {words.constraint}, are not "
-        f"finite at {case.where}: the rate of {words.coordinate} would be "
-        f"{lin.acceleration}, the multiplier {lin.multiplier}. Check the functions of "
+        f"finite at {case.where}: d{words.coordinate}/dt = {lin.acceleration} and "
+        f"multiplier = {lin.multiplier}. Check the functions of "
         "the system at this state."
     )
 
@@ -270,7 +271,7 @@ def _or_keep_fewer(*keep: Kept) -> str:
     if not kept:
         return ""
     listed = [f"{enumerated(list(x.labels))} (`{x.argument}`)" for x in kept]
-    return f", or keep less than {enumerated(listed)}"
+    return f", or keep fewer components than {enumerated(listed)}"
 
 
 def _listed(
@@ -326,7 +327,7 @@ def _unreached(
     violation: Float[Array, " l"],
     allowed: Float[Array, " l"],
 ) -> str:
-    """Say why a projection has left a violation, and what to do about it."""
+    """Describe why a projection left a violation, with advice."""
     missed = "the projection did not reach them"
     if fixed is None:
         return missed
@@ -335,7 +336,7 @@ def _unreached(
     rows = [a for a, x in enumerate(left) if abs(x) > allowed[a] / fixed.sizes[a]]
     if not rows:
         return f"{missed}{_or_keep_fewer(kept)}"
-    # Each column is the change of such violations if a kept component is released.
+    # Each column is the change of these violations along one kept component.
     released = fixed.projector @ fixed.slopes
     small = float(np.finfo(left.dtype).eps) ** 0.5
     largest = np.max(np.abs(left))

@@ -40,9 +40,14 @@ from .._system import (
     State,
     violation_scale,
 )
-from ._checks import Found, judged
-from ._keep import checked_keep, Chosen, Kept
-from ._projection import project_fibre_coordinate, project_position
+from ._checks import Found, list_checks
+from ._projection import (
+    checked_keep,
+    Chosen,
+    Kept,
+    project_fibre_coordinate,
+    project_position,
+)
 
 
 def initial_state(
@@ -59,13 +64,13 @@ def initial_state(
     keep_p: Chosen = None,
     throw: bool = True,
 ) -> State:
-    """Make a consistent state (q, v, p, λ) from a configuration and a v or p.
+    """Create a consistent state (q, v, p, λ) from a configuration and a v or p.
 
-    Of velocity and momentum one is given, and the other follows by the Legendre
-    transform p = D2L or v = D2H. The multiplier is that of the continuous problem,
-    which follows from the hidden constraints: dΦ/dt = 0 of nonholonomic constraints and
-    d²Γ/dt² = 0 of holonomic ones. From an inconsistent λ_0 the order of a method with
-    the closure `"propagated"` falls, in general to 2 for any number of stages.
+    You give the velocity or the momentum; the other follows from the Legendre transform
+    p = D2L or v = D2H. The multiplier is the multiplier of the continuous problem. It
+    follows from the hidden constraints: dΦ/dt = 0 for nonholonomic and d²Γ/dt² = 0 for
+    holonomic constraints. With an inconsistent λ_0, a method with the closure
+    `"propagated"` has in general only order 2, for any number of stages.
 
     **Arguments:**
 
@@ -79,20 +84,21 @@ def initial_state(
         velocity, in the kinetic metric, that satisfies the constraints (one linear
         solve for constraints linear or affine in v, Newton's method for others).
     - `keep_q`, `keep_v`, `keep_p`: the components of q, and of the v or p that was
-        given, that the projection must not change, as indices or names, one or a
-        sequence of them; known when tracing. The others are then the nearest, in the
-        same metric, of those that satisfy the constraints. Indices count the numbers of
-        `q` (of a tuple, the numbers of all its parts in order) or the components of `v`
-        or `p`. Names are those of the system's `coordinates`. A condition that only
-        kept components could satisfy, and do not, is an error by name.
-    - `throw`: raise if there is no such state. Otherwise all its numbers are NaN, and
-        `integrate` reports it as not finite; under `vmap` the other members of an
-        ensemble are not touched. Wrong types and shapes raise all the same.
+        given, that the projection must not change: an index, a name or a sequence of
+        them, known when tracing. The other components are then the nearest, in the same
+        metric, that satisfy the constraints. Indices count the numbers of `q` (of a
+        tuple, the numbers of all its parts in order) or the components of `v` or `p`.
+        Names are in the `coordinates` of the system. If the kept components determine a
+        constraint and violate it, the error names both.
+    - `throw`: whether to raise if there is no consistent state. If false, all numbers
+        of the state are then NaN, and `integrate` reports it as not finite; under
+        `vmap` the other members of an ensemble are not affected. Wrong types and shapes
+        raise in both cases.
 
     **Returns:** a `State`.
 
-    **Raises:** the following errors. Under `jit` those that depend on values come with
-    the same message in an error of JAX, a `JaxRuntimeError` or a `ValueError`.
+    **Raises:** the following errors. Under `jit`, an error that depends on values has
+    the same message, and JAX raises it as a `JaxRuntimeError` or a `ValueError`.
 
     - `TypeError`: `system`, `project`, `keep_q`, `keep_v`, `keep_p` or a part of `args`
         is of a wrong type.
@@ -100,14 +106,14 @@ def initial_state(
         unknown, or chosen twice or without `project=True`.
     - `ShapeError`, `DTypeError`, `NonFiniteError`: an argument, or the value of one of
         the system's functions, is not what it should be.
-    - `ConstraintViolationError`: a constraint is violated, or `q` is off the group, and
-        `project` is false or the components that are kept do not allow to correct it.
+    - `ConstraintViolationError`: a constraint is violated, or `q` is not on the group,
+        and `project` is false or the kept components prevent the correction.
     - `IrregularLagrangianError`: D2D2L (or D2D2H) is singular.
-    - `DependentConstraintsError`: D2Φ and DΓ have not full rank (admissibility), unless
-        the constraints of the system are `"redundant"`.
+    - `DependentConstraintsError`: D2Φ and DΓ do not have full rank (admissibility), and
+        the constraints of the system are `"independent"`.
     - `IncompatibleConstraintsError`: C^{ab} is singular (compatibility).
-    - `NewtonError`: no velocity belongs to the momentum (or the reverse), or Newton's
-        method found no state on the constraints from the one to be projected.
+    - `NewtonError`: no velocity was found for the momentum (or the reverse), or the
+        projection by Newton's method did not converge.
 
     !!! example
 
@@ -143,7 +149,7 @@ def initial_state(
     if throw:
         q = require(q, *inputs)
     found = _solve(system, t, q, v, p, args, project, keep)
-    checks = judged(system, found, q, v, p, project, keep)
+    checks = list_checks(system, found, q, v, p, project, keep)
     if throw:
         return require(found.state, *checks)
     good = jnp.all(jnp.stack([jnp.asarray(check.ok) for check in inputs + checks]))
@@ -183,7 +189,7 @@ def _solve(system, t, q, v, p, args, project: bool, keep: tuple[Kept, Kept]) -> 
         fixed_u = nearest.fixed
     lin, found_v, found_p = as_cpu_kernel(_motion, system, t, q, u, args)
     if not project:
-        # The velocity or momentum that was given is kept to the last bit.
+        # The given velocity or momentum is returned bit for bit.
         found_v = found_v if v is None else v
         found_p = found_p if p is None else p
     elif v is not None:
@@ -191,7 +197,7 @@ def _solve(system, t, q, v, p, args, project: bool, keep: tuple[Kept, Kept]) -> 
     else:
         found_p = keep_u.restored(found_p, p)
     state = State(q, found_v, found_p, lin.multiplier)
-    # The numbers by which the state is judged lead to no derivative.
+    # The numbers that the checks need are not differentiated.
     system, args, t, q, u, lin, starts = stop_gradient(
         (system, args, t, q, u, lin, starts)
     )
@@ -227,10 +233,10 @@ def _solve(system, t, q, v, p, args, project: bool, keep: tuple[Kept, Kept]) -> 
 def _allowed(
     system, lin: Linearisation, t, q, u, args
 ) -> tuple[Float[Array, " l"], Float[Array, " k"], FloatScalar]:
-    """Bound what violations of velocity and position constraints can be by round-off.
+    """Bound the violations of velocity and position constraints by round-off.
 
-    The third number bounds the distance to a group. Where q and v are small, constants
-    inside the constraints leave larger round-off than these, which is measured.
+    The third number bounds the distance to a group. If q and v are small, constants in
+    the constraints can cause larger round-off than q and v, so that it is measured.
     """
     tolerance = jnp.asarray(1e3 * float(jnp.finfo(u.dtype).eps), u.dtype)
     given = system, t, q, u, lin.multiplier, args
@@ -261,11 +267,11 @@ def _motion(
 def _ranks_judged(
     system: AbstractMechanicalSystem, lin: Linearisation, ranks: list[Rank]
 ) -> tuple[list[BoolScalar], FloatScalar]:
-    """Judge the ranks of constraint derivatives, and the condition number of C.
+    """Return which ranks are deficient, and the reciprocal condition number of C.
 
-    The latter is returned as its reciprocal. For redundant constraints it is one if C
-    has the rank of their derivatives, which makes them compatible, and zero otherwise;
-    their ranks are deficient only where a constraint has no derivatives at all.
+    Redundant constraints are compatible if C has the rank of their derivatives; the
+    number is then one, and otherwise zero. Their ranks are deficient only if all
+    derivatives of a constraint are zero.
     """
     jacobian, reaction, _ = lin.dense
     compliance = jacobian @ reaction
@@ -281,8 +287,8 @@ def _inverse_legendre(
 ) -> tuple[Float[Array, " n"], BoolScalar]:
     """Find the u whose fibre derivative is the given p or v, and whether it exists."""
     zero = jnp.zeros_like(given)
-    # Where the terms of the equation cancel, as at rest in a magnetic field, u is
-    # rounded by what they amount to, and not by its own size.
+    # If the terms of the equation cancel, as at rest in a magnetic field, the round-off
+    # of u is proportional to these terms and not to u.
     terms = jnp.abs(given) + jnp.abs(system.fibre_derivative(t, q, zero, args))
     scale = max_norm(jnp.abs(inverse(system.metric(t, q, zero, args))) @ terms)
     solved = root(
@@ -294,17 +300,17 @@ def _inverse_legendre(
 
 
 def checked_inputs(system, q, v, p, t):
-    """Convert what `initial_state` is given to arrays, or raise for what is wrong."""
+    """Convert the arguments of `initial_state` to arrays, and check them."""
     check_type("system", system, (LagrangianSystem, HamiltonianSystem))
     if isinstance(q, State):
         raise TypeError(
-            "`q` must be a configuration, got an nhjax.State. Of a state `y` give "
+            "`q` must be a configuration, got an nhjax.State. For a state `y` pass "
             "`y.q` and `y.v`."
         )
     if (v is None) == (p is None):
         given = "neither" if v is None else "both"
         raise ValueError(
-            f"Give either `v` or `p`; got {given} of them. Call it as "
+            f"Give either `v` or `p`, got {given} of them. Call it as "
             "`initial_state(system, q, v, t=..., args=...)`."
         )
     name, u = ("v", v) if p is None else ("p", p)
@@ -337,6 +343,6 @@ def checked_inputs(system, q, v, p, t):
                 "must agree."
             )
     t = real_scalar("t", t, u.dtype)
-    # All checks are attached to q, which no system ignores: `jax.jit` drops a check of
-    # what is not used.
+    # All checks are attached to q, since `jax.jit` drops a check of an unused value and
+    # every system uses q.
     return (q, u, None, t) if p is None else (q, None, u, t)

@@ -1,15 +1,24 @@
-"""The states on the constraints that are nearest to a given one."""
+"""The projection of a configuration and a velocity onto the constraints.
 
-from collections.abc import Callable
+A projection finds the nearest point on the constraints in the kinetic metric. The user
+may choose components of q, v or p that it keeps; the others are then the nearest among
+the points that have the kept components.
+"""
+
+import operator
+import reprlib
+from collections.abc import Callable, Iterable, Mapping
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple, TypeAlias, TypeVar
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.scipy.linalg import block_diag
 from jaxtyping import Array, Float, PyTree
 
 from .._custom_types import BoolScalar, FloatScalar
+from .._errors import is_traced
 from .._numerics import (
     inverse,
     least_norm_inverse,
@@ -19,21 +28,207 @@ from .._numerics import (
     root,
     stop_gradient,
 )
-from .._system import position_scale, velocity_scale
-from ._keep import Kept, kept_numbers
+from .._system import AbstractMechanicalSystem, position_scale, velocity_scale
+
+
+T = TypeVar("T", bound=PyTree[Array])
+# The components that a user chooses: an index, a name, or several of them.
+Chosen: TypeAlias = int | str | Iterable[int | str] | None
+
+
+class Kept(NamedTuple):
+    """The components of q, v or p that a projection does not change.
+
+    - `letter`: the argument that has these components: "q", "v" or "p".
+    - `indices`: the indices of the components among all numbers of the argument.
+    - `labels`: the names of the components in messages, such as "v[2]".
+    """
+
+    letter: str
+    indices: tuple[int, ...] = ()
+    labels: tuple[str, ...] = ()
+
+    @property
+    def argument(self) -> str:
+        """Return the name of the argument of `initial_state` that chose them."""
+        return f"keep_{self.letter}"
+
+    def restored(self, tree: T, given: T) -> T:
+        """Return `tree` with its kept numbers replaced by those of `given`."""
+        if not self.indices:
+            return tree
+        is_kept = np.zeros(sum(x.size for x in jax.tree.leaves(tree)), bool)
+        is_kept[list(self.indices)] = True
+        leaves, structure = jax.tree.flatten(tree)
+        ends = np.cumsum([x.size for x in leaves])[:-1]
+        masks = [
+            mask.reshape(x.shape)
+            for mask, x in zip(np.split(is_kept, ends), leaves, strict=True)
+        ]
+        return jax.tree.map(
+            jnp.where, jax.tree.unflatten(structure, masks), given, tree
+        )
+
+
+def kept_numbers(tree: PyTree[Array], kept: Kept) -> Float[Array, " k"]:
+    """Return the kept numbers of a tree as one vector."""
+    numbers = jnp.concatenate([x.reshape(-1) for x in jax.tree.leaves(tree)])
+    return numbers[jnp.asarray(kept.indices, int)]
+
+
+def checked_keep(
+    system: AbstractMechanicalSystem,
+    q: PyTree[Array],
+    letter: str,
+    chosen: dict[str, Any],
+    project: bool,
+) -> tuple[Kept, Kept]:
+    """Return the kept numbers of q and the kept components of the given v or p.
+
+    **Arguments:**
+
+    - `letter`: "v" or "p", whichever was given.
+    - `chosen`: the arguments `keep_q`, `keep_v` and `keep_p` by the letters q, v and p.
+    """
+    other = "p" if letter == "v" else "v"
+    if chosen[other] is not None:
+        raise ValueError(
+            f"`keep_{other}` chooses components of `{other}`, but `{letter}` is given: "
+            f"use `keep_{letter}`, or give `{other}` instead of `{letter}`."
+        )
+    dimension = system.manifold_of(q).dim
+    of_q = _kept(system, "q", chosen["q"], _labels(q), dimension)
+    labels = [f"{letter}[{i}]" for i in range(dimension)]
+    of_u = _kept(system, letter, chosen[letter], labels, dimension)
+    for kept in (of_q, of_u):
+        if kept.indices and not project:
+            raise ValueError(
+                f"`{kept.argument}` chooses what a projection keeps, but `project` is "
+                f"False, so that all of `{kept.letter}` is kept: pass `project=True`, "
+                f"or leave `{kept.argument}` out."
+            )
+    return of_q, of_u
+
+
+def _labels(q: PyTree[Array]) -> list[str]:
+    """Return a label for each number of q, such as "q[1][0]" in a tuple."""
+    found = []
+    for path, leaf in jax.tree_util.tree_leaves_with_path(q):
+        where = "q" + jax.tree_util.keystr(path)
+        found += [
+            f"{where}[{', '.join(map(str, index))}]" for index in np.ndindex(leaf.shape)
+        ]
+    return found
+
+
+def _kept(
+    system: AbstractMechanicalSystem,
+    letter: str,
+    given: Any,
+    labels: list[str],
+    dimension: int,
+) -> Kept:
+    if given is None:
+        return Kept(letter)
+    name = f"keep_{letter}"
+    entries = _entries(name, given)
+    indices = [_index(system, name, x, len(labels), dimension) for x in entries]
+    for i in indices:
+        if indices.count(i) > 1:
+            raise ValueError(f"`{name}` = {given!r} has {labels[i]} more than once.")
+    names = system.coordinates
+    if names is not None and len(names) == len(labels):
+        labels = [f"{label} ({x})" for label, x in zip(labels, names, strict=True)]
+    indices = tuple(sorted(indices))
+    return Kept(letter, indices, tuple(labels[i] for i in indices))
+
+
+def _entries(name: str, given: Any) -> list[Any]:
+    """List the indices or names that an argument chooses."""
+    if is_traced(*jax.tree.leaves(given)):
+        raise TypeError(
+            f"`{name}` is a traced array, but must be known when tracing: the program "
+            "depends on which components are kept. Pass a tuple of ints, and not as an "
+            "argument of `jax.jit` or `jax.vmap`."
+        )
+    is_one = isinstance(given, str) or getattr(given, "ndim", None) == 0
+    if is_one or not isinstance(given, Iterable):
+        return [given]
+    if isinstance(given, Mapping):
+        raise TypeError(_wrong_kind(name, given))
+    return list(given)
+
+
+def _wrong_kind(name: str, x: Any) -> str:
+    return (
+        f"`{name}` must be indices or names of components, got {reprlib.repr(x)} of "
+        f"type {type(x).__name__}."
+    )
+
+
+def _index(
+    system: AbstractMechanicalSystem, name: str, x: Any, size: int, dimension: int
+) -> int:
+    """Return the nonnegative index of a component given by index or name."""
+    letter = name[-1]
+    if isinstance(x, str):
+        return _index_of_name(system, name, x, size, dimension)
+    if isinstance(x, bool) or getattr(x, "dtype", None) == np.bool_:
+        raise TypeError(
+            f"`{name}` must be indices or names of components, not bools. For a mask, "
+            "pass `numpy.flatnonzero(mask)`."
+        )
+    try:
+        index = operator.index(x)
+    except TypeError:
+        raise TypeError(_wrong_kind(name, x)) from None
+    if not -size <= index < size:
+        raise ValueError(
+            f"`{name}` has the index {index}, but `{letter}` has {size} numbers: pass "
+            f"0 to {size - 1}."
+        )
+    return index % size
+
+
+def _index_of_name(
+    system: AbstractMechanicalSystem, name: str, x: str, size: int, dimension: int
+) -> int:
+    names, letter = system.coordinates, name[-1]
+    if names is None:
+        raise ValueError(
+            f"`{name}` has the name {x!r}, but the system has no names: pass indices, "
+            f"or name the coordinates, `{type(system).__name__}(..., "
+            "coordinates=(...))`."
+        )
+    if len(names) != dimension:
+        raise ValueError(
+            f"`{name}` has the name {x!r}, but `coordinates` of the system has "
+            f"{len(names)} names for {dimension} coordinates: {', '.join(names)}."
+        )
+    if size != dimension:
+        raise ValueError(
+            f"`{name}` has the name {x!r}, but the {size} numbers of `{letter}` are "
+            f"not the {dimension} coordinates that have names: give indices of "
+            f"`{letter}`."
+        )
+    if x not in names:
+        raise ValueError(
+            f"`{name}` has the name {x!r}, but the coordinates are {', '.join(names)}."
+        )
+    return names.index(x)
 
 
 Vector = Float[Array, " n"]
 
 
 class Fixed(NamedTuple):
-    """The combinations of constraints that kept components do not allow to change.
+    """The combinations of constraints that the kept components determine.
 
-    A row of them belongs to a constraint, divided by the size of its derivatives.
+    Each row belongs to a constraint, divided by the size of its derivatives.
 
     - `sizes`: the sizes of the derivatives of the constraints.
-    - `projector`: the projector onto the combinations that do not change, to first
-        order, however the other components change.
+    - `projector`: the projector onto the combinations that are constant, to first
+        order, when the other components change.
     - `slopes`: the derivatives of the constraints along the kept components.
     """
 
@@ -46,10 +241,10 @@ class Nearest(NamedTuple):
     """The result of a search for the nearest point on a constraint.
 
     - `x`: the point at which the search ended, a vector or an element of the group.
-    - `found`: whether it is a solution.
-    - `jacobian`: the Jacobian of the constraint where the search started.
-    - `fixed`: the combinations of constraints that kept components fix; None if no
-        components are kept.
+    - `found`: whether the search converged.
+    - `jacobian`: the Jacobian of the constraint at the start of the search.
+    - `fixed`: the combinations of constraints that the kept components determine; None
+        if no components are kept.
     """
 
     x: PyTree[Array]
@@ -61,8 +256,8 @@ class Nearest(NamedTuple):
 def project_position(system, t, q, u, args, kept: Kept, given: PyTree[Array]):
     """Project q onto Γ = 0: find the stationary point of ½ ξᵀ M ξ on Γ(t, q τ(ξ)) = 0.
 
-    M is the mass matrix at (t, q, u). The numbers of q τ(ξ) that are `kept` have the
-    values that they have in `given`. The `x` of the result is q τ(ξ).
+    M is the mass matrix at (t, q, u). The `kept` numbers of q τ(ξ) are equal to those
+    of `given`. The `x` of the result is q τ(ξ).
     """
     manifold = system.manifold_of(q)
     mass = system.metric(t, q, u, args)
@@ -85,7 +280,8 @@ def project_position(system, t, q, u, args, kept: Kept, given: PyTree[Array]):
         return nearest._replace(x=manifold.act(q, nearest.x))
     terms = jnp.full(len(kept.indices), max_norm(*jax.tree.leaves(q)))
     nearest = _nearest_keeping(mass, gamma, held, zero, sizes, terms, is_redundant)
-    # A condition such as w = 1 on a quaternion has no derivative where it holds.
+    # A condition such as w = 1 on a unit quaternion has zero derivative where it holds,
+    # so that convergence of the search does not imply it.
     moved = manifold.act(q, nearest.x)
     size = max_norm(*jax.tree.leaves(stop_gradient((q, moved))))
     off = max_norm(stop_gradient(held(nearest.x)))
@@ -94,10 +290,10 @@ def project_position(system, t, q, u, args, kept: Kept, given: PyTree[Array]):
 
 
 def project_fibre_coordinate(system, t, q, u, args, kept: Kept, given: Vector):
-    """Project u onto Φ = 0: find the stationary point w of ½ (w-u)ᵀ K (w-u) there.
+    """Project u: find the stationary point w of ½ (w-u)ᵀ K (w-u) on Φ(t, q, w) = 0.
 
-    The constraint is Φ(t, q, w) = 0, and K the metric on the fibre at (t, q, u). The
-    `kept` components of v or p, whichever was given, have the values of `given`.
+    K is the metric on the fibre at (t, q, u). The `kept` components of v or p,
+    whichever the user gave, are equal to those of `given`.
     """
 
     def phi(w):
@@ -140,19 +336,20 @@ def _nearest_keeping(
     terms_of_held: Float[Array, " k"],
     is_redundant: bool,
 ) -> Nearest:
-    """Do what `_nearest` does, and keep `held(y) = 0` as well.
+    """Find the nearest point as `_nearest` does, subject also to `held(y) = 0`.
 
     A combination of constraints is left out of the equations if its derivatives vanish
-    in all directions in which `held` does not change. The kept values then decide
-    whether it vanishes. The caller must judge all constraints at the result, at which
-    such a combination may be violated.
+    in all directions in which `held` is constant, because the kept values determine it.
+    Such a combination may be violated at the result: the caller must check all
+    constraints there.
 
-    `terms_of_held` has the sizes of the terms of `held`.
+    `terms_of_held` has the sizes of the terms of `held`, to which their round-off is
+    proportional.
     """
     jacobian = jax.jacrev(constraint)(x)
     size, terms = sizes(jacobian)
     small = float(jnp.finfo(x.dtype).eps) ** 0.75
-    # The units of single components are taken out by the metric.
+    # Scaling by the metric makes the ranks independent of the units of components.
     units = jnp.sqrt(jnp.abs(jnp.diagonal(metric)))
     units = jnp.where(units > 0, units, 1)
     by_units = jacobian / units[None], jax.jacrev(held)(x) / units[None]
@@ -194,10 +391,10 @@ def _row_sizes(matrix: Float[Array, "l n"]) -> Float[Array, " l"]:
 def _left_basis(
     matrix: Float[Array, "l n"], negligible: float
 ) -> tuple[Float[Array, "l l"], Float[Array, " l"]]:
-    """Find orthonormal combinations of rows, and which are active: one, or else zero.
+    """Find orthonormal combinations of rows, and which of them are active.
 
-    The combinations, which are the columns of the result, are active unless they are
-    negligible.
+    The combinations are the columns of the first result. The second result is one for
+    active combinations, whose singular value exceeds `negligible`, and otherwise zero.
     """
     missing = jnp.zeros(max(matrix.shape[0] - matrix.shape[1], 0), matrix.dtype)
     left, singular, _ = jnp.linalg.svd(matrix)
@@ -208,9 +405,9 @@ def _left_basis(
 def _active(
     basis: Float[Array, "l l"], active: Float[Array, " l"], sizes: Float[Array, " l"]
 ) -> Float[Array, "l l"]:
-    """Return the matrix that makes the active combinations of rows of these sizes.
+    """Return the matrix that forms the active combinations of rows of these sizes.
 
-    Where all combinations are active the rows stay as they are.
+    It is the identity if all combinations are active.
     """
     combinations = active[:, None] * basis.T / sizes[None]
     same = jnp.eye(basis.shape[0], dtype=basis.dtype)
@@ -230,17 +427,17 @@ def _nearest(
     **Arguments:**
 
     - `metric`: the matrix K.
-    - `constraint`: the function that is to vanish.
+    - `constraint`: the function that must vanish.
     - `x`: the point from which the search starts.
-    - `sizes`: called as `sizes(jacobian)`, the sizes of y and of the terms of the
-        constraint, to which their round-off is proportional.
-    - `is_redundant`: whether constraints may follow from each other.
+    - `sizes`: called as `sizes(jacobian)`; returns the sizes of y and of the terms of
+        the constraint, to which their round-off is proportional.
+    - `is_redundant`: whether constraints may be dependent.
     - `idle`: one for rows of the constraint that are zero everywhere, and zero for the
         others. The multipliers of idle rows are zero.
     """
     jacobian = jax.jacrev(constraint)(x)
     size, terms = sizes(jacobian)
-    # The round-off of the constraint moves y too. If y is zero, nothing else does.
+    # Round-off of the constraint changes y too; it is the only round-off if y is zero.
     reaction = inverse(metric) @ jacobian.T
     compliance = jacobian @ reaction
     if idle is not None:

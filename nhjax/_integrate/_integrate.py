@@ -505,7 +505,7 @@ def _check_saved(
     ]
     if leaves and not wrong:
         return
-    got = "nothing: does it lack a `return`?"
+    got = "None: is a `return` missing?"
     if wrong:
         got = f"{reprlib.repr(wrong[0])} of type {type(wrong[0]).__name__}."
     raise TypeError(

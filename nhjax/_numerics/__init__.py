@@ -5,7 +5,6 @@ from ._block_tridiagonal import (
     BlockTridiagonalInverse as BlockTridiagonalInverse,
     couplings as couplings,
 )
-from ._compensated import two_sum as two_sum
 from ._contraction import (
     absolute as absolute,
     AbstractLinearMap as AbstractLinearMap,
@@ -15,6 +14,16 @@ from ._contraction import (
     small_einsum as small_einsum,
 )
 from ._diagonal import full_jacobian as full_jacobian, jacobian as jacobian
+from ._floating_point import (
+    largest_column as largest_column,
+    max_norm as max_norm,
+    measured_noise as measured_noise,
+    NOISE_DEVIATIONS as NOISE_DEVIATIONS,
+    relative as relative,
+    two_sum as two_sum,
+    uneven_perturbations as uneven_perturbations,
+    unit as unit,
+)
 from ._implicit import (
     AbstractImplicitFunction as AbstractImplicitFunction,
     ClosureConverted as ClosureConverted,
@@ -29,7 +38,6 @@ from ._implicit import (
     with_zero_tangents as with_zero_tangents,
     zero_unless as zero_unless,
 )
-from ._index_sets import dependence as dependence
 from ._iteration import (
     iterate as iterate,
     jacobian_and_value as jacobian_and_value,
@@ -44,16 +52,6 @@ from ._least_norm import (
     NEARLY_DEPENDENT as NEARLY_DEPENDENT,
     rank_of_gram as rank_of_gram,
     reciprocal_condition_of_range as reciprocal_condition_of_range,
-)
-from ._max_norm import (
-    largest_column as largest_column,
-    max_norm as max_norm,
-    relative as relative,
-    unit as unit,
-)
-from ._noise import (
-    measured_noise as measured_noise,
-    NOISE_DEVIATIONS as NOISE_DEVIATIONS,
 )
 from ._rank import (
     dependent_rows as dependent_rows,
@@ -71,4 +69,4 @@ from ._sparse import (
     SparseMatrix as SparseMatrix,
     WeightedTranspose as WeightedTranspose,
 )
-from ._uneven_perturbations import uneven_perturbations as uneven_perturbations
+from ._sparsity import dependence as dependence

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Array, Float, PyTree
 
 from ._contraction import Matrix
-from ._index_sets import dependence
+from ._sparsity import dependence
 
 
 def jacobian(function: Callable[[Array], Array], u: Float[Array, " n"]) -> Matrix:

@@ -21,8 +21,8 @@ from jaxtyping import Array, PyTree
 from .._compile import as_cpu_kernel, cse_dce, TraceCache
 from .._custom_types import BoolScalar, FloatScalar
 from ._contraction import with_small_products
+from ._floating_point import max_norm, unit
 from ._iteration import dense_increment, iterate, Sizes, Solved
-from ._max_norm import max_norm, unit
 
 
 # Terms of the Neumann series below this many units of round-off are left out.

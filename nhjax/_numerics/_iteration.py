@@ -1,4 +1,4 @@
-"""Iterations that run until their increments are round-off, and Newton increments."""
+"""Fixed-point iterations that end at the level of round-off, and Newton increments."""
 
 from collections.abc import Callable
 from typing import Generic, NamedTuple, TypeVar
@@ -8,27 +8,27 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from .._custom_types import BoolScalar, FloatScalar, FloatScalarLike
-from ._max_norm import unit
+from ._floating_point import unit
 
 
 X = TypeVar("X")
 Aux = TypeVar("Aux")
 
 
-# Where an iteration may be slow, increments that have stopped falling are taken for
-# noise up to this many units of round-off. Larger ones may as well be those of a slow
-# iteration that approaches the solution in circles.
+# If an iteration may converge slowly, increments that have stopped falling are treated
+# as noise up to this many units of round-off. Larger ones can also come from a slow
+# iteration that spirals towards the solution.
 NOISE_UNITS = 400
-# At the first increment that fails to fall, this many units of round-off are believed
-# to be noise, and at each further one the number grows by one of the two factors below.
-# The factor is smaller where an iteration may be slow, since its increments may rise
-# and fall before it has come to an end.
+# At the first increment that fails to fall, this many units of round-off are treated as
+# noise. At each further one this level grows by one of the two factors below. The
+# factor is smaller for iterations that may be slow, since their increments may rise and
+# fall before they have converged.
 _FIRST_UNITS = 30.0
 _GROWTH, _GROWTH_IF_SLOW = 30.0, 2.0
 # An iteration diverges if an increment is larger by this factor than x and the first
 # increment together.
 _HOPELESS = 1e6
-# The magnification of round-off by the problem is not believed to exceed this factor.
+# An upper bound on the magnification of round-off by the problem.
 _LARGEST_NOISE = 1e5
 
 
@@ -47,9 +47,9 @@ class Sizes(NamedTuple):
 class Solved(NamedTuple, Generic[X, Aux]):
     """The outcome of an iteration: its last iterate, and whether it has converged.
 
-    `aux` is what the last sweep evaluated. An iteration that has not converged is
-    `exhausted` if it was given up after the largest number of iterations; otherwise it
-    has diverged.
+    `aux` holds the auxiliary values of the last sweep. An iteration that has not
+    converged is `exhausted` if it reached the maximum number of iterations; otherwise
+    it has diverged.
     """
 
     x: X
@@ -60,7 +60,7 @@ class Solved(NamedTuple, Generic[X, Aux]):
 
 
 class _Rules(NamedTuple):
-    """The constants by which `iterate` judges the increments of an iteration."""
+    """The constants with which `iterate` decides whether an iteration ends."""
 
     scale: FloatScalar
     round_off: FloatScalar
@@ -75,8 +75,8 @@ class _Progress(NamedTuple):
     """The progress of an iteration so far.
 
     - `first`, `smallest`: the first and the smallest increment.
-    - `believed`: the size of increments, relative to x, that is believed to be noise.
-    - `iterations`: how many iterations have been made.
+    - `believed`: the size of increments, relative to x, that is treated as noise.
+    - `iterations`: the number of iterations so far.
     - `done`, `converged`, `exhausted`: whether the iteration has ended, and how.
     """
 
@@ -103,24 +103,28 @@ def iterate(
     """Repeat `sweep` until its increments no longer fall.
 
     `sweep(x)` returns the next iterate, the sizes of the increment and of the iterate,
-    and whatever was evaluated at x. Increments are measured relative to `scale`, the
-    size of x, or relative to the size of the iterate if that is larger, because x may
-    start from zero. If both are zero, increments are measured relative to the first
-    one, which is measured as it is. The round-off of x is proportional to the same size
-    or, where data are larger than x, to `scale` plus `round_off`.
+    and auxiliary values at x. Increments are measured relative to `scale`, the size of
+    x, or relative to the size of the iterate if that is larger, because x may start
+    from zero. If both are zero, increments are measured relative to the first one. The
+    round-off of x is proportional to the same size or, if data are larger than x, to
+    `scale` plus `round_off`.
 
-    An increment below the unit round-off or `tolerance` ends the iteration. Small
-    increments that have stopped falling end it too, because they are round-off. How
-    large round-off can be depends on the conditioning of the problem, so that one
-    absolute threshold would be either too coarse or never met (Hairer, Lubich, Wanner,
-    GNI, section VIII.6): the more often increments fail to fall, the larger a level of
-    round-off is believed, up to `noise_units` of round-off. By default the largest
-    level is the square root of the unit round-off, which suits iterations that converge
-    so fast that nothing but noise can slow them down. An increment that is not finite,
-    or far larger than the first one and the iterate, ends the iteration as well.
+    The iteration ends
+
+    - when an increment is below the unit round-off or `tolerance`;
+    - when small increments have stopped falling, because they are then round-off;
+    - when an increment is not finite, or far larger than the first increment and the
+        iterate.
+
+    The size of round-off depends on the conditioning of the problem, so that a fixed
+    threshold would be either too coarse or never met (Hairer, Lubich, Wanner, GNI,
+    section VIII.6). Each time that an increment fails to fall, the level of increments
+    that are treated as noise is raised, up to `noise_units` of round-off. By default
+    the highest level is the square root of the unit round-off, which suits iterations
+    that converge so fast that only noise can slow them down.
     """
-    # The sweep is traced once, for the shapes and for the loop: to trace it is most of
-    # the work of tracing a step.
+    # `jit` makes JAX trace the sweep once, for the shapes and for the loop. Tracing the
+    # sweep is most of the work of tracing a step.
     sweep = jax.jit(sweep, inline=True)
     aux_shape = jax.eval_shape(sweep, x)[2]
     aux = jax.tree.map(lambda s: jnp.zeros(s.shape, s.dtype), aux_shape)
@@ -159,8 +163,7 @@ def _progress(rules: _Rules, before: _Progress, sizes: Sizes) -> _Progress:
     """Update the progress of an iteration by an increment; decide whether it ends."""
     increment = sizes.increment
     first = jnp.where(before.iterations == 0, increment, before.first)
-    # Sizes are compared without forming quotients, which would have to be computed one
-    # after the other.
+    # Sizes are compared without quotients, whose latencies would add up.
     found = jnp.maximum(rules.scale + rules.round_off, sizes.iterate)
     has_size = found > 0
     measure = jnp.where(has_size, found, before.first)
@@ -168,14 +171,14 @@ def _progress(rules: _Rules, before: _Progress, sizes: Sizes) -> _Progress:
     if sizes.noise is not None:
         noise = jnp.minimum(sizes.noise, _LARGEST_NOISE * measure)
         magnified = jnp.maximum(measure, noise)
-    # Increments that cannot be noise tell nothing of how large it is: those of an
-    # iteration that approaches the solution in circles rise and fall on their way.
+    # Only increments that can be noise raise its level: the increments of an iteration
+    # that spirals towards the solution rise and fall as well.
     may_be_noise = increment <= rules.noisiest * magnified
     stalls = may_be_noise & (increment >= before.smallest)
     more = jnp.minimum(rules.growth * before.believed, rules.noisiest)
     believed = jnp.where(stalls, more, before.believed)
     stagnant = stalls & (increment <= believed * magnified)
-    # A tolerance is relative to x itself, whatever its round-off is.
+    # A tolerance is relative to x itself, whatever the round-off of x is.
     least = jnp.maximum(rules.least, rules.tolerance_or_eps * sizes.iterate)
     least = jnp.where(has_size, least, rules.tolerance_or_eps * before.first)
     small = increment <= least

@@ -1,9 +1,9 @@
 """Lagrangian and Hamiltonian systems, their states and their linearised motion."""
 
-from ._abstract import AbstractMechanicalSystem as AbstractMechanicalSystem
 from ._arguments import (
     all_finite as all_finite,
     check_flag as check_flag,
+    check_signature as check_signature,
     check_type as check_type,
     configuration as configuration,
     dtype_advice as dtype_advice,
@@ -16,19 +16,13 @@ from ._arguments import (
 from ._checks import (
     check_functions as check_functions,
     check_state as check_state,
-    require_manifold as require_manifold,
-    require_names as require_names,
-)
-from ._closure import closure_converted as closure_converted
-from ._dependence import (
     dependence_error as dependence_error,
     dependent_names as dependent_names,
     enumerated as enumerated,
     require_independent as require_independent,
+    require_manifold as require_manifold,
+    require_names as require_names,
 )
-from ._framed import with_frames as with_frames
-from ._hamiltonian import HamiltonianSystem as HamiltonianSystem
-from ._lagrangian import LagrangianSystem as LagrangianSystem
 from ._linearisation import (
     constraint_matrices as constraint_matrices,
     continuous_multiplier as continuous_multiplier,
@@ -46,5 +40,12 @@ from ._scales import (
     velocity_scale as velocity_scale,
     violation_scale as violation_scale,
 )
-from ._signatures import check_signature as check_signature
-from ._state import check_time_and_state as check_time_and_state, State as State
+from ._systems import (
+    AbstractMechanicalSystem as AbstractMechanicalSystem,
+    check_time_and_state as check_time_and_state,
+    closure_converted as closure_converted,
+    HamiltonianSystem as HamiltonianSystem,
+    LagrangianSystem as LagrangianSystem,
+    State as State,
+    with_frames as with_frames,
+)

@@ -1,6 +1,9 @@
-"""Checks and conversions of single arguments, whatever function they belong to."""
+"""Checks and conversions of single arguments, and of the signatures of functions."""
 
+import inspect
 import reprlib
+from collections.abc import Callable
+from types import MethodType
 from typing import Any, TypeAlias
 
 import equinox as eqx
@@ -10,14 +13,22 @@ import numpy as np
 from jaxtyping import Array, PyTree
 
 from .._custom_types import Args, FloatScalar, FloatScalarLike
-from .._errors import Check, DTypeError, is_traced, NonFiniteError, ShapeError
+from .._errors import (
+    Check,
+    check_choice,
+    DTypeError,
+    is_traced,
+    NonFiniteError,
+    ShapeError,
+)
+from .._manifold import AbstractLieGroup
 
 
 Kind: TypeAlias = type | tuple[type, ...]
 
 
 def check_type(name: str, x: object, kind: Kind, advice: str = "") -> None:
-    """Raise a `TypeError` unless `x` is an instance of `kind`, or of one of several."""
+    """Raise a `TypeError` unless `x` is an instance of `kind`, a type or a tuple."""
     if isinstance(x, kind):
         return
     if isinstance(x, type):
@@ -25,7 +36,7 @@ def check_type(name: str, x: object, kind: Kind, advice: str = "") -> None:
     elif isinstance(getattr(x, "system", None), kind):
         got = f"{type(x).__name__}; pass its attribute `.system`"
     elif isinstance(x, eqx.Module):
-        # Without its fields, which would fill the message.
+        # The fields are left out, since they would fill the message.
         got = type(x).__name__
     else:
         got = f"{reprlib.repr(x)} of type {type(x).__name__}"
@@ -47,22 +58,22 @@ def check_flag(name: str, x: object) -> bool:
 
 
 def dtype_advice(dtype: Any) -> str:
-    """Say what to do about a function of the user that returns such a dtype."""
+    """Return advice for a user's function that returns a wrong dtype."""
     if dtype == jnp.bool_:
-        return "return the number that is to be zero, `a - b` in place of `a == b`."
+        return "return the number that must vanish, `a - b` instead of `a == b`."
     if jnp.issubdtype(dtype, jnp.integer):
-        return "write 1.0 for 1."
+        return "write 1.0 instead of 1."
     if jnp.issubdtype(dtype, jnp.complexfloating):
         return "take its real part."
     return "write its constants in the precision of the state."
 
 
 def no_array(x: Any) -> str:
-    """Say what a function of the user returned instead of an array, and what to do."""
+    """Describe what a user's function returned instead of an array, with advice."""
     if x is None:
-        return "nothing: does it lack a `return`?"
+        return "None: is a `return` missing?"
     if isinstance(x, tuple | list):
-        return f"a {type(x).__name__} of {len(x)}: join its parts by `jnp.stack`."
+        return f"a {type(x).__name__} of {len(x)}: join its parts with `jnp.stack`."
     return f"{reprlib.repr(x)} of type {type(x).__name__}."
 
 
@@ -78,9 +89,9 @@ def floating(name: str, x: Any) -> Array:
     if array.dtype not in (jnp.float32, jnp.float64):
         advice = f"convert it with `jnp.asarray({name}, float)`."
         if jnp.issubdtype(array.dtype, jnp.integer):
-            advice = f"write 1.0 for 1, or {advice}"
+            advice = f"write 1.0 instead of 1, or {advice}"
         elif jnp.issubdtype(array.dtype, jnp.complexfloating):
-            advice = f"if its imaginary part is zero, give `{name}.real`."
+            advice = f"if its imaginary part is zero, pass `{name}.real`."
         raise DTypeError(
             f"`{name}` has dtype {array.dtype}, but float32 or float64 is needed: "
             f"{advice}"
@@ -89,7 +100,7 @@ def floating(name: str, x: Any) -> Array:
 
 
 def configuration(q: Any) -> PyTree[Array]:
-    """Convert `q` to an array, or on a product of groups to a tuple of them."""
+    """Convert `q` to an array or, on a product of groups, to a tuple of arrays."""
     if isinstance(q, tuple | list) and any(
         isinstance(part, tuple | list) or getattr(part, "ndim", 0) > 0 for part in q
     ):
@@ -100,9 +111,9 @@ def configuration(q: Any) -> PyTree[Array]:
 def real_scalar(name: str, x: FloatScalarLike, dtype: Any) -> FloatScalar:
     """Convert a real number (or an integer) to a scalar array of `dtype`.
 
-    Anything else raises a `DTypeError`, and an array that is no scalar a `ShapeError`.
+    Other types raise a `DTypeError`, and arrays that are not scalars a `ShapeError`.
     """
-    # A number that is known stays known inside of `jit`.
+    # A concrete number stays concrete inside `jit`.
     if not is_traced(x):
         with jax.ensure_compile_time_eval():
             return _real_scalar(name, x, dtype)
@@ -128,11 +139,11 @@ def _real_scalar(name: str, x: FloatScalarLike, dtype: Any) -> FloatScalar:
 
 
 def finite(name: str, x: Any) -> Check:
-    """Make the check that every number in `x` is finite."""
+    """Create the check that every number in `x` is finite."""
     leaves = jax.tree.leaves(x)
     if is_traced(*leaves):
         return Check(all_finite(x), _not_finite, (name, x))
-    # By NumPy, which gives a known answer also inside of `jit`.
+    # NumPy gives a concrete answer inside `jit` too.
     ok = all(bool(np.all(np.isfinite(np.asarray(leaf)))) for leaf in leaves)
     return Check(ok, _not_finite, (name, x))
 
@@ -142,17 +153,16 @@ def _not_finite(name: str, x: Any) -> NonFiniteError:
 
 
 def parameters(args: Args) -> Args:
-    """Convert the floats in `args` to arrays, so that changing one recompiles nothing.
+    """Convert the floats in `args` to arrays, so that changing them does not recompile.
 
-    What is not an array afterwards is compiled in; it raises a `TypeError` if it is not
-    hashable.
+    Other values are compiled in. A `TypeError` is raised if one is not hashable.
     """
 
     def leaf(path, x):
         if eqx.is_array(x):
             return x
-        # An array made of a Python float is weakly typed, and takes part in float32 and
-        # float64 arithmetic alike.
+        # An array made from a Python float is weakly typed, so that it keeps the
+        # precision of float32 and of float64 arithmetic.
         if isinstance(x, float):
             return jnp.asarray(float(x))
         try:
@@ -160,8 +170,8 @@ def parameters(args: Args) -> Args:
         except TypeError:
             raise TypeError(
                 f"`args{jax.tree_util.keystr(path)}` is {reprlib.repr(x)} of type "
-                f"{type(x).__name__}: what is no array is compiled in, and must be "
-                "hashable for that. Use arrays in a tuple, a list, a dict or an "
+                f"{type(x).__name__}: values that are not arrays are compiled in, "
+                "and must be hashable. Use arrays in a tuple, a list, a dict or an "
                 "equinox.Module."
             ) from None
         return x
@@ -170,6 +180,163 @@ def parameters(args: Args) -> Args:
 
 
 def all_finite(tree: Any) -> Array:
-    """Tell whether every number in `tree` is finite."""
+    """Return whether every number in `tree` is finite."""
     leaves = [jnp.all(jnp.isfinite(leaf)) for leaf in jax.tree.leaves(tree)]
     return jnp.all(jnp.stack(leaves))
+
+
+def check_signature(
+    owner: str, name: str, function: object, arguments: tuple[str, ...]
+) -> None:
+    """Raise a `TypeError` unless a user's function takes `arguments`.
+
+    The function is called by position, so its arguments may have other names. It is
+    refused if two of the expected names are in the places of others.
+
+    **Arguments:**
+
+    - `owner`, `name`: the names, in the message, of the object or function of nhjax
+        that receives the function, and of the argument that passes it.
+    - `function`: the function.
+    - `arguments`: the names of its arguments, in their order.
+    """
+    expected = f"({', '.join(arguments)})"
+    if isinstance(function, tuple | list) and all(map(callable, function)):
+        raise TypeError(
+            f"{owner}: `{name}` must be one function of {expected}, got a "
+            f"{type(function).__name__} of {len(function)}. Join functions f and g by "
+            f"one that returns `jnp.hstack([f{expected}, g{expected}])`."
+        )
+    if not callable(function):
+        raise TypeError(
+            f"{owner}: `{name}` must be a function of {expected}, got {function!r}."
+        )
+    signature = _signature(function)
+    if signature is None:
+        return
+    called = f"`{_name(function)}{signature}`"
+    if not _takes(signature, arguments):
+        raise TypeError(
+            f"{owner}: `{name}` must take {expected}, but {called} does not."
+        )
+    if _confuses(signature, arguments):
+        raise TypeError(
+            f"{owner}: `{name}` must take {expected}, in this order, but {called} has "
+            "another order: nhjax passes arguments by position."
+        )
+
+
+def check_third_argument(
+    owner: str, name: str, function: Any, arguments: tuple[str, ...], letter: str
+) -> None:
+    """Raise a `TypeError` if a function of a system takes a variable it never gets.
+
+    The functions of a Lagrangian system receive v, and those of a Hamiltonian system p.
+    Holonomic constraints receive neither. `letter` is "v" or "p".
+    """
+    signature = _signature(function)
+    given = [] if signature is None else _positional_names(signature)[2:3]
+    if name == "holonomic":
+        refused, passed = {"v", letter}, "`args`"
+        remedy = "Pass a constraint on velocities as `nonholonomic`."
+    elif letter == "v":
+        refused, passed = {"p"}, "the velocity v"
+        remedy = "Write the function in terms of v."
+    else:
+        refused, passed = {"v"}, "the momentum p"
+        remedy = "Write the function in terms of p."
+    if refused.isdisjoint(given):
+        return
+    raise TypeError(
+        f"{owner}: `{name}` must take ({', '.join(arguments)}), but "
+        f"`{_name(function)}{signature}` takes {given[0]}: nhjax passes {passed} as "
+        f"the third argument. {remedy}"
+    )
+
+
+def check_constraints(owner: Any) -> None:
+    """Raise a `ValueError` unless the option `constraints` of `owner` is known."""
+    name = f"{type(owner).__name__}: `constraints`"
+    check_choice(name, owner.constraints, ("independent", "redundant"))
+
+
+def check_manifold(owner: Any) -> None:
+    """Raise a `TypeError` unless the `manifold` of `owner` is a manifold or None."""
+    manifold = owner.manifold
+    if not isinstance(manifold, AbstractLieGroup | None):
+        is_class = isinstance(manifold, type)
+        got = f"the class; write {manifold.__name__}()" if is_class else repr(manifold)
+        raise TypeError(
+            f"{type(owner).__name__}: `manifold` must be an nhjax manifold such as "
+            f"nhjax.Euclidean(3), got {got}."
+        )
+
+
+def check_coordinates(owner: Any) -> None:
+    """Raise unless the `coordinates` of `owner` are a tuple of names, or None."""
+    names = owner.coordinates
+    if names is None:
+        return
+    if not isinstance(names, tuple) or not all(isinstance(x, str) for x in names):
+        raise TypeError(
+            f"{type(owner).__name__}: `coordinates` must be a tuple of names, such "
+            f"as ('x', 'y'), got {names!r}."
+        )
+    if len(set(names)) != len(names):
+        raise ValueError(
+            f"{type(owner).__name__}: `coordinates` has a name twice: {names}. Give "
+            "each coordinate a name of its own."
+        )
+
+
+def _signature(function: Callable[..., Any]) -> inspect.Signature | None:
+    """Return the signature by which a function is called, or None if it is not known.
+
+    If a function wraps another, the signature of the wrapper is used, since the wrapped
+    function may take other arguments. A wrapper without a signature, such as the result
+    of `jax.jit`, has the signature of the wrapped function.
+    """
+    method = getattr(function, "__func__", None)
+    instance = getattr(function, "__self__", None)
+    if method is not None and instance is not None:
+        # equinox wraps methods in a class whose signature accepts all arguments.
+        function = MethodType(method, instance)
+    for follow in (False, True):
+        try:
+            signature = inspect.signature(function, follow_wrapped=follow)
+        except (TypeError, ValueError):
+            continue
+        # Annotations are left out, since they would make the message long.
+        bare = [
+            parameter.replace(annotation=inspect.Parameter.empty)
+            for parameter in signature.parameters.values()
+        ]
+        return inspect.Signature(bare)
+    return None
+
+
+def _takes(signature: inspect.Signature, arguments: tuple[str, ...]) -> bool:
+    try:
+        signature.bind(*arguments)
+    except TypeError:
+        return False
+    return True
+
+
+def _confuses(signature: inspect.Signature, arguments: tuple[str, ...]) -> bool:
+    """Return whether two or more of the names are in the places of other names."""
+    pairs = zip(_positional_names(signature), arguments, strict=False)
+    moved = [name for name, there in pairs if name != there and name in arguments]
+    return len(moved) >= 2
+
+
+def _positional_names(signature: inspect.Signature) -> list[str]:
+    by_position = (
+        inspect.Parameter.POSITIONAL_ONLY,
+        inspect.Parameter.POSITIONAL_OR_KEYWORD,
+    )
+    return [x.name for x in signature.parameters.values() if x.kind in by_position]
+
+
+def _name(function: Callable[..., Any]) -> str:
+    return getattr(function, "__name__", type(function).__name__)

@@ -1,18 +1,25 @@
-"""Checks of the shapes and types of a state and of the functions of a system."""
+"""Checks of a system at a state: shapes, dtypes, and independent constraints."""
 
 import reprlib
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, PyTree
+import numpy as np
+from jaxtyping import Array, Float, PyTree
 
-from .._custom_types import Args
-from .._errors import DTypeError, is_traced, require, ShapeError
+from .._custom_types import Args, FloatScalar
+from .._errors import (
+    DependentConstraintsError,
+    DTypeError,
+    is_traced,
+    require,
+    ShapeError,
+)
 from .._manifold import AbstractLieGroup
-from ._abstract import AbstractMechanicalSystem
+from .._numerics import dependent_rows, is_deficient, is_without_entries
 from ._arguments import dtype_advice, finite, floating, no_array
-from ._state import State
+from ._systems import AbstractMechanicalSystem, State
 
 
 def require_manifold(
@@ -30,7 +37,7 @@ def require_manifold(
 def require_names(
     system: AbstractMechanicalSystem, name: str, manifold: AbstractLieGroup
 ) -> None:
-    """Raise a `ShapeError` unless there is one name for each coordinate, or none."""
+    """Raise a `ShapeError` unless the system names all of its coordinates, or none."""
     names = system.coordinates
     if names is not None and len(names) != manifold.dim:
         raise ShapeError(
@@ -90,9 +97,9 @@ def check_functions(
 def check_state(
     system: AbstractMechanicalSystem, y: State, args: Args, called: str = "y0"
 ) -> None:
-    """Raise unless the shapes and dtypes of `y` are those of a state of `system`.
+    """Raise unless `y` has the shapes and dtypes of a state of `system`.
 
-    Messages call it `called`.
+    `called` is the name of `y` in messages.
     """
     parts = {name: getattr(y, name) for name in ("p", "v", "q", "multiplier")}
     for name, x in parts.items():
@@ -140,6 +147,106 @@ def check_state(
             "with this system."
         )
     for name, x in parts.items():
-        # The integration itself reports traced parts that are not finite, lane by lane.
+        # For traced parts the integration reports each member that is not finite.
         if not is_traced(*jax.tree.leaves(x)):
             require(x, finite(f"{called}.{name}", x))
+
+
+def _names(num_nonholonomic: int, num_holonomic: int) -> list[str]:
+    """List the names of all constraints, such as "nonholonomic[0]" or "holonomic[2]".
+
+    The order is that of the rows of the Jacobian ∂Φ/∂u and of the multipliers.
+    """
+    return [f"nonholonomic[{a}]" for a in range(num_nonholonomic)] + [
+        f"holonomic[{a}]" for a in range(num_holonomic)
+    ]
+
+
+def dependence_error(
+    jacobian: Float[Array, "l n"],
+    num_holonomic: int,
+    letter: str,
+    where: str,
+) -> DependentConstraintsError:
+    """Create the error that names the constraints which depend on each other.
+
+    **Arguments:**
+
+    - `jacobian`: the derivatives of all constraints, with the holonomic constraints
+        last, or of the holonomic constraints alone.
+    - `num_holonomic`: the number k of holonomic constraints.
+    - `letter`: the letter of nonholonomic constraints, Φ or Ψ.
+    - `where`: the state, as text.
+    """
+    rows, k = np.asarray(jacobian), num_holonomic
+    m = rows.shape[0] - k
+    names = _names(m, k)
+    zero = [a for a in range(m + k) if not np.any(rows[a])]
+    if zero and zero[0] < m:
+        advice = (
+            f"{names[zero[0]]} does not depend on velocities there; pass a "
+            "constraint on positions as `holonomic`."
+        )
+    elif zero:
+        advice = (
+            f"{names[zero[0]]} has no gradient there; rewrite it so that its gradient "
+            "is nonzero where it vanishes."
+        )
+    elif _rank(rows[:m]) + _rank(rows[m:]) > _rank(rows):
+        advice = (
+            "One of these nonholonomic constraints follows from holonomic ones: a "
+            "holonomic constraint enforces its rate too. Remove it, start from a state "
+            "at which it does not follow, or give the system "
+            '`constraints="redundant"`.'
+        )
+    else:
+        advice = (
+            "Remove redundant constraints, start from a state at which they are "
+            'independent, or give the system `constraints="redundant"`.'
+        )
+    derivatives = " and ".join([f"D2{letter}"] * (m > 0) + ["DΓ"] * (k > 0))
+    do = "do" if m > 0 and k > 0 else "does"
+    which = dependent_names(jacobian, k)
+    return DependentConstraintsError(
+        f"The constraints are dependent: {derivatives} {do} not have full rank at "
+        f"{where} (the paper's admissibility condition fails for {which}). {advice}"
+    )
+
+
+def dependent_names(matrix: Float[Array, "l c"], num_holonomic: int) -> str:
+    """Name the constraints whose rows of a matrix depend on each other.
+
+    The rows of the `num_holonomic` holonomic constraints are the last.
+    """
+    rows = np.asarray(matrix)
+    names = _names(rows.shape[0] - num_holonomic, num_holonomic)
+    return enumerated([names[a] for a in dependent_rows(rows)])
+
+
+def require_independent(
+    system: AbstractMechanicalSystem, t: FloatScalar, y: State, args: Args
+) -> None:
+    """Raise a `DependentConstraintsError` if constraints are dependent at a state."""
+    u = system.fibre_coordinate(y)
+    jacobian = jax.jacrev(system.constraint, argnums=2)(t, y.q, u, args)
+    is_redundant = system.constraints == "redundant"
+    lacking = is_without_entries if is_redundant else is_deficient
+    if jacobian.shape[0] == 0 or not lacking(jacobian):
+        return
+    k = system.position_constraint(t, y.q, args).shape[0]
+    letter = "Φ" if system.fibre_coordinate_name == "v" else "Ψ"
+    where = f"q = {y.q}, {system.fibre_coordinate_name} = {u}"
+    raise dependence_error(jacobian, k, letter, where)
+
+
+def _rank(rows: np.ndarray) -> int:
+    if not rows.size:
+        return 0
+    scaled = rows / np.max(np.abs(rows), axis=1, keepdims=True)
+    return int(np.linalg.matrix_rank(scaled, rtol=np.finfo(rows.dtype).eps ** 0.5))
+
+
+def enumerated(names: list[str], conjunction: str = "and") -> str:
+    """Write names as a list in a sentence, such as "a, b and c"."""
+    first = [", ".join(names[:-1])] if names[1:] else []
+    return f" {conjunction} ".join(first + names[-1:])

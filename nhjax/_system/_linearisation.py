@@ -26,9 +26,8 @@ from .._numerics import (
     SparseMatrix,
     WeightedTranspose,
 )
-from ._abstract import AbstractMechanicalSystem
-from ._state import check_time_and_state, State
 from ._structure import constraint_pattern, FEWEST_SPARSE
+from ._systems import AbstractMechanicalSystem, check_time_and_state, State
 
 
 class Linearisation(eqx.Module):

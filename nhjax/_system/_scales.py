@@ -17,9 +17,8 @@ from .._numerics import (
     stop_gradient,
     unit,
 )
-from ._abstract import AbstractMechanicalSystem
 from ._linearisation import Linearisation
-from ._state import State
+from ._systems import AbstractMechanicalSystem, State
 
 
 def violation_scale(

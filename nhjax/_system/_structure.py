@@ -4,7 +4,7 @@ from jaxtyping import Array, Float, PyTree
 
 from .._custom_types import Args, FloatScalar
 from .._numerics import dependence, Pattern
-from ._abstract import AbstractMechanicalSystem
+from ._systems import AbstractMechanicalSystem
 
 
 # With fewer constraints than this there is little to leave out. Of four in a row a step

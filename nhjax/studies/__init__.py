@@ -24,11 +24,12 @@ from ._order_study import (
     unicycle_order as unicycle_order,
     UnicycleOrder as UnicycleOrder,
 )
-from ._report import (
+from ._result import (
+    AbstractStudyResult as AbstractStudyResult,
     colour_blind_safe as colour_blind_safe,
     envelope as envelope,
+    write as write,
 )
-from ._result import AbstractStudyResult as AbstractStudyResult, write as write
 
 
 # The studies that `nhjax list` shows. Keyword arguments of a study are its options.

@@ -20,18 +20,16 @@ from ._arguments import (
     RETRACTIONS,
     whole_steps,
 )
-from ._report import (
-    draw_envelope,
-    format_slope,
-    format_table,
-    largest_by_fifths,
-    slopes,
-)
 from ._result import (
     AbstractStudyResult,
     compile_and_run,
+    draw_envelope,
+    format_slope,
+    format_table,
     initial_data,
+    largest_by_fifths,
     meter,
+    slopes,
     system_parameters,
     Timing,
 )

@@ -26,8 +26,14 @@ from ._arguments import (
     check_step_sizes,
     whole_steps,
 )
-from ._report import format_slope, format_table, slopes
-from ._result import AbstractStudyResult, meter, Timing
+from ._result import (
+    AbstractStudyResult,
+    format_slope,
+    format_table,
+    meter,
+    slopes,
+    Timing,
+)
 
 
 if TYPE_CHECKING:

@@ -20,8 +20,15 @@ from ._arguments import (
     check_stages,
     check_step_sizes,
 )
-from ._report import draw_envelope, format_table, largest_by_fifths
-from ._result import AbstractStudyResult, compile_and_run, meter, Timing
+from ._result import (
+    AbstractStudyResult,
+    compile_and_run,
+    draw_envelope,
+    format_table,
+    largest_by_fifths,
+    meter,
+    Timing,
+)
 
 
 if TYPE_CHECKING:

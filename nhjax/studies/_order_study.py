@@ -30,11 +30,13 @@ from ._arguments import (
     RETRACTIONS,
     whole_steps,
 )
-from ._report import format_slope, format_table, slopes
 from ._result import (
     AbstractStudyResult,
     compile_and_run,
+    format_slope,
+    format_table,
     initial_data,
+    slopes,
     system_parameters,
     Timing,
 )

@@ -3,7 +3,6 @@
 from ._andrews_squeezer import AndrewsSqueezer as AndrewsSqueezer
 from ._appell import Appell as Appell
 from ._ball_in_bowl import BallInBowl as BallInBowl
-from ._bicycle_steering import LeanToSteer as LeanToSteer, SteerTorque as SteerTorque
 from ._car_axis import CarAxis as CarAxis
 from ._car_with_trailers import CarWithTrailers as CarWithTrailers
 from ._chaotic import ChaoticSystem as ChaoticSystem
@@ -38,4 +37,8 @@ from ._unicycle import (
     UnicycleInCoordinates as UnicycleInCoordinates,
 )
 from ._veselova import Veselova as Veselova
-from ._whipple_bicycle import WhippleBicycle as WhippleBicycle
+from ._whipple_bicycle import (
+    LeanToSteer as LeanToSteer,
+    SteerTorque as SteerTorque,
+    WhippleBicycle as WhippleBicycle,
+)

@@ -1,10 +1,10 @@
 """The ball in a bowl that turns."""
 
-from typing import Any
+from typing import Any, Literal
 
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array, ArrayLike
+from jaxtyping import Array, ArrayLike, Float
 
 from .._custom_types import Args, FloatScalarLike
 from .._manifold import AbstractRetraction, Cayley, Euclidean, ProductGroup, SO3
@@ -18,10 +18,11 @@ from ._base import (
     require_positive,
     require_possible,
 )
-from ._bowl import Bowl, Shape, Vector3
 
 
 Element = tuple[Array, Array]
+Shape = Literal["paraboloid", "sphere"]
+Vector3 = Float[Array, "3"]
 
 
 class BallInBowl(AbstractConstrainedGroupExample):
@@ -108,7 +109,7 @@ class BallInBowl(AbstractConstrainedGroupExample):
         )
 
     @property
-    def bowl(self) -> Bowl:
+    def bowl(self) -> "Bowl":
         """Return the surface on which the centre of the ball moves."""
         return Bowl(self.curvature, self.shape)
 
@@ -225,3 +226,43 @@ def _steady_spin(ball: BallInBowl, rate: Array) -> Array:
 def _about_axis(x: Vector3) -> Vector3:
     """Compute e₃ × x."""
     return jnp.stack([-x[1], x[0], jnp.zeros_like(x[0])])
+
+
+class Bowl(eqx.Module):
+    """A paraboloid or a sphere of revolution, with its lowest point at the origin.
+
+    Φ = z - κ/2 (x² + y² + ε z²) with the curvature κ at the lowest point, and ε = 0 for
+    the paraboloid, 1 for the sphere.
+    """
+
+    curvature: Array
+    shape: Shape = eqx.field(static=True)
+
+    def value(self, x: Vector3) -> Array:
+        """Compute the function Φ that vanishes on the bowl, at a point."""
+        round_part = x if self.shape == "sphere" else x[:2]
+        return x[2] - 0.5 * self.curvature * (round_part @ round_part)
+
+    def slope(self, x: Vector3) -> Vector3:
+        """Compute the gradient ∇Φ at a point."""
+        inward = -self.curvature * x
+        if self.shape == "paraboloid":
+            inward = inward.at[2].set(0.0)
+        return inward.at[2].add(1.0)
+
+    def normal(self, x: Vector3) -> Vector3:
+        """Compute the normal ∇Φ/|∇Φ| at a point, which points into the bowl."""
+        slope = self.slope(x)
+        return slope / jnp.sqrt(slope @ slope)
+
+    def height(self, square: Array) -> Array:
+        """Compute z where Φ = 0 and x² + y² = `square`, in the lower half."""
+        if self.shape == "paraboloid":
+            return 0.5 * self.curvature * square
+        root = 1 - self.curvature**2 * square
+        require_possible(
+            root > 0,
+            "`position` must be nearer to the axis than the radius "
+            f"{1 / self.curvature} of the sphere, got {jnp.sqrt(square)}.",
+        )
+        return self.curvature * square / (1 + jnp.sqrt(root))

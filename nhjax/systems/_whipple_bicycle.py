@@ -14,12 +14,12 @@ from .._system import LagrangianSystem
 from ._base import (
     AbstractNonholonomicExample,
     coordinates,
+    given_forces,
     parameter,
     require_positive,
     require_possible,
     require_shape,
 )
-from ._bicycle_start import rolling_start
 from ._frames import (
     about_axis,
     about_x,
@@ -137,7 +137,7 @@ class WhippleBicycle(AbstractNonholonomicExample):
         """
         given = (lean, steer, lean_rate, steer_rate, speed)
         bicycle = cls(**parameters)
-        q0, v0, touches = rolling_start(bicycle, *(parameter(x) for x in given))
+        q0, v0, touches = _rolling_start(bicycle, *(parameter(x) for x in given))
         require_possible(
             touches,
             "No pitch was found at which both wheels touch the ground with `lean` = "
@@ -270,3 +270,88 @@ def _frames(bicycle: WhippleBicycle, q: Array) -> tuple[Frame, Frame]:
 def _in_plane(q: Array, x: Array, z: Array) -> Float[Array, "3"]:
     """Return (x, 0, z), a point of the plane in which the upright bicycle lies."""
     return jnp.stack([x, jnp.zeros_like(x), z]).astype(q.dtype)
+
+
+class SteerTorque(eqx.Module):
+    """The torque of a rider on the handlebar: `args`, in N m, positive to the right.
+
+    Without `args` there is none.
+
+    !!! example
+
+        >>> from nhjax.systems import SteerTorque, WhippleBicycle
+        >>> bicycle = WhippleBicycle(steering=SteerTorque())
+        >>> float(bicycle.force(0.0, bicycle.q0, bicycle.v0, 1.5)[5])
+        1.5
+    """
+
+    def __call__(self, t: FloatScalarLike, q: Array, v: Array, args: Args) -> Array:
+        """Return the torque, which is `args`, or zero where that is None."""
+        return given_forces(args, (), v.dtype, "a torque on the steer axis")
+
+
+class LeanToSteer(eqx.Module):
+    """A rider who steers into the fall: the torque K φ + D φ̇ of the lean angle φ.
+
+    **Parameters:** `lean_gain` K [N m/rad] and `lean_rate_gain` D [N m s/rad]. The
+    default keeps the bicycle of `WhippleBicycle` upright at 2 to 6 m/s.
+
+    **Source:** Schwab, Kooijman and Meijaard, *Some recent developments in bicycle
+    dynamics and control* (2008).
+
+    !!! example
+
+        >>> from nhjax.systems import LeanToSteer, WhippleBicycle
+        >>> bicycle = WhippleBicycle(steering=LeanToSteer(lean_rate_gain=10.0))
+        >>> y0 = bicycle.initial_state()
+        >>> round(float(y0.multiplier[4]), 1)
+        -302.2
+    """
+
+    lean_gain: Array = eqx.field(converter=parameter, default=0.0)
+    lean_rate_gain: Array = eqx.field(converter=parameter, default=20.0)
+
+    def __call__(self, t: FloatScalarLike, q: Array, v: Array, args: Args) -> Array:
+        """Compute the torque K φ + D φ̇."""
+        return self.lean_gain * q[3] + self.lean_rate_gain * v[3]
+
+
+@eqx.filter_jit
+def _rolling_start(
+    bicycle: Any,
+    lean: Array,
+    steer: Array,
+    lean_rate: Array,
+    steer_rate: Array,
+    speed: Array,
+) -> tuple[Array, Array, Array]:
+    """Compute (q0, v0): the pitch by Newton's method, the other rates linearly.
+
+    The third result tells whether both wheels touch the ground.
+    """
+
+    def at(pitch):
+        angles = jnp.stack([lean, pitch, steer])
+        return jnp.concatenate([jnp.zeros(3), angles, jnp.zeros(2)])
+
+    def depth(pitch):
+        return bicycle.holonomic(0.0, at(pitch), None)[0]
+
+    def improve(_, pitch):
+        value, slope = jax.jvp(depth, (pitch,), (jnp.ones_like(pitch),))
+        return pitch - value / slope
+
+    q0 = at(jax.lax.fori_loop(0, 12, improve, jnp.zeros_like(lean)))
+
+    def slip(v):
+        _, sinking = jax.jvp(lambda q: bicycle.holonomic(0.0, q, None), (q0,), (v,))
+        return jnp.concatenate([bicycle.constraint(0.0, q0, v, None), sinking])
+
+    roll_rate = -speed / bicycle.rear_radius
+    given = jnp.stack([lean_rate, steer_rate, roll_rate])
+    free, bound = jnp.asarray([3, 5, 6]), jnp.asarray([0, 1, 2, 4, 7])
+    v0 = jnp.zeros(8).at[free].set(given)
+    slopes = jax.jacfwd(slip)(v0)
+    v0 = v0.at[bound].set(jnp.linalg.solve(slopes[:, bound], -slip(v0)))
+    near = jnp.abs(depth(q0[4])) < 1e-3 * bicycle.front_radius
+    return q0, v0, near & (jnp.abs(q0[4]) < 0.5 * jnp.pi)

@@ -80,7 +80,7 @@ BY_VALUE = {
     "dependent": (
         adjusted(rows=jnp.stack([ROWS[0], 2 * ROWS[0]])),
         nhjax.DependentConstraintsError,
-        r"D2Φ has not full rank at q = \[1\. 2\. 3\.\].*admissibility.*fails for "
+        r"D2Φ does not have full rank at q = \[1\. 2\. 3\.\].*admissibility.*fails for "
         r"nonholonomic\[0\] and nonholonomic\[1\]\)\. Remove redundant",
     ),
     "no velocity": (

@@ -681,7 +681,7 @@ def test_a_nonlinear_constraint_that_kept_components_exclude():
     system = nhjax.LagrangianSystem(
         lambda t, q, v, args: 0.5 * v @ v, nonholonomic=lambda t, q, v, args: v @ v - 1
     )
-    message = r"Start nearer to them, or keep less than v\[0\] \(`keep_v`\)\."
+    message = r"the constraints, or keep fewer components than v\[0\] \(`keep_v`\)\."
     with pytest.raises(nhjax.NewtonError, match=message):
         nhjax.initial_state(
             system, jnp.zeros(3), jnp.array([2.0, 0.1, 0.2]), project=True, keep_v=0
@@ -711,7 +711,7 @@ ON_SO3 = nhjax.LagrangianSystem(
         (
             {"keep_v": [4]},
             ValueError,
-            r"`keep_v` has the index 4, but `v` has 4 .*: 0 to 3",
+            r"`keep_v` has the index 4, but `v` has 4 .*: pass 0 to 3",
         ),
         ({"keep_q": (-5,)}, ValueError, r"`keep_q` has the index -5, but `q` has 4 "),
         (

@@ -239,7 +239,7 @@ WRONG = {
     "shape (1,)": Event(lambda t, y, args: y.q),
     "dtype bool": Event(lambda t, y, args: y.q[0] > 0),
     "dtype int32": Event(lambda t, y, args: jnp.ones((), jnp.int32)),
-    "got nothing: does it lack a `return`": Event(lambda t, y, args: None),
+    "got None: is a `return` missing": Event(lambda t, y, args: None),
     "a pair (q, v)": at(0.5, reset=lambda t, y, args: y.q),
     "`v` with an array of shape ()": at(0.5, reset=lambda t, y, args: (y.q, y.v[0])),
     "`q` with an array of shape (1, 1)": at(

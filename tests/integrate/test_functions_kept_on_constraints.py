@@ -52,7 +52,7 @@ def in_momenta(example):
     """The Hamiltonian form of an example whose mass matrix is the identity."""
     return nhjax.HamiltonianSystem(
         lambda t, q, p, args: p @ p - example.system.lagrangian(t, q, p, args),
-        nonholonomic=example.system.nonholonomic,
+        nonholonomic=lambda t, q, p, args: example.constraint(t, q, p, args),
     )
 
 

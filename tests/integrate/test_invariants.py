@@ -116,7 +116,7 @@ def on_momenta(system):
     """The Hamiltonian form of a system of unit mass."""
     return nhjax.HamiltonianSystem(
         lambda t, q, p, args: p @ p - system.lagrangian(t, q, p, args),
-        nonholonomic=system.nonholonomic,
+        nonholonomic=lambda t, q, p, args: system.nonholonomic(t, q, p, args),
     )
 
 

@@ -153,8 +153,8 @@ def test_nonholonomic_constraints_and_both_forms_agree_with_dense_matrices(form)
     ends = []
     for hidden in (False, True):
 
-        def constraint(t, q, v, args, hidden=hidden):
-            return skates(t, q, v.at[0].add(0.0) if hidden else v, args)
+        def constraint(t, q, u, args, hidden=hidden):
+            return skates(t, q, u.at[0].add(0.0) if hidden else u, args)
 
         if form == "lagrangian":
             system = nhjax.LagrangianSystem(

@@ -253,8 +253,8 @@ def on_a_sphere(rows, form="lagrangian"):
     The rows are the blade, the rate of the sphere times its radius, and their sum.
     """
 
-    def given(t, q, v, args):
-        blade, rate = v[0] - 0.3 * q[2] * v[1], q @ v
+    def given(t, q, u, args):
+        blade, rate = u[0] - 0.3 * q[2] * u[1], q @ u
         return jnp.stack([blade, rate, blade + rate])[jnp.asarray(rows)]
 
     functions = {

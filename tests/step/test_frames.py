@@ -43,8 +43,8 @@ def height(t, q, args):
     return q[0][1] + 0.3 * jnp.sin(q[0][2])
 
 
-def blade(t, q, v, args):
-    return v[0] * jnp.cos(q[1][0]) - v[3] + 0.2 * jnp.sin(q[0][2])
+def blade(t, q, u, args):
+    return u[0] * jnp.cos(q[1][0]) - u[3] + 0.2 * jnp.sin(q[0][2])
 
 
 def push(t, q, v, args):

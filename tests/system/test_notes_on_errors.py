@@ -134,8 +134,8 @@ def test_note_on_function_of_system_on_group_names_it(name, mistake):
 # Where `args` is forgotten after the start --------------------------------------------
 
 
-def massive(t, q, v, args):
-    return 0.5 * args["mass"] * v @ v
+def massive(t, q, u, args):
+    return 0.5 * args["mass"] * u @ u
 
 
 def leaning(t, q, v, args):

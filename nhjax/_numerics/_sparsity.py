@@ -1,4 +1,8 @@
-"""Which entries of a Jacobian vanish, found from the program of the function."""
+"""The sparsity pattern of a Jacobian, found from the program of the function.
+
+Each element of an array on the way has the set of inputs that it depends on. These sets
+are propagated through the operations of the program, from the inputs to the results.
+"""
 
 import functools
 from collections.abc import Callable, Sequence
@@ -13,25 +17,25 @@ from jaxtyping import Array, Bool, Float
 from .._compile import CALLING, ELEMENTWISE, SMALL_PRODUCT
 
 
-# These operations put elements of their operands into other places, which NumPy does on
-# sets of indices as well; a gather needs the value of its indices.
-_MOVING = """
+# These operations rearrange the elements of their operands. NumPy rearranges the sets
+# of inputs in the same way. A gather needs the values of its indices.
+_REARRANGING = """
     broadcast_in_dim concatenate copy copy_p expand_dims gather pad reshape rev slice
     split squeeze transpose
 """.split()  # noqa: SIM905
-# Values that may be indices are computed if they are no longer than this.
+# Values that may be indices are computed if they have at most this many elements.
 _LONGEST_INDEX = 10_000
 
 
 def dependence(
     function: Callable[[Array], Array], u: Float[Array, " n"]
 ) -> Bool[np.ndarray, "l n"]:
-    """Tell which entries ∂f_a/∂u_i of a Jacobian may differ from zero at some u.
+    """Return which entries ∂f_a/∂u_i of a Jacobian may differ from zero at some u.
 
-    Sets of indices are propagated through the operations of the program that computes
-    directional derivatives, so that an entry that is false vanishes for all u.
-    Operations that are not understood, loops and branches count as such in which all
-    results depend on all inputs.
+    Sets of inputs are propagated through the program that computes directional
+    derivatives, so that an entry that is false is zero for all u. All results of a
+    loop, of a branch and of an unknown operation count as dependent on all of its
+    inputs.
     """
 
     def push(du):
@@ -47,12 +51,12 @@ def dependence(
     return found.reshape(-1, n)
 
 
-# The sets of a value's elements, of shape (..., n), and its value if it is known.
+# The sets of the elements of an array, of shape (..., n), and its value if known.
 _Value = tuple[np.ndarray, np.ndarray | None]
 
 
 def _known(x: Any) -> np.ndarray | None:
-    """Return the value of a constant that may be an index, or lead to one."""
+    """Return the value of a constant that indices may be computed from, or None."""
     if isinstance(x, jax.core.Tracer) or np.size(x) > _LONGEST_INDEX:
         return None
     return np.asarray(x) if _may_be_index(np.asarray(x).dtype) else None
@@ -65,7 +69,7 @@ def _may_be_index(dtype: Any) -> bool:
 def _followed(
     program: Any, consts: Sequence[Any], inputs: Sequence[_Value], n: int
 ) -> list[_Value]:
-    """Find the sets of a program's results, given those of its inputs."""
+    """Return the sets of a program's results, given those of its inputs."""
     values = dict(zip(program.invars, inputs, strict=True))
     for variable, const in zip(program.constvars, consts, strict=True):
         values[variable] = (np.zeros((*variable.aval.shape, n), bool), const)
@@ -97,7 +101,7 @@ def _results(equation: Any, inputs: list[_Value], n: int) -> list[_Value]:
         out = _applied(equation, known)
         return [(np.zeros((*x.shape, n), bool), x) for x in out]
     if not inputs:
-        # Numbers from nothing, such as those of a range.
+        # Operations without operands, such as `iota`.
         return [(np.zeros((*shape, n), bool), None) for shape in shapes]
     sets = [s for s, _ in inputs]
     found = _sets(equation, sets, known, shapes)
@@ -110,7 +114,7 @@ def _results(equation: Any, inputs: list[_Value], n: int) -> list[_Value]:
 
 
 def _applied(equation: Any, operands: Sequence[Any]) -> list[np.ndarray]:
-    """Apply the operation of an equation to values."""
+    """Evaluate the operation of an equation."""
     operands = [np.asarray(x) for x in operands]
     bound = equation.primitive.get_bind_params(equation.params)
     functions, params = bound if isinstance(bound, tuple) else ((), bound)
@@ -127,13 +131,13 @@ def _sets(
     known: list[np.ndarray | None],
     shapes: list[tuple[int, ...]],
 ) -> list[np.ndarray] | None:
-    """Find the sets of the results of an operation; None if it is not understood."""
+    """Return the sets of the results of an operation; None if it is unknown."""
     name, params, n = equation.primitive.name, equation.params, sets[0].shape[-1]
     if name in ELEMENTWISE:
         whole = [np.broadcast_to(s, (*shapes[0], n)) for s in sets]
         return [functools.reduce(np.logical_or, whole)]
-    if name in _MOVING:
-        return _moved(name, params, sets, known)
+    if name in _REARRANGING:
+        return _rearranged(name, params, sets, known)
     if name.startswith("reduce_") and "axes" in params:
         return [np.asarray(sets[0].any(axis=tuple(params["axes"])))]
     if name == SMALL_PRODUCT:
@@ -158,7 +162,7 @@ def _sets(
 def _of_product(
     params: dict[str, Any], first: np.ndarray, second: np.ndarray
 ) -> np.ndarray:
-    """Unite the sets of the numbers that a small product combines."""
+    """Unite the sets of the factors of each element of a small product."""
     result, parts = params["result"], []
     for indices, part in ((params["first"], first), (params["second"], second)):
         summed = [k for k, index in enumerate(indices) if index not in result]
@@ -171,19 +175,19 @@ def _of_product(
     return parts[0] | parts[1]
 
 
-def _moved(
+def _rearranged(
     name: str,
     params: dict[str, Any],
     sets: list[np.ndarray],
     known: list[np.ndarray | None],
 ) -> list[np.ndarray] | None:
-    """Move sets as an operation moves elements; None if it is not known where to."""
+    """Rearrange sets as an operation rearranges elements; None if unknown."""
     x, n = sets[0], sets[0].shape[-1]
     last = x.ndim - 1
     if name in ("copy", "copy_p"):
         return [x]
     if name in ("expand_dims", "reshape", "squeeze"):
-        # Their results have the elements in the same order.
+        # These operations keep the order of the elements.
         return None if params.get("dimensions") and name == "reshape" else [x]
     if name == "transpose":
         return [np.transpose(x, (*params["permutation"], last))]
@@ -230,7 +234,7 @@ def _padded(x: np.ndarray, filled: np.ndarray, config: Any) -> np.ndarray:
 def _gathered(
     params: dict[str, Any], x: np.ndarray, index: np.ndarray | None
 ) -> list[np.ndarray] | None:
-    """Move sets as a gather does that reads single elements along one axis."""
+    """Rearrange sets as a gather of single elements along one axis does."""
     numbers, sizes = params["dimension_numbers"], params["slice_sizes"]
     (axis, *others) = numbers.start_index_map
     if index is None or others or numbers.operand_batching_dims:
@@ -241,7 +245,7 @@ def _gathered(
     if numbers.collapsed_slice_dims != (axis,):
         return None
     places = index[..., 0]
-    # An index out of range is clamped, or gives a number that depends on nothing.
+    # An index out of range is clamped, or gives a constant.
     picked = np.take(x, np.clip(places, 0, x.shape[axis] - 1), axis=axis)
     first = list(range(axis, axis + places.ndim))
     rest = [k for k in range(picked.ndim - 1) if k not in first]

@@ -1,0 +1,604 @@
+"""Lagrangian and Hamiltonian systems with constraints, and their states.
+
+A system is written on TQ or on T*Q: its state has a position q and a fibre coordinate
+u, which is the velocity v of a Lagrangian and the momentum p of a Hamiltonian system.
+Everything above this room uses the common interface, `AbstractMechanicalSystem`.
+"""
+
+from abc import abstractmethod
+from collections.abc import Callable
+from functools import partial
+from typing import Any, ClassVar, Literal, TypeVar
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, PyTree
+
+from .._custom_types import (
+    Args,
+    FloatScalar,
+    FloatScalarLike,
+    PhaseFunction,
+    PositionFunction,
+)
+from .._errors import naming, ShapeError
+from .._manifold import AbstractLieGroup, Euclidean, framed, is_framed, unframed
+from .._numerics import ClosureConverted, inverse, jacobian, matvec
+from ._arguments import (
+    check_constraints,
+    check_coordinates,
+    check_manifold,
+    check_signature,
+    check_third_argument,
+    check_type,
+)
+
+
+class State(eqx.Module):
+    """The state of a mechanical system at one time, or a trajectory of them.
+
+    - `q`: the configuration, shape (n,); on a group an element, on a product of groups
+        a tuple of elements.
+    - `v`: the velocity, shape (n,); on a group the body velocity.
+    - `p`: the momentum, shape (n,), with p = D2L(t, q, v) or v = D2H(t, q, p).
+    - `multiplier`: shape (m + k,): λ of the m nonholonomic constraints, then ν of the k
+        holonomic ones. The reaction on the system is λᵀ D2Φ + νᵀ L_q^* DΓ, with ♭_H D2Ψ
+        in place of D2Φ for a Hamiltonian system.
+
+    Create one with `nhjax.initial_state`, which makes the four parts consistent.
+    """
+
+    q: PyTree[Array]
+    v: Float[Array, " n"]
+    p: Float[Array, " n"]
+    multiplier: Float[Array, " l"]
+
+
+def check_time_and_state(function: str, t: Any, y: Any, first: str = "") -> None:
+    """Raise unless `y` is a `State` at one time and `t` is not a `State`."""
+    advice = f"Call it as `{function}({first}t, y, args)`."
+    if isinstance(t, State):
+        raise TypeError(f"`t` must be a time, got an nhjax.State. {advice}")
+    check_type("y", y, State, advice)
+    if jnp.ndim(y.p) > 1:
+        raise ShapeError(
+            f"`y.p` has shape {y.p.shape}, but the state at one time has shape (n,). "
+            f"For a trajectory use `jax.vmap` over `t` and `y`."
+        )
+
+
+class AbstractMechanicalSystem(eqx.Module):
+    """A mechanical system with constraints, written on TQ or on T*Q.
+
+    The two kinds differ in the fibre coordinate u, which is the velocity of a
+    Lagrangian and the momentum of a Hamiltonian system. Both kinds provide the
+    functions `velocity`, `momentum`, `free_force`, `constraint` and `metric` of
+    (t, q, u). The equations of a step use only these functions.
+    """
+
+    nonholonomic: eqx.AbstractVar[PhaseFunction | None]
+    holonomic: eqx.AbstractVar[PositionFunction | None]
+    force: eqx.AbstractVar[PhaseFunction | None]
+    manifold: eqx.AbstractVar[AbstractLieGroup | None]
+    constraints: eqx.AbstractVar[Literal["independent", "redundant"]]
+    coordinates: eqx.AbstractVar[tuple[str, ...] | None]
+
+    # The name of the function L or H, and the letter of the fibre coordinate.
+    generator: eqx.AbstractClassVar[Literal["lagrangian", "hamiltonian"]]
+    fibre_coordinate_name: eqx.AbstractClassVar[Literal["v", "p"]]
+
+    def __check_init__(self):
+        owner, letter = type(self).__name__, self.fibre_coordinate_name
+        for name, arguments in self.signatures().items():
+            function = getattr(self, name)
+            if function is not None or name == self.generator:
+                check_signature(owner, name, function, arguments)
+                check_third_argument(owner, name, function, arguments, letter)
+        check_constraints(self)
+        check_manifold(self)
+        check_coordinates(self)
+
+    @abstractmethod
+    def momentum(
+        self, t: FloatScalarLike, q: PyTree[Array], u: Float[Array, " n"], args: Args
+    ) -> Float[Array, " n"]:
+        """Compute the momentum p at (t, q, u)."""
+
+    @abstractmethod
+    def velocity(
+        self, t: FloatScalarLike, q: PyTree[Array], u: Float[Array, " n"], args: Args
+    ) -> Float[Array, " n"]:
+        """Compute the velocity v at (t, q, u), left-trivialised on a group."""
+
+    @abstractmethod
+    def metric(
+        self, t: FloatScalarLike, q: PyTree[Array], u: Float[Array, " n"], args: Args
+    ) -> Float[Array, "n n"]:
+        """Compute the metric K on the fibre: the Hessian D2D2L or D2D2H."""
+
+    @abstractmethod
+    def free_force(
+        self, t: FloatScalarLike, q: PyTree[Array], u: Float[Array, " n"], args: Args
+    ) -> Float[Array, " n"]:
+        """Compute the force on the system without the constraint reactions."""
+
+    @abstractmethod
+    def flat(
+        self,
+        t: FloatScalarLike,
+        q: PyTree[Array],
+        u: Float[Array, " n"],
+        derivative: Float[Array, " n"],
+        args: Args,
+    ) -> Float[Array, " n"]:
+        """Convert a constraint's derivative in u to a covector: D2Φ, or ♭_H D2Ψ."""
+
+    @abstractmethod
+    def energy(self, t: FloatScalarLike, y: State, args: Args = None) -> FloatScalar:
+        """Compute the energy of the system in the state `y` at time `t`."""
+
+    @classmethod
+    def signatures(cls) -> dict[str, tuple[str, ...]]:
+        """Map the name of each function of the system to the names of its arguments."""
+        of_phase = ("t", "q", cls.fibre_coordinate_name, "args")
+        return {
+            cls.generator: of_phase,
+            "nonholonomic": of_phase,
+            "holonomic": ("t", "q", "args"),
+            "force": of_phase,
+        }
+
+    def functions(
+        self, t: Any, q: PyTree[Any], u: Any, args: Args
+    ) -> dict[str, tuple[Callable[..., Any], tuple[Any, ...]]]:
+        """Map the name of each function to a callable and its arguments."""
+        values = {"t": t, "q": q, self.fibre_coordinate_name: u, "args": args}
+        return {
+            name: (partial(self.call, name), tuple(values[x] for x in arguments))
+            for name, arguments in self.signatures().items()
+            if getattr(self, name) is not None
+        }
+
+    def call(self, name: str, *arguments: Any) -> Any:
+        """Call a function of the system, and add a note to an error that it raises.
+
+        The note says which function of the system raised the error.
+        """
+        function = getattr(self, name)
+        called = f"{name}({', '.join(self.signatures()[name])})"
+        with naming(called, function, arguments[-1]):
+            return function(*arguments)
+
+    def fibre_coordinate(self, y: State) -> Float[Array, " n"]:
+        """Return the fibre coordinate u of a state, which is its v or its p."""
+        return getattr(y, self.fibre_coordinate_name)
+
+    def fibre_derivative(
+        self, t: FloatScalarLike, q: PyTree[Array], u: Float[Array, " n"], args: Args
+    ) -> Float[Array, " n"]:
+        """Compute the fibre derivative D2L(t, q, v) = p or D2H(t, q, p) = v."""
+        other = self.momentum if self.fibre_coordinate_name == "v" else self.velocity
+        return other(t, q, u, args)
+
+    def manifold_of(self, q: PyTree[Array]) -> AbstractLieGroup:
+        """Return the configuration manifold; without one, R^n with n = len(q)."""
+        return Euclidean(q.shape[0]) if self.manifold is None else self.manifold
+
+    def position_constraint(
+        self, t: FloatScalarLike, q: PyTree[Array], args: Args = None
+    ) -> Float[Array, " k"]:
+        """Compute the holonomic constraints Γ(t, q), of shape (k,), k = 0 if none."""
+        if self.holonomic is None:
+            return jnp.zeros((0,), jax.tree.leaves(q)[0].dtype)
+        return jnp.atleast_1d(self.call("holonomic", t, q, args))
+
+    def kinematic_constraint(
+        self,
+        t: FloatScalarLike,
+        q: PyTree[Array],
+        u: Float[Array, " n"],
+        args: Args = None,
+    ) -> Float[Array, " m"]:
+        """Compute the nonholonomic constraints, of shape (m,) with m = 0 if none."""
+        if self.nonholonomic is None:
+            return jnp.zeros((0,), u.dtype)
+        return jnp.atleast_1d(self.call("nonholonomic", t, q, u, args))
+
+    def tangency(
+        self,
+        t: FloatScalarLike,
+        q: PyTree[Array],
+        u: Float[Array, " n"],
+        args: Args = None,
+    ) -> Float[Array, " k"]:
+        """Compute the rates dΓ/dt of the holonomic constraints, of shape (k,)."""
+        if self.holonomic is None:
+            return jnp.zeros((0,), u.dtype)
+        v = self.velocity(t, q, u, args)
+        manifold, t = self.manifold_of(q), jnp.asarray(t, u.dtype)
+        return jax.jvp(
+            lambda t, xi: self.position_constraint(t, manifold.act(q, xi), args),
+            (t, jnp.zeros_like(v)),
+            (jnp.ones_like(t), v),
+        )[1]
+
+    def constraint(
+        self,
+        t: FloatScalarLike,
+        q: PyTree[Array],
+        u: Float[Array, " n"],
+        args: Args = None,
+    ) -> Float[Array, " l"]:
+        """Compute all constraints on velocities, of shape (l,) with l = m + k.
+
+        The m nonholonomic constraints come first, then the rates dΓ/dt of the k
+        holonomic constraints. By Chetaev's rule a holonomic constraint and its rate
+        have the same reaction, so that these rows determine all multipliers.
+        """
+        if self.holonomic is None:
+            return self.kinematic_constraint(t, q, u, args)
+        if self.nonholonomic is None:
+            return self.tangency(t, q, u, args)
+        return jnp.concatenate(
+            [self.kinematic_constraint(t, q, u, args), self.tangency(t, q, u, args)]
+        )
+
+    def reaction(
+        self,
+        t: FloatScalarLike,
+        q: PyTree[Array],
+        u: Float[Array, " n"],
+        multiplier: Float[Array, " l"],
+        args: Args = None,
+    ) -> Float[Array, " n"]:
+        """Compute the reaction force of all constraints, given their multipliers."""
+        total, m = jnp.zeros_like(u), 0
+        if self.nonholonomic is not None:
+            phi, pullback = jax.vjp(
+                lambda u: self.kinematic_constraint(t, q, u, args), u
+            )
+            m = phi.shape[0]
+            total = self.flat(t, q, u, pullback(multiplier[:m])[0], args)
+        if self.holonomic is not None:
+            total = total + self.manifold_of(q).left_gradient(
+                lambda g: jnp.sum(
+                    multiplier[m:] * self.position_constraint(t, g, args)
+                ),
+                q,
+            )
+        return total
+
+    def constraint_violation(
+        self, t: FloatScalarLike, y: State, args: Args = None
+    ) -> Float[Array, " c"]:
+        """Compute all constraint functions at a state, of shape (m + 2k,).
+
+        The order is: the m nonholonomic constraints, the time derivatives of the k
+        holonomic constraints, and the k holonomic constraints themselves. All of them
+        vanish at a consistent state.
+        """
+        check_time_and_state("constraint_violation", t, y)
+        on_velocities = self.constraint(t, y.q, self.fibre_coordinate(y), args)
+        return jnp.concatenate([on_velocities, self.position_constraint(t, y.q, args)])
+
+
+class LagrangianSystem(AbstractMechanicalSystem):
+    """A Lagrangian system with constraints and external forces.
+
+    Its motion obeys, with multipliers λ, ν and Chetaev's rule for the reaction (paper,
+    sections 3 and 6),
+
+    d/dt D2L = ad*_v D2L + L_q^* D1L + F + λᵀ D2Φ + νᵀ L_q^* DΓ,
+
+    Φ(t, q, v) = 0,    Γ(t, q) = 0,    q̇ = q v,
+
+    which on R^n is the familiar d/dt D2L = D1L + F + λᵀ D2Φ + νᵀ DΓ with q̇ = v.
+    Automatic differentiation computes all derivatives. If a function is an
+    `equinox.Module`, its array leaves are parameters of the system, and gradients with
+    respect to the system include them. A system contains functions, which `jax.jit`
+    does not accept as arguments: compile functions that take a system with
+    `equinox.filter_jit`.
+
+    Values that the functions read besides their arguments (globals, variables of
+    enclosing functions, attributes of objects) are compiled in. `integrate` and
+    `initial_state` compare them from call to call and compile again if one has changed.
+    A `jax.jit` of your own does not: pass values that change in `args`, or as array
+    fields of an `equinox.Module`. Changes of these never recompile. `docs/systems.md`
+    has the details.
+
+    **Arguments:**
+
+    - `lagrangian`: L, called as `lagrangian(t, q, v, args)`, a scalar. On a group it is
+        left-trivialised: `q` is an element, `v` the body velocity in the Lie algebra.
+    - `nonholonomic`: Φ, called as `nonholonomic(t, q, v, args)`, of shape () or (m,):
+        linear, affine or nonlinear in v, and it may depend on time.
+    - `holonomic`: Γ, called as `holonomic(t, q, args)`, of shape () or (k,).
+    - `force`: an external covector F, called as `force(t, q, v, args)`, of shape (n,);
+        on a group in left-trivialised components.
+    - `manifold`: the configuration manifold; by default R^n with the n of the state.
+    - `constraints`: `"independent"` refuses dependent constraints. `"redundant"` allows
+        constraints that follow from others, also nonholonomic constraints that follow
+        from holonomic ones. Many multipliers then have the same reaction. The result
+        has the multipliers with the least Σ |λ_a B_a|², where |λ_a B_a| is the size of
+        the reaction of one constraint in the metric M⁻¹, and zero for a nonholonomic
+        constraint that follows from holonomic ones. Reactions are marked as not unique.
+        `docs/systems.md` has the details.
+    - `coordinates`: a tuple of the names of the n coordinates, for
+        `Solution.to_xarray` and for `keep_q`, `keep_v` and `keep_p` of `initial_state`;
+        None by default.
+
+    !!! example
+
+        >>> import jax.numpy as jnp, nhjax
+        >>> blade = lambda t, q, v, args: -jnp.sin(q[2]) * v[0] + jnp.cos(q[2]) * v[1]
+        >>> skate = nhjax.LagrangianSystem(
+        ...     lambda t, q, v, args: 0.5 * v @ v, nonholonomic=blade)
+    """
+
+    lagrangian: PhaseFunction
+    nonholonomic: PhaseFunction | None = eqx.field(default=None, kw_only=True)
+    holonomic: PositionFunction | None = eqx.field(default=None, kw_only=True)
+    force: PhaseFunction | None = eqx.field(default=None, kw_only=True)
+    manifold: AbstractLieGroup | None = eqx.field(default=None, kw_only=True)
+    constraints: Literal["independent", "redundant"] = eqx.field(
+        default="independent", kw_only=True, static=True
+    )
+    coordinates: tuple[str, ...] | None = eqx.field(
+        default=None, kw_only=True, static=True
+    )
+
+    generator: ClassVar[Literal["lagrangian", "hamiltonian"]] = "lagrangian"
+    fibre_coordinate_name: ClassVar[Literal["v", "p"]] = "v"
+
+    def momentum(
+        self,
+        t: FloatScalarLike,
+        q: PyTree[Array],
+        u: Float[Array, " n"],
+        args: Args = None,
+    ) -> Float[Array, " n"]:
+        """Compute the momentum p = D2L(t, q, u), the Legendre transform of u."""
+        return jax.grad(self.call, argnums=3)("lagrangian", t, q, u, args)
+
+    def velocity(
+        self,
+        t: FloatScalarLike,
+        q: PyTree[Array],
+        u: Float[Array, " n"],
+        args: Args = None,
+    ) -> Float[Array, " n"]:
+        """Return the velocity v, which is the fibre coordinate `u` itself."""
+        return u
+
+    def metric(
+        self,
+        t: FloatScalarLike,
+        q: PyTree[Array],
+        u: Float[Array, " n"],
+        args: Args = None,
+    ) -> Float[Array, "n n"]:
+        """Compute the mass matrix M = D2D2L, the metric on velocities."""
+        return jax.jacfwd(self.momentum, argnums=2)(t, q, u, args)
+
+    def free_force(
+        self,
+        t: FloatScalarLike,
+        q: PyTree[Array],
+        u: Float[Array, " n"],
+        args: Args = None,
+    ) -> Float[Array, " n"]:
+        """Compute the force without the reaction of the constraints, L_q^* D1L + F."""
+        manifold = self.manifold_of(q)
+        d1l = manifold.left_gradient(
+            lambda g: self.call("lagrangian", t, g, u, args), q
+        )
+        return d1l if self.force is None else d1l + self.call("force", t, q, u, args)
+
+    def flat(
+        self,
+        t: FloatScalarLike,
+        q: PyTree[Array],
+        u: Float[Array, " n"],
+        derivative: Float[Array, " n"],
+        args: Args = None,
+    ) -> Float[Array, " n"]:
+        """Return the derivative D2Φ itself, which is a covector already."""
+        return derivative
+
+    def energy(self, t: FloatScalarLike, y: State, args: Args = None) -> FloatScalar:
+        """Compute the energy E = D2L(t, q, v)·v - L of a state.
+
+        **Arguments:**
+
+        - `t`: the time.
+        - `y`: a state, such as an entry of `Solution.ys`. For a whole trajectory use
+            `jax.vmap(system.energy)(sol.ts, sol.ys)`.
+        - `args`: passed on to the Lagrangian.
+
+        **Returns:** a scalar.
+
+        !!! example
+
+            >>> import jax.numpy as jnp, nhjax
+            >>> free = nhjax.LagrangianSystem(lambda t, q, v, args: 0.5 * v @ v)
+            >>> y = nhjax.initial_state(free, q=jnp.zeros(2), v=jnp.array([3.0, 4.0]))
+            >>> float(free.energy(0.0, y))
+            12.5
+        """
+        check_time_and_state("energy", t, y)
+        p = self.momentum(t, y.q, y.v, args)
+        return jnp.sum(p * y.v) - self.call("lagrangian", t, y.q, y.v, args)
+
+
+class HamiltonianSystem(AbstractMechanicalSystem):
+    """A Hamiltonian system with constraints and external forces.
+
+    Its motion obeys (paper, section 3)
+
+    ṗ = ad*_v p - L_q^* D1H + F + λᵀ ♭_H D2Ψ + νᵀ L_q^* DΓ,    q̇ = q v,    v = D2H,
+
+    Ψ(t, q, p) = 0,    Γ(t, q) = 0,
+
+    where ♭_H = (D2D2H)⁻¹ maps velocities to momenta. The paper's Hamiltonian equations
+    are integrated, with the stage momenta as unknowns, so that no Legendre transform
+    has to be inverted. Values that the functions read besides their arguments are
+    compiled in, as for a `LagrangianSystem`.
+
+    **Arguments:**
+
+    - `hamiltonian`: H, called as `hamiltonian(t, q, p, args)`, a scalar. On a group it
+        is left-trivialised: `q` is an element, `p` a covector of the Lie algebra.
+    - `nonholonomic`: Ψ, called as `nonholonomic(t, q, p, args)`, of shape () or (m,).
+    - `holonomic`: Γ, called as `holonomic(t, q, args)`, of shape () or (k,).
+    - `force`: an external covector F, called as `force(t, q, p, args)`, of shape (n,).
+    - `manifold`: the configuration manifold; by default R^n with the n of the state.
+    - `constraints`: `"independent"` refuses dependent constraints. `"redundant"` allows
+        constraints that follow from others, also nonholonomic constraints that follow
+        from holonomic ones. Many multipliers then have the same reaction. The result
+        has the multipliers with the least Σ |λ_a B_a|², where |λ_a B_a| is the size of
+        the reaction of one constraint in the metric M⁻¹, and zero for a nonholonomic
+        constraint that follows from holonomic ones. Reactions are marked as not unique.
+        `docs/systems.md` has the details.
+    - `coordinates`: a tuple of the names of the n coordinates, for
+        `Solution.to_xarray` and for `keep_q`, `keep_v` and `keep_p` of `initial_state`;
+        None by default.
+
+    !!! example
+
+        >>> import jax.numpy as jnp, nhjax
+        >>> oscillator = nhjax.HamiltonianSystem(
+        ...     lambda t, q, p, args: 0.5 * p @ p + 0.5 * q @ q)
+        >>> y = nhjax.initial_state(oscillator, jnp.array([1.0]), p=jnp.array([0.0]))
+        >>> float(oscillator.energy(0.0, y))
+        0.5
+    """
+
+    hamiltonian: PhaseFunction
+    nonholonomic: PhaseFunction | None = eqx.field(default=None, kw_only=True)
+    holonomic: PositionFunction | None = eqx.field(default=None, kw_only=True)
+    force: PhaseFunction | None = eqx.field(default=None, kw_only=True)
+    manifold: AbstractLieGroup | None = eqx.field(default=None, kw_only=True)
+    constraints: Literal["independent", "redundant"] = eqx.field(
+        default="independent", kw_only=True, static=True
+    )
+    coordinates: tuple[str, ...] | None = eqx.field(
+        default=None, kw_only=True, static=True
+    )
+
+    generator: ClassVar[Literal["lagrangian", "hamiltonian"]] = "hamiltonian"
+    fibre_coordinate_name: ClassVar[Literal["v", "p"]] = "p"
+
+    def momentum(
+        self,
+        t: FloatScalarLike,
+        q: PyTree[Array],
+        u: Float[Array, " n"],
+        args: Args = None,
+    ) -> Float[Array, " n"]:
+        """Return the momentum p, which is the fibre coordinate `u` itself."""
+        return u
+
+    def velocity(
+        self,
+        t: FloatScalarLike,
+        q: PyTree[Array],
+        u: Float[Array, " n"],
+        args: Args = None,
+    ) -> Float[Array, " n"]:
+        """Compute the velocity v = D2H(t, q, u)."""
+        return jax.grad(self.call, argnums=3)("hamiltonian", t, q, u, args)
+
+    def metric(
+        self,
+        t: FloatScalarLike,
+        q: PyTree[Array],
+        u: Float[Array, " n"],
+        args: Args = None,
+    ) -> Float[Array, "n n"]:
+        """Compute the metric D2D2H on momenta, the inverse of the mass matrix."""
+        return jax.jacfwd(self.velocity, argnums=2)(t, q, u, args)
+
+    def free_force(
+        self,
+        t: FloatScalarLike,
+        q: PyTree[Array],
+        u: Float[Array, " n"],
+        args: Args = None,
+    ) -> Float[Array, " n"]:
+        """Compute the force without the reaction of the constraints, -L_q^* D1H + F."""
+        manifold = self.manifold_of(q)
+        d1h = manifold.left_gradient(
+            lambda g: self.call("hamiltonian", t, g, u, args), q
+        )
+        return -d1h if self.force is None else self.call("force", t, q, u, args) - d1h
+
+    def flat(
+        self,
+        t: FloatScalarLike,
+        q: PyTree[Array],
+        u: Float[Array, " n"],
+        derivative: Float[Array, " n"],
+        args: Args = None,
+    ) -> Float[Array, " n"]:
+        """Compute ♭_H D2Ψ = (D2D2H)⁻¹ D2Ψ from a constraint's derivative D2Ψ."""
+        return matvec(
+            inverse(jacobian(lambda u: self.velocity(t, q, u, args), u)), derivative
+        )
+
+    def energy(self, t: FloatScalarLike, y: State, args: Args = None) -> FloatScalar:
+        """Compute the energy H(t, q, p) of a state.
+
+        The arguments are those of `LagrangianSystem.energy`.
+        """
+        check_time_and_state("energy", t, y)
+        return self.call("hamiltonian", t, y.q, y.p, args)
+
+
+S = TypeVar("S", bound=AbstractMechanicalSystem)
+
+
+def closure_converted(system: S, t: FloatScalar, y: State, args: Args) -> S:
+    """Return the system with the arrays that its functions close over as leaves.
+
+    The derivative rules of a step reach only the leaves of its arguments.
+    """
+    functions = system.functions(t, y.q, system.fibre_coordinate(y), args)
+    return eqx.tree_at(
+        lambda system: [getattr(system, name) for name in functions],
+        system,
+        [ClosureConverted(f, *example) for f, example in functions.values()],
+    )
+
+
+def with_frames(system: S, q: PyTree[Array]) -> tuple[S, PyTree[Array]]:
+    """Return the system and the configuration q with precomputed frames.
+
+    A frame holds the sine and cosine of an angle. With it, the methods of the system
+    rotate vectors between body and plane without trigonometric functions. They accept
+    positions with and without frames; the user's functions receive positions without.
+    On a manifold without frames the system and q are returned unchanged.
+    """
+    # The methods of a subclass may not support frames.
+    if type(system) not in (LagrangianSystem, HamiltonianSystem):
+        return system, q
+    position = framed(system.manifold_of(q), q)
+    if not any(map(is_framed, jax.tree.leaves(position, is_leaf=is_framed))):
+        return system, q
+    names = [name for name in system.signatures() if getattr(system, name) is not None]
+    functions = [getattr(system, name) for name in names]
+    system = eqx.tree_at(
+        lambda system: [getattr(system, name) for name in names],
+        system,
+        [_OfPosition(function) for function in functions],
+    )
+    return system, position
+
+
+class _OfPosition(eqx.Module):
+    """A function of (t, q, args) or (t, q, u, args) that accepts q with frames."""
+
+    function: PhaseFunction | PositionFunction
+
+    def __call__(self, t, q, *rest):
+        return self.function(t, unframed(q), *rest)
