@@ -1,25 +1,39 @@
-"""A search for steps that are accepted though they are not solved.
+"""Search for accepted steps that are not solved, and for refused starts that are good.
 
-Every system of the gallery, a bicycle and ten random systems, over steps from h = 0.004
-up to failure, by `SimplifiedNewton` and by `Newton` from the same states; then single
-steps from many states of systems with steep potentials, and of a body in a chart that
-it may leave. A step that a solver accepts is judged by figures that are computed here:
-the residual of the stage equations at the stages found, relative to the size of its
-terms; the violation of the constraints at the end, relative to the size of theirs; and
-the distance of the two solvers' ends. Where one solver alone accepts a step, the
-distance is that of its stages from where one more iteration of Newton's method takes
-them.
+`--only steps`: every system of the gallery, a bicycle and ten random systems, with
+steps from h = 0.004 up to failure, by `SimplifiedNewton` and by `Newton` from the same
+states; then single steps from many states of systems with steep potentials, and of a
+body in a chart that it may leave. An accepted step is judged by three figures that are
+computed here: the residual of the stage equations at the stages found, relative to the
+size of its terms; the violation of the constraints at the end, relative to the size of
+their terms; and the distance between the ends of the two solvers. Where one solver
+alone accepts a step, the distance is the change of its stages in one more iteration of
+Newton's method.
 
-The terms of an equation r(x; q) = 0 have the size |∂r/∂x| |x| + |∂r/∂q| |q|, in which
-|x| is the largest of the velocities, of the multipliers and so on: nothing smaller than
-the unit round-off times that can be asked of r (Oettli and Prager, 1964). Accelerations
-count by what they do in a step: |u̇| is at least |u| / h.
+The terms of an equation r(x; q) = 0 have the size |∂r/∂x| |x| + |∂r/∂q| |q|, where |x|
+is the largest velocity, the largest multiplier and so on. No residual smaller than this
+size times the unit round-off can be demanded (Oettli and Prager, 1964). An acceleration
+counts by its effect in a step: |u̇| is at least |u| / h.
+
+`--only starts`: how often `initial_state(..., project=True)` refuses a state near the
+constraints. Every system of the gallery with constraints gets states that are off by 0
+to 1e-2 in random directions: in q (in its entries, as rounding would change them, and
+along the group), in v, and in v at rest. None may be refused below 1e-3. Unit vectors
+rounded to ten digits are a case of their own.
+
+`--only near_zero`: starts near zero of systems whose constraints contain constants. The
+true round-off of a constraint at a state is the largest difference between its value in
+float64 and in 50 digits, at nine states nearby. `initial_state` gets states that
+violate the constraint by 0, 10 and 1000 of these units, without projection.
 """
 
 import argparse
-from collections.abc import Callable
+import datetime
+import json
+import logging
+from collections.abc import Callable, Iterator
 from dataclasses import replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -37,11 +51,13 @@ from nhjax._step._equations import StageEquations, StageUnknowns, with_moved_pos
 from nhjax._step._stage_iteration import stage_residual
 from nhjax._step._step import equations_of_step
 from nhjax._system import position_scale, violation_scale
+from nhjax.systems._base import AbstractExample
 
 from . import near_rest
 from ._examples import of_the_gallery
+from ._high_precision import evaluate, to_float
 from ._random_systems import random_systems
-from ._report import add_keep, markdown_table, number, with_saved, write
+from ._report import add_keep, markdown_table, number, RESULTS, with_saved, write
 
 
 SMALLEST, LARGEST, SIZES = 0.004, 4.0, 10
@@ -343,16 +359,205 @@ COLUMNS = {
 } | {"distance": "distance", "apart": "apart"}
 
 
-def main() -> None:
-    """Print and save the table."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--systems", nargs="+", help="names, or parts of names")
-    parser.add_argument("--stages", type=int, nargs="+", default=[2, 3, 4, 5, 6])
-    parser.add_argument("--num-steps", type=int, default=200, help="of each size")
-    parser.add_argument("--starts", type=int, default=3000, help="of steep systems")
-    add_keep(parser)
-    options = parser.parse_args()
-    jax.config.update("jax_enable_x64", True)
+# Starts -------------------------------------------------------------------------------
+
+OFFSETS = (0.0, *(10.0**k for k in range(-16, -1)))
+LARGEST_THAT_MUST_PASS = 1e-4
+
+
+def constrained() -> Iterator[AbstractExample]:
+    """Yield the systems of the gallery with constraints, with default parameters."""
+    for make in near_rest.examples().values():
+        system = (example := make()).system
+        if system.nonholonomic is not None or system.holonomic is not None:
+            yield example
+
+
+def cast(tree: Any, dtype: Any) -> Any:
+    """Convert the floating-point arrays of a tree to a precision."""
+    return jax.tree.map(
+        lambda x: x.astype(dtype) if eqx.is_inexact_array(x) else x, tree
+    )
+
+
+def direction(rng: np.random.Generator, like: Any) -> Any:
+    """Draw a random direction of length one with the structure of a tree."""
+    parts = jax.tree.map(lambda x: rng.normal(size=x.shape), like)
+    size = np.sqrt(sum(np.sum(x**2) for x in jax.tree.leaves(parts)))
+    return jax.tree.map(lambda x, y: jnp.asarray(x / size, y.dtype), parts, like)
+
+
+def disturbed(
+    system: Any, kind: str, q: Any, v: Any, offset: float, rng: np.random.Generator
+) -> tuple[Any, Any]:
+    """Move q or v by `offset` in a random direction."""
+    if kind == "q":
+        step = direction(rng, q)
+        return jax.tree.map(lambda x, dx: x + offset * dx, q, step), v
+    along = offset * direction(rng, v)
+    if kind == "q, along the group":
+        return system.manifold_of(q).act(q, along), v
+    return q, v + along
+
+
+def kinds(example: AbstractExample) -> list[str]:
+    """List what may be off; at rest only where constraints are linear in v."""
+    flat = example.system.manifold_of(example.q0).is_flat
+    along = [] if flat else ["q, along the group"]
+    rest = [] if isinstance(example, systems.Appell) else ["v, at rest", "q, at rest"]
+    return ["q", *along, "v", *rest]
+
+
+def refused(start: Callable[..., nhjax.State], *given: Any) -> bool:
+    """Return whether a state is refused or is not finite."""
+    try:
+        y = start(*given)
+        return not all(bool(jnp.all(jnp.isfinite(x))) for x in jax.tree.leaves(y))
+    except (RuntimeError, ValueError):  # JAX chooses which of them
+        return True
+
+
+def count_near_constraints(
+    example: AbstractExample, dtype: Any, directions: int, offsets=OFFSETS
+) -> dict[str, list[int]]:
+    """Count the refused states for each kind of disturbance and each offset."""
+    system, rng = cast(example.system, dtype), np.random.default_rng(0)
+    start = jax.jit(lambda q, v: nhjax.initial_state(system, q, v, project=True))
+    there = start(*cast((example.q0, example.v0), dtype))
+    away = start(*disturbed(system, "q", there.q, there.v, 0.2, rng))
+    table = {}
+    for kind in kinds(example):
+        table[kind] = []
+        for offset in offsets:
+            given = []
+            for i in range(directions):
+                base = (there, away)[i % 2]
+                v = jnp.zeros_like(base.v) if kind.endswith("rest") else base.v
+                what = kind.removesuffix(", at rest")
+                given.append(disturbed(system, what, base.q, v, offset, rng))
+            table[kind].append(sum(refused(start, q, v) for q, v in given))
+    return table
+
+
+def rounded_unit_vectors(number: int) -> int:
+    """Count the unit vectors, rounded to ten digits, that a pendulum refuses."""
+    system, rng = systems.SphericalPendulum().system, np.random.default_rng(0)
+    start = jax.jit(lambda q, v: nhjax.initial_state(system, q, v, project=True))
+    zeros = jnp.zeros(3)
+    return sum(
+        refused(start, jnp.round(direction(rng, zeros), 10), zeros)
+        for _ in range(number)
+    )
+
+
+def measure_near_constraints(directions: int) -> dict[str, Any]:
+    """Count refused states of all systems, and refused rounded unit vectors."""
+    rows = []
+    for example in constrained():
+        name = type(example).__name__
+        for dtype in (jnp.float64, jnp.float32):
+            table = count_near_constraints(example, dtype, directions)
+            for kind, counts in table.items():
+                about = {"system": name, "dtype": dtype.__name__, "disturbed": kind}
+                rows.append(about | {"refused": counts})
+                print(rows[-1], flush=True)
+        jax.clear_caches()
+    return {
+        "directions": directions,
+        "offsets": OFFSETS,
+        "rounded_unit_vectors_refused": rounded_unit_vectors(1000),
+        "rows": rows,
+    }
+
+
+UNITS = 0, 10, 1000
+POSITION_SIZES = 1e-12, 1e-9, 1e-6, 1e-3
+
+
+class Case(NamedTuple):
+    """A holonomic constraint, and the coordinate that it determines.
+
+    `constraint` is a function of q. It is linear in the coordinate `place`, with the
+    given slope.
+    """
+
+    constraint: Callable[[Any], Any]
+    num_coordinates: int
+    place: int
+    slope: float
+
+
+def _wheel(q):
+    """The height of a wheel of 0.3 m, upright except for a lean and a pitch."""
+    axle = jnp.sin(q[1]) * jnp.cos(q[2])
+    return q[0] + 0.3 - 0.3 * jnp.sqrt(1 - axle**2)
+
+
+def _beside_a_constant(q):
+    """Numbers that are added to 100 before they are squared."""
+    return ((100 + q[1] / 100) ** 2 - 100**2) * jnp.cos(q[2]) - q[0]
+
+
+CASES = {
+    "height of a frame": Case(
+        lambda q: (1.02 + q[1]) * jnp.cos(q[2]) - 1.02 - q[0], 3, 0, -1.0
+    ),
+    "height of a wheel": Case(_wheel, 3, 0, 1.0),
+    "beside a constant": Case(_beside_a_constant, 3, 0, -1.0),
+    "length of a rod": Case(
+        lambda q: (1 + q[0]) ** 2 + q[1] ** 2 + q[2] ** 2 - 1 - 2 * q[3], 4, 3, -2.0
+    ),
+}
+
+
+def exact(case: Case, q: np.ndarray) -> float:
+    """Evaluate a constraint in 50 digits, and round the result."""
+    return float(to_float(evaluate(case.constraint, jnp.asarray(q))))
+
+
+def true_round_off(
+    case: Case, q: np.ndarray, size: float, rng: np.random.Generator
+) -> float:
+    """Find the true round-off of a constraint near a state."""
+    errors = []
+    for _ in range(9):
+        near = q + 0.3 * size * rng.uniform(-1, 1, q.size)
+        errors.append(
+            abs(float(case.constraint(jnp.asarray(near))) - exact(case, near))
+        )
+    return max(errors)
+
+
+def count_near_zero(case: Case, number: int) -> list[dict[str, Any]]:
+    """Count the refused starts for each size of q and each violation."""
+    system = nhjax.LagrangianSystem(
+        lambda t, q, v, args: 0.5 * v @ v,
+        holonomic=lambda t, q, args: case.constraint(q)[None],
+    )
+    start = jax.jit(
+        lambda q: nhjax.initial_state(system, q, jnp.zeros_like(q), throw=False)
+    )
+    rng, rows = np.random.default_rng(0), []
+    for size in POSITION_SIZES:
+        counts = dict.fromkeys(UNITS, 0)
+        for _ in range(number):
+            q = size * rng.uniform(-1, 1, case.num_coordinates)
+            q[case.place] = 0.0
+            q[case.place] -= exact(case, q) / case.slope
+            unit = true_round_off(case, q, size, rng)
+            for units in UNITS:
+                moved = q.copy()
+                moved[case.place] += units * unit / case.slope * rng.choice([-1, 1])
+                counts[units] += refused(start, jnp.asarray(moved))
+        rows.append({"size": size, "number": number, "refused": counts})
+    return rows
+
+
+# The command --------------------------------------------------------------------------
+
+
+def measure_steps(options: argparse.Namespace) -> list[dict]:
+    """Measure the steps of the systems and stages that the options ask for."""
     # The programs run for seconds and would be optimised for minutes.
     jax.config.update("jax_disable_most_optimizations", True)
     wanted = options.systems or [""]
@@ -374,20 +579,110 @@ def main() -> None:
             for stages in options.stages:
                 data.append(measure_starts(name, stages, options.starts))
                 print(data[-1], flush=True)
-    save(with_saved("acceptance", data) if options.keep else data)
+    jax.config.update("jax_disable_most_optimizations", False)
+    return with_saved("acceptance", data) if options.keep else data
 
 
-def save(data: list[dict]) -> None:
-    """Print and save the table of all rows."""
+PARTS = ("steps", "starts", "near_zero")
+
+
+def main() -> None:
+    """Measure the parts asked for, and save them with what was saved of the others."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument(
+        "--only",
+        nargs="*",
+        choices=PARTS,
+        default=PARTS,
+        help="the parts to measure; without a name, the saved tables are printed again",
+    )
+    parser.add_argument("--systems", nargs="+", help="of steps: parts of names")
+    parser.add_argument("--stages", type=int, nargs="+", default=[2, 3, 4, 5, 6])
+    parser.add_argument("--num-steps", type=int, default=200, help="of each size")
+    parser.add_argument("--starts", type=int, default=3000, help="of steep systems")
+    parser.add_argument("--directions", type=int, default=50, help="of starts")
+    add_keep(parser)
+    options = parser.parse_args()
+    jax.config.update("jax_enable_x64", True)
+    # Otherwise each refusal writes a line.
+    logging.getLogger("jax._src.callback").disabled = True
+    path = RESULTS / "acceptance.json"
+    saved = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
+    dates = saved.get("dates", {})
+    dates |= dict.fromkeys(options.only, datetime.date.today().isoformat())
+    data: dict[str, Any] = {
+        key: saved.get(key) for key in ("rows", "starts", "near_zero")
+    }
+    if "steps" in options.only:
+        data["rows"] = measure_steps(options)
+    if "starts" in options.only:
+        data["starts"] = measure_near_constraints(options.directions)
+    if "near_zero" in options.only:
+        data["near_zero"] = [
+            {"constraint": name} | row
+            for name, case in CASES.items()
+            for row in count_near_zero(case, options.directions)
+        ]
+    sections = [
+        (__doc__ or "").strip(),
+        f"## Steps\n\nMeasured on {dates['steps']}. {summary(data['rows'])}",
+        table_of_steps(data["rows"]),
+        f"## Starts\n\nMeasured on {dates['starts']}. {of_starts(data['starts'])}",
+        f"## Starts near zero\n\nMeasured on {dates['near_zero']}; refused of "
+        f"{data['near_zero'][0]['number']}:",
+        table_near_zero(data["near_zero"]),
+    ]
+    title = "Are accepted steps solved, and good starts accepted?"
+    write("acceptance", title, "\n\n".join(sections), {"dates": dates} | data)
+
+
+def table_of_steps(data: list[dict]) -> str:
+    """Return the table of all steps."""
     rows = []
     for row in data:
         figures = [row[key] for key in COLUMNS.values()]
         cells = [number(x) if isinstance(x, float) else str(x) for x in figures]
         rows.append([row["system"], str(row["stages"]), *cells])
-    header = ["system", "s", *COLUMNS]
-    text = "\n\n".join([(__doc__ or "").strip(), summary(data)])
-    text += "\n\n" + markdown_table(header, rows)
-    write("acceptance", "Are accepted steps solved?", text, {"rows": data})
+    return markdown_table(["system", "s", *COLUMNS], rows)
+
+
+def of_starts(starts: dict[str, Any]) -> str:
+    """Say how many starts are refused, with a table of the cases with refusals."""
+    rows = starts["rows"]
+    worst = max(
+        x
+        for row in rows
+        for offset, x in zip(OFFSETS, row["refused"], strict=True)
+        if offset <= LARGEST_THAT_MUST_PASS
+    )
+    text = (
+        f"{len(rows)} combinations of a system, a precision and a disturbance, with "
+        f"{starts['directions']} states for each of {len(OFFSETS)} offsets from 0 to "
+        f"{OFFSETS[-1]:.0e}: at most {worst} states of one combination and offset "
+        "below 1e-3 are refused. Of 1000 unit vectors rounded to ten digits, "
+        f"{starts['rounded_unit_vectors_refused']} are refused."
+    )
+    cells = [
+        [row["system"], row["dtype"], row["disturbed"], *map(str, row["refused"])]
+        for row in rows
+        if any(row["refused"])
+    ]
+    if not cells:
+        return f"{text} No state was refused at any offset."
+    header = ["system", "dtype", "disturbed", *(f"{x:.0e}" for x in OFFSETS)]
+    return f"{text} The combinations with refusals:\n\n{markdown_table(header, cells)}"
+
+
+def table_near_zero(data: list[dict[str, Any]]) -> str:
+    """Return the table of the starts near zero."""
+    header = ["constraint", "size of q", *(f"{k} units" for k in UNITS)]
+    rows = [
+        [row["constraint"], f"{row['size']:.0e}", *map(str, row["refused"].values())]
+        for row in data
+    ]
+    return markdown_table(header, rows)
 
 
 def summary(data: list[dict]) -> str:

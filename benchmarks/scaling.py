@@ -1,13 +1,17 @@
 """What a step costs against s, n, the constraints, the batch and the number of steps.
 
-The chaotic system with n = 2m + 1 coordinates; for the number of constraints a family
-with a diagonal mass matrix, made here. Compile time is apart from run time. Run times
-are medians of seven, those of one axis interleaved, so that what else runs hits all of
-them; the least of the seven is beside it, and shows what noise there was.
+The system is the chaotic one with n = 2m + 1 coordinates, except for the number of
+constraints, which has three families: skates with a diagonal mass matrix, a chain of
+pendula (each link shares coordinates with two others, so that C = B M⁻¹ Bᵀ is
+tridiagonal), and a star of rods on one body (C is full).
+
+Compile time is separate from run time. Run times are medians of seven. The runs of one
+axis are interleaved, so that other load on the machine affects all of them; the
+smallest of the seven is given too, and shows the noise.
 
 Exponents are slopes in logarithms: from the first point of the range to its last, and
-fitted to all of them. Iterations per step are beside the times, since a change of
-either is a change of cost. `--smoke` takes a minute.
+fitted to all of them. Iterations per step are given too, since a change of either is a
+change of cost. `--smoke` takes a minute.
 """
 
 import argparse
@@ -42,6 +46,7 @@ class Problem(NamedTuple):
     stages: int = STAGES
     members: int = 1
     num_steps: int = 200
+    h: float = H
 
 
 class Axis(NamedTuple):
@@ -97,11 +102,37 @@ def skates(n: int, k: int) -> tuple[nhjax.LagrangianSystem, nhjax.State]:
     return system, nhjax.initial_state(system, jnp.asarray(q), jnp.asarray(v))
 
 
+def chain(n: int) -> tuple[nhjax.LagrangianSystem, nhjax.State]:
+    """A chain of n links at rest, whose rods point in slightly different directions."""
+    angles = tuple(0.5 + 0.3 * np.sin(np.arange(n)))
+    example = systems.PendulumChain.swinging(angles)
+    return example.system, example.initial_state()
+
+
+def star(n: int) -> tuple[nhjax.LagrangianSystem, nhjax.State]:
+    """A free body with n masses on rods, which turn about it."""
+
+    def lagrangian(t, q, v, args):
+        return 0.5 * v @ v - 9.81 * jnp.sum(q[1::2])
+
+    def rods(t, q, args):
+        places = q.reshape(-1, 2)
+        return jnp.sum((places[1:] - places[:1]) ** 2, axis=1) - 1.0
+
+    angles = np.linspace(0.1, 3.0, n)
+    cos, sin = np.cos(angles), np.sin(angles)
+    q = np.concatenate([np.zeros(2), np.stack([cos, sin], 1).reshape(-1)])
+    v = np.concatenate([np.zeros(2), np.stack([-sin, cos], 1).reshape(-1)])
+    system = nhjax.LagrangianSystem(lagrangian, holonomic=rods)
+    return system, nhjax.initial_state(system, jnp.asarray(q), jnp.asarray(v))
+
+
 def axes(smoke: bool) -> list[Axis]:
     """What is measured."""
     stages = [2, 3] if smoke else list(range(2, 9))
     masses = [3, 5] if smoke else [2, 3, 5, 10, 20, 35, 50]
     constraints = [1, 2] if smoke else [1, 2, 5, 10, 20]
+    links = [10, 20] if smoke else [10, 20, 30, 60, 100]
     batches = [1, 10] if smoke else [1, 10, 100, 10**3, 10**4, 10**5]
     steps = [5, 10] if smoke else [10, 100, 10**3, 10**4, 10**5]
     num_steps = 10 if smoke else 200
@@ -124,6 +155,23 @@ def axes(smoke: bool) -> list[Axis]:
             f"number of constraints, n = {n}",
             [Problem(k, *skates(n, k), num_steps=num_steps) for k in constraints],
             fitted_from=1,
+        ),
+        *(
+            Axis(
+                name,
+                label,
+                [
+                    Problem(
+                        n, *family(n), num_steps=max(10, 20 * num_steps // n), h=1e-3
+                    )
+                    for n in links
+                ],
+                fitted_from=10,
+            )
+            for name, label, family in (
+                ("chain", "links of a chain, C tridiagonal", chain),
+                ("star", "rods of a star, C full", star),
+            )
         ),
         Axis(
             "batch",
@@ -158,7 +206,7 @@ def run(problem: Problem) -> Callable[[nhjax.State], tuple[Any, Array]]:
             problem.system,
             nhjax.LobattoIIIAB(problem.stages),
             y0,
-            dt=H,
+            dt=problem.h,
             num_steps=problem.num_steps,
             throw=False,
         )
@@ -245,8 +293,8 @@ def summary(measured: list[tuple[Axis, list[dict[str, Any]]]]) -> str:
 
 def draw(measured: list[tuple[Axis, list[dict[str, Any]]]], path: Path) -> None:
     """The time of a step along each axis, and compile times along all."""
-    figure = Figure(figsize=(10.5, 6), layout="constrained")
-    panels = figure.subplots(2, 3).ravel()
+    figure = Figure(figsize=(14, 6), layout="constrained")
+    panels = figure.subplots(2, 4).ravel()
     for k, (ax, (axis, rows)) in enumerate(zip(panels, measured, strict=False)):
         x = np.array([row["size"] for row in rows], float)
         y = np.array([row["step"] for row in rows])

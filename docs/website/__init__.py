@@ -1,7 +1,6 @@
-"""The documentation as a site: `python -m docs.website build` makes it, offline.
+"""The documentation as a site: `python -m docs.website build` builds it offline.
 
-- `pages` gathers the pages of `docs/`, benchmarks and notebooks, and keeps their links.
-- `api` makes a page for each public name, in the order of `groups`.
-- `extension` and `signatures` tell the generator how docstrings and maths are written.
-- `links` reads the built pages and finds what leads nowhere or outside.
+- `pages` gathers the written pages, and `api` makes a page for each public name.
+- `extension` and `signatures` extend the generator: maths, links of names, and the
+  arguments of Equinox's modules.
 """

@@ -1,7 +1,6 @@
-"""What the pages write and Python-Markdown does not know: doctests, maths, names.
+"""Syntax of the pages that Python-Markdown does not know: maths, equations and names.
 
-The generator loads this module by its name and hands it to the pages and to the
-docstrings alike.
+The generator loads this module by its name, and uses it for pages and docstrings.
 """
 
 import re
@@ -13,42 +12,32 @@ from markdown.extensions import Extension
 from markdown.preprocessors import Preprocessor
 
 
-# What stands in backquotes is left as it is, and matched first for that reason.
+# Code in backquotes stays as it is, and is matched first for that reason.
 MATHS = re.compile(
     r"(?P<code>(?P<ticks>`+)(?!`).+?(?<!`)(?P=ticks)(?!`))"
     r"|\$\$(?P<block>.+?)\$\$"
     r"|(?<![\\\w$])\$(?P<inline>[^\s$](?:[^$]*?[^\s$])?)\$(?![\d\w$])",
     re.DOTALL,
 )
-# A name of nhjax in backquotes, alone or called, that is no link yet.
+# A name of nhjax in backquotes, alone or called, that is not a link yet.
 NAME = re.compile(r"(?<![`\[])`(?P<name>[A-Za-z_][\w./]*)(?:\([^`]*\))?`(?!`)")
 # Lines such as `L = m/2 |v|² - V,`, and those that begin so.
 END = re.compile(r"^[^`]* = [^`]*[,;]$")
 START = re.compile(r"\s*\S[^`.:]{0,24} = ")
-PROMPT = re.compile(r"( *)>>> ")
+DOCTEST = re.compile(r"(?<!`pycon\n)^( *)>>> .*\n(?:.*\S.*\n)*", re.MULTILINE)
 
 
 class Doctests(Preprocessor):
-    """Examples with prompts, which docstrings indent, become fenced blocks."""
+    """Fence examples with prompts, which docstrings indent."""
 
     def run(self, lines: list[str]) -> list[str]:
-        """Fence each run of lines from a prompt to the next empty line."""
-        fenced, indent, is_fenced = [], None, False
-        for line in lines:
-            is_fenced ^= line.lstrip().startswith("```")
-            prompt = PROMPT.match(line)
-            if indent is None and prompt and not is_fenced:
-                indent = prompt[1]
-                fenced.append(f"{indent}```pycon")
-            elif indent is not None and not line.strip():
-                fenced.append(f"{indent}```")
-                indent = None
-            fenced.append(line)
-        return fenced if indent is None else [*fenced, f"{indent}```"]
+        """Fence the lines from a prompt to the next empty line, outside of fences."""
+        text = "\n".join([*lines, ""])
+        return DOCTEST.sub(r"\1```pycon\n\g<0>\1```\n", text).split("\n")
 
 
 class Equations(Preprocessor):
-    """Equations in plain text that stand in lines of their own keep these lines."""
+    """Keep the line breaks between equations in plain text."""
 
     def run(self, lines: list[str]) -> list[str]:
         """Break a line that ends an equation where the next one begins another."""
@@ -60,10 +49,10 @@ class Equations(Preprocessor):
 
 
 class Maths(Preprocessor):
-    """Formulas become MathML, which browsers draw without scripts or fonts of ours."""
+    """Turn formulas into MathML, which browsers draw without scripts and fonts."""
 
     def run(self, lines: list[str]) -> list[str]:
-        """Put a placeholder for the MathML in the place of each formula."""
+        """Replace each formula by a placeholder for its MathML."""
         return MATHS.sub(self._formula, "\n".join(lines)).split("\n")
 
     def _formula(self, match: re.Match[str]) -> str:
@@ -79,14 +68,14 @@ class Maths(Preprocessor):
 
 
 class Names(Preprocessor):
-    """Public names in backquotes become links to their pages."""
+    """Turn public names in backquotes into links to their pages."""
 
     def __init__(self, md: Markdown, names: dict[str, str]):
         super().__init__(md)
         self.names = names
 
     def run(self, lines: list[str]) -> list[str]:
-        """Link what is no heading."""
+        """Link the names in all lines that are not headings."""
         return [
             line if line.startswith("#") else NAME.sub(self._link, line)
             for line in lines
@@ -98,7 +87,7 @@ class Names(Preprocessor):
 
 
 class SiteExtension(Extension):
-    """All of the above; the option `names` leads from what is written to a path."""
+    """All of the above; the option `names` maps names to the paths of their objects."""
 
     def __init__(self, **kwargs: Any):
         self.config = {"names": [{}, "paths of objects by the names for them"]}

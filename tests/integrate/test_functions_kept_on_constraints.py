@@ -8,10 +8,20 @@ import numpy as np
 import pytest
 
 import nhjax
-from benchmarks.invariants_on_constraints import particle_at, substituted_energy
 from nhjax import LobattoIIIAB, SaveAt, systems
 from support.helpers import central_difference, scalar
 from support.long import long, long_but
+
+
+def particle_at(y: float) -> systems.NonholonomicParticle:
+    """The particle with a start at this y."""
+    return systems.NonholonomicParticle(q0=(1.0, y, 0.2), v0=(0.4, 0.7, 0.4 * y))
+
+
+def substituted_energy(t, q, v, args):
+    """The energy of the particle, with y v_x in the place of v_z."""
+    kinetic = v[0] ** 2 + v[1] ** 2 + (q[1] * v[0]) ** 2
+    return 0.5 * kinetic + 0.5 * (q[0] ** 2 + q[1] ** 2)
 
 
 PARTICLE = systems.NonholonomicParticle()

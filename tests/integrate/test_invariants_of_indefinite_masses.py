@@ -1,27 +1,83 @@
 """Runs that keep the energy where the mass matrix is negative or indefinite."""
 
 from functools import cache
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy.integrate import solve_ivp
 
 import nhjax
-from benchmarks.invariants_on_constraints import (
-    ends_by_scipy,
-    errors_of_members,
-    MEMBERS,
-    saddle,
-    saddle_rates,
-    saddle_starts,
-)
 from nhjax import LobattoIIIAB, SaveAt, systems
 from support.long import long, long_but
 from support.orders import rms
 
 
 PARTICLE = systems.NonholonomicParticle()
+DURATION, MEMBERS = 5.0, 300
+
+
+def saddle() -> nhjax.LagrangianSystem:
+    """A system with an indefinite mass matrix and a nonholonomic constraint."""
+
+    def lagrangian(t, q, v, args):
+        return 0.5 * (v[0] ** 2 + v[1] ** 2 - v[2] ** 2) - 0.5 * q @ q
+
+    return nhjax.LagrangianSystem(
+        lagrangian, nonholonomic=lambda t, q, v, args: v[0] - 0.5 * q[1] * v[1]
+    )
+
+
+def saddle_rates(t: float, z: np.ndarray) -> np.ndarray:
+    """The motion of `saddle` in plain NumPy: M a = -q + λ B with B a = v_2² / 2."""
+    q, v = z[:3], z[3:]
+    mass, slope = np.array([1.0, 1.0, -1.0]), np.array([1.0, -0.5 * q[1], 0.0])
+    free = -q / mass
+    multiplier = (0.5 * v[1] ** 2 - slope @ free) / (slope @ (slope / mass))
+    return np.concatenate([v, free + multiplier * slope / mass])
+
+
+@cache
+def saddle_starts() -> np.ndarray:
+    """States (q, v) on the constraint, with v_3 = 0.9."""
+    q, v = np.random.default_rng(0).normal(size=(2, MEMBERS, 3))
+    v[:, 2], v[:, 0] = 0.9, 0.5 * q[:, 1] * v[:, 1]
+    return np.concatenate([q, v], axis=1)
+
+
+def ends_by_scipy(rates: Any, starts: np.ndarray) -> np.ndarray:
+    """The states after the duration, at tight tolerances."""
+    options = {"method": "DOP853", "rtol": 1e-11, "atol": 1e-12}
+    ends = [solve_ivp(rates, (0, DURATION), z, **options).y[:, -1] for z in starts]
+    return np.array(ends)
+
+
+def errors_of_members(
+    system: Any, starts: np.ndarray, ends: np.ndarray, stages: int, num_steps: int, kept
+) -> tuple[np.ndarray, np.ndarray]:
+    """The relative error of each member, and the largest error of its energy."""
+    n = starts.shape[1] // 2
+
+    @jax.jit
+    @jax.vmap
+    def run(z):
+        y0 = nhjax.initial_state(system, z[:n], v=z[n:])
+        sol = nhjax.integrate(
+            *(system, LobattoIIIAB(stages), y0),
+            **{"dt": DURATION / num_steps, "num_steps": num_steps, "invariants": kept},
+            saveat=SaveAt(t0=True, steps=True),
+            throw=False,
+        )
+        energies = jax.vmap(system.energy)(sol.ts, sol.ys)
+        off = jnp.max(jnp.abs(energies - energies[0]))
+        return sol.ys.q[-1], sol.result == nhjax.RESULTS.successful, off
+
+    q, successful, off = map(np.asarray, run(jnp.asarray(starts)))
+    assert np.all(successful)
+    misses = np.max(np.abs(q - ends[:, :n]), axis=1)
+    return misses / np.max(np.abs(ends[:, :n]), axis=1), off
 
 
 def null_coordinates(t, q, v, args):

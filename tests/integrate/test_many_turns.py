@@ -7,12 +7,20 @@ import pytest
 from jax.flatten_util import ravel_pytree
 
 import nhjax
-from benchmarks.brouwer import with_a_heading_on_a_circle
 from nhjax import systems
 
 
 def disc_with_a_heading_on_a_circle():
-    return with_a_heading_on_a_circle(systems.VerticalRollingDisc())
+    """Return the rolling disc on R^3 x SO(2), where its steps are those on R^4."""
+    disc = systems.VerticalRollingDisc()
+    system = nhjax.LagrangianSystem(
+        lambda t, q, v, args: disc.lagrangian(t, jnp.concatenate(q), v, args),
+        nonholonomic=lambda t, q, v, args: disc.constraint(
+            t, jnp.concatenate(q), v, args
+        ),
+        manifold=nhjax.ProductGroup(nhjax.Euclidean(3), nhjax.SO2(nhjax.Exponential())),
+    )
+    return system, (disc.q0[:3], disc.q0[3:]), disc.v0
 
 
 def unicycle():
