@@ -34,9 +34,9 @@ from nhjax._method import AbstractMethod
 from nhjax._numerics import max_norm
 from nhjax._step import step, StepOutcome, StepState
 from nhjax._step._jacobian import stage_residual
-from nhjax._step._stage_system import nudged, StageSystem
+from nhjax._step._stage_system import nudged, StageEquations
 from nhjax._step._step import equations_of_step
-from nhjax._step._unknowns import Stages
+from nhjax._step._unknowns import StageUnknowns
 from nhjax._system import position_scale, violation_scale
 
 from . import near_rest
@@ -99,7 +99,7 @@ class Row(NamedTuple):
     distance: Array
 
 
-def judge(stages: StageSystem, outcome: StepOutcome) -> Judged:
+def judge(stages: StageEquations, outcome: StepOutcome) -> Judged:
     """The figures of a step, from the stages and the state that were found."""
     residual, correction = residual_and_correction(stages, outcome.stages)
     return Judged(
@@ -112,7 +112,7 @@ def judge(stages: StageSystem, outcome: StepOutcome) -> Judged:
 
 
 def residual_and_correction(
-    stages: StageSystem, x: Stages
+    stages: StageEquations, x: StageUnknowns
 ) -> tuple[Float[Array, ""], Float[Array, ""]]:
     """The largest residual of the stage equations over the size of its terms, and how
     far Newton's method would move the velocities, relative to their size.
@@ -133,7 +133,7 @@ def residual_and_correction(
     return largest_ratio(r, terms), correction
 
 
-def block_sizes(stages: StageSystem, x: Stages) -> Float[Array, " k"]:
+def block_sizes(stages: StageEquations, x: StageUnknowns) -> Float[Array, " k"]:
     """For each unknown the size of the largest of its kind."""
     sizes = jax.tree.map(max_norm, x)
     slowest = sizes.node_fibre_coordinate / jnp.abs(stages.h)
@@ -145,7 +145,7 @@ def block_sizes(stages: StageSystem, x: Stages) -> Float[Array, " k"]:
     return ravel_pytree(jax.tree.map(jnp.full_like, x, sizes))[0]
 
 
-def relative_violation(stages: StageSystem, step_state: StepState) -> Float[Array, ""]:
+def relative_violation(stages: StageEquations, step_state: StepState) -> Float[Array, ""]:
     """The largest violation of a constraint at the end over the size of its terms."""
     system, t, args = stages.system, stages.t + stages.h, stages.args
     q, u = step_state.state.q, system.fibre_coordinate(step_state.state)

@@ -43,7 +43,7 @@ from nhjax._step import (
 )
 from nhjax._step._jacobian import increment_size, stage_residual
 from nhjax._step._step import equations_of_step
-from nhjax._step._unknowns import Stages
+from nhjax._step._unknowns import StageUnknowns
 from nhjax._system import function_noise
 from nhjax.systems._base import AbstractExample
 
@@ -114,13 +114,13 @@ def steps(system, method, solver, y0, h) -> Tried:
 
 
 @eqx.filter_jit
-def equations(method, arguments: StepArguments, x: Stages) -> Float[Array, " k"]:
+def equations(method, arguments: StepArguments, x: StageUnknowns) -> Float[Array, " k"]:
     """Evaluate all stage equations of a step."""
     return stage_residual(equations_of_step(arguments, method), x)[0]
 
 
 @eqx.filter_jit
-def inverse_jacobian(method, arguments, x: Stages) -> Float[Array, "k k"]:
+def inverse_jacobian(method, arguments, x: StageUnknowns) -> Float[Array, "k k"]:
     """Invert the Jacobian of all stage equations."""
     z, unravel = ravel_pytree(x)
     return jnp.linalg.inv(
@@ -129,7 +129,7 @@ def inverse_jacobian(method, arguments, x: Stages) -> Float[Array, "k k"]:
 
 
 @eqx.filter_jit
-def size_of_change(method, arguments, x: Stages, dz: Float[Array, " k"]) -> Array:
+def size_of_change(method, arguments, x: StageUnknowns, dz: Float[Array, " k"]) -> Array:
     """Measure a change of the unknowns as the solvers do."""
     z, unravel = ravel_pytree(x)
     stages = equations_of_step(arguments, method)
@@ -137,7 +137,7 @@ def size_of_change(method, arguments, x: Stages, dz: Float[Array, " k"]) -> Arra
 
 
 @np.errstate(over="ignore", invalid="ignore")
-def distance(method, arguments: StepArguments, x: Stages) -> Distance:
+def distance(method, arguments: StepArguments, x: StageUnknowns) -> Distance:
     """Find how far stages are from the solution of their step, and the noise."""
     z, unravel = ravel_pytree(x)
     z = np.asarray(z)

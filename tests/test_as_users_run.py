@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from oracles import as_users_run, with_shapes
+from support import as_users_run, with_shapes
 
 
 pytestmark = pytest.mark.long

@@ -6,7 +6,7 @@ from typing import Any
 import pytest
 
 import nhjax
-from oracles.pages import blocks, page
+from support.pages import blocks, page
 
 
 def _sections():

@@ -6,7 +6,7 @@ from functools import cache
 import numpy as np
 import pytest
 
-from oracles.notebook_runs import FITS, run_notebook
+from support.notebook_runs import FITS, run_notebook
 
 
 pytestmark = pytest.mark.long

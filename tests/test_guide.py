@@ -4,8 +4,8 @@ from pathlib import Path
 
 import pytest
 
-from oracles.long import long_but
-from oracles.pages import blocks, DOCS, page, run_page
+from support.long import long_but
+from support.pages import blocks, DOCS, page, run_page
 
 
 PAGES = (

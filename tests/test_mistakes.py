@@ -38,7 +38,7 @@ from nhjax import (
     ShapeError,
     systems,
 )
-from oracles.mistakes import (
+from support.mistakes import (
     EXPLICIT_RK4,
     FREE,
     kinetic,

@@ -2,7 +2,7 @@
 
 import pytest
 
-from oracles.notebook_runs import FITS, NOTEBOOKS, run_notebook
+from support.notebook_runs import FITS, NOTEBOOKS, run_notebook
 
 
 pytestmark = pytest.mark.long

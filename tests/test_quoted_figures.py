@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from oracles.pages import assert_agree, page, quoted, results, rows_of
+from support.pages import assert_agree, page, quoted, results, rows_of
 
 
 @pytest.mark.parametrize(

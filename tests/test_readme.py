@@ -6,7 +6,7 @@ import re
 
 import pytest
 
-from oracles.pages import assert_agree, blocks, page, quoted, results, ROOT, rows_of
+from support.pages import assert_agree, blocks, page, quoted, results, ROOT, rows_of
 
 
 README = (ROOT / "README.md").read_text(encoding="utf-8")

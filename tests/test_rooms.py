@@ -161,7 +161,7 @@ def test_what_leans_on_internals_is_on_their_page():
 
 
 def test_no_test_imports_from_another():
-    """What several tests need is in `tests/oracles` and in `conftest.py`."""
+    """What several tests need is in `tests/support` and in `conftest.py`."""
     folder = Path(__file__).parent
     tests = {path.stem: path for path in folder.rglob("test_*.py")}
     assert len(tests) > 100

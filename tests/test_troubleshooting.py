@@ -9,7 +9,7 @@ import pytest
 
 import nhjax
 from nhjax._results import result_codes
-from oracles.pages import page, run_page
+from support.pages import page, run_page
 
 
 ROOT = Path(__file__).parents[1]

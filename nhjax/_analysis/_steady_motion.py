@@ -16,7 +16,7 @@ from .._custom_types import Args, BoolScalar, FloatScalar, FloatScalarLike
 from .._errors import Check, NewtonError, require
 from .._numerics import (
     ClosureConverted,
-    frozen,
+    stop_gradient,
     iterate,
     jacobian_and_value,
     max_norm,
@@ -181,14 +181,14 @@ def steady_motion(
     check_symmetry(symmetry, y)
     outcome = solve_along_symmetry(system, t, y, args, symmetry, held, max_iterations)
     # The check uses the compiled program of `linear_stability`, which users call next.
-    given = frozen((system, t, outcome.state, args))
+    given = stop_gradient((system, t, outcome.state, args))
     conditions = _symmetry_conditions(
         linearise_along_symmetry(*given, symmetry), given[2]
     )
     return require(
         (outcome.state, outcome.rates),
         *outcome.checks,
-        *symmetry_checks(frozen(conditions)),
+        *symmetry_checks(stop_gradient(conditions)),
     )
 
 
@@ -284,10 +284,10 @@ def solve_along_symmetry(
         return motion, jnp.concatenate(lifts, axis=1), constraints
 
     # The rates for which the generators are closest to the velocity.
-    here = frozen(
+    here = stop_gradient(
         lift_generators(system, symmetry, t, y.q, system.fibre_coordinate(y), args)
     )
-    guess = jnp.linalg.pinv(here[0].T) @ frozen(y.v)
+    guess = jnp.linalg.pinv(here[0].T) @ stop_gradient(y.v)
     phase_conditions = _phase_conditions(jnp.concatenate(here, axis=1), held)
 
     def residual(z):
@@ -373,7 +373,7 @@ def least_norm_root(
     residual = ClosureConverted(residual, start)
     # Derivatives come from the two steps after the iteration. Without `frozen`, JAX
     # would also differentiate the loop, which jax 0.10.1 cannot do twice.
-    fixed_residual, start = frozen((residual, start))
+    fixed_residual, start = stop_gradient((residual, start))
 
     def newton_step(x):
         jacobian, value, _ = jacobian_and_value(lambda x: (fixed_residual(x), None), x)
@@ -388,7 +388,7 @@ def least_norm_root(
         unit(max_norm(start)),
         max_iterations=max_iterations,
     )
-    x, (inverse, jacobian) = frozen((solved.x, solved.aux))
+    x, (inverse, jacobian) = stop_gradient((solved.x, solved.aux))
 
     # With a fixed Jacobian, each further step corrects one more order of derivatives.
     def refined(x, _):
@@ -401,7 +401,7 @@ def least_norm_root(
     # derivatives, each times the size of its unknown. An unknown without influence has
     # size zero.
     sizes = jnp.where(
-        jnp.any(jacobian != 0, axis=0), jnp.abs(start) + jnp.abs(frozen(x)), 0
+        jnp.any(jacobian != 0, axis=0), jnp.abs(start) + jnp.abs(stop_gradient(x)), 0
     )
     eps = float(jnp.finfo(x.dtype).eps)
     # All unknowns of one kind get the largest of their sizes. If all are zero, as at

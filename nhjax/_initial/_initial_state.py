@@ -6,7 +6,7 @@ from .._compile import as_cpu_kernel, tracked_jit
 from .._custom_types import Args, BoolScalar, FloatScalar, FloatScalarLike
 from .._errors import DTypeError, require, ShapeError
 from .._numerics import (
-    frozen,
+    stop_gradient,
     inverse,
     is_without_entries,
     max_norm,
@@ -157,7 +157,7 @@ def _solve(system, t, q, v, p, args, project: bool, keep: tuple[Kept, Kept]) -> 
     keep_q, keep_u = keep
     is_fibre_coordinate = (v is None) == (system.fibre_coordinate_name == "p")
     legendre_solved = projected = jnp.asarray(True)
-    off_group = manifold.distance_to_group(frozen(q))
+    off_group = manifold.distance_to_group(stop_gradient(q))
     starts, fixed_q, fixed_u = [], None, None
     if project:
         normal = manifold.normalise(q)
@@ -172,7 +172,7 @@ def _solve(system, t, q, v, p, args, project: bool, keep: tuple[Kept, Kept]) -> 
             starts.append(Rank(nearest.jacobian, start, ~projected))
         if keep_q.indices:
             q = keep_q.restored(q, given_q)
-            off_group = manifold.distance_to_group(frozen(q))
+            off_group = manifold.distance_to_group(stop_gradient(q))
     u = given
     if not is_fibre_coordinate:
         u, legendre_solved = _inverse_legendre(system, t, q, given, args)
@@ -192,7 +192,7 @@ def _solve(system, t, q, v, p, args, project: bool, keep: tuple[Kept, Kept]) -> 
         found_p = keep_u.restored(found_p, p)
     state = State(q, found_v, found_p, lin.multiplier)
     # The numbers by which the state is judged lead to no derivative.
-    system, args, t, q, u, lin, starts = frozen((system, args, t, q, u, lin, starts))
+    system, args, t, q, u, lin, starts = stop_gradient((system, args, t, q, u, lin, starts))
     here = Rank(lin.dense[0], q, projected)
     ranks = (
         [here]

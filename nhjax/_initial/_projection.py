@@ -12,7 +12,7 @@ from jaxtyping import Array, Float, PyTree
 from .._custom_types import BoolScalar, FloatScalar
 from .._numerics import (
     DenseMatrix,
-    frozen,
+    stop_gradient,
     inverse,
     least_norm_inverse,
     least_norm_solve,
@@ -88,8 +88,8 @@ def project_position(system, t, q, u, args, kept: Kept, given: PyTree[Array]):
     nearest = _nearest_keeping(mass, gamma, held, zero, sizes, terms, is_redundant)
     # A condition such as w = 1 on a quaternion has no derivative where it holds.
     moved = manifold.act(q, nearest.x)
-    size = max_norm(*jax.tree.leaves(frozen((q, moved))))
-    off = max_norm(frozen(held(nearest.x)))
+    size = max_norm(*jax.tree.leaves(stop_gradient((q, moved))))
+    off = max_norm(stop_gradient(held(nearest.x)))
     is_kept = off <= 1e3 * float(jnp.finfo(u.dtype).eps) * size
     return nearest._replace(x=moved, found=nearest.found & is_kept)
 
@@ -157,7 +157,7 @@ def _nearest_keeping(
     units = jnp.sqrt(jnp.abs(jnp.diagonal(metric)))
     units = jnp.where(units > 0, units, 1)
     by_units = jacobian / units[None], jax.jacrev(held)(x) / units[None]
-    slopes, rows = frozen(by_units)
+    slopes, rows = stop_gradient(by_units)
     row_sizes, slope_sizes = _row_sizes(rows), _row_sizes(slopes)
     rows, slopes = rows / row_sizes[:, None], slopes / slope_sizes[:, None]
     along_kept = slopes @ jnp.linalg.pinv(rows, rtol=small)
@@ -184,7 +184,7 @@ def _nearest_keeping(
     )
     unchanging = basis * (1 - active)[None]
     fixed = Fixed(slope_sizes, unchanging @ unchanging.T, along_kept)
-    return nearest._replace(jacobian=jacobian, fixed=frozen(fixed))
+    return nearest._replace(jacobian=jacobian, fixed=stop_gradient(fixed))
 
 
 def _row_sizes(matrix: Float[Array, "l n"]) -> Float[Array, " l"]:

@@ -16,7 +16,7 @@ from .._errors import DTypeError, naming, ShapeError
 from .._numerics import (
     ClosureConverted,
     dependence,
-    frozen,
+    stop_gradient,
     max_norm,
     square_jacobian,
 )
@@ -77,7 +77,7 @@ def kept_invariants(
 def _noise_and_least_part(
     function, system, t, q, u, args, value
 ) -> tuple[Float[Array, " k"], FloatScalar]:
-    function, system, args = frozen((function, system, args))
+    function, system, args = stop_gradient((function, system, args))
     noise = noise_near(
         lambda t, q, u: invariant_values(function, system, t, q, u, args),
         system.manifold_of(q),
@@ -85,7 +85,7 @@ def _noise_and_least_part(
     )
     # A mass matrix that is indefinite at one state is so at all states of a motion: an
     # eigenvalue that changes its sign makes it singular, and a singular one ends a run.
-    t, q, u = frozen((t, q, u))
+    t, q, u = stop_gradient((t, q, u))
     metric = square_jacobian(lambda u: system.fibre_derivative(t, q, u, args), u)
     return noise, jnp.where(metric.is_definite(), 0, LEAST_PART).astype(value.dtype)
 

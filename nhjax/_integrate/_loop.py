@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Int
 
-from .._numerics import moving_with
+from .._numerics import with_zero_tangents
 from .._step import RoundOff
 from ._progress_meter import AbstractProgressMeter
 from ._saving import Rows, Saving, static_length
@@ -91,7 +91,7 @@ class Loop(eqx.Module):
 
     def moving(self, carry: AbstractCarry) -> AbstractCarry:
         """Return the same carry, whose state has tangents wherever the run has some."""
-        state = moving_with(carry.step_state.state, self.stepper)
+        state = with_zero_tangents(carry.step_state.state, self.stepper)
         return eqx.tree_at(lambda x: x.step_state.state, carry, state)
 
     def no_rows(self, carry: AbstractCarry) -> Rows:
@@ -110,4 +110,4 @@ class Loop(eqx.Module):
     def empty_rows(self, carry: AbstractCarry) -> Rows:
         """Return buffers of zeros for all rows that the run saves."""
         rows = self.saving.empty(self.row_shapes(carry))
-        return moving_with(rows, (self.stepper, carry))
+        return with_zero_tangents(rows, (self.stepper, carry))

@@ -4,9 +4,9 @@ from ._compensated import two_sum as two_sum
 from ._contraction import inverse as inverse, small_einsum as small_einsum
 from ._implicit import (
     ClosureConverted as ClosureConverted,
-    frozen as frozen,
+    stop_gradient as stop_gradient,
     has_tangent as has_tangent,
-    moving_with as moving_with,
+    with_zero_tangents as with_zero_tangents,
     nan_unless as nan_unless,
     root as root,
     solve_contraction as solve_contraction,

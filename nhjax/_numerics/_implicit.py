@@ -160,7 +160,7 @@ def root(
     return Solved(unravel(x), None, converged > 0, exhausted > 0, num_iterations)
 
 
-def moving_with(tree: X, parameters: PyTree[Any]) -> X:
+def with_zero_tangents(tree: X, parameters: PyTree[Any]) -> X:
     """Return the same values, with tangents wherever any parameter has one.
 
     JAX traces the body of a loop once more if a part of the carry that had no
@@ -252,7 +252,7 @@ def nan_unless(ok: BoolScalar, tree: X) -> X:
     return jax.tree.map(lambda x: jnp.where(ok, x, jnp.nan), tree)
 
 
-def frozen(tree: T) -> T:
+def stop_gradient(tree: T) -> T:
     """Stop derivatives through the arrays of a tree, and keep its other leaves."""
     return jax.tree.map(
         lambda x: jax.lax.stop_gradient(x) if eqx.is_array(x) else x, tree

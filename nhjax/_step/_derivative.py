@@ -12,7 +12,7 @@ from .._manifold import unframed
 from .._method import AbstractMethod
 from .._numerics import (
     ClosureConverted,
-    frozen,
+    stop_gradient,
     has_tangent,
     solve_contraction,
     zero_unless,
@@ -26,7 +26,7 @@ from ._positions import end_position
 from ._record import StepRecord
 from ._stage_equations import stage_forces
 from ._step import equations_of_step, step, StepArguments, StepOutcome
-from ._unknowns import Stages
+from ._unknowns import StageUnknowns
 
 
 @eqx.filter_custom_jvp
@@ -65,7 +65,7 @@ def _differentiable_step_jvp(primals, tangents):
     return outcome, tangent_of_outcome(outcome, change(perturbed, x, tangents[0]))
 
 
-Changes: TypeAlias = tuple[Stages, State, StepRecord]
+Changes: TypeAlias = tuple[StageUnknowns, State, StepRecord]
 
 
 def change_of_step(
@@ -73,9 +73,9 @@ def change_of_step(
     method: AbstractMethod,
     stage_solver: AbstractStageSolver,
     ok: BoolScalar,
-    x: Stages,
+    x: StageUnknowns,
     fixed: StepArguments,
-) -> Callable[[StepArguments, Stages, StepArguments], Changes]:
+) -> Callable[[StepArguments, StageUnknowns, StepArguments], Changes]:
     """Make the function (perturbed, x, rates) of the changes of a solved step.
 
     It computes how the stages x, the state at the end and the record of the step
@@ -83,7 +83,7 @@ def change_of_step(
     is `fixed`. The changes are zero unless the step is `ok`.
     """
     stages = equations_of_step(arguments, method)
-    at, lin, solved = frozen((stages, arguments.step_state.lin, x))
+    at, lin, solved = stop_gradient((stages, arguments.step_state.lin, x))
     frozen_newton_map = stage_solver.frozen_newton_map(at, lin, solved)
 
     def change(perturbed, x, rates):
@@ -147,7 +147,7 @@ def primitive_step(
 
 
 def _end(
-    arguments: StepArguments, method: AbstractMethod, x: Stages
+    arguments: StepArguments, method: AbstractMethod, x: StageUnknowns
 ) -> tuple[State, StepRecord]:
     """Compute the state at the end of a step and its record, given the stages alone.
 
@@ -164,7 +164,7 @@ def _end(
     def continuous():
         # With the symmetric closure this multiplier is one of the unknowns of the step,
         # but of redundant constraints it is not the one of the least norm there.
-        if stages.symmetric and system.constraints != "redundant":
+        if stages.end_multiplier_is_unknown and system.constraints != "redundant":
             return x.end_multiplier
         return linearise(system, t, q, u, args, may_be_sparse=True).multiplier
 

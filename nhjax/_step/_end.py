@@ -8,12 +8,12 @@ from jaxtyping import Array, Float, PyTree
 from .._system import State
 from ._record import StepRecord
 from ._stage_equations import end_impulse, start_impulse
-from ._stage_system import StageSystem
-from ._unknowns import StageForces, Stages
+from ._stage_system import StageEquations
+from ._unknowns import StageForces, StageUnknowns
 
 
 def end_state(
-    stages: StageSystem,
+    stages: StageEquations,
     q: PyTree[Array],
     u: Float[Array, " n"],
     p: Float[Array, " n"],
@@ -43,7 +43,7 @@ def end_state(
 
 
 def step_record(
-    stages: StageSystem, start: State, x: Stages, forces: StageForces
+    stages: StageEquations, start: State, x: StageUnknowns, forces: StageForces
 ) -> StepRecord:
     """Make the record of a step.
 
@@ -51,7 +51,7 @@ def step_record(
     dense output lead from the momentum at its start to that at its end.
     """
     force = forces.force
-    if stages.kept is not None:
+    if stages.invariants is not None:
         chart = stages.chart(x)
         y = chart.ends[1][None]
         impulse = chart.momentum_at_origin(start_impulse(stages, x))

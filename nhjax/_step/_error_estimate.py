@@ -8,13 +8,13 @@ from .._custom_types import FloatScalar
 from .._method import AbstractMethod
 from .._numerics import max_norm, NOISE_UNITS, relative, small_einsum
 from .._system import Linearisation
-from ._stage_system import StageSystem
-from ._unknowns import Stages
+from ._stage_system import StageEquations
+from ._unknowns import StageUnknowns
 
 
 def error_ratios(
-    stages: StageSystem,
-    x: Stages,
+    stages: StageEquations,
+    x: StageUnknowns,
     force: Float[Array, "s n"],
     u: Float[Array, " n"],
     lin: Linearisation,

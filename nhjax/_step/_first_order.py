@@ -18,8 +18,8 @@ from .._custom_types import FloatScalar
 from .._numerics import dependence, full_jacobian, small_einsum
 from .._system import Linearisation, total_force
 from ._positions import in_nodes, in_stages
-from ._stage_system import StageSystem
-from ._unknowns import Stages
+from ._stage_system import StageEquations
+from ._unknowns import StageUnknowns
 
 
 # The part of the Jacobian that simplified Newton inverts; None selects the faster one.
@@ -33,7 +33,7 @@ _MOST_STAGES, _MOST_COORDINATES, _MOST_RESPONSES = 5, 6, 100
 
 
 def uses_first_order_terms(
-    stages: StageSystem, lin: Linearisation, jacobian: JacobianName
+    stages: StageEquations, lin: Linearisation, jacobian: JacobianName
 ) -> bool:
     """Return whether the Jacobian of simplified Newton includes the terms of order h.
 
@@ -61,7 +61,7 @@ def uses_first_order_terms(
     return not stages.manifold.is_flat or _has_terms(stages)
 
 
-def _forces_have_slopes(stages: StageSystem) -> bool:
+def _forces_have_slopes(stages: StageEquations) -> bool:
     """Return whether forces can be differentiated by velocities in forward mode.
 
     Callbacks cannot, nor can functions with a custom rule for reverse mode only. No
@@ -81,7 +81,7 @@ def _forces_have_slopes(stages: StageSystem) -> bool:
     return True
 
 
-def _has_terms(stages: StageSystem) -> bool:
+def _has_terms(stages: StageEquations) -> bool:
     # On a vector space the terms vanish unless momenta depend on positions, or forces
     # on velocities. This is decided from the traced functions of the system.
     system, t, args = stages.system, stages.t, stages.args
@@ -125,7 +125,7 @@ class FirstOrderTerms(eqx.Module):
     node_force: Float[Array, "n n"]  # h N⁻¹ ∂w/∂H of the body forces w
 
     def of_stages(
-        self, stages: StageSystem, z: Float[Array, "s n *c"]
+        self, stages: StageEquations, z: Float[Array, "s n *c"]
     ) -> Float[Array, "s n *c"]:
         """Compute the changes of stage velocities that change the residuals by N z."""
         a, a_hat, b = (stages.coefficients(name) for name in ("a", "a_hat", "b"))
@@ -143,7 +143,7 @@ class FirstOrderTerms(eqx.Module):
         return z - _times(self.node_inertia, z)
 
     def by_force(
-        self, stages: StageSystem, change: Float[Array, "s n *c"]
+        self, stages: StageEquations, change: Float[Array, "s n *c"]
     ) -> Float[Array, "r n *c"]:
         """Compute the part of the changes of node velocities that is due to forces.
 
@@ -152,7 +152,7 @@ class FirstOrderTerms(eqx.Module):
         return _times(self.node_force, _weighted(stages.node_weights, change))
 
     def by_position(
-        self, stages: StageSystem, change: Float[Array, "s n *c"]
+        self, stages: StageEquations, change: Float[Array, "s n *c"]
     ) -> Float[Array, "r n *c"]:
         """Compute the part of the changes of node velocities that is due to positions.
 
@@ -183,7 +183,7 @@ def _times(
 
 
 def first_order_terms(
-    stages: StageSystem, x: Stages, lin: Linearisation
+    stages: StageEquations, x: StageUnknowns, lin: Linearisation
 ) -> FirstOrderTerms:
     """Compute the terms at the start of the step, in the chart of the stages x."""
     h, c = stages.h, stages.coefficients("c")
@@ -228,7 +228,7 @@ def _size(matrix: Float[Array, "n n"]) -> FloatScalar:
 
 
 def momenta_of_forces(
-    stages: StageSystem, x: Stages, forces: Float[Array, "s n c"]
+    stages: StageEquations, x: StageUnknowns, forces: Float[Array, "s n c"]
 ) -> tuple[Float[Array, "s n c"], Float[Array, "r n c"]]:
     """Compute the momenta of stages and nodes from forces at the stages, for h = 1.
 
@@ -279,7 +279,7 @@ class _ChartSlopes(NamedTuple):
     base: Float[Array, "n n"]
 
 
-def _in_body(stages: StageSystem, u: Array, acceleration: Array) -> _BodySlopes:
+def _in_body(stages: StageEquations, u: Array, acceleration: Array) -> _BodySlopes:
     system, args, manifold = stages.system, stages.args, stages.manifold
     t, zero = stages.t, jnp.zeros_like(u)
 
@@ -298,13 +298,13 @@ def _in_body(stages: StageSystem, u: Array, acceleration: Array) -> _BodySlopes:
     return _BodySlopes(rate, full_jacobian(less_transported, zero))
 
 
-def _force_slope(stages: StageSystem, x: Stages, u: Array) -> Array:
+def _force_slope(stages: StageEquations, x: StageUnknowns, u: Array) -> Array:
     system, t, q, args = stages.system, stages.t, stages.q, stages.args
     multiplier = stages.multipliers(x)[0]
     return full_jacobian(lambda u: total_force(system, t, q, u, multiplier, args), u)
 
 
-def _in_chart(stages: StageSystem, x: Stages, u: Array) -> _ChartSlopes:
+def _in_chart(stages: StageEquations, x: StageUnknowns, u: Array) -> _ChartSlopes:
     system, args, manifold = stages.system, stages.args, stages.manifold
     t, multiplier, chart = stages.t, stages.multipliers(x)[0], stages.chart(x)
     zero = jnp.zeros_like(u)

@@ -234,7 +234,7 @@ def moving_part(slopes: Float[Array, "k n"], u: Float[Array, " n"]) -> Array:
     return jnp.sum(jnp.abs(slopes * u[None]), axis=1)
 
 
-class ImpulseWeights(eqx.Module):
+class InvariantCorrection(eqx.Module):
     """The linearised equations for the impulses ε of a step, near its solution.
 
     To leading order a change of ε changes the invariants at the end by G δε with
@@ -276,7 +276,7 @@ class ImpulseWeights(eqx.Module):
         covectors: Float[Array, "k n"],
         moving: Float[Array, " k"],
         hamiltonian: bool,
-    ) -> "ImpulseWeights":
+    ) -> "InvariantCorrection":
         """Make the weights from what is given at the start and known at the end."""
         start, end = (
             given.momentum_inverse.matvec(x) for x in (given.covectors, covectors)

@@ -28,7 +28,7 @@ from .._numerics import (
     compressed_products,
     DenseMatrix,
     DiagonalMatrix,
-    frozen,
+    stop_gradient,
     inverse,
     InverseMatrix,
     max_norm,
@@ -47,7 +47,7 @@ from ._first_order import (
     momenta_of_forces,
     uses_first_order_terms,
 )
-from ._invariants import ImpulseWeights
+from ._invariants import InvariantCorrection
 from ._stage_equations import (
     constraint_jacobian,
     constraint_values,
@@ -60,8 +60,8 @@ from ._stage_equations import (
     stage_forces,
     stage_velocities,
 )
-from ._stage_system import StageSystem
-from ._unknowns import StageForces, Stages
+from ._stage_system import StageEquations
+from ._unknowns import StageForces, StageUnknowns
 
 
 # The update.
@@ -79,8 +79,8 @@ class Evaluation(NamedTuple):
 
 
 def simplified_newton_update(
-    stages: StageSystem, factors: "StageJacobianFactors", x: Stages
-) -> tuple[Stages, Evaluation]:
+    stages: StageEquations, factors: "StageJacobianFactors", x: StageUnknowns
+) -> tuple[StageUnknowns, Evaluation]:
     """Compute the next iterate of simplified Newton, and evaluate the equations at x.
 
     Each residual is evaluated at the newest iterate (Gauss-Seidel). This costs the same
@@ -91,7 +91,7 @@ def simplified_newton_update(
     r_nodes = node_residual(stages, x_next, forces.force)
     change = x_next.velocity - x.velocity
     x_next = factors.correct_nodes(stages, x_next, r_nodes, change)
-    if stages.kept is not None:
+    if stages.invariants is not None:
         # The impulses come before the constraints, so that the constraints see the
         # change by the impulses. If a system is nearly at rest, the work of the
         # reactions on this change is not small.
@@ -100,7 +100,7 @@ def simplified_newton_update(
     if stages.constrained:
         kinematic, holonomic = constraint_values(stages, x_next)
         x_next = factors.correct_multipliers(stages, x_next, kinematic, holonomic)
-    if stages.symmetric:
+    if stages.end_multiplier_is_unknown:
         # λ_c depends on v_{k+1} at zeroth order: it must be corrected with the new
         # velocity. Otherwise the two errors feed each other, and the rate of
         # convergence is only the square root.
@@ -144,13 +144,13 @@ class StageJacobianFactors(eqx.Module):
     velocity_reaction: ReactionMatrix
     schur_inverse: InverseMatrix
     end: Linearisation
-    impulses: ImpulseWeights | None = None
+    impulses: InvariantCorrection | None = None
     first_order: FirstOrderTerms | None = None
     responses: MultiplierResponses | None = None
 
     def correct_stages(
-        self, stages: StageSystem, x: Stages, residual: Float[Array, "s n"]
-    ) -> Stages:
+        self, stages: StageEquations, x: StageUnknowns, residual: Float[Array, "s n"]
+    ) -> StageUnknowns:
         """Compute u - N⁻¹ r_u for the stages, and their velocities."""
         change = self.momentum_inverse.matvec(residual)
         if self.first_order is not None:
@@ -162,11 +162,11 @@ class StageJacobianFactors(eqx.Module):
 
     def correct_nodes(
         self,
-        stages: StageSystem,
-        x: Stages,
+        stages: StageEquations,
+        x: StageUnknowns,
         residual: Float[Array, "r n"],
         change: Float[Array, "s n"],
-    ) -> Stages:
+    ) -> StageUnknowns:
         """Compute the fibre coordinates u - N⁻¹ r_v of the nodes.
 
         The residual was evaluated at positions that include the `change` of the stage
@@ -181,11 +181,11 @@ class StageJacobianFactors(eqx.Module):
 
     def correct_multipliers(
         self,
-        stages: StageSystem,
-        x: Stages,
+        stages: StageEquations,
+        x: StageUnknowns,
         kinematic: Float[Array, "r m"] | Float[Array, "0"],
         holonomic: Float[Array, "s k"] | Float[Array, "0"],
-    ) -> Stages:
+    ) -> StageUnknowns:
         """Change the free multipliers so that the linearised constraints hold."""
         residual = jnp.concatenate([kinematic.reshape(-1), holonomic.reshape(-1)])
         change = -self.schur_inverse.matvec(residual)
@@ -221,10 +221,10 @@ class StageJacobianFactors(eqx.Module):
 
     def correct_end(
         self,
-        stages: StageSystem,
-        x: Stages,
+        stages: StageEquations,
+        x: StageUnknowns,
         residual: tuple[Float[Array, " n"], Float[Array, " l"]],
-    ) -> Stages:
+    ) -> StageUnknowns:
         """Correct the acceleration and λ_c at the end of the step.
 
         The unknowns of the closure change with λ_c, so that the nodes stay the same to
@@ -256,8 +256,8 @@ class StageJacobianFactors(eqx.Module):
         )
 
     def correct_impulses(
-        self, stages: StageSystem, x: Stages, error: Float[Array, " k"]
-    ) -> Stages:
+        self, stages: StageEquations, x: StageUnknowns, error: Float[Array, " k"]
+    ) -> StageUnknowns:
         """Change ε so that the linearised equations of the invariants hold.
 
         The stages and nodes change with ε, so that their momentum equations, which have
@@ -289,8 +289,8 @@ class StageJacobianFactors(eqx.Module):
 
 
 def factorise_stage_jacobian(
-    stages: StageSystem,
-    x: Stages,
+    stages: StageEquations,
+    x: StageUnknowns,
     lin: Linearisation,
     jacobian: JacobianName,
 ) -> StageJacobianFactors:
@@ -299,13 +299,13 @@ def factorise_stage_jacobian(
     `jacobian` selects whether the terms of order h are included.
     """
     factors = _factors_without_impulses(stages, x, lin, jacobian)
-    if stages.kept is None:
+    if stages.invariants is None:
         return factors
     return replace(factors, impulses=impulse_weights(stages, x))
 
 
 def _factors_without_impulses(
-    stages: StageSystem, x: Stages, lin: Linearisation, jacobian: JacobianName
+    stages: StageEquations, x: StageUnknowns, lin: Linearisation, jacobian: JacobianName
 ) -> StageJacobianFactors:
     terms = None
     if uses_first_order_terms(stages, lin, jacobian):
@@ -326,7 +326,7 @@ def _factors_without_impulses(
 
 
 def _dense_factors(
-    stages: StageSystem, lin: Linearisation, jacobian: Float[Array, "s l n"]
+    stages: StageEquations, lin: Linearisation, jacobian: Float[Array, "s l n"]
 ) -> StageJacobianFactors:
     """Compute the factors with the Jacobians B of the constraints at all stages."""
     reaction = DenseMatrix(jacobian).weighted_transpose(lin.metric_inverse).entries
@@ -358,7 +358,7 @@ def _dense_factors(
 
 
 def _schur_complement(
-    stages: StageSystem, blocks: Float[Array, "r s l l"]
+    stages: StageEquations, blocks: Float[Array, "r s l l"]
 ) -> Float[Array, "c c"]:
     """Assemble the derivative of the constraints by h δy and h δΛ.
 
@@ -389,7 +389,7 @@ def _schur_complement(
 
 
 def _sparse_factors(
-    stages: StageSystem, x: Stages, lin: Linearisation, pattern: Pattern
+    stages: StageEquations, x: StageUnknowns, lin: Linearisation, pattern: Pattern
 ) -> StageJacobianFactors:
     """Compute the factors for constraints each of which uses few coordinates."""
     nodes = sparse_constraint_jacobian(stages, x, pattern)
@@ -425,8 +425,8 @@ def _sparse_factors(
 
 
 def _first_order_factors(
-    stages: StageSystem,
-    x: Stages,
+    stages: StageEquations,
+    x: StageUnknowns,
     lin: Linearisation,
     jacobian: Float[Array, "s l n"],
     terms: FirstOrderTerms,
@@ -462,7 +462,7 @@ def _first_order_factors(
 
 
 def _reactions(
-    stages: StageSystem, jacobian: Float[Array, "s l n"]
+    stages: StageEquations, jacobian: Float[Array, "s l n"]
 ) -> Float[Array, "s n c"]:
     """Compute the reactions at the stages to each unknown of the closure, each Λ."""
     m, one = stages.num_nonholonomic, jnp.eye(len(jacobian), dtype=jacobian.dtype)
@@ -500,7 +500,7 @@ def _with_mass_at_end(
 
 
 def stage_residual(
-    stages: StageSystem, x: Stages
+    stages: StageEquations, x: StageUnknowns
 ) -> tuple[Float[Array, " k"], Evaluation]:
     """Evaluate all equations of a step (the paper's four summaries) in one vector.
 
@@ -543,11 +543,11 @@ def stage_residual(
     if stages.hamiltonian:
         parts.append(x.velocity - stage_velocities(stages, x))
     parts += constraint_values(stages, x)
-    if stages.symmetric:
+    if stages.end_multiplier_is_unknown:
         parts += end_residual(stages, x)
-    if stages.kept is not None:
+    if stages.invariants is not None:
         # This is the equation that simplified Newton solves.
-        weights = frozen(impulse_weights(stages, x))
+        weights = stop_gradient(impulse_weights(stages, x))
         parts.append(-weights.change(x.impulse, invariant_errors(stages, x)))
     return (
         ravel_pytree(parts)[0],
@@ -559,7 +559,7 @@ def stage_residual(
 
 
 def update_norms(
-    stages: StageSystem, x: Stages, x_next: Stages, lin: Linearisation
+    stages: StageEquations, x: StageUnknowns, x_next: StageUnknowns, lin: Linearisation
 ) -> Sizes:
     """Measure an increment and the fibre coordinates of the next iterate.
 
@@ -570,7 +570,7 @@ def update_norms(
     return Sizes(increment, max_norm(x_next.node_fibre_coordinate[-1]))
 
 
-def fibre_coordinate_size(stages: StageSystem, x: Stages) -> FloatScalar:
+def fibre_coordinate_size(stages: StageEquations, x: StageUnknowns) -> FloatScalar:
     """Return the smaller of the max norms of the stage and node fibre coordinates.
 
     While an iteration is far from a solution, one of the two can be much larger than
@@ -581,7 +581,7 @@ def fibre_coordinate_size(stages: StageSystem, x: Stages) -> FloatScalar:
 
 
 def increment_size(
-    stages: StageSystem, x: Stages, x_next: Stages, lin: Linearisation
+    stages: StageEquations, x: StageUnknowns, x_next: StageUnknowns, lin: Linearisation
 ) -> FloatScalar:
     """Measure an increment by its largest change of fibre coordinates.
 
@@ -608,8 +608,8 @@ def increment_size(
     return jnp.where(in_chart(stages, x_next), size, jnp.inf)
 
 
-def unknown_units(stages: StageSystem, lin: Linearisation) -> list[FloatScalar]:
-    """Return the size of each field of `Stages` that changes u by one.
+def unknown_units(stages: StageEquations, lin: Linearisation) -> list[FloatScalar]:
+    """Return the size of each field of `StageUnknowns` that changes u by one.
 
     As in `increment_size`, multipliers are measured by their effect h N⁻¹ R δΛ on u.
     The round-off of a multiplier grows like 1 / h: measured by its own size, it could
@@ -630,8 +630,8 @@ def unknown_units(stages: StageSystem, lin: Linearisation) -> list[FloatScalar]:
         "end_acceleration": 1 / unit(h),
         "end_multiplier": multiplier,
     }
-    if stages.kept is not None:
-        largest = max_norm(lin.momentum_inverse.matvec(stages.kept.covectors))
+    if stages.invariants is not None:
+        largest = max_norm(lin.momentum_inverse.matvec(stages.invariants.covectors))
         units["impulse"] = 1 / unit(largest)
-    names = [field.name for field in dataclasses.fields(Stages)]
+    names = [field.name for field in dataclasses.fields(StageUnknowns)]
     return [units[name] for name in names if name in units]

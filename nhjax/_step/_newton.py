@@ -34,17 +34,17 @@ from ._jacobian import (
 )
 from ._round_off import PART
 from ._scale import fibre_coordinate_scale, Scale
-from ._stage_system import nudged, StageSystem
+from ._stage_system import nudged, StageEquations
 from ._tolerance import check_tolerance, tolerance_array
-from ._unknowns import Stages
+from ._unknowns import StageUnknowns
 
 
 # One iteration on the stages of a step. The equations are an argument, so that the
 # iteration can be differentiated with respect to the data in them.
-FrozenNewtonMap: TypeAlias = Callable[[StageSystem, Stages], Stages]
+FrozenNewtonMap: TypeAlias = Callable[[StageEquations, StageUnknowns], StageUnknowns]
 
 
-# Stages with a larger residual than this, relative to the momenta, are no solution.
+# StageUnknowns with a larger residual than this, relative to the momenta, are no solution.
 _GROSS = 1e-6
 
 
@@ -64,13 +64,13 @@ class AbstractStageSolver(eqx.Module):
 
     @abstractmethod
     def solve(
-        self, stages: StageSystem, x0: Stages, lin: Linearisation, skip: Array
-    ) -> Solved[Stages, Evaluation]:
+        self, stages: StageEquations, x0: StageUnknowns, lin: Linearisation, skip: Array
+    ) -> Solved[StageUnknowns, Evaluation]:
         """Solve the stage equations from `x0`; do nothing where `skip` is true."""
 
     @abstractmethod
     def frozen_newton_map(
-        self, stages: StageSystem, lin: Linearisation, x: Stages
+        self, stages: StageEquations, lin: Linearisation, x: StageUnknowns
     ) -> FrozenNewtonMap:
         """Make an iteration whose fixed points solve the stage equations.
 
@@ -82,11 +82,11 @@ class AbstractStageSolver(eqx.Module):
 
 def _iterated(
     stage_solver: AbstractStageSolver,
-    sweep: Callable[[Stages], tuple[Stages, Sizes, Evaluation]],
-    x0: Stages,
+    sweep: Callable[[StageUnknowns], tuple[StageUnknowns, Sizes, Evaluation]],
+    x0: StageUnknowns,
     scale: Scale,
     skip: Array,
-) -> Solved[Stages, Evaluation]:
+) -> Solved[StageUnknowns, Evaluation]:
     """Run the iteration on the stages of a solver, whose own sweep is an argument."""
     return iterate(
         sweep,
@@ -158,13 +158,13 @@ class SimplifiedNewton(AbstractStageSolver):
             check_flag("fallback", self.fallback)
 
     def solve(
-        self, stages: StageSystem, x0: Stages, lin: Linearisation, skip: Array
-    ) -> Solved[Stages, Evaluation]:
+        self, stages: StageEquations, x0: StageUnknowns, lin: Linearisation, skip: Array
+    ) -> Solved[StageUnknowns, Evaluation]:
         """Solve the stage equations from `x0`; do nothing where `skip` is true."""
         factors = factorise_stage_jacobian(stages, x0, lin, self.jacobian)
         scale = fibre_coordinate_scale(stages, x0, lin)
 
-        def sweep(x: Stages):
+        def sweep(x: StageUnknowns):
             x_next, evaluation = simplified_newton_update(stages, factors, x)
             return x_next, update_norms(stages, x, x_next, lin), evaluation
 
@@ -189,7 +189,7 @@ class SimplifiedNewton(AbstractStageSolver):
         return Newton(tolerance=self.tolerance)
 
     def frozen_newton_map(
-        self, stages: StageSystem, lin: Linearisation, x: Stages
+        self, stages: StageEquations, lin: Linearisation, x: StageUnknowns
     ) -> FrozenNewtonMap:
         """Make the iteration of `solve`, with the constraint Jacobians at the solution.
 
@@ -237,8 +237,8 @@ class Newton(AbstractStageSolver):
     tolerance: FloatScalarLike = eqx.field(converter=tolerance_array, default=0.0)
 
     def solve(
-        self, stages: StageSystem, x0: Stages, lin: Linearisation, skip: Array
-    ) -> Solved[Stages, Evaluation]:
+        self, stages: StageEquations, x0: StageUnknowns, lin: Linearisation, skip: Array
+    ) -> Solved[StageUnknowns, Evaluation]:
         """Solve the stage equations from `x0`; do nothing where `skip` is true."""
         _, unravel = ravel_pytree(x0)
         scale = fibre_coordinate_scale(stages, x0, lin)
@@ -250,7 +250,7 @@ class Newton(AbstractStageSolver):
         def residual(z):
             return stage_residual(stages, unravel(z))
 
-        def sweep(x: Stages):
+        def sweep(x: StageUnknowns):
             z, _ = ravel_pytree(x)
             jacobian, r, evaluation = jacobian_and_value(residual, z)
             change = stage_residual(moved, x)[0] - r
@@ -291,14 +291,14 @@ class Newton(AbstractStageSolver):
         )
 
     def frozen_newton_map(
-        self, stages: StageSystem, lin: Linearisation, x: Stages
+        self, stages: StageEquations, lin: Linearisation, x: StageUnknowns
     ) -> FrozenNewtonMap:
         """Make Newton's iteration with its Jacobian fixed, that at the solution."""
         z, unravel = ravel_pytree(x)
         jacobian = jax.jacfwd(lambda z: stage_residual(stages, unravel(z))[0])(z)
         jacobian_inverse = jnp.linalg.inv(jacobian)
 
-        def update(stages: StageSystem, x: Stages) -> Stages:
+        def update(stages: StageEquations, x: StageUnknowns) -> StageUnknowns:
             residual, _ = stage_residual(stages, x)
             return unravel(ravel_pytree(x)[0] - jacobian_inverse @ residual)
 

@@ -7,26 +7,26 @@ from jaxtyping import Array, Float, PyTree
 
 from .._numerics import small_einsum
 from ._chart import AbstractChart
-from ._stage_system import StageSystem
-from ._unknowns import Stages
+from ._stage_system import StageEquations
+from ._unknowns import StageUnknowns
 
 
 def in_stages(
-    stages: StageSystem, x: Stages
+    stages: StageEquations, x: StageUnknowns
 ) -> tuple[AbstractChart, Float[Array, "s n"]]:
     """Make the chart and the coordinates y^i of the stages, from h Σ a_ij H^j."""
     return _in_chart(stages, x, stages.method.a)
 
 
 def in_nodes(
-    stages: StageSystem, x: Stages
+    stages: StageEquations, x: StageUnknowns
 ) -> tuple[AbstractChart, Float[Array, "r n"]]:
     """Make the chart and the coordinates of the nodes with momenta of their own."""
     return _in_chart(stages, x, stages.node_rows)
 
 
 def stage_positions(
-    stages: StageSystem, chart: AbstractChart, y: Float[Array, "s n"]
+    stages: StageEquations, chart: AbstractChart, y: Float[Array, "s n"]
 ) -> PyTree[Array]:
     """Compute the positions of the stages, the first of which is q_k if c_1 = 0."""
     if np.any(stages.method.a[0]):
@@ -38,14 +38,14 @@ def stage_positions(
     )
 
 
-def end_position(stages: StageSystem, x: Stages) -> PyTree[Array]:
+def end_position(stages: StageEquations, x: StageUnknowns) -> PyTree[Array]:
     """Compute the configuration q_{k+1} at the end of the step."""
     chart = stages.chart(x)
     return chart.position(chart.ends[1])
 
 
 def _in_chart(
-    stages: StageSystem, x: Stages, rows: np.ndarray
+    stages: StageEquations, x: StageUnknowns, rows: np.ndarray
 ) -> tuple[AbstractChart, Float[Array, "r n"]]:
     chart = stages.chart(x)
     start, end = chart.ends

@@ -60,7 +60,7 @@ def round_off_of_steps(
     `lin` is the linearisation at the state. The iteration on the stages magnifies the
     round-off of constraints by the inverse of the method's coefficients.
     """
-    lin = frozen(lin)
+    lin = stop_gradient(lin)
     inverse = lin.momentum_inverse.absolute()
     by_velocity, by_force = (
         max_norm(inverse.matvec(x)) for x in (noise.momentum, noise.force)
@@ -87,7 +87,7 @@ def magnifications(method: AbstractMethod) -> tuple[float, float]:
     The first number is that of nonholonomic constraints, the second that of holonomic
     ones: h N⁻¹ R δΛ is so much larger than the change that would make up for the error
     of one constraint. They are largest root sums of squares of rows of the inverses of
-    R E and of (A Â, b); see `StageSystem`. Pseudo-inverses, since a method that is not
+    R E and of (A Â, b); see `StageEquations`. Pseudo-inverses, since a method that is not
     meant for one kind of constraints may have a singular matrix for it.
     """
 

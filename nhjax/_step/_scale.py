@@ -11,8 +11,8 @@ from .._manifold import unframed
 from .._numerics import max_norm, uneven_perturbations
 from .._system import Linearisation, position_scale
 from ._stage_equations import impulse_weights
-from ._stage_system import StageSystem
-from ._unknowns import Stages
+from ._stage_system import StageEquations
+from ._unknowns import StageUnknowns
 
 
 class Scale(NamedTuple):
@@ -27,7 +27,7 @@ class Scale(NamedTuple):
 
 
 def fibre_coordinate_scale(
-    stages: StageSystem, x0: Stages, lin: Linearisation
+    stages: StageEquations, x0: StageUnknowns, lin: Linearisation
 ) -> Scale:
     """Estimate the size of the fibre coordinates of a step and their round-off.
 
@@ -58,7 +58,7 @@ def fibre_coordinate_scale(
     if m:
         sizes = jnp.pad(_kinematic_scale(stages, q, x0), (0, k))
         round_off = round_off + lin.largest_correction(sizes)
-    if stages.kept is not None:
+    if stages.invariants is not None:
         round_off = round_off + impulse_weights(stages, x0).noise
     if stages.round_off is not None:
         round_off = jnp.maximum(round_off, stages.round_off.size(h))
@@ -66,7 +66,7 @@ def fibre_coordinate_scale(
 
 
 def _kinematic_scale(
-    stages: StageSystem, q: PyTree[Array], x0: Stages
+    stages: StageEquations, q: PyTree[Array], x0: StageUnknowns
 ) -> Float[Array, " m"]:
     """Estimate how far nonholonomic constraints move if positions move by their size.
 

@@ -10,16 +10,16 @@ from jaxtyping import Array, Float
 from .._custom_types import BoolScalar
 from .._numerics import Pattern, small_einsum, sparse_jacobian, SparseMatrix
 from .._system import motion_residual, total_force
-from ._invariants import ImpulseWeights, moving_part
+from ._invariants import InvariantCorrection, moving_part
 from ._positions import end_position, in_nodes, in_stages, stage_positions
-from ._stage_system import StageSystem
-from ._unknowns import StageForces, Stages
+from ._stage_system import StageEquations
+from ._unknowns import StageForces, StageUnknowns
 
 
 T = TypeVar("T")
 
 
-def stage_velocities(stages: StageSystem, x: Stages) -> Float[Array, "s n"]:
+def stage_velocities(stages: StageEquations, x: StageUnknowns) -> Float[Array, "s n"]:
     """Compute the chart velocities dτ_y⁻¹ D2H(Q^i, P^i) of a Hamiltonian system."""
     chart, y = in_stages(stages, x)
     v = jax.vmap(lambda t, q, u: stages.system.velocity(t, q, u, stages.args))(
@@ -28,7 +28,7 @@ def stage_velocities(stages: StageSystem, x: Stages) -> Float[Array, "s n"]:
     return chart.chart_velocities(y, v)
 
 
-def stage_forces(stages: StageSystem, x: Stages) -> StageForces:
+def stage_forces(stages: StageEquations, x: StageUnknowns) -> StageForces:
     """Compute the forces n^i, multipliers Λ^i and residuals of the stage momenta."""
     h, a_hat, b = stages.h, stages.coefficients("a_hat"), stages.coefficients("b")
     multiplier = stages.multipliers(x)
@@ -55,7 +55,7 @@ def stage_forces(stages: StageSystem, x: Stages) -> StageForces:
 
 
 def node_residual(
-    stages: StageSystem, x: Stages, force: Float[Array, "s n"]
+    stages: StageEquations, x: StageUnknowns, force: Float[Array, "s n"]
 ) -> Float[Array, "r n"]:
     """Compute the residuals of the momentum equations at the nodes.
 
@@ -69,13 +69,13 @@ def node_residual(
     start = chart.momentum_at_origin(_start_momentum(stages, x))
     gained = stages.h * small_einsum("ij,jn->in", stages.node_weights, force)
     residual = momentum - chart.from_origin(y, start[None] + gained)
-    if stages.kept is None:
+    if stages.invariants is None:
         return residual
     last = residual[-1:] - end_impulse(stages, x)[None]
     return jnp.concatenate([residual[:-1], last])
 
 
-def node_constraint(stages: StageSystem, x: Stages) -> Float[Array, "r m"]:
+def node_constraint(stages: StageEquations, x: StageUnknowns) -> Float[Array, "r m"]:
     """Compute the nonholonomic constraints Φ(q^i, u^i) at the nodes."""
     chart, y = in_nodes(stages, x)
     values = jax.vmap(
@@ -86,7 +86,7 @@ def node_constraint(stages: StageSystem, x: Stages) -> Float[Array, "r m"]:
     return stages.redundancy.reduced(values, stages.h * x.closure, 0)
 
 
-def holonomic_constraint(stages: StageSystem, x: Stages) -> Float[Array, "s k"]:
+def holonomic_constraint(stages: StageEquations, x: StageUnknowns) -> Float[Array, "s k"]:
     """Compute Γ(Q^i) / h for i >= 2, and the tangency dΓ/dt at the end of the step.
 
     The division by h makes the values the size of velocities, as the tangency is.
@@ -107,7 +107,7 @@ def holonomic_constraint(stages: StageSystem, x: Stages) -> Float[Array, "s k"]:
     return stages.redundancy.reduced(values, stages.h * x.holonomic, m)
 
 
-def constraint_values(stages: StageSystem, x: Stages) -> tuple[Array, Array]:
+def constraint_values(stages: StageEquations, x: StageUnknowns) -> tuple[Array, Array]:
     """Compute the nonholonomic constraints at the nodes and the holonomic ones."""
     none = jnp.zeros((0,), stages.p.dtype)
     return (
@@ -116,13 +116,13 @@ def constraint_values(stages: StageSystem, x: Stages) -> tuple[Array, Array]:
     )
 
 
-def constraint_jacobian(stages: StageSystem, x: Stages) -> Float[Array, "r l n"]:
+def constraint_jacobian(stages: StageEquations, x: StageUnknowns) -> Float[Array, "r l n"]:
     """Compute B = ∂Φ/∂u of all constraints on velocities at the nodes i >= 2."""
     return _at_nodes(stages, x, jax.jacrev)
 
 
 def sparse_constraint_jacobian(
-    stages: StageSystem, x: Stages, pattern: Pattern
+    stages: StageEquations, x: StageUnknowns, pattern: Pattern
 ) -> SparseMatrix:
     """Compute B = ∂Φ/∂u at the nodes i >= 2 as a sparse matrix of a known pattern."""
     return _at_nodes(
@@ -133,7 +133,7 @@ def sparse_constraint_jacobian(
 
 
 def _at_nodes(
-    stages: StageSystem, x: Stages, differentiated: Callable[..., Callable[..., T]]
+    stages: StageEquations, x: StageUnknowns, differentiated: Callable[..., Callable[..., T]]
 ) -> T:
     times, u = stages.stage_times[1:], x.node_fibre_coordinate
     if not stages.num_nonholonomic:
@@ -148,7 +148,7 @@ def _at_nodes(
 
 
 def end_residual(
-    stages: StageSystem, x: Stages
+    stages: StageEquations, x: StageUnknowns
 ) -> tuple[Float[Array, " n"], Float[Array, " l"]]:
     """Compute the residuals of the equations of motion at the end of the step.
 
@@ -168,57 +168,57 @@ def end_residual(
     return on_momentum, hidden
 
 
-def start_impulse(stages: StageSystem, x: Stages) -> Float[Array, " n"]:
+def start_impulse(stages: StageEquations, x: StageUnknowns) -> Float[Array, " n"]:
     """Compute the impulse ε ω_k at the start of a step that keeps invariants."""
-    assert stages.kept is not None
-    return small_einsum("k,kn->n", x.impulse, stages.kept.covectors)
+    assert stages.invariants is not None
+    return small_einsum("k,kn->n", x.impulse, stages.invariants.covectors)
 
 
-def _start_momentum(stages: StageSystem, x: Stages) -> Float[Array, " n"]:
+def _start_momentum(stages: StageEquations, x: StageUnknowns) -> Float[Array, " n"]:
     """Compute the momentum after the impulse at the start of the step."""
-    return stages.p if stages.kept is None else stages.p + start_impulse(stages, x)
+    return stages.p if stages.invariants is None else stages.p + start_impulse(stages, x)
 
 
-def end_impulse(stages: StageSystem, x: Stages) -> Float[Array, " n"]:
+def end_impulse(stages: StageEquations, x: StageUnknowns) -> Float[Array, " n"]:
     """Compute the impulse ε ω_{k+1} at the end of the step."""
     _, covectors = end_slopes(stages, x)
     return small_einsum("k,kn->n", x.impulse, covectors)
 
 
 def end_slopes(
-    stages: StageSystem, x: Stages
+    stages: StageEquations, x: StageUnknowns
 ) -> tuple[Float[Array, "k n"], Float[Array, "k n"]]:
     """Compute ∂I/∂u and ω of the invariants at the end of a step; see `Directions`."""
-    assert stages.kept is not None
-    found = stages.kept.invariants.directions(*_end_point(stages, x))
+    assert stages.invariants is not None
+    found = stages.invariants.invariants.directions(*_end_point(stages, x))
     return found.slopes, found.covectors
 
 
-def invariant_errors(stages: StageSystem, x: Stages) -> Float[Array, " k"]:
+def invariant_errors(stages: StageEquations, x: StageUnknowns) -> Float[Array, " k"]:
     """Compute the errors of the invariants at the end of a step."""
-    assert stages.kept is not None
-    return stages.kept.invariants.tangent_error(*_end_point(stages, x))
+    assert stages.invariants is not None
+    return stages.invariants.invariants.tangent_error(*_end_point(stages, x))
 
 
-def impulse_weights(stages: StageSystem, x: Stages) -> ImpulseWeights:
+def impulse_weights(stages: StageEquations, x: StageUnknowns) -> InvariantCorrection:
     """Weigh the equations for the impulses of a step, near the given stages."""
-    assert stages.kept is not None
+    assert stages.invariants is not None
     slopes, covectors = end_slopes(stages, x)
     moving = moving_part(slopes, x.node_fibre_coordinate[-1])
     given = slopes, covectors, moving, stages.hamiltonian
-    return ImpulseWeights.at(stages.kept, *given)
+    return InvariantCorrection.at(stages.invariants, *given)
 
 
-def _end_point(stages: StageSystem, x: Stages) -> tuple[Any, ...]:
+def _end_point(stages: StageEquations, x: StageUnknowns) -> tuple[Any, ...]:
     """Return what functions of the system are given at the end of the step."""
-    assert stages.kept is not None
-    end = stages.chart(x).advance(*stages.kept.position)
+    assert stages.invariants is not None
+    end = stages.chart(x).advance(*stages.invariants.position)
     q = stages.manifold.wrapped(*end)
     u = x.node_fibre_coordinate[-1]
     return stages.system, stages.t + stages.h, q, u, stages.args
 
 
-def in_chart(stages: StageSystem, x: Stages) -> BoolScalar:
+def in_chart(stages: StageEquations, x: StageUnknowns) -> BoolScalar:
     """Tell whether stages, nodes and end lie where the chart is invertible."""
     chart, y = in_stages(stages, x)
     return chart.in_domain(jnp.concatenate([y, chart.ends[1][None]]))

@@ -18,13 +18,13 @@ from ._curved_chart import chart_of_step
 from ._invariants import StartImpulses
 from ._redundancy import Redundancy
 from ._round_off import RoundOff
-from ._unknowns import Stages
+from ._unknowns import StageUnknowns
 
 
-class StageSystem(eqx.Module):
+class StageEquations(eqx.Module):
     """The discrete equations of one step from (q_k, p_k, λ_k).
 
-    These are the paper's four Summaries in the unknowns of `Stages`, in the chart of
+    These are the paper's four Summaries in the unknowns of `StageUnknowns`, in the chart of
     the method. With w^i the body force at stage i (reactions included), y^i the
     coordinates of the stage, n^i = Ad^*_{τ(y^i)⁻¹} w^i, F^i the same force in the chart
     and M the momentum μ_k carried to its origin, they read
@@ -39,7 +39,7 @@ class StageSystem(eqx.Module):
     `method.closure_weights`; by the multiplier that a state carries, Λ^s for the
     propagated closure and λ_c for the others (`end_state`, `first_step_state`); and, if
     it uses λ_c at the end, by two more unknowns and equations (`symmetric`). To keep
-    invariants, momenta receive impulses at both ends of the step; see `ImpulseWeights`.
+    invariants, momenta receive impulses at both ends of the step; see `InvariantCorrection`.
     """
 
     system: AbstractMechanicalSystem
@@ -66,7 +66,7 @@ class StageSystem(eqx.Module):
         lin: Linearisation,
         kept: StartImpulses | None = None,
         round_off: RoundOff | None = None,
-    ) -> "StageSystem":
+    ) -> "StageEquations":
         """Make the equations of a step of size h from the state y at t."""
         system, q = with_frames(system, y.q)
         given = t, h, q, y.p, y.multiplier, args
@@ -118,7 +118,7 @@ class StageSystem(eqx.Module):
         """Return the configuration space."""
         return self.system.manifold_of(self.q)
 
-    def chart(self, x: Stages) -> AbstractChart:
+    def chart(self, x: StageUnknowns) -> AbstractChart:
         """Make the chart in which the step is written."""
         return chart_of_step(
             self.manifold, self.method.chart, self.q, self.increment(x)
@@ -162,7 +162,7 @@ class StageSystem(eqx.Module):
         )
         return self.t + self.h * nodes
 
-    def multipliers(self, x: Stages) -> Float[Array, "s l"]:
+    def multipliers(self, x: StageUnknowns) -> Float[Array, "s l"]:
         """Compute the multipliers Λ^1..Λ^s of all constraints at the stages.
 
         They follow from the unknowns of the closure and the holonomic multipliers.
@@ -172,7 +172,7 @@ class StageSystem(eqx.Module):
             return change
         return self._padded("start", self.multiplier) + change
 
-    def multiplier_change(self, dx: Stages) -> Float[Array, "s l"]:
+    def multiplier_change(self, dx: StageUnknowns) -> Float[Array, "s l"]:
         """Compute the part of the multipliers Λ that is linear in the unknowns."""
         change = self.free_multipliers(dx.closure, dx.holonomic)
         if self.symmetric:
@@ -199,14 +199,14 @@ class StageSystem(eqx.Module):
         part = jnp.outer(self.closure_weights(weights), known)
         return jnp.pad(part, ((0, 0), (0, self.num_holonomic)))
 
-    def increment(self, x: Stages) -> Float[Array, " n"]:
+    def increment(self, x: StageUnknowns) -> Float[Array, " n"]:
         """Compute the increment ξ = h Σ b_j H^j, which takes q_k to q_{k+1}."""
         # The product is formed as h * (b @ H): coefficients h b_j, rounded once and for
         # all, would bias every step in the same way.
         return self.h * small_einsum("s,sn->n", self.coefficients("b"), x.velocity)
 
 
-def nudged(stages: StageSystem, nudge: FloatScalar) -> StageSystem:
+def nudged(stages: StageEquations, nudge: FloatScalar) -> StageEquations:
     """Return the equations with q_k moved by about `nudge` times its size.
 
     The change of a solution by this move, divided by `nudge`, estimates its change by

@@ -5,11 +5,11 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from .._system import Linearisation
-from ._stage_system import StageSystem
-from ._unknowns import Stages
+from ._stage_system import StageEquations
+from ._unknowns import StageUnknowns
 
 
-def starting_values(stages: StageSystem, u: Array, lin: Linearisation) -> Stages:
+def starting_values(stages: StageEquations, u: Array, lin: Linearisation) -> StageUnknowns:
     """Compute the stages to first order in h, from acceleration and λ_c at the start.
 
     The values do not depend on the step before, so that a step is a function of its
@@ -21,28 +21,28 @@ def starting_values(stages: StageSystem, u: Array, lin: Linearisation) -> Stages
     node_times = jnp.sum(stages.node_weights, axis=1)
     # The unknown ν of the symmetric closure vanishes with h, and starts from zero; all
     # other unknowns of a closure are multipliers.
-    free = (jnp.arange(s - 1) >= int(stages.symmetric)).astype(u.dtype)
+    free = (jnp.arange(s - 1) >= int(stages.end_multiplier_is_unknown)).astype(u.dtype)
     nothing = jnp.zeros((0,), u.dtype)
     in_stages = u[None] + jnp.outer(stage_times, push)
-    velocity, momentum, kept = in_stages, jnp.zeros((s, 0), u.dtype), stages.kept
+    velocity, momentum, kept = in_stages, jnp.zeros((s, 0), u.dtype), stages.invariants
     if stages.hamiltonian:
         velocity, momentum = (
             _starting_velocities(stages, u, lin, stage_times),
             in_stages,
         )
-    return Stages(
+    return StageUnknowns(
         velocity=velocity,
         momentum=momentum,
         node_fibre_coordinate=u[None] + jnp.outer(node_times, push),
         closure=jnp.outer(free, lin.multiplier[:m]),
         holonomic=jnp.outer(jnp.ones((s,), u.dtype), lin.multiplier[m:]),
-        end_acceleration=lin.acceleration if stages.symmetric else nothing,
-        end_multiplier=lin.multiplier if stages.symmetric else nothing,
+        end_acceleration=lin.acceleration if stages.end_multiplier_is_unknown else nothing,
+        end_multiplier=lin.multiplier if stages.end_multiplier_is_unknown else nothing,
         impulse=None if kept is None else jnp.zeros_like(kept.sizes),
     )
 
 
-def _starting_velocities(stages: StageSystem, u, lin: Linearisation, times) -> Array:
+def _starting_velocities(stages: StageEquations, u, lin: Linearisation, times) -> Array:
     v = stages.system.velocity(stages.t, stages.q, u, stages.args)
     _, rate = jax.jvp(
         lambda t, xi, u: stages.system.velocity(

@@ -11,7 +11,7 @@ from jaxtyping import Array, Float, Int, PyTree
 from .._custom_types import Args, BoolScalar, FloatScalar
 from .._method import AbstractMethod
 from .._numerics import (
-    frozen,
+    stop_gradient,
     has_tangent,
     largest_column,
     max_norm,
@@ -38,9 +38,9 @@ from ._newton import AbstractStageSolver
 from ._record import StepRecord
 from ._round_off import RoundOff
 from ._stage_equations import end_impulse, in_chart, start_impulse
-from ._stage_system import StageSystem
+from ._stage_system import StageEquations
 from ._starting_values import starting_values
-from ._unknowns import Stages
+from ._unknowns import StageUnknowns
 
 
 class StepState(eqx.Module):
@@ -110,7 +110,7 @@ class StepOutcome(NamedTuple):
 
     step_state: StepState
     record: StepRecord
-    stages: Stages
+    stages: StageUnknowns
     result: RESULTS
     num_iterations: Int[Array, ""]
     residual: FloatScalar
@@ -144,7 +144,7 @@ def first_step_state(
         state=State(y0.q, y0.v, y0.p, y0.multiplier if carried else multiplier),
         q_compensation=system.manifold_of(y0.q).no_compensation(y0.q),
         p_compensation=jnp.zeros_like(y0.p),
-        lin=frozen(lin),
+        lin=stop_gradient(lin),
     )
 
 
@@ -171,7 +171,7 @@ def _continuous_multiplier_jvp(primals, tangents):
     return multiplier, zero_unless(ok, change)
 
 
-def equations_of_step(arguments: StepArguments, method: AbstractMethod) -> StageSystem:
+def equations_of_step(arguments: StepArguments, method: AbstractMethod) -> StageEquations:
     """Make the equations of a step, with those of the invariants that it keeps."""
     system, t, args = arguments.system, arguments.t, arguments.args
     step_state, invariants = arguments.step_state, arguments.invariants
@@ -180,7 +180,7 @@ def equations_of_step(arguments: StepArguments, method: AbstractMethod) -> Stage
         position = step_state.state.q, step_state.q_compensation
         kept = StartImpulses.at(invariants, system, t, y, position, args, lin)
     given = t, arguments.h, y, args, lin, kept, arguments.round_off
-    return StageSystem.at(system, method, *given)
+    return StageEquations.at(system, method, *given)
 
 
 def step(
@@ -243,18 +243,18 @@ def step(
 
 
 def _invariant_error(
-    stages: StageSystem, q: PyTree[Array], u: Float[Array, " n"]
+    stages: StageEquations, q: PyTree[Array], u: Float[Array, " n"]
 ) -> FloatScalar | None:
     """Measure the errors of invariants at the end by the sizes of their terms."""
-    if stages.kept is None:
+    if stages.invariants is None:
         return None
-    invariants, t = stages.kept.invariants, stages.t + stages.h
+    invariants, t = stages.invariants.invariants, stages.t + stages.h
     error = invariants.error(stages.system, t, q, u, stages.args)
-    return max_norm(relative(error, stages.kept.sizes))
+    return max_norm(relative(error, stages.invariants.sizes))
 
 
 def _result(
-    solved: Solved[Stages, Evaluation],
+    solved: Solved[StageUnknowns, Evaluation],
     lin: Linearisation,
     step_state: StepState,
     is_in_chart: BoolScalar,

@@ -6,7 +6,7 @@ import equinox as eqx
 from jaxtyping import Array, Float, PyTree
 
 
-class Stages(eqx.Module):
+class StageUnknowns(eqx.Module):
     """The unknowns of one step: stage velocities, node coordinates and multipliers.
 
     Unknowns that a system or a closure does not have are arrays without entries.

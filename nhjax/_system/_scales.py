@@ -15,7 +15,7 @@ from jaxtyping import Array, Float, PyTree
 from .._custom_types import Args, BoolScalar, FloatScalar, FloatScalarLike
 from .._manifold import AbstractLieGroup
 from .._numerics import (
-    frozen,
+    stop_gradient,
     JacobianMatrix,
     max_norm,
     measured_noise,
@@ -151,7 +151,7 @@ def function_noise(
     """
     # A closure, because `args` may contain objects that are not arrays.
     positions = jax.eval_shape(lambda: system.position_constraint(t, q, args))
-    system, args = frozen((system, args))
+    system, args = stop_gradient((system, args))
 
     def values(t, q, u):
         return FunctionNoise(
@@ -177,7 +177,7 @@ def noise_near(
 
     `like` has the structure, shapes and dtype of its results; see `measured_noise`.
     """
-    (t, q, u), n = frozen((t, q, u)), u.shape[0]
+    (t, q, u), n = stop_gradient((t, q, u)), u.shape[0]
     # Angles are reduced to the first turn: those of many turns have more round-off.
     q = manifold.wrapped(q, manifold.no_compensation(q))
     return measured_noise(

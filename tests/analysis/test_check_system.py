@@ -6,8 +6,8 @@ import pytest
 
 import nhjax
 from nhjax.systems import HeavyTop, RollingDisc, SphericalPendulum, VerticalRollingDisc
-from oracles.driven import ARGS, DRIVEN
-from oracles.forms import in_space
+from support.driven import ARGS, DRIVEN
+from support.forms import in_space
 
 
 def report_of(example):

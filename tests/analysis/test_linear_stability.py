@@ -12,7 +12,7 @@ from nhjax.systems import (
     RollingTorus,
     SphericalPendulum,
 )
-from oracles.polar_pendulum import GRAVITY, polar_pendulum
+from support.polar_pendulum import GRAVITY, polar_pendulum
 
 
 def conical(system, angle):

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 import nhjax
-from oracles.driven import ARGS, DRIVEN
-from oracles.forms import in_rotation, in_space
-from oracles.group_gallery import SOLVED
-from oracles.group_oracle import acceleration_and_multiplier
+from support.driven import ARGS, DRIVEN
+from support.forms import in_rotation, in_space
+from support.group_gallery import SOLVED
+from support.group_oracle import acceleration_and_multiplier
 
 
 EXAMPLES = ("unicycle", "ball tilted", "Suslov", "rigid body", "spherical pendulum")

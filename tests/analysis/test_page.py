@@ -3,7 +3,7 @@
 import jax.numpy as jnp
 import numpy as np
 
-from oracles.pages import blocks, page, run_page
+from support.pages import blocks, page, run_page
 
 
 def test_analysis_page_when_run_prints_as_shown():

@@ -9,7 +9,7 @@ import pytest
 
 import nhjax
 from nhjax.systems import HeavyTop
-from oracles.group_problems import both_forms
+from support.group_problems import both_forms
 
 
 AXIS, SPACE = jnp.asarray([0.0, 0.0, 1.0]), nhjax.SO3()

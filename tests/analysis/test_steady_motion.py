@@ -7,7 +7,7 @@ import pytest
 
 import nhjax
 from nhjax.systems import SphericalPendulum
-from oracles.polar_pendulum import GRAVITY, polar_pendulum
+from support.polar_pendulum import GRAVITY, polar_pendulum
 
 
 def test_steady_motion_of_a_pendulum_with_given_rate_is_its_cone():

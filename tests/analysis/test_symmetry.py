@@ -8,8 +8,8 @@ from scipy.optimize import linear_sum_assignment
 
 import nhjax
 from nhjax.systems import FreeRigidBody, HeavyTop, RollingTorus, SphericalPendulum
-from oracles.group_problems import both_forms
-from oracles.rolling_bodies import matrix_of, RollingBody, torus
+from support.group_problems import both_forms
+from support.rolling_bodies import matrix_of, RollingBody, torus
 
 
 AXIS = jnp.asarray([0.0, 0.0, 1.0])

@@ -12,7 +12,7 @@ import pytest
 
 import nhjax
 from nhjax import SaveAt
-from oracles.falling import (
+from support.falling import (
     end,
     falling,
     traces,

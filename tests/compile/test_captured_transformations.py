@@ -10,7 +10,7 @@ import pytest
 
 import nhjax
 from nhjax._compile._tracked_jit import captured, MOST_ENTRIES
-from oracles.falling import (
+from support.falling import (
     end,
     falling,
     traces,

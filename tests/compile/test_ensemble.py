@@ -10,7 +10,7 @@ import pytest
 import nhjax
 from nhjax import lanes
 from nhjax._compile import as_cpu_kernel
-from oracles.lane_kernels import kernel_ir, TRIPLE, WIDTH
+from support.lane_kernels import kernel_ir, TRIPLE, WIDTH
 
 
 def wanders(g, x, k):

@@ -13,7 +13,7 @@ import pytest
 
 import nhjax
 from benchmarks import ensembles
-from oracles.ensembles import BAD, start, starts
+from support.ensembles import BAD, start, starts
 
 
 @pytest.fixture(scope="module")
@@ -130,7 +130,7 @@ SEVERAL = """
 import jax
 jax.config.update("jax_enable_x64", True)
 import numpy as np, nhjax
-from oracles.ensembles import start, starts
+from support.ensembles import start, starts
 assert len(jax.devices()) == 3
 whole, one = nhjax.ensemble(start, starts()), jax.devices()[:1]
 alone = nhjax.ensemble(start, starts(), devices=one)

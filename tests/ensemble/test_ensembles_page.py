@@ -1,6 +1,6 @@
 """The code of the page about ensembles runs as printed."""
 
-from oracles.pages import run_page
+from support.pages import run_page
 
 
 def test_ensembles_page_code_runs(tmp_path, monkeypatch):

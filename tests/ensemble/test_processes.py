@@ -19,7 +19,7 @@ import pytest
 
 import nhjax
 from nhjax._ensemble import _processes
-from oracles import processes
+from support import processes
 
 
 # JAX must know of the other process before anything uses the devices.
@@ -32,7 +32,7 @@ index, port, folder, task = sys.argv[1:]
 jax.distributed.initialize(f"localhost:{port}", 2, int(index))
 import nhjax
 from nhjax._ensemble import _processes
-from oracles import processes
+from support import processes
 getattr(processes, task)(int(index), Path(folder))
 """
 ROOT = Path(__file__).parents[2]

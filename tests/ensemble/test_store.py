@@ -18,7 +18,7 @@ import xarray
 
 import nhjax
 from nhjax._ensemble import _durable
-from oracles.ensembles import BAD, start, starts
+from support.ensembles import BAD, start, starts
 
 
 COUNT, CHUNK = 50, 4

@@ -9,7 +9,7 @@ import pytest
 
 import nhjax
 from nhjax import systems
-from oracles.long import long
+from support.long import long
 
 
 BODY = systems.FreeRigidBody()

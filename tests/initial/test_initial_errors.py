@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 import nhjax
-from oracles.mistakes import (
+from support.mistakes import (
     Q,
     start,
     system_with,

@@ -14,7 +14,7 @@ from scipy.optimize import minimize
 import nhjax
 from nhjax import systems
 from nhjax.systems import RollingDisc, VerticalRollingDisc, WhippleBicycle
-from oracles.long import long
+from support.long import long
 
 
 RNG = np.random.default_rng(3)

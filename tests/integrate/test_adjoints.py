@@ -10,14 +10,14 @@ import pytest
 
 import nhjax
 from nhjax import LobattoIIIAB, SaveAt, systems
-from oracles.driven import Driven
-from oracles.helpers import (
+from support.driven import Driven
+from support.helpers import (
     central_difference,
     direction,
     dot,
     scalar,
 )
-from oracles.long import long
+from support.long import long
 
 
 DIRECT = nhjax.DirectAdjoint()

@@ -13,8 +13,8 @@ from nhjax import SaveAt
 from nhjax.systems import (
     ChaoticSystem,
 )
-from oracles.driven import Driven
-from oracles.particle_run import assert_trees_close, DT, PARTICLE, run
+from support.driven import Driven
+from support.particle_run import assert_trees_close, DT, PARTICLE, run
 
 
 # Transformations ----------------------------------------------------------------------

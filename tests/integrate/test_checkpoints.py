@@ -10,7 +10,7 @@ import pytest
 
 import nhjax
 from nhjax import LobattoIIIAB, SaveAt, systems
-from oracles.driven import ARGS, DRIVEN, driven_state
+from support.driven import ARGS, DRIVEN, driven_state
 
 
 CHECKPOINT = SaveAt(checkpoint=True)

@@ -18,10 +18,10 @@ from scipy.integrate import solve_ivp
 
 import nhjax
 from nhjax.systems import ChaplyginSleigh, NonholonomicParticle
-from oracles import helpers, paper_mechanics as paper
-from oracles.driven import FIELD, FRICTION
-from oracles.long import long_but
-from oracles.orders import assert_order, rms, SCIPY_FLOOR, trajectories
+from support import helpers, paper_mechanics as paper
+from support.driven import FIELD, FRICTION
+from support.long import long_but
+from support.orders import assert_order, rms, SCIPY_FLOOR, trajectories
 
 
 PARTICLE, SLEIGH = NonholonomicParticle(), ChaplyginSleigh()

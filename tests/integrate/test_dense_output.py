@@ -9,8 +9,8 @@ import pytest
 import nhjax
 from nhjax import SaveAt
 from nhjax.systems import Appell, NonholonomicParticle
-from oracles import helpers
-from oracles.long import long
+from support import helpers
+from support.long import long
 
 
 PARTICLE = NonholonomicParticle()

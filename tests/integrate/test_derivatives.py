@@ -8,13 +8,13 @@ import pytest
 
 import nhjax
 from nhjax import LobattoIIIAB, SaveAt, systems
-from oracles import helpers
-from oracles.driven import Driven
-from oracles.gradients import assert_gradient, split, STEPS
-from oracles.helpers import (
+from support import helpers
+from support.driven import Driven
+from support.gradients import assert_gradient, split, STEPS
+from support.helpers import (
     scalar,
 )
-from oracles.long import long
+from support.long import long
 
 
 # What is given, and what is saved -----------------------------------------------------

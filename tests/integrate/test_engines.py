@@ -11,7 +11,7 @@ import pytest
 import nhjax
 from benchmarks.engines import difference, FINAL_TIMES, gallery, program
 from nhjax import LobattoIIIAB, systems
-from oracles.long import long, long_but
+from support.long import long, long_but
 
 
 pytestmark = pytest.mark.usefixtures("optimised_kernels")

@@ -9,9 +9,9 @@ import pytest
 
 import nhjax
 from nhjax import Event, LobattoIIIAB, SaveAt
-from oracles.helpers import central_difference, direction, dot, moved, scalar
-from oracles.impacts import rod_run, SLIDE, slide, START
-from oracles.long import long
+from support.helpers import central_difference, direction, dot, moved, scalar
+from support.impacts import rod_run, SLIDE, slide, START
+from support.long import long
 
 
 DIRECT, CHECKPOINTS, REVERSIBLE = (

@@ -9,7 +9,7 @@ import pytest
 
 import nhjax
 from nhjax import Event, LobattoIIIAB, RESULTS, SaveAt
-from oracles.helpers import scalar
+from support.helpers import scalar
 
 
 METHOD = LobattoIIIAB(2)

@@ -7,8 +7,8 @@ import pytest
 
 import nhjax
 from nhjax import Event, LobattoIIIAB, RESULTS, SaveAt, systems
-from oracles.impacts import Latch, ROD, rod_run, SLIDE, slide, START, turned
-from oracles.long import long
+from support.impacts import Latch, ROD, rod_run, SLIDE, slide, START, turned
+from support.long import long
 
 
 LATCH = Latch()

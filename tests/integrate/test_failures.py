@@ -11,7 +11,7 @@ from nhjax import SaveAt
 from nhjax.systems import (
     Appell,
 )
-from oracles.particle_run import assert_trees_equal, PARTICLE, run, STEPS
+from support.particle_run import assert_trees_equal, PARTICLE, run, STEPS
 
 
 # Failures -----------------------------------------------------------------------------

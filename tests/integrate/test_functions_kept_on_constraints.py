@@ -10,8 +10,8 @@ import pytest
 import nhjax
 from benchmarks.invariants_on_constraints import particle_at, substituted_energy
 from nhjax import LobattoIIIAB, SaveAt, systems
-from oracles.helpers import central_difference, scalar
-from oracles.long import long, long_but
+from support.helpers import central_difference, scalar
+from support.long import long, long_but
 
 
 PARTICLE = systems.NonholonomicParticle()

@@ -8,9 +8,9 @@ import pytest
 import nhjax
 from docs.machines import machines
 from nhjax import LobattoIIIAB, systems
-from oracles import helpers
-from oracles.gradients import split, STEPS
-from oracles.helpers import (
+from support import helpers
+from support.gradients import split, STEPS
+from support.helpers import (
     central_difference,
     direction,
     dot,
@@ -18,7 +18,7 @@ from oracles.helpers import (
     scalar,
     SideBySide,
 )
-from oracles.long import long_but
+from support.long import long_but
 
 
 def assert_gradients_of_examples(examples, method, turning):

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 import nhjax
-from oracles import helpers
-from oracles.helpers import CLOSURES, GALLERY, integrate_recorded, problem, recorded
-from oracles.long import long, long_but
+from support import helpers
+from support.helpers import CLOSURES, GALLERY, integrate_recorded, problem, recorded
+from support.long import long, long_but
 
 
 # Linear, affine, nonlinear and time-dependent constraints, and chaos.

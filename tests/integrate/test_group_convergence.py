@@ -10,10 +10,10 @@ import pytest
 
 import nhjax
 from nhjax import systems
-from oracles import group_oracle
-from oracles.helpers import SideBySide
-from oracles.long import long, long_but
-from oracles.orders import assert_order, DURATION, rms, SCIPY_FLOOR, trajectories
+from support import group_oracle
+from support.helpers import SideBySide
+from support.long import long, long_but
+from support.orders import assert_order, DURATION, rms, SCIPY_FLOOR, trajectories
 
 
 RETRACTIONS = {"cayley": nhjax.Cayley(), "exponential": nhjax.Exponential()}

@@ -10,9 +10,9 @@ import pytest
 
 import nhjax
 from nhjax import SaveAt, systems
-from oracles.helpers import SideBySide
-from oracles.long import long
-from oracles.own_groups import Heisenberg, HeisenbergBySecondKind
+from support.helpers import SideBySide
+from support.long import long
+from support.own_groups import Heisenberg, HeisenbergBySecondKind
 
 
 BALL = systems.TurntableBall()

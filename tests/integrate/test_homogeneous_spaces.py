@@ -7,7 +7,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 import nhjax
-from oracles.orders import assert_order, DURATION, rms, SCIPY_FLOOR, trajectories
+from support.orders import assert_order, DURATION, rms, SCIPY_FLOOR, trajectories
 
 
 GRAVITY = 9.81

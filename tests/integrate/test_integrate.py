@@ -11,8 +11,8 @@ from nhjax import SaveAt
 from nhjax.systems import (
     HarmonicOscillator,
 )
-from oracles import helpers
-from oracles.particle_run import assert_trees_close, DT, PARTICLE, run, STEPS
+from support import helpers
+from support.particle_run import assert_trees_close, DT, PARTICLE, run, STEPS
 
 
 # Time ---------------------------------------------------------------------------------

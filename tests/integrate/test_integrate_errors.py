@@ -8,7 +8,7 @@ import pytest
 import nhjax
 from nhjax import SaveAt
 from nhjax.systems import HarmonicOscillator, NonholonomicParticle
-from oracles.mistakes import (
+from support.mistakes import (
     changed,
     EXPLICIT_RK4,
     FREE,

@@ -13,11 +13,11 @@ from scipy.optimize import brentq
 import nhjax
 from benchmarks._examples import suslov_in_a_potential
 from nhjax import LobattoIIIAB, SaveAt, systems
-from oracles import paper_equations as paper, paper_mechanics as mechanics
-from oracles.helpers import central_difference, scalar
-from oracles.long import long, long_but
-from oracles.orders import assert_order, rms, SCIPY_FLOOR, trajectories
-from oracles.pages import run_page
+from support import paper_equations as paper, paper_mechanics as mechanics
+from support.helpers import central_difference, scalar
+from support.long import long, long_but
+from support.orders import assert_order, rms, SCIPY_FLOOR, trajectories
+from support.pages import run_page
 
 
 CHAOTIC, CVT = systems.ChaoticSystem(), systems.ContinuouslyVariableTransmission.low()

@@ -17,8 +17,8 @@ from benchmarks.invariants_on_constraints import (
     saddle_starts,
 )
 from nhjax import LobattoIIIAB, SaveAt, systems
-from oracles.long import long, long_but
-from oracles.orders import rms
+from support.long import long, long_but
+from support.orders import rms
 
 
 PARTICLE = systems.NonholonomicParticle()

@@ -8,8 +8,8 @@ from scipy.integrate import solve_ivp
 
 import nhjax
 from nhjax._system import linearise
-from oracles import orders
-from oracles.long import long
+from support import orders
+from support.long import long
 
 
 LINKS = 9

@@ -9,8 +9,8 @@ import pytest
 
 import nhjax
 from nhjax import SaveAt
-from oracles.long import long
-from oracles.particle_run import assert_trees_equal, PARTICLE
+from support.long import long
+from support.particle_run import assert_trees_equal, PARTICLE
 
 
 # Two programs agree bit for bit in kernels as users have them; without optimisation a

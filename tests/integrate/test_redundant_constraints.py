@@ -10,8 +10,8 @@ from scipy.integrate import solve_ivp
 
 import nhjax
 from nhjax import systems
-from oracles import orders, paper_equations
-from oracles.long import long
+from support import orders, paper_equations
+from support.long import long
 
 
 THREE = nhjax.LobattoIIIAB(3)

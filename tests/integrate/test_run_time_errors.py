@@ -8,7 +8,7 @@ import pytest
 import nhjax
 from nhjax import SaveAt
 from nhjax.systems import Appell
-from oracles.mistakes import (
+from support.mistakes import (
     changed,
     PARTICLE,
     run,

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from nhjax import SaveAt
-from oracles.particle_run import (
+from support.particle_run import (
     assert_trees_close,
     assert_trees_equal,
     DT,

@@ -12,8 +12,8 @@ import pytest
 
 import nhjax
 from nhjax import LobattoIIIAB, systems
-from oracles.helpers import scalar
-from oracles.long import long
+from support.helpers import scalar
+from support.long import long
 
 
 PARTICLE = systems.NonholonomicParticle()

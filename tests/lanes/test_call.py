@@ -12,8 +12,8 @@ import pytest
 from jax import lax
 
 from nhjax import lanes
-from oracles import lane_processes
-from oracles.lane_kernels import kernel_ir, SHARED, TRIPLE, WIDTH
+from support import lane_processes
+from support.lane_kernels import kernel_ir, SHARED, TRIPLE, WIDTH
 
 
 def call(name, *operands, shape=None):

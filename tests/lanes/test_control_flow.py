@@ -6,8 +6,8 @@ import numpy as np
 from jax import lax
 
 from nhjax.lanes import llvm_ir
-from oracles import lanes_run
-from oracles.lanes_samples import (
+from support import lanes_run
+from support.lanes_samples import (
     assert_as_jax,
     count,
     MEMBERS,

@@ -11,8 +11,8 @@ import scipy.special
 from nhjax.lanes import _coefficients
 from nhjax.lanes._elementary_functions import definitions, SUPPORTED
 from nhjax.lanes._writer import symbol
-from oracles import approximations, ulps
-from oracles.native_lanes import Native
+from support import approximations, ulps
+from support.native_lanes import Native
 
 
 OPS = sorted(SUPPORTED)

@@ -16,9 +16,9 @@ import pytest
 from hypothesis import HealthCheck, strategies as st
 
 from nhjax.lanes import _builder
-from oracles import lanes_run
-from oracles.random_programs import programs
-from oracles.random_steps import evaluate, numbers
+from support import lanes_run
+from support.random_programs import programs
+from support.random_steps import evaluate, numbers
 
 
 EXAMPLES = int(os.environ.get("NHJAX_FUZZ", "100"))

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from nhjax.lanes import _ffi, _handler, _native
-from oracles import ffi_runtime
-from oracles.ffi_runtime import Runtime
-from oracles.lane_kernels import kernel_ir, TRIPLE, WIDTH
+from support import ffi_runtime
+from support.ffi_runtime import Runtime
+from support.lane_kernels import kernel_ir, TRIPLE, WIDTH
 
 
 NUMBERS = itertools.count()

@@ -9,8 +9,8 @@ import pytest
 
 from nhjax import lanes
 from nhjax.lanes import _handler, _native
-from oracles import lane_processes
-from oracles.lane_kernels import VECTORS
+from support import lane_processes
+from support.lane_kernels import VECTORS
 
 
 LINUX = "x86_64-unknown-linux-gnu"

@@ -14,8 +14,8 @@ from jax import lax
 from nhjax._compile import _jaxprs
 from nhjax._numerics import small_einsum
 from nhjax.lanes import _program, Unsupported
-from oracles import lanes_run
-from oracles.random_steps import Kind, numbers
+from support import lanes_run
+from support.random_steps import Kind, numbers
 
 
 MEMBERS = 11

@@ -5,8 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from nhjax.lanes import llvm_ir
-from oracles import lanes_run
-from oracles.lanes_samples import (
+from support import lanes_run
+from support.lanes_samples import (
     repeated,
 )
 

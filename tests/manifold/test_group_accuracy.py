@@ -20,7 +20,7 @@ from nhjax._manifold import (
     SO3,
 )
 from nhjax._manifold._retraction import arctan_ratio, stumpff
-from oracles.group_samples import (
+from support.group_samples import (
     batched,
     directions,
     distance,

@@ -14,7 +14,7 @@ from nhjax._manifold import (
     SE3,
     SO3,
 )
-from oracles.group_samples import (
+from support.group_samples import (
     batched,
     chart,
     compiled,

@@ -15,7 +15,7 @@ from nhjax._manifold import (
     SO2,
     SO3,
 )
-from oracles.group_samples import (
+from support.group_samples import (
     GROUPS,
     MIXED,
 )

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from nhjax._manifold import AbstractLieGroup, ProductGroup, SO3
-from oracles.long import long
-from oracles.own_groups import (
+from support.long import long
+from support.own_groups import (
     Heisenberg,
     SL2,
 )

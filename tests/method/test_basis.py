@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from nhjax._method import AbstractMethod, Gauss, LobattoIIIAB, PartitionedRungeKutta
-from oracles.tableaux import (
+from support.tableaux import (
     RADAU_IIA,
     RK4,
     STAGES,

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from nhjax._method import Gauss, LobattoIIIAB, PartitionedRungeKutta
-from oracles.tableaux import (
+from support.tableaux import (
     CLOSURES,
     EXPLICIT_EULER,
     IMPLICIT_EULER,

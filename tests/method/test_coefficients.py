@@ -13,7 +13,7 @@ import pytest
 
 from nhjax._method import AbstractMethod, Gauss, LobattoIIIAB, PartitionedRungeKutta
 from nhjax._method._tableau import gauss_tableau, lobatto_tableau
-from oracles.tableaux import (
+from support.tableaux import (
     assert_holds_exactly_up_to,
     b_defect,
     c_defect,

@@ -13,7 +13,7 @@ from nhjax._method._order_conditions import (
     order,
     partitioned_order,
 )
-from oracles.long import long
+from support.long import long
 
 
 def exact(rows):

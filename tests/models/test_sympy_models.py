@@ -11,7 +11,7 @@ import nhjax
 from benchmarks import _sympy_models as sympy_models
 from benchmarks.sympy_models import particles, seconds
 from nhjax import LobattoIIIAB, systems
-from oracles.rolling_bodies import kane_levinson_field
+from support.rolling_bodies import kane_levinson_field
 
 
 @pytest.fixture(scope="module")

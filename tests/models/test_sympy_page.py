@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from oracles.pages import run_page
+from support.pages import run_page
 
 
 def test_sympy_page_when_its_code_runs_gives_the_printed_results():

@@ -13,7 +13,7 @@ from benchmarks import near_rest
 from benchmarks._random_systems import random_systems
 from benchmarks.acceptance import ALLOWED, gallery, measure, measure_starts, SAME
 from nhjax import RESULTS
-from oracles.long import long
+from support.long import long
 
 
 ROUND_OFF = 1e-13

@@ -11,8 +11,8 @@ import pytest
 from scipy.integrate import solve_ivp
 
 import nhjax
-from oracles import closure_steps as steps
-from oracles.collocation import (
+from support import closure_steps as steps
+from support.collocation import (
     in_digits,
     largest,
     lobatto,
@@ -20,8 +20,8 @@ from oracles.collocation import (
     rational,
     slope,
 )
-from oracles.long import long, long_but
-from oracles.orders import assert_order, rms, SCIPY_FLOOR, trajectories
+from support.long import long, long_but
+from support.orders import assert_order, rms, SCIPY_FLOOR, trajectories
 
 
 EXACT = {

@@ -14,8 +14,8 @@ from nhjax._step import first_step_state
 from nhjax._step._jacobian import factorise_stage_jacobian, simplified_newton_update
 from nhjax._step._starting_values import starting_values
 from nhjax._step._step import equations_of_step, StepArguments
-from oracles.forms import in_space
-from oracles.long import long
+from support.forms import in_space
+from support.long import long
 
 
 def contraction(example, method, h):

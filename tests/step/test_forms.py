@@ -16,9 +16,9 @@ from nhjax._step._stage_equations import (
     stage_forces,
     stage_velocities,
 )
-from nhjax._step._stage_system import StageSystem
+from nhjax._step._stage_system import StageEquations
 from nhjax._step._starting_values import starting_values
-from oracles.forms import (
+from support.forms import (
     free_forms,
     GAUSS,
     in_rotation,
@@ -27,14 +27,14 @@ from oracles.forms import (
     Start,
     STEP,
 )
-from oracles.group_problems import (
+from support.group_problems import (
     FORMS,
     INERTIA,
     problem,
     QUATERNION,
     RETRACTIONS,
 )
-from oracles.long import long
+from support.long import long
 
 
 @pytest.mark.parametrize(
@@ -105,7 +105,7 @@ def one_step(system, method, y0):
     def run(y0):
         t, h = jnp.zeros(()), jnp.asarray(STEP)
         lin = first_step_state(system, method, t, y0, None).lin
-        stages = StageSystem(system, method, t, h, y0.q, y0.p, lin.multiplier, None)
+        stages = StageEquations(system, method, t, h, y0.q, y0.p, lin.multiplier, None)
         x0 = starting_values(stages, system.fibre_coordinate(y0), lin)
         solver = nhjax.SimplifiedNewton()
         solved = solver.solve(stages, x0, lin, jnp.asarray(False)).x

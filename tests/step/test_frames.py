@@ -11,11 +11,11 @@ import nhjax
 from nhjax._compile import as_cpu_kernel
 from nhjax._manifold import unframed
 from nhjax._step._positions import end_position
-from nhjax._step._stage_system import StageSystem
+from nhjax._step._stage_system import StageEquations
 from nhjax._step._starting_values import starting_values
 from nhjax._step._step import equations_of_step, first_step_state, StepArguments
-from oracles.group_problems import RETRACTIONS
-from oracles.long import long
+from support.group_problems import RETRACTIONS
+from support.long import long
 
 
 # A body in the plane, and a wheel on its axle.
@@ -89,7 +89,7 @@ def test_equations_of_a_step_are_the_same_with_frames(form, retraction, chart):
     arguments = StepArguments(system, t, jnp.asarray(0.1), given, None)
     stages = equations_of_step(arguments, method)
     plain = replace(stages, system=system, q=unframed(stages.q))
-    assert isinstance(plain, StageSystem)
+    assert isinstance(plain, StageEquations)
     x = starting_values(stages, system.fibre_coordinate(y0), given.lin)
     key = jax.random.key(0)
     x = jax.tree.map(lambda z: z + 0.1 * jax.random.normal(key, z.shape), x)

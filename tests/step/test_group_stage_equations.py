@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 
 import nhjax
-from oracles import paper_group_equations as paper
-from oracles.charts import CHARTS
-from oracles.group_problems import (
+from support import paper_group_equations as paper
+from support.charts import CHARTS
+from support.group_problems import (
     BUILDERS,
     FORMS,
     ON_SE3,
@@ -23,8 +23,8 @@ from oracles.group_problems import (
     solved_steps,
     WITHOUT_CLOSURE,
 )
-from oracles.helpers import CLOSURES, SOLVERS
-from oracles.long import long_but
+from support.helpers import CLOSURES, SOLVERS
+from support.long import long_but
 
 
 TOLERANCE = 1e-14

@@ -8,8 +8,8 @@ import pytest
 
 import nhjax
 from nhjax._numerics import measured_noise
-from oracles import hub_bicycle
-from oracles.long import long
+from support import hub_bicycle
+from support.long import long
 
 
 NEWTON = nhjax.Newton()

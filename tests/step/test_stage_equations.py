@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 
 import nhjax
-from oracles import helpers, paper_equations as paper, paper_mechanics as mechanics
-from oracles.driven import FIELD, FRICTION
-from oracles.helpers import CLOSURES, GALLERY, recorded, SOLVERS
-from oracles.long import long
+from support import helpers, paper_equations as paper, paper_mechanics as mechanics
+from support.driven import FIELD, FRICTION
+from support.helpers import CLOSURES, GALLERY, recorded, SOLVERS
+from support.long import long
 
 
 TOLERANCE = 1e-14

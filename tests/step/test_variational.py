@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 
 import nhjax
-from oracles import paper_group_equations as paper
-from oracles.forms import (
+from support import paper_group_equations as paper
+from support.forms import (
     free_forms,
     LOBATTO,
     Start,
     STEP,
 )
-from oracles.group_problems import (
+from support.group_problems import (
     BODY,
     both_forms,
     FORMS,
@@ -23,7 +23,7 @@ from oracles.group_problems import (
     RETRACTIONS,
     solved_steps,
 )
-from oracles.long import long
+from support.long import long
 
 
 def momenta_along(start, form, momentum, chart="middle"):

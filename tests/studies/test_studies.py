@@ -15,7 +15,7 @@ from nhjax import studies
 from nhjax.__main__ import main
 from nhjax.studies import _chaotic_energy
 from nhjax.systems import ChaoticSystem, NonholonomicParticle
-from oracles.long import long_but
+from support.long import long_but
 
 
 PNG = b"\x89PNG\r\n\x1a\n"

@@ -10,7 +10,7 @@ import pytest
 
 import nhjax
 from nhjax import HamiltonianSystem, LagrangianSystem, LobattoIIIAB
-from oracles.mistakes import kinetic
+from support.mistakes import kinetic
 
 
 METHOD = LobattoIIIAB(2)

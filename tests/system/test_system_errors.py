@@ -7,7 +7,7 @@ import jax
 import pytest
 
 import nhjax
-from oracles.mistakes import (
+from support.mistakes import (
     kinetic,
     start,
     system_with,

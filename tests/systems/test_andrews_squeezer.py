@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 
 from nhjax.systems import AndrewsSqueezer
-from oracles import andrews
-from oracles.flow import flow
-from oracles.library_motion import library_motion
-from oracles.long import long
-from oracles.mechanisms import (
+from support import andrews
+from support.flow import flow
+from support.library_motion import library_motion
+from support.long import long
+from support.mechanisms import (
     assert_motion,
     assert_order,
     assert_single_precision,

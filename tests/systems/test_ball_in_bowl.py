@@ -9,9 +9,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from nhjax.systems import BallInBowl, TurntableBall
-from oracles.bowl import Bowl, UP
-from oracles.machines import accelerations, assert_orders, drifts, runs_of_both, stack
-from oracles.rolling_bodies import matrix_of
+from support.bowl import Bowl, UP
+from support.machines import accelerations, assert_orders, drifts, runs_of_both, stack
+from support.rolling_bodies import matrix_of
 
 
 TILTED = (0.7, -0.3, 0.5, np.sqrt(0.17))

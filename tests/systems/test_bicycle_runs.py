@@ -9,9 +9,9 @@ import pytest
 
 import nhjax
 from nhjax.systems import LeanToSteer, WhippleBicycle
-from oracles import bicycle as oracle
-from oracles.library_motion import library_motion
-from oracles.orders import Ladder
+from support import bicycle as oracle
+from support.library_motion import library_motion
+from support.orders import Ladder
 
 
 GAINS = np.array([-3.0, 5.0])

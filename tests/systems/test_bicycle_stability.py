@@ -7,8 +7,8 @@ import pytest
 
 import nhjax
 from nhjax.systems import WhippleBicycle
-from oracles import bicycle as oracle
-from oracles.library_motion import motion_at
+from support import bicycle as oracle
+from support.library_motion import motion_at
 
 
 # Meijaard et al. (2007), section 5(b): M, C1, K0 and K2.

@@ -10,10 +10,10 @@ import pytest
 
 import nhjax
 from nhjax.systems import CarWithTrailers
-from oracles.cars import Train
-from oracles.library_motion import library_motion
-from oracles.long import long
-from oracles.orders import Ladder
+from support.cars import Train
+from support.library_motion import library_motion
+from support.long import long
+from support.orders import Ladder
 
 
 def some_car(num_trailers, seed, same_trailers=False):

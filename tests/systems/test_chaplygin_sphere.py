@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from nhjax.systems import ChaplyginSphere
-from oracles.flow import flow
-from oracles.machines import accelerations, assert_orders, drifts, runs_of_both
-from oracles.rolling_bodies import (
+from support.flow import flow
+from support.machines import accelerations, assert_orders, drifts, runs_of_both
+from support.rolling_bodies import (
     assert_newton_and_euler,
     errors_of,
     matrix_of,

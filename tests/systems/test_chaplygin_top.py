@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 
 from nhjax.systems import ChaplyginSphere, ChaplyginTop
-from oracles.machines import accelerations, assert_orders, drifts, runs_of_both
-from oracles.rolling_bodies import (
+from support.machines import accelerations, assert_orders, drifts, runs_of_both
+from support.rolling_bodies import (
     assert_newton_and_euler,
     cross,
     errors_of,

@@ -5,11 +5,11 @@ import pytest
 
 import nhjax
 from nhjax.systems import FlyballGovernor
-from oracles import governor
-from oracles.flow import flow
-from oracles.library_motion import library_motion
-from oracles.long import long
-from oracles.mechanisms import (
+from support import governor
+from support.flow import flow
+from support.library_motion import library_motion
+from support.long import long
+from support.mechanisms import (
     assert_motion,
     assert_order,
     assert_single_precision,

@@ -23,13 +23,13 @@ from nhjax.systems import (
     UnicycleInCoordinates,
     Veselova,
 )
-from oracles.group_gallery import (
+from support.group_gallery import (
     assert_close,
     GALLERY,
     SOLVED,
     TILTED,
 )
-from oracles.group_oracle import (
+from support.group_oracle import (
     acceleration_and_multiplier,
     oracle,
     rotated,

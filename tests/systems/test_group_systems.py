@@ -21,7 +21,7 @@ from nhjax.systems import (
     Unicycle,
     Veselova,
 )
-from oracles.group_gallery import (
+from support.group_gallery import (
     assert_close,
     GALLERY,
     KINDS,
@@ -29,7 +29,7 @@ from oracles.group_gallery import (
     SOLVED,
     UNSOLVED,
 )
-from oracles.group_oracle import (
+from support.group_oracle import (
     acceleration_and_multiplier,
     constraints_of,
     oracle,

@@ -5,17 +5,17 @@ import numpy as np
 import pytest
 
 from nhjax.systems import DoublePendulum, PendulumChain
-from oracles.flow import flow
-from oracles.library_motion import library_motion
-from oracles.long import long
-from oracles.mechanisms import (
+from support.flow import flow
+from support.library_motion import library_motion
+from support.long import long
+from support.mechanisms import (
     assert_motion,
     assert_order,
     assert_single_precision,
     invariants,
     runs,
 )
-from oracles.pendula import Chain
+from support.pendula import Chain
 
 
 ANGLES, RATES = np.array([0.9, -0.4, 1.6]), np.array([0.5, 1.2, -0.8])

@@ -7,11 +7,11 @@ from scipy.integrate import quad
 
 import nhjax
 from nhjax.systems import FourBar, SliderCrank
-from oracles import linkages
-from oracles.flow import flow
-from oracles.library_motion import library_motion
-from oracles.long import long
-from oracles.mechanisms import (
+from support import linkages
+from support.flow import flow
+from support.library_motion import library_motion
+from support.long import long
+from support.mechanisms import (
     assert_motion,
     assert_order,
     assert_single_precision,

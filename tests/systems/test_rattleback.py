@@ -12,8 +12,8 @@ from scipy.interpolate import make_interp_spline
 
 import nhjax
 from nhjax.systems import Rattleback
-from oracles.machines import accelerations, assert_orders, drifts, runs_of_both, stack
-from oracles.rolling_bodies import (
+from support.machines import accelerations, assert_orders, drifts, runs_of_both, stack
+from support.rolling_bodies import (
     assert_newton_and_euler,
     ellipsoid,
     errors_of,

@@ -9,8 +9,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from nhjax.systems import RollingTorus
-from oracles.machines import accelerations, assert_orders, drifts, runs_of_both, stack
-from oracles.rolling_bodies import (
+from support.machines import accelerations, assert_orders, drifts, runs_of_both, stack
+from support.rolling_bodies import (
     assert_newton_and_euler,
     errors_of,
     matrix_of,

@@ -5,17 +5,17 @@ import pytest
 from scipy.integrate import quad
 
 from nhjax.systems import SpatialSliderCrank
-from oracles.flow import flow
-from oracles.library_motion import library_motion
-from oracles.long import long
-from oracles.mechanisms import (
+from support.flow import flow
+from support.library_motion import library_motion
+from support.long import long
+from support.mechanisms import (
     assert_motion,
     assert_order,
     assert_single_precision,
     invariants,
     runs,
 )
-from oracles.spatial_linkage import SpatialSliderCrank as Oracle
+from support.spatial_linkage import SpatialSliderCrank as Oracle
 
 
 MACHINE = SpatialSliderCrank()

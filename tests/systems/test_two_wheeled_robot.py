@@ -9,10 +9,10 @@ import pytest
 
 import nhjax
 from nhjax.systems import TwoWheeledRobot
-from oracles.cars import Robot
-from oracles.library_motion import library_motion
-from oracles.long import long
-from oracles.orders import Ladder
+from support.cars import Robot
+from support.library_motion import library_motion
+from support.long import long
+from support.orders import Ladder
 
 
 def some_robot(seed):

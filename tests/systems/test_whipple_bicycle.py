@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from nhjax.systems import LeanToSteer, SteerTorque, WhippleBicycle
-from oracles import bicycle as oracle
-from oracles.library_motion import library_motion
+from support import bicycle as oracle
+from support.library_motion import library_motion
 
 
 # Basu-Mandal et al. (2007), table 1. Their angles are psi of the lean, theta of the

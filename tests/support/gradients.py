@@ -5,7 +5,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from oracles.helpers import (
+from support.helpers import (
     central_difference,
     direction,
     dot,

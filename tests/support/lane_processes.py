@@ -17,7 +17,7 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).parent.parent))
 
 from nhjax import lanes
-from oracles.lane_kernels import COUNT_THREADS, kernel_ir, RUNNING, TRIPLE, WIDTH
+from support.lane_kernels import COUNT_THREADS, kernel_ir, RUNNING, TRIPLE, WIDTH
 
 
 jax.config.update("jax_enable_x64", True)

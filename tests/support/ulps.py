@@ -1,6 +1,6 @@
 """Errors of elementary functions against mpmath, in units of the last place.
 
-`PYTHONPATH=.:tests python -m oracles.ulps 100000` prints the largest error of each
+`PYTHONPATH=.:tests python -m support.ulps 100000` prints the largest error of each
 function over that many arguments, and where it is.
 """
 
@@ -14,7 +14,7 @@ from mpmath import mp, mpf
 
 from nhjax.lanes._elementary_functions import definitions, SUPPORTED
 from nhjax.lanes._writer import symbol
-from oracles.native_lanes import Native
+from support.native_lanes import Native
 
 
 # Numbers of mpmath, whose class is an attribute of a context before mpmath 1.4.

@@ -14,8 +14,8 @@ from typing import Self
 
 import numpy as np
 
-from oracles.charts import CHARTS, dual, rows
-from oracles.group_mechanics import Mechanics
+from support.charts import CHARTS, dual, rows
+from support.group_mechanics import Mechanics
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,7 @@ the Test Set for IVP Solvers; the multiplier has the opposite sign there.
 import numpy as np
 from numpy import cos, sin
 
-from oracles.mechanisms import saddle
+from support.mechanisms import saddle
 
 
 M2, M4, M6 = 0.00365, 0.00706, 0.00706

@@ -7,7 +7,7 @@ import numpy as np
 
 import nhjax
 from nhjax._system import State
-from oracles.group_problems import (
+from support.group_problems import (
     both_forms,
     E3,
     INERTIA,

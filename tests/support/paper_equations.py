@@ -14,7 +14,7 @@ from functools import cache
 import numpy as np
 from numpy.polynomial import legendre
 
-from oracles.paper_mechanics import (
+from support.paper_mechanics import (
     largest,
     Mechanics,
 )

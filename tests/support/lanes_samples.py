@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from jax import lax
 
-from oracles import lanes_run
+from support import lanes_run
 
 
 WIDTHS = pytest.mark.parametrize("width", [1, 4, 8])

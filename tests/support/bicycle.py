@@ -9,7 +9,7 @@ import math
 
 import numpy as np
 
-from oracles.flow import flow
+from support.flow import flow
 
 
 # Meijaard et al. (2007), table 1.

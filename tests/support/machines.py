@@ -8,8 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 
 import nhjax
-from oracles.library_motion import motion_at
-from oracles.orders import slopes
+from support.library_motion import motion_at
+from support.orders import slopes
 
 
 class Runs(NamedTuple):

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from hypothesis import strategies as st
 from jax import lax
 
-from oracles.random_steps import (
+from support.random_steps import (
     DTYPES,
     evaluate,
     INTEGERS,

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 
 import nhjax
 from nhjax import SaveAt, systems
-from oracles.user_features import (
+from support.user_features import (
     close,
     DT,
     feature,

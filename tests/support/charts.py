@@ -6,7 +6,7 @@ start and the end. `paper_group_equations` uses them.
 
 import numpy as np
 
-from oracles.group_mechanics import MatrixGroup
+from support.group_mechanics import MatrixGroup
 
 
 def rows(function, *arguments):

@@ -9,8 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 
 import nhjax
-from oracles import orders
-from oracles.orders import runs_of_all_steps
+from support import orders
+from support.orders import runs_of_all_steps
 
 
 def assert_motion(found, expected, tolerance=1e-11):

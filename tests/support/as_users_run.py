@@ -5,12 +5,12 @@ import jax
 
 jax.config.update("jax_enable_x64", True)
 
-from oracles import (  # noqa: E402
+from support import (  # noqa: E402
     features_of_derivatives,
     features_of_runs,
     features_of_systems,
 )
-from oracles.user_features import FEATURES  # noqa: E402
+from support.user_features import FEATURES  # noqa: E402
 
 
 __all__ = ["features_of_derivatives", "features_of_runs", "features_of_systems"]

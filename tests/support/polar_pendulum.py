@@ -2,7 +2,7 @@
 
 import jax.numpy as jnp
 
-from oracles.group_problems import both_forms
+from support.group_problems import both_forms
 
 
 GRAVITY = 9.81

@@ -10,7 +10,7 @@ from sympy.physics.mechanics import dynamicsymbols
 
 import nhjax
 from nhjax import LobattoIIIAB, systems
-from oracles.user_features import assert_exact, close, feature, PARTICLE, run, TWO
+from support.user_features import assert_exact, close, feature, PARTICLE, run, TWO
 
 
 @feature

@@ -3,7 +3,7 @@
 Most functions are a few exact terms and a polynomial for the rest, the tail. A tail's
 share says how much of its error enters the function's relative error. The polynomials
 interpolate at Chebyshev's nodes, which is within a small factor of the best that there
-is. `python tests/oracles/approximations.py` prints the module with the coefficients.
+is. `python tests/support/approximations.py` prints the module with the coefficients.
 """
 
 from collections.abc import Callable
@@ -144,7 +144,7 @@ def module() -> str:
         '"""Coefficients of polynomials, lowest power first.',
         "",
         "They interpolate at Chebyshev's nodes, and are computed and printed by",
-        "`python tests/oracles/approximations.py`. `tests/lanes` judges their errors.",
+        "`python tests/support/approximations.py`. `tests/lanes` judges their errors.",
         '"""',
     ]
     for name, given in APPROXIMATIONS.items():

@@ -10,7 +10,7 @@ import xarray
 
 import nhjax
 from nhjax import SaveAt, systems
-from oracles.user_features import (
+from support.user_features import (
     assert_exact,
     close,
     DT,

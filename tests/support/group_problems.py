@@ -13,8 +13,8 @@ import nhjax
 from nhjax._step import first_step_state, step, StepArguments
 from nhjax._step._unknowns import Stages
 from nhjax._system import State
-from oracles import group_mechanics as by_hand
-from oracles.group_mechanics import MatrixGroup
+from support import group_mechanics as by_hand
+from support.group_mechanics import MatrixGroup
 
 
 FORMS = ("lagrangian", "hamiltonian")

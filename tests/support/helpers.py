@@ -9,7 +9,7 @@ import numpy as np
 
 import nhjax
 from nhjax import systems
-from oracles.driven import ARGS, DRIVEN, driven_state
+from support.driven import ARGS, DRIVEN, driven_state
 
 
 CVT = systems.ContinuouslyVariableTransmission

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import sympy
 
-from oracles.collocation import Collocation, inverse, motion, MP, newton, numbers
+from support.collocation import Collocation, inverse, motion, MP, newton, numbers
 
 
 class Errors(NamedTuple):

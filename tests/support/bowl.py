@@ -8,8 +8,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from oracles.flow import flow
-from oracles.rolling_bodies import cross, hat
+from support.flow import flow
+from support.rolling_bodies import cross, hat
 
 
 UP = np.array([0.0, 0.0, 1.0])

@@ -9,7 +9,7 @@ import math
 
 import numpy as np
 
-from oracles.flow import flow
+from support.flow import flow
 
 
 def along(heading):
