@@ -20,6 +20,7 @@ from jaxtyping import Array, Float, PyTree
 from .._custom_types import BoolScalar, FloatScalar
 from .._errors import is_traced
 from .._numerics import (
+    DenseMatrix,
     inverse,
     least_norm_inverse,
     least_norm_solve,
@@ -300,7 +301,7 @@ def project_fibre_coordinate(system, t, q, u, args, kept: Kept, given: Vector):
         return system.constraint(t, q, w, args)
 
     def sizes(jacobian):
-        return max_norm(u), velocity_scale(system, jacobian, t, q, u, args)
+        return max_norm(u), velocity_scale(system, DenseMatrix(jacobian), t, q, u, args)
 
     metric = system.metric(t, q, u, args)
     is_redundant = system.constraints == "redundant"

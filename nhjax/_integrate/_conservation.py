@@ -16,10 +16,8 @@ from .._errors import DTypeError, naming, ShapeError
 from .._numerics import (
     ClosureConverted,
     dependence,
-    is_definite,
-    jacobian,
-    matvec,
     max_norm,
+    square_jacobian,
     stop_gradient,
 )
 from .._step import invariant_values, Invariants, LEAST_PART
@@ -88,8 +86,8 @@ def _noise_and_least_part(
     # A mass matrix that is indefinite at one state is so at all states of a motion: an
     # eigenvalue that changes its sign makes it singular, and a singular one ends a run.
     t, q, u = stop_gradient((t, q, u))
-    metric = jacobian(lambda u: system.fibre_derivative(t, q, u, args), u)
-    return noise, jnp.where(is_definite(metric), 0, LEAST_PART).astype(value.dtype)
+    metric = square_jacobian(lambda u: system.fibre_derivative(t, q, u, args), u)
+    return noise, jnp.where(metric.is_definite(), 0, LEAST_PART).astype(value.dtype)
 
 
 def _check_function(
@@ -177,8 +175,8 @@ def conserves(
 
         def nearer(_, u):
             lin = linearise(system, t, q, u, args)
-            excess = matvec(lin.compliance_inverse, lin.violation)
-            return u - matvec(lin.reaction, excess)
+            excess = lin.compliance_inverse.matvec(lin.violation)
+            return u - lin.reaction.matvec(excess)
 
         u = jax.lax.fori_loop(0, _ITERATIONS, nearer, u0 + w * (1 + jnp.abs(u0)))
         lin = linearise(system, t, q, u, args)

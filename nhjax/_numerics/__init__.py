@@ -1,19 +1,6 @@
 """The numerical building blocks without mechanics: products, norms, iterations."""
 
-from ._block_tridiagonal import (
-    block_tridiagonal_inverse as block_tridiagonal_inverse,
-    BlockTridiagonalInverse as BlockTridiagonalInverse,
-    couplings as couplings,
-)
-from ._contraction import (
-    absolute as absolute,
-    AbstractLinearMap as AbstractLinearMap,
-    inverse as inverse,
-    Matrix as Matrix,
-    matvec as matvec,
-    small_einsum as small_einsum,
-)
-from ._diagonal import full_jacobian as full_jacobian, jacobian as jacobian
+from ._contraction import inverse as inverse, small_einsum as small_einsum
 from ._floating_point import (
     largest_column as largest_column,
     max_norm as max_norm,
@@ -45,28 +32,37 @@ from ._iteration import (
     Sizes as Sizes,
     Solved as Solved,
 )
-from ._least_norm import (
-    least_norm_inverse as least_norm_inverse,
-    least_norm_inverse_by_blocks as least_norm_inverse_by_blocks,
-    least_norm_solve as least_norm_solve,
-    NEARLY_DEPENDENT as NEARLY_DEPENDENT,
-    rank_of_gram as rank_of_gram,
-    reciprocal_condition_of_range as reciprocal_condition_of_range,
+from ._operators import (
+    AbstractOperator as AbstractOperator,
+    block_tridiagonal_inverse as block_tridiagonal_inverse,
+    BlockTridiagonalInverse as BlockTridiagonalInverse,
+    compressed_products as compressed_products,
+    DenseMatrix as DenseMatrix,
+    DiagonalMatrix as DiagonalMatrix,
+    full_jacobian as full_jacobian,
+    InverseMatrix as InverseMatrix,
+    JacobianMatrix as JacobianMatrix,
+    Pattern as Pattern,
+    ReactionMatrix as ReactionMatrix,
+    sparse_jacobian as sparse_jacobian,
+    SparseMatrix as SparseMatrix,
+    square_jacobian as square_jacobian,
+    SquareMatrix as SquareMatrix,
+    WeightedTranspose as WeightedTranspose,
 )
 from ._rank import (
     dependent_rows as dependent_rows,
     is_deficient as is_deficient,
-    is_definite as is_definite,
     is_nearly_singular as is_nearly_singular,
     is_without_entries as is_without_entries,
+    least_norm_inverse as least_norm_inverse,
+    least_norm_inverse_by_blocks as least_norm_inverse_by_blocks,
+    least_norm_solve as least_norm_solve,
+    NEARLY_DEPENDENT as NEARLY_DEPENDENT,
     Rank as Rank,
+    rank_of_gram as rank_of_gram,
     reciprocal_condition as reciprocal_condition,
+    reciprocal_condition_of_range as reciprocal_condition_of_range,
     those_that_count as those_that_count,
-)
-from ._sparse import (
-    Pattern as Pattern,
-    sparse_jacobian as sparse_jacobian,
-    SparseMatrix as SparseMatrix,
-    WeightedTranspose as WeightedTranspose,
 )
 from ._sparsity import dependence as dependence

@@ -1,17 +1,17 @@
-"""Products and inverses of tiny matrices, written in elementary operations.
+"""Products and inverses of small matrices, written in elementary operations.
 
-For matrices of a few rows a call into a library of linear algebra is too expensive:
-inside a time loop the calls cost more than the arithmetic, they cannot be compiled into
-one kernel with the operations around them, and batches of them run one by one.
+For matrices of a few rows, calling a library of linear algebra is too expensive. Inside
+a time loop the calls cost more than the arithmetic. They cannot be compiled into one
+kernel with the operations around them, and a batch of them runs one by one.
+`small_einsum` and `inverse` are made of elementary operations up to a limit of size;
+`with_small_products` rewrites the products in the functions of a user.
 """
 
 import math
 import string
-from abc import abstractmethod
 from collections.abc import Callable
-from typing import Any, TypeAlias
+from typing import Any
 
-import equinox as eqx
 import jax
 import jax.extend
 import jax.numpy as jnp
@@ -21,34 +21,17 @@ from .._compile import LARGEST_REDUCTION, LONGEST_SUM, small_product
 
 
 # Matrices with more rows are inverted by a library: a kernel may not sum more numbers
-# than a matrix of this size has.
+# than the entries of a matrix of this size.
 LARGEST = math.isqrt(LARGEST_REDUCTION)
-# Larger products, and sums longer than `LONGEST_SUM`, are left to a library too: the
-# program that is written out must stay short. From some 10⁵ terms on the library was
-# faster (measured).
+# A library computes larger products, and sums longer than `LONGEST_SUM`, too, so that
+# the program stays short. From about 10⁵ terms on the library was faster (measured).
 LARGEST_PRODUCT = 2**15
 
 
-class AbstractLinearMap(eqx.Module):
-    """A matrix that is not kept as an array of its entries."""
-
-    @abstractmethod
-    def matvec(self, x: Float[Array, "..."]) -> Float[Array, "..."]:
-        """Multiply the vectors along the last axis of x by the matrix."""
-
-    @abstractmethod
-    def absolute(self) -> "AbstractLinearMap":
-        """Return the matrix of absolute values, or one that serves to estimate it."""
-
-
-# A square matrix, or its diagonal if it has no other entries.
-Matrix: TypeAlias = Float[Array, "n n"] | Float[Array, " n"]
-
-
 def small_einsum(subscripts: str, a: Array, b: Array) -> Array:
-    """Compute `jnp.einsum(subscripts, a, b)`, as single products and sums if small.
+    """Compute `jnp.einsum(subscripts, a, b)`, by single products and sums if small.
 
-    Each index that is summed stands in both operands.
+    Each index that is summed must be in both operands.
     """
     operands, result = subscripts.split("->")
     first, second = operands.split(",")
@@ -65,7 +48,7 @@ def small_einsum(subscripts: str, a: Array, b: Array) -> Array:
 def _small_product(
     first: str, second: str, result: str, a: tuple[int, ...], b: tuple[int, ...]
 ) -> dict[str, Any] | None:
-    """Make the parameters of a product of arrays of these shapes; None if large."""
+    """Return the parameters of a product of these shapes, or None if it is large."""
     lengths = dict(zip(first, a, strict=True))
     for index, length in zip(second, b, strict=True):
         if lengths.setdefault(index, length) != length:
@@ -76,29 +59,6 @@ def _small_product(
     if by_terms and (summed > LONGEST_SUM or size > LARGEST_PRODUCT):
         return None
     return {"first": first, "second": second, "result": result, "by_terms": by_terms}
-
-
-def absolute(matrix: Array | AbstractLinearMap) -> Array | AbstractLinearMap:
-    """Return the matrix of absolute values."""
-    if isinstance(matrix, AbstractLinearMap):
-        return matrix.absolute()
-    return jnp.abs(matrix)
-
-
-def matvec(
-    matrix: Array | AbstractLinearMap, x: Float[Array, "... n"]
-) -> Float[Array, "... k"]:
-    """Multiply the vectors along the last axis of x by a matrix.
-
-    An array of one axis stands for a diagonal matrix. The array x has at most four
-    axes.
-    """
-    if isinstance(matrix, AbstractLinearMap):
-        return matrix.matvec(x)
-    if matrix.ndim == 1:
-        return jnp.expand_dims(matrix, range(x.ndim - 1)) * x
-    rows = "abc"[: x.ndim - 1]
-    return small_einsum(f"kn,{rows}n->{rows}k", matrix, x)
 
 
 def _contract_axes(dimension_numbers, a: Array, b: Array) -> Array:
@@ -117,10 +77,13 @@ def _contract_axes(dimension_numbers, a: Array, b: Array) -> Array:
 
 
 @jax.custom_jvp
-def inverse(matrix: Matrix) -> Matrix:
-    """Invert a small matrix; the result is not finite if there is no inverse."""
+def inverse(matrix: Float[Array, "n *n"]) -> Float[Array, "n *n"]:
+    """Invert a small matrix; the result is not finite if there is no inverse.
+
+    An array of one axis is the diagonal of a diagonal matrix, and so is the result.
+    """
     size = matrix.shape[0]
-    # A system with one constraint, whose matrix has size 1, is the commonest case.
+    # Systems with one constraint, and a matrix of size 1, are the most common ones.
     if matrix.ndim == 1 or size == 1:
         return 1 / matrix
     if size == 0:
@@ -150,18 +113,18 @@ def _eliminated(matrix: Float[Array, "m m"]) -> Float[Array, "m m"]:
         table, order = carry
         column, row = at(table.T, k), at(table, k)
         best = jnp.argmax(jnp.where(rows >= k, jnp.abs(column), -1))
-        # Rows are chosen by masks: an index that varies over a batch would lead to
-        # gather and scatter operations.
+        # Rows are selected by masks: an index that differs between the members of a
+        # batch would need gather and scatter operations.
         is_k, is_pivot = rows == k, rows == best
         pivot_row = jnp.sum(jnp.where(is_pivot[:, None], table, 0), axis=0)
         pivot = at(pivot_row, k)
         scaled = jnp.where(is_k, 1 / pivot, pivot_row / pivot)
-        # Rows k and `best` change places.
+        # Exchange the rows k and `best`.
         column = jnp.where(is_pivot, at(column, k), column)
         table = jnp.where(is_pivot[:, None], row[None], table)
         place = jnp.sum(jnp.where(is_pivot, order, 0))
         order = jnp.where(is_pivot, at(order, k), order)
-        # Column k is replaced by the column of the inverse.
+        # Replace column k by the column of the inverse.
         table = jnp.where(is_k[None], 0, table) - column[:, None] * scaled[None]
         table = jnp.where(is_k[:, None], scaled[None], table)
         return table, jnp.where(is_k, place, order)
@@ -172,7 +135,7 @@ def _eliminated(matrix: Float[Array, "m m"]) -> Float[Array, "m m"]:
 
 
 def with_small_products(program: Any) -> Callable[..., list[Any]]:
-    """Make a function of a program, in which small matrix products are written out."""
+    """Return the function of a jaxpr, with small matrix products written out."""
 
     def run(*args):
         return _evaluated(program.jaxpr, program.consts, args)
@@ -211,6 +174,6 @@ def _evaluated(program, consts, args):
 
 
 def _is_plain(equation) -> bool:
-    """Tell whether a product and its factors are numbers of one floating dtype."""
+    """Return whether a product and its factors have the same floating dtype."""
     types = {variable.aval.dtype for variable in (*equation.invars, *equation.outvars)}
     return len(types) == 1 and jnp.issubdtype(types.pop(), jnp.inexact)

@@ -1,22 +1,32 @@
-"""The rank of the derivatives of constraints, and which rows are dependent."""
+"""The rank of small matrices, and inverses of matrices without full rank.
+
+Constraints are independent if the rows of their Jacobian B are. `Rank` collects the
+Jacobians whose rank must be full, `reciprocal_condition` measures how close the rows
+are to being dependent, and `dependent_rows` lists the rows for an error message. Where
+redundant constraints are allowed, `least_norm_inverse` replaces the inverse of
+C = B K⁻¹ Bᵀ: it solves C x = b with the least norm of x.
+"""
 
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import jax.scipy.linalg
 import numpy as np
-from jaxtyping import Array, Float, PyTree
+from jaxtyping import Array, Float, Int, PyTree
 
 from .._custom_types import BoolScalar, FloatScalar
-from ._contraction import Matrix
+
+
+# The rank of Jacobians.
 
 
 class Rank(NamedTuple):
-    """The derivatives of constraints at some configuration, which must have full rank.
+    """The derivatives of constraints at a configuration, which must have full rank.
 
-    The `jacobian` has k rows of DΓ, or m + k rows of D2Φ and DΓ, and `counts` tells
-    whether its rank matters: where Newton's method starts it does so only if the method
-    fails, since otherwise the method has left the place.
+    The `jacobian` has k rows of DΓ, or m + k rows of D2Φ and DΓ. `counts` says whether
+    its rank matters. At the starting values of Newton's method it matters only if the
+    method fails; otherwise the method has moved to another configuration.
     """
 
     jacobian: Float[Array, "l n"]
@@ -25,15 +35,15 @@ class Rank(NamedTuple):
 
     @property
     def deficient(self) -> BoolScalar:
-        """Tell whether the rank matters and is not full."""
+        """Return whether the rank matters and is not full."""
         return self.counts & is_deficient(self.jacobian)
 
 
 def those_that_count(ranks: list[Rank]) -> list[Rank]:
-    """Keep at most one matrix of each shape, namely the one that counts.
+    """Keep at most one matrix of each shape, namely the one whose rank matters.
 
-    The fewer matrices there are, the fewer singular values must be computed, which cost
-    more than anything else here.
+    Singular values are more expensive than all else here, so that they are computed for
+    as few matrices as possible.
     """
     merged: dict[tuple[int, ...], Rank] = {}
     for rank in ranks:
@@ -48,18 +58,18 @@ def those_that_count(ranks: list[Rank]) -> list[Rank]:
 def reciprocal_condition(matrix: Float[Array, "k l"]) -> FloatScalar:
     """Compute the reciprocal condition number of the rows of a matrix, after scaling.
 
-    Rows, and of square matrices the columns too, are scaled to size one, which makes
+    Rows are scaled to size one, and so are the columns of square matrices. This makes
     the ratio independent of the units of single coordinates and constraints.
     """
     if matrix.shape[0] == 0:
         return jnp.ones((), matrix.dtype)
     rows = jnp.max(jnp.abs(matrix), axis=1)
     if matrix.shape[0] == 1:
-        # There is one singular value. A library's call takes long to compile.
+        # There is one singular value. The library call would take long to compile.
         return jnp.where(rows[0] == 0, 0, rows[0] / rows[0])
     rows = jnp.where(rows > 0, rows, 1)
     if matrix.shape[0] == matrix.shape[1]:
-        # The matrix is divided by each root on its own: their product could overflow.
+        # The matrix is divided by one root after the other: their product can overflow.
         roots = jnp.sqrt(rows)
         scaled = matrix / roots[:, None] / roots[None, :]
     else:
@@ -72,24 +82,34 @@ def reciprocal_condition(matrix: Float[Array, "k l"]) -> FloatScalar:
 
 
 def is_deficient(matrix: Float[Array, "k l"]) -> BoolScalar:
-    """Tell whether the rows are dependent up to round-off; NaN does not count so."""
+    """Return whether the rows are dependent to round-off; rows with NaN are not."""
     eps = jnp.finfo(matrix.dtype).eps
     return reciprocal_condition(matrix) <= 10 * matrix.shape[1] * eps
 
 
 def is_without_entries(matrix: Float[Array, "k l"]) -> BoolScalar:
-    """Tell whether some row is zero."""
+    """Return whether some row is zero."""
     return jnp.any(jnp.all(matrix == 0, axis=1))
+
+
+def dependent_rows(jacobian: np.ndarray) -> list[int]:
+    """Find the rows that take part in a vanishing linear combination of rows."""
+    rows = np.max(np.abs(jacobian), axis=1, keepdims=True)
+    left, singular, _ = np.linalg.svd(jacobian / np.where(rows > 0, rows, 1))
+    singular = np.append(singular, np.zeros(len(jacobian) - len(singular)))
+    tolerance = np.sqrt(np.finfo(jacobian.dtype).eps)
+    null = left[:, singular <= tolerance * np.max(singular)]
+    return [a for a, row in enumerate(null) if np.any(np.abs(row) > tolerance)]
 
 
 def is_nearly_singular(
     matrix: Float[Array, "l l"], inverse: Float[Array, "l l"]
 ) -> BoolScalar:
-    """Tell from what was computed as its inverse if a matrix is singular.
+    """Return whether a matrix is singular to round-off, given its computed inverse.
 
-    The product of their largest entries, after rows and columns of the matrix are
-    scaled as those of a Gram matrix, estimates the condition number. It takes no
-    library of linear algebra, and can be a part of any program.
+    Rows and columns are scaled as for a Gram matrix. The product of the largest entries
+    of the matrix and of its inverse then estimates the condition number. No library of
+    linear algebra is called, so that the estimate can be part of any kernel.
     """
     size = matrix.shape[0]
     if size < 2:
@@ -101,32 +121,113 @@ def is_nearly_singular(
     return ~(10 * size * jnp.finfo(matrix.dtype).eps * number < 1)
 
 
-def is_definite(matrix: Matrix) -> BoolScalar:
-    """Tell whether a symmetric matrix is positive or negative definite.
+# Symmetric matrices C without full rank.
 
-    It is if all pivots of the elimination without row exchanges have one sign.
+
+def _negligible(dtype: jnp.dtype) -> float:
+    """Return the size of eigenvalues of a scaled matrix that count as zero.
+
+    An eigenvalue that is zero is computed as a few units of round-off. Constraints that
+    are so close to being dependent cannot be told from dependent ones.
     """
-    pivots = matrix
-    if matrix.ndim == 2:
-        rows = jnp.arange(matrix.shape[0])
-
-        def eliminate(k, carry):
-            table, pivots = carry
-            column = jax.lax.dynamic_index_in_dim(table, k, keepdims=False)
-            pivot = jax.lax.dynamic_index_in_dim(column, k, keepdims=False)
-            table = table - column[:, None] * (column / pivot)[None]
-            return table, jnp.where(rows == k, pivot, pivots)
-
-        given = matrix, jnp.zeros_like(matrix[0])
-        _, pivots = jax.lax.fori_loop(0, len(rows), eliminate, given)
-    return jnp.all(pivots > 0) | jnp.all(pivots < 0)
+    return float(jnp.finfo(dtype).eps) ** 0.75
 
 
-def dependent_rows(jacobian: np.ndarray) -> list[int]:
-    """Find the rows that take part in a vanishing linear combination of rows."""
-    rows = np.max(np.abs(jacobian), axis=1, keepdims=True)
-    left, singular, _ = np.linalg.svd(jacobian / np.where(rows > 0, rows, 1))
-    singular = np.append(singular, np.zeros(len(jacobian) - len(singular)))
-    tolerance = np.sqrt(np.finfo(jacobian.dtype).eps)
-    null = left[:, singular <= tolerance * np.max(singular)]
-    return [a for a, row in enumerate(null) if np.any(np.abs(row) > tolerance)]
+# Away from a solution, dependent equations are dependent only up to the distance from
+# it. Singular values below this part of the largest one count as zero there.
+NEARLY_DEPENDENT = 1e-4
+
+
+def least_norm_inverse(
+    matrix: Float[Array, "l l"], negligible: float | None = None
+) -> Float[Array, "l l"]:
+    """Compute the inverse X of a symmetric C that solves C x = b with the least norm.
+
+    If C x = b has solutions, X b is the one with the least Σ C_aa x_a². With
+    D = diag(C_aa)^(-1/2) it is X = D (D C D)⁺ D. Eigenvalues of D C D count as zero if
+    they are round-off, or below the part `negligible` of the largest one. If some
+    constraints are scaled, only their multipliers are scaled.
+    """
+    if matrix.shape[0] == 0:
+        return matrix
+    scaled, root = _unit_diagonal(matrix)
+    if negligible is None:
+        negligible = _negligible(matrix.dtype)
+    found = jnp.linalg.pinv(scaled, rtol=negligible, hermitian=True)
+    return found / root[:, None] / root[None, :]
+
+
+def least_norm_inverse_by_blocks(
+    matrix: Float[Array, "l l"], first: int
+) -> Float[Array, "l l"]:
+    """Compute a generalised inverse of C that solves the last equations first.
+
+    The `first` equations have zero unknowns as far as they follow from the other
+    equations. Apart from this, each of the two parts of x has the least norm of
+    `least_norm_inverse`. If no equation of one part follows from the other part, the
+    result is `least_norm_inverse`.
+    """
+    if first in (0, matrix.shape[0]):
+        return least_norm_inverse(matrix)
+    others = least_norm_inverse(matrix[first:, first:])
+    onto = matrix[:first, first:] @ others
+    # Where equations follow from the others, the Schur complement is round-off. It is
+    # compared with a one, the size of the diagonal before.
+    left = matrix[:first, :first] - onto @ matrix[first:, :first]
+    root = _roots(matrix[:first, :first])
+    scaled = jax.scipy.linalg.block_diag(
+        left / root[:, None] / root[None, :], jnp.ones((1, 1), matrix.dtype)
+    )
+    found = jnp.linalg.pinv(scaled, rtol=_negligible(matrix.dtype), hermitian=True)
+    found = found[:first, :first] / root[:, None] / root[None, :]
+    coupled = found @ onto
+    return jnp.block([[found, -coupled], [-coupled.T, others + onto.T @ coupled]])
+
+
+def rank_of_gram(matrix: Float[Array, "l l"]) -> Int[Array, ""]:
+    """Compute the rank of a symmetric matrix as in `least_norm_inverse`."""
+    if matrix.shape[0] == 0:
+        return jnp.zeros((), int)
+    return jnp.sum(_eigenvalues(matrix)[1])
+
+
+def reciprocal_condition_of_range(matrix: Float[Array, "l l"]) -> FloatScalar:
+    """Compute the ratio of the smallest eigenvalue that is not zero to the largest."""
+    if matrix.shape[0] == 0:
+        return jnp.ones((), matrix.dtype)
+    values, is_kept = _eigenvalues(matrix)
+    return jnp.min(jnp.where(is_kept, values, jnp.inf)) / jnp.max(values)
+
+
+def _eigenvalues(matrix: Float[Array, "l l"]) -> tuple[Array, Array]:
+    """Compute |eigenvalues| of the scaled matrix, and which of them are not zero."""
+    values = jnp.abs(jnp.linalg.eigvalsh(_unit_diagonal(matrix)[0]))
+    return values, values > _negligible(matrix.dtype) * jnp.max(values)
+
+
+def _unit_diagonal(matrix: Float[Array, "l l"]) -> tuple[Array, Array]:
+    """Scale rows and columns alike, so that the diagonal entries are one or zero."""
+    root = _roots(matrix)
+    return matrix / root[:, None] / root[None, :], root
+
+
+def _roots(matrix: Float[Array, "l l"]) -> Float[Array, " l"]:
+    diagonal = jnp.abs(jnp.diagonal(matrix))
+    return jnp.sqrt(jnp.where(diagonal > 0, diagonal, 1))
+
+
+def least_norm_solve(matrix: Float[Array, "l l"], b: Array) -> Array:
+    """Solve nearly dependent equations, ignoring small singular values.
+
+    Rows and columns are first scaled to size one. This is for Newton's method with
+    equations that are dependent at the solution.
+    """
+
+    def sizes(x, axis):
+        largest = jnp.max(jnp.abs(x), axis=axis, keepdims=True)
+        return jnp.sqrt(jnp.where(largest > 0, largest, 1))
+
+    rows, columns = sizes(matrix, 1), sizes(matrix, 0)
+    scaled = matrix / rows / columns
+    found = jnp.linalg.pinv(scaled, rtol=NEARLY_DEPENDENT) @ (b / rows[:, 0])
+    return found / columns[0]

@@ -7,6 +7,7 @@ from ._invariants import (
     Invariants as Invariants,
     LEAST_PART as LEAST_PART,
 )
+from ._jacobian import stage_residual as stage_residual
 from ._round_off import (
     round_off_of_steps as round_off_of_steps,
     RoundOff as RoundOff,
@@ -18,7 +19,6 @@ from ._solvers import (
     Newton as Newton,
     SimplifiedNewton as SimplifiedNewton,
 )
-from ._stage_iteration import stage_residual as stage_residual
 from ._step import (
     estimated_error as estimated_error,
     first_step_state as first_step_state,

@@ -1,6 +1,13 @@
-"""The terms of order h in the linearised stage equations of one step."""
+"""The terms of order h in the Jacobian of the stage equations, and when to use them.
 
-from typing import NamedTuple
+With the mass matrix and the constraints at the start of the step alone, simplified
+Newton reduces the error by a factor O(h) an iteration. `FirstOrderTerms` makes this
+O(h²): it adds how the mass matrix changes along the step, and the derivatives of
+momenta by positions and of forces by velocities. `uses_first_order_terms` decides
+whether these terms are available and whether they make a step faster.
+"""
+
+from typing import Literal, NamedTuple, TypeAlias
 
 import equinox as eqx
 import jax
@@ -8,7 +15,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from .._custom_types import FloatScalar
-from .._numerics import full_jacobian, small_einsum
+from .._numerics import dependence, full_jacobian, small_einsum
 from .._system import Linearisation, total_force
 from ._equations import (
     node_coordinates,
@@ -16,6 +23,79 @@ from ._equations import (
     StageEquations,
     StageUnknowns,
 )
+
+
+# The part of the Jacobian that simplified Newton inverts; None selects the faster one.
+JacobianName: TypeAlias = Literal["leading", "first_order"] | None
+
+# The terms pay if the iterations that they save cost more time than the terms: up to
+# this many stages, coordinates, and entries of the responses of stages to multipliers,
+# and without holonomic constraints. Larger programs of one trajectory are no longer
+# compiled as scalars, and become several times slower.
+_MOST_STAGES, _MOST_COORDINATES, _MOST_RESPONSES = 5, 6, 100
+
+
+def uses_first_order_terms(
+    stages: StageEquations, lin: Linearisation, jacobian: JacobianName
+) -> bool:
+    """Return whether the Jacobian of simplified Newton includes the terms of order h.
+
+    **Raises:** `ValueError` if they are requested and not available.
+    """
+    if jacobian == "leading":
+        return False
+    is_available = not stages.hamiltonian
+    is_available &= stages.redundancy is None and not lin.is_sparse
+    if jacobian == "first_order":
+        if not is_available:
+            raise ValueError(
+                '`SimplifiedNewton(jacobian="first_order")` is not available for '
+                "Hamiltonian systems, redundant constraints, or constraints so many "
+                'that they are kept sparse; use "leading" or None.'
+            )
+        return True
+    s, n, m = stages.method.stages, stages.p.shape[0], stages.num_nonholonomic
+    is_small = s <= _MOST_STAGES and n <= _MOST_COORDINATES
+    is_small &= s * n * (s - 1) * m <= _MOST_RESPONSES
+    if not is_available or not is_small or stages.num_holonomic > 0:
+        return False
+    if not _forces_have_slopes(stages):
+        return False
+    return not stages.manifold.is_flat or _has_terms(stages)
+
+
+def _forces_have_slopes(stages: StageEquations) -> bool:
+    """Return whether forces can be differentiated by velocities in forward mode.
+
+    Callbacks cannot, nor can functions with a custom rule for reverse mode only. No
+    other part of a step needs this derivative.
+    """
+
+    def force(u):
+        return total_force(
+            stages.system, stages.t, stages.q, u, stages.multiplier, stages.args
+        )
+
+    zero = jnp.zeros_like(stages.p)
+    try:
+        jax.eval_shape(lambda u: full_jacobian(force, u), zero)
+    except (NotImplementedError, TypeError, ValueError):
+        return False
+    return True
+
+
+def _has_terms(stages: StageEquations) -> bool:
+    # On a vector space the terms vanish unless momenta depend on positions, or forces
+    # on velocities. This is decided from the traced functions of the system.
+    system, t, args = stages.system, stages.t, stages.args
+    q, zero = stages.q, jnp.zeros_like(stages.p)
+    by_position = dependence(
+        lambda xi: system.momentum(t, stages.manifold.act(q, xi), zero, args), zero
+    )
+    by_velocity = dependence(
+        lambda u: total_force(system, t, q, u, stages.multiplier, args), zero
+    )
+    return bool(by_position.any() or by_velocity.any())
 
 
 class FirstOrderTerms(eqx.Module):
@@ -27,31 +107,30 @@ class FirstOrderTerms(eqx.Module):
     δr_i = N_i δH_i + ∂Π/∂y δy_i - h Σ_j â_ij ∂F/∂H δH_j - ∂base/∂ξ δξ - ...,
     δy_i = h Σ_j a_ij δH_j,
 
-    and those of the nodes likewise. The leading part is N δH_i with the mass matrix N
-    at the start of the step. All others are of the order of h: how the mass matrix
-    turns until the stage, N_i = N + h c_i Ṅ, how momenta change with positions, and how
-    forces change with velocities. Their derivatives are those at the start of the step,
-    multiplied by N⁻¹, so that with z_i = N⁻¹ r_i
+    and the equations of the nodes likewise. The leading part is N δH_i with the mass
+    matrix N at the start of the step. All other terms are of order h: the change of the
+    mass matrix until the stage, N_i = N + h c_i Ṅ, the change of momenta with
+    positions, and the change of forces with velocities. Their derivatives are taken at
+    the start of the step and multiplied by N⁻¹, so that with z_i = N⁻¹ r_i
 
-    δH_i = z_i - N⁻¹ (the terms, of z),
+    δH_i = z_i - N⁻¹ (the terms, applied to z),
 
-    of which the error is of the order of h². The first product of the Neumann series is
-    enough: what it leaves out is as small as what the derivatives at the start leave
-    out.
+    with an error of order h². The first term of the Neumann series is enough: the
+    derivatives at the start of the step have an error of the same order.
     """
 
     inertia: Float[Array, "s n n"]  # N⁻¹ (N_i - N) of the stages
     momentum: Float[Array, "n n"]  # h N⁻¹ ∂Π/∂y
     force: Float[Array, "n n"]  # h N⁻¹ ∂F/∂H
-    base: Float[Array, "n n"]  # h N⁻¹ times the derivative of the constant term by ξ
+    base: Float[Array, "n n"]  # h N⁻¹ ∂base/∂ξ
     node_inertia: Float[Array, "r n n"]  # N⁻¹ (N_i - N) of the nodes
-    node_momentum: Float[Array, "n n"]  # the same as above, of the momenta at nodes
-    node_force: Float[Array, "n n"]
+    node_momentum: Float[Array, "n n"]  # h N⁻¹ ∂p/∂y of the momenta p at the nodes
+    node_force: Float[Array, "n n"]  # h N⁻¹ ∂w/∂H of the body forces w
 
     def of_stages(
         self, stages: StageEquations, z: Float[Array, "s n *c"]
     ) -> Float[Array, "s n *c"]:
-        """Solve for changes of stage velocities that change the residuals by N z."""
+        """Compute the changes of stage velocities that change the residuals by N z."""
         a, a_hat, b = (stages.coefficients(name) for name in ("a", "a_hat", "b"))
         by_node = _weighted(a, z)
         return (
@@ -63,24 +142,31 @@ class FirstOrderTerms(eqx.Module):
         )
 
     def of_nodes(self, z: Float[Array, "r n *c"]) -> Float[Array, "r n *c"]:
-        """Compute the changes of the velocities at the nodes that balance N z."""
+        """Compute the changes of node velocities that change the residuals by N z."""
         return z - _times(self.node_inertia, z)
 
     def by_force(
         self, stages: StageEquations, change: Float[Array, "s n *c"]
     ) -> Float[Array, "r n *c"]:
-        """Compute the changes of the node velocities by forces, given the stages'."""
+        """Compute the part of the changes of node velocities that is due to forces.
+
+        `change` is the change of the stage velocities.
+        """
         return _times(self.node_force, _weighted(stages.node_weights, change))
 
     def by_position(
         self, stages: StageEquations, change: Float[Array, "s n *c"]
     ) -> Float[Array, "r n *c"]:
-        """Compute how positions move the nodes if the stage velocities change."""
+        """Compute the part of the changes of node velocities that is due to positions.
+
+        `change` is the change of the stage velocities.
+        """
         return -_times(self.node_momentum, _weighted(stages.node_weights, change))
 
 
-# Forces that change so much, as a friction that is steep at rest, are no part of a
-# series: the leading part alone does better, and more so if friction soon saturates.
+# If forces change more than this, such as friction that is steep at rest, the series
+# does not converge. The leading part alone does better, in particular if the friction
+# saturates soon.
 _LARGEST = 5.0
 
 
@@ -94,15 +180,9 @@ def _weighted(
 def _times(
     matrix: Float[Array, "... k n"], z: Float[Array, "r n *c"]
 ) -> Float[Array, "r k *c"]:
-    """Multiply the rows of z by one matrix, or each by a matrix of its own."""
+    """Multiply each row of z by the same matrix, or by its own matrix of a stack."""
     own, rest = "i"[: matrix.ndim - 2], "c"[: z.ndim - 2]
     return small_einsum(f"{own}kn,in{rest}->ik{rest}", matrix, z)
-
-
-def full_momentum_inverse(lin: Linearisation) -> Float[Array, "n n"]:
-    """Return N⁻¹ as a matrix, also where only its diagonal is kept."""
-    inverse = lin.momentum_inverse
-    return jnp.diag(inverse) if inverse.ndim == 1 else inverse
 
 
 def first_order_terms(
@@ -110,10 +190,10 @@ def first_order_terms(
 ) -> FirstOrderTerms:
     """Compute the terms at the start of the step, in the chart of the stages x."""
     h, c = stages.h, stages.coefficients("c")
-    # The starting values begin at u_k.
+    # The starting values begin at the fibre coordinate u_k of the start.
     first = jnp.sum(stages.coefficients("a_hat"), axis=1)[0]
     u = x.velocity[0] - first * h * lin.acceleration
-    inverse = full_momentum_inverse(lin)
+    inverse = lin.momentum_inverse.as_matrix()
 
     def scaled(matrix):
         return small_einsum("kl,ln->kn", inverse, matrix)
@@ -139,14 +219,14 @@ def first_order_terms(
         node_momentum=h * scaled(body.momentum),
         node_force=h * scaled(chart.body_force),
     )
-    # A derivative may not be finite, as that of |v| at rest.
-    keeps = [jnp.all(jnp.isfinite(x)) for x in jax.tree.leaves(terms)]
-    keeps = jnp.all(jnp.stack(keeps)) & (_size(terms.force) <= _LARGEST)
-    return jax.tree.map(lambda x: jnp.where(keeps, x, 0), terms)
+    # A derivative may not be finite, such as the derivative of |v| at rest.
+    is_finite = [jnp.all(jnp.isfinite(x)) for x in jax.tree.leaves(terms)]
+    is_usable = jnp.all(jnp.stack(is_finite)) & (_size(terms.force) <= _LARGEST)
+    return jax.tree.map(lambda x: jnp.where(is_usable, x, 0), terms)
 
 
 def _size(matrix: Float[Array, "n n"]) -> FloatScalar:
-    """Measure a matrix, whatever the units of the coordinates are."""
+    """Measure a matrix independently of the units of the coordinates."""
     return jnp.sqrt(jnp.sum(jnp.abs(matrix * matrix.T)))
 
 
@@ -155,7 +235,7 @@ def momenta_of_forces(
 ) -> tuple[Float[Array, "s n c"], Float[Array, "r n c"]]:
     """Compute the momenta of stages and nodes from forces at the stages, for h = 1.
 
-    The chart carries forces from stage to stage, which is of the order of h too.
+    The chart transports forces from stage to stage, which is a term of order h too.
     """
     a_hat, b = stages.coefficients("a_hat"), stages.coefficients("b")
     if stages.manifold.is_flat:
@@ -178,26 +258,28 @@ def momenta_of_forces(
 class _BodySlopes(NamedTuple):
     """Derivatives at the start of a step, in the body frame.
 
-    They are the rate of N = ∂p/∂u along the motion, and the derivatives of the momenta
-    by positions, less how momenta are carried there.
+    - `inertia_rate`: the rate of N = ∂p/∂u along the motion.
+    - `momentum`: the derivative of the momentum by the position, less the derivative of
+        the momentum that is transported there.
     """
 
-    inertia_rate: Array
-    momentum: Array
+    inertia_rate: Float[Array, "n n"]
+    momentum: Float[Array, "n n"]
 
 
 class _ChartSlopes(NamedTuple):
     """Derivatives at the start of a step, in its chart.
 
-    They are how ∂Π/∂H changes with dτ_y along y = v, then ∂Π/∂y, ∂F/∂H, ∂w/∂H, and the
-    derivative of the constant term of Π by the increment of the step.
+    - `turning`: the rate at which ∂Π/∂H changes through dτ_y along y = v.
+    - `momentum`, `force`, `body_force`: ∂Π/∂y, ∂F/∂H and ∂w/∂H.
+    - `base`: the derivative of the constant term of Π by the increment of the step.
     """
 
-    turning: Array
-    momentum: Array
-    force: Array
-    body_force: Array
-    base: Array
+    turning: Float[Array, "n n"]
+    momentum: Float[Array, "n n"]
+    force: Float[Array, "n n"]
+    body_force: Float[Array, "n n"]
+    base: Float[Array, "n n"]
 
 
 def _in_body(stages: StageEquations, u: Array, acceleration: Array) -> _BodySlopes:
@@ -207,7 +289,7 @@ def _in_body(stages: StageEquations, u: Array, acceleration: Array) -> _BodySlop
     def momentum(t, xi, u):
         return system.momentum(t, manifold.act(stages.q, xi), u, args)
 
-    def carried(xi):
+    def less_transported(xi):
         p = momentum(t, xi, u)
         return p if manifold.is_flat else p - manifold.to_end(xi, stages.p)
 
@@ -216,7 +298,7 @@ def _in_body(stages: StageEquations, u: Array, acceleration: Array) -> _BodySlop
         (t, zero, u),
         (jnp.ones_like(t), u, acceleration),
     )
-    return _BodySlopes(rate, full_jacobian(carried, zero))
+    return _BodySlopes(rate, full_jacobian(less_transported, zero))
 
 
 def _force_slope(stages: StageEquations, x: StageUnknowns, u: Array) -> Array:
@@ -231,13 +313,13 @@ def _coordinates(stages: StageEquations, x: StageUnknowns, u: Array) -> _ChartSl
     zero = jnp.zeros_like(u)
 
     def pair(y, xi, velocity):
-        """Compute Π, F and w at q_k τ(ξ), as if its coordinates were y."""
+        """Compute Π, F and w at the position q_k τ(ξ), with the chart coordinates y."""
         q = manifold.act(stages.q, xi)
         u = chart.body_velocities(y[None], velocity[None])[0]
         p = system.momentum(t, q, u, args)
         w = total_force(system, t, q, u, multiplier, args)
-        is_in_chart = chart.to_chart(y[None], velocity[None], p[None], w[None])
-        return is_in_chart[0][0], is_in_chart[1][0], w
+        pair = chart.to_chart(y[None], velocity[None], p[None], w[None])
+        return pair[0][0], pair[1][0], w
 
     def inertia(y):
         return full_jacobian(lambda v: pair(y, zero, v)[0], u)
@@ -252,8 +334,8 @@ def _coordinates(stages: StageEquations, x: StageUnknowns, u: Array) -> _ChartSl
     force, body_force = full_jacobian(lambda v: pair(zero, zero, v)[1:], u)
     of_base = full_jacobian(base, stages.increment(x))
     if stages.method.chart == "middle":
-        # The coordinates of all points move by -½ δξ; of the constant term, the forces
-        # enter at both ends alike.
+        # The coordinates of all points move by -½ δξ. Both ends contribute the same
+        # forces to the constant term.
         of_base = of_base + 0.5 * slope + 0.5 * (body_force - force)
     else:
         of_base = of_base + body_force - force

@@ -11,10 +11,9 @@ from jaxtyping import Array, Float, PyTree
 from .._custom_types import Args, FloatScalar
 from .._numerics import (
     inverse,
-    Matrix,
-    matvec,
     max_norm,
     small_einsum,
+    SquareMatrix,
     unit,
 )
 from .._system import (
@@ -206,7 +205,7 @@ class InvariantsAtStart(eqx.Module):
     functions: Invariants
     slopes: Float[Array, "k n"]
     covectors: Float[Array, "k n"]
-    momentum_inverse: Matrix
+    momentum_inverse: SquareMatrix
     row_sums: Float[Array, " n"]
     moving: Float[Array, " k"]
     sizes: Float[Array, " k"]
@@ -228,9 +227,7 @@ class InvariantsAtStart(eqx.Module):
         all_slopes = functions.slopes(system, t, y.q, u, args)
         sizes = functions.sizes(system, t, y.q, u, args, all_slopes)
         slopes, covectors, _ = functions.directions(system, t, y.q, u, args, all_slopes)
-        row_sums = jnp.abs(lin.metric_inverse)
-        if row_sums.ndim == 2:
-            row_sums = jnp.sum(row_sums, axis=1)
+        row_sums = lin.metric_inverse.absolute_row_sums()
         given = slopes, covectors, lin.momentum_inverse, row_sums
         return cls(functions, *given, moving_part(slopes, u), sizes, position)
 
@@ -286,8 +283,7 @@ class InvariantCorrection(eqx.Module):
     ) -> "InvariantCorrection":
         """Build the equations from the values at the start and at the end of a step."""
         start, end = (
-            matvec(at_start.momentum_inverse, x)
-            for x in (at_start.covectors, covectors)
+            at_start.momentum_inverse.matvec(x) for x in (at_start.covectors, covectors)
         )
         gram = small_einsum("kn,ln->kl", at_start.slopes, start)
         gram = gram + small_einsum("kn,ln->kl", slopes, end)
@@ -323,5 +319,5 @@ class InvariantCorrection(eqx.Module):
     ) -> Float[Array, " k"]:
         """Compute the change of ε that solves the linearised equations."""
         residual = self.errors * error + self.rest * impulse
-        wanted = impulse - matvec(self.inverse, residual)
+        wanted = impulse - small_einsum("kl,l->k", self.inverse, residual)
         return jnp.clip(wanted, -self.limits, self.limits) - impulse

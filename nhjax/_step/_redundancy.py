@@ -1,4 +1,4 @@
-"""Redundant constraints: equations of a step of which some follow from the others."""
+"""Redundant constraints: some equations of a step follow from the others."""
 
 import equinox as eqx
 import jax
@@ -13,21 +13,22 @@ from .._system import Linearisation
 class Redundancy(eqx.Module):
     """The equations for the multipliers of redundant constraints.
 
-    With C at the start of the step and C⁻ its inverse of the least norm, P = C C⁻
-    projects the values of constraints onto those that their derivatives there can
-    reach, of which there are as many as independent constraints. Near the start P Φ
-    vanishes only where Φ does. The equations that are left over are replaced by
+    With C at the start of the step and C⁻ its least-norm inverse, P = C C⁻ projects the
+    values of the constraints onto the range of C. The dimension of this range is the
+    number of independent constraints. Near the start of the step P Φ vanishes only
+    where Φ does. The remaining equations are replaced by
 
     (1 - P) diag(C) h δΛ = 0,
 
-    so that multipliers stay among those of the least norm, up to what the derivatives
-    change within the step.
+    so that the multipliers keep the least norm, up to the change of the derivatives
+    within the step.
 
-    Nonholonomic and holonomic constraints do not mix in P: the former hold at the nodes
-    and the latter at the stages, where the rates of these are no zeros. A combination
-    of nonholonomic ones that follows from holonomic ones is among what is left over,
-    and P has the first diagonal block of C C⁻ for the former and the last for the
-    latter. At the end of the step both hold, and so does what follows.
+    P is block diagonal: it does not mix nonholonomic constraints, which hold at the
+    nodes, with holonomic constraints, which hold at the stages, where their rates do
+    not vanish. The blocks are the first and the last diagonal block of C C⁻. A
+    combination of nonholonomic constraints that follows from holonomic ones is among
+    the remaining equations. At the end of the step both kinds hold, and so do all
+    equations that follow from them.
     """
 
     projector: Float[Array, "l l"]  # P
@@ -35,7 +36,7 @@ class Redundancy(eqx.Module):
 
     @classmethod
     def at(cls, lin: Linearisation, m: int) -> "Redundancy":
-        """Make the equations for a step from the state of a linearisation.
+        """Return the equations of a step, from the linearisation at its start.
 
         `m` is the number of nonholonomic constraints.
         """
@@ -45,21 +46,27 @@ class Redundancy(eqx.Module):
         projector = jax.scipy.linalg.block_diag(whole[:m, :m], whole[m:, m:])
         unit = jnp.eye(projector.shape[0], dtype=projector.dtype)
         sizes = jnp.sum(jnp.abs(compliance) * unit, axis=1)
-        # A row without derivatives is left out; its multiplier has no unit.
+        # The multiplier of a row without derivatives has no unit.
         sizes = jnp.where(sizes > 0, sizes, 1)
         return cls(projector, (unit - projector) * sizes[None, :])
 
     def reduced(
         self, values: Float[Array, "r c"], multipliers: Float[Array, "r c"], first: int
     ) -> Float[Array, "r c"]:
-        """Compute P Φ + (1 - P) diag(C) h Λ for the rows from `first` on."""
+        """Compute P Φ + (1 - P) diag(C) h Λ for the constraints from number `first` on.
+
+        `values` are Φ and `multipliers` h Λ, with one row for each node or stage.
+        """
         rows = slice(first, first + values.shape[1])
         return small_einsum(
             "ab,rb->ra", self.projector[rows, rows], values
         ) + small_einsum("ab,rb->ra", self.rest[rows, rows], multipliers)
 
     def schur_rest(self, stages: int, m: int) -> Float[Array, "c c"]:
-        """Compute the derivative of (1 - P) diag(C) h Λ by all h Λ; m is as in `at`."""
+        """Compute the derivative of (1 - P) diag(C) h Λ by all h Λ.
+
+        `m` is the number of nonholonomic constraints.
+        """
         k = self.rest.shape[0] - m
         counts = (stages - 1) * (m > 0), stages * (k > 0)
         blocks = [self.rest[:m, :m]] * counts[0] + [self.rest[m:, m:]] * counts[1]

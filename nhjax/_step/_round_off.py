@@ -9,7 +9,7 @@ from jaxtyping import Array, Float
 
 from .._custom_types import FloatScalar
 from .._method import AbstractMethod
-from .._numerics import absolute, matvec, max_norm, stop_gradient
+from .._numerics import max_norm, stop_gradient
 from .._system import FunctionNoise, Linearisation
 
 
@@ -63,9 +63,9 @@ def round_off_of_steps(
     the method's coefficients magnifies the round-off of constraints.
     """
     lin = stop_gradient(lin)
-    inverse = absolute(lin.momentum_inverse)
+    inverse = lin.momentum_inverse.absolute()
     by_velocity, by_force = (
-        max_norm(matvec(inverse, x)) for x in (noise.momentum, noise.force)
+        max_norm(inverse.matvec(x)) for x in (noise.momentum, noise.force)
     )
     by_position = jnp.zeros_like(by_velocity)
     if lin.violation.shape[0]:

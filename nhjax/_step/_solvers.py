@@ -19,10 +19,8 @@ from .._custom_types import FloatScalar, FloatScalarLike
 from .._errors import check_choice, is_traced
 from .._manifold import unframed
 from .._numerics import (
-    absolute,
     iterate,
     jacobian_and_value,
-    matvec,
     max_norm,
     NOISE_UNITS,
     Sizes,
@@ -36,17 +34,17 @@ from ._equations import (
     StageUnknowns,
     with_moved_positions,
 )
-from ._factorisation import leading_structure
-from ._jacobian_choice import JacobianName
-from ._round_off import PART
-from ._stage_iteration import (
-    corrected,
+from ._first_order import JacobianName
+from ._jacobian import (
     Evaluation,
+    factorise_stage_jacobian,
     fibre_coordinate_size,
     increment_size,
-    sizes,
+    simplified_newton_update,
     stage_residual,
+    update_norms,
 )
+from ._round_off import PART
 
 
 # An iteration on the stages of a step. The equations are an argument, so that the
@@ -177,12 +175,12 @@ class SimplifiedNewton(AbstractStageSolver):
         self, stages: StageEquations, x0: StageUnknowns, lin: Linearisation, skip: Array
     ) -> Solved[StageUnknowns, Evaluation]:
         """Solve the stage equations from `x0`; do nothing where `skip` is true."""
-        structure = leading_structure(stages, x0, lin, self.jacobian)
+        factors = factorise_stage_jacobian(stages, x0, lin, self.jacobian)
         scale = fibre_coordinate_scale(stages, x0, lin)
 
         def iteration(x: StageUnknowns):
-            x_next, evaluation = corrected(stages, structure, x)
-            return x_next, sizes(stages, x, x_next, lin), evaluation
+            x_next, evaluation = simplified_newton_update(stages, factors, x)
+            return x_next, update_norms(stages, x, x_next, lin), evaluation
 
         solved = _iterated(self, iteration, x0, scale, skip)
         if not self.fallback:
@@ -214,8 +212,8 @@ class SimplifiedNewton(AbstractStageSolver):
         """
         if self.fallback:
             return self._newton.frozen_newton_map(stages, lin, x)
-        structure = leading_structure(stages, x, lin, self.jacobian)
-        return lambda stages, x: corrected(stages, structure, x)[0]
+        factors = factorise_stage_jacobian(stages, x, lin, self.jacobian)
+        return lambda stages, x: simplified_newton_update(stages, factors, x)[0]
 
 
 def is_simplified_alone(stage_solver: AbstractStageSolver) -> bool:
@@ -295,7 +293,7 @@ class Newton(AbstractStageSolver):
         solved = _iterated(self, iteration, x0, scale, skip)
         # Where forces grow without bound, increments are small even far from a
         # solution. Therefore the residual is checked too.
-        gross = matvec(lin.momentum_inverse, solved.aux.forces.residual)
+        gross = lin.momentum_inverse.matvec(solved.aux.forces.residual)
         found = fibre_coordinate_size(stages, solved.x)
         measure = jnp.maximum(scale.size + scale.round_off, found)
         allowed = 1e3 * jnp.asarray(self.tolerance, measure.dtype)
@@ -315,11 +313,11 @@ class Newton(AbstractStageSolver):
         jacobian = jax.jacfwd(lambda z: stage_residual(stages, unravel(z))[0])(z)
         jacobian_inverse = jnp.linalg.inv(jacobian)
 
-        def corrected(stages: StageEquations, x: StageUnknowns) -> StageUnknowns:
+        def update(stages: StageEquations, x: StageUnknowns) -> StageUnknowns:
             residual, _ = stage_residual(stages, x)
             return unravel(ravel_pytree(x)[0] - jacobian_inverse @ residual)
 
-        return corrected
+        return update
 
 
 class Scale(NamedTuple):
@@ -422,7 +420,7 @@ def fibre_coordinate_scale(
     h = jnp.abs(stages.h)
     rate = max_norm(lin.acceleration)
     if stages.constrained:
-        rate = rate + max_norm(matvec(absolute(lin.reaction), jnp.abs(lin.multiplier)))
+        rate = rate + max_norm(lin.reaction.absolute().matvec(jnp.abs(lin.multiplier)))
     size = h * rate + max_norm(
         x0.node_fibre_coordinate, x0.momentum if stages.hamiltonian else x0.velocity
     )

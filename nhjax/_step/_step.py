@@ -24,7 +24,6 @@ from .._numerics import (
     fixed_point_tangent,
     has_tangent,
     largest_column,
-    matvec,
     max_norm,
     NOISE_UNITS,
     relative,
@@ -54,9 +53,9 @@ from ._equations import (
     start_impulse,
 )
 from ._invariants import Invariants, InvariantsAtStart
+from ._jacobian import Evaluation, unknown_units
 from ._round_off import RoundOff
 from ._solvers import AbstractStageSolver, starting_values
-from ._stage_iteration import Evaluation, unknown_units
 
 
 class StepState(eqx.Module):
@@ -403,9 +402,9 @@ def error_ratios(
     def change(weights: Float[Array, " s"]) -> tuple[Array, Array]:
         moved = small_einsum("s,sn->n", weights, x.velocity)
         if stages.hamiltonian:
-            moved = matvec(lin.metric_inverse, moved)
+            moved = lin.metric_inverse.matvec(moved)
         gained = h * small_einsum("s,sn->n", weights, force)
-        return moved, matvec(lin.momentum_inverse, gained)
+        return moved, lin.momentum_inverse.matvec(gained)
 
     # The floor is the round-off of u, because a difference of this size says nothing
     # about the error.
@@ -419,8 +418,8 @@ def error_ratios(
         # Multipliers of single stages may be wrong although their sum is right.
         # Therefore the part of the difference that violates the constraints is left
         # out; the step satisfies the constraints.
-        excess = matvec(lin.compliance_inverse, matvec(lin.jacobian, gained))
-        gained = gained - matvec(lin.reaction, excess)
+        excess = lin.compliance_inverse.matvec(lin.jacobian.matvec(gained))
+        gained = gained - lin.reaction.matvec(excess)
     return relative(jnp.stack([max_norm(moved), max_norm(gained)]), whole)
 
 

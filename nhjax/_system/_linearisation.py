@@ -1,3 +1,10 @@
+"""The equations of motion, linearised at a state, and the continuous multiplier λ_c.
+
+`linearise` computes the matrices of the equations of motion and solves them for the
+acceleration and the multiplier. `constraint_matrices` computes the same matrices
+without the solution, and `motion_residual` evaluates the equations themselves.
+"""
+
 from collections.abc import Callable
 from functools import reduce
 from typing import Literal, NamedTuple
@@ -9,22 +16,18 @@ from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from .._custom_types import Args, FloatScalar, FloatScalarLike
 from .._numerics import (
-    absolute,
-    block_tridiagonal_inverse,
-    BlockTridiagonalInverse,
-    couplings,
-    inverse,
-    is_nearly_singular,
-    jacobian,
+    DenseMatrix,
+    DiagonalMatrix,
+    InverseMatrix,
+    JacobianMatrix,
     least_norm_inverse,
     least_norm_inverse_by_blocks,
-    Matrix,
-    matvec,
     max_norm,
+    ReactionMatrix,
     small_einsum,
     sparse_jacobian,
-    SparseMatrix,
-    WeightedTranspose,
+    square_jacobian,
+    SquareMatrix,
 )
 from ._structure import constraint_pattern, FEWEST_SPARSE
 from ._systems import AbstractMechanicalSystem, check_time_and_state, State
@@ -33,27 +36,28 @@ from ._systems import AbstractMechanicalSystem, check_time_and_state, State
 class Linearisation(eqx.Module):
     """The equations of motion, linearised at one state (t, q, u), and their solution.
 
-    u is the fibre coordinate of the system, v or p. With N = ∂p/∂u, B = ∂Φ/∂u of the
-    constraints on velocities, and R = ♭ Bᵀ their reactions, the motion satisfies
+    u is the fibre coordinate of the system, v or p. With N = ∂p/∂u, the Jacobian
+    B = ∂Φ/∂u of the constraints on velocities, and the reactions R = ♭ Bᵀ, the motion
+    satisfies
 
     N u̇ - R λ = ad*_v p + free force - ∂t p - D1p v,    B u̇ = -∂t Φ - D1Φ v,
 
-    which determines C λ with C = B N⁻¹ R, the paper's compatibility matrix C^{ab}
-    (section 3), and so the multiplier λ. For a Lagrangian system N is the mass matrix
-    M = D2D2L, R = Bᵀ, and u̇ is the acceleration; for a Hamiltonian one N = 1 and
-    R = (D2D2H)⁻¹ Bᵀ. In both cases N⁻¹ R = K⁻¹ Bᵀ with K the metric on the fibre.
+    These equations determine C λ, with the Delassus matrix C = B N⁻¹ R, which the paper
+    calls the compatibility matrix C^{ab} (section 3), and so the multiplier λ. For a
+    Lagrangian system N is the mass matrix M = D2D2L, R = Bᵀ, and u̇ is the acceleration.
+    For a Hamiltonian system N = 1 and R = (D2D2H)⁻¹ Bᵀ. In both cases N⁻¹ R = K⁻¹ Bᵀ
+    with the fibre Hessian K = D2D2L or D2D2H.
 
-    The same matrices are the leading structure of the stage system. Inverses are formed
-    once, and later computations multiply with them: the matrices are tiny, and a
-    triangular solve inside an iteration costs far more than a product. Those of many
-    constraints, each of which shares coordinates with few others, are kept sparse.
+    The Jacobian of the stage equations has the same matrices. Inverses are computed
+    once, and later computations multiply by them: the matrices are tiny, and a
+    triangular solve inside an iteration costs far more than a product. The matrices of
+    many constraints are sparse if each constraint shares coordinates with few others.
     """
 
-    metric_inverse: Matrix  # K⁻¹
-    jacobian: Float[Array, "l n"] | SparseMatrix  # B
-    reaction: Float[Array, "n l"] | WeightedTranspose  # N⁻¹ R
-    # C⁻¹, or of the least norm
-    compliance_inverse: Float[Array, "l l"] | BlockTridiagonalInverse
+    metric_inverse: SquareMatrix  # K⁻¹
+    jacobian: JacobianMatrix  # B
+    reaction: ReactionMatrix  # N⁻¹ R
+    compliance_inverse: InverseMatrix  # C⁻¹, or its least-norm substitute
     acceleration: Float[Array, " n"]  # u̇
     multiplier: Float[Array, " l"]
     violation: Float[Array, " l"]
@@ -61,35 +65,36 @@ class Linearisation(eqx.Module):
     is_redundant: bool = eqx.field(static=True)
 
     @property
-    def momentum_inverse(self) -> Matrix:
-        """Return N⁻¹, the inverse mass matrix or, for a Hamiltonian system, identity.
-
-        A vector stands for the diagonal matrix with these entries.
-        """
+    def momentum_inverse(self) -> SquareMatrix:
+        """Return N⁻¹: the inverse mass matrix, or one for a Hamiltonian system."""
         if self.fibre_coordinate_name == "v":
             return self.metric_inverse
-        return jnp.ones_like(self.acceleration)
+        return DiagonalMatrix(jnp.ones_like(self.acceleration))
+
+    @property
+    def is_sparse(self) -> bool:
+        """Return whether the matrices of the constraints are stored as sparse ones."""
+        return self.jacobian.pattern is not None
 
     @property
     def dense(self) -> tuple[Array, Array, Array]:
-        """Return B, N⁻¹ R and C⁻¹ as arrays, of a linearisation that is not sparse."""
-        assert not isinstance(self.jacobian, SparseMatrix)
-        assert not isinstance(self.reaction, WeightedTranspose)
-        assert not isinstance(self.compliance_inverse, BlockTridiagonalInverse)
-        return self.jacobian, self.reaction, self.compliance_inverse
+        """Return B, N⁻¹ R and C⁻¹ as arrays with all entries."""
+        matrices = self.jacobian, self.reaction, self.compliance_inverse
+        jacobian, reaction, inverse = (matrix.as_matrix() for matrix in matrices)
+        return jacobian, reaction, inverse
 
     @property
     def is_singular(self) -> Bool[Array, ""]:
-        """Tell whether the metric K or the compatibility matrix C is singular."""
-        inverses = [self.metric_inverse, *jax.tree.leaves(self.compliance_inverse)]
+        """Return whether the fibre Hessian K or the Delassus matrix C is singular."""
+        inverses = jax.tree.leaves((self.metric_inverse, self.compliance_inverse))
         return ~reduce(jnp.logical_and, [jnp.all(jnp.isfinite(x)) for x in inverses])
 
     @property
     def is_unique(self) -> Bool[Array, " l"]:
-        """Tell which multipliers are unique; of redundant constraints not all are."""
+        """Return which multipliers are unique; with redundant constraints, not all."""
         if not self.is_redundant:
             return jnp.ones(self.violation.shape, bool)
-        # It projects onto what the derivatives of the constraints can reach.
+        # The product C C⁻ projects onto the range of C.
         jacobian, reaction, _ = self.dense
         compliance = small_einsum("kn,nl->kl", jacobian, reaction)
         kept = small_einsum("kl,lm->km", compliance, least_norm_inverse(compliance))
@@ -98,7 +103,7 @@ class Linearisation(eqx.Module):
 
     @property
     def num_redundant(self) -> Int[Array, ""]:
-        """Count the constraints that follow from others, if these are redundant."""
+        """Return the number of redundant constraints, 0 if none are allowed."""
         if not self.is_redundant:
             return jnp.zeros((), jnp.int32)
         jacobian, reaction, inverse = self.dense
@@ -108,37 +113,29 @@ class Linearisation(eqx.Module):
 
     @property
     def determines_multipliers(self) -> Bool[Array, ""]:
-        """Tell whether C can be inverted in the working precision."""
-        if isinstance(self.jacobian, SparseMatrix):
-            assert isinstance(self.compliance_inverse, BlockTridiagonalInverse)
-            squares = SparseMatrix(self.jacobian.values**2, self.jacobian.pattern)
-            sizes = jnp.abs(matvec(squares, self.metric_inverse))
-            eps = float(jnp.finfo(sizes.dtype).eps)
-            number = 1 / (10 * sizes.shape[0] * eps)
-            return ~self.compliance_inverse.exceeds(sizes, number)
-        jacobian, reaction, inverse = self.dense
-        compliance = small_einsum("kn,nl->kl", jacobian, reaction)
-        return ~is_nearly_singular(compliance, inverse)
+        """Return whether C can be inverted in the working precision."""
+        factors = self.jacobian, self.reaction
+        return ~self.compliance_inverse.is_nearly_singular(*factors)
 
     def solve(
         self, momentum_residual: Float[Array, " n"], hidden_residual: Float[Array, " l"]
     ) -> tuple[Float[Array, " n"], Float[Array, " l"]]:
-        """Find (u̇, λ) with N u̇ - R λ and B u̇ equal to the two given residuals."""
-        free = matvec(self.momentum_inverse, momentum_residual)
-        hidden = hidden_residual - matvec(self.jacobian, free)
-        multiplier = matvec(self.compliance_inverse, hidden)
-        return free + matvec(self.reaction, multiplier), multiplier
+        """Solve N u̇ - R λ = momentum_residual, B u̇ = hidden_residual for (u̇, λ)."""
+        free = self.momentum_inverse.matvec(momentum_residual)
+        hidden = hidden_residual - self.jacobian.matvec(free)
+        multiplier = self.compliance_inverse.matvec(hidden)
+        return free + self.reaction.matvec(multiplier), multiplier
 
     def largest_correction(self, sizes: Float[Array, " l"]) -> FloatScalar:
-        """Bound the change of u that makes up for violations of the given sizes."""
-        multipliers = matvec(absolute(self.compliance_inverse), sizes)
-        return max_norm(matvec(absolute(self.reaction), multipliers))
+        """Bound the change of u that corrects constraint violations of given sizes."""
+        multipliers = self.compliance_inverse.absolute().matvec(sizes)
+        return max_norm(self.reaction.absolute().matvec(multipliers))
 
 
 def _momentum_and_constraint(
     system: AbstractMechanicalSystem, q: PyTree[Array], args: Args
 ) -> Callable[..., tuple[Array, Array]]:
-    """Make the function (t, ξ, u) -> (p, Φ) on the chart ξ -> q τ(ξ) around q.
+    """Return the function (t, ξ, u) -> (p, Φ) on the chart ξ -> q τ(ξ) around q.
 
     The equations of motion follow from its derivatives.
     """
@@ -152,7 +149,7 @@ def _momentum_and_constraint(
 
 
 def _inertial_force(system, q, p: Array, v: Array) -> Array:
-    """Compute ad*_v p, the term in ṗ by which the body momentum turns."""
+    """Compute ad*_v p, the term of ṗ by which the body momentum turns."""
     manifold = system.manifold_of(q)
     return jnp.zeros_like(p) if manifold.is_flat else manifold.ad_dual(v, p)
 
@@ -165,7 +162,7 @@ def total_force(
     multiplier: Float[Array, " l"],
     args: Args,
 ) -> Float[Array, " n"]:
-    """Compute the whole force W: the free force plus the reaction of constraints."""
+    """Compute the total force W: the free force plus the reaction of constraints."""
     free = system.free_force(t, q, u, args)
     return free + system.reaction(t, q, u, multiplier, args)
 
@@ -182,8 +179,8 @@ def motion_residual(
     """Compute the residuals of the equations of motion and of the hidden constraint.
 
     These are ṗ - ad*_v p - W and dΦ/dt along (q̇, u̇) = (q v, a), where a is the given
-    `acceleration`. They vanish where the multiplier is the continuous multiplier
-    λ = λ_c(q, u) and a the acceleration that belongs to it.
+    `acceleration`. They vanish if the multiplier is the continuous multiplier λ_c(q, u)
+    and a is its acceleration.
     """
     v = system.velocity(t, q, u, args)
     (p, _), (p_dot, phi_dot) = jax.jvp(
@@ -196,25 +193,24 @@ def motion_residual(
 
 
 class ConstraintMatrices(NamedTuple):
-    """The matrices of `Linearisation` that need no solution of the equations."""
+    """The matrices of `Linearisation`, without the solution of the equations."""
 
-    metric_inverse: Matrix  # K⁻¹
-    jacobian: Float[Array, "l n"] | SparseMatrix  # B
-    reaction: Float[Array, "n l"] | WeightedTranspose  # K⁻¹ Bᵀ
-    compliance_inverse: Float[Array, "l l"] | BlockTridiagonalInverse  # C⁻¹
+    metric_inverse: SquareMatrix  # K⁻¹
+    jacobian: JacobianMatrix  # B
+    reaction: ReactionMatrix  # K⁻¹ Bᵀ
+    compliance_inverse: InverseMatrix  # C⁻¹
 
     def tangent_part(
         self, slope: Float[Array, " n"]
     ) -> tuple[Float[Array, " n"], Float[Array, " l"]]:
-        """Split a derivative s = ∂I/∂u by u: s - Bᵀ μ with B K⁻¹ (s - Bᵀ μ) = 0.
+        """Project a derivative s = ∂I/∂u onto the directions allowed by constraints.
 
-        Return s - Bᵀ μ and the multipliers μ = C⁻¹ B K⁻¹ s.
+        Return s - Bᵀ μ, which satisfies B K⁻¹ (s - Bᵀ μ) = 0, and the multipliers
+        μ = C⁻¹ B K⁻¹ s.
         """
-        pushed = matvec(self.jacobian, matvec(self.metric_inverse, slope))
-        multiplier = matvec(self.compliance_inverse, pushed)
-        if isinstance(self.jacobian, SparseMatrix):
-            return slope - self.jacobian.rmatvec(multiplier), multiplier
-        return slope - small_einsum("ln,l->n", self.jacobian, multiplier), multiplier
+        pushed = self.jacobian.matvec(self.metric_inverse.matvec(slope))
+        multiplier = self.compliance_inverse.matvec(pushed)
+        return slope - self.jacobian.rmatvec(multiplier), multiplier
 
 
 def constraint_matrices(
@@ -227,31 +223,29 @@ def constraint_matrices(
     *,
     may_be_sparse: bool = False,
 ) -> ConstraintMatrices:
-    """Compute the metric and the derivatives of the constraints at (t, q, u).
+    """Compute the fibre Hessian and the derivatives of the constraints at (t, q, u).
 
-    With `may_be_sparse` the matrices of many constraints are sparse where that pays.
+    With `may_be_sparse` the matrices of many constraints are sparse where this is
+    faster.
     """
-    metric = jacobian(lambda u: system.fibre_derivative(t, q, u, args), u)
-    metric_inverse = inverse(metric)
+    metric = square_jacobian(lambda u: system.fibre_derivative(t, q, u, args), u)
+    metric_inverse = metric.inverse()
     pattern = None
-    if may_be_sparse and num_constraints >= FEWEST_SPARSE and metric.ndim == 1:
+    if may_be_sparse and num_constraints >= FEWEST_SPARSE and metric.is_diagonal:
         pattern = constraint_pattern(system, t, q, u, args)
     if pattern is None:
-        slopes = jax.jacrev(system.constraint, argnums=2)(t, q, u, args)
-        reaction = matvec(metric_inverse, slopes).T
-        compliance = small_einsum("kn,nl->kl", slopes, reaction)
-        if system.constraints == "redundant":
-            k = jax.eval_shape(lambda: system.position_constraint(t, q, args)).size
-            m = slopes.shape[0] - k
-            compliance_inverse = least_norm_inverse_by_blocks(compliance, m)
-        else:
-            compliance_inverse = inverse(compliance)
+        slopes = DenseMatrix(jax.jacrev(system.constraint, argnums=2)(t, q, u, args))
     else:
         slopes = sparse_jacobian(lambda u: system.constraint(t, q, u, args), u, pattern)
-        reaction = WeightedTranspose(metric_inverse, slopes)
-        rows = SparseMatrix(slopes.values[None], pattern)
-        products = couplings(rows, rows, metric_inverse)
-        compliance_inverse = block_tridiagonal_inverse(products, pattern)
+    reaction = slopes.weighted_transpose(metric_inverse)
+    if system.constraints == "redundant":
+        k = jax.eval_shape(lambda: system.position_constraint(t, q, args)).size
+        compliance = small_einsum("kn,nl->kl", slopes.as_matrix(), reaction.as_matrix())
+        compliance_inverse = DenseMatrix(
+            least_norm_inverse_by_blocks(compliance, num_constraints - k)
+        )
+    else:
+        compliance_inverse = slopes.inverse_of_product(reaction)
     return ConstraintMatrices(metric_inverse, slopes, reaction, compliance_inverse)
 
 
@@ -266,7 +260,8 @@ def linearise(
 ) -> Linearisation:
     """Linearise the equations of motion at (t, q, u), and solve them for u̇ and λ_c.
 
-    With `may_be_sparse` the matrices of many constraints are sparse where that pays.
+    With `may_be_sparse` the matrices of many constraints are sparse where this is
+    faster.
     """
     zero, v = jnp.zeros_like(u), system.velocity(t, q, u, args)
     (p, violation), (p_dot, phi_dot) = jax.jvp(
@@ -296,10 +291,10 @@ def continuous_multiplier(
 ) -> Float[Array, " l"]:
     """Compute the multiplier λ_c of the continuous equations of motion at a state.
 
-    It follows from the hidden constraint dΦ/dt = 0, and for the rows of holonomic
-    constraints, which come last, from d²Γ/dt² = 0 (the paper's section 3). Along a
-    trajectory of a Lobatto method it is of order 2s-2, while the multiplier that the
-    paper propagates is of order s or s-1.
+    It follows from the hidden constraint dΦ/dt = 0, and for holonomic constraints,
+    whose rows come last, from d²Γ/dt² = 0 (the paper's section 3). Along a trajectory
+    of a Lobatto method it has order 2s-2, while the multiplier that the paper
+    propagates has order s or s-1.
 
     **Arguments:**
 
@@ -311,7 +306,7 @@ def continuous_multiplier(
     **Returns:** an array of shape (m + k,) for m nonholonomic and k holonomic
     constraints, in units of force over those of D2Φ.
 
-    **Raises:** `TypeError` if `y` is no `State`.
+    **Raises:** `TypeError` if `y` is not a `State`.
 
     !!! example
 

@@ -1,4 +1,9 @@
-"""The sizes of terms and the noise of functions, which tell errors from round-off."""
+"""The sizes of the terms of constraints, and the round-off of the system's functions.
+
+A violation of a constraint is an error only if it is larger than the round-off of the
+terms that cancel in the constraint. This file estimates the sizes of these terms from
+derivatives, and measures the round-off of functions at nearby points.
+"""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -10,10 +15,10 @@ from jaxtyping import Array, Float, PyTree
 from .._custom_types import Args, BoolScalar, FloatScalar, FloatScalarLike
 from .._manifold import AbstractLieGroup
 from .._numerics import (
+    JacobianMatrix,
     max_norm,
     measured_noise,
     NOISE_DEVIATIONS,
-    SparseMatrix,
     stop_gradient,
     unit,
 )
@@ -33,15 +38,15 @@ def violation_scale(
 
     The estimate treats Φ as affine in u. It is not the size of the terms at u itself: a
     constraint such as v[1] has a single term, which is round-off in every state that
-    satisfies the constraint. Where u vanishes nothing tells the size of velocities, and
-    one unit of theirs stands for it: terms that cancel leave round-off there too.
+    satisfies the constraint. If u is zero, the size of velocities is unknown. It is
+    taken as one, since terms that cancel have round-off at rest too.
     """
     return velocity_scale(system, lin.jacobian, t, q, u, args)
 
 
 def velocity_scale(
     system: AbstractMechanicalSystem,
-    jacobian: Float[Array, "l n"] | SparseMatrix,
+    jacobian: JacobianMatrix,
     t: FloatScalar,
     q: PyTree[Array],
     u: Float[Array, " n"],
@@ -49,8 +54,7 @@ def velocity_scale(
 ) -> Float[Array, " l"]:
     """Estimate the sizes of the terms of Φ from its Jacobian ∂Φ/∂u alone."""
     affine = _finite_or_zero(system.constraint(t, q, jnp.zeros_like(u), args))
-    slopes = _row_sums(jacobian)
-    return slopes * unit(max_norm(u)) + affine
+    return jacobian.absolute_row_sums() * unit(max_norm(u)) + affine
 
 
 def position_scale(
@@ -62,8 +66,8 @@ def position_scale(
 ) -> Float[Array, " k"]:
     """Estimate, row by row, how large the terms of Γ are for a q of the given size.
 
-    The estimate treats Γ as affine in q. Where q vanishes one unit stands for its size.
-    Where a sparse linearisation at q has the derivatives of Γ already, it serves.
+    The estimate treats Γ as affine in q. If q is zero, its size is taken as one. A
+    sparse linearisation `lin` at q already has the derivatives of Γ; they are used.
     """
 
     def gamma(q):
@@ -73,12 +77,8 @@ def position_scale(
     if system.holonomic is None:
         return constant
     size = unit(max_norm(*jax.tree.leaves(q)))
-    if (
-        lin is not None
-        and isinstance(lin.jacobian, SparseMatrix)
-        and lin.fibre_coordinate_name == "v"
-    ):
-        return _row_sums(lin.jacobian) * size + constant
+    if lin is not None and lin.is_sparse and lin.fibre_coordinate_name == "v":
+        return lin.jacobian.absolute_row_sums() * size + constant
     slopes = jax.tree.map(
         lambda slope: jnp.sum(jnp.abs(slope), axis=tuple(range(1, slope.ndim))),
         jax.jacrev(gamma)(q),
@@ -95,9 +95,9 @@ def keeps_constraints(
     small: FloatScalarLike,
     round_off: tuple[Float[Array, " l"], Float[Array, " k"]] | None,
 ) -> BoolScalar:
-    """Tell whether all constraints hold at y, up to `small` times their terms.
+    """Return whether all constraints hold at y, up to `small` times their terms.
 
-    Violations of velocity and position constraints up to their `round_off` are none.
+    Violations of velocity and position constraints up to their `round_off` are allowed.
     """
     u = system.fibre_coordinate(y)
     positions = system.position_constraint(t, y.q, args)
@@ -111,19 +111,13 @@ def keeps_constraints(
     )
 
 
-def _row_sums(matrix: Float[Array, "l n"] | SparseMatrix) -> Float[Array, " l"]:
-    if isinstance(matrix, SparseMatrix):
-        return jnp.sum(jnp.abs(matrix.values), axis=0)
-    return jnp.sum(jnp.abs(matrix), axis=1)
-
-
 def _finite_or_zero(x: Array) -> Array:
-    # Where a constraint is singular at zero, that value says nothing of its size.
+    # If a constraint is singular at zero, its value there does not measure its size.
     return jnp.abs(jnp.nan_to_num(x, nan=0.0, posinf=0.0, neginf=0.0))
 
 
 class FunctionNoise(NamedTuple):
-    """The round-off of the functions of a system at a state, one number for each value.
+    """The round-off of the functions of a system at a state, a number for each value.
 
     The functions are the momentum, the free force, all constraints on velocities and
     the holonomic constraints on positions.
@@ -136,7 +130,7 @@ class FunctionNoise(NamedTuple):
 
     @property
     def violations(self) -> tuple[Float[Array, " l"], Float[Array, " k"]]:
-        """Bound violations of velocity and position constraints that are round-off."""
+        """Return bounds of the round-off in violations of velocities and positions."""
         parts = self.on_velocities, self.on_positions
         on_velocities, on_positions = (NOISE_DEVIATIONS * x for x in parts)
         return on_velocities, on_positions
@@ -154,7 +148,7 @@ def function_noise(
 
     Only the shape of the multiplier is used.
     """
-    # Not as arguments: `args` may hold what is no array.
+    # A closure, because `args` may contain objects that are not arrays.
     positions = jax.eval_shape(lambda: system.position_constraint(t, q, args))
     system, args = stop_gradient((system, args))
 
@@ -180,10 +174,10 @@ def noise_near(
 ) -> PyTree[Array]:
     """Measure the round-off of a function of (t, q, u) near a state.
 
-    `like` has the shapes and the type of what it returns; see `measured_noise`.
+    `like` has the structure, shapes and dtype of its results; see `measured_noise`.
     """
     (t, q, u), n = stop_gradient((t, q, u)), u.shape[0]
-    # Steps are taken from angles of the first turn, which have no round-off of others.
+    # Angles are reduced to the first turn: those of many turns have more round-off.
     q = manifold.wrapped(q, manifold.no_compensation(q))
     return measured_noise(
         lambda z: function(t + z[0], manifold.act(q, z[1 : n + 1]), u + z[n + 1 :]),

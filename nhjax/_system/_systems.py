@@ -24,7 +24,7 @@ from .._custom_types import (
 )
 from .._errors import naming, ShapeError
 from .._manifold import AbstractLieGroup, Euclidean, framed, is_framed, unframed
-from .._numerics import ClosureConverted, inverse, jacobian, matvec
+from .._numerics import ClosureConverted, square_jacobian
 from ._arguments import (
     check_constraints,
     check_coordinates,
@@ -542,9 +542,8 @@ class HamiltonianSystem(AbstractMechanicalSystem):
         args: Args = None,
     ) -> Float[Array, " n"]:
         """Compute ♭_H D2Ψ = (D2D2H)⁻¹ D2Ψ from a constraint's derivative D2Ψ."""
-        return matvec(
-            inverse(jacobian(lambda u: self.velocity(t, q, u, args), u)), derivative
-        )
+        metric = square_jacobian(lambda u: self.velocity(t, q, u, args), u)
+        return metric.inverse().matvec(derivative)
 
     def energy(self, t: FloatScalarLike, y: State, args: Args = None) -> FloatScalar:
         """Compute the energy H(t, q, p) of a state.

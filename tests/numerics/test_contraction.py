@@ -1,4 +1,4 @@
-"""Small products and inverses that are written out give what libraries give."""
+"""Small products and inverses that are written out agree with those of libraries."""
 
 import jax
 import jax.numpy as jnp
@@ -18,7 +18,7 @@ def assert_same(got, expected):
     "subscripts", ["ij,jk->ik", "i,ij->j", "i,i->", "jnm,jm->jn", "ij,ijab->iajb"]
 )
 @pytest.mark.parametrize("size", [3, 20])
-def test_contractions_are_those_of_einsum(subscripts, size):
+def test_small_einsum_of_any_size_equals_einsum(subscripts, size):
     operands = [
         np.random.default_rng(k).normal(
             size=[2 if i in "ab" else size for i in indices]
@@ -31,8 +31,8 @@ def test_contractions_are_those_of_einsum(subscripts, size):
 
 
 @pytest.mark.parametrize("size", [3, 20])
-def test_contractions_are_mapped_and_differentiated_as_einsum_is(size):
-    """Also in reverse mode over forward mode, and where one operand has no batch."""
+def test_small_einsum_under_vmap_and_grad_equals_einsum(size):
+    """Include reverse over forward mode, and an operand without a batch axis."""
     a, b, c = np.random.default_rng(0).normal(size=(3, size, size, size))
 
     def derivatives(contract):
@@ -54,7 +54,7 @@ def test_contractions_are_mapped_and_differentiated_as_einsum_is(size):
         np.testing.assert_allclose(x, y, rtol=1e-10, atol=1e-10)
 
 
-def test_a_contraction_is_one_operation_until_it_is_lowered():
+def test_small_einsum_before_lowering_is_one_operation():
     def gradient(x):
         return jax.grad(lambda x: jnp.sum(small_einsum("ij,jk->ik", x, x)))(x)
 
@@ -68,7 +68,7 @@ def test_a_contraction_is_one_operation_until_it_is_lowered():
 
 
 @pytest.mark.parametrize("mode", ["auto", "explicit"])
-def test_contractions_of_arrays_that_are_spread_over_devices(mode):
+def test_small_einsum_of_sharded_arrays_equals_einsum(mode):
     kind = getattr(jax.sharding.AxisType, mode.capitalize())
     mesh = jax.make_mesh((1,), ("x",), axis_types=(kind,))
     spec = jax.sharding.PartitionSpec("x")
@@ -87,12 +87,12 @@ def test_contractions_of_arrays_that_are_spread_over_devices(mode):
     np.testing.assert_allclose(got, jax.jit(function)(*map(np.asarray, (a, b))))
 
 
-def test_operands_that_do_not_fit_are_refused():
+def test_small_einsum_of_wrong_shapes_raises():
     with pytest.raises(ValueError, match="do not fit ij,jk"):
         small_einsum("ij,jk->ik", jnp.ones((2, 1)), jnp.ones((3, 2)))
 
 
-def test_products_of_a_program_are_written_out():
+def test_small_products_of_jaxpr_are_written_out():
     def function(x, y):
         inner = jax.jit(lambda x: x @ y)
         batch = jnp.einsum("bij,bjk->bki", inner(x), y)
@@ -107,23 +107,23 @@ def test_products_of_a_program_are_written_out():
 
 
 @pytest.mark.parametrize("size", [0, 1, 2, 7, 16, 32, 33])
-def test_inverses(size):
+def test_inverse_of_any_size_solves(size):
     matrix = np.random.default_rng(size).normal(size=(size, size))
     got = inverse(jnp.asarray(matrix))
     np.testing.assert_allclose(got @ matrix, np.eye(size), rtol=0, atol=1e-12)
 
 
-def test_inverses_need_rows_exchanged():
+def test_inverse_with_zero_pivot_exchanges_rows():
     matrix = jnp.array([[0.0, 2.0, 0.0], [1e-20, 1.0, 1.0], [3.0, 0.0, 0.0]])
     np.testing.assert_allclose(inverse(matrix) @ matrix, np.eye(3), rtol=0, atol=1e-14)
 
 
-def test_a_singular_matrix_has_no_finite_inverse():
+def test_inverse_of_singular_matrix_is_not_finite():
     for matrix in (jnp.zeros((1, 1)), jnp.ones((2, 2)), jnp.diag(jnp.arange(3.0))):
         assert not np.all(np.isfinite(inverse(matrix)))
 
 
-def test_derivatives_of_inverses():
+def test_derivative_of_inverse_equals_formula():
     matrix, rate = np.random.default_rng(0).normal(size=(2, 4, 4))
     x, change = jax.jvp(inverse, (jnp.asarray(matrix),), (jnp.asarray(rate),))
     np.testing.assert_allclose(change, -x @ rate @ x, rtol=1e-12)
@@ -132,8 +132,8 @@ def test_derivatives_of_inverses():
     np.testing.assert_allclose(np.sum(gradient * rate), expected, rtol=1e-12)
 
 
-def test_a_sum_over_the_members_of_a_batch_is_not_written_out():
-    """The gradient by an operand that all members share has a term for each of them."""
+def test_sum_over_members_of_batch_is_not_written_out():
+    """The gradient by an operand that all members share has a term for each member."""
     matrix, vectors = jnp.ones((40, 40)), jnp.arange(40000.0).reshape(1000, 40)
 
     @jax.jit

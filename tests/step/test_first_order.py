@@ -11,9 +11,8 @@ from jax.flatten_util import ravel_pytree
 import nhjax
 from nhjax import systems
 from nhjax._step import first_step_state
-from nhjax._step._factorisation import leading_structure
+from nhjax._step._jacobian import factorise_stage_jacobian, simplified_newton_update
 from nhjax._step._solvers import starting_values
-from nhjax._step._stage_iteration import corrected
 from nhjax._step._step import equations_of_step, StepArguments
 from support.forms import in_space
 from support.long import long
@@ -38,9 +37,11 @@ def contraction(example, method, h):
         z, unravel = ravel_pytree(x)
 
         def slope(jacobian):
-            structure = leading_structure(stages, x0, lin, jacobian)
+            factors = factorise_stage_jacobian(stages, x0, lin, jacobian)
             return jax.jacfwd(
-                lambda z: ravel_pytree(corrected(stages, structure, unravel(z))[0])[0]
+                lambda z: ravel_pytree(
+                    simplified_newton_update(stages, factors, unravel(z))[0]
+                )[0]
             )(z)
 
         return [slope(jacobian) for jacobian in ("leading", "first_order")]

@@ -1,0 +1,638 @@
+"""The factors of the stage Jacobian, and the simplified Newton update that uses them.
+
+The stage equations are solved by iterations `x -> x - J⁻¹ r(x)`. Simplified Newton
+inverts a part of the Jacobian J once a step, in `factorise_stage_jacobian`: the mass
+matrix and the Schur complement of the constraints at the start of the step, with or
+without the terms of order h of `FirstOrderTerms`. Each `simplified_newton_update` then
+evaluates the stage equations once and multiplies by these factors. All matrices are
+tiny, so that the factors are inverses: a triangular solve inside an iteration costs far
+more than a product.
+
+The end of the file has the residual of all equations in one vector, for solvers with
+the exact Jacobian, and the norms by which iterations measure their updates.
+"""
+
+import dataclasses
+from dataclasses import replace
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax.flatten_util import ravel_pytree
+from jaxtyping import Array, Float
+
+from .._custom_types import BoolScalar, FloatScalar
+from .._numerics import (
+    block_tridiagonal_inverse,
+    compressed_products,
+    DenseMatrix,
+    DiagonalMatrix,
+    inverse,
+    InverseMatrix,
+    max_norm,
+    Pattern,
+    ReactionMatrix,
+    Sizes,
+    small_einsum,
+    SquareMatrix,
+    stop_gradient,
+    unit,
+)
+from .._system import Linearisation
+from ._equations import (
+    constraint_jacobian,
+    constraint_values,
+    end_residual,
+    invariant_correction,
+    invariant_errors,
+    is_in_chart,
+    node_residual,
+    sparse_constraint_jacobian,
+    stage_forces,
+    stage_velocities,
+    StageEquations,
+    StageForces,
+    StageUnknowns,
+)
+from ._first_order import (
+    first_order_terms,
+    FirstOrderTerms,
+    JacobianName,
+    momenta_of_forces,
+    uses_first_order_terms,
+)
+from ._invariants import InvariantCorrection
+
+
+# The update.
+
+
+class Evaluation(NamedTuple):
+    """The stage equations, evaluated by a stage solver at its last iterate.
+
+    `newton` says whether Newton's method had to take over from simplified Newton.
+    """
+
+    forces: StageForces
+    node_residual: Float[Array, "r n"]
+    newton: BoolScalar
+
+
+def simplified_newton_update(
+    stages: StageEquations, factors: "StageJacobianFactors", x: StageUnknowns
+) -> tuple[StageUnknowns, Evaluation]:
+    """Compute the next iterate of simplified Newton, and evaluate the equations at x.
+
+    Each residual is evaluated at the newest iterate (Gauss-Seidel). This costs the same
+    as evaluating all of them at x, and converges faster.
+    """
+    forces = stage_forces(stages, x)
+    x_next = factors.correct_stages(stages, x, forces.residual)
+    r_nodes = node_residual(stages, x_next, forces.force)
+    change = x_next.velocity - x.velocity
+    x_next = factors.correct_nodes(stages, x_next, r_nodes, change)
+    if stages.invariants is not None:
+        # The impulses come before the constraints, so that the constraints see the
+        # change by the impulses. If a system is nearly at rest, the work of the
+        # reactions on this change is not small.
+        error = invariant_errors(stages, x_next)
+        x_next = factors.correct_impulses(stages, x_next, error)
+    if stages.constrained:
+        kinematic, holonomic = constraint_values(stages, x_next)
+        x_next = factors.correct_multipliers(stages, x_next, kinematic, holonomic)
+    if stages.end_multiplier_is_unknown:
+        # λ_c depends on v_{k+1} at zeroth order: it must be corrected with the new
+        # velocity. Otherwise the two errors feed each other, and the rate of
+        # convergence is only the square root.
+        x_next = factors.correct_end(stages, x_next, end_residual(stages, x_next))
+    return x_next, Evaluation(forces, r_nodes, jnp.asarray(False))
+
+
+class MultiplierResponses(NamedTuple):
+    """The changes of stages and nodes with each unknown of the multipliers.
+
+    The last axis lists these unknowns, h δy of the closure and h δΛ. With the terms of
+    order h the responses are stored, since the Schur complement is formed from them.
+    """
+
+    velocity: Float[Array, "s n c"]
+    node_fibre_coordinate: Float[Array, "r n c"]
+
+
+class StageJacobianFactors(eqx.Module):
+    """A part of the Jacobian of the stage equations of one step, factorised.
+
+    With N and K at the start of the step, B_i at the nodes of given stages, R the node
+    rows of a_ij and δΛ the change of all multipliers, the unknowns change by
+
+    δu_i = -N⁻¹ r_u + h Σ_j â_ij K⁻¹ B_jᵀ δΛ_j        (stages),
+    δu_i = -N⁻¹ r_v + h Σ_j R_ij K⁻¹ B_jᵀ δΛ_j        (nodes).
+
+    The constraints require B_i δu_i = -r_Φ at the nodes, Σ_j a_ij B_i δu_j = -r_Γ at
+    the positions, and B_s δu_s = -r for the rate of the holonomic constraints at the
+    end of the step. These three conditions give a Schur complement for the unknowns
+    h δy of the closure and h δΛ of the holonomic constraints. For small h it is
+    invertible by hypothesis H2 (for the symmetric closure by the sign of ν) and the
+    compatibility condition.
+
+    With `first_order`, the terms of order h are added to N⁻¹ r, and the changes with
+    the multipliers are the `responses`, which include these terms.
+    """
+
+    momentum_inverse: SquareMatrix
+    reaction: ReactionMatrix
+    velocity_reaction: ReactionMatrix
+    schur_inverse: InverseMatrix
+    end: Linearisation
+    impulses: InvariantCorrection | None = None
+    first_order: FirstOrderTerms | None = None
+    responses: MultiplierResponses | None = None
+
+    def correct_stages(
+        self, stages: StageEquations, x: StageUnknowns, residual: Float[Array, "s n"]
+    ) -> StageUnknowns:
+        """Compute u - N⁻¹ r_u for the stages, and their velocities."""
+        change = self.momentum_inverse.matvec(residual)
+        if self.first_order is not None:
+            change = self.first_order.of_stages(stages, change)
+        if not stages.hamiltonian:
+            return eqx.tree_at(lambda z: z.velocity, x, x.velocity - change)
+        x = eqx.tree_at(lambda z: z.momentum, x, x.momentum - change)
+        return eqx.tree_at(lambda z: z.velocity, x, stage_velocities(stages, x))
+
+    def correct_nodes(
+        self,
+        stages: StageEquations,
+        x: StageUnknowns,
+        residual: Float[Array, "r n"],
+        change: Float[Array, "s n"],
+    ) -> StageUnknowns:
+        """Compute the fibre coordinates u - N⁻¹ r_v of the nodes.
+
+        The residual was evaluated at positions that include the `change` of the stage
+        velocities, but with forces that do not.
+        """
+        du = -self.momentum_inverse.matvec(residual)
+        if self.first_order is not None:
+            du = self.first_order.of_nodes(du)
+            du = du + self.first_order.by_force(stages, change)
+        at_nodes = x.node_fibre_coordinate + du
+        return eqx.tree_at(lambda z: z.node_fibre_coordinate, x, at_nodes)
+
+    def correct_multipliers(
+        self,
+        stages: StageEquations,
+        x: StageUnknowns,
+        kinematic: Float[Array, "r m"] | Float[Array, "0"],
+        holonomic: Float[Array, "s k"] | Float[Array, "0"],
+    ) -> StageUnknowns:
+        """Change the free multipliers so that the linearised constraints hold."""
+        residual = jnp.concatenate([kinematic.reshape(-1), holonomic.reshape(-1)])
+        change = -self.schur_inverse.matvec(residual)
+        h_dy = change[: x.closure.size].reshape(x.closure.shape)
+        h_dholonomic = change[x.closure.size :].reshape(x.holonomic.shape)
+        if self.responses is not None:
+            velocity, at_nodes = self.responses
+            return replace(
+                x,
+                velocity=x.velocity + small_einsum("inc,c->in", velocity, change),
+                node_fibre_coordinate=x.node_fibre_coordinate
+                + small_einsum("inc,c->in", at_nodes, change),
+                closure=x.closure + h_dy / stages.h,
+                holonomic=x.holonomic + h_dholonomic / stages.h,
+            )
+        h_dlambda = stages.free_multipliers(h_dy, h_dholonomic)
+        # This is h K⁻¹ Bᵀ δΛ; only the multipliers need a division by h.
+        push = self.reaction.matvec(h_dlambda)
+        a_hat, momentum = stages.coefficients("a_hat"), x.momentum
+        velocity_push = push
+        if stages.hamiltonian:
+            velocity_push = self.velocity_reaction.matvec(h_dlambda)
+            momentum = momentum + small_einsum("ij,jn->in", a_hat, push)
+        return replace(
+            x,
+            velocity=x.velocity + small_einsum("ij,jn->in", a_hat, velocity_push),
+            momentum=momentum,
+            node_fibre_coordinate=x.node_fibre_coordinate
+            + small_einsum("ij,jn->in", stages.node_weights, push),
+            closure=x.closure + h_dy / stages.h,
+            holonomic=x.holonomic + h_dholonomic / stages.h,
+        )
+
+    def correct_end(
+        self,
+        stages: StageEquations,
+        x: StageUnknowns,
+        residual: tuple[Float[Array, " n"], Float[Array, " l"]],
+    ) -> StageUnknowns:
+        """Correct the acceleration and λ_c at the end of the step.
+
+        The unknowns of the closure change with λ_c, so that the nodes stay the same to
+        leading order. Otherwise their constraints, which have just been solved, would
+        be violated again, which would cost another iteration.
+        """
+        momentum_residual, hidden_residual = residual
+        da, dlam = self.end.solve(-momentum_residual, -hidden_residual)
+        m = stages.num_nonholonomic
+        dlam_closure = dlam[:m]
+        response, on_stages = map(
+            stages.closure_weights, ("response", "stage_response")
+        )
+
+        def pushed(u: Array, reaction: ReactionMatrix) -> Array:
+            last = reaction[-1].first_columns(m)
+            return u + jnp.outer(on_stages, stages.h * last.matvec(dlam_closure))
+
+        momentum = x.momentum
+        if stages.hamiltonian:
+            momentum = pushed(momentum, self.reaction)
+        return replace(
+            x,
+            velocity=pushed(x.velocity, self.velocity_reaction),
+            momentum=momentum,
+            closure=x.closure + jnp.outer(response, dlam_closure),
+            end_acceleration=x.end_acceleration + da,
+            end_multiplier=x.end_multiplier + dlam,
+        )
+
+    def correct_impulses(
+        self, stages: StageEquations, x: StageUnknowns, error: Float[Array, " k"]
+    ) -> StageUnknowns:
+        """Change ε so that the linearised equations of the invariants hold.
+
+        The stages and nodes change with ε, so that their momentum equations, which have
+        just been solved, still hold to leading order.
+        """
+        weights = self.impulses
+        assert weights is not None
+        change = weights.change(x.impulse, error)
+        start, velocity, end = (
+            small_einsum("k,kn->n", change, direction)
+            for direction in (weights.start, weights.velocity, weights.end)
+        )
+        momentum = x.momentum
+        if stages.hamiltonian:
+            momentum = momentum + start[None]
+        at_nodes = x.node_fibre_coordinate + start[None]
+        return replace(
+            x,
+            velocity=x.velocity + velocity[None],
+            momentum=momentum,
+            node_fibre_coordinate=jnp.concatenate(
+                [at_nodes[:-1], at_nodes[-1:] + end[None]]
+            ),
+            impulse=x.impulse + change,
+        )
+
+
+# The factors.
+
+
+def factorise_stage_jacobian(
+    stages: StageEquations,
+    x: StageUnknowns,
+    lin: Linearisation,
+    jacobian: JacobianName,
+) -> StageJacobianFactors:
+    """Factorise the stage Jacobian, with N and K at the start of the step, B_i at x.
+
+    `jacobian` selects whether the terms of order h are included.
+    """
+    factors = _factors_without_impulses(stages, x, lin, jacobian)
+    if stages.invariants is None:
+        return factors
+    return replace(factors, impulses=invariant_correction(stages, x))
+
+
+def _factors_without_impulses(
+    stages: StageEquations, x: StageUnknowns, lin: Linearisation, jacobian: JacobianName
+) -> StageJacobianFactors:
+    terms = None
+    if uses_first_order_terms(stages, lin, jacobian):
+        terms = first_order_terms(stages, x, lin)
+    if not stages.constrained:
+        n, dtype = stages.p.shape[0], stages.p.dtype
+        reaction = DenseMatrix(jnp.zeros((stages.method.stages, n, 0), dtype))
+        schur_inverse = DenseMatrix(jnp.zeros((0, 0), dtype))
+        given = lin.momentum_inverse, reaction, reaction, schur_inverse, lin
+        return StageJacobianFactors(*given, first_order=terms)
+    if lin.jacobian.pattern is not None:
+        return _sparse_factors(stages, x, lin, lin.jacobian.pattern)
+    at_nodes = constraint_jacobian(stages, x)
+    rows = jnp.concatenate([lin.jacobian.as_matrix()[None], at_nodes])
+    if terms is not None:
+        return _first_order_factors(stages, x, lin, rows, terms)
+    return _dense_factors(stages, lin, rows)
+
+
+def _dense_factors(
+    stages: StageEquations, lin: Linearisation, jacobian: Float[Array, "s l n"]
+) -> StageJacobianFactors:
+    """Compute the factors with the Jacobians B of the constraints at all stages."""
+    reaction = DenseMatrix(jacobian).weighted_transpose(lin.metric_inverse).entries
+    rows, redundancy = jacobian[1:], stages.redundancy
+    if redundancy is not None:
+        rows = small_einsum("ab,ibn->ian", redundancy.projector, rows)
+    blocks = small_einsum("ian,jnb->ijab", rows, reaction)
+    schur, compliance = _schur_complement(stages, blocks), blocks[-1, -1]
+    if redundancy is not None:
+        compliance = compliance + redundancy.rest
+        schur = schur + redundancy.schur_rest(
+            stages.method.stages, stages.num_nonholonomic
+        )
+    velocity_reaction = reaction
+    if stages.hamiltonian:
+        velocity_reaction = jnp.swapaxes(jacobian, 1, 2)
+    return StageJacobianFactors(
+        momentum_inverse=lin.momentum_inverse,
+        reaction=DenseMatrix(reaction),
+        velocity_reaction=DenseMatrix(velocity_reaction),
+        schur_inverse=DenseMatrix(inverse(schur)),
+        end=replace(
+            lin,
+            jacobian=DenseMatrix(rows[-1]),
+            reaction=DenseMatrix(reaction[-1]),
+            compliance_inverse=DenseMatrix(inverse(compliance)),
+        ),
+    )
+
+
+def _schur_complement(
+    stages: StageEquations, blocks: Float[Array, "r s l l"]
+) -> Float[Array, "c c"]:
+    """Assemble the derivative of the constraints by h δy and h δΛ.
+
+    `blocks` are the products B_i K⁻¹ B_jᵀ for i >= 2 and all j.
+    """
+    m, k, s = stages.num_nonholonomic, stages.num_holonomic, stages.method.stages
+    a, a_hat, b = (stages.coefficients(name) for name in ("a", "a_hat", "b"))
+    rows = []
+    if m:
+        nodes = small_einsum("ij,ijab->iajb", a[1:], blocks[:, :, :m])
+        rows.append(nodes.reshape((s - 1) * m, s, m + k))
+    if k:
+        positions = small_einsum(
+            "ij,ijab->iajb", small_einsum("ik,kj->ij", a[1:], a_hat), blocks[:, :, m:]
+        )
+        rows.append(positions.reshape((s - 1) * k, s, m + k))
+        rows.append(small_einsum("j,jab->ajb", b, blocks[-1, :, m:]))
+    change = jnp.concatenate(rows)
+    columns = []
+    if m:
+        closure = small_einsum(
+            "cjb,jl->clb", change[:, :, :m], stages.closure_weights("E")
+        )
+        columns.append(closure.reshape(change.shape[0], -1))
+    if k:
+        columns.append(change[:, :, m:].reshape(change.shape[0], -1))
+    return jnp.concatenate(columns, axis=1)
+
+
+def _sparse_factors(
+    stages: StageEquations, x: StageUnknowns, lin: Linearisation, pattern: Pattern
+) -> StageJacobianFactors:
+    """Compute the factors for constraints each of which uses few coordinates."""
+    nodes = sparse_constraint_jacobian(stages, x, pattern)
+    rows = nodes.stacked_after(lin.jacobian)
+    reaction = rows.weighted_transpose(lin.metric_inverse)
+    products = compressed_products(rows[1:], reaction)
+    a, a_hat, b = (stages.coefficients(name) for name in ("a", "a_hat", "b"))
+    if stages.num_nonholonomic:
+        weights = a[1:, :, None] * stages.closure_weights("E")[None]
+        schur = small_einsum("ijk,ijcbl->ikcbl", weights, products)
+    else:
+        weights = small_einsum("ik,kj->ij", a[1:], a_hat)
+        on_positions = weights[:, :, None, None, None] * products
+        on_rate = b[:, None, None, None] * products[-1]
+        schur = jnp.concatenate([on_positions, on_rate[None]])
+    end = replace(
+        lin,
+        jacobian=rows[-1],
+        reaction=reaction[-1],
+        compliance_inverse=block_tridiagonal_inverse(products[-1:, -1:], pattern),
+    )
+    velocity_reaction = reaction
+    if stages.hamiltonian:
+        ones = DiagonalMatrix(jnp.ones_like(stages.p))
+        velocity_reaction = rows.weighted_transpose(ones)
+    return StageJacobianFactors(
+        momentum_inverse=lin.momentum_inverse,
+        reaction=reaction,
+        velocity_reaction=velocity_reaction,
+        schur_inverse=block_tridiagonal_inverse(schur, pattern),
+        end=end,
+    )
+
+
+def _first_order_factors(
+    stages: StageEquations,
+    x: StageUnknowns,
+    lin: Linearisation,
+    jacobian: Float[Array, "s l n"],
+    terms: FirstOrderTerms,
+) -> StageJacobianFactors:
+    """Compute the factors with the terms of order h."""
+    reaction = DenseMatrix(jacobian).weighted_transpose(lin.metric_inverse)
+    momenta = momenta_of_forces(stages, x, _reactions(stages, jacobian))
+    on_stages, on_nodes = (
+        jnp.swapaxes(lin.momentum_inverse.matvec(jnp.swapaxes(p, 1, 2)), 1, 2)
+        for p in momenta
+    )
+    velocity = terms.of_stages(stages, on_stages)
+    at_nodes = terms.of_nodes(on_nodes) + terms.by_force(stages, velocity)
+    at_nodes = at_nodes + terms.by_position(stages, velocity)
+
+    def constraints(velocity, at_nodes):
+        moved = replace(x, velocity=velocity, node_fibre_coordinate=at_nodes)
+        return jnp.concatenate(
+            [value.reshape(-1) for value in constraint_values(stages, moved)]
+        )
+
+    _, push = jax.linearize(constraints, x.velocity, x.node_fibre_coordinate)
+    schur = jax.vmap(push, in_axes=2, out_axes=1)(velocity, at_nodes)
+    return StageJacobianFactors(
+        momentum_inverse=lin.momentum_inverse,
+        reaction=reaction,
+        velocity_reaction=reaction,
+        schur_inverse=DenseMatrix(inverse(schur)),
+        end=_with_mass_at_end(lin, terms, jacobian[-1]),
+        first_order=terms,
+        responses=MultiplierResponses(velocity, at_nodes),
+    )
+
+
+def _reactions(
+    stages: StageEquations, jacobian: Float[Array, "s l n"]
+) -> Float[Array, "s n c"]:
+    """Compute the reactions at the stages to each unknown of the closure, each Λ."""
+    m, one = stages.num_nonholonomic, jnp.eye(len(jacobian), dtype=jacobian.dtype)
+    weights = stages.closure_weights("E")
+    parts = [
+        small_einsum("jmn,jr->jnrm", jacobian[:, :m], weights),
+        small_einsum("jkn,ji->jnik", jacobian[:, m:], one),
+    ]
+    columns = [x.reshape(*x.shape[:2], x.shape[2] * x.shape[3]) for x in parts]
+    return jnp.concatenate(columns, axis=2)
+
+
+def _with_mass_at_end(
+    lin: Linearisation, terms: FirstOrderTerms, jacobian: Float[Array, "l n"]
+) -> Linearisation:
+    """Replace the mass matrix and constraints of a linearisation by those at the end.
+
+    Otherwise u̇ and λ_c at the end would converge no faster than without these terms.
+    """
+    at_start = lin.momentum_inverse.as_matrix()
+    change = small_einsum("kl,ln->kn", terms.node_inertia[-1], at_start)
+    at_end = at_start - change
+    reaction = small_einsum("kn,ln->kl", at_end, jacobian)
+    compliance = small_einsum("kn,nl->kl", jacobian, reaction)
+    return replace(
+        lin,
+        metric_inverse=DenseMatrix(at_end),
+        jacobian=DenseMatrix(jacobian),
+        reaction=DenseMatrix(reaction),
+        compliance_inverse=DenseMatrix(inverse(compliance)),
+    )
+
+
+# The residual in one vector.
+
+
+def stage_residual(
+    stages: StageEquations, x: StageUnknowns
+) -> tuple[Float[Array, " k"], Evaluation]:
+    """Evaluate all equations of a step (the paper's four summaries) in one vector.
+
+    A stage solver of your own looks for the stages at which the vector vanishes; see
+    the page on extending in the documentation.
+
+    **Arguments:**
+
+    - `stages`: the equations of the step, an argument of `AbstractStageSolver.solve`.
+    - `x`: the unknowns, a pytree with the structure of the starting values, which are
+        another argument of `solve`.
+
+    **Returns:** the residuals, of shape (k,) with as many entries as `x` has numbers,
+    in the units of momenta and of the constraints; and the values that were evaluated
+    on the way, which belong into the field `aux` of `Solved`.
+
+    !!! example
+
+        >>> import nhjax
+        >>> import equinox as eqx
+        >>> class Checked(nhjax.AbstractStageSolver):
+        ...     solver: nhjax.Newton = nhjax.Newton()
+        ...     max_iterations: int = eqx.field(static=True, default=30)
+        ...     tolerance: float = 0.0
+        ...     def solve(self, stages, x0, lin, skip):
+        ...         r, _ = nhjax.stage_residual(stages, x0)
+        ...         assert r.shape == (20,)
+        ...         return self.solver.solve(stages, x0, lin, skip)
+        ...     def frozen_newton_map(self, stages, lin, x):
+        ...         return self.solver.frozen_newton_map(stages, lin, x)
+        >>> disc = nhjax.systems.VerticalRollingDisc()
+        >>> sol = nhjax.integrate(disc.system, nhjax.LobattoIIIAB(2),
+        ...     disc.initial_state(), dt=0.1, num_steps=1, stage_solver=Checked())
+        >>> int(sol.stats["num_steps"])
+        1
+    """
+    forces = stage_forces(stages, x)
+    r_nodes = node_residual(stages, x, forces.force)
+    parts = [forces.residual, r_nodes]
+    if stages.hamiltonian:
+        parts.append(x.velocity - stage_velocities(stages, x))
+    parts += constraint_values(stages, x)
+    if stages.end_multiplier_is_unknown:
+        parts += end_residual(stages, x)
+    if stages.invariants is not None:
+        # This is the equation that simplified Newton solves.
+        weights = stop_gradient(invariant_correction(stages, x))
+        parts.append(-weights.change(x.impulse, invariant_errors(stages, x)))
+    return (
+        ravel_pytree(parts)[0],
+        Evaluation(forces, r_nodes, jnp.asarray(False)),
+    )
+
+
+# The norms of updates.
+
+
+def update_norms(
+    stages: StageEquations, x: StageUnknowns, x_next: StageUnknowns, lin: Linearisation
+) -> Sizes:
+    """Measure an increment and the fibre coordinates of the next iterate.
+
+    Only the coordinates at the end of the step are measured: this is enough to judge
+    the increment, and measuring all coordinates would cost time.
+    """
+    increment = increment_size(stages, x, x_next, lin)
+    return Sizes(increment, max_norm(x_next.node_fibre_coordinate[-1]))
+
+
+def fibre_coordinate_size(stages: StageEquations, x: StageUnknowns) -> FloatScalar:
+    """Return the smaller of the max norms of the stage and node fibre coordinates.
+
+    While an iteration is far from a solution, one of the two can be much larger than
+    any size that is related to the other.
+    """
+    u = x.momentum if stages.hamiltonian else x.velocity
+    return jnp.minimum(max_norm(u), max_norm(x.node_fibre_coordinate))
+
+
+def increment_size(
+    stages: StageEquations, x: StageUnknowns, x_next: StageUnknowns, lin: Linearisation
+) -> FloatScalar:
+    """Measure an increment by its largest change of fibre coordinates.
+
+    The size is infinite once the iterates have left the chart.
+    """
+    changes = [
+        x_next.node_fibre_coordinate - x.node_fibre_coordinate,
+        x_next.velocity - x.velocity,
+    ]
+    if stages.hamiltonian:
+        changes[1] = lin.metric_inverse.matvec(changes[1])
+        changes.append(x_next.momentum - x.momentum)
+    if stages.constrained:
+        # Multipliers are measured by their effect h N⁻¹ R δΛ on u, separately from the
+        # changes of u itself: Λ can still be wrong where the stages and nodes happen to
+        # be right.
+        before, after = map(stages.multiplier_change, (x, x_next))
+        # With one constraint this is a number that is the same for all iterates.
+        reaction = lin.reaction.max_norm_equivalent()
+        changes.append(stages.h * reaction.matvec(after - before))
+    size = max_norm(*changes)
+    if stages.manifold.is_flat:
+        return size
+    return jnp.where(is_in_chart(stages, x_next), size, jnp.inf)
+
+
+def unknown_units(stages: StageEquations, lin: Linearisation) -> list[FloatScalar]:
+    """Return the size of each field of `StageUnknowns` that changes u by one.
+
+    As in `increment_size`, multipliers are measured by their effect h N⁻¹ R δΛ on u.
+    The round-off of a multiplier grows like 1 / h: measured by its own size, it could
+    not be told from an iteration that does not converge.
+    """
+    h = jnp.abs(stages.h)
+    one = jnp.ones_like(h)
+    velocity = one
+    if stages.hamiltonian:
+        velocity = 1 / unit(lin.metric_inverse.largest_entry_bound())
+    multiplier = 1 / unit(h * lin.reaction.largest_entry_bound())
+    units = {
+        "velocity": velocity,
+        "momentum": one,
+        "node_fibre_coordinate": one,
+        "closure": multiplier,
+        "holonomic": multiplier,
+        "end_acceleration": 1 / unit(h),
+        "end_multiplier": multiplier,
+    }
+    if stages.invariants is not None:
+        largest = max_norm(lin.momentum_inverse.matvec(stages.invariants.covectors))
+        units["impulse"] = 1 / unit(largest)
+    names = [field.name for field in dataclasses.fields(StageUnknowns)]
+    return [units[name] for name in names if name in units]
