@@ -20,7 +20,7 @@ from jaxtyping import Array, Float, PyTree
 from .._compile import as_cpu_kernel, tracked_jit
 from .._custom_types import Args, BoolScalar, FloatScalar
 from .._errors import Check, DependentConstraintsError, naming, ShapeError
-from .._numerics import is_deficient, jacobian_and_value, max_norm, unit
+from .._numerics import is_deficient, jacobian_and_value, max_norm, nonzero_or_one
 from .._system import AbstractMechanicalSystem, linearise, State
 
 
@@ -88,7 +88,7 @@ class LinearisedEquations(NamedTuple):
 
 def state_size(y: State) -> Array:
     """Return the largest absolute value in a state, the scale of its errors."""
-    return unit(max_norm(*jax.tree.leaves(y.q), y.v, y.p))
+    return nonzero_or_one(max_norm(*jax.tree.leaves(y.q), y.v, y.p))
 
 
 @tracked_jit("system", "args")

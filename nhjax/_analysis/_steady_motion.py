@@ -19,10 +19,10 @@ from .._numerics import (
     iterate,
     jacobian_and_value,
     max_norm,
-    Sizes,
+    nonzero_or_one,
     Solved,
     stop_gradient,
-    unit,
+    UpdateNorms,
 )
 from .._system import AbstractMechanicalSystem, linearise, parameters, State
 from ._linearisation import (
@@ -380,12 +380,12 @@ def least_norm_root(
         # The pseudo-inverse ignores dependent equations.
         inverse = free[:, None] * jnp.linalg.pinv(jacobian * free[None, :])
         increment = inverse @ value
-        return x - increment, Sizes(max_norm(increment)), (inverse, jacobian)
+        return x - increment, UpdateNorms(max_norm(increment)), (inverse, jacobian)
 
     solved = iterate(
         newton_step,
         jnp.zeros_like(free),
-        unit(max_norm(start)),
+        nonzero_or_one(max_norm(start)),
         max_iterations=max_iterations,
     )
     x, (inverse, jacobian) = stop_gradient((solved.x, solved.aux))

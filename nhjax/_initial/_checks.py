@@ -16,7 +16,7 @@ from .._errors import (
     NewtonError,
     NonFiniteError,
 )
-from .._numerics import Rank
+from .._numerics import RankCondition
 from .._system import (
     AbstractMechanicalSystem,
     all_finite,
@@ -52,7 +52,7 @@ class Found(NamedTuple):
     positions: Float[Array, " k"]  # the holonomic constraints
     off_group: FloatScalar
     regularity: FloatScalar
-    ranks: list[Rank]
+    ranks: list[RankCondition]
     deficient: list[BoolScalar]
     compatibility: FloatScalar
     allowed: Float[Array, " l"]
@@ -257,7 +257,7 @@ def _force_error(case: _Case) -> NonFiniteError:
     )
 
 
-def _dependence_error(case: _Case, rank: Rank) -> DependentConstraintsError:
+def _dependence_error(case: _Case, rank: RankCondition) -> DependentConstraintsError:
     return dependence_error(
         rank.jacobian,
         case.found.positions.shape[0],

@@ -6,16 +6,16 @@ from .._compile import as_cpu_kernel, tracked_jit
 from .._custom_types import Args, BoolScalar, FloatScalar, FloatScalarLike
 from .._errors import DTypeError, require, ShapeError
 from .._numerics import (
+    active_ranks,
+    has_zero_row,
     inverse,
-    is_without_entries,
     max_norm,
     nan_unless,
-    Rank,
     rank_of_gram,
+    RankCondition,
     reciprocal_condition,
     root,
     stop_gradient,
-    those_that_count,
     tree_where,
 )
 from .._system import (
@@ -175,7 +175,7 @@ def _solve(system, t, q, v, p, args, project: bool, keep: tuple[Kept, Kept]) -> 
             start = q
             nearest = project_position(system, t, q, guess, args, keep_q, given_q)
             q, projected, fixed_q = nearest.x, nearest.found, nearest.fixed
-            starts.append(Rank(nearest.jacobian, start, ~projected))
+            starts.append(RankCondition(nearest.jacobian, start, ~projected))
         if keep_q.indices:
             q = keep_q.restored(q, given_q)
             off_group = manifold.distance_to_group(stop_gradient(q))
@@ -184,7 +184,7 @@ def _solve(system, t, q, v, p, args, project: bool, keep: tuple[Kept, Kept]) -> 
         u, legendre_solved = _inverse_legendre(system, t, q, given, args)
     if project and (system.nonholonomic is not None or system.holonomic is not None):
         nearest = project_fibre_coordinate(system, t, q, u, args, keep_u, given)
-        starts.append(Rank(nearest.jacobian, q, projected & ~nearest.found))
+        starts.append(RankCondition(nearest.jacobian, q, projected & ~nearest.found))
         u, projected = nearest.x, projected & nearest.found
         fixed_u = nearest.fixed
     lin, found_v, found_p = as_cpu_kernel(_motion, system, t, q, u, args)
@@ -201,11 +201,9 @@ def _solve(system, t, q, v, p, args, project: bool, keep: tuple[Kept, Kept]) -> 
     system, args, t, q, u, lin, starts = stop_gradient(
         (system, args, t, q, u, lin, starts)
     )
-    here = Rank(lin.dense[0], q, projected)
+    here = RankCondition(lin.dense[0], q, projected)
     ranks = (
-        [here]
-        if system.constraints == "redundant"
-        else those_that_count([*starts, here])
+        [here] if system.constraints == "redundant" else active_ranks([*starts, here])
     )
     positions = system.position_constraint(t, q, args)
     deficient, compatibility = _ranks_judged(system, lin, ranks)
@@ -265,7 +263,7 @@ def _motion(
 
 
 def _ranks_judged(
-    system: AbstractMechanicalSystem, lin: Linearisation, ranks: list[Rank]
+    system: AbstractMechanicalSystem, lin: Linearisation, ranks: list[RankCondition]
 ) -> tuple[list[BoolScalar], FloatScalar]:
     """Return which ranks are deficient, and the reciprocal condition number of C.
 
@@ -274,12 +272,12 @@ def _ranks_judged(
     derivatives of a constraint are zero.
     """
     jacobian, reaction, _ = lin.dense
-    compliance = jacobian @ reaction
+    delassus = jacobian @ reaction
     if system.constraints != "redundant":
-        return [rank.deficient for rank in ranks], reciprocal_condition(compliance)
+        return [rank.deficient for rank in ranks], reciprocal_condition(delassus)
     rank = rank_of_gram(jacobian @ jacobian.T)
-    full = (rank_of_gram(compliance) == rank).astype(compliance.dtype)
-    return [rank.counts & is_without_entries(rank.jacobian) for rank in ranks], full
+    full = (rank_of_gram(delassus) == rank).astype(delassus.dtype)
+    return [rank.is_active & has_zero_row(rank.jacobian) for rank in ranks], full
 
 
 def _inverse_legendre(

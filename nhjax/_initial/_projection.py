@@ -440,14 +440,14 @@ def _nearest(
     size, terms = sizes(jacobian)
     # Round-off of the constraint changes y too; it is the only round-off if y is zero.
     reaction = inverse(metric) @ jacobian.T
-    compliance = jacobian @ reaction
+    delassus = jacobian @ reaction
     if idle is not None:
-        compliance = compliance + jnp.diag(idle)
+        delassus = delassus + jnp.diag(idle)
     invert, solve = inverse, jnp.linalg.solve
     if is_redundant:
         invert = partial(least_norm_inverse, negligible=NEARLY_DEPENDENT**2)
         solve = least_norm_solve
-    response = reaction @ invert(compliance)
+    response = reaction @ invert(delassus)
     scale = size + max_norm(jnp.abs(response) @ terms)
 
     def stationarity(z):

@@ -201,7 +201,12 @@ def _agree(old: Linearisation, new: Linearisation) -> BoolScalar:
     """Return whether the matrices of two linearisations agree up to eps^(1/4)."""
     pairs = [
         pair
-        for name in ("metric_inverse", "jacobian", "reaction", "compliance_inverse")
+        for name in (
+            "fibre_hessian_inverse",
+            "jacobian",
+            "reaction",
+            "delassus_inverse",
+        )
         for pair in zip(
             jax.tree.leaves(getattr(old, name)),
             jax.tree.leaves(getattr(new, name)),

@@ -15,7 +15,7 @@ from .._custom_types import Args, BoolScalar, FloatScalar
 from .._errors import DTypeError, naming, ShapeError
 from .._numerics import (
     ClosureConverted,
-    dependence,
+    jacobian_sparsity,
     max_norm,
     square_jacobian,
     stop_gradient,
@@ -142,7 +142,7 @@ def _require_conserved_energy(
 def _depends_on_time(function: Callable[..., Any], t: FloatScalar, *rest: Any) -> bool:
     """Tell whether the program of a function contains its first argument."""
     time = jnp.reshape(t, (1,))
-    found = dependence(lambda t: jnp.atleast_1d(function(t[0], *rest)), time)
+    found = jacobian_sparsity(lambda t: jnp.atleast_1d(function(t[0], *rest)), time)
     return bool(np.any(found))
 
 
@@ -175,7 +175,7 @@ def conserves(
 
         def nearer(_, u):
             lin = linearise(system, t, q, u, args)
-            excess = lin.compliance_inverse.matvec(lin.violation)
+            excess = lin.delassus_inverse.matvec(lin.violation)
             return u - lin.reaction.matvec(excess)
 
         u = jax.lax.fori_loop(0, _ITERATIONS, nearer, u0 + w * (1 + jnp.abs(u0)))

@@ -19,7 +19,7 @@ from jaxtyping import Array, Float, Int, PyTree
 from .._compile import TraceCache
 from .._custom_types import Args, BoolScalar, FloatScalar, IntScalar
 from .._method import AbstractMethod
-from .._numerics import iterate, max_norm, nan_gradient_unless, Sizes, tree_where
+from .._numerics import iterate, max_norm, nan_gradient_unless, tree_where, UpdateNorms
 from .._results import RESULTS
 from .._step import (
     AbstractStageSolver,
@@ -467,7 +467,7 @@ def step_back(
             multiplier = multiplier + miss
         size = max_norm(*misses)
         z = State(manifold.act(z.q, xi), z.v, z.p + misses[1], multiplier)
-        return z, Sizes(size), y
+        return z, UpdateNorms(size), y
 
     scale = 1 + max_norm(target.p)
     limit = stepper.stage_solver.max_iterations

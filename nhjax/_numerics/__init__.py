@@ -6,10 +6,10 @@ from ._floating_point import (
     max_norm as max_norm,
     measured_noise as measured_noise,
     NOISE_DEVIATIONS as NOISE_DEVIATIONS,
+    nonzero_or_one as nonzero_or_one,
     relative as relative,
     two_sum as two_sum,
     uneven_perturbations as uneven_perturbations,
-    unit as unit,
 )
 from ._implicit import (
     AbstractImplicitFunction as AbstractImplicitFunction,
@@ -29,8 +29,8 @@ from ._iteration import (
     iterate as iterate,
     jacobian_and_value as jacobian_and_value,
     NOISE_UNITS as NOISE_UNITS,
-    Sizes as Sizes,
     Solved as Solved,
+    UpdateNorms as UpdateNorms,
 )
 from ._operators import (
     AbstractOperator as AbstractOperator,
@@ -42,27 +42,27 @@ from ._operators import (
     full_jacobian as full_jacobian,
     InverseMatrix as InverseMatrix,
     JacobianMatrix as JacobianMatrix,
-    Pattern as Pattern,
     ReactionMatrix as ReactionMatrix,
     sparse_jacobian as sparse_jacobian,
     SparseMatrix as SparseMatrix,
+    SparsityPattern as SparsityPattern,
     square_jacobian as square_jacobian,
     SquareMatrix as SquareMatrix,
     WeightedTranspose as WeightedTranspose,
 )
 from ._rank import (
+    active_ranks as active_ranks,
     dependent_rows as dependent_rows,
+    has_zero_row as has_zero_row,
     is_deficient as is_deficient,
     is_nearly_singular as is_nearly_singular,
-    is_without_entries as is_without_entries,
     least_norm_inverse as least_norm_inverse,
     least_norm_inverse_by_blocks as least_norm_inverse_by_blocks,
     least_norm_solve as least_norm_solve,
     NEARLY_DEPENDENT as NEARLY_DEPENDENT,
-    Rank as Rank,
     rank_of_gram as rank_of_gram,
+    RankCondition as RankCondition,
     reciprocal_condition as reciprocal_condition,
     reciprocal_condition_of_range as reciprocal_condition_of_range,
-    those_that_count as those_that_count,
 )
-from ._sparsity import dependence as dependence
+from ._sparsity import jacobian_sparsity as jacobian_sparsity

@@ -54,7 +54,7 @@ def largest_column(*arrays: Float[Array, "_ n"]) -> tuple[FloatScalar, Int[Array
     return value, column
 
 
-def unit(scale: FloatScalarLike | Float[Array, "*k"]) -> Float[Array, "*k"]:
+def nonzero_or_one(scale: FloatScalarLike | Float[Array, "*k"]) -> Float[Array, "*k"]:
     """Return the scale, or one where the scale is zero."""
     return jnp.where(scale > 0, scale, 1)
 
@@ -63,7 +63,7 @@ def relative(
     size: Float[Array, "*k"], scale: FloatScalarLike | Float[Array, "*k"]
 ) -> Float[Array, "*k"]:
     """Divide a size by its scale, or by one where the scale is zero."""
-    return size / unit(scale)
+    return size / nonzero_or_one(scale)
 
 
 def two_sum(

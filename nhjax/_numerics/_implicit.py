@@ -21,8 +21,8 @@ from jaxtyping import Array, PyTree
 from .._compile import as_cpu_kernel, cse_dce, TraceCache
 from .._custom_types import BoolScalar, FloatScalar
 from ._contraction import with_small_products
-from ._floating_point import max_norm, unit
-from ._iteration import dense_increment, iterate, Sizes, Solved
+from ._floating_point import max_norm, nonzero_or_one
+from ._iteration import dense_increment, iterate, Solved, UpdateNorms
 
 
 # Terms of the Neumann series below this many units of round-off are left out.
@@ -161,7 +161,7 @@ def solve_contraction(
         def iteration(x):
             increment = _minus(b, matvec(x))
             x = [x + dx for x, dx in zip(x, increment, strict=True)]
-            return x, Sizes(size(increment), size(x)), None
+            return x, UpdateNorms(size(increment), size(x)), None
 
         scale = size(b)
         tolerance = _UNITS_LEFT * float(jnp.finfo(scale.dtype).eps)
@@ -176,7 +176,7 @@ def solve_contraction(
         return nan_unless(solved.converged, solved.x)
 
     pairs = zip(given, units, strict=True)
-    scales = [unit(jax.lax.stop_gradient(one)) for x, one in pairs if x.size]
+    scales = [nonzero_or_one(jax.lax.stop_gradient(one)) for x, one in pairs if x.size]
     x = jax.lax.custom_linear_solve(
         operator,
         _depending_on_all(_not_empty(b)),
@@ -239,7 +239,7 @@ def root(
         # The part that is not judged must be finite too.
         rest = jnp.where(jnp.all(jnp.isfinite(dx)), 0, jnp.inf).astype(dx.dtype)
         size = rest + max_norm(*jax.tree.leaves(judged(unravel(dx))))
-        return x + dx, Sizes(size), None
+        return x + dx, UpdateNorms(size), None
 
     def newton(_, x):
         solved = iterate(iteration, x, scale, max_iterations=max_iterations)

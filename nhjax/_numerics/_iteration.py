@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from .._custom_types import BoolScalar, FloatScalar, FloatScalarLike
-from ._floating_point import unit
+from ._floating_point import nonzero_or_one
 
 
 X = TypeVar("X")
@@ -32,7 +32,7 @@ _HOPELESS = 1e6
 _LARGEST_NOISE = 1e5
 
 
-class Sizes(NamedTuple):
+class UpdateNorms(NamedTuple):
     """The sizes of an increment and of the iterate that it leads to, in the same unit.
 
     `noise`, where it is known, is the change of the iterate if the data of the problem
@@ -47,7 +47,7 @@ class Sizes(NamedTuple):
 class Solved(NamedTuple, Generic[X, Aux]):
     """The outcome of an iteration: its last iterate, and whether it has converged.
 
-    `aux` holds the auxiliary values of the last sweep. An iteration that has not
+    `aux` holds the auxiliary values of the last iteration. An iteration that has not
     converged is `exhausted` if it reached the maximum number of iterations; otherwise
     it has diverged.
     """
@@ -90,7 +90,7 @@ class _Progress(NamedTuple):
 
 
 def iterate(
-    sweep: Callable[[X], tuple[X, Sizes, Aux]],
+    iteration: Callable[[X], tuple[X, UpdateNorms, Aux]],
     x: X,
     scale: FloatScalar,
     *,
@@ -100,9 +100,9 @@ def iterate(
     noise_units: float | None = None,
     skip: Bool[Array, ""] | bool = False,
 ) -> Solved[X, Aux]:
-    """Repeat `sweep` until its increments no longer fall.
+    """Repeat `iteration` until its increments no longer fall.
 
-    `sweep(x)` returns the next iterate, the sizes of the increment and of the iterate,
+    `iteration(x)` returns the next iterate, the sizes of the increment and of the iterate,
     and auxiliary values at x. Increments are measured relative to `scale`, the size of
     x, or relative to the size of the iterate if that is larger, because x may start
     from zero. If both are zero, increments are measured relative to the first one. The
@@ -123,10 +123,10 @@ def iterate(
     the highest level is the square root of the unit round-off, which suits iterations
     that converge so fast that only noise can slow them down.
     """
-    # `jit` makes JAX trace the sweep once, for the shapes and for the loop. Tracing the
-    # sweep is most of the work of tracing a step.
-    sweep = jax.jit(sweep, inline=True)
-    aux_shape = jax.eval_shape(sweep, x)[2]
+    # `jit` makes JAX trace the iteration once, for the shapes and for the loop. Tracing the
+    # iteration is most of the work of tracing a step.
+    iteration = jax.jit(iteration, inline=True)
+    aux_shape = jax.eval_shape(iteration, x)[2]
     aux = jax.tree.map(lambda s: jnp.zeros(s.shape, s.dtype), aux_shape)
     dtype = jnp.result_type(*[leaf.dtype for leaf in jax.tree.leaves(x)])
     eps = float(jnp.finfo(dtype).eps)
@@ -144,7 +144,7 @@ def iterate(
 
     def body(carry):
         x, _, progress = carry
-        x_next, sizes, aux = sweep(x)
+        x_next, sizes, aux = iteration(x)
         return x_next, aux, _progress(rules, progress, sizes)
 
     zero = jnp.zeros((), jnp.int32)
@@ -159,11 +159,11 @@ def iterate(
     return Solved(x, aux, progress.converged, progress.exhausted, progress.iterations)
 
 
-def _progress(rules: _Rules, before: _Progress, sizes: Sizes) -> _Progress:
+def _progress(rules: _Rules, before: _Progress, sizes: UpdateNorms) -> _Progress:
     """Update the progress of an iteration by an increment; decide whether it ends."""
     increment = sizes.increment
     first = jnp.where(before.iterations == 0, increment, before.first)
-    # Sizes are compared without quotients, whose latencies would add up.
+    # UpdateNorms are compared without quotients, whose latencies would add up.
     found = jnp.maximum(rules.scale + rules.round_off, sizes.iterate)
     has_size = found > 0
     measure = jnp.where(has_size, found, before.first)
@@ -188,7 +188,7 @@ def _progress(rules: _Rules, before: _Progress, sizes: Sizes) -> _Progress:
     bounded = increment < _HOPELESS * (measure + first)
     exhausted = bounded & ~converged & (count >= rules.max_iterations)
     return _Progress(
-        first=unit(first),
+        first=nonzero_or_one(first),
         smallest=jnp.minimum(increment, before.smallest),
         believed=believed,
         iterations=count,

@@ -29,7 +29,7 @@ from .._custom_types import BoolScalar, FloatScalar
 from ._contraction import inverse, small_einsum
 from ._floating_point import max_norm
 from ._rank import is_nearly_singular
-from ._sparsity import dependence
+from ._sparsity import jacobian_sparsity
 
 
 class AbstractOperator(eqx.Module):
@@ -198,7 +198,7 @@ class SparseMatrix(AbstractOperator):
     """
 
     values: Float[Array, "... w l"]
-    pattern: "Pattern" = eqx.field(static=True)
+    pattern: "SparsityPattern" = eqx.field(static=True)
 
     def __getitem__(
         self, k: int | slice | tuple[slice | None, ...] | None
@@ -314,7 +314,7 @@ class BlockTridiagonalInverse(AbstractOperator):
     inverses: Float[Array, "N g g"]
     lower: Float[Array, "N g g"]
     upper: Float[Array, "N g g"]
-    pattern: "Pattern" = eqx.field(static=True)
+    pattern: "SparsityPattern" = eqx.field(static=True)
 
     def matvec(self, x: Float[Array, "..."]) -> Float[Array, "..."]:
         """Compute the solution for a residual."""
@@ -424,7 +424,7 @@ def square_jacobian(
     def push(du):
         return jax.jvp(function, (u,), (du,))[1]
 
-    found = dependence(function, u)
+    found = jacobian_sparsity(function, u)
     if found.shape == (u.shape[0],) * 2 and not np.any(
         found & ~np.eye(len(u), dtype=bool)
     ):
@@ -453,7 +453,9 @@ def _unit_vectors(u: Float[Array, " n"]) -> Float[Array, "n n"]:
 
 
 def sparse_jacobian(
-    function: Callable[[Array], Array], u: Float[Array, " n"], pattern: "Pattern"
+    function: Callable[[Array], Array],
+    u: Float[Array, " n"],
+    pattern: "SparsityPattern",
 ) -> SparseMatrix:
     """Compute the Jacobian of a function whose sparsity is that of `pattern`.
 
@@ -476,7 +478,7 @@ def sparse_jacobian(
 # Patterns of sparse matrices.
 
 
-class Pattern:
+class SparsityPattern:
     """The places of the entries of a sparse matrix B, and what follows from them.
 
     - `columns`: entry e of row a is in column `columns[e, a]`, shape (w, l); it exists
@@ -512,7 +514,7 @@ class Pattern:
         self.order = orders[best]
 
     def __eq__(self, other: object) -> bool:
-        return isinstance(other, Pattern) and self.key == other.key
+        return isinstance(other, SparsityPattern) and self.key == other.key
 
     def __hash__(self) -> int:
         return hash(self.key)
@@ -580,7 +582,7 @@ def compressed_products(
 
 
 def block_tridiagonal_inverse(
-    products: Float[Array, "q q c b l"], pattern: Pattern
+    products: Float[Array, "q q c b l"], pattern: SparsityPattern
 ) -> BlockTridiagonalInverse:
     """Factorise a matrix in the compressed form of `compressed_products`.
 

@@ -1,8 +1,8 @@
 """The rank of small matrices, and inverses of matrices without full rank.
 
-Constraints are independent if the rows of their Jacobian B are. `Rank` collects the
-Jacobians whose rank must be full, `reciprocal_condition` measures how close the rows
-are to being dependent, and `dependent_rows` lists the rows for an error message. Where
+Constraints are independent if the rows of their Jacobian B are. A `RankCondition` is a
+Jacobian whose rank must be full, `reciprocal_condition` measures how close the rows are
+to being dependent, and `dependent_rows` lists the rows for an error message. Where
 redundant constraints are allowed, `least_norm_inverse` replaces the inverse of
 C = B K⁻¹ Bᵀ: it solves C x = b with the least norm of x.
 """
@@ -21,7 +21,7 @@ from .._custom_types import BoolScalar, FloatScalar
 # The rank of Jacobians.
 
 
-class Rank(NamedTuple):
+class RankCondition(NamedTuple):
     """The derivatives of constraints at a configuration, which must have full rank.
 
     The `jacobian` has k rows of DΓ, or m + k rows of D2Φ and DΓ. `counts` says whether
@@ -31,26 +31,26 @@ class Rank(NamedTuple):
 
     jacobian: Float[Array, "l n"]
     q: PyTree[Array]
-    counts: BoolScalar
+    is_active: BoolScalar
 
     @property
     def deficient(self) -> BoolScalar:
         """Return whether the rank matters and is not full."""
-        return self.counts & is_deficient(self.jacobian)
+        return self.is_active & is_deficient(self.jacobian)
 
 
-def those_that_count(ranks: list[Rank]) -> list[Rank]:
+def active_ranks(ranks: list[RankCondition]) -> list[RankCondition]:
     """Keep at most one matrix of each shape, namely the one whose rank matters.
 
     Singular values are more expensive than all else here, so that they are computed for
     as few matrices as possible.
     """
-    merged: dict[tuple[int, ...], Rank] = {}
+    merged: dict[tuple[int, ...], RankCondition] = {}
     for rank in ranks:
         other = merged.setdefault(rank.jacobian.shape, rank)
         if other is not rank:
             merged[rank.jacobian.shape] = jax.tree.map(
-                lambda x, y, counts=rank.counts: jnp.where(counts, x, y), rank, other
+                lambda x, y, counts=rank.is_active: jnp.where(counts, x, y), rank, other
             )
     return list(merged.values())
 
@@ -87,7 +87,7 @@ def is_deficient(matrix: Float[Array, "k l"]) -> BoolScalar:
     return reciprocal_condition(matrix) <= 10 * matrix.shape[1] * eps
 
 
-def is_without_entries(matrix: Float[Array, "k l"]) -> BoolScalar:
+def has_zero_row(matrix: Float[Array, "k l"]) -> BoolScalar:
     """Return whether some row is zero."""
     return jnp.any(jnp.all(matrix == 0, axis=1))
 

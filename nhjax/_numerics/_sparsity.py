@@ -27,7 +27,7 @@ _REARRANGING = """
 _LONGEST_INDEX = 10_000
 
 
-def dependence(
+def jacobian_sparsity(
     function: Callable[[Array], Array], u: Float[Array, " n"]
 ) -> Bool[np.ndarray, "l n"]:
     """Return which entries ∂f_a/∂u_i of a Jacobian may differ from zero at some u.

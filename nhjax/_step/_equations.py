@@ -15,10 +15,10 @@ from .._manifold import AbstractLieGroup, unframed
 from .._method import AbstractMethod
 from .._numerics import (
     max_norm,
-    Pattern,
     small_einsum,
     sparse_jacobian,
     SparseMatrix,
+    SparsityPattern,
     uneven_perturbations,
 )
 from .._system import (
@@ -356,10 +356,10 @@ def holonomic_constraint(
         lambda t, q: stages.system.position_constraint(t, q, stages.args)
     )(stages.stage_times[1:], nodes)
     end = jax.tree.map(lambda leaf: leaf[-1], nodes)
-    tangency = stages.system.tangency(
+    rate = stages.system.holonomic_rate(
         stages.t + stages.h, end, x.node_fibre_coordinate[-1], stages.args
     )
-    values = jnp.concatenate([on_positions / stages.h, tangency[None]])
+    values = jnp.concatenate([on_positions / stages.h, rate[None]])
     if stages.redundancy is None:
         return values
     m = stages.num_nonholonomic
@@ -401,7 +401,7 @@ def constraint_jacobian(
 
 
 def sparse_constraint_jacobian(
-    stages: StageEquations, x: StageUnknowns, pattern: Pattern
+    stages: StageEquations, x: StageUnknowns, pattern: SparsityPattern
 ) -> SparseMatrix:
     """Compute B = ∂Φ/∂u at the nodes i >= 2 as a sparse matrix of known `pattern`."""
     return _at_nodes(

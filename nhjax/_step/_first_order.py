@@ -15,7 +15,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from .._custom_types import FloatScalar
-from .._numerics import dependence, full_jacobian, small_einsum
+from .._numerics import full_jacobian, jacobian_sparsity, small_einsum
 from .._system import Linearisation, total_force
 from ._equations import (
     node_coordinates,
@@ -89,10 +89,10 @@ def _has_terms(stages: StageEquations) -> bool:
     # on velocities. This is decided from the traced functions of the system.
     system, t, args = stages.system, stages.t, stages.args
     q, zero = stages.q, jnp.zeros_like(stages.p)
-    by_position = dependence(
+    by_position = jacobian_sparsity(
         lambda xi: system.momentum(t, stages.manifold.act(q, xi), zero, args), zero
     )
-    by_velocity = dependence(
+    by_velocity = jacobian_sparsity(
         lambda u: total_force(system, t, q, u, stages.multiplier, args), zero
     )
     return bool(by_position.any() or by_velocity.any())

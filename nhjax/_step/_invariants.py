@@ -12,9 +12,9 @@ from .._custom_types import Args, FloatScalar
 from .._numerics import (
     inverse,
     max_norm,
+    nonzero_or_one,
     small_einsum,
     SquareMatrix,
-    unit,
 )
 from .._system import (
     AbstractMechanicalSystem,
@@ -227,7 +227,7 @@ class InvariantsAtStart(eqx.Module):
         all_slopes = functions.slopes(system, t, y.q, u, args)
         sizes = functions.sizes(system, t, y.q, u, args, all_slopes)
         slopes, covectors, _ = functions.directions(system, t, y.q, u, args, all_slopes)
-        row_sums = lin.metric_inverse.absolute_row_sums()
+        row_sums = lin.fibre_hessian_inverse.absolute_row_sums()
         given = slopes, covectors, lin.momentum_inverse, row_sums
         return cls(functions, *given, moving_part(slopes, u), sizes, position)
 
@@ -290,7 +290,7 @@ class InvariantCorrection(eqx.Module):
         eps = float(jnp.finfo(gram.dtype).eps)
         one = jnp.eye(gram.shape[0], dtype=gram.dtype)
         g = jnp.sum(gram * one, axis=1)
-        denominator = unit(g**2 + eps * at_start.sizes**2)
+        denominator = nonzero_or_one(g**2 + eps * at_start.sizes**2)
         errors, a = g / denominator, g**2 / denominator
         matrix = errors[:, None] * gram + (1 - a)[:, None] * one
         # If one function follows from others, the matrix is singular.
@@ -307,7 +307,9 @@ class InvariantCorrection(eqx.Module):
             errors=jnp.where(acts, errors, 0),
             rest=jnp.where(acts, 1 - a, 1),
             inverse=jnp.where(acts, solved, one),
-            limits=_LARGEST_PART * (at_start.moving + moving) / unit(jnp.sum(terms, 1)),
+            limits=_LARGEST_PART
+            * (at_start.moving + moving)
+            / nonzero_or_one(jnp.sum(terms, 1)),
             start=start,
             end=end,
             velocity=at_start.slopes if hamiltonian else start,

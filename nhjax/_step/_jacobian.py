@@ -31,13 +31,13 @@ from .._numerics import (
     inverse,
     InverseMatrix,
     max_norm,
-    Pattern,
+    nonzero_or_one,
     ReactionMatrix,
-    Sizes,
     small_einsum,
+    SparsityPattern,
     SquareMatrix,
     stop_gradient,
-    unit,
+    UpdateNorms,
 )
 from .._system import Linearisation
 from ._equations import (
@@ -330,14 +330,16 @@ def _dense_factors(
     stages: StageEquations, lin: Linearisation, jacobian: Float[Array, "s l n"]
 ) -> StageJacobianFactors:
     """Compute the factors with the Jacobians B of the constraints at all stages."""
-    reaction = DenseMatrix(jacobian).weighted_transpose(lin.metric_inverse).entries
+    reaction = (
+        DenseMatrix(jacobian).weighted_transpose(lin.fibre_hessian_inverse).entries
+    )
     rows, redundancy = jacobian[1:], stages.redundancy
     if redundancy is not None:
         rows = small_einsum("ab,ibn->ian", redundancy.projector, rows)
     blocks = small_einsum("ian,jnb->ijab", rows, reaction)
-    schur, compliance = _schur_complement(stages, blocks), blocks[-1, -1]
+    schur, delassus = _schur_complement(stages, blocks), blocks[-1, -1]
     if redundancy is not None:
-        compliance = compliance + redundancy.rest
+        delassus = delassus + redundancy.rest
         schur = schur + redundancy.schur_rest(
             stages.method.stages, stages.num_nonholonomic
         )
@@ -353,7 +355,7 @@ def _dense_factors(
             lin,
             jacobian=DenseMatrix(rows[-1]),
             reaction=DenseMatrix(reaction[-1]),
-            compliance_inverse=DenseMatrix(inverse(compliance)),
+            delassus_inverse=DenseMatrix(inverse(delassus)),
         ),
     )
 
@@ -390,12 +392,15 @@ def _schur_complement(
 
 
 def _sparse_factors(
-    stages: StageEquations, x: StageUnknowns, lin: Linearisation, pattern: Pattern
+    stages: StageEquations,
+    x: StageUnknowns,
+    lin: Linearisation,
+    pattern: SparsityPattern,
 ) -> StageJacobianFactors:
     """Compute the factors for constraints each of which uses few coordinates."""
     nodes = sparse_constraint_jacobian(stages, x, pattern)
     rows = nodes.stacked_after(lin.jacobian)
-    reaction = rows.weighted_transpose(lin.metric_inverse)
+    reaction = rows.weighted_transpose(lin.fibre_hessian_inverse)
     products = compressed_products(rows[1:], reaction)
     a, a_hat, b = (stages.coefficients(name) for name in ("a", "a_hat", "b"))
     if stages.num_nonholonomic:
@@ -410,7 +415,7 @@ def _sparse_factors(
         lin,
         jacobian=rows[-1],
         reaction=reaction[-1],
-        compliance_inverse=block_tridiagonal_inverse(products[-1:, -1:], pattern),
+        delassus_inverse=block_tridiagonal_inverse(products[-1:, -1:], pattern),
     )
     velocity_reaction = reaction
     if stages.hamiltonian:
@@ -433,7 +438,7 @@ def _first_order_factors(
     terms: FirstOrderTerms,
 ) -> StageJacobianFactors:
     """Compute the factors with the terms of order h."""
-    reaction = DenseMatrix(jacobian).weighted_transpose(lin.metric_inverse)
+    reaction = DenseMatrix(jacobian).weighted_transpose(lin.fibre_hessian_inverse)
     momenta = momenta_of_forces(stages, x, _reactions(stages, jacobian))
     on_stages, on_nodes = (
         jnp.swapaxes(lin.momentum_inverse.matvec(jnp.swapaxes(p, 1, 2)), 1, 2)
@@ -487,13 +492,13 @@ def _with_mass_at_end(
     change = small_einsum("kl,ln->kn", terms.node_inertia[-1], at_start)
     at_end = at_start - change
     reaction = small_einsum("kn,ln->kl", at_end, jacobian)
-    compliance = small_einsum("kn,nl->kl", jacobian, reaction)
+    delassus = small_einsum("kn,nl->kl", jacobian, reaction)
     return replace(
         lin,
-        metric_inverse=DenseMatrix(at_end),
+        fibre_hessian_inverse=DenseMatrix(at_end),
         jacobian=DenseMatrix(jacobian),
         reaction=DenseMatrix(reaction),
-        compliance_inverse=DenseMatrix(inverse(compliance)),
+        delassus_inverse=DenseMatrix(inverse(delassus)),
     )
 
 
@@ -561,14 +566,14 @@ def stage_residual(
 
 def update_norms(
     stages: StageEquations, x: StageUnknowns, x_next: StageUnknowns, lin: Linearisation
-) -> Sizes:
+) -> UpdateNorms:
     """Measure an increment and the fibre coordinates of the next iterate.
 
     Only the coordinates at the end of the step are measured: this is enough to judge
     the increment, and measuring all coordinates would cost time.
     """
     increment = increment_size(stages, x, x_next, lin)
-    return Sizes(increment, max_norm(x_next.node_fibre_coordinate[-1]))
+    return UpdateNorms(increment, max_norm(x_next.node_fibre_coordinate[-1]))
 
 
 def fibre_coordinate_size(stages: StageEquations, x: StageUnknowns) -> FloatScalar:
@@ -593,7 +598,7 @@ def increment_size(
         x_next.velocity - x.velocity,
     ]
     if stages.hamiltonian:
-        changes[1] = lin.metric_inverse.matvec(changes[1])
+        changes[1] = lin.fibre_hessian_inverse.matvec(changes[1])
         changes.append(x_next.momentum - x.momentum)
     if stages.constrained:
         # Multipliers are measured by their effect h N⁻¹ R δΛ on u, separately from the
@@ -620,19 +625,19 @@ def unknown_units(stages: StageEquations, lin: Linearisation) -> list[FloatScala
     one = jnp.ones_like(h)
     velocity = one
     if stages.hamiltonian:
-        velocity = 1 / unit(lin.metric_inverse.largest_entry_bound())
-    multiplier = 1 / unit(h * lin.reaction.largest_entry_bound())
+        velocity = 1 / nonzero_or_one(lin.fibre_hessian_inverse.largest_entry_bound())
+    multiplier = 1 / nonzero_or_one(h * lin.reaction.largest_entry_bound())
     units = {
         "velocity": velocity,
         "momentum": one,
         "node_fibre_coordinate": one,
         "closure": multiplier,
         "holonomic": multiplier,
-        "end_acceleration": 1 / unit(h),
+        "end_acceleration": 1 / nonzero_or_one(h),
         "end_multiplier": multiplier,
     }
     if stages.invariants is not None:
         largest = max_norm(lin.momentum_inverse.matvec(stages.invariants.covectors))
-        units["impulse"] = 1 / unit(largest)
+        units["impulse"] = 1 / nonzero_or_one(largest)
     names = [field.name for field in dataclasses.fields(StageUnknowns)]
     return [units[name] for name in names if name in units]

@@ -41,11 +41,11 @@ class Redundancy(eqx.Module):
         `m` is the number of nonholonomic constraints.
         """
         jacobian, reaction, inverse = lin.dense
-        compliance = small_einsum("kn,nl->kl", jacobian, reaction)
-        whole = small_einsum("kl,lm->km", compliance, inverse)
+        delassus = small_einsum("kn,nl->kl", jacobian, reaction)
+        whole = small_einsum("kl,lm->km", delassus, inverse)
         projector = jax.scipy.linalg.block_diag(whole[:m, :m], whole[m:, m:])
         unit = jnp.eye(projector.shape[0], dtype=projector.dtype)
-        sizes = jnp.sum(jnp.abs(compliance) * unit, axis=1)
+        sizes = jnp.sum(jnp.abs(delassus) * unit, axis=1)
         # The multiplier of a row without derivatives has no unit.
         sizes = jnp.where(sizes > 0, sizes, 1)
         return cls(projector, (unit - projector) * sizes[None, :])

@@ -23,9 +23,9 @@ from .._numerics import (
     jacobian_and_value,
     max_norm,
     NOISE_UNITS,
-    Sizes,
     Solved,
     uneven_perturbations,
+    UpdateNorms,
 )
 from .._system import all_finite, check_flag, Linearisation, position_scale, real_scalar
 from ._equations import (
@@ -283,7 +283,7 @@ class Newton(AbstractStageSolver):
                 increment_size(stages, x, unravel(z + noise), lin) for noise in noises
             )
             noise = jnp.maximum(by_positions / nudge, PART * by_equations / eps)
-            found = Sizes(
+            found = UpdateNorms(
                 increment_size(stages, x, x_next, lin),
                 fibre_coordinate_size(stages, x_next),
                 noise,
@@ -333,7 +333,7 @@ class Scale(NamedTuple):
 
 def _iterated(
     stage_solver: AbstractStageSolver,
-    iteration: Callable[[StageUnknowns], tuple[StageUnknowns, Sizes, Evaluation]],
+    iteration: Callable[[StageUnknowns], tuple[StageUnknowns, UpdateNorms, Evaluation]],
     x0: StageUnknowns,
     scale: Scale,
     skip: Array,

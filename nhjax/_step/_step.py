@@ -402,7 +402,7 @@ def error_ratios(
     def change(weights: Float[Array, " s"]) -> tuple[Array, Array]:
         moved = small_einsum("s,sn->n", weights, x.velocity)
         if stages.hamiltonian:
-            moved = lin.metric_inverse.matvec(moved)
+            moved = lin.fibre_hessian_inverse.matvec(moved)
         gained = h * small_einsum("s,sn->n", weights, force)
         return moved, lin.momentum_inverse.matvec(gained)
 
@@ -418,7 +418,7 @@ def error_ratios(
         # Multipliers of single stages may be wrong although their sum is right.
         # Therefore the part of the difference that violates the constraints is left
         # out; the step satisfies the constraints.
-        excess = lin.compliance_inverse.matvec(lin.jacobian.matvec(gained))
+        excess = lin.delassus_inverse.matvec(lin.jacobian.matvec(gained))
         gained = gained - lin.reaction.matvec(excess)
     return relative(jnp.stack([max_norm(moved), max_norm(gained)]), whole)
 

@@ -17,7 +17,7 @@ from .._errors import (
     ShapeError,
 )
 from .._manifold import AbstractLieGroup
-from .._numerics import dependent_rows, is_deficient, is_without_entries
+from .._numerics import dependent_rows, has_zero_row, is_deficient
 from ._arguments import dtype_advice, finite, floating, no_array
 from ._systems import AbstractMechanicalSystem, State
 
@@ -230,7 +230,7 @@ def require_independent(
     u = system.fibre_coordinate(y)
     jacobian = jax.jacrev(system.constraint, argnums=2)(t, y.q, u, args)
     is_redundant = system.constraints == "redundant"
-    lacking = is_without_entries if is_redundant else is_deficient
+    lacking = has_zero_row if is_redundant else is_deficient
     if jacobian.shape[0] == 0 or not lacking(jacobian):
         return
     k = system.position_constraint(t, y.q, args).shape[0]

@@ -54,10 +54,10 @@ class Linearisation(eqx.Module):
     many constraints are sparse if each constraint shares coordinates with few others.
     """
 
-    metric_inverse: SquareMatrix  # K⁻¹
+    fibre_hessian_inverse: SquareMatrix  # K⁻¹
     jacobian: JacobianMatrix  # B
     reaction: ReactionMatrix  # N⁻¹ R
-    compliance_inverse: InverseMatrix  # C⁻¹, or its least-norm substitute
+    delassus_inverse: InverseMatrix  # C⁻¹, or its least-norm substitute
     acceleration: Float[Array, " n"]  # u̇
     multiplier: Float[Array, " l"]
     violation: Float[Array, " l"]
@@ -68,7 +68,7 @@ class Linearisation(eqx.Module):
     def momentum_inverse(self) -> SquareMatrix:
         """Return N⁻¹: the inverse mass matrix, or one for a Hamiltonian system."""
         if self.fibre_coordinate_name == "v":
-            return self.metric_inverse
+            return self.fibre_hessian_inverse
         return DiagonalMatrix(jnp.ones_like(self.acceleration))
 
     @property
@@ -79,14 +79,14 @@ class Linearisation(eqx.Module):
     @property
     def dense(self) -> tuple[Array, Array, Array]:
         """Return B, N⁻¹ R and C⁻¹ as arrays with all entries."""
-        matrices = self.jacobian, self.reaction, self.compliance_inverse
+        matrices = self.jacobian, self.reaction, self.delassus_inverse
         jacobian, reaction, inverse = (matrix.as_matrix() for matrix in matrices)
         return jacobian, reaction, inverse
 
     @property
     def is_singular(self) -> Bool[Array, ""]:
         """Return whether the fibre Hessian K or the Delassus matrix C is singular."""
-        inverses = jax.tree.leaves((self.metric_inverse, self.compliance_inverse))
+        inverses = jax.tree.leaves((self.fibre_hessian_inverse, self.delassus_inverse))
         return ~reduce(jnp.logical_and, [jnp.all(jnp.isfinite(x)) for x in inverses])
 
     @property
@@ -96,8 +96,8 @@ class Linearisation(eqx.Module):
             return jnp.ones(self.violation.shape, bool)
         # The product C C⁻ projects onto the range of C.
         jacobian, reaction, _ = self.dense
-        compliance = small_einsum("kn,nl->kl", jacobian, reaction)
-        kept = small_einsum("kl,lm->km", compliance, least_norm_inverse(compliance))
+        delassus = small_einsum("kn,nl->kl", jacobian, reaction)
+        kept = small_einsum("kl,lm->km", delassus, least_norm_inverse(delassus))
         small = float(jnp.finfo(kept.dtype).eps) ** 0.5
         return jnp.abs(1 - jnp.diagonal(kept)) <= small
 
@@ -107,15 +107,15 @@ class Linearisation(eqx.Module):
         if not self.is_redundant:
             return jnp.zeros((), jnp.int32)
         jacobian, reaction, inverse = self.dense
-        compliance = small_einsum("kn,nl->kl", jacobian, reaction)
-        rank = jnp.sum(compliance * inverse.T)
-        return compliance.shape[0] - jnp.round(rank).astype(jnp.int32)
+        delassus = small_einsum("kn,nl->kl", jacobian, reaction)
+        rank = jnp.sum(delassus * inverse.T)
+        return delassus.shape[0] - jnp.round(rank).astype(jnp.int32)
 
     @property
     def determines_multipliers(self) -> Bool[Array, ""]:
         """Return whether C can be inverted in the working precision."""
         factors = self.jacobian, self.reaction
-        return ~self.compliance_inverse.is_nearly_singular(*factors)
+        return ~self.delassus_inverse.is_nearly_singular(*factors)
 
     def solve(
         self, momentum_residual: Float[Array, " n"], hidden_residual: Float[Array, " l"]
@@ -123,12 +123,12 @@ class Linearisation(eqx.Module):
         """Solve N u̇ - R λ = momentum_residual, B u̇ = hidden_residual for (u̇, λ)."""
         free = self.momentum_inverse.matvec(momentum_residual)
         hidden = hidden_residual - self.jacobian.matvec(free)
-        multiplier = self.compliance_inverse.matvec(hidden)
+        multiplier = self.delassus_inverse.matvec(hidden)
         return free + self.reaction.matvec(multiplier), multiplier
 
     def largest_correction(self, sizes: Float[Array, " l"]) -> FloatScalar:
         """Bound the change of u that corrects constraint violations of given sizes."""
-        multipliers = self.compliance_inverse.absolute().matvec(sizes)
+        multipliers = self.delassus_inverse.absolute().matvec(sizes)
         return max_norm(self.reaction.absolute().matvec(multipliers))
 
 
@@ -195,10 +195,10 @@ def motion_residual(
 class ConstraintMatrices(NamedTuple):
     """The matrices of `Linearisation`, without the solution of the equations."""
 
-    metric_inverse: SquareMatrix  # K⁻¹
+    fibre_hessian_inverse: SquareMatrix  # K⁻¹
     jacobian: JacobianMatrix  # B
     reaction: ReactionMatrix  # K⁻¹ Bᵀ
-    compliance_inverse: InverseMatrix  # C⁻¹
+    delassus_inverse: InverseMatrix  # C⁻¹
 
     def tangent_part(
         self, slope: Float[Array, " n"]
@@ -208,8 +208,8 @@ class ConstraintMatrices(NamedTuple):
         Return s - Bᵀ μ, which satisfies B K⁻¹ (s - Bᵀ μ) = 0, and the multipliers
         μ = C⁻¹ B K⁻¹ s.
         """
-        pushed = self.jacobian.matvec(self.metric_inverse.matvec(slope))
-        multiplier = self.compliance_inverse.matvec(pushed)
+        pushed = self.jacobian.matvec(self.fibre_hessian_inverse.matvec(slope))
+        multiplier = self.delassus_inverse.matvec(pushed)
         return slope - self.jacobian.rmatvec(multiplier), multiplier
 
 
@@ -229,7 +229,7 @@ def constraint_matrices(
     faster.
     """
     metric = square_jacobian(lambda u: system.fibre_derivative(t, q, u, args), u)
-    metric_inverse = metric.inverse()
+    fibre_hessian_inverse = metric.inverse()
     pattern = None
     if may_be_sparse and num_constraints >= FEWEST_SPARSE and metric.is_diagonal:
         pattern = constraint_pattern(system, t, q, u, args)
@@ -237,16 +237,16 @@ def constraint_matrices(
         slopes = DenseMatrix(jax.jacrev(system.constraint, argnums=2)(t, q, u, args))
     else:
         slopes = sparse_jacobian(lambda u: system.constraint(t, q, u, args), u, pattern)
-    reaction = slopes.weighted_transpose(metric_inverse)
+    reaction = slopes.weighted_transpose(fibre_hessian_inverse)
     if system.constraints == "redundant":
         k = jax.eval_shape(lambda: system.position_constraint(t, q, args)).size
-        compliance = small_einsum("kn,nl->kl", slopes.as_matrix(), reaction.as_matrix())
-        compliance_inverse = DenseMatrix(
-            least_norm_inverse_by_blocks(compliance, num_constraints - k)
+        delassus = small_einsum("kn,nl->kl", slopes.as_matrix(), reaction.as_matrix())
+        delassus_inverse = DenseMatrix(
+            least_norm_inverse_by_blocks(delassus, num_constraints - k)
         )
     else:
-        compliance_inverse = slopes.inverse_of_product(reaction)
-    return ConstraintMatrices(metric_inverse, slopes, reaction, compliance_inverse)
+        delassus_inverse = slopes.inverse_of_product(reaction)
+    return ConstraintMatrices(fibre_hessian_inverse, slopes, reaction, delassus_inverse)
 
 
 def linearise(

@@ -19,8 +19,8 @@ from .._numerics import (
     max_norm,
     measured_noise,
     NOISE_DEVIATIONS,
+    nonzero_or_one,
     stop_gradient,
-    unit,
 )
 from ._linearisation import Linearisation
 from ._systems import AbstractMechanicalSystem, State
@@ -54,7 +54,7 @@ def velocity_scale(
 ) -> Float[Array, " l"]:
     """Estimate the sizes of the terms of Φ from its Jacobian ∂Φ/∂u alone."""
     affine = _finite_or_zero(system.constraint(t, q, jnp.zeros_like(u), args))
-    return jacobian.absolute_row_sums() * unit(max_norm(u)) + affine
+    return jacobian.absolute_row_sums() * nonzero_or_one(max_norm(u)) + affine
 
 
 def position_scale(
@@ -76,7 +76,7 @@ def position_scale(
     constant = _finite_or_zero(gamma(jax.tree.map(jnp.zeros_like, q)))
     if system.holonomic is None:
         return constant
-    size = unit(max_norm(*jax.tree.leaves(q)))
+    size = nonzero_or_one(max_norm(*jax.tree.leaves(q)))
     if lin is not None and lin.is_sparse and lin.fibre_coordinate_name == "v":
         return lin.jacobian.absolute_row_sums() * size + constant
     slopes = jax.tree.map(

@@ -3,7 +3,7 @@
 from jaxtyping import Array, Float, PyTree
 
 from .._custom_types import Args, FloatScalar
-from .._numerics import dependence, Pattern
+from .._numerics import jacobian_sparsity, SparsityPattern
 from ._systems import AbstractMechanicalSystem
 
 
@@ -20,7 +20,7 @@ def constraint_pattern(
     q: PyTree[Array],
     u: Float[Array, " n"],
     args: Args,
-) -> Pattern | None:
+) -> SparsityPattern | None:
     """Find the places of the entries of B = ∂Φ/∂u; None if B is to be dense.
 
     That is where constraints are redundant, or of both kinds, or each shares
@@ -29,6 +29,6 @@ def constraint_pattern(
     kinds = [system.nonholonomic, system.holonomic]
     if system.constraints == "redundant" or None not in kinds:
         return None
-    entries = dependence(lambda u: system.constraint(t, q, u, args), u)
-    pattern = Pattern(entries)
+    entries = jacobian_sparsity(lambda u: system.constraint(t, q, u, args), u)
+    pattern = SparsityPattern(entries)
     return pattern if pattern.group <= _LARGEST_BLOCK * len(entries) else None

@@ -205,7 +205,7 @@ class AbstractMechanicalSystem(eqx.Module):
             return jnp.zeros((0,), u.dtype)
         return jnp.atleast_1d(self.call("nonholonomic", t, q, u, args))
 
-    def tangency(
+    def holonomic_rate(
         self,
         t: FloatScalarLike,
         q: PyTree[Array],
@@ -239,9 +239,12 @@ class AbstractMechanicalSystem(eqx.Module):
         if self.holonomic is None:
             return self.kinematic_constraint(t, q, u, args)
         if self.nonholonomic is None:
-            return self.tangency(t, q, u, args)
+            return self.holonomic_rate(t, q, u, args)
         return jnp.concatenate(
-            [self.kinematic_constraint(t, q, u, args), self.tangency(t, q, u, args)]
+            [
+                self.kinematic_constraint(t, q, u, args),
+                self.holonomic_rate(t, q, u, args),
+            ]
         )
 
     def reaction(

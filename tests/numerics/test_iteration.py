@@ -4,7 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from nhjax._numerics import iterate, Sizes
+from nhjax._numerics import iterate, UpdateNorms
 
 
 def circling(rate, angle, units):
@@ -16,7 +16,7 @@ def circling(rate, angle, units):
     def sweep(x):
         after = jnp.asarray(turn) @ x
         # Only one component is measured, which rises and falls.
-        return after, Sizes(jnp.abs(after[0] - x[0])), None
+        return after, UpdateNorms(jnp.abs(after[0] - x[0])), None
 
     return iterate(
         sweep,
@@ -39,7 +39,7 @@ def test_an_iteration_in_circles_is_not_taken_for_noise_on_its_way(rate, angle):
 def test_noise_that_never_falls_ends_an_iteration():
     def sweep(k):
         # Some 150 units of round-off, with both signs.
-        return k + 1, Sizes(150 * 2.2e-16 * (1.5 + jnp.sin(k))), None
+        return k + 1, UpdateNorms(150 * 2.2e-16 * (1.5 + jnp.sin(k))), None
 
     solved = iterate(
         sweep, jnp.asarray(0.0), jnp.asarray(1.0), max_iterations=50, noise_units=400
@@ -50,7 +50,7 @@ def test_noise_that_never_falls_ends_an_iteration():
 
 def test_increments_that_do_not_fall_and_are_no_noise_never_end_well():
     def sweep(k):
-        return k + 1, Sizes(1e-10 * (1.5 + jnp.sin(k))), None
+        return k + 1, UpdateNorms(1e-10 * (1.5 + jnp.sin(k))), None
 
     solved = iterate(
         sweep, jnp.asarray(0.0), jnp.asarray(1.0), max_iterations=50, noise_units=400
@@ -65,7 +65,7 @@ def test_round_off_of_data_ends_an_iteration_and_multiplies_no_tolerance(
 ):
     # Increments 10⁻¹, 10⁻², ...; the data are a thousand times as large as x.
     solved = iterate(
-        lambda k: (k + 1, Sizes(0.9 * 10.0**-k), None),
+        lambda k: (k + 1, UpdateNorms(0.9 * 10.0**-k), None),
         jnp.asarray(1.0),
         jnp.asarray(1.0),
         max_iterations=50,

@@ -107,10 +107,10 @@ def test_diagonal_mass_matrix_is_recognised_in_both_forms(flip):
     q, v = jnp.array([0.1, 0.5, 0.2]), jnp.array([1.0, -0.3, 0.5])
     y0 = nhjax.initial_state(system, q=q, v=v, project=True)
     lin = linearise(system, jnp.asarray(0.0), q, system.fibre_coordinate(y0), None)
-    assert lin.metric_inverse.is_diagonal
+    assert lin.fibre_hessian_inverse.is_diagonal
     assert system.metric(0.0, q, system.fibre_coordinate(y0)).shape == (3, 3)
     full = system.metric(0.0, q, system.fibre_coordinate(y0))
-    found = lin.metric_inverse.inverse().as_matrix()
+    found = lin.fibre_hessian_inverse.inverse().as_matrix()
     np.testing.assert_allclose(found, full, rtol=1e-15)
 
 

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from nhjax._numerics import dependence
+from nhjax._numerics import jacobian_sparsity
 
 
 X = jnp.asarray(np.random.default_rng(3).standard_normal(12))
@@ -42,7 +42,7 @@ KEPT = {
 @pytest.mark.parametrize("name", [*EXACT, *KEPT])
 def test_no_entry_is_missed(name):
     function = (EXACT | KEPT)[name]
-    found = dependence(function, X)
+    found = jacobian_sparsity(function, X)
     entries = np.asarray(jax.jacfwd(function)(X)) != 0
     assert found.shape == entries.shape
     assert not np.any(entries & ~found)
@@ -57,4 +57,4 @@ def test_a_derivative_of_ones_own_counts():
 
     square.defjvp(lambda x, dx: (square(*x), 2 * x[0] * jnp.roll(dx[0], 1)))
     expected = np.roll(np.eye(12, dtype=bool), -1, axis=1)
-    np.testing.assert_array_equal(dependence(square, X), expected)
+    np.testing.assert_array_equal(jacobian_sparsity(square, X), expected)
