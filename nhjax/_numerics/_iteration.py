@@ -102,8 +102,8 @@ def iterate(
 ) -> Solved[X, Aux]:
     """Repeat `iteration` until its increments no longer fall.
 
-    `iteration(x)` returns the next iterate, the sizes of the increment and of the iterate,
-    and auxiliary values at x. Increments are measured relative to `scale`, the size of
+    `iteration(x)` returns the next iterate, the sizes of the increment and of the
+    iterate, and auxiliary values at x. Increments are measured relative to `scale`, the size of
     x, or relative to the size of the iterate if that is larger, because x may start
     from zero. If both are zero, increments are measured relative to the first one. The
     round-off of x is proportional to the same size or, if data are larger than x, to
@@ -123,8 +123,8 @@ def iterate(
     the highest level is the square root of the unit round-off, which suits iterations
     that converge so fast that only noise can slow them down.
     """
-    # `jit` makes JAX trace the iteration once, for the shapes and for the loop. Tracing the
-    # iteration is most of the work of tracing a step.
+    # `jit` makes JAX trace the iteration once, for the shapes and for the loop: that is
+    # most of the work of tracing a step.
     iteration = jax.jit(iteration, inline=True)
     aux_shape = jax.eval_shape(iteration, x)[2]
     aux = jax.tree.map(lambda s: jnp.zeros(s.shape, s.dtype), aux_shape)
