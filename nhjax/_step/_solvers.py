@@ -52,7 +52,7 @@ from ._round_off import PART
 FrozenNewtonMap: TypeAlias = Callable[[StageEquations, StageUnknowns], StageUnknowns]
 
 
-# Stages with a larger residual than this, relative to the momenta, are not a solution.
+# Where the residual is larger than this, relative to the momenta, there is no solution.
 _GROSS = 1e-6
 
 
