@@ -69,7 +69,7 @@ class NewtonError(RuntimeError):
 class IntegrationError(RuntimeError):
     """Raised if `integrate` could not continue a trajectory to the end of the run.
 
-    The message names the lane of a batch, the step and the reason.
+    The message names the member of a batch, the step and the reason.
     """
 
 
@@ -169,8 +169,8 @@ def require(tree: T, *checks: Check) -> T:
 
     With concrete values the exception is raised here and now. With traced ones it is
     raised when the compiled program runs, as a runtime error of JAX with the same
-    message, which under `vmap` begins with the first lane that fails. The returned tree
-    must be used afterwards: `jax.jit` drops checks whose result is not used.
+    message, which under `vmap` begins with the first member that fails. The returned
+    tree must be used afterwards: `jax.jit` drops checks whose result is not used.
     """
     # The message is about values alone, so that their derivatives are dropped.
     checks = tuple(
@@ -218,19 +218,19 @@ def _on_host(values: PyTree[Any]) -> PyTree[Any]:
 
 
 def _first_error(bad: np.ndarray, values: tuple[np.ndarray, list]) -> Exception:
-    """Make the exception of the first failed check in the first lane that has one."""
-    lane = next(index for index in np.ndindex(bad.shape) if bad[index])
+    """Create the exception of the first failed check in the first failed member."""
+    member = next(index for index in np.ndindex(bad.shape) if bad[index])
     failed, details = jax.tree.map(
-        lambda x: x[lane] if isinstance(x, np.ndarray) else x, values
+        lambda x: x[member] if isinstance(x, np.ndarray) else x, values
     )
     error, values = details[int(np.argmax(failed))]
     exception = error(*values)
-    if lane:
-        exception.args = (f"lane {lane_name(lane)}: {exception}",)
+    if member:
+        exception.args = (f"member {member_name(member)}: {exception}",)
     return exception
 
 
-def lane_name(index: tuple[int, ...]) -> int | tuple[int, ...] | None:
+def member_name(index: tuple[int, ...]) -> int | tuple[int, ...] | None:
     """Write an index into a batch as users would; it is None without a batch."""
     return index if len(index) > 1 else (index[0] if index else None)
 
@@ -248,7 +248,7 @@ def raise_where(
 
     The exception is `error(bad, values)`, called with NumPy arrays on the host; under
     `vmap` all of them have the batch as leading axes. Only a call-back can put numbers
-    into a message, and only one of our own sees the lanes of a batch.
+    into a message, and only one of our own sees the members of a batch.
     """
     # The same array often belongs to several checks.
     leaves, treedef = jax.tree.flatten(values)
@@ -280,7 +280,7 @@ def _passes(on_host: Callable[..., Any]) -> Callable[..., Bool[Array, ""]]:
 
     @jax.custom_jvp
     def passes(bad, *arrays):
-        return _lanes(on_host)(bad, *arrays)
+        return _one_result_of_batch(on_host)(bad, *arrays)
 
     @passes.defjvp
     def _(primals, tangents):
@@ -293,11 +293,11 @@ def _passes(on_host: Callable[..., Any]) -> Callable[..., Bool[Array, ""]]:
     return passes
 
 
-def _lanes(on_host: Callable[..., Any]) -> Callable[..., Bool[Array, ""]]:
-    """Make the function of `_passes`, so that a batch has one result for all lanes.
+def _one_result_of_batch(on_host: Callable[..., Any]) -> Callable[..., Bool[Array, ""]]:
+    """Wrap the function of `_passes`, so that a batch has one result for all members.
 
-    If each lane had its own result, `vmap` would call the host even if all lanes are
-    good.
+    If each member had its own result, `vmap` would call the host even if all members
+    are good.
     """
 
     @custom_vmap
@@ -316,7 +316,7 @@ def _lanes(on_host: Callable[..., Any]) -> Callable[..., Bool[Array, ""]]:
             x if batched else jnp.broadcast_to(x, (axis_size, *x.shape))
             for x, batched in zip(arrays, in_batched, strict=True)
         ]
-        return _lanes(on_host)(*full), False
+        return _one_result_of_batch(on_host)(*full), False
 
     return passes
 

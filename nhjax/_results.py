@@ -7,7 +7,7 @@ import equinox as eqx
 import jax
 import numpy as np
 
-from ._errors import lane_name
+from ._errors import member_name
 
 
 JUMPS = (
@@ -45,7 +45,7 @@ def _counted(codes: np.ndarray, names: dict[int, str]) -> str:
     parts = []
     for code in np.unique(codes):
         where, name = np.argwhere(codes == code), names[int(code)]
-        first = lane_name(tuple(where[0].tolist()))
+        first = member_name(tuple(where[0].tolist()))
         which = "" if name == "successful" else f" (first: {first})"
         parts.append(f"{len(where)} {name}{which}")
     return f"{codes.size} runs: {', '.join(parts)}" if parts else "0 runs"

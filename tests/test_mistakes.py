@@ -1150,7 +1150,7 @@ RUNS = [
         TypeError,
         "`method` must be an nhjax.LobattoIIIAB",
         "got 3 of type int",
-        "Such as nhjax.LobattoIIIAB(3)",
+        "For example, pass nhjax.LobattoIIIAB(3)",
     ),
     row(
         "gave the class of a method",
@@ -1171,14 +1171,14 @@ RUNS = [
         lambda: run(Y0, adjoint="direct"),
         TypeError,
         "`adjoint` must be an nhjax.AbstractAdjoint, got 'direct'",
-        "Such as nhjax.DirectAdjoint()",
+        "For example, pass nhjax.DirectAdjoint()",
     ),
     row(
         "gave True as what is saved",
         lambda: run(Y0, saveat=True),
         TypeError,
         "`saveat` must be an nhjax.SaveAt, got True",
-        "Such as nhjax.SaveAt(t0=True, steps=True)",
+        "For example, pass nhjax.SaveAt(t0=True, steps=True)",
     ),
     row(
         "gave True as progress meter",
@@ -1369,7 +1369,7 @@ EVENTS = [
         lambda: falls(lambda t, y, args: t),
         TypeError,
         "`event` must be an nhjax.Event",
-        "Such as nhjax.Event(cond_fn)",
+        "For example, pass nhjax.Event(cond_fn)",
     ),
     row(
         "compared in a condition",

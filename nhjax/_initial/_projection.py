@@ -209,7 +209,7 @@ def _index_of_name(
     if size != dimension:
         raise ValueError(
             f"`{name}` has the name {x!r}, but the {size} numbers of `{letter}` are "
-            f"not the {dimension} coordinates that have names: give indices of "
+            f"not the {dimension} coordinates that have names: pass indices of "
             f"`{letter}`."
         )
     if x not in names:

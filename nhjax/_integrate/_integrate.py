@@ -220,11 +220,15 @@ def integrate(
         (1, 4)
     """
     check_type("system", system, (LagrangianSystem, HamiltonianSystem))
-    check_type("method", method, METHODS, "Such as nhjax.LobattoIIIAB(3).")
-    check_type("saveat", saveat, SaveAt, "Such as nhjax.SaveAt(t0=True, steps=True).")
-    newton = "Such as nhjax.Newton()."
+    check_type("method", method, METHODS, "For example, pass nhjax.LobattoIIIAB(3).")
+    check_type(
+        "saveat", saveat, SaveAt, "For example, pass nhjax.SaveAt(t0=True, steps=True)."
+    )
+    newton = "For example, pass nhjax.Newton()."
     check_type("stage_solver", stage_solver, AbstractStageSolver, newton)
-    check_type("adjoint", adjoint, AbstractAdjoint, "Such as nhjax.DirectAdjoint().")
+    check_type(
+        "adjoint", adjoint, AbstractAdjoint, "For example, pass nhjax.DirectAdjoint()."
+    )
     check_type("progress_meter", progress_meter, AbstractProgressMeter)
     throw = check_flag("throw", throw)
     needed_by = _what_needs_the_length(saveat, progress_meter)

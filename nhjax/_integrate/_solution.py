@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Array, Float, PyTree
 
 from .._custom_types import FloatScalarLike
-from .._errors import IntegrationError, is_traced, lane_name, raise_where
+from .._errors import IntegrationError, is_traced, member_name, raise_where
 from .._results import EVENT_OCCURRED, FALLBACK, JUMPS, messages, RESULTS
 from .._system import State
 from ._checkpoint import Checkpoint
@@ -59,8 +59,7 @@ class Solution(eqx.Module):
         nodes that were reached. After an event that ends the run, all entries of `ts`
         and `ys`, and `t1`, are those of the event.
 
-    Under `vmap` every array has the batch as its leading axis; a member of the batch is
-    called a lane.
+    Under `vmap` every array has a leading axis for the members of the batch.
     """
 
     t0: Float[Array, ""]
@@ -164,11 +163,11 @@ class Solution(eqx.Module):
         return to_dataset(self, coordinates, {} if units is None else units)
 
     def failures(self) -> list[tuple[int | tuple[int, ...] | None, int, str]]:
-        """List the runs that failed, each as (lane, step, reason).
+        """List the runs that failed, each as (member, step, reason).
 
         `step` is the index of the step that failed, and `reason` is the message of its
-        `RESULTS`. `lane` is None for a solution without a batch, an index for a batch,
-        and a tuple of indices for a batch of batches.
+        `RESULTS`. `member` is None for a solution without a batch, an index for a
+        batch, and a tuple of indices for a batch of batches.
         """
         outcome = _outcome(self)
         if is_traced(*outcome):
@@ -211,7 +210,7 @@ def is_singular_from_the_start(sol: Solution) -> bool:
 def raise_failures(
     sol: Solution, dt: FloatScalarLike | None = None, used_newton: bool = False
 ) -> Solution:
-    """Return `sol`, or raise an `IntegrationError` with lane, step and reason.
+    """Return `sol`, or raise an `IntegrationError` with member, step and reason.
 
     With the step size `dt`, the message suggests another one. It recommends Newton's
     method unless the run has already `used_newton`.
@@ -251,16 +250,16 @@ def _failures(
                 f"coordinate {coordinate}."
             )
         if message not in ("", EVENT_OCCURRED):
-            failures.append((lane_name(index), int(steps[index]), message))
+            failures.append((member_name(index), int(steps[index]), message))
     return failures
 
 
 def _failure_message(
     failures: list[tuple[int | tuple[int, ...] | None, int, str]], dt: float | None
 ) -> str:
-    lane, k, reason = failures[0]
-    where = "" if lane is None else f"lane {lane}, "
-    others = f" ({len(failures) - 1} more lanes failed)" if failures[1:] else ""
+    member, k, reason = failures[0]
+    where = "" if member is None else f"member {member}, "
+    others = f" ({len(failures) - 1} more members failed)" if failures[1:] else ""
     if dt is not None and "smaller `dt`" in reason:
         smooth = "if all forces are smooth, " if JUMPS in reason else ""
         reason += f" `dt` is {dt:.6g}: {smooth}try {0.5 * dt:.6g}."

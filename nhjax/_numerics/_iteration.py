@@ -103,11 +103,11 @@ def iterate(
     """Repeat `iteration` until its increments no longer fall.
 
     `iteration(x)` returns the next iterate, the sizes of the increment and of the
-    iterate, and auxiliary values at x. Increments are measured relative to `scale`, the size of
-    x, or relative to the size of the iterate if that is larger, because x may start
-    from zero. If both are zero, increments are measured relative to the first one. The
-    round-off of x is proportional to the same size or, if data are larger than x, to
-    `scale` plus `round_off`.
+    iterate, and auxiliary values at x. Increments are measured relative to `scale`, the
+    size of x, or relative to the size of the iterate if that is larger, because x may
+    start from zero. If both are zero, increments are measured relative to the first
+    one. The round-off of x is proportional to the same size or, if data are larger than
+    x, to `scale` plus `round_off`.
 
     The iteration ends
 

@@ -27,7 +27,7 @@ def started(system, q=IDENTITY, v=SPIN, **options):
 # Elements of the group ----------------------------------------------------------------
 
 
-def test_an_element_off_the_group_is_refused():
+def test_initial_state_off_group_is_refused():
     with pytest.raises(
         nhjax.ConstraintViolationError,
         match=r"`q` = \[1\.1 .*not an element of the group SO3.*off by 0\.1.*normalise",
@@ -35,7 +35,7 @@ def test_an_element_off_the_group_is_refused():
         started(BODY.system, 1.1 * IDENTITY)
 
 
-def test_an_element_off_the_group_is_refused_under_jit():
+def test_initial_state_off_group_under_jit_is_refused():
     start = jax.jit(lambda q: started(BODY.system, q))
     with pytest.raises(
         RuntimeError,
@@ -44,12 +44,12 @@ def test_an_element_off_the_group_is_refused_under_jit():
         jax.block_until_ready(start(1.1 * IDENTITY))
 
 
-def test_projection_returns_to_the_group():
+def test_projection_of_element_off_group_returns_to_group():
     y = started(BODY.system, 1.1 * IDENTITY, project=True)
     np.testing.assert_allclose(y.q, IDENTITY, rtol=3e-16)
 
 
-def test_integration_does_not_start_off_the_group():
+def test_integrate_from_state_off_group_is_refused():
     y0 = started(BODY.system)
     y0 = nhjax.State(1.1 * y0.q, y0.v, y0.p, y0.multiplier)
     with pytest.raises(
@@ -66,18 +66,18 @@ def test_integration_does_not_start_off_the_group():
         ((IDENTITY, jnp.zeros(2), jnp.zeros(1)), r"2 .*got.*3|3.*2"),
     ],
 )
-def test_an_element_of_another_shape_is_refused(q, message):
+def test_initial_state_on_group_with_wrong_shape_is_refused(q, message):
     with pytest.raises((nhjax.ShapeError, TypeError), match=message):
         nhjax.initial_state(BALL.system, q, jnp.zeros(5))
 
 
-def test_a_tuple_needs_a_manifold():
+def test_tuple_as_configuration_without_manifold_is_refused():
     free = nhjax.LagrangianSystem(lambda t, q, v, args: 0.5 * v @ v)
     with pytest.raises(nhjax.ShapeError, match=r"tuple.*manifold"):
         nhjax.initial_state(free, (jnp.zeros(2), jnp.zeros(1)), jnp.zeros(3))
 
 
-def test_parts_of_unlike_precision_are_refused():
+def test_initial_state_on_product_with_mixed_dtypes_is_refused():
     q = (BALL.q0[0], BALL.q0[1].astype(jnp.float32))
     with pytest.raises(nhjax.DTypeError, match="float32"):
         nhjax.initial_state(BALL.system, q, BALL.v0)
@@ -106,7 +106,7 @@ def spinning_up(retraction):
     ],
     ids=["exponential, start", "exponential, middle", "cayley, start"],
 )
-def test_a_step_that_turns_too_far_names_its_index(retraction, chart, largest):
+def test_step_that_rotates_beyond_chart_is_named_by_index(retraction, chart, largest):
     system, h = spinning_up(retraction), 0.5
     y0 = started(system, v=jnp.zeros(3))
     run = partial(
@@ -133,7 +133,7 @@ def test_a_step_that_turns_too_far_names_its_index(retraction, chart, largest):
 # Holonomic constraints ----------------------------------------------------------------
 
 
-def test_a_position_off_the_constraint_is_refused():
+def test_initial_state_off_holonomic_constraint_is_refused():
     with pytest.raises(
         nhjax.ConstraintViolationError,
         match=r"1 of 1 holonomic .* at q = .*Γ\[0\] = .*`project=True`",
@@ -141,13 +141,13 @@ def test_a_position_off_the_constraint_is_refused():
         started(PENDULUM.system, 1.1 * PENDULUM.q0, PENDULUM.v0)
 
 
-def test_a_velocity_off_the_tangent_space_is_refused():
+def test_initial_state_with_velocity_off_holonomic_constraint_is_refused():
     with pytest.raises(nhjax.ConstraintViolationError, match=r"dΓ\[0\]/dt = .*proje"):
         started(PENDULUM.system, PENDULUM.q0, PENDULUM.v0 + PENDULUM.q0)
 
 
 @pytest.mark.parametrize("kind", ["lagrangian", "hamiltonian"])
-def test_projection_reaches_positions_and_velocities(kind):
+def test_projection_onto_holonomic_constraint_corrects_positions_and_velocities(kind):
     system, name = PENDULUM.system, "v"
     if kind == "hamiltonian":
         name = "p"
@@ -163,7 +163,7 @@ def test_projection_reaches_positions_and_velocities(kind):
     assert np.max(np.abs(system.constraint_violation(0.0, y))) < 1e-15
 
 
-def test_a_projection_in_the_kinetic_metric_of_a_group():
+def test_projection_on_group_is_nearest_in_kinetic_metric():
     top = systems.HeavyTopSE3()
     q = top.q0 + jnp.array([0.0, 0.0, 0.0, 0.0, 0.1, 0.0, -0.1])
     y = nhjax.initial_state(top.system, q, top.v0, project=True)
@@ -171,7 +171,7 @@ def test_a_projection_in_the_kinetic_metric_of_a_group():
     assert float(jnp.max(jnp.abs(y.q - q))) < 0.15
 
 
-def test_a_position_that_cannot_be_reached():
+def test_projection_onto_unreachable_constraint_is_refused():
     system = nhjax.LagrangianSystem(
         lambda t, q, v, args: 0.5 * v @ v, holonomic=lambda t, q, args: q @ q + 1.0
     )
@@ -179,7 +179,7 @@ def test_a_position_that_cannot_be_reached():
         nhjax.initial_state(system, jnp.ones(2), jnp.zeros(2), project=True)
 
 
-def test_dependent_holonomic_constraints_are_refused():
+def test_initial_state_with_dependent_holonomic_constraints_is_refused():
     system = nhjax.LagrangianSystem(
         lambda t, q, v, args: 0.5 * v @ v,
         holonomic=lambda t, q, args: jnp.stack([q[0], 2.0 * q[0]]),
@@ -188,7 +188,7 @@ def test_dependent_holonomic_constraints_are_refused():
         nhjax.initial_state(system, jnp.zeros(2), jnp.array([0.0, 1.0]))
 
 
-def test_a_holonomic_constraint_of_the_wrong_shape():
+def test_holonomic_constraint_of_wrong_shape_is_refused():
     system = nhjax.LagrangianSystem(
         lambda t, q, v, args: 0.5 * v @ v, holonomic=lambda t, q, args: jnp.eye(2)
     )
@@ -198,7 +198,7 @@ def test_a_holonomic_constraint_of_the_wrong_shape():
         nhjax.initial_state(system, jnp.zeros(2), jnp.zeros(2))
 
 
-def test_holonomic_constraints_need_the_hypotheses_of_the_paper():
+def test_method_without_hypotheses_is_refused_for_holonomic_constraints():
     with pytest.raises(ValueError, match="H1"):
         nhjax.integrate(
             PENDULUM.system,
@@ -213,7 +213,7 @@ def test_holonomic_constraints_need_the_hypotheses_of_the_paper():
 
 
 @pytest.mark.parametrize("name", ["hamiltonian", "nonholonomic", "force"])
-def test_functions_of_a_hamiltonian_system_must_be_functions(name):
+def test_function_of_hamiltonian_system_that_is_a_number_is_refused(name):
     functions = {"hamiltonian": lambda t, q, p, args: 0.5 * p @ p} | {name: 3}
     with pytest.raises(
         TypeError, match=rf"HamiltonianSystem: `{name}`.*\(t, q, p, args\), got 3"
@@ -221,7 +221,7 @@ def test_functions_of_a_hamiltonian_system_must_be_functions(name):
         nhjax.HamiltonianSystem(**functions)  # pyright: ignore
 
 
-def test_an_irregular_hamiltonian_is_refused():
+def test_initial_state_of_irregular_hamiltonian_is_refused():
     system = nhjax.HamiltonianSystem(lambda t, q, p, args: 0.5 * p[0] ** 2 + q[1])
     with pytest.raises(
         nhjax.IrregularLagrangianError, match=r"Hamiltonian is not regular.*D2D2H"
@@ -229,7 +229,7 @@ def test_an_irregular_hamiltonian_is_refused():
         nhjax.initial_state(system, jnp.zeros(2), p=jnp.ones(2))
 
 
-def test_a_velocity_without_a_momentum():
+def test_initial_state_from_velocity_without_momentum_is_refused():
     def relativistic(t, q, p, args):
         return jnp.sum(jnp.sqrt(1.0 + p**2))
 
@@ -242,7 +242,7 @@ def test_a_velocity_without_a_momentum():
         nhjax.initial_state(system, jnp.zeros(2), jnp.array([1.5, 0.0]))
 
 
-def test_a_momentum_off_the_constraint_is_refused():
+def test_initial_state_with_momentum_off_constraint_is_refused():
     system = nhjax.HamiltonianSystem(
         lambda t, q, p, args: 0.5 * p @ p,
         nonholonomic=lambda t, q, p, args: p[2] - q[1] * p[0],
@@ -253,6 +253,6 @@ def test_a_momentum_off_the_constraint_is_refused():
         nhjax.initial_state(system, jnp.zeros(3), p=jnp.ones(3))
 
 
-def test_positional_constraints_are_refused():
+def test_constraint_as_positional_argument_is_refused():
     with pytest.raises(TypeError):
         nhjax.LagrangianSystem(BALL.lagrangian, BALL.constraint)  # pyright: ignore

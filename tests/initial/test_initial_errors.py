@@ -130,29 +130,29 @@ def started():
 
 
 @by_value
-def test_initial_state_refuses_values(case):
+def test_initial_state_with_wrong_values_is_refused(case):
     wrong, exception, message = case
     with pytest.raises(exception, match=message):
         start_adjustable(**(GOOD | wrong))
 
 
 @by_value
-def test_initial_state_refuses_values_under_jit(case, started):
+def test_initial_state_with_wrong_values_under_jit_is_refused(case, started):
     wrong, exception, message = case
     with pytest.raises(RuntimeError, match=f"{exception.__name__}: .*{message}"):
         jax.block_until_ready(started[0](**(GOOD | wrong)))
 
 
 @by_value
-def test_initial_state_refuses_one_lane_under_vmap(case, started):
+def test_initial_state_with_one_wrong_member_under_vmap_is_refused(case, started):
     wrong, exception, message = case
-    message = f"{exception.__name__}: lane 1: .*{message}"
-    lanes = jax.tree.map(lambda *x: jnp.stack(x), GOOD, GOOD | wrong, GOOD)
+    message = f"{exception.__name__}: member 1: .*{message}"
+    members = jax.tree.map(lambda *x: jnp.stack(x), GOOD, GOOD | wrong, GOOD)
     with pytest.raises(RuntimeError, match=message):
-        jax.block_until_ready(started[1](lanes))
+        jax.block_until_ready(started[1](members))
 
 
-def test_a_failure_of_a_compiled_program_is_told_in_few_lines(started, caplog):
+def test_error_of_compiled_initial_state_has_few_lines(started, caplog):
     wrong = GOOD | {"v": jnp.array([0.5, 0.25, -0.5])}
     with pytest.raises(nhjax.ConstraintViolationError) as eager:
         start_adjustable(**wrong)
@@ -169,7 +169,7 @@ def test_a_failure_of_a_compiled_program_is_told_in_few_lines(started, caplog):
     assert caplog.records == []
 
 
-def test_failure_of_own_callback_is_logged_as_jax_does(caplog):
+def test_error_of_user_callback_is_logged_as_by_jax(caplog):
     def fail(x):
         raise ValueError("my own words")
 
@@ -191,7 +191,7 @@ def test_failure_of_own_callback_is_logged_as_jax_does(caplog):
     ],
     ids=["plain", "vmap", "vmap of jacfwd", "jacrev"],
 )
-def test_checks_that_hold_do_not_call_the_host(transform, monkeypatch):
+def test_initial_state_with_correct_values_does_not_call_host(transform, monkeypatch):
     pure_callback, traced, called = jax.pure_callback, [], []
 
     def observed(function, *others, **options):
@@ -210,7 +210,7 @@ def test_checks_that_hold_do_not_call_the_host(transform, monkeypatch):
     assert not called
 
 
-def test_initial_state_accepts_the_others(started):
+def test_initial_state_with_correct_values_is_accepted(started):
     expected = start_adjustable(**GOOD)
     for got in (
         started[0](**GOOD),
@@ -223,7 +223,7 @@ def relativistic(t, q, v, args):
     return -jnp.sqrt(1.0 - v @ v)
 
 
-def test_a_momentum_without_a_velocity():
+def test_initial_state_from_momentum_without_velocity_is_refused():
     # L = v - v²/2 + |v|³/6 has p = 1 - v + v²/2 >= 1/2.
     def lagrangian(t, q, v, args):
         return jnp.sum(v - v**2 / 2 + jnp.abs(v) ** 3 / 6)
@@ -232,18 +232,18 @@ def test_a_momentum_without_a_velocity():
         start(system_with(lagrangian=lagrangian), v=None, p=0.1 * jnp.ones(3))
 
 
-def test_a_velocity_beyond_the_domain_is_not_called_irregular():
+def test_velocity_outside_domain_of_lagrangian_is_reported_as_not_finite():
     with pytest.raises(nhjax.NonFiniteError, match=r"v = \[0\.9.*L = nan"):
         start(system_with(lagrangian=relativistic), v=0.9 * jnp.ones(3))
 
 
-def test_an_irregular_lagrangian_is_found_from_a_momentum_too():
+def test_irregular_lagrangian_is_refused_from_momentum():
     system = system_with(lagrangian=lambda t, q, v, args: v[0] ** 2)
     with pytest.raises(nhjax.IrregularLagrangianError, match=r"p = \[1\. 0\. 0\.\]"):
         start(system, v=None, p=jnp.array([1.0, 0.0, 0.0]))
 
 
-def test_a_projection_that_cannot_succeed():
+def test_projection_onto_empty_constraint_is_refused():
     system = system_with(nonholonomic=lambda t, q, v, args: v @ v + 1.0)
     with pytest.raises(nhjax.NewtonError, match=r"projected.*v = .*Φ = .*Start nearer"):
         start(system, project=True)

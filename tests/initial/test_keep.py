@@ -91,7 +91,7 @@ SPHERE = nhjax.LagrangianSystem(
 
 
 @pytest.mark.parametrize("kept", [(0,), (1, 4), (5, 0, 2), (-1,)])
-def test_kept_velocities_have_their_bits_and_the_others_are_nearest(kept):
+def test_projection_with_kept_velocities_keeps_bits_and_is_nearest(kept):
     y = nhjax.initial_state(
         LAGRANGIAN, jnp.asarray(Q), jnp.asarray(V), t=0.7, project=True, keep_v=kept
     )
@@ -106,7 +106,7 @@ def test_kept_velocities_have_their_bits_and_the_others_are_nearest(kept):
 
 @pytest.mark.parametrize("given", ["v", "p"])
 @pytest.mark.parametrize("system", [LAGRANGIAN, HAMILTONIAN], ids=["L", "H"])
-def test_velocities_and_momenta_are_kept_in_both_forms(system, given):
+def test_projection_keeps_velocities_and_momenta_in_both_forms(system, given):
     # Of a Lagrangian the distance is that of velocities, of a Hamiltonian of momenta:
     # they are the same number.
     u, kept = V if given == "v" else MASS @ V, (1, 3)
@@ -128,7 +128,7 @@ def test_velocities_and_momenta_are_kept_in_both_forms(system, given):
     assert np.max(np.abs(system.constraint_violation(0.7, y))) < 1e-13
 
 
-def test_a_constraint_nonlinear_in_velocities_is_met_beside_kept_ones():
+def test_projection_with_kept_velocity_satisfies_nonlinear_constraint():
     mass = np.array([1.0, 3.0, 0.2, 2.0])
     system = nhjax.LagrangianSystem(
         lambda t, q, v, args: 0.5 * v @ (jnp.asarray(mass) * v),
@@ -164,7 +164,7 @@ def test_a_constraint_nonlinear_in_velocities_is_met_beside_kept_ones():
     np.testing.assert_allclose(v[1:], scipys.x, atol=1e-6)
 
 
-def test_a_disc_rolls_at_the_speed_that_is_kept():
+def test_disc_with_kept_speed_rolls_at_that_speed():
     disc = VerticalRollingDisc(mass=4.0, roll_inertia=0.3, radius=0.7)
     v, q = jnp.array([3.0, 0.0, 0.0, 0.2]), jnp.zeros(4)
     free = nhjax.initial_state(disc.system, q, v, project=True)
@@ -174,7 +174,7 @@ def test_a_disc_rolls_at_the_speed_that_is_kept():
     np.testing.assert_allclose(y.v, [3.0, 0.0, 3.0 / 0.7, 0.2], rtol=1e-15)
 
 
-def test_a_bicycle_runs_at_the_rates_that_are_kept():
+def test_bicycle_with_kept_rates_runs_at_these_rates():
     # The gallery solves for the pitch and five rates without a projection.
     expected = WhippleBicycle.running(3.0, 0.2, -0.1, lean=0.1, steer=0.05)
     q = jnp.zeros(8).at[jnp.array([3, 5])].set(jnp.array([0.1, 0.05]))
@@ -196,7 +196,7 @@ def test_a_bicycle_runs_at_the_rates_that_are_kept():
 # Positions ----------------------------------------------------------------------------
 
 
-def test_kept_positions_have_their_bits_and_the_others_are_nearest():
+def test_projection_with_kept_positions_keeps_bits_and_is_nearest():
     q, v = np.array([0.3, 0.5, 0.9]), np.array([0.1, 0.2, 0.3])
     y = nhjax.initial_state(
         SPHERE, jnp.asarray(q), jnp.asarray(v), t=1.0, project=True, keep_q=0, keep_v=1
@@ -212,7 +212,7 @@ def test_kept_positions_have_their_bits_and_the_others_are_nearest():
     np.testing.assert_allclose(y.v, expected, atol=1e-14)
 
 
-def test_positions_at_the_origin_are_kept():
+def test_projection_keeps_positions_at_origin():
     slopes = np.array([1.0, 2.0, 3.0])
     system = nhjax.LagrangianSystem(
         lambda t, q, v, args: 0.5 * v @ v,
@@ -249,7 +249,7 @@ SLIDER = np.cos(ANGLE) + 2 * np.cos(ROD)
     ],
     ids=["crank", "crank and rod"],
 )
-def test_a_linkage_follows_the_crank_that_is_kept(q, kept):
+def test_linkage_with_kept_crank_angle_is_closed(q, kept):
     y = nhjax.initial_state(
         CRANK,
         jnp.array(q),
@@ -268,7 +268,7 @@ def test_a_linkage_follows_the_crank_that_is_kept(q, kept):
 # Groups -------------------------------------------------------------------------------
 
 
-def test_body_velocities_of_a_disc_on_a_group_are_kept():
+def test_projection_keeps_body_velocities_on_group():
     disc = RollingDisc(radius=0.5)
     y = nhjax.initial_state(
         disc.system, disc.q0, jnp.array([3.0, 0.1, 0.2, 0.0]), project=True, keep_v=0
@@ -293,7 +293,7 @@ def plane_body(retraction):
 @pytest.mark.parametrize(
     "retraction", [nhjax.Cayley(), nhjax.Exponential()], ids=["Cayley", "Exponential"]
 )
-def test_coordinates_of_a_pose_in_the_plane_are_kept_in_space(retraction, kept):
+def test_projection_keeps_coordinates_of_pose_in_plane(retraction, kept):
     system, group = plane_body(retraction), nhjax.SE2(retraction)
     q = np.array([0.2, 0.1, 0.4])
     y = nhjax.initial_state(
@@ -342,7 +342,7 @@ PLACE = np.array([0.5, 0.6, 0.7])
         long("SE3", (5, 6, 0, 1, 2, 3)),
     ],
 )
-def test_an_attitude_or_a_place_in_space_is_kept(kind, kept):
+def test_projection_keeps_attitude_or_position_in_space(kind, kept):
     # The constraint couples both: a point of the body stays on the sphere.
     def point(attitude, place):
         w, x, y, z = attitude
@@ -365,18 +365,18 @@ def test_an_attitude_or_a_place_in_space_is_kept(kind, kept):
     assert np.max(np.abs(found - given)) > 1e-3
 
 
-def test_a_kept_attitude_that_is_not_of_length_one_is_refused():
+def test_kept_quaternion_not_of_unit_length_is_refused():
     body = systems.FreeRigidBody()
     q, v = 1.1 * jnp.asarray(QUATERNION), jnp.zeros(3)
     message = (
-        r"`q` with its kept numbers = \[ 0\.55 .*not an element of the group.*fewer in "
-        r"`keep_q`, which keeps q\[0\], q\[1\], q\[2\] and q\[3\]"
+        r"`q` with its kept numbers = \[ 0\.55 .*not an element of the group.*fewer "
+        r"components than q\[0\], q\[1\], q\[2\] and q\[3\] in `keep_q`"
     )
     with pytest.raises(nhjax.ConstraintViolationError, match=message):
         nhjax.initial_state(body.system, q, v, project=True, keep_q=range(4))
 
 
-def test_one_number_of_a_quaternion_that_cannot_be_kept_is_refused():
+def test_kept_number_of_quaternion_out_of_reach_is_refused():
     # At the identity no rotation leaves the real part as it is, to first order.
     system = nhjax.LagrangianSystem(
         lambda t, q, v, args: 0.5 * v @ v,
@@ -393,7 +393,7 @@ def test_one_number_of_a_quaternion_that_cannot_be_kept_is_refused():
 # Choices that leave nothing or little free --------------------------------------------
 
 
-def test_all_components_may_be_kept_where_they_satisfy_the_constraints():
+def test_projection_with_all_components_kept_accepts_consistent_state():
     bicycle = WhippleBicycle.running(3.0, 0.2, lean=0.1)
     y = nhjax.initial_state(
         bicycle.system,
@@ -407,7 +407,7 @@ def test_all_components_may_be_kept_where_they_satisfy_the_constraints():
     assert_kept(y.v, bicycle.v0, range(8))
 
 
-def test_a_consistent_choice_with_too_few_free_components_succeeds():
+def test_projection_with_few_free_components_accepts_consistent_choice():
     u = jnp.array([2.0, 0.5, 1.0, 0.0])
     system = nhjax.LagrangianSystem(
         lambda t, q, v, args: 0.5 * v @ v,
@@ -418,7 +418,7 @@ def test_a_consistent_choice_with_too_few_free_components_succeeds():
 
 
 @pytest.mark.parametrize("kept", [(0,), (3,), (0, 3)])
-def test_redundant_constraints_are_met_beside_kept_components(kept):
+def test_projection_with_kept_components_satisfies_redundant_constraints(kept):
     doubled = nhjax.LagrangianSystem(
         LAGRANGIAN.lagrangian,
         nonholonomic=lambda t, q, v, args: jnp.concatenate(
@@ -436,7 +436,7 @@ def test_redundant_constraints_are_met_beside_kept_components(kept):
     assert_kept(start[1].v, V, kept)
 
 
-def test_a_component_that_hardly_enters_a_constraint_is_not_made_enormous():
+def test_projection_with_tiny_coefficient_of_free_component_is_refused():
     # The cosine of π/2 is 6e-17 and not zero: a speed of 1e16 would satisfy this.
     skate = nhjax.LagrangianSystem(
         lambda t, q, v, args: 0.5 * v @ v,
@@ -448,7 +448,7 @@ def test_a_component_that_hardly_enters_a_constraint_is_not_made_enormous():
 
 
 @pytest.mark.parametrize("unit", [1e-12, 1e-6, 1.0, 1e6, 1e12])
-def test_units_of_components_decide_nothing(unit):
+def test_projection_with_kept_components_does_not_depend_on_units(unit):
     # Lengths in units of their own: masses and rows of two coordinates change.
     scale = np.array([unit, 1.0, unit, 1.0, 1.0, 1.0])
     metric, rows = MASS * scale[:, None] * scale, ROWS * scale
@@ -464,7 +464,7 @@ def test_units_of_components_decide_nothing(unit):
 
 
 @pytest.mark.parametrize("size", [0.0, 1e-300, 1e-30, 1e-8, 1e8])
-def test_velocities_of_any_size_are_kept(size):
+def test_projection_keeps_velocities_of_any_size(size):
     u = size * jnp.asarray(V)
     system = nhjax.LagrangianSystem(
         lambda t, q, v, args: 0.5 * v @ jnp.asarray(MASS) @ v,
@@ -476,7 +476,7 @@ def test_velocities_of_any_size_are_kept(size):
     np.testing.assert_allclose(y.v, size * expected, rtol=1e-10, atol=1e-11 * size)
 
 
-def test_terms_that_cancel_near_zero_are_no_violation_of_kept_components():
+def test_projection_with_kept_components_accepts_round_off_near_zero():
     # 0.1 + 0.2 - 0.3 is round-off, which the same floor allows as without `keep_q`.
     system = nhjax.LagrangianSystem(
         lambda t, q, v, args: 0.5 * (v @ v),
@@ -489,7 +489,7 @@ def test_terms_that_cancel_near_zero_are_no_violation_of_kept_components():
         nhjax.initial_state(system, jnp.array([1e-11, 0.0]), jnp.ones(2), **kept)
 
 
-def test_components_are_kept_in_single_precision():
+def test_projection_in_float32_keeps_components():
     q = jnp.array([0.3, 0.5, 0.9], jnp.float32)
     v = jnp.array([0.1, 0.2, 0.3], jnp.float32)
     y = nhjax.initial_state(SPHERE, q, v, project=True, keep_q=[1], keep_v=[0])
@@ -509,7 +509,7 @@ def kept_start(q, v, t=0.3, **options):
     )
 
 
-def test_kept_components_under_jit_and_vmap():
+def test_projection_with_kept_components_under_jit_and_vmap_agrees():
     q = jnp.asarray(RNG.uniform(0.3, 0.6, size=(4, 3)))
     v = jnp.asarray(RNG.normal(size=(4, 3)))
     batch = jax.jit(jax.vmap(kept_start))(q, v)
@@ -524,7 +524,7 @@ def test_kept_components_under_jit_and_vmap():
         )
 
 
-def test_derivatives_agree_with_differences():
+def test_projection_with_kept_components_has_derivatives_of_differences():
     q, v = jnp.array([0.3, 0.5, 0.9]), jnp.array([0.1, 0.2, 0.3])
 
     @jax.jit
@@ -544,7 +544,7 @@ def test_derivatives_agree_with_differences():
     np.testing.assert_array_equal(forward[4], jnp.eye(7)[4])
 
 
-def test_derivatives_on_a_group_agree_with_differences():
+def test_projection_with_kept_components_on_group_has_derivatives_of_differences():
     system = plane_body(nhjax.Cayley())
 
     @jax.jit
@@ -560,7 +560,7 @@ def test_derivatives_on_a_group_agree_with_differences():
     np.testing.assert_allclose(jax.jacrev(outcome)(q), differences, atol=1e-8)
 
 
-def test_a_gradient_where_a_kept_choice_determines_the_others():
+def test_projection_determined_by_kept_components_has_exact_gradient():
     disc = VerticalRollingDisc(radius=0.7)
 
     def roll(speed, radius):
@@ -620,7 +620,7 @@ BLADE = nhjax.LagrangianSystem(
         ),
     ],
 )
-def test_an_over_determined_choice_is_named(v, kept, message, released):
+def test_kept_velocities_that_violate_constraint_are_named(v, kept, message, released):
     v = jnp.array(v)
 
     def start(v, kept=kept):
@@ -637,7 +637,7 @@ def test_an_over_determined_choice_is_named(v, kept, message, released):
         assert_kept(start(v, rest).v, v, rest)
 
 
-def test_an_over_determined_position_is_named_with_its_constraint():
+def test_kept_position_that_violates_constraint_is_named():
     system = nhjax.LagrangianSystem(
         lambda t, q, v, args: 0.5 * v @ v,
         holonomic=lambda t, q, args: jnp.stack([q[0] + q[1] - 1.0, q[2] ** 2 - 4.0]),
@@ -651,7 +651,7 @@ def test_an_over_determined_position_is_named_with_its_constraint():
         nhjax.initial_state(system, q, jnp.zeros(3), project=True, keep_q=[0, 2])
 
 
-def test_parts_of_a_tuple_are_named_as_such():
+def test_kept_components_of_tuple_are_named_by_part():
     disc = RollingDisc()
     system = nhjax.LagrangianSystem(
         disc.lagrangian,
@@ -665,7 +665,7 @@ def test_parts_of_a_tuple_are_named_as_such():
         )
 
 
-def test_an_over_determined_momentum_of_a_lagrangian_is_named():
+def test_kept_momenta_of_lagrangian_that_violate_constraint_are_named():
     message = r"determine Φ\[0\]: leave p\[0\] \(x\) or p\[2\] \(z\) out of `keep_p`"
     with pytest.raises(nhjax.ConstraintViolationError, match=message):
         nhjax.initial_state(
@@ -677,7 +677,7 @@ def test_an_over_determined_momentum_of_a_lagrangian_is_named():
         )
 
 
-def test_a_nonlinear_constraint_that_kept_components_exclude():
+def test_kept_velocity_that_excludes_nonlinear_constraint_is_refused():
     system = nhjax.LagrangianSystem(
         lambda t, q, v, args: 0.5 * v @ v, nonholonomic=lambda t, q, v, args: v @ v - 1
     )
@@ -688,7 +688,7 @@ def test_a_nonlinear_constraint_that_kept_components_exclude():
         )
 
 
-def test_an_over_determined_member_is_nan_with_throw_false():
+def test_kept_velocities_that_violate_constraint_give_nan_member_without_throw():
     v = jnp.array([[3.0, -1.0, 9.0, 0.0], [3.0, 1.0, 3.0, 0.0]])
 
     def start(v):
@@ -742,15 +742,15 @@ ON_SO3 = nhjax.LagrangianSystem(
         ),
     ],
 )
-def test_a_wrong_choice_names_the_argument(options, exception, message):
+def test_wrong_choice_of_kept_components_names_argument(options, exception, message):
     v = jnp.array([3.0, -1.0, 3.0, 0.0])
     with pytest.raises(exception, match=message):
         nhjax.initial_state(BLADE, jnp.zeros(4), v, **{"project": True, **options})
 
 
-def test_names_are_refused_where_there_are_none():
+def test_names_of_kept_components_without_coordinates_are_refused():
     given = {"project": True, "keep_v": ("x",)}
-    with pytest.raises(ValueError, match=r"no names: give indices.*coordinates=\("):
+    with pytest.raises(ValueError, match=r"no names: pass indices.*coordinates=\("):
         nhjax.initial_state(SPHERE, jnp.ones(3), jnp.zeros(3), **given)
     quaternion = jnp.asarray(QUATERNION)
     message = r"`keep_q` has the name 'a', but the 4 numbers of `q` are not the 3 coord"
@@ -763,7 +763,7 @@ def test_names_are_refused_where_there_are_none():
         nhjax.initial_state(misnamed, jnp.ones(3), jnp.zeros(3), **given)
 
 
-def test_a_choice_that_is_traced_is_refused():
+def test_traced_choice_of_kept_components_is_refused():
     def start(kept):
         v = jnp.array([3.0, -1.0, 3.0, 0.0])
         return nhjax.initial_state(BLADE, jnp.zeros(4), v, project=True, keep_v=kept)
@@ -774,7 +774,7 @@ def test_a_choice_that_is_traced_is_refused():
     np.testing.assert_array_equal(y.v, [3.0, -1.0, 3.0, 0.0])
 
 
-def test_an_empty_choice_keeps_nothing():
+def test_empty_choice_of_kept_components_has_no_effect():
     v = jnp.array([3.0, 0.0, 0.0, 1.0])
     given = BLADE, jnp.zeros(4), v
     y = nhjax.initial_state(*given, project=True)

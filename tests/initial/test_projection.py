@@ -49,7 +49,7 @@ def moved(tree, offset, rng):
 
 
 @pytest.mark.parametrize("example", CONSTRAINED, ids=lambda x: type(x).__name__)
-def test_no_state_near_the_constraints_is_refused(example):
+def test_projection_accepts_states_near_constraints(example):
     start, rng = projector(example.system), np.random.default_rng(0)
     y = start(example.q0, example.v0)
     # Appell's constraint, a cone of velocities, is not regular at rest.
@@ -63,7 +63,7 @@ def test_no_state_near_the_constraints_is_refused(example):
                 assert jnp.max(jnp.abs(near.v - v)) <= 10 * offset + 1e-13
 
 
-def test_no_state_near_the_constraints_is_refused_in_single_precision():
+def test_projection_in_float32_accepts_states_near_constraints():
     start, rng = projector(SPHERE), np.random.default_rng(0)
     rest = jnp.zeros(3, jnp.float32)
     q = start(jnp.array([0.6, 0.3, 0.7], jnp.float32), rest).q
@@ -72,7 +72,7 @@ def test_no_state_near_the_constraints_is_refused_in_single_precision():
             start(moved(q.astype(float), offset, rng).astype(jnp.float32), rest)
 
 
-def test_unit_vectors_that_were_rounded_are_projected():
+def test_projection_accepts_rounded_unit_vectors():
     start, rng = projector(SPHERE), np.random.default_rng(0)
     for _ in range(60):
         q = np.round(np.asarray(directions(rng, jnp.zeros(3))), 10)
@@ -82,7 +82,7 @@ def test_unit_vectors_that_were_rounded_are_projected():
 
 
 @pytest.mark.parametrize("size", [1e-6, 1.0, 1e6])
-def test_the_unit_of_length_decides_nothing(size):
+def test_projection_does_not_depend_on_unit_of_length(size):
     system = nhjax.LagrangianSystem(
         lambda t, q, v, args: 0.5 * v @ v, holonomic=lambda t, q, args: q @ q - size**2
     )
@@ -93,7 +93,7 @@ def test_the_unit_of_length_decides_nothing(size):
             start(moved(y.q, offset * size, rng), jnp.zeros(3))
 
 
-def test_velocities_next_to_nothing_are_projected():
+def test_projection_accepts_tiny_velocities():
     start, rng = projector(SPHERE), np.random.default_rng(0)
     for size in [1e-300, 1e-30, 1e-16, 1e-8]:
         q, v = (np.asarray(directions(rng, jnp.zeros(3))) for _ in range(2))
@@ -101,7 +101,7 @@ def test_velocities_next_to_nothing_are_projected():
         np.testing.assert_allclose(y.v / size, v - (v @ q) * q, atol=1e-14)
 
 
-def test_a_momentum_next_to_that_of_rest_has_its_velocity():
+def test_velocity_from_momentum_near_rest_is_exact():
     # In a magnetic field p = M v + A, and v is what remains of their difference.
     field = jnp.array([1.0, -2.0, 0.5]) / 3
     mass = jnp.array([[3.0, 1.0, 0.5], [1.0, 2.0, 0.3], [0.5, 0.3, 0.7]])
@@ -134,14 +134,14 @@ NAMED = (
 )
 
 
-def test_redundant_constraints_are_named_before_any_projection():
+def test_redundant_constraints_are_named_before_projection():
     with pytest.raises(nhjax.DependentConstraintsError, match=NAMED):
         nhjax.initial_state(
             THREE, jnp.array([0.6, 0.6, 0.3]), jnp.zeros(3), project=True
         )
 
 
-def test_redundant_constraints_are_named_under_jit():
+def test_redundant_constraints_under_jit_are_named():
     with pytest.raises(RuntimeError, match=f"DependentConstraintsError: .*{NAMED}"):
         jax.block_until_ready(
             projector(THREE)(jnp.array([0.6, 0.6, 0.3]), jnp.zeros(3))
@@ -149,7 +149,7 @@ def test_redundant_constraints_are_named_under_jit():
 
 
 @pytest.mark.parametrize("project", [False, True])
-def test_a_constraint_that_is_given_in_both_kinds_is_named(project):
+def test_constraint_given_in_both_kinds_is_named(project):
     system = nhjax.LagrangianSystem(
         lambda t, q, v, args: 0.5 * v @ v,
         nonholonomic=lambda t, q, v, args: jnp.stack([v[0], q @ v]),
@@ -165,7 +165,7 @@ def test_a_constraint_that_is_given_in_both_kinds_is_named(project):
         )
 
 
-def test_three_rows_that_depend_on_each_other_are_enumerated():
+def test_three_dependent_constraints_are_enumerated():
     system = nhjax.HamiltonianSystem(
         lambda t, q, p, args: 0.5 * p @ p,
         nonholonomic=lambda t, q, p, args: jnp.stack([p[0], p[1], p[2], p[0] - p[2]]),
@@ -178,7 +178,7 @@ def test_three_rows_that_depend_on_each_other_are_enumerated():
         nhjax.initial_state(system, jnp.zeros(4), p=jnp.zeros(4), project=True)
 
 
-def test_a_projection_from_where_a_constraint_has_no_gradient():
+def test_projection_from_zero_gradient_of_constraint_is_refused():
     message = (
         r"DΓ does not have full rank at .*0\. 0\. 0\.\].*holonomic\[0\] has no gradi"
     )
@@ -186,7 +186,7 @@ def test_a_projection_from_where_a_constraint_has_no_gradient():
         nhjax.initial_state(SPHERE, jnp.zeros(3), jnp.zeros(3), project=True)
 
 
-def test_terms_that_cancel_at_the_origin_are_no_violation():
+def test_initial_state_with_cancelling_terms_at_origin_is_accepted():
     # 0.1 + 0.2 - 0.3 is one unit of round-off, and nothing tells the size of q.
     system = nhjax.LagrangianSystem(
         lambda t, q, v, args: 0.5 * (v @ v),
@@ -198,7 +198,7 @@ def test_terms_that_cancel_at_the_origin_are_no_violation():
         nhjax.initial_state(system, jnp.asarray([1e-11, 0.0]), jnp.ones(2))
 
 
-def test_a_rate_that_is_round_off_is_no_violation_at_rest():
+def test_initial_state_at_rest_with_constraint_rate_of_round_off_is_accepted():
     racer = systems.RollerRacer(
         gait=lambda t: 0.6 * jnp.sin(4 * t + 0.5 * jnp.pi),
         q0=(0.0, 0.0, 0.0, 0.6),

@@ -144,5 +144,5 @@ def test_failure_message_names_coordinate_and_smaller_dt():
     with pytest.raises(nhjax.IntegrationError, match=message):
         run_with(0.25)
     # Each lane has a step of its own.
-    with pytest.raises(Exception, match=f"lane 1, step 0: .*{message}"):
+    with pytest.raises(Exception, match=f"member 1, step 0: .*{message}"):
         jax.vmap(run_with)(jnp.asarray([1e-6, 0.25]))

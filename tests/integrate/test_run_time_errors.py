@@ -80,9 +80,9 @@ def test_integrate_with_one_wrong_member_under_vmap_raises(case, compiled):
     bad = good | jax.tree.map(jnp.asarray, wrong)
     lanes = jax.tree.map(lambda *x: jnp.stack(x), good, bad)
     if message.startswith("step"):
-        message = f"Integration failed in lane 1, {message}"
+        message = f"Integration failed in member 1, {message}"
     else:
-        message = f"Error: lane 1: {message}"
+        message = f"Error: member 1: {message}"
     with pytest.raises(RuntimeError, match=message):
         jax.block_until_ready(batch(lanes))
 
@@ -126,11 +126,12 @@ def test_failure_under_jit_names_step_and_reason():
 
 def test_failure_under_vmap_names_the_member():
     speeds = jnp.array([-1.0, 0.5, -0.5, 0.25])
-    message = r"Integration failed in lane 1, step 1[0-2] \(1 more lanes failed\): "
+    message = r"Integration failed in member 1, step 1[0-2] \(1 more members failed\): "
     with pytest.raises(RuntimeError, match=message):
         jax.block_until_ready(jax.jit(jax.vmap(fall))(speeds))
     message = (
-        r"Integration failed in lane \(0, 1\), step 1[0-2] \(1 more lanes failed\): "
+        r"Integration failed in member \(0, 1\), step 1[0-2] "
+        r"\(1 more members failed\): "
     )
     with pytest.raises(RuntimeError, match=message):
         jax.block_until_ready(jax.jit(jax.vmap(jax.vmap(fall)))(speeds.reshape(2, 2)))
@@ -147,7 +148,7 @@ def test_a_failure_under_vmap_is_told_once(transform, caplog):
     with pytest.raises((RuntimeError, ValueError)) as error:
         jax.block_until_ready(transform(jax.vmap(fall))(speeds))
     told = "".join([str(error.value), *(x.getMessage() for x in caplog.records)])
-    assert told.count("Integration failed in lane 1") == 1
+    assert told.count("Integration failed in member 1") == 1
 
 
 def test_failures_of_a_traced_solution_raises():
@@ -189,7 +190,7 @@ def test_evaluate_outside_the_run_under_jit_and_vmap_raises(dense):
     outside = r"`t` = 0\.5 lies outside the run, from 0\.0 to 0\.4"
     with pytest.raises(RuntimeError, match=outside):
         jax.block_until_ready(jax.jit(lambda t: dense.evaluate(t))(0.5))
-    with pytest.raises(RuntimeError, match=f"lane 1: Solution.evaluate: {outside}"):
+    with pytest.raises(RuntimeError, match=f"member 1: Solution.evaluate: {outside}"):
         jax.block_until_ready(jax.vmap(dense.evaluate)(jnp.array([0.1, 0.5])))
 
 

@@ -29,14 +29,14 @@ def circling(rate, angle, units):
 
 @pytest.mark.parametrize("angle", [0.7, 1.4, 1.9, 2.6])
 @pytest.mark.parametrize("rate", [0.3, 0.5, 0.7])
-def test_an_iteration_in_circles_is_not_taken_for_noise_on_its_way(rate, angle):
+def test_iteration_that_spirals_is_not_stopped_as_noise(rate, angle):
     solved = circling(rate, angle, 400)
     assert solved.converged
     # What is left of the error is of the size of what is believed to be noise.
     assert float(jnp.max(jnp.abs(solved.x))) < 100 * np.finfo(float).eps / (1 - rate)
 
 
-def test_noise_that_never_falls_ends_an_iteration():
+def test_iteration_ends_with_increments_that_are_noise():
     def sweep(k):
         # Some 150 units of round-off, with both signs.
         return k + 1, UpdateNorms(150 * 2.2e-16 * (1.5 + jnp.sin(k))), None
@@ -48,7 +48,7 @@ def test_noise_that_never_falls_ends_an_iteration():
     assert int(solved.num_iterations) < 20
 
 
-def test_increments_that_do_not_fall_and_are_no_noise_never_end_well():
+def test_iteration_with_large_increments_that_do_not_fall_is_exhausted():
     def sweep(k):
         return k + 1, UpdateNorms(1e-10 * (1.5 + jnp.sin(k))), None
 
@@ -60,7 +60,7 @@ def test_increments_that_do_not_fall_and_are_no_noise_never_end_well():
 
 
 @pytest.mark.parametrize(("tolerance", "iterations"), [(0.0, 13), (1e-6, 6)])
-def test_round_off_of_data_ends_an_iteration_and_multiplies_no_tolerance(
+def test_iteration_with_large_data_ends_at_their_round_off_and_keeps_tolerance(
     tolerance, iterations
 ):
     # Increments 10⁻¹, 10⁻², ...; the data are a thousand times as large as x.

@@ -40,7 +40,7 @@ KEPT = {
 
 
 @pytest.mark.parametrize("name", [*EXACT, *KEPT])
-def test_no_entry_is_missed(name):
+def test_sparsity_pattern_contains_all_nonzero_entries_of_jacobian(name):
     function = (EXACT | KEPT)[name]
     found = jacobian_sparsity(function, X)
     entries = np.asarray(jax.jacfwd(function)(X)) != 0
@@ -50,7 +50,7 @@ def test_no_entry_is_missed(name):
         np.testing.assert_array_equal(found, entries)
 
 
-def test_a_derivative_of_ones_own_counts():
+def test_sparsity_pattern_of_custom_jvp_follows_its_rule():
     @jax.custom_jvp
     def square(x):
         return x**2

@@ -18,7 +18,7 @@ from support.mistakes import (
 
 
 @pytest.mark.parametrize("name", ["nonholonomic", "force"])
-def test_functions_must_be_functions(name):
+def test_function_of_system_that_is_a_number_is_refused(name):
     with pytest.raises(TypeError, match=rf"`{name}`.*\(t, q, v, args\), got 3"):
         system_with(**{name: 3})
 
@@ -52,16 +52,14 @@ class Methods(eqx.Module):
         ),
     ],
 )
-def test_functions_must_take_the_arguments_they_are_called_with(
-    name, function, message
-):
+def test_function_of_system_with_wrong_signature_is_refused(name, function, message):
     with pytest.raises(
         TypeError, match=rf"LagrangianSystem: `{name}` must take {message}"
     ):
         system_with(**{name: function})
 
 
-def test_functions_of_momenta_must_take_the_arguments_they_are_called_with():
+def test_hamiltonian_with_wrong_signature_is_refused():
     message = (
         r"HamiltonianSystem: `hamiltonian` must take \(t, q, p, args\), but .*p\)`"
     )
@@ -69,7 +67,7 @@ def test_functions_of_momenta_must_take_the_arguments_they_are_called_with():
         nhjax.HamiltonianSystem(lambda t, q, p: 0.5 * p @ p)  # pyright: ignore
 
 
-def test_functions_whose_arguments_cannot_be_known_are_accepted():
+def test_function_of_system_with_unknown_signature_is_accepted():
     def without_args(function):
         @functools.wraps(function)
         def called(t, q, v, args):
@@ -86,7 +84,7 @@ def test_functions_whose_arguments_cannot_be_known_are_accepted():
         system_with(lagrangian=lagrangian)
 
 
-def test_an_error_inside_a_function_is_its_own():
+def test_error_inside_function_of_system_keeps_its_message():
     def lagrangian(t, q, v, args):
         return kinetic(t, q, v)  # pyright: ignore[reportCallIssue]
 
@@ -104,11 +102,11 @@ def test_an_error_inside_a_function_is_its_own():
         ("nonholonomic", lambda *args: args[2][0]),
     ],
 )
-def test_functions_whose_arguments_have_other_names_are_accepted(name, function):
+def test_function_of_system_with_other_argument_names_is_accepted(name, function):
     assert getattr(system_with(**{name: function}), name) is function
 
 
-def test_order_of_arguments_is_checked_behind_a_partial_function():
+def test_partial_function_with_arguments_in_wrong_order_is_refused():
     with pytest.raises(TypeError, match=r"in this order, but .*\(q, v, t, args\)`"):
         system_with(
             lagrangian=functools.partial(lambda m, q, v, t, args: m * v @ v, 2.0)

@@ -124,7 +124,7 @@ def _as_events(event: Any) -> tuple[Event, ...] | None:
     events = tuple(event) if isinstance(event, list | tuple) else event
     if not isinstance(events, tuple):
         events = (events,)
-    advice = "Such as nhjax.Event(cond_fn), or a sequence of them."
+    advice = "For example, pass nhjax.Event(cond_fn), or a sequence of events."
     for one in events:
         check_type("event", one, Event, advice)
     return events or None
