@@ -2,12 +2,12 @@
 
 A function compiled by `jax.jit` keeps the values that globals and closed-over variables
 had when it was traced. `tracked_jit` traces the function again when such a value
-changes. At each call `captured` lists the values that the functions of the user read:
-it reads the names from their bytecode (`names`) and searches each value by its kind
-(`Kind`). The list is a part of the key under which compiled programs are cached.
+changes: at each call `captured` lists the values that the functions of the user read,
+and the list is a part of the key of the compiled program.
 """
 
 import argparse
+import contextlib
 import dis
 import enum
 import hashlib
@@ -16,9 +16,11 @@ import sys
 import sysconfig
 import types
 from collections import deque
-from collections.abc import Callable, Collection, Hashable
-from functools import lru_cache, partial, wraps
-from typing import Any, NamedTuple, TypeAlias, TypeVar
+from collections.abc import Callable, Collection, Hashable, Iterator
+from dataclasses import dataclass, field
+from functools import lru_cache, partial, WRAPPER_ASSIGNMENTS, wraps
+from itertools import islice
+from typing import Any, TypeAlias, TypeVar
 
 import equinox as eqx
 import jax
@@ -28,430 +30,242 @@ import numpy as np
 from ._garbage_collection import rare_collections
 
 
-# The attributes read from a variable, as in `module.part.constant`.
-Path: TypeAlias = tuple[str, ...]
+# Where a value was read: the identity of its owner, and a name or index.
+Place: TypeAlias = tuple[int, Hashable]
+# A value inside another one, after its owner and its name there.
+Part: TypeAlias = tuple[object, Hashable, Any]
+T = TypeVar("T")
 
-_LOADS_GLOBAL = ("LOAD_GLOBAL", "LOAD_NAME", "LOAD_FROM_DICT_OR_GLOBALS")
-_LOADS_CLOSED = ("LOAD_DEREF", "LOAD_CLASSDEREF", "LOAD_FROM_DICT_OR_DEREF")
-_LOADS_ATTRIBUTE = ("LOAD_ATTR", "LOAD_METHOD")
+# If functions read more values, the others are ignored: comparing them would take
+# longer than a short run.
+MOST_ENTRIES = 2000
 # These libraries may be installed from a working copy, outside of the usual folders.
 _LIBRARIES = ("equinox", "jax", "jaxlib", "jaxtyping", "nhjax", "numpy")
-
-
-class Names(NamedTuple):
-    """The variables that code reads, each with the attribute paths read from it.
-
-    Variables that the code itself assigns are left out: a function must not be traced
-    again because of what it did itself.
-    """
-
-    of_globals: dict[str, set[Path]]
-    closed_over: dict[str, set[Path]]
+_NUMBERS, _ARRAYS = (float, complex), (np.ndarray, np.generic)
+_PLAIN = (bool, int, str, bytes, type(None), type(Ellipsis), np.dtype)
+_LEAVES = (*_PLAIN, *_NUMBERS, *_ARRAYS, jax.core.Tracer)
+_MAPPINGS = (dict, types.MappingProxyType)
+_SEQUENCES = (list, tuple, deque, set, frozenset)
+# Values of these classes are compared by their parts, though libraries define them.
+_CONTAINERS = (*_MAPPINGS, *_SEQUENCES, types.MethodType, partial)
+_CONTAINERS += (types.SimpleNamespace, argparse.Namespace, eqx.Module)
 
 
 @lru_cache(maxsize=4096)
-def names(code: types.CodeType) -> Names:
-    """Find the variables that a function and the functions defined inside it read."""
-    found, assigned = Names({}, {}), Names({}, {})
-    path: list[str] | None = None
+def _names(code: types.CodeType) -> tuple[dict[str, None], dict[str, None]]:
+    """Find the globals and attributes that code and the functions inside it read."""
+    variables, attributes = {}, {}
     for instruction in dis.get_instructions(code):
-        operation, name = instruction.opname, instruction.argval
-        if operation in _LOADS_ATTRIBUTE and path is not None:
-            path.append(name)
-            continue
-        _close(found, path)
-        path = None
-        if operation in _LOADS_GLOBAL:
-            path = ["of_globals", name]
-        elif operation in _LOADS_CLOSED:
-            path = ["closed_over", name]
-        elif operation == "STORE_GLOBAL":
-            assigned.of_globals[name] = set()
-        elif operation == "STORE_DEREF":
-            assigned.closed_over[name] = set()
-    _close(found, path)
+        if instruction.opname in ("LOAD_ATTR", "LOAD_METHOD"):
+            attributes[instruction.argval] = None
+        elif instruction.opname in ("LOAD_GLOBAL", "LOAD_NAME"):
+            variables[instruction.argval] = None
     for inner in code.co_consts:
         if isinstance(inner, types.CodeType):
-            for variables, others in zip(found, names(inner), strict=True):
-                for name, paths in others.items():
-                    variables.setdefault(name, set()).update(paths)
-    return Names(*map(_without, found, assigned))
-
-
-def _close(found: Names, path: list[str] | None) -> None:
-    if path is not None:
-        kind, name, *attributes = path
-        getattr(found, kind).setdefault(name, set()).add(tuple(attributes))
-
-
-def _without(
-    variables: dict[str, set[Path]], others: dict[str, set[Path]]
-) -> dict[str, set[Path]]:
-    return {name: paths for name, paths in variables.items() if name not in others}
+            variables |= _names(inner)[0]
+            attributes |= _names(inner)[1]
+    return variables, attributes
 
 
 @lru_cache(maxsize=4096)
-def is_installed(module: str) -> bool:
-    """Return whether a module belongs to Python or an installed library, not to the
-    user.
-    """
-    if module == "__main__":
-        return False
+def _is_installed(module: str) -> bool:
+    """Return whether a module belongs to Python or a library, not to the user."""
     if module.partition(".")[0] in (*_LIBRARIES, *sys.builtin_module_names):
         return True
     file = getattr(sys.modules.get(module), "__file__", None)
-    folders = {
-        sysconfig.get_path(name)
-        for name in ("stdlib", "platstdlib", "purelib", "platlib")
-    }
-    return file is not None and file.startswith(tuple(folders))
+    kinds = ("stdlib", "platstdlib", "purelib", "platlib")
+    folders = tuple(sysconfig.get_path(kind) for kind in kinds)
+    return module != "__main__" and file is not None and file.startswith(folders)
 
 
-class Kind(enum.Enum):
-    """How a value is searched for the values that it contains."""
+@dataclass(frozen=True)
+class _Identity:
+    """An object that is compared by its identity, and kept so that none reuses it."""
 
-    PLAIN = enum.auto()
-    FLOAT = enum.auto()
-    COMPLEX = enum.auto()
-    TRACER = enum.auto()
-    ARRAY = enum.auto()
-    NUMPY = enum.auto()
-    FUNCTION = enum.auto()
-    METHOD = enum.auto()
-    PARTIAL = enum.auto()
-    MAPPING = enum.auto()
-    SEQUENCE = enum.auto()
-    CLASS = enum.auto()
-    # An object whose attributes are searched.
-    OPEN = enum.auto()
-    # Any other object, which is compared by its identity alone.
-    OPAQUE = enum.auto()
+    number: int
+    value: object = field(compare=False)
 
 
-# The kind of a class is given by the first row that fits.
-_KINDS: list[tuple[Kind, tuple[type, ...]]] = [
-    (Kind.OPAQUE, (enum.Enum, types.ModuleType)),
-    (Kind.NUMPY, (np.ndarray, np.generic)),
-    (Kind.PLAIN, (bool, int, str, bytes, type(None), type(Ellipsis), np.dtype)),
-    (Kind.FLOAT, (float,)),
-    (Kind.COMPLEX, (complex,)),
-    (Kind.TRACER, (jax.core.Tracer,)),
-    (Kind.ARRAY, (jax.Array,)),
-    (Kind.FUNCTION, (types.FunctionType,)),
-    (Kind.METHOD, (types.MethodType,)),
-    (Kind.PARTIAL, (partial,)),
-    (Kind.MAPPING, (dict, types.MappingProxyType)),
-    (Kind.SEQUENCE, (list, tuple, deque, set, frozenset)),
-    (Kind.CLASS, (type,)),
-    # These classes belong to libraries, but hold values of the user.
-    (Kind.OPEN, (types.SimpleNamespace, argparse.Namespace, eqx.Module)),
-]
+class _Unrepeatable:
+    """A value that equals only itself; it stands for a tracer."""
 
 
 @lru_cache(maxsize=4096)
-def kind_of(cls: type) -> Kind:
-    """Return the kind of the instances of a class."""
-    for kind, classes in _KINDS:
-        if issubclass(cls, classes):
-            return kind
-    return Kind.OPAQUE if is_installed(cls.__module__) else Kind.OPEN
+def _is_leaf(cls: type) -> bool:
+    """Return whether values of a class have no parts, except arrays of objects."""
+    return issubclass(cls, _LEAVES) and not issubclass(cls, enum.Enum)
 
 
-# If functions read more values than this, the other values are ignored: comparing them
-# would take longer than a short run.
-MOST_ENTRIES = 2000
+@lru_cache(maxsize=4096)
+def _is_open(cls: type) -> bool:
+    """Return whether values of a class are compared by their parts."""
+    closed = enum.Enum, type, types.ModuleType, jax.Array
+    of_user = not (issubclass(cls, closed) or _is_installed(cls.__module__))
+    return of_user or issubclass(cls, _CONTAINERS)
 
 
-class Place(NamedTuple):
-    """The place where a value was read: an object's identity, and a name or index."""
-
-    owner: int
-    name: Hashable
-
-
-class Entry(NamedTuple):
-    """A value that a function reads, and where it was read.
-
-    The owner, which is the object in which the value was found, is kept so that its
-    identity is not reused. `key` is compared between calls: it contains the owner's
-    number in the order of the visit, or -1, where `place` has the owner's identity.
-    `content` is compared within a call: there a value that has parts is compared by its
-    identity, not by its number.
-    """
-
-    key: tuple[int, Hashable, Hashable]
-    place: Place
-    owner: object
-    content: Hashable
-
-    @property
-    def atom(self) -> Hashable:
-        """The value in a form that can be compared and hashed."""
-        return self.key[-1]
-
-
-class Identity:
-    """A wrapper that compares objects by identity.
-
-    The object is kept, so that its identity is not reused.
-    """
-
-    def __init__(self, value: object):
-        self.value = value
-
-    def __hash__(self) -> int:
-        return id(self.value)
-
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, Identity) and self.value is other.value
-
-
-class Unrepeatable:
-    """A value that equals only itself; it stands for a tracer.
-
-    A program that was made with a tracer cannot be used again.
-    """
-
-
-def captured(tree: Any, ignored: Collection[Place] = ()) -> list[Entry]:
-    """List the values that the functions in a tree read, except at ignored places.
-
-    The arrays in the tree are left out, because they are arguments of the compiled
-    program.
-    """
-    walk = _Walk(ignored)
-    walk.arguments(tree)
-    return walk.entries
-
-
-def all_of(owner: object) -> Place:
-    """Return the place that stands for everything inside an object."""
-    return Place(id(owner), Ellipsis)
-
-
-class _Walk:
-    def __init__(self, ignored: Collection[Place]):
-        self.entries: list[Entry] = []
-        self.ignored = ignored
-        # The visited objects, by identity, with their numbers in order: equal
-        # structures have equal numbers. The entries keep the objects, so that
-        # identities are not reused.
-        self.numbers: dict[int, int] = {}
-        # The identities of the classes whose attributes have been recorded.
-        self.searched: set[int] = set()
-
-    def arguments(self, tree: Any) -> None:
-        """Record static fields, leaves that are not arrays, and the code of classes."""
-        nodes = []
-
-        def note(node: Any) -> bool:
-            nodes.append(node)
-            return False
-
-        leaves = jax.tree.leaves(tree, is_leaf=note)
-        leaf_ids = set(map(id, leaves))
-        for index, node in enumerate(nodes):
-            kind = kind_of(type(node))
-            if kind is Kind.ARRAY or kind is Kind.TRACER:
-                continue
-            if id(node) in leaf_ids:
-                self.read(tree, index, node)
-            elif kind is Kind.OPEN:
-                self.methods(type(node))
-                variables = _variables(node)
-                for name in _static_fields(type(node)):
-                    if name in variables:
-                        self.read(node, name, variables[name])
-
-    def read(self, owner: object, name: Hashable, value: Any) -> None:
-        """Record one value, and the values inside of it."""
-        place = Place(id(owner), name)
-        if len(self.entries) >= MOST_ENTRIES:
-            return
-        if self.ignored and (place in self.ignored or all_of(owner) in self.ignored):
-            return
-        kind, is_new = kind_of(type(value)), False
-        atom = content = _atom(value, kind)
-        if atom is None:
-            content = Identity(value)
-            is_new = id(value) not in self.numbers
-            number = self.numbers.setdefault(id(value), len(self.numbers))
-            atom = _name(value, kind), number
-        key = (self.numbers.get(id(owner), -1), name, atom)
-        self.entries.append(Entry(key, place, owner, content))
-        if is_new:
-            self.contents(value, kind)
-
-    def contents(self, value: Any, kind: Kind) -> None:
-        """Record the values inside of a value that has parts."""
-        if kind is Kind.FUNCTION:
-            self.function(value)
-        elif kind is Kind.MAPPING:
-            for key, item in list(value.items()):
-                name = key if kind_of(type(key)) is Kind.PLAIN else Identity(key)
-                self.read(value, name, item)
-        elif kind is Kind.SEQUENCE or kind is Kind.NUMPY:
-            for index, item in enumerate(list(value)):
-                self.read(value, index, item)
-        elif kind is Kind.METHOD:
-            self.named(value, ("__self__", "__func__"))
-        elif kind is Kind.PARTIAL:
-            self.named(value, ("func", "args", "keywords"))
-        elif kind is Kind.CLASS:
-            self.methods(value)
-        elif kind is Kind.OPEN:
-            self.attributes(value)
-            self.methods(type(value))
-        # Decorators keep the wrapped function under this name. The result of `jax.jit`
-        # is an object of a library's class, and so opaque.
-        if kind is Kind.FUNCTION or kind is Kind.OPAQUE:
-            self.named(value, ("__wrapped__",))
-
-    def named(self, value: Any, attributes: Collection[str]) -> None:
-        """Record the attributes in a list of names that the value has."""
-        for name in attributes:
-            if hasattr(value, name):
-                self.read(value, name, getattr(value, name))
-
-    def attributes(self, value: Any) -> None:
-        """Record the attributes of an object, those in slots included."""
-        for name, item in list(_variables(value).items()):
-            self.read(value, name, item)
-        for base in type(value).__mro__:
-            slots = vars(base).get("__slots__", ())
-            self.named(value, (slots,) if isinstance(slots, str) else tuple(slots))
-
-    def methods(self, kind: type) -> None:
-        """Record the attributes of a user's class, and what its methods read."""
-        for base in kind.__mro__:
-            if is_installed(base.__module__) or id(base) in self.searched:
-                continue
-            self.searched.add(id(base))
-            # A class that a function reads has a number before it is searched.
-            self.numbers.setdefault(id(base), len(self.numbers))
-            for name, item in list(vars(base).items()):
-                if isinstance(item, property):
-                    item = item.fget
-                elif isinstance(item, staticmethod | classmethod):
-                    item = item.__func__
-                if isinstance(item, types.FunctionType):
-                    # The generated methods of a dataclass read no values of the user.
-                    if item.__code__.co_filename != "<string>":
-                        self.read(base, name, item)
-                elif not (name.startswith("__") or name == "_abc_impl"):
-                    self.read(base, name, item)
-
-    def function(self, function: types.FunctionType) -> None:
-        """Record what a function closes over, its defaults, and globals it reads."""
-        code, variables = function.__code__, function.__globals__
-        found = names(code)
-        cells = function.__closure__ or ()
-        for name, cell in zip(code.co_freevars, cells, strict=True):
-            for path in found.closed_over.get(name, ()):
-                try:
-                    content = cell.cell_contents
-                except ValueError:
-                    # The closed-over variable has no value yet.
-                    break
-                self.chain(cell, "content", content, path)
-        if function.__defaults__:
-            self.read(function, "defaults", function.__defaults__)
-        if function.__kwdefaults__:
-            self.read(function, "kwdefaults", function.__kwdefaults__)
-        # The globals of a library are assumed to stay the same.
-        if is_installed(str(variables.get("__name__", ""))):
-            return
-        for name, paths in found.of_globals.items():
-            for path in paths if name in variables else ():
-                self.chain(variables, name, variables[name], path)
-
-    def chain(self, owner: object, name: str, value: Any, path: Path) -> None:
-        """Record `value` and the path `value.a.b` through modules of the user."""
-        self.read(owner, name, value)
-        for attribute in path:
-            if not isinstance(value, types.ModuleType) or is_installed(value.__name__):
-                return
-            if attribute not in vars(value):
-                return
-            owner, value = value, vars(value)[attribute]
-            self.read(owner, attribute, value)
-
-
-def _atom(value: Any, kind: Kind) -> Hashable | None:
-    """Return a value without parts, with its type; `None` if it may have parts."""
-    if kind is Kind.PLAIN:
-        return type(value), value
-    if kind is Kind.FLOAT:
-        # In hexadecimal form zeros of different signs differ, and NaN equals itself.
-        return type(value), float.hex(value)
-    if kind is Kind.COMPLEX:
-        return type(value), repr(value)
-    if kind is Kind.TRACER:
-        return Unrepeatable()
-    if kind is Kind.NUMPY and not value.dtype.hasobject:
-        # Arrays of NumPy can be changed in place, so that their contents are compared.
-        # Arrays of JAX cannot.
-        digest = hashlib.blake2b(value.tobytes(), digest_size=16).digest()
-        return type(value), value.dtype, value.shape, digest
-    is_closed = kind is Kind.OPAQUE and not hasattr(value, "__wrapped__")
-    is_library = kind is Kind.CLASS and is_installed(value.__module__)
-    if kind is Kind.ARRAY or is_closed or is_library:
-        return Identity(value)
-    return None
-
-
-def _name(value: Any, kind: Kind) -> Hashable:
-    """Return what distinguishes values with parts, apart from their parts."""
-    if kind is Kind.FUNCTION:
+def _atom(value: Any) -> Hashable:
+    """Return what is compared of a value, apart from its parts."""
+    cls = type(value)
+    if _is_open(cls):
+        return cls
+    if cls is types.FunctionType:
         return value.__code__
-    if kind is Kind.NUMPY:
-        return value.shape
-    return Identity(value) if kind in (Kind.CLASS, Kind.OPAQUE) else type(value)
+    if not _is_leaf(cls):
+        return _Identity(id(value), value)
+    if isinstance(value, _ARRAYS):
+        # NumPy's arrays can be changed in place; JAX's cannot.
+        digest = hashlib.blake2b(value.tobytes(), digest_size=16).digest()
+        return cls, value.dtype, value.shape, digest
+    if isinstance(value, _NUMBERS):
+        # Zeros of different signs differ, and NaN equals itself.
+        return cls, repr(value)
+    return (cls, value) if isinstance(value, _PLAIN) else _Unrepeatable()
+
+
+def _parts(value: Any) -> Iterator[Part]:
+    """Yield the values inside a value, each with its owner and its name there."""
+    if isinstance(value, types.FunctionType):
+        yield from _read_by(value)
+    elif isinstance(value, _MAPPINGS):
+        yield from ((value, (type(key), key), x) for key, x in list(value.items()))
+    elif isinstance(value, (*_SEQUENCES, np.ndarray)):
+        yield from ((value, index, x) for index, x in enumerate(list(value)))
+    elif isinstance(value, type):
+        yield from _of_class(value)
+    elif isinstance(value, (types.MethodType, partial)):
+        for name in ("__self__", "__func__", "func", "args", "keywords"):
+            if hasattr(type(value), name):
+                yield value, name, getattr(value, name)
+    elif _is_open(type(value)):
+        # The attributes, and the slots after them, without calling code of the class.
+        state: Any = object.__getstate__(value)
+        for variables in state if isinstance(state, tuple) else (state,):
+            for name, x in list((variables or {}).items()):
+                if name not in WRAPPER_ASSIGNMENTS:
+                    yield value, name, x
+        yield value, "__class__", type(value)
+    elif hasattr(value, "__wrapped__"):
+        # The result of `jax.jit` keeps the user's function under this name.
+        yield value, "__wrapped__", value.__wrapped__
+
+
+def _read_by(function: types.FunctionType) -> Iterator[Part]:
+    """Yield what a function closes over, its defaults, and the globals that it reads.
+
+    The globals of libraries are assumed to stay the same. If a value is a module of the
+    user, its variables with the name of an attribute in the code follow.
+    """
+    variables, attributes = _names(function.__code__)
+    found: list[Part] = []
+    for cell in function.__closure__ or ():
+        with contextlib.suppress(ValueError):  # An empty cell has no content.
+            found.append((cell, "content", cell.cell_contents))
+    for name in ("__defaults__", "__kwdefaults__", "__wrapped__"):
+        if (value := getattr(function, name, None)) is not None:
+            found.append((function, name, value))
+    known = function.__globals__
+    if not _is_installed(str(known.get("__name__", ""))):
+        found += [(known, name, known[name]) for name in variables if name in known]
+    modules = set()
+    for part in found:  # The list grows.
+        yield part
+        module = part[2]
+        if isinstance(module, types.ModuleType) and not _is_installed(module.__name__):
+            known = {} if module in modules else vars(module)
+            modules.add(module)
+            found += [(known, x, known[x]) for x in attributes if x in known]
+
+
+def _of_class(cls: type) -> Iterator[Part]:
+    """Yield the attributes and methods of a user's class and of its bases."""
+    bases = [base for base in cls.__mro__ if not _is_installed(base.__module__)]
+    for base in bases:
+        for name, value in list(vars(base).items()):
+            if isinstance(value, property):
+                value = value.fget
+            elif isinstance(value, (staticmethod, classmethod)):
+                value = value.__func__
+            if isinstance(value, types.FunctionType):
+                # Methods that a dataclass generates read no values of the user.
+                if value.__code__.co_filename != "<string>":
+                    yield base, name, value
+            elif not (name.startswith("__") or name == "_abc_impl"):
+                yield base, name, value
 
 
 @lru_cache(maxsize=4096)
-def _static_fields(cls: type) -> list[str]:
-    fields = getattr(cls, "__dataclass_fields__", {}).items()
-    return [name for name, field in fields if field.metadata.get("static", False)]
+def _static_fields(cls: type) -> tuple[str, ...] | None:
+    """Return the names of static fields; `None` for library classes without any."""
+    fields = getattr(cls, "__dataclass_fields__", {}).values()
+    names = tuple(x.name for x in fields if x.metadata.get("static", False))
+    return names or (None if _is_installed(cls.__module__) else ())
 
 
-def _variables(value: Any) -> dict[str, Any]:
-    """Return the attributes of an object without calling code of its class."""
-    try:
-        return object.__getattribute__(value, "__dict__")
-    except AttributeError:
-        return {}
+def static_parts(tree: Any) -> list[Any]:
+    """List the leaves of a tree that are not arrays, and the static fields and the
+    classes of its nodes. Its arrays are arguments of the compiled program.
+    """
+    nodes: list[Any] = []
+
+    def note(node: Any) -> bool:
+        nodes.append(node)
+        return False
+
+    leaves = jax.tree.leaves(tree, is_leaf=note)
+    found = [leaf for leaf in leaves if not eqx.is_array(leaf)]
+    for node in nodes:
+        names = _static_fields(type(node))
+        if names is not None:
+            found += [type(node), *(getattr(node, name, None) for name in names)]
+    return found
 
 
-T = TypeVar("T")
+class Captured:
+    """The values that functions read, except at the ignored places.
 
-# The largest number of entries in each of the two dictionaries below. When there are
-# more, all are dropped, and programs that are still used are traced once more.
-_MOST = 1000
-
-
-class _Key:
-    """The values that functions read, as a key for compiled programs.
-
-    `is_traced` is set when a program has been traced with this key.
+    - `atoms`: the values in a fixed order, each with the number of its owner and its
+      name there. Objects have numbers in the order of the search, so that equal
+      functions that were made again have equal atoms.
+    - `contents`: the owner and the content of each place; the content of an object with
+      parts is its identity. The owners are kept, so that none reuses an identity.
     """
 
-    def __init__(self, atoms: tuple[Hashable, ...]):
-        self.atoms = atoms
-        self.hash = hash(atoms)
-        self.is_traced = False
+    def __init__(self, functions: Any, ignored: Collection[Place] = ()):
+        self.atoms: list[Hashable] = []
+        self.contents: dict[Place, tuple[object, Hashable]] = {}
+        numbers: dict[int, int] = {}
+        stack: list[Part] = [(None, "", functions)]
+        while stack and len(self.atoms) < MOST_ENTRIES:
+            owner, name, value = stack.pop()
+            place = id(owner), name
+            if ignored and (place in ignored or (id(owner), ...) in ignored):
+                continue
+            content = atom = _atom(value)
+            has_objects = isinstance(value, np.ndarray) and value.dtype.hasobject
+            if has_objects or not _is_leaf(type(value)):
+                content = _Identity(id(value), value)
+                if id(value) not in numbers:
+                    numbers[id(value)] = len(numbers)
+                    stack += list(islice(_parts(value), MOST_ENTRIES))[::-1]
+                atom = atom, numbers[id(value)]
+            self.atoms.append((numbers.get(id(owner), -1), name, atom))
+            self.contents[place] = owner, content
 
-    def __hash__(self) -> int:
-        return self.hash
 
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, _Key) and self.atoms == other.atoms
+@dataclass(frozen=True)
+class _Key:
+    """The values that functions read; `traces` grows when a program is traced."""
+
+    atoms: tuple[Hashable, ...]
+    traces: list[None] = field(default_factory=list, compare=False)
 
 
 # Values that change during tracing, such as a list in which a function counts its
-# calls, are ignored: otherwise the function would be traced again forever. The
-# dictionary maps their places to the owners, so that the identities of these are not
-# reused.
+# calls, are ignored: otherwise the function would be traced again forever. The owners
+# are kept, so that their identities are not reused. If there are more entries than
+# _MOST, all are dropped, and programs that are still used are traced once more.
+_MOST = 1000
 _changed_by_tracing: dict[Place, object] = {}
 # The key with which a program was traced, by the key as it was after tracing.
 _key_before_tracing: dict[_Key, _Key] = {}
@@ -474,19 +288,19 @@ def tracked_jit(*tracked: str) -> Callable[[Callable[..., T]], Callable[..., T]]
 
         @eqx.filter_jit
         def compiled(key: _Key, *args: Any) -> T:
-            key.is_traced = True
+            key.traces.append(None)
             with rare_collections():
                 return function(*args)
 
         @wraps(function)
         def call(*args: Any) -> T:
-            functions = [args[position] for position in which]
-            before = captured(functions, _changed_by_tracing)
-            key = _key(before)
+            functions = static_parts([args[position] for position in which])
+            before = Captured(functions, _changed_by_tracing)
+            key = _Key(tuple(before.atoms))
             key = _key_before_tracing.get(key, key)
             out = compiled(key, *args)
-            if key.is_traced:
-                key.is_traced = False
+            if key.traces:
+                key.traces.clear()
                 _remember_changes(key, before, functions)
             return out
 
@@ -495,39 +309,26 @@ def tracked_jit(*tracked: str) -> Callable[[Callable[..., T]], Callable[..., T]]
     return decorator
 
 
-def _key(entries: list[Entry]) -> _Key:
-    return _Key(tuple(entry.key for entry in entries))
-
-
-def _remember_changes(key: _Key, before: list[Entry], functions: Any) -> None:
-    """Remember what tracing changed, so that the program is found at the next call.
-
-    From now on the changed places are ignored, and the key as it is after tracing leads
-    to the key as it was before.
+def _remember_changes(key: _Key, before: Captured, functions: Any) -> None:
+    """Ignore the places that tracing changed from now on, and find the program by the
+    key as it is after tracing too.
     """
-    after = captured(functions, _changed_by_tracing)
-    changed = _changed(before, after)
-    if not changed:
-        return
-    for memory in (_changed_by_tracing, _key_before_tracing):
-        if len(memory) > _MOST:
-            memory.clear()
-    _changed_by_tracing.update(changed)
-    _key_before_tracing[_key(captured(functions, _changed_by_tracing))] = key
-
-
-def _changed(before: list[Entry], after: list[Entry]) -> dict[Place, object]:
-    """Find the places where two lists of entries differ, with their owners."""
-    atoms = [{entry.place: entry for entry in entries} for entries in (before, after)]
+    after = Captured(functions, _changed_by_tracing)
     changed = {}
-    for one, other in (atoms, atoms[::-1]):
-        for place, entry in one.items():
-            there = other.get(place)
-            if isinstance(entry.content, Unrepeatable):
+    for one, other in ((before, after), (after, before)):
+        for place, (owner, content) in one.contents.items():
+            there = other.contents.get(place)
+            if isinstance(content, _Unrepeatable):
                 continue
-            if there is None and isinstance(entry.owner, list | set | deque):
+            if there is None and isinstance(owner, list | set | deque):
                 # The container grows, so that its next element would again be new.
-                place = all_of(entry.owner)
-            if there is None or there.content != entry.content:
-                changed[place] = entry.owner
-    return changed
+                place = (id(owner), ...)
+            if there is None or there[1] != content:
+                changed[place] = owner
+    if changed:
+        for memory in (_changed_by_tracing, _key_before_tracing):
+            if len(memory) > _MOST:
+                memory.clear()
+        _changed_by_tracing.update(changed)
+        now = Captured(functions, _changed_by_tracing)
+        _key_before_tracing[_Key(tuple(now.atoms))] = key

@@ -1,5 +1,6 @@
 """What functions close over under transformations, and what is not tracked."""
 
+from collections import deque
 from typing import Any
 
 import equinox as eqx
@@ -9,7 +10,7 @@ import numpy as np
 import pytest
 
 import nhjax
-from nhjax._compile._tracked_jit import captured, MOST_ENTRIES
+from nhjax._compile._tracked_jit import Captured, MOST_ENTRIES
 from support.falling import (
     end,
     falling,
@@ -155,9 +156,53 @@ def test_captured_values_with_cycles_or_without_hash_are_compared():
     np.testing.assert_allclose([first, end(lagrangian)[0]], [-0.5, -1.5], rtol=1e-13)
 
 
+def kinds_of_values():
+    """Pairs of a value and a change inside of it."""
+    inner, planet = [1.0], Planet()
+    objects = np.array([None, None], object)
+    objects[1] = inner
+    nested: dict[str, Any] = {"a": {"b": 1, "c": 2}}
+    pairs: list[Any] = [[1.0], [1.0]]
+    zero: list[float] = [0.0]
+    whole: list[float] = [1]
+    return {
+        "array of objects": (objects, lambda: inner.append(2.0)),
+        "set": (numbers := {1}, lambda: numbers.add(2)),
+        "queue": (queue := deque([1]), lambda: queue.append(2)),
+        "attribute": (planet, lambda: setattr(planet, "g", 2.0)),
+        "sign of zero": (zero, lambda: zero.__setitem__(0, -0.0)),
+        "type of number": (whole, lambda: whole.__setitem__(0, 1.0)),
+        "identity": (pairs, lambda: pairs.__setitem__(1, pairs[0])),
+        "level of a key": (nested, lambda: nested.update(c=nested["a"].pop("c"))),
+    }
+
+
+@pytest.mark.parametrize("kind", kinds_of_values())
+def test_captured_of_value_changed_inside_has_other_atoms(kind):
+    value, change = kinds_of_values()[kind]
+
+    def function():
+        return value
+
+    before = Captured(function).atoms
+    assert Captured(function).atoms == before
+    change()
+    assert Captured(function).atoms != before
+
+
+def test_captured_of_global_with_name_of_attribute_is_not_compared(monkeypatch):
+    # A global `q` in a notebook is not the position of a state.
+    def function(y):
+        return y.q
+
+    before = Captured(function).atoms
+    monkeypatch.setitem(globals(), "q", 1.0)
+    assert Captured(function).atoms == before
+
+
 def test_captured_values_of_huge_container_are_limited():
     many = [float(i) for i in range(100_000)]
-    assert len(captured(lambda: many)) == MOST_ENTRIES
+    assert len(Captured(lambda: many).atoms) == MOST_ENTRIES
 
 
 def test_captured_values_of_library_are_not_searched():
@@ -165,7 +210,7 @@ def test_captured_values_of_library_are_not_searched():
         return jnp.sin(q) + np.pi + jax.nn.relu(q) + eqx.is_array(q)
 
     # The function itself and four modules.
-    assert len(captured(function)) <= 6
+    assert len(Captured(function).atoms) <= 6
 
 
 def test_captured_values_after_list_filled_by_tracing_are_compared():

@@ -34,10 +34,17 @@ def results(name: str) -> dict[str, Any]:
     return json.loads(path.read_text(encoding="utf-8"))
 
 
-def quoted(text: str, pattern: str) -> tuple[str, ...]:
-    """The groups of a pattern that is found once in a text, across its line breaks."""
+NUMBER = r"(\d+(?: \d{3})*(?:\.\d+)?(?:e-?\d+)?)"
+
+
+def quoted(text: str, sentence: str) -> tuple[str, ...]:
+    """Return the numbers in the places `{}` of a sentence that a text contains once.
+
+    `…` stands for any words. Line breaks of the text do not count.
+    """
+    pattern = re.escape(sentence).replace(r"\{\}", NUMBER).replace("…", ".*?")
     found = re.findall(pattern, " ".join(text.split()))
-    assert len(found) == 1, f"found {len(found)} times: {pattern}"
+    assert len(found) == 1, f"found {len(found)} times: {sentence}"
     return found[0] if isinstance(found[0], tuple) else (found[0],)
 
 
