@@ -81,7 +81,7 @@ def test_linear_stability_of_rotation_about_the_middle_axis_is_unstable():
     np.testing.assert_allclose(mode, [1, 0, ratio], rtol=0, atol=1e-13)
 
 
-def test_linear_stability_eigenvalues_agree_with_those_of_a_step():
+def test_linear_stability_eigenvalues_agree_with_step_derivative():
     sleigh = ChaplyginSleigh(q0=(0.0, 0.0, 0.0), v0=(1.2, 0.0, 0.0))
     system, y = sleigh.system, sleigh.initial_state()
     # In straight motion, only the turning rate has a nonzero eigenvalue.

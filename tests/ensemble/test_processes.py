@@ -176,7 +176,7 @@ def test_processes_with_different_calls_raise_in_all():
             Scripted().check_same_call(call)
 
 
-def test_processes_with_different_numbers_of_devices_are_named():
+def test_processes_with_different_numbers_of_devices_raise():
     _processes.check_equal_devices([0, 1, 1, 0])
     with pytest.raises(ValueError, match="process 0 has 2, process 1 has 1"):
         _processes.check_equal_devices([0, 0, 1])

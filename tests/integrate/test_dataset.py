@@ -36,7 +36,7 @@ def sol():
 
 
 @pytest.mark.parametrize("name", ["q", "v", "p"])
-def test_names_of_the_system_label_its_coordinates(sol, name):
+def test_dataset_with_names_of_the_system_labels_coordinates(sol, name):
     data = sol.to_xarray(units={"time": "s", "x": "m"})
     got = data[name].sel(coordinate="y", time=0.75)
     np.testing.assert_array_equal(got, getattr(sol.ys, name)[3, 1])
@@ -50,14 +50,14 @@ def test_names_of_the_system_label_its_coordinates(sol, name):
     assert int(data.stats_num_steps) == 4
 
 
-def test_a_velocity_has_a_unit_if_time_and_coordinate_have_one(sol):
+def test_dataset_velocity_with_units_of_time_and_coordinate_has_a_unit(sol):
     assert "velocity_unit" not in sol.to_xarray(units={"x": "m"}).coords
     data = sol.to_xarray(units={"time": "10 s", "x": "rad", "y": "m"})
     assert data.velocity_unit.values.tolist() == ["rad/(10 s)", "m/(10 s)"]
     assert sol.to_xarray(units={"p": "N s"}).p.attrs == {"units": "N s"}
 
 
-def test_a_batch_has_its_trajectories_first():
+def test_dataset_of_a_batch_has_trajectories_as_first_dimension():
     system = falling()
     same = jax.vmap(lambda v: run(system, args=v))(jnp.arange(3.0))
     data = same.to_xarray(coordinates=NAMES, units={"q": "m"})
@@ -71,7 +71,7 @@ def test_a_batch_has_its_trajectories_first():
     np.testing.assert_allclose(data.t.sel(trajectory=1), 0.2 * np.arange(5))
 
 
-def test_a_product_of_groups_has_a_variable_for_each_factor():
+def test_dataset_of_a_group_product_has_a_variable_for_each_factor():
     sol = nhjax.integrate(
         BALL.system,
         LobattoIIIAB(2),
@@ -86,7 +86,7 @@ def test_a_product_of_groups_has_a_variable_for_each_factor():
     np.testing.assert_array_equal(data.v.sel(coordinate="ω2"), sol.ys.v[:, 1])
 
 
-def test_saved_functions_are_named_by_their_paths():
+def test_dataset_of_saved_functions_is_named_by_tree_paths():
     def fn(t, y, args):
         return {"energy": y.v @ y.v, "more": (y.q, [t])}
 
@@ -110,12 +110,12 @@ def test_saved_functions_are_named_by_their_paths():
         (lambda t, y, args: {"a_b": t, "a": {"b": t}}, "have the name 'a_b'"),
     ],
 )
-def test_names_of_functions_replace_nothing(fn, message):
+def test_dataset_with_clashing_function_names_raises(fn, message):
     with pytest.raises(ValueError, match=message):
         run(falling(), saveat=SaveAt(steps=2, fn=fn)).to_xarray()
 
 
-def test_what_has_no_labels_is_refused(sol, monkeypatch):
+def test_dataset_of_a_solution_without_labels_raises(sol, monkeypatch):
     with pytest.raises(ValueError, match="no saved times"):
         dataclasses.replace(sol, ts=None, ys=None).to_xarray()
     with pytest.raises(ValueError, match="2 different names are needed"):
@@ -140,7 +140,7 @@ def test_what_has_no_labels_is_refused(sol, monkeypatch):
         sol.to_xarray()
 
 
-def test_names_that_are_no_names_of_the_coordinates_are_refused():
+def test_dataset_with_wrong_coordinate_names_raises():
     with pytest.raises(TypeError, match="`coordinates` must be a tuple of names"):
         falling(coordinates="xy")
     with pytest.raises(ValueError, match="has a name twice"):

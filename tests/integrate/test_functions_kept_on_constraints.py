@@ -42,7 +42,7 @@ def particles(y0, dt):
 
 @pytest.mark.parametrize("y", [0.0, 0.3, 1.0, 2.0, 3.0, 5.0, 8.0])
 @pytest.mark.parametrize("dt", [0.05, 0.1])
-def test_the_particle_takes_as_many_sweeps_as_with_the_energy_kept(dt, y):
+def test_invariant_on_constraints_takes_as_many_sweeps_as_energy(dt, y):
     energy, found = particles(particle_at(y).initial_state(), dt)
     for sol in (energy, found):
         assert sol.result == nhjax.RESULTS.successful
@@ -148,7 +148,7 @@ NAMES = [
 @pytest.mark.parametrize(
     "name", long_but(("Hamiltonian", "mass and constraint not constant"), NAMES)
 )
-def test_what_constraints_add_to_the_energy_changes_no_step(name):
+def test_invariant_energy_with_multiples_of_constraints_changes_no_step(name):
     system, y0 = to_run(name)
 
     @jax.jit
@@ -173,7 +173,7 @@ def test_what_constraints_add_to_the_energy_changes_no_step(name):
 # The impulses of single steps, by equations written in NumPy.
 
 
-def test_impulses_leave_out_what_reactions_undo():
+def test_invariant_impulses_exclude_directions_of_reactions():
     """p_{k+1} - p_k - h Σ b W = ε (ω_k + ω_{k+1}) with B M⁻¹ ω = 0 at both ends."""
     saveat = SaveAt(t0=True, steps=True, dense=True)
     system, y0 = PARTICLE.system, PARTICLE.initial_state()
@@ -227,7 +227,7 @@ def test_steps_there_and_back_return_to_the_start(closure, stages):
 
 
 @pytest.mark.parametrize("closure", ["symmetric", "consistent", "propagated"])
-def test_two_functions_are_kept_to_round_off(closure):
+def test_invariants_of_two_functions_on_constraints_stay_at_round_off(closure):
     def both(t, q, v, args):
         driver = 0.5 * v[1] ** 2 + 0.5 * q[1] ** 2
         passenger = 0.5 * (1 + q[1] ** 2) * v[0] ** 2 + 0.5 * q[0] ** 2
@@ -250,7 +250,7 @@ ADJOINTS = {
 
 
 @pytest.mark.parametrize("name", long_but(["direct"], ADJOINTS))
-def test_gradients_are_those_of_differences(name):
+def test_invariant_gradients_on_constraints_match_finite_differences(name):
     y0 = particle_at(1.0).initial_state()
 
     def loss(x):

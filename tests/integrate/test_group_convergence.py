@@ -240,7 +240,7 @@ def test_holonomic_constraints_on_a_group_keep_order_2s_minus_2(
         assert_finest_order(2 * stages - 2, errors, quantity)
 
 
-def test_a_group_and_its_coordinates_converge_alike_to_the_same_motion():
+def test_group_and_coordinates_converge_to_the_same_motion():
     on_group = systems.Unicycle()
     in_coordinates = on_group.in_coordinates()
     counts, method = COUNTS[3], nhjax.LobattoIIIAB(3)

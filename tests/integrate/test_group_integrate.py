@@ -77,7 +77,7 @@ def test_dense_output_of_a_hamiltonian_system_with_a_holonomic_constraint():
     np.testing.assert_allclose(sol.evaluate(0.33).v, v, atol=1e-3)
 
 
-def test_single_precision_on_a_group():
+def test_group_run_in_single_precision_is_accurate():
     y0 = BALL.initial_state(jnp.float32)
     sol = run(BALL, y0=y0, dt=0.1, num_steps=50)
     assert {leaf.dtype for leaf in jax.tree.leaves(sol.ys)} == {jnp.dtype(jnp.float32)}
@@ -96,7 +96,7 @@ def there_and_back(system, method, y0):
     return largest((change.q, change.v))
 
 
-def test_step_back_in_the_chart_at_its_start_does_not_undo_a_step():
+def test_group_step_back_with_chart_at_its_start_is_not_reversible():
     # Measured: 2e-5 (Cayley, s = 2).
     suslov, y0 = systems.Suslov(), systems.Suslov().initial_state()
     errors = [
@@ -112,7 +112,7 @@ def test_step_back_in_the_chart_at_its_start_does_not_undo_a_step():
     [(nhjax.Cayley(), 2), long(nhjax.Exponential(), 3), long(nhjax.Cayley(), 4)],
     ids=str,
 )
-def test_step_back_in_the_chart_in_its_middle_undoes_a_step(retraction, stages):
+def test_group_step_back_with_chart_in_its_middle_is_reversible(retraction, stages):
     beside = SideBySide(
         tuple(
             kind(retraction=retraction)
@@ -130,7 +130,7 @@ def test_step_back_in_the_chart_in_its_middle_undoes_a_step(retraction, stages):
     assert there_and_back(system, nhjax.LobattoIIIAB(stages), y0) <= 1e-13
 
 
-def test_a_body_without_weight_keeps_its_horizontal_momentum_beside_a_reaction():
+def test_group_body_without_weight_conserves_horizontal_momentum():
     veselova = systems.Veselova(weight=(0.0, 0.0, 0.0))
     saveat = SaveAt(t0=True, steps=10)
     ys = run(veselova, dt=0.1, num_steps=1000, saveat=saveat).ys
@@ -139,7 +139,7 @@ def test_a_body_without_weight_keeps_its_horizontal_momentum_beside_a_reaction()
     assert largest(ys.v - ys.v[:1]) > 0.1
 
 
-def test_ten_thousand_steps_stay_on_the_group_and_keep_the_linear_integrals():
+def test_group_run_of_ten_thousand_steps_conserves_linear_integrals():
     def integrals(t, y, args):
         return BALL.first_integrals(y.q, y.v), BALL.manifold.distance_to_group(y.q)
 
@@ -225,14 +225,14 @@ def instructions(system, y0):
     return str(text).count(" = ")
 
 
-def test_a_vector_space_costs_nothing_for_being_a_group():
+def test_group_of_a_vector_space_adds_no_equations_to_the_program():
     particle = systems.NonholonomicParticle()
     on_group = dataclasses.replace(particle.system, manifold=nhjax.Euclidean(3))
     y0 = particle.initial_state()
     assert instructions(on_group, y0) == instructions(particle.system, y0)
 
 
-def test_the_constraint_kinds_have_separate_rows_of_the_multiplier():
+def test_multiplier_of_both_constraint_kinds_has_separate_rows():
     sleigh = systems.RodSleigh()
     y0 = sleigh.initial_state()
     assert y0.multiplier.shape == (2,)
@@ -243,7 +243,7 @@ def test_the_constraint_kinds_have_separate_rows_of_the_multiplier():
     assert float(sol.stats["max_constraint_violation"]) < 1e-14
 
 
-def test_a_moving_holonomic_constraint():
+def test_holonomic_constraint_that_moves_is_followed():
     """A bead on a straight wire that turns at the rate args: r'' = rate² r."""
 
     def wire(t, q, args):

@@ -62,7 +62,7 @@ def point_of_pendulum(ts, v):
 
 
 @pytest.mark.parametrize("stages", COUNTS)
-def test_a_spherical_pendulum_is_its_horizontal_lift(stages):
+def test_group_pendulum_on_a_sphere_equals_its_horizontal_lift(stages):
     v = jnp.array([1.3, -0.7, 0.0])
     errors = ([], [])
     for ts, y, _ in run(pendulum(0.4), v, stages):
@@ -76,7 +76,7 @@ def test_a_spherical_pendulum_is_its_horizontal_lift(stages):
     assert_order(2 * stages - 2, *errors, floor=SCIPY_FLOOR)
 
 
-def test_the_inertia_of_forbidden_turns_matters_no_more_than_errors_do():
+def test_group_inertia_of_forbidden_rotations_changes_only_errors():
     # The constraint holds at the nodes; at the stages the lifts turn a little.
     v = jnp.array([1.3, -0.7, 0.0])
     light, heavy = (run(pendulum(inertia), v, 3) for inertia in (0.1, 3.0))
@@ -90,7 +90,7 @@ def test_the_inertia_of_forbidden_turns_matters_no_more_than_errors_do():
 
 
 @pytest.mark.parametrize("moments", [(1.0, 1.0), (1.0, 1.5)])
-def test_the_path_of_the_point_depends_on_the_attitude_only_if_moments_differ(moments):
+def test_group_path_depends_on_attitude_only_with_unequal_moments(moments):
     # Attitudes that differ by a turn about the third body axis are one point of the
     # sphere. The metric on it is invariant under such turns if the moments are equal.
     system = nhjax.LagrangianSystem(
@@ -118,7 +118,7 @@ def test_the_path_of_the_point_depends_on_the_attitude_only_if_moments_differ(mo
         assert distance > 0.01
 
 
-def test_a_skate_on_a_sphere_moves_as_its_reduced_equations_say():
+def test_group_skate_on_a_sphere_matches_reduced_equations():
     # The contact is the third body axis, the blade points along the first: the contact
     # may not move along the second, which is Suslov's constraint ω₁ = 0.
     turning_inertia = 0.3

@@ -37,7 +37,7 @@ def energy_of_the_chaotic_system(q, v):
 
 
 @pytest.mark.parametrize("stages", [2, 3])
-def test_each_step_is_one_of_the_paper_between_two_scalings_of_its_momenta(stages):
+def test_invariant_step_is_a_step_of_the_paper_between_two_scalings(stages):
     h, y0 = 0.1, CHAOTIC.initial_state()
     saveat = SaveAt(t0=True, steps=True, dense=True)
     method = LobattoIIIAB(stages)
@@ -87,7 +87,7 @@ def test_each_step_is_one_of_the_paper_between_two_scalings_of_its_momenta(stage
     np.testing.assert_allclose(energies, energies[0], rtol=2e-15)
 
 
-def test_a_step_on_a_group_is_that_of_an_outer_search_for_the_scaling():
+def test_invariant_step_on_a_group_equals_an_outer_search_for_the_scaling():
     system, y = suslov_in_a_potential()
     method = LobattoIIIAB(3, "propagated")
 
@@ -146,7 +146,9 @@ def to_run(name):
         ("both kinds of constraints", 3, 3e-15),
     ],
 )
-def test_energy_and_constraints_stay_at_round_off_there_and_back(name, stages, bound):
+def test_invariant_energy_and_constraints_forwards_and_back_stay_at_round_off(
+    name, stages, bound
+):
     system, y0 = to_run(name)
     method = LobattoIIIAB(stages)
 
@@ -180,7 +182,7 @@ COUNTS = {2: (32, 64, 128), 3: (16, 32, 64), 4: (8, 16, 32)}
 
 @pytest.mark.parametrize("stages", long_but((3,), COUNTS))
 @pytest.mark.parametrize("part", ["R^n", "group"])
-def test_the_order_is_2s_minus_2(part, stages):
+def test_invariant_run_converges_with_order_2s_minus_2(part, stages):
     example = {"R^n": PARTICLE, "group": SUSLOV}[part]
     y0, method, counts = example.initial_state(), LobattoIIIAB(stages), COUNTS[stages]
     runs = trajectories(example.system, method, y0, counts, invariants="energy")
@@ -197,7 +199,7 @@ def test_the_order_is_2s_minus_2(part, stages):
         assert_order(2 * stages - 2, counts, values)
 
 
-def test_a_moving_energy_is_kept_on_a_turntable():
+def test_invariant_moving_energy_on_a_turntable_is_conserved():
     ball = systems.TurntableBall(moments=(0.3, 0.4, 0.5))
 
     def moving_energy(t, q, v, args):
@@ -210,7 +212,7 @@ def test_a_moving_energy_is_kept_on_a_turntable():
     assert float(sol.stats["max_constraint_violation"]) < 1e-14
 
 
-def test_two_functions_are_kept_and_dense_output_ends_in_the_states():
+def test_invariants_of_two_functions_are_conserved_with_dense_output():
     def both(t, q, v, args):
         energies = [CVT.driver_energy(q, v), CVT.passenger_energy(q, v)]
         return jnp.stack(energies)
@@ -227,7 +229,7 @@ def test_two_functions_are_kept_and_dense_output_ends_in_the_states():
         )
 
 
-def test_members_of_an_ensemble_keep_their_own_energies_in_single_precision():
+def test_invariant_energies_of_an_ensemble_in_single_precision_are_conserved():
     q0, v0 = CHAOTIC.ensemble(2, jnp.float32)
     scales = jnp.array([0.5, 1.0, 1.5], jnp.float32)
     y0 = jax.vmap(lambda q, v, a: nhjax.initial_state(CHAOTIC.system, q, a * v))(
@@ -278,7 +280,7 @@ def differences():
 
 
 @pytest.mark.parametrize("name", long_but(["reversible"], ADJOINTS))
-def test_gradients_are_those_of_differences(name):
+def test_invariant_gradients_match_finite_differences(name):
     gradient = jax.jit(jax.grad(loss_of(ADJOINTS[name])))(jnp.array([0.2, 1.0]))
     np.testing.assert_allclose(gradient, differences(), rtol=1e-9)
 
@@ -319,7 +321,7 @@ def run_of(
 
 
 @pytest.mark.parametrize("name", REFUSED)
-def test_systems_whose_energy_cannot_be_conserved_are_refused_by_name(name):
+def test_invariant_energy_of_a_system_that_cannot_conserve_it_raises(name):
     with pytest.raises(ValueError, match=f'invariants="energy"`: .* a `{name}`'):
         run_of(**REFUSED[name])
 
@@ -334,17 +336,17 @@ def test_systems_whose_energy_cannot_be_conserved_are_refused_by_name(name):
         pytest.param(lambda t, q, v, args: v[0] - v[1] ** 2, id="nonlinear"),
     ],
 )
-def test_constraints_whose_reactions_do_work_are_refused(constraint):
+def test_invariant_energy_with_reactions_that_do_work_raises(constraint):
     with pytest.raises(nhjax.IntegrationError, match="affine, rheonomic"):
         run_of(nonholonomic=constraint, v=(0.0, 0.0))
 
 
-def test_a_function_that_is_not_conserved_is_refused():
+def test_invariant_function_that_is_not_conserved_raises():
     with pytest.raises(nhjax.IntegrationError, match=r"step 0: .* does not conserve"):
         run_of(lambda t, q, v, args: q[0] ** 2, v=(0.0, 1.0))
 
 
-def test_a_linear_constraint_that_turns_with_time_does_no_work():
+def test_invariant_energy_with_a_rotating_linear_constraint_is_conserved():
     def turning(t, q, v, args):
         return v[0] * jnp.cos(t) + v[1] * jnp.sin(t)
 
@@ -363,7 +365,9 @@ def test_a_linear_constraint_that_turns_with_time_does_no_work():
         (lambda *given: jnp.ones((), "float32"), nhjax.DTypeError, "float32"),
     ],
 )
-def test_what_is_not_a_function_of_the_state_is_refused(invariants, error, message):
+def test_invariants_that_are_not_functions_of_the_state_raise(
+    invariants, error, message
+):
     with pytest.raises(error, match=message):
         run_of(invariants)
 
@@ -390,7 +394,7 @@ def swing():
 
 
 @pytest.mark.parametrize("dt", [0.1, 0.5])
-def test_a_pendulum_is_led_through_its_turning_points(dt):
+def test_invariant_energy_of_a_pendulum_at_turning_points_is_conserved(dt):
     """It starts at one, at rest, and a node falls on the next by its symmetry."""
     sol = swing()(pendulum(1.0, 0.0)[1], dt)
     q, v = sol.ys.q[:, 0], sol.ys.v[:, 0]
@@ -399,7 +403,7 @@ def test_a_pendulum_is_led_through_its_turning_points(dt):
 
 
 @pytest.mark.parametrize(("stages", "counts"), [(2, (64, 128)), (3, (64, 128))])
-def test_the_order_holds_for_a_motion_that_starts_at_rest(stages, counts):
+def test_invariant_run_from_rest_keeps_its_order(stages, counts):
     system, y0 = pendulum(1.0, 0.0)
     method = LobattoIIIAB(stages)
     errors = []
@@ -418,7 +422,7 @@ def test_the_order_holds_for_a_motion_that_starts_at_rest(stages, counts):
     assert_order(2 * stages - 2, counts, errors, floor=SCIPY_FLOOR)
 
 
-def test_at_rest_there_is_no_impulse():
+def test_invariant_impulse_at_rest_vanishes():
     sol = swing()(pendulum(0.0, 0.0)[1], 0.1)
     np.testing.assert_array_equal(sol.ys.q, 0.0)
     slope = jax.grad(
@@ -435,7 +439,7 @@ def pendulum_at(q):
     return nhjax.State(y.q + q, y.v, y.p, y.multiplier)
 
 
-def test_next_to_a_saddle_the_error_stays_below_the_root_of_round_off():
+def test_invariant_error_near_a_saddle_stays_below_the_root_of_round_off():
     """Where the energy is all potential impulses are ill-determined, and limited."""
     sol = swing()(pendulum(np.pi - 1e-6, 0.0)[1], 0.2)
     assert sol.result == nhjax.RESULTS.successful
@@ -475,7 +479,9 @@ def charge_rates(t, z):
 @pytest.mark.parametrize(
     ("stages", "counts"), [(2, (128, 256, 512)), long(3, (32, 64, 128))]
 )
-def test_a_charge_from_rest_loses_a_logarithm_of_the_step(stages, counts):
+def test_invariant_run_of_a_charge_from_rest_loses_a_logarithm_of_the_step(
+    stages, counts
+):
     """The error is h^(2s-2) (a + b log(1/h)): equal growth each time h is halved."""
     system, y0 = charge()
     start = np.concatenate([y0.q, y0.v])
@@ -500,7 +506,7 @@ def test_a_charge_from_rest_loses_a_logarithm_of_the_step(stages, counts):
 
 
 @pytest.mark.parametrize(("dt", "limited"), [(0.9, False), (1.19, True)])
-def test_a_run_with_a_limited_impulse_does_not_lead_back(dt, limited):
+def test_invariant_run_with_limited_impulse_is_not_reversible(dt, limited):
     @jax.jit
     def run(y0, dt):
         given = pendulum(0.0, 0.0)[0], LobattoIIIAB(2), y0
@@ -523,6 +529,6 @@ def test_a_run_with_a_limited_impulse_does_not_lead_back(dt, limited):
         assert off < 1e-14
 
 
-def test_the_page_runs_as_printed():
+def test_invariants_page_runs_as_printed():
     found = run_page("invariants")["sol"].ys
     np.testing.assert_allclose(found, found[0], rtol=0, atol=1e-15)

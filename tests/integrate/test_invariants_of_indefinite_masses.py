@@ -114,7 +114,7 @@ def errors_at_the_end(name, stages, num_steps, invariants):
 
 
 @pytest.mark.parametrize("name", ["a saddle", long("null coordinates")])
-def test_no_member_is_spoilt_where_the_energy_of_motion_changes_its_sign(name):
+def test_invariant_energy_where_kinetic_energy_changes_sign_stays_in_every_member(name):
     """Large impulses where v·Mv nearly vanishes would spoil some members."""
     plain, walk = errors_at_the_end(name, 3, 50, None)
     kept, off = errors_at_the_end(name, 3, 50, "energy")
@@ -126,7 +126,7 @@ def test_no_member_is_spoilt_where_the_energy_of_motion_changes_its_sign(name):
 
 
 @pytest.mark.parametrize("stages", long_but((3,), (2, 3)))
-def test_the_order_stays_where_the_energy_of_motion_changes_its_sign(stages):
+def test_invariant_run_where_kinetic_energy_changes_sign_keeps_its_order(stages):
     counts = {2: (200, 400), 3: (50, 100)}[stages]
     found = [errors_at_the_end("a saddle", stages, n, "energy")[0] for n in counts]
     slope = np.log2(rms(found[0][:, None]) / rms(found[1][:, None]))
@@ -134,7 +134,7 @@ def test_the_order_stays_where_the_energy_of_motion_changes_its_sign(stages):
 
 
 @pytest.mark.long
-def test_two_functions_are_no_worse_than_the_energy_alone():
+def test_invariants_of_two_functions_are_as_accurate_as_energy_alone():
     """The energy of q_3 is conserved separately."""
 
     def both(t, q, v, args):
@@ -150,7 +150,7 @@ def test_two_functions_are_no_worse_than_the_energy_alone():
     assert np.max(kept) < 20 * np.max(plain)
 
 
-def test_the_norm_of_a_timelike_geodesic_is_kept_around_a_black_hole():
+def test_invariant_norm_of_a_geodesic_around_a_black_hole_is_conserved():
     """The mass matrix is indefinite, but v·Mv = -1 all along."""
 
     def schwarzschild(t, q, v, args):
@@ -169,7 +169,7 @@ def test_the_norm_of_a_timelike_geodesic_is_kept_around_a_black_hole():
     np.testing.assert_allclose(norms, -1.0, rtol=0, atol=3e-15)
 
 
-def test_a_negative_mass_matrix_takes_the_steps_of_the_positive_one():
+def test_invariant_steps_with_negative_mass_matrix_equal_the_positive_ones():
     system, y0 = PARTICLE.system, PARTICLE.initial_state()
     negative = nhjax.LagrangianSystem(
         lambda *given: -system.lagrangian(*given), nonholonomic=system.nonholonomic
@@ -187,7 +187,7 @@ def test_a_negative_mass_matrix_takes_the_steps_of_the_positive_one():
         assert float(found.stats["max_invariant_error"]) < 1e-15
 
 
-def test_an_ill_conditioned_mass_matrix_that_is_definite_keeps_its_energy():
+def test_invariant_energy_with_ill_conditioned_definite_mass_matrix_is_conserved():
     """The terms of v·Mv cancel to a part of 1e-4, which is no sign of a saddle."""
     mass = np.array([[1e4, 1e4], [1e4, 1e4 + 1]])
 

@@ -65,7 +65,7 @@ def rods_of(q):
     return np.sum(rods**2, axis=1) - 1.0, 2 * rows
 
 
-def test_the_discrete_equations_hold_with_all_constraints(recorded):
+def test_redundant_constraints_satisfy_the_discrete_equations(recorded):
     pair, h = paper_equations.lobatto(3), 0.02
     records, weight = recorded.interpolation.records, np.array([0, -GRAVITY, 0])
     for k in range(0, 40, 3):
@@ -82,7 +82,7 @@ def test_the_discrete_equations_hold_with_all_constraints(recorded):
         np.testing.assert_allclose(rows[-1] @ (end / MASSES), 0, atol=1e-13)
 
 
-def test_the_motion_is_that_without_the_redundant_rod(recorded):
+def test_redundant_rod_does_not_change_the_motion(recorded):
     saveat = nhjax.SaveAt(t0=True, steps=True)
     sol = nhjax.integrate(
         TWO_RODS, THREE, start(TWO_RODS), dt=0.02, num_steps=40, saveat=saveat
@@ -93,7 +93,7 @@ def test_the_motion_is_that_without_the_redundant_rod(recorded):
     assert int(sol.stats["num_redundant"]) == 0
 
 
-def test_the_order_is_that_of_independent_constraints():
+def test_redundant_constraints_keep_the_order():
     counts = (20, 40, 80)
     lanes = orders.trajectories(THREE_RODS, THREE, start(THREE_RODS), counts)
     ends = [jax.tree.map(lambda x: x[-1], lane) for lane in lanes]
@@ -112,7 +112,7 @@ def test_the_order_is_that_of_independent_constraints():
         orders.assert_order(4, counts, errors, orders.SCIPY_FLOOR)
 
 
-def test_multipliers_are_those_with_the_least_reactions():
+def test_redundant_multipliers_have_the_smallest_norm():
     motion = nhjax.motion(THREE_RODS, 0.0, start(THREE_RODS))
     _, rows = rods_of(PLACE)
     # The unknowns |B_a| λ_a, in the metric M⁻¹, have the least norm.
@@ -126,7 +126,7 @@ def test_multipliers_are_those_with_the_least_reactions():
     assert np.all(alone.is_unique)
 
 
-def test_a_state_near_the_constraints_is_projected_onto_them():
+def test_redundant_constraints_project_a_nearby_state():
     q = jnp.asarray(PLACE + np.array([0.05, -0.02, 0.04]))
     v = jnp.asarray([1.0, 0.2, -0.1])
     got, expected = (
@@ -138,7 +138,7 @@ def test_a_state_near_the_constraints_is_projected_onto_them():
 
 
 @pytest.mark.long
-def test_gradients_are_those_without_the_redundant_rod():
+def test_redundant_rod_does_not_change_gradients():
     def loss(system, count, x):
         place = jnp.stack([jnp.sin(x[0]), -jnp.cos(x[0]), 0.0 * x[0]])
         v = x[1] * jnp.stack([jnp.cos(x[0]), jnp.sin(x[0]), 0.0 * x[0]])
@@ -176,7 +176,7 @@ DOUBLED = nhjax.LagrangianSystem(
 MOMENTUM = DOUBLED.momentum(0.0, LINKAGE.q0, LINKAGE.v0)
 
 
-def test_a_linkage_with_a_doubled_constraint_moves_as_without_it():
+def test_redundant_copy_of_a_constraint_does_not_change_a_linkage():
     one, other = (
         nhjax.integrate(
             system,
@@ -191,7 +191,7 @@ def test_a_linkage_with_a_doubled_constraint_moves_as_without_it():
     np.testing.assert_allclose(one.ys.v, other.ys.v, rtol=0, atol=1e-12)
 
 
-def test_only_reactions_of_dependent_constraints_are_not_unique():
+def test_redundant_constraints_leave_other_reactions_unique():
     y = nhjax.State(LINKAGE.q0, LINKAGE.v0, MOMENTUM, jnp.zeros(3))
     motion = nhjax.motion(DOUBLED, 0.0, y)
     np.testing.assert_array_equal(motion.is_unique, [False, True, False])
@@ -220,7 +220,7 @@ def knives(t, q, p, args):
 
 
 @pytest.mark.parametrize("closure", ["symmetric", "propagated"])
-def test_nonholonomic_constraints_may_be_redundant(closure):
+def test_redundant_nonholonomic_constraints_run(closure):
     q, p = jnp.array([1.0, 0.5, 0.0]), jnp.array([0.3, 1.0, 0.15])
     ends = []
     for system in (
@@ -284,7 +284,7 @@ def run_on_a_sphere(rows, form, closure):
     ("form", "closure"),
     [long("lagrangian", "symmetric"), ("hamiltonian", "consistent")],
 )
-def test_a_rate_that_is_a_constraint_again_changes_nothing(form, closure):
+def test_redundant_rate_of_a_constraint_does_not_change_the_motion(form, closure):
     _, one = run_on_a_sphere((0,), form, closure)
     system, two = run_on_a_sphere((0, 1), form, closure)
     for name in ("q", "v", "p"):
@@ -309,7 +309,7 @@ def sphere_with_a_blade(t, x):
     return np.concatenate([v, load + multiplier @ rows])
 
 
-def test_what_does_not_follow_of_such_constraints_is_kept_with_the_order():
+def test_redundant_rate_leaves_independent_rows_enforced_with_the_order():
     # Of the rate and of its sum with the blade, the blade alone is new.
     counts = (10, 20, 40)
     q, v = jnp.array([0.6, 0.0, 0.8]), jnp.array([0.1, 0.5, 0.0])
@@ -346,17 +346,17 @@ NAMED = r"fails for holonomic\[0\], holonomic\[1\] and holonomic\[2\]\).*redunda
     ],
     ids=["initial_state", "integrate", "motion"],
 )
-def test_dependent_constraints_are_named_with_the_option(call):
+def test_redundant_constraints_without_the_option_raise(call):
     with pytest.raises(nhjax.DependentConstraintsError, match=NAMED):
         call(plate((0, 1, 2)), start(THREE_RODS))
 
 
-def test_reactions_of_dependent_constraints_are_no_numbers_under_jit():
+def test_redundant_reactions_under_jit_are_nan():
     motion = jax.jit(lambda y: nhjax.motion(plate((0, 1, 2)), 0.0, y))
     assert np.all(np.isnan(motion(start(THREE_RODS)).multiplier))
 
 
-def test_constraints_that_are_dependent_for_an_instant_are_not_redundant():
+def test_redundant_constraints_for_an_instant_only_fail():
     # A line and a curve that touches it, from where they touch.
     system = nhjax.LagrangianSystem(
         lambda t, q, v, args: 0.5 * v @ v,
@@ -368,7 +368,7 @@ def test_constraints_that_are_dependent_for_an_instant_are_not_redundant():
         nhjax.integrate(system, nhjax.LobattoIIIAB(2), y0, dt=0.1, num_steps=2)
 
 
-def test_a_nonholonomic_constraint_that_follows_from_holonomic_ones_is_named():
+def test_redundant_nonholonomic_constraint_of_holonomic_ones_is_named():
     system = nhjax.LagrangianSystem(
         lambda t, q, v, args: 0.5 * v @ v,
         nonholonomic=lambda t, q, v, args: jnp.stack([v[0], q @ v]),
@@ -379,7 +379,7 @@ def test_a_nonholonomic_constraint_that_follows_from_holonomic_ones_is_named():
         nhjax.initial_state(system, jnp.array([0.6, 0.0, 0.8]), jnp.zeros(3))
 
 
-def test_an_unknown_kind_of_constraints_is_refused():
+def test_redundant_option_of_unknown_kind_raises():
     wrong: Any = "doubled"
     with pytest.raises(ValueError, match="`constraints` must be one of 'independent'"):
         nhjax.LagrangianSystem(lambda t, q, v, args: 0.5 * v @ v, constraints=wrong)

@@ -143,7 +143,7 @@ def test_failure_under_jit_raises_whatever_part_of_the_solution_is_used():
 
 
 @pytest.mark.parametrize("transform", [lambda f: f, jax.jit], ids=["plain", "jit"])
-def test_a_failure_under_vmap_is_told_once(transform, caplog):
+def test_failure_under_vmap_is_reported_once(transform, caplog):
     speeds = jnp.array([-1.0, 0.5, -0.5, 0.25])
     with pytest.raises((RuntimeError, ValueError)) as error:
         jax.block_until_ready(transform(jax.vmap(fall))(speeds))

@@ -114,7 +114,7 @@ def _specials(dtype):
 @pytest.mark.parametrize("width", WIDTHS)
 @pytest.mark.parametrize("dtype", DTYPES)
 @pytest.mark.parametrize("op", OPS)
-def test_elementary_function_at_special_values_is_that_of_c(op, dtype, width, native):
+def test_elementary_function_at_special_values_equals_c(op, dtype, width, native):
     values = _specials(DTYPES[dtype])
     given = [values]
     if op in ulps.BINARY:

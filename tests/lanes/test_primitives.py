@@ -247,7 +247,7 @@ def test_primitives_that_kernels_contain_have_cases():
 
 
 @pytest.mark.parametrize("name", sorted(_CASES))
-def test_primitive_computes_what_jax_does(name):
+def test_primitive_in_lanes_equals_jax(name):
     for number, (function, kinds) in enumerate(_CASES[name]):
         operands = [numbers(kind, MEMBERS, number + i) for i, kind in enumerate(kinds)]
         expected = jax.tree.leaves(jax.jit(jax.vmap(function))(*operands))
@@ -286,14 +286,14 @@ def test_unsupported_program_raises_with_reason(function, reason):
         lanes_run.run_batched(function, 4, np.ones((2, 3)))
 
 
-def test_program_with_too_many_nodes_is_refused(monkeypatch):
+def test_program_with_too_many_nodes_raises(monkeypatch):
     monkeypatch.setattr(_program, "MOST_NODES", 100)
     lanes_run.run_batched(lambda x: jnp.sin(x), 4, np.ones((2, 10)))
     with pytest.raises(Unsupported, match="more than 120 operations"):
         lanes_run.run_batched(lambda x: jnp.outer(x, x), 4, np.ones((2, 20)))
 
 
-def test_primitive_with_unknown_parameters_is_refused_by_name():
+def test_primitive_with_unknown_parameters_is_named():
     program = jax.make_jaxpr(lambda x: lax.rev(x, (0,)))(np.zeros(3))
     (equation,) = program.eqns
     params = {f"{key}_elsewhere": value for key, value in equation.params.items()}
@@ -303,7 +303,7 @@ def test_primitive_with_unknown_parameters_is_refused_by_name():
         _program.build_graph(program.replace(jaxpr=jaxpr))
 
 
-def test_program_with_effects_is_refused():
+def test_program_with_effects_raises():
     def function(x):
         jax.debug.print("{}", x)
         return x

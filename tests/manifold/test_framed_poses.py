@@ -54,7 +54,7 @@ def test_framed_pose_tangent_is_its_derivative(group):
 
 
 @with_retractions
-def test_framed_pose_left_gradient_equals_that_of_the_pose(group):
+def test_framed_pose_left_gradient_equals_pose_gradient(group):
     def function(q):
         x, y, angle = unframed(q)
         return x**2 * jnp.sin(angle) + y * jnp.cos(2 * angle)

@@ -78,7 +78,7 @@ def test_lagranges_method_imported_agrees_with_its_own_equations():
     np.testing.assert_allclose(values, 0, atol=1e-13)
 
 
-def test_a_projection_keeps_what_is_chosen_by_name_or_symbol():
+def test_sympy_projection_keeps_coordinates_chosen_by_name_or_symbol():
     model = from_sympy(
         (DX**2 + DY**2 + A.diff() ** 2) / 2, [X, Y, A], nonholonomic=DX - 2 * DY
     )

@@ -116,7 +116,7 @@ def test_published_end_has_six_digits_of_the_acceleration_and_multiplier():
 
 
 @pytest.mark.parametrize("name", ["q", "v", "multiplier"])
-def test_order_is_that_of_the_method(lanes, reference, name):
+def test_run_converges_with_method_order(lanes, reference, name):
     stages, found = lanes
     assert_order(2 * stages - 2, COUNTS, found.errors(name, reference[name]))
 
@@ -155,7 +155,7 @@ def test_points_lie_on_the_bodies():
     np.testing.assert_array_equal(points["C"], [0.014, 0.072])
 
 
-def test_all_is_computed_in_single_precision():
+def test_system_in_single_precision_stays_in_it():
     assert_single_precision(SQUEEZER)
 
 
@@ -169,6 +169,6 @@ def test_all_is_computed_in_single_precision():
         ({"stiffness": 0.0}, r"`stiffness` must be positive, got 0"),
     ],
 )
-def test_a_bad_parameter_is_named(parameters, message):
+def test_parameter_out_of_range_is_named(parameters, message):
     with pytest.raises(ValueError, match=message):
         AndrewsSqueezer(**parameters)

@@ -106,7 +106,7 @@ def test_accelerations_and_forces_are_those_of_newton_and_euler(ball):
 
 
 @pytest.mark.long
-def test_order_is_that_of_the_method(runs_of):
+def test_run_converges_with_method_order(runs_of):
     ball = BALLS["paraboloid"]
     oracle = newton_euler(ball)
     times = DURATION * np.arange(1, COUNTS[-1] + 1) / COUNTS[-1]
@@ -169,7 +169,7 @@ def test_invariants_are_constant_by_the_independent_equations(ball):
     assert np.ptp(energies) > 1e-3, "the bowl does no work"
 
 
-def test_a_flat_bowl_is_the_turntable():
+def test_flat_bowl_equals_the_turntable():
     table = TurntableBall.rolling((0.4, -0.2), (0.7, 0.9), 2.0, radius=0.1, rate=1.3)
     ball = BallInBowl.rolling((0.4, -0.2), (0.7, 0.9), 2.0, curvature=0.0, rate=1.3)
     x, w, R = newton_euler(ball).trajectory(*start_of(ball), [1.5])
@@ -235,7 +235,7 @@ def test_points_are_on_the_ball_and_on_the_bowl():
     np.testing.assert_allclose(points["pole"], [0.5, 0, 0.2875], atol=1e-16)
 
 
-def test_system_computes_in_the_precision_of_the_state():
+def test_system_computes_in_precision_of_the_state():
     for ball in BALLS.values():
         y0 = ball.initial_state(jnp.float32)
         leaves = jax.tree.leaves((y0.q, y0.v, y0.multiplier))
@@ -272,6 +272,6 @@ def test_system_computes_in_the_precision_of_the_state():
         ),
     ],
 )
-def test_a_bad_parameter_is_named(build, message):
+def test_parameter_out_of_range_is_named(build, message):
     with pytest.raises(ValueError, match=message):
         build()

@@ -18,7 +18,7 @@ GAINS = np.array([-3.0, 5.0])
 STEERED = LeanToSteer(*GAINS)
 
 
-def test_a_rider_who_steers_into_the_fall_gives_that_torque():
+def test_rider_steering_into_the_fall_applies_its_torque():
     parameters = oracle.BENCHMARK
 
     def found(*where):
@@ -36,7 +36,7 @@ def test_a_rider_who_steers_into_the_fall_gives_that_torque():
     np.testing.assert_allclose(acceleration, linear, rtol=1e-6)
 
 
-def test_the_default_lean_to_steer_makes_slow_running_stable():
+def test_default_lean_to_steer_stabilises_slow_running():
     gains = (float(LeanToSteer().lean_gain), float(LeanToSteer().lean_rate_gain))
     for speed in (2.0, 3.0, 4.0, 5.0, 6.0):
         steered = oracle.linear_motion(oracle.BENCHMARK, speed, gains)
@@ -91,7 +91,7 @@ each_bicycle = pytest.mark.parametrize("stages", [2, 3], ids=["steered-2", "free
 @pytest.mark.long
 @each_bicycle
 @pytest.mark.parametrize("part", range(3), ids=["q", "v", "multiplier"])
-def test_the_motion_converges_to_that_of_kanes_method(stages, part):
+def test_motion_converges_to_kanes_equations(stages, part):
     _, states, continuous = runs(stages)
     found = (states.q, states.v, continuous)[part]
     LADDERS[stages].assert_order(2 * stages - 2, found, reference(stages)[part])
@@ -129,7 +129,7 @@ def test_energy_stays_in_a_run_of_five_seconds():
 
 
 @pytest.mark.long
-def test_the_rider_does_the_work_that_becomes_energy():
+def test_energy_equals_the_work_of_the_rider():
     bicycle = BICYCLES[2]
     q, v, _ = reference(2)
     power = np.array([rider(0.0, *x) * x[1][5] for x in zip(q, v, strict=True)])

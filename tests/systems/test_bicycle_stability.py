@@ -36,7 +36,7 @@ EIGENVALUES = (
 WEAVE, CAPSIZE = 4.29238253634111, 6.02426201538837
 
 
-def test_the_linear_equations_of_the_oracle_are_those_of_meijaard():
+def test_linear_equations_of_the_oracle_equal_meijaards():
     for matrix, printed in zip(
         oracle.canonical(oracle.BENCHMARK), MATRICES, strict=True
     ):
@@ -115,9 +115,7 @@ def test_small_steps_have_derivatives_also_at_rest(multipliers):
     [(WEAVE, "complex"), (CAPSIZE, "real")],
     ids=["weave", "capsize"],
 )
-def test_the_speeds_at_which_it_is_as_stable_as_not_are_the_printed(
-    multipliers, printed, first
-):
+def test_speeds_of_neutral_stability_equal_published_ones(multipliers, printed, first):
     speeds = np.round(printed, 2) + 0.002 * np.arange(-5, 6)
     eigenvalues = multipliers(speeds, 0.015)
     oscillates = np.abs(eigenvalues.imag) > 1e-3

@@ -76,7 +76,7 @@ def test_run_ends_at_the_published_solution(lanes):
 
 
 @pytest.mark.parametrize("name", ["q", "v", "multiplier"])
-def test_order_is_that_of_the_method(lanes, reference, name):
+def test_run_converges_with_method_order(lanes, reference, name):
     stages, found = lanes
     assert_order(2 * stages - 2, COUNTS, found.errors(name, reference[name]))
 
@@ -119,11 +119,11 @@ def test_points_are_those_of_wheels_and_ends():
     np.testing.assert_array_equal(points["right_end"], [1.0, 0.5])
 
 
-def test_nothing_is_conserved():
+def test_car_axis_has_no_invariants():
     assert AXIS.invariants(0.0, AXIS.q0, AXIS.v0) == {}
 
 
-def test_all_is_computed_in_single_precision():
+def test_system_in_single_precision_stays_in_it():
     assert_single_precision(AXIS)
 
 
@@ -139,6 +139,6 @@ def test_all_is_computed_in_single_precision():
         ({"q0": (0.0,)}, r"`q0` must have shape \(4,\)"),
     ],
 )
-def test_a_bad_parameter_is_named(parameters, message):
+def test_parameter_out_of_range_is_named(parameters, message):
     with pytest.raises(ValueError, match=message):
         CarAxis(**parameters)

@@ -63,7 +63,7 @@ def test_accelerations_and_forces_of_the_ground_are_those_of_the_reduced_equatio
 
 
 @pytest.mark.parametrize("speed", [4.0, -1.5])
-def test_the_velocity_of_a_speed_and_a_steer_rate_does_not_slip(speed):
+def test_velocity_of_a_speed_and_a_steer_rate_does_not_slip(speed):
     car = some_car(3, 5)
     v = car.velocity(car.q0, speed, 0.4)
     slips = car.constraint(0.0, car.q0, v, None)
@@ -76,7 +76,7 @@ def test_the_velocity_of_a_speed_and_a_steer_rate_does_not_slip(speed):
 
 
 @pytest.mark.parametrize("steer", [0.4, -0.25, 0.0])
-def test_a_turning_car_goes_on_turning_on_circles(steer):
+def test_turning_car_keeps_moving_on_circles(steer):
     car = CarWithTrailers.turning(
         3, 6.0, steer, trailer_length=(3.0, 2.0, 4.0), trailer_hitch=(1.0, 0.0, 0.5)
     )
@@ -134,13 +134,13 @@ def reference():
 
 @pytest.mark.parametrize("stages", [long(2), 3])
 @pytest.mark.parametrize("part", range(3), ids=["q", "v", "multiplier"])
-def test_the_motion_converges_to_that_of_the_reduced_equations(stages, part):
+def test_motion_converges_to_reduced_equations(stages, part):
     _, states, continuous = runs(stages)
     found = (states.q, states.v, continuous)[part]
     LADDERS[stages].assert_order(2 * stages - 2, found, reference()[part])
 
 
-def test_the_controls_do_the_work_that_becomes_energy():
+def test_energy_equals_the_work_of_the_controls():
     car = driven()
     q, v, _ = reference()
     energy = [float(car.energy(0.0, q[k], v[k])) for k in (0, -1)]
@@ -171,7 +171,7 @@ def test_without_controls_both_invariants_stay_and_no_axle_slips():
 
 
 @pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
-def test_it_computes_in_the_precision_of_the_state(dtype):
+def test_system_computes_in_precision_of_the_state(dtype):
     car = some_car(2, 6)
     t, q, v = jnp.zeros((), dtype), car.q0.astype(dtype), car.v0.astype(dtype)
     values = (
@@ -184,7 +184,7 @@ def test_it_computes_in_the_precision_of_the_state(dtype):
     assert {value.dtype for value in values} == {jnp.dtype(dtype)}
 
 
-def test_its_points_lie_along_the_train():
+def test_points_lie_along_the_train():
     car = CarWithTrailers(2, q0=(1.0, 2.0, 0.0, 0.3, 0.0, np.pi / 2))
     expected = {
         "rear_axle": (1.0, 2.0),
@@ -203,7 +203,7 @@ def test_its_points_lie_along_the_train():
         np.testing.assert_allclose(point, expected[name], rtol=0, atol=1e-14)
 
 
-def test_gradients_reach_every_parameter():
+def test_gradients_in_every_parameter_are_not_zero():
     car = some_car(2, 7)
 
     def value(car):
@@ -232,6 +232,6 @@ def test_gradients_reach_every_parameter():
         (lambda: CarWithTrailers(v0=(0.0,) * 4), r"`v0` must have shape \(5,\)"),
     ],
 )
-def test_a_bad_parameter_is_named(build, message):
+def test_parameter_out_of_range_is_named(build, message):
     with pytest.raises(ValueError, match=message):
         build()

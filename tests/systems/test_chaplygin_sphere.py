@@ -64,7 +64,7 @@ def test_accelerations_and_forces_are_those_of_newton_and_euler(ball):
 
 
 @pytest.mark.long
-def test_order_is_that_of_the_method(runs_of):
+def test_run_converges_with_method_order(runs_of):
     ball = SPHERES["default"]
     start = np.asarray(ball.q0[:4]), np.asarray(ball.v0[3:])
     errors_at = errors_of(newton_euler(ball), start, DURATION, COUNTS[-1])
@@ -129,7 +129,7 @@ def test_points_are_on_the_sphere_and_on_the_plane():
     np.testing.assert_allclose(poles / 0.3, matrix_of(ball.q0[:4]), atol=1e-15)
 
 
-def test_system_computes_in_the_precision_of_the_state():
+def test_system_computes_in_precision_of_the_state():
     ball = SPHERES["default"]
     y0 = ball.initial_state(jnp.float32)
     assert y0.q.dtype == y0.v.dtype == y0.multiplier.dtype == jnp.float32
@@ -151,6 +151,6 @@ def test_system_computes_in_the_precision_of_the_state():
         ),
     ],
 )
-def test_a_bad_parameter_is_named(build, message):
+def test_parameter_out_of_range_is_named(build, message):
     with pytest.raises(ValueError, match=message):
         build()

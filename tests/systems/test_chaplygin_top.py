@@ -42,7 +42,7 @@ def test_accelerations_and_forces_are_those_of_newton_and_euler(top):
 
 
 @pytest.mark.long
-def test_order_is_that_of_the_method(runs_of):
+def test_run_converges_with_method_order(runs_of):
     top = TOPS["Routh"]
     start = np.asarray(top.q0[:4]), np.asarray(top.v0[3:])
     errors_at = errors_of(newton_euler(top), start, DURATION, COUNTS[-1])
@@ -121,7 +121,7 @@ def test_points_are_on_the_sphere_and_on_the_plane():
     )
 
 
-def test_system_computes_in_the_precision_of_the_state():
+def test_system_computes_in_precision_of_the_state():
     top = TOPS["Routh"]
     y0 = top.initial_state(jnp.float32)
     assert y0.q.dtype == y0.v.dtype == y0.multiplier.dtype == jnp.float32
@@ -141,6 +141,6 @@ def test_system_computes_in_the_precision_of_the_state():
         (lambda: ChaplyginTop(offset=0.1).initial_state(), "constraint"),
     ],
 )
-def test_a_bad_parameter_is_named(build, message):
+def test_parameter_out_of_range_is_named(build, message):
     with pytest.raises(ValueError, match=message):
         build()

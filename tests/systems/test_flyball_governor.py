@@ -67,7 +67,7 @@ def test_published_springs_accelerate_the_governor_by_kanes_equations():
 
 
 @pytest.mark.parametrize("name", ["q", "v", "multiplier"])
-def test_order_is_that_of_the_method(lanes, reference, name):
+def test_run_converges_with_method_order(lanes, reference, name):
     stages, found = lanes
     assert_order(2 * stages - 2, COUNTS, found.errors(name, reference[name]))
 
@@ -140,7 +140,7 @@ def test_points_are_those_of_hinges_and_balls():
 
 
 @pytest.mark.parametrize("example", [RIGID, SPRUNG], ids=["rods", "springs"])
-def test_all_is_computed_in_single_precision(example):
+def test_system_in_single_precision_stays_in_it(example):
     assert_single_precision(example)
 
 
@@ -153,11 +153,11 @@ def test_all_is_computed_in_single_precision(example):
         ({"couplers": "ropes"}, r'`couplers` must be "rods" or "springs", got \'ropes'),
     ],
 )
-def test_a_bad_parameter_is_named(parameters, message):
+def test_parameter_out_of_range_is_named(parameters, message):
     with pytest.raises(ValueError, match=message):
         FlyballGovernor(**parameters)
 
 
-def test_couplers_that_do_not_reach_the_shaft_are_named():
+def test_couplers_too_short_for_the_shaft_raise():
     with pytest.raises(ValueError, match=r"`coupler_length` 0\.3 does not reach"):
         FlyballGovernor.turning(0.1, 1.0, coupler_length=0.3)

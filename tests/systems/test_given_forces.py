@@ -33,7 +33,7 @@ MACHINES = {
 
 
 @pytest.mark.parametrize(("example", "forces", "same"), MACHINES.values(), ids=MACHINES)
-def test_forces_are_taken_in_their_shape_alone(example, forces, same):
+def test_force_args_are_accepted_in_their_shape_only(example, forces, same):
     def force(args):
         return example.force(0.0, example.q0, example.v0, args)
 
@@ -49,7 +49,7 @@ def test_forces_are_taken_in_their_shape_alone(example, forces, same):
         assert f"of shape {shape}" in str(error.value)
 
 
-def test_the_error_comes_before_a_run():
+def test_initial_state_with_force_args_of_wrong_shape_raises():
     robot, _, _ = MACHINES["robot"]
     with pytest.raises(nhjax.ShapeError, match=r"torques of the motors .* \(2,\), got"):
         nhjax.initial_state(robot.system, robot.q0, robot.v0, args=jnp.ones((3, 2)))

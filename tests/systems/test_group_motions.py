@@ -266,7 +266,7 @@ def test_suslov_ends_in_a_steady_rotation():
         (lambda: RodSleigh(mass2=0.0), r"`mass2` must be positive, got 0"),
     ],
 )
-def test_a_bad_parameter_is_named(build, message):
+def test_parameter_out_of_range_is_named(build, message):
     with pytest.raises(ValueError, match=message):
         build()
 

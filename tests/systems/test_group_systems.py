@@ -98,7 +98,7 @@ def test_initial_state_carries_the_multiplier_of_the_continuous_system(example):
 
 @over(KINDS)
 @pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
-def test_system_computes_in_the_precision_of_the_state(example, dtype):
+def test_system_computes_in_precision_of_the_state(example, dtype):
     system = example.system
     q, v = jax.tree.map(lambda x: x.astype(dtype), (example.q0, example.v0))
     t = jnp.zeros((), dtype)
@@ -112,7 +112,7 @@ def test_system_computes_in_the_precision_of_the_state(example, dtype):
 
 
 @over(KINDS)
-def test_gradients_reach_the_parameters(example):
+def test_gradients_in_parameters_are_finite(example):
     q, v = example.q0, 0.9 * example.v0
 
     def value(system):

@@ -210,7 +210,7 @@ def test_driven_racer_accelerates_by_the_reduced_equations():
 
 
 @pytest.mark.parametrize("name", ["q", "v", "multiplier"])
-def test_order_is_that_of_the_method(lanes, reference, name):
+def test_run_converges_with_method_order(lanes, reference, name):
     stages, found = lanes
     assert_order(2 * stages - 2, COUNTS, found.errors(name, reference[name]))
 
@@ -286,7 +286,7 @@ def test_gait_may_be_any_function_of_time():
     assert_motion(library_motion(own, 0.0, driven.q0, driven.v0), expected, 1e-15)
 
 
-def test_all_is_computed_in_single_precision(case):
+def test_system_in_single_precision_stays_in_it(case):
     assert_single_precision(case.example)
 
 
@@ -310,6 +310,6 @@ def test_all_is_computed_in_single_precision(case):
         ),
     ],
 )
-def test_a_mistake_is_named(build, message):
+def test_locomotion_parameter_out_of_range_is_named(build, message):
     with pytest.raises(ValueError, match=message):
         build()

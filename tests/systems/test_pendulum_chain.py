@@ -69,7 +69,7 @@ def test_chain_of_two_links_is_the_double_pendulum():
 
 
 @pytest.mark.parametrize("name", ["q", "v", "multiplier"])
-def test_order_is_that_of_the_method(lanes, reference, name):
+def test_run_converges_with_method_order(lanes, reference, name):
     stages, found = lanes
     assert_order(2 * stages - 2, COUNTS, found.errors(name, reference[name]))
 
@@ -101,7 +101,7 @@ def test_default_chain_hangs_on_one_line_at_rest():
     assert not jnp.any(chain.v0)
 
 
-def test_all_is_computed_in_single_precision():
+def test_system_in_single_precision_stays_in_it():
     assert_single_precision(CHAIN)
 
 
@@ -118,6 +118,6 @@ def test_all_is_computed_in_single_precision():
         ),
     ],
 )
-def test_a_bad_parameter_is_named(build, message):
+def test_parameter_out_of_range_is_named(build, message):
     with pytest.raises(ValueError, match=message):
         build()

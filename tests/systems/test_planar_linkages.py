@@ -92,7 +92,7 @@ def test_crank_takes_the_time_of_the_quadrature(machine, reference):
 
 
 @pytest.mark.parametrize("name", ["q", "v", "multiplier"])
-def test_order_is_that_of_the_method(lanes, reference, name):
+def test_run_converges_with_method_order(lanes, reference, name):
     stages, found = lanes
     assert_order(2 * stages - 2, COUNTS, found.errors(name, reference[name]))
 
@@ -144,7 +144,7 @@ def test_parallelogram_falls_as_a_pendulum_does():
     np.testing.assert_allclose(lane.q[:, 2], lane.q[:, 0], rtol=0, atol=1e-14)
 
 
-def test_a_parallelogram_does_not_pass_the_place_where_it_may_fold():
+def test_parallelogram_at_a_singular_configuration_fails():
     linkage = FourBar.parallelogram()
     system, start = linkage.system, linkage.initial_state()
     message = "constraints become dependent in the course of the step"
@@ -172,7 +172,7 @@ def test_points_are_those_of_the_joints():
     np.testing.assert_allclose(sides, [0.1, 0.4, 0.3, 0.4], rtol=1e-14)
 
 
-def test_all_is_computed_in_single_precision(machine):
+def test_system_in_single_precision_stays_in_it(machine):
     assert_single_precision(machine[0])
 
 
@@ -194,6 +194,6 @@ def test_all_is_computed_in_single_precision(machine):
         ),
     ],
 )
-def test_a_bad_parameter_is_named(build, message):
+def test_parameter_out_of_range_is_named(build, message):
     with pytest.raises(ValueError, match=message):
         build()

@@ -103,7 +103,7 @@ def test_tilts_are_the_papers_angles():
     np.testing.assert_allclose(up, expected, rtol=0, atol=1e-15)
 
 
-def test_a_stone_at_rest_rocks_as_its_radii_of_curvature_say():
+def test_rattleback_at_rest_rocks_at_frequency_of_its_radii_of_curvature():
     a, b, c, h, m, g, e = 0.2, 0.03, 0.02, 0.01, 1.0, 9.81, 1e-5
     rocking = []
     for turn in (*np.eye(2), *-np.eye(2)):
@@ -121,7 +121,7 @@ def test_a_stone_at_rest_rocks_as_its_radii_of_curvature_say():
 
 @pytest.mark.long
 @pytest.mark.parametrize("stages", [2, 3])
-def test_order_is_that_of_the_method(runs_of, errors_at, stages):
+def test_run_converges_with_method_order(runs_of, errors_at, stages):
     assert_orders(runs_of[stages], 2 * stages - 2, errors_at, floor=1e-11)
 
 
@@ -186,7 +186,7 @@ def spins(first_reversal):
 
 
 @pytest.mark.long
-def test_spin_reverses_when_the_equations_of_the_paper_say(first_reversal, spins):
+def test_spin_reverses_at_the_time_of_the_papers_equations(first_reversal, spins):
     _, v, _ = spins
     end, state, afterwards = first_reversal
     assert end == pytest.approx(2.38, abs=0.01)
@@ -196,13 +196,13 @@ def test_spin_reverses_when_the_equations_of_the_paper_say(first_reversal, spins
 
 
 @pytest.mark.long
-def test_a_spin_in_the_other_sense_does_not_reverse(spins):
+def test_spin_in_the_other_sense_does_not_reverse(spins):
     _, v, _ = spins
     assert np.all(v[1, :, 5] < -4.0)
 
 
 @pytest.mark.long
-def test_damping_takes_the_energy_that_its_power_says(spins):
+def test_energy_lost_by_damping_equals_its_power(spins):
     for ts, v, energy in zip(*spins, strict=True):
         power = -DAMPING * np.sum(v[:, 3:] ** 2, axis=1)
         work = make_interp_spline(ts, power, k=7).integrate(ts[0], ts[-1])
@@ -229,7 +229,7 @@ def test_points_are_on_the_stone_and_on_the_plane():
     assert np.min(heights) > 0
 
 
-def test_system_computes_in_the_precision_of_the_state():
+def test_system_computes_in_precision_of_the_state():
     stone = STONES["damped"]
     y0 = stone.initial_state(jnp.float32)
     assert y0.q.dtype == y0.v.dtype == y0.multiplier.dtype == jnp.float32
@@ -254,6 +254,6 @@ def test_system_computes_in_the_precision_of_the_state():
         ),
     ],
 )
-def test_a_bad_parameter_is_named(build, message):
+def test_parameter_out_of_range_is_named(build, message):
     with pytest.raises(ValueError, match=message):
         build()

@@ -144,7 +144,7 @@ def test_runs_stay_on_the_circle_to_the_order_of_the_method(tumbling, name):
 
 
 @pytest.mark.long
-def test_order_is_that_of_the_method(tumbling):
+def test_run_converges_with_method_order(tumbling):
     body, found = tumbling
     start = np.asarray(body.q0[:4]), np.asarray(body.v0[3:])
     errors_at = errors_of(newton_euler(body), start, DURATION, COUNTS[-1])
@@ -163,7 +163,7 @@ def test_constraints_hold_to_round_off_and_energy_stays(tumbling):
         assert np.all(drift < largest[stages]), drift
 
 
-def test_a_disc_with_its_centre_at_rest_turns_as_moffatt_says():
+def test_disc_with_centre_at_rest_has_moffatts_rate():
     tilt, radius, gravity = 0.3, 0.04, 9.81
     disc = RollingTorus.circling(
         tilt,
@@ -188,7 +188,7 @@ def test_centre_moves_on_the_circle_that_was_asked_for():
 
 
 @pytest.mark.parametrize("spin", [2.0, 6.0])
-def test_an_upright_disc_leans_and_turns_at_rouths_frequency(spin):
+def test_upright_disc_oscillates_at_rouths_frequency(spin):
     disc = BODIES["disc"]
     m, a, g = 1.0, 0.5, 9.81
     I, J = 0.0625, 0.125
@@ -228,7 +228,7 @@ def test_points_are_on_the_body_and_on_the_plane():
     assert abs(float(axle @ np.asarray(spoke))) < 1e-15
 
 
-def test_system_computes_in_the_precision_of_the_state():
+def test_system_computes_in_precision_of_the_state():
     body = BODIES["torus"].rolling((0.8, 0.6, 0.0, 0.0), (0.2, 0.5, 4.0))
     y0 = body.initial_state(jnp.float32)
     assert y0.q.dtype == y0.v.dtype == y0.multiplier.dtype == jnp.float32
@@ -261,6 +261,6 @@ def test_steady_motion_is_differentiable_in_its_tilt():
         (lambda: RollingTorus(radius=0.6).initial_state(), "constraint"),
     ],
 )
-def test_a_bad_parameter_is_named(build, message):
+def test_parameter_out_of_range_is_named(build, message):
     with pytest.raises(ValueError, match=message):
         build()

@@ -101,7 +101,7 @@ def test_crank_takes_the_time_of_the_quadrature(reference):
 
 
 @pytest.mark.parametrize("name", ["q", "v", "multiplier"])
-def test_order_is_that_of_the_method(lanes, reference, name):
+def test_run_converges_with_method_order(lanes, reference, name):
     stages, found = lanes
     assert_order(2 * stages - 2, COUNTS, found.errors(name, reference[name]))
 
@@ -128,7 +128,7 @@ def test_points_are_those_of_the_joints():
     assert np.linalg.norm(points["slider"] - points["pin"]) == pytest.approx(0.3)
 
 
-def test_all_is_computed_in_single_precision():
+def test_system_in_single_precision_stays_in_it():
     assert_single_precision(MACHINE)
 
 
@@ -143,6 +143,6 @@ def test_all_is_computed_in_single_precision():
         ),
     ],
 )
-def test_a_bad_parameter_is_named(build, message):
+def test_parameter_out_of_range_is_named(build, message):
     with pytest.raises(ValueError, match=message):
         build()

@@ -236,7 +236,7 @@ def test_chaotic_default_is_the_middle_of_the_ensemble():
 
 @over(GALLERY)
 @pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
-def test_system_computes_in_the_precision_of_the_state(example, dtype):
+def test_system_computes_in_precision_of_the_state(example, dtype):
     y0 = example.initial_state(dtype)
     assert y0.q.dtype == y0.v.dtype == y0.p.dtype == y0.multiplier.dtype == dtype
     t = jnp.zeros((), dtype)
@@ -261,7 +261,7 @@ def test_parameters_are_leaves_of_the_system(example):
     assert len(jax.tree.leaves(example)) <= len(jax.tree.leaves(example.system))
 
 
-def test_gradient_reaches_a_parameter_through_the_system():
+def test_gradient_in_a_parameter_through_the_system_is_exact():
     t, q, v = jnp.zeros(()), jnp.ones(3), jnp.ones(3)
 
     def value(stiffness):
@@ -271,7 +271,7 @@ def test_gradient_reaches_a_parameter_through_the_system():
     assert jax.grad(value)(jnp.array(2.0)) == -1.0
 
 
-def test_a_new_parameter_value_does_not_recompile():
+def test_parameter_with_new_value_does_not_recompile():
     traces = 0
 
     @jax.jit
@@ -300,7 +300,7 @@ def test_a_new_parameter_value_does_not_recompile():
         (lambda: HarmonicOscillator(mass=0.0), r"`mass` must be positive, got 0"),
     ],
 )
-def test_a_bad_parameter_is_named(build, message):
+def test_parameter_out_of_range_is_named(build, message):
     with pytest.raises(ValueError, match=message):
         build()
 

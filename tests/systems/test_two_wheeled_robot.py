@@ -44,7 +44,7 @@ def test_accelerations_and_forces_of_the_ground_are_those_of_the_reduced_equatio
 
 
 @pytest.mark.parametrize("seed", range(2))
-def test_a_rolling_robot_does_not_slip(seed):
+def test_rolling_robot_does_not_slip(seed):
     robot, speed, turn, _ = some_robot(seed)
     slips = robot.constraint(0.0, robot.q0, robot.v0, None)
     np.testing.assert_allclose(slips, 0.0, rtol=0, atol=2e-15)
@@ -52,7 +52,7 @@ def test_a_rolling_robot_does_not_slip(seed):
     np.testing.assert_allclose(robot.v0, expected, rtol=1e-14)
 
 
-def test_the_default_data_are_those_of_rolling():
+def test_default_data_roll_without_slip():
     default, rolling = TwoWheeledRobot(), TwoWheeledRobot.rolling()
     np.testing.assert_allclose(default.v0, rolling.v0, rtol=1e-15)
     np.testing.assert_array_equal(default.q0, rolling.q0)
@@ -86,13 +86,13 @@ def reference():
 
 @pytest.mark.parametrize("stages", [long(2), 3])
 @pytest.mark.parametrize("part", range(3), ids=["q", "v", "multiplier"])
-def test_the_motion_converges_to_that_of_the_reduced_equations(stages, part):
+def test_motion_converges_to_reduced_equations(stages, part):
     _, states, continuous = runs(stages)
     found = (states.q, states.v, continuous)[part]
     LADDERS[stages].assert_order(2 * stages - 2, found, reference()[part])
 
 
-def test_the_motors_do_the_work_that_becomes_energy():
+def test_energy_equals_the_work_of_the_motors():
     robot = TwoWheeledRobot.rolling(0.8, 1.1, 0.3)
     q, v, _ = reference()
     energy = [float(robot.energy(0.0, q[k], v[k])) for k in (0, -1)]
@@ -116,7 +116,7 @@ def test_without_torques_energy_stays_and_no_wheel_slips():
     np.testing.assert_allclose(check(0.0, q, v, None), 0.0, rtol=0, atol=2e-14)
 
 
-def test_with_its_centre_over_the_axle_it_goes_on_along_a_circle():
+def test_robot_with_centre_over_the_axle_moves_on_a_circle():
     robot = TwoWheeledRobot.rolling(0.8, 1.1, offset=0.0)
     acceleration, multiplier = library_motion(robot, 0.0, robot.q0, robot.v0, None)
     np.testing.assert_allclose(acceleration[2:], 0.0, rtol=0, atol=1e-15)
@@ -127,7 +127,7 @@ def test_with_its_centre_over_the_axle_it_goes_on_along_a_circle():
 
 
 @pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
-def test_it_computes_in_the_precision_of_the_state(dtype):
+def test_system_computes_in_precision_of_the_state(dtype):
     robot = TwoWheeledRobot()
     t, q, v = jnp.zeros((), dtype), robot.q0.astype(dtype), robot.v0.astype(dtype)
     values = (
@@ -139,7 +139,7 @@ def test_it_computes_in_the_precision_of_the_state(dtype):
     assert {value.dtype for value in values} == {jnp.dtype(dtype)}
 
 
-def test_its_points_are_in_front_of_and_beside_the_axle():
+def test_points_are_in_front_of_and_beside_the_axle():
     robot = TwoWheeledRobot()
     q = jnp.array([1.0, 2.0, np.pi / 2, 0.0, 0.0])
     expected = {
@@ -154,7 +154,7 @@ def test_its_points_are_in_front_of_and_beside_the_axle():
         np.testing.assert_allclose(point, expected[name], rtol=0, atol=1e-15)
 
 
-def test_gradients_reach_every_parameter():
+def test_gradients_in_every_parameter_are_not_zero():
     robot = TwoWheeledRobot()
 
     def value(robot):
@@ -177,6 +177,6 @@ def test_gradients_reach_every_parameter():
         ({"q0": (0.0, 0.0)}, r"`q0` must have shape \(5,\), got \(2,\)"),
     ],
 )
-def test_a_bad_parameter_is_named(parameters, message):
+def test_parameter_out_of_range_is_named(parameters, message):
     with pytest.raises(ValueError, match=message):
         TwoWheeledRobot(**parameters)

@@ -148,7 +148,7 @@ def test_accelerations_are_those_of_table_1_of_basu_mandal():
 
 
 @pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
-def test_it_computes_in_the_precision_of_the_state(dtype):
+def test_system_computes_in_precision_of_the_state(dtype):
     bicycle = WhippleBicycle(steering=LeanToSteer())
     t, q, v = jnp.zeros((), dtype), bicycle.q0.astype(dtype), bicycle.v0.astype(dtype)
     values = (
@@ -161,7 +161,7 @@ def test_it_computes_in_the_precision_of_the_state(dtype):
     assert {value.dtype for value in values} == {jnp.dtype(dtype)}
 
 
-def test_gradients_reach_every_parameter():
+def test_gradients_in_every_parameter_are_not_zero():
     bicycle, q, v, _ = other_bicycle(3)
 
     def value(bicycle):
@@ -176,7 +176,7 @@ def test_gradients_reach_every_parameter():
             assert np.all(np.asarray(getattr(gradient, name)) != 0), name
 
 
-def test_its_points_are_those_of_the_upright_bicycle_and_turn_with_it():
+def test_points_rotate_with_the_upright_bicycle():
     bicycle = WhippleBicycle()
     points = bicycle.points(0.0, bicycle.q0)
     expected = {
@@ -226,6 +226,6 @@ def test_energy_is_an_invariant_only_without_a_torque():
         ({"v0": (1.0, 2.0)}, r"`v0` must have shape \(8,\), got \(2,\)"),
     ],
 )
-def test_a_bad_parameter_is_named(parameters, message):
+def test_parameter_out_of_range_is_named(parameters, message):
     with pytest.raises(ValueError, match=message):
         WhippleBicycle(**parameters)
