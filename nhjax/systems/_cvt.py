@@ -4,8 +4,8 @@ import math
 
 import equinox as eqx
 import jax.numpy as jnp
+import scipy
 from jaxtyping import Array, ArrayLike
-from scipy.special import ellipj, ellipkinc
 
 from .._custom_types import Args, FloatScalarLike
 from ._base import AbstractConstrainedExample, coordinates, parameter
@@ -99,13 +99,15 @@ class ContinuouslyVariableTransmission(AbstractConstrainedExample):
         half -= turns * math.pi
         if modulus_squared < 1:
             phase = math.atan2(math.sin(half), rate)
-            start = ellipkinc(phase, modulus_squared)
-            sn, cn, dn, _ = ellipj(t + start, modulus_squared)
+            start = scipy.special.ellipkinc(phase, modulus_squared)
+            sn, cn, dn, _ = scipy.special.ellipj(t + start, modulus_squared)
             half, rate = math.atan2(modulus * sn, dn), modulus * cn
         else:
             direction = math.copysign(1.0, rate)
-            start = ellipkinc(direction * half, 1 / modulus_squared)
-            _, _, dn, am = ellipj(modulus * t + start, 1 / modulus_squared)
+            start = scipy.special.ellipkinc(direction * half, 1 / modulus_squared)
+            _, _, dn, am = scipy.special.ellipj(
+                modulus * t + start, 1 / modulus_squared
+            )
             half, rate = direction * am, direction * modulus * dn
         return float(2 * (half + turns * math.pi)), float(2 * rate)
 

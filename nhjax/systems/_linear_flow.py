@@ -4,8 +4,8 @@ import math
 from collections.abc import Callable
 
 import numpy as np
+import scipy
 from numpy.polynomial import legendre
-from scipy.spatial.transform import Rotation
 
 from ._base import NODES, WEIGHTS
 
@@ -79,7 +79,8 @@ def attitude_in_space(
 
 def rotation(quaternion: np.ndarray) -> np.ndarray:
     """Compute the rotation matrix of a quaternion (w, x, y, z), on the host."""
-    return Rotation.from_quat(np.roll(quaternion, -1)).as_matrix()
+    turn = scipy.spatial.transform.Rotation.from_quat(np.roll(quaternion, -1))
+    return turn.as_matrix()
 
 
 def _product_matrix(omega: np.ndarray, side: float) -> np.ndarray:

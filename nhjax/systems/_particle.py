@@ -4,8 +4,8 @@ import math
 
 import equinox as eqx
 import numpy as np
+import scipy
 from jaxtyping import Array
-from scipy.special import ellipkinc
 
 from .._custom_types import Args, FloatScalarLike
 from ._base import (
@@ -67,12 +67,12 @@ class NonholonomicParticle(AbstractConstrainedExample):
         nu = math.sqrt(stiffness / mass)
         amplitude = math.hypot(y0, dy0 / nu)
         phase = math.atan2(y0, dy0 / nu)
-        start = ellipkinc(phase, -(amplitude**2))
+        start = scipy.special.ellipkinc(phase, -(amplitude**2))
         dx_ds0 = math.sqrt(1 + y0**2) * dx0 / nu
 
         def planar_motion(times):
             y = amplitude * np.sin(nu * times + phase)
-            s = ellipkinc(nu * times + phase, -(amplitude**2)) - start
+            s = scipy.special.ellipkinc(nu * times + phase, -(amplitude**2)) - start
             x = x0 * np.cos(s) + dx_ds0 * np.sin(s)
             dx = nu * (dx_ds0 * np.cos(s) - x0 * np.sin(s)) / np.sqrt(1 + y**2)
             return x, y, dx

@@ -5,8 +5,8 @@ from collections.abc import Callable
 
 import equinox as eqx
 import numpy as np
+import scipy
 from jaxtyping import Array
-from scipy.special import ellipj, ellipkinc
 
 from .._custom_types import Args, FloatScalarLike
 from .._manifold import AbstractRetraction, Cayley, SO3
@@ -121,10 +121,10 @@ def _euler_solution(
     parity = 1.0 if (two - one) % 3 == 1 else -1.0
     side2 = parity * side1 * side3 * math.copysign(1.0, I3 - I1)
     phase = math.atan2(side2 * w2 * math.sqrt(ratio21), side1 * w1)
-    start = ellipkinc(phase, modulus)
+    start = scipy.special.ellipkinc(phase, modulus)
 
     def angular_velocity(times):
-        sn, cn, dn, _ = ellipj(sigma * times + start, modulus)
+        sn, cn, dn, _ = scipy.special.ellipj(sigma * times + start, modulus)
         omega = np.empty((3, *np.shape(times)))
         omega[one] = side1 * amplitude1 * cn
         omega[two] = side2 * amplitude2 * sn

@@ -6,8 +6,8 @@ from collections.abc import Callable
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
+import scipy
 from jaxtyping import Array, ArrayLike
-from scipy.special import ellipj, ellipkinc
 
 from .._custom_types import Args, FloatScalarLike
 from .._system import LagrangianSystem
@@ -139,10 +139,10 @@ def _height(
     modulus = (high - low) / (beyond - low)
     sigma = math.sqrt(0.5 * g * (beyond - low)) / length
     phase = math.atan2(math.sqrt(-low), math.copysign(math.sqrt(high), dz0))
-    start = ellipkinc(phase, modulus)
+    start = scipy.special.ellipkinc(phase, modulus)
 
     def height(times):
-        sn, cn, dn, _ = ellipj(sigma * times + start, modulus)
+        sn, cn, dn, _ = scipy.special.ellipj(sigma * times + start, modulus)
         rise = high - low
         return z0 + low + rise * sn**2, 2 * rise * sigma * sn * cn * dn
 
