@@ -1,9 +1,9 @@
 """The gallery: a picture of each system, and the page that shows them.
 
 `python docs/gallery.py` runs every system, draws docs/gallery/NAME.png and writes
-docs/gallery.md, whose text is that of the docstrings; `--text` writes the page alone,
-and names after it draw these pictures alone. What is drawn of machines that have
-points is in docs/machines.py.
+docs/gallery.md, whose text comes from the docstrings. `--text` writes only the page,
+and names select the pictures to draw. docs/machines.py draws the machines that have
+points.
 """
 
 import argparse
@@ -31,7 +31,7 @@ Drawn = Callable[[Any, np.ndarray], np.ndarray]
 
 
 class Picture(NamedTuple):
-    """What is drawn of a system without rods: a path in the plane or in space.
+    """The picture of a system without rods: a path in the plane or in space.
 
     `path(q, v)` takes arrays with time first, and returns two or three numbers for each
     time; `axes` are their names.
@@ -63,7 +63,7 @@ PLANE, SPACE, TURNING = ("x", "y"), ("x", "y", "z"), ("ω₁", "ω₂", "ω₃")
 
 
 def pictures() -> tuple[Picture, ...]:
-    """What is drawn of each system that is no machine."""
+    """The pictures of all systems that are not machines."""
     s = systems
     tip = "the path of the third body axis in space"
     return (
@@ -173,8 +173,8 @@ OPENING = """\
 # Gallery
 
 `nhjax.systems` has {count} systems, each with parameters, initial data, invariants and
-its source; many have an exact solution. `python docs/gallery.py` draws these pictures,
-and this is all that it takes for one of them:
+its source. Many have an exact solution. `python docs/gallery.py` draws these pictures.
+This code draws one of them:
 
 ```python
 import jax
@@ -195,8 +195,8 @@ ax = nhjax.plot.trajectory(sol, (0, 1), names=("x", "y"))
 ```
 
 Parameters are arguments of the class, `ChaplyginSleigh(offset=0.2)`, and gradients
-reach them. A dot marks the start. Textbook systems come first;
-[Real machines](machines.md) says what the machines after them are checked against.
+reach them. A dot marks the start. Textbook systems come first, then machines;
+[Real machines](machines.md) describes how the machines are tested.
 """
 
 
@@ -220,7 +220,7 @@ def page() -> str:
 
 
 def _described(example: Any) -> str:
-    """What a docstring says of a system before its parameters, and its source."""
+    """The part of a docstring before the parameters, and the source."""
     text = inspect.getdoc(type(example)) or ""
     before, _, after = text.partition("**Parameters:**")
     source = next(
@@ -232,8 +232,8 @@ def _described(example: Any) -> str:
 def main() -> None:
     """Draw the pictures and write the page."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--text", action="store_true", help="write the page alone")
-    parser.add_argument("names", nargs="*", help="draw the pictures of these alone")
+    parser.add_argument("--text", action="store_true", help="write only the page")
+    parser.add_argument("names", nargs="*", help="draw only these pictures")
     options = parser.parse_args()
     jax.config.update("jax_enable_x64", True)
     (DOCS / "gallery.md").write_text(page(), encoding="utf-8")

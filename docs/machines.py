@@ -3,8 +3,8 @@
     python docs/machines.py                      writes docs/machines.png
     python docs/machines.py --animate Rattleback writes docs/Rattleback.gif
 
-A picture has the paths of some points over the run, and what connects the points at a
-few times. `machines` is also the list that the benchmarks go through.
+A picture shows the paths of some points over the run, and the rods between points at a
+few times. The benchmarks use `machines` too.
 """
 
 import argparse
@@ -29,13 +29,13 @@ FRAME_RATE = 16
 
 
 class Machine(NamedTuple):
-    """A machine of the gallery, a run of it, and what of it is drawn.
+    """A machine of the gallery, with a run and the parts to draw.
 
     - `rods`: the names of points that are connected, one after the other.
     - `traced`: the names of points whose paths are drawn.
     - `wheels`: the names of a hub, of a point of the rim, and of another point of the
         wheel's plane, of each wheel that an animation shows.
-    - `follow`: the name of a point that an animation moves along with.
+    - `follow`: the name of a point that stays in the centre of an animation.
     """
 
     example: Any

@@ -1,14 +1,28 @@
-"""The rooms of nhjax and the imports between them: `python docs/rooms.py` draws them.
+"""The rooms of nhjax, the imports between them, and the size of the repository.
 
-It writes docs/rooms.png and docs/rooms.md. `tests/test_rooms.py` uses the same
-functions to check that no arrow points up.
+- `python docs/rooms.py` draws docs/rooms.png and writes docs/rooms.md.
+- `python docs/rooms.py --measure [--json] [--tree PATH]` measures this checkout, or
+    another one, and prints the figures.
+- `python docs/rooms.py --measure --record NAME` also stores them under a name in
+    docs/rooms.json, and writes docs/rooms.md, whose last table has a column for each
+    name.
+
+`tests/test_rooms.py` uses the same functions to check that no arrow points up.
 """
 
+import argparse
 import ast
+import importlib
+import json
+import sys
+import traceback
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
+import jax
+import jax.extend
+import jax.numpy as jnp
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import FancyArrowPatch
@@ -40,7 +54,7 @@ ROOMS = tuple(room for floor in FLOORS for room in floor)
 
 
 class Import(NamedTuple):
-    """One module of the package that reads from another, and at which line."""
+    """An import of one module of the package by another, with its line."""
 
     importer: str
     imported: str
@@ -48,9 +62,9 @@ class Import(NamedTuple):
 
 
 def read_sources(package: Path = PACKAGE) -> dict[str, str]:
-    """The text of each module, by its dotted name without that of the package.
+    """The text of each module, by its dotted name inside the package.
 
-    A room that is a folder goes by its own name; the package itself is "".
+    A folder has its own name, and the package itself the name "".
     """
     sources = {}
     for path in sorted(package.rglob("*.py")):
@@ -62,7 +76,7 @@ def read_sources(package: Path = PACKAGE) -> dict[str, str]:
 
 
 def read_imports(sources: Mapping[str, str], name: str = "nhjax") -> list[Import]:
-    """Every import of a module of the package by another, functions' own included."""
+    """Every import of a module of the package by another, also inside functions."""
     folders = {module.rpartition(".")[0] for module in sources} | {""}
     found = []
     for module, text in sources.items():
@@ -82,7 +96,7 @@ def read_imports(sources: Mapping[str, str], name: str = "nhjax") -> list[Import
 def _targets(
     node: ast.Import | ast.ImportFrom, here: list[str], name: str
 ) -> Iterator[list[str]]:
-    """What a statement imports, as paths from the top of the package."""
+    """The names that a statement imports, as paths from the top of the package."""
     if isinstance(node, ast.Import):
         for alias in node.names:
             parts = alias.name.split(".")
@@ -101,7 +115,7 @@ def _targets(
 
 
 def _module_of(target: list[str], sources: Mapping[str, str]) -> str | None:
-    """The module that a path leads to; what follows it is a name inside."""
+    """The module at the start of a path; the rest of the path is a name inside it."""
     for length in range(len(target), -1, -1):
         module = ".".join(target[:length])
         if module in sources:
@@ -115,10 +129,10 @@ def room(module: str) -> str:
 
 
 def between_rooms(imports: Iterable[Import]) -> list[Import]:
-    """The imports that lead from a room to another.
+    """The imports that lead from one room to another.
 
-    The package's own `__init__`, which gathers the public names, is no room. It stands
-    above all but the command line.
+    The package's own `__init__`, which collects the public names, is not a room. It is
+    above all rooms except the command line.
     """
     return [
         found
@@ -168,12 +182,12 @@ def circle(arrows: Iterable[tuple[str, str]]) -> list[str] | None:
 
 
 def num_files(modules: Iterable[str], folder: str) -> int:
-    """The number of files of a room, rooms inside of it included."""
+    """The number of files of a room, including rooms inside it."""
     return sum(name == folder or name.startswith(f"{folder}.") for name in modules)
 
 
 def num_floors(imports: Iterable[Import], folder: str) -> int:
-    """The length of the longest chain of imports inside a folder, without its door."""
+    """The longest chain of imports inside a folder, without its `__init__`."""
     leads_to: dict[str, set[str]] = {}
     for found in imports:
         if all(x.rpartition(".")[0] == folder for x in found[:2]):
@@ -183,6 +197,173 @@ def num_floors(imports: Iterable[Import], folder: str) -> int:
         return 1 + max(map(height, leads_to.get(module, ())), default=0)
 
     return max(map(height, leads_to), default=1)
+
+
+def folders(sources: Mapping[str, str]) -> list[str]:
+    """The rooms that are folders, with the folders inside them."""
+    return sorted({module.rpartition(".")[0] for module in sources} - {""})
+
+
+def count(folder: Path, without: Path | None = None) -> tuple[int, int]:
+    """The number of Python files below a folder, and of their lines.
+
+    Files below `without` are not counted.
+    """
+    paths = [
+        path
+        for path in folder.rglob("*.py")
+        if without is None or not path.is_relative_to(without)
+    ]
+    lines = sum(len(path.read_text(encoding="utf-8").splitlines()) for path in paths)
+    return len(paths), lines
+
+
+# The function that repeats a sweep until it converges. An evaluation of the Lagrangian
+# below it is one inside the stage iteration.
+ITERATION = "iterate"
+
+
+class Stack(NamedTuple):
+    """The frames of nhjax from `integrate` to one evaluation of the Lagrangian.
+
+    Each frame is a pair of a file, relative to the package, and a function.
+    """
+
+    frames: tuple[tuple[str, str], ...]
+
+    @property
+    def num_files(self) -> int:
+        """The number of different files."""
+        return len({file for file, _ in self.frames})
+
+    def passes(self, function: str) -> bool:
+        """Whether a function with this name is among the frames."""
+        return any(name == function for _, name in self.frames)
+
+
+def stacks(nhjax: Any, transformation: str) -> list[Stack]:
+    """The stack at each evaluation of the Lagrangian of one call of `integrate`.
+
+    The Lagrangian is traced once, and then evaluated through its jaxpr. It contains an
+    arctangent, which nothing else computes, and the operation records the traceback
+    whenever it is evaluated. Frames of other packages are left out.
+
+    **Arguments:**
+
+    - `nhjax`: the package.
+    - `transformation`: `"plain"`, `"vmap"` or `"grad"`.
+    """
+    package, found = Path(nhjax.__file__).parent, []
+    operation = jax.extend.core.primitives.atan2_p
+    bind = operation.bind
+
+    def recorded(*args, **params):
+        found.append([frame for frame, _ in traceback.walk_stack(None)][::-1])
+        return bind(*args, **params)
+
+    def lagrangian(t, q, v, args):
+        return 0.5 * v @ v - 0.5 * args * q @ q - jnp.arctan2(q[0], 3.0)
+
+    system = nhjax.LagrangianSystem(
+        lagrangian, nonholonomic=lambda t, q, v, args: v[2] - q[1] * v[0]
+    )
+    q, v = jnp.array([1.0, 1.0, 0.0]), jnp.array([1.0, 0.0, 1.0])
+    start = nhjax.initial_state(system, q, v, args=1.0)
+
+    def end(args):
+        method = nhjax.LobattoIIIAB(2)
+        run = nhjax.integrate(system, method, start, dt=0.1, num_steps=3, args=args)
+        return run.ys.q[-1, 0]
+
+    calls = {
+        "plain": lambda: end(1.0),
+        "vmap": lambda: jax.vmap(end)(jnp.ones(3)),
+        "grad": lambda: jax.grad(end)(1.0),
+    }
+    operation.bind = recorded
+    try:
+        calls[transformation]()
+    finally:
+        del operation.bind
+    chosen = []
+    for stack in found:
+        inside = [
+            (Path(frame.f_code.co_filename), frame.f_code.co_name) for frame in stack
+        ]
+        frames = [
+            (path.relative_to(package).as_posix(), name)
+            for path, name in inside
+            if path.is_relative_to(package)
+        ]
+        names = [name for _, name in frames]
+        if "integrate" in names:
+            chosen.append(Stack(tuple(frames[names.index("integrate") :])))
+    return chosen
+
+
+def deepest(found: Iterable[Stack]) -> Stack:
+    """The stack with the most frames; among equals the one in most files."""
+    return max(found, key=lambda stack: (len(stack.frames), stack.num_files))
+
+
+def deepest_stacks(nhjax: Any) -> dict[str, Stack]:
+    """The deepest evaluations of the Lagrangian, by the transformation of the call.
+
+    - `plain`, `vmap`, `grad`: those inside the stage iteration.
+    - `grad, derivative`: those that only the derivative of the run makes.
+    """
+    by_call = {name: stacks(nhjax, name) for name in ("plain", "vmap", "grad")}
+    result = {
+        name: deepest(stack for stack in found if stack.passes(ITERATION))
+        for name, found in by_call.items()
+    }
+    others = set(by_call["grad"]) - set(by_call["plain"])
+    result["grad, derivative"] = deepest(others)
+    return result
+
+
+def measured(tree: Path, found: Mapping[str, Stack]) -> dict[str, int | str]:
+    """The figures of a checkout, with the stacks found in it."""
+    package = tree / "nhjax"
+    sources = read_sources(package)
+    imports = read_imports(sources)
+    between = between_rooms(imports)
+    arrows = {(room(one.importer), room(one.imported)) for one in between}
+    floors = {name: num_floors(imports, name) for name in folders(sources)}
+    parts = {
+        "nhjax": count(package),
+        "nhjax without the gallery": count(package, package / "systems"),
+        "tests": count(tree / "tests"),
+        "benchmarks": count(tree / "benchmarks"),
+        "docs/website": count(tree / "docs" / "website"),
+    }
+    figures: dict[str, int | str] = {}
+    for name, (num_files, num_lines) in parts.items():
+        figures[f"files, {name}"] = num_files
+        figures[f"lines, {name}"] = num_lines
+    figures["arrows between rooms"] = len(arrows)
+    figures["floors of the deepest room"] = max(floors.values())
+    for name, floor in floors.items():
+        figures[f"floors, {name.replace('.', '/')}"] = floor
+    for name, stack in found.items():
+        figures[f"frames, {name}"] = len(stack.frames)
+        figures[f"files of the frames, {name}"] = stack.num_files
+    return figures
+
+
+def table(columns: Mapping[str, Mapping[str, Any]]) -> list[str]:
+    """The lines of a table with a column for each set of figures."""
+    rows = list(dict.fromkeys(row for column in columns.values() for row in column))
+    lines = [f"| | {' | '.join(columns)} |", f"| --- |{' ---: |' * len(columns)}"]
+    for row in sorted(rows, key=lambda row: row.startswith("floors, ")):
+        cells = [str(column.get(row, "-")) for column in columns.values()]
+        lines.append(f"| {row} | {' | '.join(cells)} |")
+    return lines
+
+
+def recorded_figures() -> dict[str, dict[str, int | str]]:
+    """The figures that were recorded, by the name of their checkout."""
+    return json.loads((DOCS / "rooms.json").read_text(encoding="utf-8"))
 
 
 def purpose(source: str) -> str:
@@ -200,16 +381,16 @@ def page(sources: Mapping[str, str]) -> str:
     lines = [
         "# The rooms",
         "",
-        "The package is made of rooms, each a folder or a file with one purpose. A",
-        "room imports only from rooms below it, and from a folder only what its",
-        "`__init__` names. `tests/test_rooms.py` reads the imports and fails on an",
+        "The package consists of rooms. A room is a folder or a file with one purpose.",
+        "It imports only from rooms below it, and from a folder only the names in its",
+        "`__init__`. `tests/test_rooms.py` reads the imports and fails on an",
         "arrow that points up. `python docs/rooms.py` draws the picture from the",
         "imports and writes this page. Grey arrows lead to the ground floor.",
         "",
         "![The rooms of nhjax and their imports](rooms.png)",
         "",
-        "From the top down, with the number of files of each room and its floors, the",
-        "length of the longest chain of imports inside it:",
+        "From the top down. The floors of a room are the length of the longest chain",
+        "of imports inside it:",
         "",
         "| room | purpose | imports from | files | floors |",
         "| --- | --- | --- | --- | --- |",
@@ -219,11 +400,25 @@ def page(sources: Mapping[str, str]) -> str:
         cells = [f"`{name}`", purpose(sources[name]), ", ".join(below)]
         cells += [str(num_files(sources, name)), str(num_floors(imports, name))]
         lines.append(f"| {' | '.join(cells)} |")
+    lines += [
+        "",
+        "## Before and after",
+        "",
+        "`python docs/rooms.py --measure` measures a checkout: Python files and their",
+        "lines, arrows between rooms, floors inside each folder, and the depth of the",
+        "Lagrangian below `integrate`. The depth is read from real tracebacks. It",
+        "counts the frames of nhjax from `integrate` to the deepest evaluation of the",
+        "Lagrangian inside the stage iteration. The rows `grad, derivative` count the",
+        "frames to the deepest evaluation that only the derivative of the run makes.",
+        "[One call, followed](one_call.md) explains the frames.",
+        "",
+        *table(recorded_figures()),
+    ]
     return "\n".join(lines) + "\n"
 
 
 def draw(sources: Mapping[str, str]) -> Figure:
-    """The picture of the rooms, each on a level of its own and arrows pointing down."""
+    """The picture of the rooms, each on its own level, with arrows that point down."""
     figure = Figure(figsize=(9, 10), layout="constrained")
     ax = figure.subplots()
     box = {"boxstyle": "round,pad=0.4", "facecolor": "#eef3f8", "edgecolor": "#4a6a8a"}
@@ -273,7 +468,7 @@ _PLACES = {name: (_COLUMNS[name], height) for height, name in enumerate(ROOMS)}
 def _arrow(
     ax: Axes, start: tuple[float, float], end: tuple[float, float], *, light: bool
 ) -> None:
-    """A curve that leaves a room at its bottom and comes to another at its top."""
+    """A curve from the bottom of a room to the top of another."""
     (x0, y0), (x1, y1) = (start[0], start[1] - 0.24), (end[0], end[1] + 0.26)
     pull = 0.45 * (y0 - y1)
     path = MplPath(
@@ -293,10 +488,44 @@ def _arrow(
 
 
 def main() -> None:
-    """Write the picture and the page."""
-    sources = read_sources()
-    draw(sources).savefig(DOCS / "rooms.png", dpi=80)
-    (DOCS / "rooms.md").write_text(page(sources), encoding="utf-8")
+    """Write the picture and the page, or measure a checkout."""
+    parser = argparse.ArgumentParser(description="Draw or measure the rooms of nhjax.")
+    parser.add_argument("--measure", action="store_true", help="print the figures")
+    parser.add_argument("--json", action="store_true", help="print them as JSON")
+    parser.add_argument("--stacks", action="store_true", help="print the frames too")
+    parser.add_argument("--tree", type=Path, default=DOCS.parent, help="the checkout")
+    parser.add_argument("--record", metavar="NAME", help="store the figures")
+    given = parser.parse_args()
+    if given.measure:
+        _measure(given)
+    if not given.measure or given.record:
+        sources = read_sources()
+        draw(sources).savefig(DOCS / "rooms.png", dpi=80)
+        (DOCS / "rooms.md").write_text(page(sources), encoding="utf-8")
+
+
+def _measure(given: argparse.Namespace) -> None:
+    tree = given.tree.resolve()
+    sys.path.insert(0, str(tree))
+    nhjax = importlib.import_module("nhjax")
+    if not Path(nhjax.__file__ or "").is_relative_to(tree):
+        raise SystemExit(f"nhjax was imported from {nhjax.__file__}, not from {tree}.")
+    jax.config.update("jax_enable_x64", True)
+    found = deepest_stacks(nhjax)
+    figures = measured(tree, found)
+    name = given.record or "this checkout"
+    if given.record:
+        recorded = recorded_figures() | {given.record: figures}
+        text = json.dumps(recorded, indent=2) + "\n"
+        (DOCS / "rooms.json").write_text(text, encoding="utf-8")
+    if given.json:
+        print(json.dumps(figures, indent=2))
+    else:
+        print("\n".join(table({name: figures})))
+    if given.stacks:
+        for name, stack in found.items():
+            print(f"\n{name}:")
+            print("\n".join(f"  {file}: {function}" for file, function in stack.frames))
 
 
 if __name__ == "__main__":

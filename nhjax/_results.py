@@ -15,16 +15,16 @@ JUMPS = (
     "the jump, however small: smooth them, as in `jnp.tanh(v / 0.01)`, or split the "
     "run at the jump with an `nhjax.Event`."
 )
-# Advice for those alone whose stage solver does not turn to Newton's method itself.
+# Advice only for stage solvers that do not switch to Newton's method themselves.
 FALLBACK = (
     ", or `stage_solver=nhjax.SimplifiedNewton(fallback=True)`, by which Newton's "
     "method takes over steps that are not solved"
 )
-EVENT_OCCURRED = "An event ended the run, as was asked for; this is no failure."
+EVENT_OCCURRED = "An event ended the run, as requested; this is not a failure."
 
 
-# By its metaclass an enumeration looks up the text of a result, and it prints a result
-# with this text.
+# The metaclass of an enumeration looks up the text of a result, with which a result is
+# printed.
 class _Named(type(eqx.Enumeration)):
     """An enumeration whose items have texts that begin with their names."""
 
@@ -54,12 +54,12 @@ def _counted(codes: np.ndarray, names: dict[int, str]) -> str:
 class RESULTS(eqx.Enumeration, metaclass=_Named):
     """The ways in which a run can end.
 
-    `RESULTS[sol.result]` is the name of the result, and a message that says what to do.
-    For many runs it says how many ended in which way; `sol.failures()` has the message
-    of each. `print(sol.result)` shows the same.
+    `RESULTS[sol.result]` is the name of the result with a message that says what to do.
+    For many runs it counts the results by name; `sol.failures()` has the message
+    of each failed run. `print(sol.result)` shows the same.
     """
 
-    # So a result is printed as `nhjax.RESULTS<...>`.
+    # With this, a result is printed as `nhjax.RESULTS<...>`.
     __module__ = "nhjax"
 
     successful = ""
@@ -75,9 +75,9 @@ class RESULTS(eqx.Enumeration, metaclass=_Named):
         + ", or more iterations; where stiff forces magnify round-off, a `tolerance` "
         "of the stage solver. None of these helps in two cases. Forces "
         + JUMPS
-        + " And where constraints become dependent in the course of the step, as those "
-        "of a linkage whose bars come to lie in one line, the multipliers and the way "
-        "on are not determined."
+        + " And if constraints become dependent during the step, such as those of a "
+        "linkage whose bars lie in one line, the multipliers and the further motion "
+        "are not determined."
     )
     singular_stage_matrix = (
         "The mass matrix D2D2L (or D2D2H) or the compatibility matrix C = D2Φ M⁻¹ D2Φᵀ "
@@ -92,35 +92,35 @@ class RESULTS(eqx.Enumeration, metaclass=_Named):
     left_chart = (
         "A step turned so far that it left the chart of the retraction (a rotation "
         "near π for Cayley and near 2π for Exponential, from the origin of the chart, "
-        "which lies in the middle of a step or at its start), or its iteration left "
-        "it: with Cayley and two stages, a step of about one radian need have no "
-        "solution. Take a smaller `dt`, `retraction=nhjax.Exponential()`, or more "
+        "which is in the middle of a step or at its start), or its iteration left "
+        "it: with Cayley and two stages, a step of about one radian may have no "
+        "solution. Use a smaller `dt`, `retraction=nhjax.Exponential()`, or more "
         "stages."
     )
     lost_constraints = (
-        "Constraints are violated at the end of a step, though as many hold as were "
+        "Constraints are violated at the end of a step, although as many hold as were "
         "independent at its start: the redundant constraints contradict each other, or "
-        "more of them became independent. Leave out those that do not always follow "
-        "from the others."
+        "more of them became independent. Leave out constraints that do not always "
+        "follow from the others."
     )
     inconsistent_start = (
         "The initial state violates the constraints at `t0`, its q is not an element "
-        "of the group, or its p is not the momentum of its v. Make `y0` with "
+        "of the group, or its p is not the momentum of its v. Create `y0` with "
         "`nhjax.initial_state`, for the system, args and time of the integration; do "
         "not change a state by hand."
     )
     invalid_argument = (
         "An argument of the run is not valid: `dt` or `t0` is not finite, `dt` is zero "
         "or so small that time does not advance, `num_steps` is less than 1, or `ts` "
-        "of `SaveAt` is not sorted or reaches outside of the run. With `throw=True` "
+        "of `SaveAt` is not sorted or reaches outside the run. With `throw=True` "
         "the message names it."
     )
     not_conserved = (
-        "The system does not conserve what `invariants` asks for: its rate of change "
+        "The system does not conserve the `invariants`: their rate of change "
         "along the motion is not zero at the start, or at a state near it. Reactions "
         "of affine, rheonomic and other constraints that are not homogeneous in the "
-        "velocities do work, as forces do; what such a system conserves, if anything, "
-        "such as a moving energy, can be given as a function."
+        "velocities do work, as forces do. If such a system conserves another "
+        "quantity, such as a moving energy, pass it as a function."
     )
     event_occurred = EVENT_OCCURRED
     nonfinite_event = (
@@ -129,22 +129,22 @@ class RESULTS(eqx.Enumeration, metaclass=_Named):
     )
     inconsistent_reset = (
         "The state that the `reset` of an event returned is not finite, violates the "
-        "constraints, its q is off the group, or its v and p do not belong together. "
+        "constraints, its q is not on the group, or its v and p do not agree. "
         "Return a pair (q, v), for a Hamiltonian system (q, p), whose velocity "
         "satisfies the constraints."
     )
     too_many_events = (
-        "There were more events than the `max_events` of the `nhjax.Event`s make room "
-        "for, or one followed itself within round-off. Give them a larger "
-        "`max_events`, unless the events accumulate at one time, as the bounces of a "
-        "ball that comes to rest do: then end the run, or let the reset keep the "
+        "There were more events than the sum of the `max_events` of the "
+        "`nhjax.Event`s, or an event triggered itself within round-off. Increase "
+        "`max_events`, unless the events accumulate at one time, like the bounces of a "
+        "ball that comes to rest: then end the run, or let the reset keep the "
         "motion away from the next event."
     )
 
 
 @functools.cache
 def result_codes() -> dict[str, int]:
-    """Map the names of all `RESULTS` to the integers that stand for them in arrays."""
+    """Map the names of all `RESULTS` to the integers that represent them in arrays."""
     names = (
         "successful",
         "nonlinear_divergence",

@@ -1254,7 +1254,7 @@ RUNS = [
         lambda: run(nhjax.State(Y0.q, 2 * Y0.v + 1, Y0.p, Y0.multiplier)),
         IntegrationError,
         "step 0: The initial state violates the constraints",
-        "Make `y0` with `nhjax.initial_state`",
+        "Create `y0` with `nhjax.initial_state`",
     ),
     row(
         "gave one step its arguments in the order of `integrate`",
@@ -1292,7 +1292,7 @@ RUNS = [
         ),
         ValueError,
         "the system has a `force`, which may do work, so that its energy is not",
-        "If it conserves something else, give that as a function",
+        "If it conserves another quantity, pass that as a function",
     ),
     row(
         "asked to keep the energy of a system that depends on time",

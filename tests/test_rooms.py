@@ -4,8 +4,12 @@ import ast
 import re
 from pathlib import Path
 
+import jax
+import jax.extend
+import jax.numpy as jnp
 import pytest
 
+import nhjax
 from docs import rooms
 
 
@@ -176,3 +180,63 @@ def test_no_test_imports_from_another():
             parts = {part for module in modules for part in module.split(".")}
             found += [f"{name} <- {other}" for other in parts & tests.keys()]
     assert found == []
+
+
+@pytest.mark.parametrize("transformation", ["plain", "grad"])
+def test_measured_stacks_lead_from_integrate_to_lagrangian(transformation):
+    found = rooms.stacks(nhjax, transformation)
+    assert all(stack.frames[0][1] == "integrate" for stack in found)
+    inside = rooms.deepest(stack for stack in found if stack.passes(rooms.ITERATION))
+    assert ("_integrate/_integrate.py", "run") in inside.frames
+    assert inside.frames[-1][1] == "__call__"
+    assert 10 < len(inside.frames) < 50
+    assert 5 < inside.num_files < len(inside.frames)
+
+
+def test_deepest_stack_has_most_frames():
+    frames = (("_a.py", "integrate"), ("_b.py", "iterate"), ("_a.py", "f"))
+    stack = rooms.Stack(frames)
+    assert stack.passes("iterate")
+    assert not stack.passes("step")
+    assert stack.num_files == 2
+    assert rooms.deepest([rooms.Stack(frames[:2]), stack]) == stack
+
+
+def test_measuring_leaves_operations_as_they_were():
+    before = jax.extend.core.primitives.atan2_p.bind
+    rooms.stacks(nhjax, "plain")
+    assert jax.extend.core.primitives.atan2_p.bind == before
+    assert float(jnp.arctan2(1.0, 1.0)) == pytest.approx(jnp.pi / 4)
+
+
+def test_measured_figures_count_files_lines_and_floors(tmp_path):
+    for path, text in {
+        "nhjax/__init__.py": "from ._a import x\n",
+        "nhjax/_a/__init__.py": "from ._b import x\n",
+        "nhjax/_a/_b.py": "from ._c import x\n",
+        "nhjax/_a/_c.py": "from ..systems import x\n\n",
+        "nhjax/systems/__init__.py": "x = 1\n",
+        "tests/test_a.py": "\n\n\n",
+        "benchmarks/a.py": "\n",
+        "docs/website/a.txt": "\n",
+    }.items():
+        (tmp_path / path).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / path).write_text(text, encoding="utf-8")
+    found = {"plain": rooms.Stack((("_a.py", "integrate"), ("_a.py", "run")))}
+    assert rooms.measured(tmp_path, found) == {
+        "files, nhjax": 5,
+        "lines, nhjax": 6,
+        "files, nhjax without the gallery": 4,
+        "lines, nhjax without the gallery": 5,
+        "files, tests": 1,
+        "lines, tests": 3,
+        "files, benchmarks": 1,
+        "lines, benchmarks": 1,
+        "files, docs/website": 0,
+        "lines, docs/website": 0,
+        "arrows between rooms": 1,
+        "floors of the deepest room": 2,
+        "floors, _a": 2,
+        "frames, plain": 2,
+        "files of the frames, plain": 1,
+    }

@@ -1,4 +1,4 @@
-"""The invariants that a run is to keep, and whether its system conserves them."""
+"""The invariants that a run keeps, and whether its system conserves them."""
 
 import math
 from collections.abc import Callable
@@ -32,11 +32,12 @@ from .._system import (
 )
 
 
-# Rates of change are looked at in the initial state and in this many around it.
+# Rates of change are checked at the initial state and at this many states near it.
 _SAMPLES, _SPREAD = 3, 0.3
-# By Newton's method these are moved onto constraints that are nonlinear in velocities.
+# Newton iterations that move these states onto constraints on velocities, which may be
+# nonlinear.
 _ITERATIONS = 5
-# Rates that within a step amount to this many units of round-off tell nothing.
+# Rates of change below this many units of round-off per step are ignored.
 _UNITS = 1e3
 
 
@@ -47,11 +48,11 @@ def kept_invariants(
     y: State,
     args: Args,
 ) -> Invariants | None:
-    """Make what a run keeps, at its values in the initial state y.
+    """Return the invariants that a run keeps, with their values at the initial state y.
 
-    Raise a `TypeError` for what is neither None, "energy" nor a function, and a
-    `ValueError` that says why a system does not conserve its energy, where that can be
-    seen from its functions alone.
+    Raise a `TypeError` if `invariants` is not None, "energy" or a function. Raise a
+    `ValueError` if the functions of the system alone show that it does not conserve its
+    energy; the message gives the reason.
     """
     if invariants is None:
         return None
@@ -83,11 +84,11 @@ def _noise_and_least_part(
         system.manifold_of(q),
         *(t, q, u, value),
     )
-    # A mass matrix that is indefinite at one state is so at all states of a motion: an
-    # eigenvalue that changes its sign makes it singular, and a singular one ends a run.
+    # If the mass matrix is indefinite at one state, it is so along the motion: an
+    # eigenvalue that changes its sign makes it singular, which ends the run.
     t, q, u = stop_gradient((t, q, u))
-    metric = square_jacobian(lambda u: system.fibre_derivative(t, q, u, args), u)
-    return noise, jnp.where(metric.is_definite(), 0, LEAST_PART).astype(value.dtype)
+    hessian = square_jacobian(lambda u: system.fibre_derivative(t, q, u, args), u)
+    return noise, jnp.where(hessian.is_definite(), 0, LEAST_PART).astype(value.dtype)
 
 
 def _check_function(
@@ -135,12 +136,12 @@ def _require_conserved_energy(
     if reason is not None:
         raise ValueError(
             f'`invariants="energy"`: the system {reason}, so that its energy is not '
-            "conserved. If it conserves something else, give that as a function."
+            "conserved. If it conserves another quantity, pass that as a function."
         )
 
 
 def _depends_on_time(function: Callable[..., Any], t: FloatScalar, *rest: Any) -> bool:
-    """Tell whether the program of a function contains its first argument."""
+    """Return whether the program of a function uses its first argument."""
     time = jnp.reshape(t, (1,))
     found = jacobian_sparsity(lambda t: jnp.atleast_1d(function(t[0], *rest)), time)
     return bool(np.any(found))
@@ -154,11 +155,11 @@ def conserves(
     y: State,
     args: Args,
 ) -> BoolScalar:
-    """Tell whether invariants have no rate of change, at a state and near it.
+    """Return whether the rate of change of invariants is zero, at a state and near it.
 
-    States near it are moved onto the constraints on velocities. Those that still
-    violate them are not judged, nor those at which the equations of motion have no
-    solution. Where there are holonomic constraints only the velocity is varied.
+    States near it are moved onto the constraints on velocities. States that still
+    violate them are ignored, and so are states at which the equations of motion have no
+    solution. With holonomic constraints, only the velocity is varied.
     """
     u0, manifold = system.fibre_coordinate(y), system.manifold_of(y.q)
     numbers = np.random.default_rng(0).standard_normal((2, _SAMPLES, u0.shape[0]))

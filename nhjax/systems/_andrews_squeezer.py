@@ -23,7 +23,7 @@ class AndrewsSqueezer(AbstractExample):
     L = Σ (m_k/2 |ċ_k|² + I_k/2 ω_k²) - c₀/2 (|D - C| - l₀)²,
     Φ = (P₂ - P₃, P₂ - P₄, P₂ - P₆),  Q = (M, 0, 0, 0, 0, 0, 0),
 
-    with q = (β, θ, γ, φ, δ, Ω, ε) [rad]. The bodies K1 to K7 stand at the angles β,
+    with q = (β, θ, γ, φ, δ, Ω, ε) [rad]. The bodies K1 to K7 have the angles β,
     β + θ, γ, φ + δ, δ, Ω + ε and ε. Each turns about its inner joint: K1 about the
     origin O, K2 about the end of K1, K3 about B, K5 and K7 about A, K4 about the end
     of K5, K6 about that of K7. c_k are the centres of mass and P_k the outer ends, of

@@ -17,9 +17,9 @@ class ContinuouslyVariableTransmission(AbstractConstrainedExample):
     L = ½ (ẋ² + ẏ² + ż²) - ½ (x² + z² - 2 cos y + ε sin 2y),
     Φ = ż + sin(y) ẋ,  q = (x, y, z), in dimensionless units.
 
-    The driver y is a pendulum that the passenger (x, z) does not act on. Their
+    The passenger (x, z) does not act on the driver y, which is a pendulum. Their
     energies E_d = ½ ẏ² - cos y + ½ ε sin 2y and E_p = ½ (ẋ² + ż² + x² + z²) are
-    conserved one by one.
+    conserved separately.
 
     **Parameters:** `epsilon` ε >= 0, the perturbation of the pendulum [1]. `low` and
     `high` give the two sets of initial data: an oscillating driver (E_d = 4/5,

@@ -30,7 +30,7 @@ class FourBar(AbstractExample):
     with q = (θ₁, θ₂, θ₃), the angles of crank, coupler and rocker from the horizontal
     [rad], and e(θ) = (cos θ, sin θ). The crank turns about the origin, the rocker about
     (l₄, 0). The bars are uniform, I = m l²/12 about their centres c. By default it is
-    a crank-rocker of 1 kg/m whose crank turns round and round.
+    a crank-rocker of 1 kg/m whose crank makes full turns.
 
     **Parameters:** `lengths` (l₁, l₂, l₃, l₄) [m], the last that of the ground;
     `masses` (m₁, m₂, m₃) [kg]; `gravity` g [m/s²]; `torque` M on the crank [N m].

@@ -30,7 +30,7 @@ class PendulumChain(AbstractExample):
     at half a radian from the vertical and at rest.
 
     **Source:** Daniel Bernoulli (1738); Hairer, Lubich and Wanner, *Geometric Numerical
-    Integration*, section VII.1, for the formulation. Of two links it is the
+    Integration*, section VII.1, for the formulation. With two links it is the
     `DoublePendulum`.
 
     !!! example

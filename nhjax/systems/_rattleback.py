@@ -31,8 +31,8 @@ class Rattleback(AbstractRollingBody):
     ellipsoid, the third one upward at rest, and s is the lowest point, seen from the
     centre of mass. Φ is its height, and φ the horizontal velocity at the contact; their
     multipliers are the force of the plane in space [N]. The third axis is a principal
-    axis of inertia; the others are not, and so a spin in one sense turns into rocking,
-    and that into a spin in the other sense.
+    axis of inertia; the others are not, so that a spin in one sense turns into rocking,
+    and rocking into a spin in the other sense.
 
     With `damping` σ the air exerts the torque -σω, and energy is not conserved.
 

@@ -26,7 +26,7 @@ class Suslov(AbstractConstrainedGroupExample):
     ℓ = ½ ω·Iω,  φ = ω₃,
 
     with q the attitude, a quaternion, and ω the body angular velocity; the axes have
-    I₁₂ = 0. Where the axis e₃ is not a principal one, every motion tends to a steady
+    I₁₂ = 0. If the axis e₃ is not a principal axis, every motion tends to a steady
     rotation about an axis in the plane of e₁ and e₂: the dynamics attract, though
     energy is conserved.
 

@@ -43,11 +43,11 @@ class WhippleBicycle(AbstractNonholonomicExample):
     q = (x, y, ψ, φ, θ, δ, θ_R, θ_F): where the rear wheel touches the ground [m], yaw,
     lean (to the right), pitch of the rear frame, steer (to the right) and the angles of
     the wheels relative to their frames [rad]; a wheel that rolls forward has a negative
-    rate. That the rear wheel touches the ground is built in. The holonomic constraint
-    is the depth of the front wheel's lowest point below the ground, and Φ are the
-    horizontal velocities in space of the points of the rear and of the front wheel that
-    touch the ground: the multipliers are the forces (x, y) of the ground on the rear
-    and on the front wheel, and the force z on the front wheel.
+    rate. The coordinates imply that the rear wheel touches the ground. The holonomic
+    constraint is the depth of the front wheel's lowest point below the ground, and Φ
+    are the horizontal velocities in space of the points of the rear and of the front
+    wheel that touch the ground. The multipliers are the forces (x, y) of the ground on
+    the rear and on the front wheel, and the force z on the front wheel.
 
     `steering` is the torque on the steer axis as a function (t, q, v, args):
     `SteerTorque()`, `LeanToSteer()`, one of your own, or None for a bicycle that nobody
