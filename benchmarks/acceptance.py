@@ -47,8 +47,12 @@ from nhjax import systems
 from nhjax._method import AbstractMethod
 from nhjax._numerics import max_norm
 from nhjax._step import step, StepOutcome, StepState
-from nhjax._step._equations import StageEquations, StageUnknowns, with_moved_positions
-from nhjax._step._jacobian import stage_residual
+from nhjax._step._equations import (
+    stage_residual,
+    StageEquations,
+    StageUnknowns,
+    with_moved_positions,
+)
 from nhjax._step._step import equations_of_step
 from nhjax._system import position_scale, violation_scale
 from nhjax.systems._base import AbstractExample

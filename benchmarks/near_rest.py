@@ -41,8 +41,8 @@ from nhjax._step import (
     step,
     StepArguments,
 )
-from nhjax._step._equations import StageUnknowns
-from nhjax._step._jacobian import increment_size, stage_residual
+from nhjax._step._equations import stage_residual, StageUnknowns
+from nhjax._step._jacobian import increment_size
 from nhjax._step._step import equations_of_step
 from nhjax._system import function_noise
 from nhjax.systems._base import AbstractExample

@@ -66,6 +66,25 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     items.sort(key=lambda item: rank.get(item.path, len(rank)))
 
 
+# Files that use the same runs, which a process keeps.
+TOGETHER = ("tests/integrate/test_geometry.py", "tests/step/test_stage_equations.py")
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_make_scheduler(config, log):
+    """Give each file to one process, and those in TOGETHER to the same one."""
+    from xdist.scheduler import LoadFileScheduling
+
+    class Scheduling(LoadFileScheduling):
+        def _split_scope(self, nodeid: str) -> str:
+            file = super()._split_scope(nodeid)
+            return TOGETHER[0] if file.endswith(TOGETHER) else file
+
+    # Another way to distribute that was asked for, such as `--dist=load`, is taken.
+    if config.getoption("dist") == "loadfile":
+        return Scheduling(config, log)
+
+
 @pytest.fixture(autouse=True, scope="session")
 def rare_garbage_collection():
     """Tracing makes a great many objects, most of which live: looking costs a tenth."""

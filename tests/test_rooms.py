@@ -49,11 +49,7 @@ def test_rooms_are_entered_by_the_door():
     assert around == []
 
 
-# The room that is still deeper.
-DEEP = {"_step"}
-
-
-@pytest.mark.parametrize("room", sorted({*rooms.ROOMS, "_integrate._events"} - DEEP))
+@pytest.mark.parametrize("room", sorted({*rooms.ROOMS, "_integrate._events"}))
 def test_room_has_at_most_five_floors(room):
     assert rooms.num_floors(IMPORTS, room) <= 5
 

@@ -41,6 +41,8 @@ T = TypeVar("T")
 MOST_ENTRIES = 2000
 # These libraries may be installed from a working copy, outside of the usual folders.
 _LIBRARIES = ("equinox", "jax", "jaxlib", "jaxtyping", "nhjax", "numpy")
+# Python 3.12 reads a global in the body of a class inside a function by the last one.
+_GLOBAL_LOADS = ("LOAD_GLOBAL", "LOAD_NAME", "LOAD_FROM_DICT_OR_GLOBALS")
 _NUMBERS, _ARRAYS = (float, complex), (np.ndarray, np.generic)
 _PLAIN = (bool, int, str, bytes, type(None), type(Ellipsis), np.dtype)
 _LEAVES = (*_PLAIN, *_NUMBERS, *_ARRAYS, jax.core.Tracer)
@@ -58,7 +60,7 @@ def _names(code: types.CodeType) -> tuple[dict[str, None], dict[str, None]]:
     for instruction in dis.get_instructions(code):
         if instruction.opname in ("LOAD_ATTR", "LOAD_METHOD"):
             attributes[instruction.argval] = None
-        elif instruction.opname in ("LOAD_GLOBAL", "LOAD_NAME"):
+        elif instruction.opname in _GLOBAL_LOADS:
             variables[instruction.argval] = None
     for inner in code.co_consts:
         if isinstance(inner, types.CodeType):

@@ -2,24 +2,24 @@
 
 from .._numerics import Solved as Solved
 from ._chart import chart_of_step as chart_of_step
+from ._equations import stage_residual as stage_residual
 from ._invariants import (
     invariant_values as invariant_values,
     Invariants as Invariants,
     LEAST_PART as LEAST_PART,
 )
-from ._jacobian import stage_residual as stage_residual
 from ._round_off import (
     round_off_of_steps as round_off_of_steps,
     RoundOff as RoundOff,
 )
 from ._solvers import (
-    AbstractStageSolver as AbstractStageSolver,
     is_simplified_alone as is_simplified_alone,
     leaves_steps_to_newton as leaves_steps_to_newton,
     Newton as Newton,
     SimplifiedNewton as SimplifiedNewton,
 )
 from ._step import (
+    AbstractStageSolver as AbstractStageSolver,
     estimated_error as estimated_error,
     first_step_state as first_step_state,
     ImplicitStep as ImplicitStep,

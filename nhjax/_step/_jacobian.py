@@ -8,21 +8,18 @@ evaluates the stage equations once and multiplies by these factors. All matrices
 tiny, so that the factors are inverses: a triangular solve inside an iteration costs far
 more than a product.
 
-The end of the file has the residual of all equations in one vector, for solvers with
-the exact Jacobian, and the norms by which iterations measure their updates.
+The end of the file has the norms by which iterations measure their updates.
 """
 
-import dataclasses
 from dataclasses import replace
 from typing import NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
-from .._custom_types import BoolScalar, FloatScalar
+from .._custom_types import FloatScalar
 from .._numerics import (
     block_tridiagonal_inverse,
     compressed_products,
@@ -31,12 +28,10 @@ from .._numerics import (
     inverse,
     InverseMatrix,
     max_norm,
-    nonzero_or_one,
     ReactionMatrix,
     small_einsum,
     SparsityPattern,
     SquareMatrix,
-    stop_gradient,
     UpdateNorms,
 )
 from .._system import Linearisation
@@ -44,6 +39,7 @@ from ._equations import (
     constraint_jacobian,
     constraint_values,
     end_residual,
+    Evaluation,
     invariant_correction,
     invariant_errors,
     is_in_chart,
@@ -52,7 +48,6 @@ from ._equations import (
     stage_forces,
     stage_velocities,
     StageEquations,
-    StageForces,
     StageUnknowns,
 )
 from ._first_order import (
@@ -63,20 +58,6 @@ from ._first_order import (
     uses_first_order_terms,
 )
 from ._invariants import InvariantCorrection
-
-
-# The update.
-
-
-class Evaluation(NamedTuple):
-    """The stage equations, evaluated by a stage solver at its last iterate.
-
-    `newton` says whether Newton's method had to take over from simplified Newton.
-    """
-
-    forces: StageForces
-    node_residual: Float[Array, "r n"]
-    newton: BoolScalar
 
 
 def simplified_newton_update(
@@ -502,65 +483,6 @@ def _with_mass_at_end(
     )
 
 
-# The residual in one vector.
-
-
-def stage_residual(
-    stages: StageEquations, x: StageUnknowns
-) -> tuple[Float[Array, " k"], Evaluation]:
-    """Evaluate all equations of a step (the paper's four summaries) in one vector.
-
-    A stage solver of your own looks for the stages at which the vector vanishes; see
-    the page on extending in the documentation.
-
-    **Arguments:**
-
-    - `stages`: the equations of the step, an argument of `AbstractStageSolver.solve`.
-    - `x`: the unknowns, a pytree with the structure of the starting values, which are
-        another argument of `solve`.
-
-    **Returns:** the residuals, of shape (k,) with as many entries as `x` has numbers,
-    in the units of momenta and of the constraints; and the values that were evaluated
-    on the way, which belong into the field `aux` of `Solved`.
-
-    !!! example
-
-        >>> import nhjax
-        >>> import equinox as eqx
-        >>> class Checked(nhjax.AbstractStageSolver):
-        ...     solver: nhjax.Newton = nhjax.Newton()
-        ...     max_iterations: int = eqx.field(static=True, default=30)
-        ...     tolerance: float = 0.0
-        ...     def solve(self, stages, x0, lin, skip):
-        ...         r, _ = nhjax.stage_residual(stages, x0)
-        ...         assert r.shape == (20,)
-        ...         return self.solver.solve(stages, x0, lin, skip)
-        ...     def frozen_newton_map(self, stages, lin, x):
-        ...         return self.solver.frozen_newton_map(stages, lin, x)
-        >>> disc = nhjax.systems.VerticalRollingDisc()
-        >>> sol = nhjax.integrate(disc.system, nhjax.LobattoIIIAB(2),
-        ...     disc.initial_state(), dt=0.1, num_steps=1, stage_solver=Checked())
-        >>> int(sol.stats["num_steps"])
-        1
-    """
-    forces = stage_forces(stages, x)
-    r_nodes = node_residual(stages, x, forces.force)
-    parts = [forces.residual, r_nodes]
-    if stages.hamiltonian:
-        parts.append(x.velocity - stage_velocities(stages, x))
-    parts += constraint_values(stages, x)
-    if stages.end_multiplier_is_unknown:
-        parts += end_residual(stages, x)
-    if stages.invariants is not None:
-        # This is the equation that simplified Newton solves.
-        weights = stop_gradient(invariant_correction(stages, x))
-        parts.append(-weights.change(x.impulse, invariant_errors(stages, x)))
-    return (
-        ravel_pytree(parts)[0],
-        Evaluation(forces, r_nodes, jnp.asarray(False)),
-    )
-
-
 # The norms of updates.
 
 
@@ -612,32 +534,3 @@ def increment_size(
     if stages.manifold.is_flat:
         return size
     return jnp.where(is_in_chart(stages, x_next), size, jnp.inf)
-
-
-def unknown_units(stages: StageEquations, lin: Linearisation) -> list[FloatScalar]:
-    """Return the size of each field of `StageUnknowns` that changes u by one.
-
-    As in `increment_size`, multipliers are measured by their effect h N⁻¹ R δΛ on u.
-    The round-off of a multiplier grows like 1 / h: measured by its own size, it could
-    not be told from an iteration that does not converge.
-    """
-    h = jnp.abs(stages.h)
-    one = jnp.ones_like(h)
-    velocity = one
-    if stages.hamiltonian:
-        velocity = 1 / nonzero_or_one(lin.fibre_hessian_inverse.largest_entry_bound())
-    multiplier = 1 / nonzero_or_one(h * lin.reaction.largest_entry_bound())
-    units = {
-        "velocity": velocity,
-        "momentum": one,
-        "node_fibre_coordinate": one,
-        "closure": multiplier,
-        "holonomic": multiplier,
-        "end_acceleration": 1 / nonzero_or_one(h),
-        "end_multiplier": multiplier,
-    }
-    if stages.invariants is not None:
-        largest = max_norm(lin.momentum_inverse.matvec(stages.invariants.covectors))
-        units["impulse"] = 1 / nonzero_or_one(largest)
-    names = [field.name for field in dataclasses.fields(StageUnknowns)]
-    return [units[name] for name in names if name in units]

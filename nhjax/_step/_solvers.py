@@ -4,10 +4,9 @@ Both start from values that are correct to first order in h. They stop when thei
 increments are round-off, relative to the scale of the step.
 """
 
-from abc import abstractmethod
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Any, NamedTuple, TypeAlias
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -17,7 +16,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, PyTree
 
 from .._custom_types import FloatScalar, FloatScalarLike
-from .._errors import check_choice, is_traced
+from .._errors import check_choice
 from .._manifold import unframed
 from .._numerics import (
     iterate,
@@ -31,42 +30,27 @@ from .._numerics import (
 )
 from .._system import all_finite, check_flag, Linearisation, position_scale, real_scalar
 from ._equations import (
+    Evaluation,
     invariant_correction,
+    stage_residual,
     StageEquations,
     StageUnknowns,
     with_moved_positions,
 )
 from ._first_order import JacobianName
 from ._jacobian import (
-    Evaluation,
     factorise_stage_jacobian,
     fibre_coordinate_size,
     increment_size,
     simplified_newton_update,
-    stage_residual,
     update_norms,
 )
 from ._round_off import PART
-
-
-# An iteration on the stages of a step. The equations are an argument, so that the
-# iteration can be differentiated with respect to their data.
-FrozenNewtonMap: TypeAlias = Callable[[StageEquations, StageUnknowns], StageUnknowns]
+from ._step import AbstractStageSolver, FrozenNewtonMap
 
 
 # Where the residual is larger than this, relative to the momenta, there is no solution.
 _GROSS = 1e-6
-
-
-def check_tolerance(tolerance: Any) -> None:
-    """Raise a `ValueError` unless the `tolerance` of a solver is finite and >= 0."""
-    if is_traced(tolerance):
-        return
-    if not np.all(np.isfinite(tolerance) & (np.asarray(tolerance) >= 0)):
-        raise ValueError(
-            f"`tolerance` must be finite and >= 0, got {tolerance}; 0 iterates to "
-            "round-off."
-        )
 
 
 def tolerance_array(tolerance: FloatScalarLike) -> FloatScalarLike:
@@ -78,38 +62,6 @@ def tolerance_array(tolerance: FloatScalarLike) -> FloatScalarLike:
     if isinstance(tolerance, int | float) and not isinstance(tolerance, bool):
         return np.asarray(float(tolerance))
     return real_scalar("tolerance", tolerance, jnp.result_type(float))
-
-
-class AbstractStageSolver(eqx.Module):
-    """A solver of the stage equations of a step, the option `stage_solver`."""
-
-    max_iterations: eqx.AbstractVar[int]
-    tolerance: eqx.AbstractVar[FloatScalarLike]
-
-    def __check_init__(self):
-        if not isinstance(self.max_iterations, int) or self.max_iterations < 1:
-            raise ValueError(
-                f"{type(self).__name__}: `max_iterations` must be an int >= 1, got "
-                f"{self.max_iterations!r}."
-            )
-        check_tolerance(self.tolerance)
-
-    @abstractmethod
-    def solve(
-        self, stages: StageEquations, x0: StageUnknowns, lin: Linearisation, skip: Array
-    ) -> Solved[StageUnknowns, Evaluation]:
-        """Solve the stage equations from `x0`; do nothing where `skip` is true."""
-
-    @abstractmethod
-    def frozen_newton_map(
-        self, stages: StageEquations, lin: Linearisation, x: StageUnknowns
-    ) -> FrozenNewtonMap:
-        """Build an iteration whose fixed points solve the stage equations.
-
-        Its Jacobian is frozen, that is, constant. The iteration contracts at the
-        solution `x`. The derivatives of the solution follow from this iteration by the
-        implicit function theorem.
-        """
 
 
 class SimplifiedNewton(AbstractStageSolver):
@@ -360,54 +312,6 @@ def _iterated(
         noise_units=NOISE_UNITS,
         skip=skip,
     )
-
-
-def starting_values(
-    stages: StageEquations, u: Array, lin: Linearisation
-) -> StageUnknowns:
-    """Compute the stages to first order in h, from u̇ and λ_c at the start.
-
-    The values do not depend on the previous step, so that a step is a function of its
-    state only.
-    """
-    m, s = stages.num_nonholonomic, stages.method.stages
-    invariants = stages.invariants
-    push = stages.h * lin.acceleration
-    stage_times = jnp.sum(stages.coefficients("a_hat"), axis=1)
-    node_times = jnp.sum(stages.node_weights, axis=1)
-    # The unknown ν of the symmetric closure vanishes with h, and starts from zero. All
-    # other unknowns of a closure are multipliers.
-    free = (jnp.arange(s - 1) >= int(stages.end_multiplier_is_unknown)).astype(u.dtype)
-    empty = jnp.zeros((0,), u.dtype)
-    at_stages = u[None] + jnp.outer(stage_times, push)
-    velocity, momentum = at_stages, jnp.zeros((s, 0), u.dtype)
-    if stages.hamiltonian:
-        velocity = _starting_velocities(stages, u, lin, stage_times)
-        momentum = at_stages
-    return StageUnknowns(
-        velocity=velocity,
-        momentum=momentum,
-        node_fibre_coordinate=u[None] + jnp.outer(node_times, push),
-        closure=jnp.outer(free, lin.multiplier[:m]),
-        holonomic=jnp.outer(jnp.ones((s,), u.dtype), lin.multiplier[m:]),
-        end_acceleration=lin.acceleration
-        if stages.end_multiplier_is_unknown
-        else empty,
-        end_multiplier=lin.multiplier if stages.end_multiplier_is_unknown else empty,
-        impulse=None if invariants is None else jnp.zeros_like(invariants.sizes),
-    )
-
-
-def _starting_velocities(stages: StageEquations, u, lin: Linearisation, times) -> Array:
-    v = stages.system.velocity(stages.t, stages.q, u, stages.args)
-    _, rate = jax.jvp(
-        lambda t, xi, u: stages.system.velocity(
-            t, stages.manifold.act(stages.q, xi), u, stages.args
-        ),
-        (stages.t, jnp.zeros_like(u), u),
-        (jnp.ones_like(stages.t), v, lin.acceleration),
-    )
-    return v[None] + jnp.outer(times, stages.h * rate)
 
 
 def fibre_coordinate_scale(

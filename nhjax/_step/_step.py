@@ -4,6 +4,7 @@
 the same step as a differentiable function.
 """
 
+from abc import abstractmethod
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any, NamedTuple, TypeAlias
@@ -15,7 +16,8 @@ import numpy as np
 from jaxtyping import Array, Float, Int, PyTree
 
 from .._compile import TraceCache
-from .._custom_types import Args, BoolScalar, FloatScalar
+from .._custom_types import Args, BoolScalar, FloatScalar, FloatScalarLike
+from .._errors import is_traced
 from .._manifold import unframed
 from .._method import AbstractMethod
 from .._numerics import (
@@ -45,17 +47,17 @@ from .._system import (
 from ._equations import (
     end_impulse,
     end_position,
+    Evaluation,
     is_in_chart,
     stage_forces,
     StageEquations,
     StageForces,
     StageUnknowns,
     start_impulse,
+    unknown_units,
 )
 from ._invariants import Invariants, InvariantsAtStart
-from ._jacobian import Evaluation, unknown_units
 from ._round_off import RoundOff
-from ._solvers import AbstractStageSolver, starting_values
 
 
 class StepState(eqx.Module):
@@ -149,6 +151,54 @@ class StepOutcome(NamedTuple):
     newton: BoolScalar
     invariant_error: FloatScalar | None
     error_ratios: Float[Array, "2"] | None
+
+
+# An iteration on the stages of a step. The equations are an argument, so that the
+# iteration can be differentiated with respect to their data.
+FrozenNewtonMap: TypeAlias = Callable[[StageEquations, StageUnknowns], StageUnknowns]
+
+
+class AbstractStageSolver(eqx.Module):
+    """A solver of the stage equations of a step, the option `stage_solver`."""
+
+    max_iterations: eqx.AbstractVar[int]
+    tolerance: eqx.AbstractVar[FloatScalarLike]
+
+    def __check_init__(self):
+        if not isinstance(self.max_iterations, int) or self.max_iterations < 1:
+            raise ValueError(
+                f"{type(self).__name__}: `max_iterations` must be an int >= 1, got "
+                f"{self.max_iterations!r}."
+            )
+        check_tolerance(self.tolerance)
+
+    @abstractmethod
+    def solve(
+        self, stages: StageEquations, x0: StageUnknowns, lin: Linearisation, skip: Array
+    ) -> Solved[StageUnknowns, Evaluation]:
+        """Solve the stage equations from `x0`; do nothing where `skip` is true."""
+
+    @abstractmethod
+    def frozen_newton_map(
+        self, stages: StageEquations, lin: Linearisation, x: StageUnknowns
+    ) -> FrozenNewtonMap:
+        """Build an iteration whose fixed points solve the stage equations.
+
+        Its Jacobian is frozen, that is, constant. The iteration contracts at the
+        solution `x`. The derivatives of the solution follow from this iteration by the
+        implicit function theorem.
+        """
+
+
+def check_tolerance(tolerance: Any) -> None:
+    """Raise a `ValueError` unless the `tolerance` of a solver is finite and >= 0."""
+    if is_traced(tolerance):
+        return
+    if not np.all(np.isfinite(tolerance) & (np.asarray(tolerance) >= 0)):
+        raise ValueError(
+            f"`tolerance` must be finite and >= 0, got {tolerance}; 0 iterates to "
+            "round-off."
+        )
 
 
 def first_step_state(
@@ -278,6 +328,54 @@ def equations_of_step(
         )
     given = t, arguments.h, y, args, lin, invariants, arguments.round_off
     return StageEquations.at(system, method, *given)
+
+
+def starting_values(
+    stages: StageEquations, u: Array, lin: Linearisation
+) -> StageUnknowns:
+    """Compute the stages to first order in h, from u̇ and λ_c at the start.
+
+    The values do not depend on the previous step, so that a step is a function of its
+    state only.
+    """
+    m, s = stages.num_nonholonomic, stages.method.stages
+    invariants = stages.invariants
+    push = stages.h * lin.acceleration
+    stage_times = jnp.sum(stages.coefficients("a_hat"), axis=1)
+    node_times = jnp.sum(stages.node_weights, axis=1)
+    # The unknown ν of the symmetric closure vanishes with h, and starts from zero. All
+    # other unknowns of a closure are multipliers.
+    free = (jnp.arange(s - 1) >= int(stages.end_multiplier_is_unknown)).astype(u.dtype)
+    empty = jnp.zeros((0,), u.dtype)
+    at_stages = u[None] + jnp.outer(stage_times, push)
+    velocity, momentum = at_stages, jnp.zeros((s, 0), u.dtype)
+    if stages.hamiltonian:
+        velocity = _starting_velocities(stages, u, lin, stage_times)
+        momentum = at_stages
+    return StageUnknowns(
+        velocity=velocity,
+        momentum=momentum,
+        node_fibre_coordinate=u[None] + jnp.outer(node_times, push),
+        closure=jnp.outer(free, lin.multiplier[:m]),
+        holonomic=jnp.outer(jnp.ones((s,), u.dtype), lin.multiplier[m:]),
+        end_acceleration=lin.acceleration
+        if stages.end_multiplier_is_unknown
+        else empty,
+        end_multiplier=lin.multiplier if stages.end_multiplier_is_unknown else empty,
+        impulse=None if invariants is None else jnp.zeros_like(invariants.sizes),
+    )
+
+
+def _starting_velocities(stages: StageEquations, u, lin: Linearisation, times) -> Array:
+    v = stages.system.velocity(stages.t, stages.q, u, stages.args)
+    _, rate = jax.jvp(
+        lambda t, xi, u: stages.system.velocity(
+            t, stages.manifold.act(stages.q, xi), u, stages.args
+        ),
+        (stages.t, jnp.zeros_like(u), u),
+        (jnp.ones_like(stages.t), v, lin.acceleration),
+    )
+    return v[None] + jnp.outer(times, stages.h * rate)
 
 
 def end_state(

@@ -9,6 +9,7 @@ keeps errors above a floor of at least 20 times the error of the reference.
 """
 
 from functools import cache
+from itertools import product
 
 import jax
 import jax.numpy as jnp
@@ -85,22 +86,23 @@ def solved_errors(part, stages, closure):
 
 
 every_part = pytest.mark.parametrize("part", PARTS)
-every_closure = pytest.mark.parametrize("closure", helpers.CLOSURES)
 every_stages = pytest.mark.parametrize("stages", long_but((2, 3, 4), COUNTS))
-some_methods = pytest.mark.parametrize(
+# Four stages are an even number as two are: in the quick suite the closure that depends
+# on the parity is enough for them.
+every_method = pytest.mark.parametrize(
     ("stages", "closure"),
-    [
-        (2, "symmetric"),
-        (3, "symmetric"),
-        (4, "symmetric"),
-        (3, "propagated"),
-        (4, "consistent"),
-    ],
+    long_but(
+        [*product((2, 3), helpers.CLOSURES), (4, "propagated")],
+        product(COUNTS, helpers.CLOSURES),
+    ),
+)
+# Of the multiplier nothing is asked here: each number of stages and each closure once.
+some_methods = pytest.mark.parametrize(
+    ("stages", "closure"), [(2, "symmetric"), (3, "propagated"), (4, "consistent")]
 )
 
 
-@every_stages
-@every_closure
+@every_method
 @every_part
 @pytest.mark.parametrize("quantity", ["q", "v", "p", "continuous"])
 def test_state_and_continuous_multiplier_converge_with_order_2s_minus_2(
@@ -122,8 +124,13 @@ def test_propagated_multiplier_converges_with_order_s_or_s_minus_1(part, stages)
     assert_order(order, counts, [errors[n]["multiplier"] for n in counts])
 
 
-@every_stages
-@pytest.mark.parametrize("closure", ["consistent", "symmetric"])
+@pytest.mark.parametrize(
+    ("stages", "closure"),
+    long_but(
+        product((2, 3), ("consistent", "symmetric")),
+        product(COUNTS, ("consistent", "symmetric")),
+    ),
+)
 @every_part
 def test_multiplier_of_other_closures_converges_with_order_2s_minus_2(
     part, closure, stages

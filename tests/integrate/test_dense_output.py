@@ -50,7 +50,8 @@ def order(error):
     return np.polyfit(np.log(STEP_SIZES), np.log(error), 1)[0]
 
 
-@pytest.mark.parametrize("stages", [2, 3, 4, 5])
+# Two stages are the exception; of others, an odd and an even number.
+@pytest.mark.parametrize("stages", [2, 3, 4])
 def test_dense_output_without_velocity_forces_has_expected_orders(stages):
     q, v, multiplier = PARTICLE.exact(T)
     problem = PARTICLE.system, PARTICLE.initial_state(), None
@@ -76,7 +77,7 @@ def test_dense_output_with_velocity_forces_has_expected_orders(stages):
         assert abs(order(error[name]) - stages) < 0.25, name
 
 
-@pytest.mark.parametrize(("stages", "expected"), [(3, 2), (4, 4), (5, 4)])
+@pytest.mark.parametrize(("stages", "expected"), [(3, 2), (4, 4)])
 def test_dense_output_of_propagated_multiplier_has_expected_orders(stages, expected):
     # s for even s, s - 1 for odd s, as at the nodes.
     _, _, multiplier = PARTICLE.exact(T)

@@ -12,8 +12,7 @@ import nhjax
 from nhjax import systems
 from nhjax._step import first_step_state
 from nhjax._step._jacobian import factorise_stage_jacobian, simplified_newton_update
-from nhjax._step._solvers import starting_values
-from nhjax._step._step import equations_of_step, StepArguments
+from nhjax._step._step import equations_of_step, starting_values, StepArguments
 from support.forms import in_space
 from support.long import long
 

@@ -17,7 +17,7 @@ from nhjax._step._equations import (
     stage_velocities,
     StageEquations,
 )
-from nhjax._step._solvers import starting_values
+from nhjax._step._step import starting_values
 from support.forms import (
     free_forms,
     GAUSS,

@@ -11,8 +11,12 @@ import nhjax
 from nhjax._compile import as_cpu_kernel
 from nhjax._manifold import unframed
 from nhjax._step._equations import end_position, StageEquations
-from nhjax._step._solvers import starting_values
-from nhjax._step._step import equations_of_step, first_step_state, StepArguments
+from nhjax._step._step import (
+    equations_of_step,
+    first_step_state,
+    starting_values,
+    StepArguments,
+)
 from support.group_problems import RETRACTIONS
 from support.long import long
 

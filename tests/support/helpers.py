@@ -45,12 +45,13 @@ BESIDE = ("particle", "chaotic", "sleigh", "Appell")
 _ENDS = np.cumsum([GALLERY[name].q0.size for name in BESIDE])
 
 
-def _split(x):
+def parts_side_by_side(x):
+    """The part of each system in positions or velocities of `SIDE_BY_SIDE`."""
     return jnp.split(x, _ENDS)
 
 
 def _beside_lagrangian(t, q, v, args):
-    pieces = list(zip(_split(q), _split(v), strict=True))
+    pieces = list(zip(parts_side_by_side(q), parts_side_by_side(v), strict=True))
     total = DRIVEN.lagrangian(t, *pieces.pop(), args)
     for name, (q_part, v_part) in zip(BESIDE, pieces, strict=True):
         total = total + GALLERY[name].lagrangian(t, q_part, v_part, None)
@@ -58,7 +59,7 @@ def _beside_lagrangian(t, q, v, args):
 
 
 def _beside_constraint(t, q, v, args):
-    pieces = list(zip(_split(q), _split(v), strict=True))
+    pieces = list(zip(parts_side_by_side(q), parts_side_by_side(v), strict=True))
     last = DRIVEN.constraint(t, *pieces.pop(), args)
     values = [
         GALLERY[name].constraint(t, q_part, v_part, None)
@@ -68,7 +69,7 @@ def _beside_constraint(t, q, v, args):
 
 
 def _beside_friction(t, q, v, args):
-    parts = _split(v)
+    parts = parts_side_by_side(v)
     rest = [jnp.zeros_like(part) for part in parts[:-1]]
     return jnp.concatenate([*rest, DRIVEN.friction(t, q, parts[-1], args)])
 

@@ -10,7 +10,13 @@ from scipy.spatial.transform import Rotation
 
 from nhjax.systems import BallInBowl, TurntableBall
 from support.bowl import Bowl, UP
-from support.machines import accelerations, assert_orders, drifts, runs_of_both, stack
+from support.machines import (
+    accelerations,
+    assert_orders,
+    drifts,
+    runs_of_three_stages,
+    stack,
+)
 from support.rolling_bodies import matrix_of
 
 
@@ -58,8 +64,8 @@ def start_of(ball):
 
 
 @pytest.fixture(scope="module")
-def runs_of():
-    return runs_of_both(BALLS["paraboloid"], COUNTS, DURATION)
+def found():
+    return runs_of_three_stages(BALLS["paraboloid"], COUNTS, DURATION)
 
 
 def random_balls(ball, number):
@@ -106,7 +112,7 @@ def test_accelerations_and_forces_are_those_of_newton_and_euler(ball):
 
 
 @pytest.mark.long
-def test_run_converges_with_method_order(runs_of):
+def test_run_converges_with_method_order(found):
     ball = BALLS["paraboloid"]
     oracle = newton_euler(ball)
     times = DURATION * np.arange(1, COUNTS[-1] + 1) / COUNTS[-1]
@@ -127,19 +133,17 @@ def test_run_converges_with_method_order(runs_of):
             "multiplier": multiplier - np.array(multipliers)[nodes],
         }
 
-    for stages in (2, 3):
-        assert_orders(runs_of[stages], 2 * stages - 2, errors_at, floor=1e-11)
+    assert_orders(found, 4, errors_at, floor=1e-11)
 
 
 @pytest.mark.long
-def test_constraints_hold_to_round_off_and_moving_energy_stays(runs_of):
+def test_constraints_hold_to_round_off_and_moving_energy_stays(found):
     ball = BALLS["paraboloid"]
     # Of 2 J; the coarsest runs take four times the duration.
-    largest = {2: (1e-2, 3e-3, 6e-4), 3: (2e-6, 1e-7, 6e-9)}
-    for stages in (2, 3):
-        assert np.max(runs_of[stages].violation) < 1e-13
-        drift = drifts(ball, runs_of[stages])["moving_energy"]
-        assert np.all(drift < largest[stages]), drift
+    largest = (2e-6, 1e-7, 6e-9)
+    assert np.max(found.violation) < 1e-13
+    drift = drifts(ball, found)["moving_energy"]
+    assert np.all(drift < largest), drift
 
 
 @over(BALLS)
@@ -202,7 +206,7 @@ def test_accelerations_are_those_of_the_steady_circle(ball):
 
 
 @pytest.mark.long
-def test_runs_stay_on_the_circle_to_the_order_of_the_method(runs_of):
+def test_runs_stay_on_the_circle_to_the_order_of_the_method():
     ball = CIRCLING["paraboloid"]
 
     def errors_at(t, y, _):
@@ -210,8 +214,8 @@ def test_runs_stay_on_the_circle_to_the_order_of_the_method(runs_of):
         path = [0.4 * np.cos(angle), 0.4 * np.sin(angle), np.full_like(t, 0.12)]
         return {"position": y.q[1] - np.stack(path, axis=1)}
 
-    for stages, found in runs_of_both(ball, COUNTS, DURATION).items():
-        assert_orders(found, 2 * stages - 2, errors_at, floor=1e-12)
+    found = runs_of_three_stages(ball, COUNTS, DURATION)
+    assert_orders(found, 4, errors_at, floor=1e-12)
 
 
 @pytest.mark.parametrize("shape", ["paraboloid", "sphere"])

@@ -8,7 +8,7 @@ import pytest
 
 from nhjax.systems import ChaplyginSphere
 from support.flow import flow
-from support.machines import accelerations, assert_orders, drifts, runs_of_both
+from support.machines import accelerations, assert_orders, drifts, runs_of_three_stages
 from support.rolling_bodies import (
     assert_newton_and_euler,
     errors_of,
@@ -53,8 +53,8 @@ def chaplygin(ball):
 
 
 @pytest.fixture(scope="module")
-def runs_of():
-    return runs_of_both(SPHERES["default"], COUNTS, DURATION)
+def found():
+    return runs_of_three_stages(SPHERES["default"], COUNTS, DURATION)
 
 
 @pytest.mark.parametrize("ball", SPHERES.values(), ids=SPHERES)
@@ -64,16 +64,15 @@ def test_accelerations_and_forces_are_those_of_newton_and_euler(ball):
 
 
 @pytest.mark.long
-def test_run_converges_with_method_order(runs_of):
+def test_run_converges_with_method_order(found):
     ball = SPHERES["default"]
     start = np.asarray(ball.q0[:4]), np.asarray(ball.v0[3:])
     errors_at = errors_of(newton_euler(ball), start, DURATION, COUNTS[-1])
-    for stages in (2, 3):
-        assert_orders(runs_of[stages], 2 * stages - 2, errors_at, floor=1e-11)
+    assert_orders(found, 4, errors_at, floor=1e-11)
 
 
 @pytest.mark.long
-def test_order_is_the_same_against_chaplygins_equations(runs_of):
+def test_order_is_the_same_against_chaplygins_equations(found):
     ball = SPHERES["default"]
     field, velocity = chaplygin(ball)
     q0, v0 = ball.q0, ball.v0
@@ -86,18 +85,16 @@ def test_order_is_the_same_against_chaplygins_equations(runs_of):
         found = [matrix_of(quaternion)[2] for quaternion in y.q[:, :4]]
         return {"omega": y.v[:, 3:] - np.array(omega), "up": np.array(found) - up}
 
-    for stages in (2, 3):
-        assert_orders(runs_of[stages], 2 * stages - 2, errors_at, floor=1e-11)
+    assert_orders(found, 4, errors_at, floor=1e-11)
 
 
 @pytest.mark.long
-def test_constraints_hold_to_round_off_and_invariants_stay(runs_of):
+def test_constraints_hold_to_round_off_and_invariants_stay(found):
     # Of 2 to 14 in SI units; the coarsest runs take four times the duration.
-    largest = {2: (1e-3, 3e-4, 6e-5), 3: (1e-5, 5e-7, 3e-8)}
-    for stages in (2, 3):
-        assert np.max(runs_of[stages].violation) < 1e-13
-        for name, drift in drifts(SPHERES["default"], runs_of[stages]).items():
-            assert np.all(drift < largest[stages]), (name, drift)
+    largest = (1e-5, 5e-7, 3e-8)
+    assert np.max(found.violation) < 1e-13
+    for name, drift in drifts(SPHERES["default"], found).items():
+        assert np.all(drift < largest), (name, drift)
 
 
 def test_invariants_are_constant_by_the_independent_equations():

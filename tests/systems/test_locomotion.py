@@ -10,7 +10,6 @@ from nhjax.systems import RollerRacer, Snakeboard
 from support import locomotion
 from support.flow import flow
 from support.library_motion import library_motion
-from support.long import long
 from support.mechanisms import (
     assert_motion,
     assert_order,
@@ -153,9 +152,9 @@ def reference(case):
     return {"q": q, "v": v, "multiplier": multiplier, "work": end[-1]}
 
 
-@pytest.fixture(scope="module", params=(long(2), 3))
-def lanes(request, case):
-    return request.param, runs(case.example, request.param, COUNTS, END, case.args)
+@pytest.fixture(scope="module")
+def found(case):
+    return runs(case.example, 3, COUNTS, END, case.args)
 
 
 def test_free_board_accelerates_by_the_reduced_equations():
@@ -210,13 +209,11 @@ def test_driven_racer_accelerates_by_the_reduced_equations():
 
 
 @pytest.mark.parametrize("name", ["q", "v", "multiplier"])
-def test_run_converges_with_method_order(lanes, reference, name):
-    stages, found = lanes
-    assert_order(2 * stages - 2, COUNTS, found.errors(name, reference[name]))
+def test_run_converges_with_method_order(found, reference, name):
+    assert_order(4, COUNTS, found.errors(name, reference[name]))
 
 
-def test_axles_do_not_slip_along_a_run(case, lanes):
-    _, found = lanes
+def test_axles_do_not_slip_along_a_run(case, found):
     assert max(found.violations) < 1e-13
     example = case.example
     lane = found.lanes[0]
@@ -232,18 +229,16 @@ def test_axles_do_not_slip_along_a_run(case, lanes):
             assert abs(sideways) < 1e-9
 
 
-def test_energy_is_the_work_of_the_joints(case, lanes, reference):
-    stages, found = lanes
+def test_energy_is_the_work_of_the_joints(case, found, reference):
     lane, example = found.lanes[-1], case.example
     gained = example.energy(END, lane.q[-1], lane.v[-1])
     gained = gained - example.energy(0.0, example.q0, example.v0)
     assert abs(reference["work"]) > 0.005
-    bound = {2: 2e-4, 3: 1e-8}[stages]
+    bound = 1e-8
     assert gained == pytest.approx(reference["work"], rel=0, abs=bound)
 
 
-def test_invariants_change_by_the_torques_alone(case, lanes):
-    stages, found = lanes
+def test_invariants_change_by_the_torques_alone(case, found):
     example, lane = case.example, found.lanes[-1]
     values = invariants(example, lane.t, lane.q, lane.v)
     if case.args is None:
@@ -252,7 +247,7 @@ def test_invariants_change_by_the_torques_alone(case, lanes):
     start = example.invariants(0.0, example.q0, example.v0)
     work = (lane.q[:, 3:] - np.asarray(example.q0[3:])) @ np.atleast_1d(case.args)
     drift = values.pop("energy") - float(start["energy"]) - work
-    assert np.max(np.abs(drift)) < {2: 2e-4, 3: 1e-8}[stages]
+    assert np.max(np.abs(drift)) < 1e-8
     momenta = ("rotor_momentum", "rear_momentum", "front_momentum")
     assert set(values) == (set(momenta) if isinstance(example, Snakeboard) else set())
     for name, torque in zip(momenta[: len(values)], BOARD_TORQUES, strict=False):

@@ -7,7 +7,6 @@ import pytest
 from nhjax.systems import DoublePendulum, PendulumChain
 from support.flow import flow
 from support.library_motion import library_motion
-from support.long import long
 from support.mechanisms import (
     assert_motion,
     assert_order,
@@ -36,9 +35,9 @@ def reference():
     return {"q": q, "v": v, "multiplier": multiplier}
 
 
-@pytest.fixture(scope="module", params=(long(2), 3))
-def lanes(request):
-    return request.param, runs(CHAIN, request.param, COUNTS, END)
+@pytest.fixture(scope="module")
+def found():
+    return runs(CHAIN, 3, COUNTS, END)
 
 
 def test_acceleration_and_multiplier_follow_from_the_angles():
@@ -69,13 +68,11 @@ def test_chain_of_two_links_is_the_double_pendulum():
 
 
 @pytest.mark.parametrize("name", ["q", "v", "multiplier"])
-def test_run_converges_with_method_order(lanes, reference, name):
-    stages, found = lanes
-    assert_order(2 * stages - 2, COUNTS, found.errors(name, reference[name]))
+def test_run_converges_with_method_order(found, reference, name):
+    assert_order(4, COUNTS, found.errors(name, reference[name]))
 
 
-def test_rods_keep_their_lengths_along_a_run(lanes):
-    _, found = lanes
+def test_rods_keep_their_lengths_along_a_run(found):
     places = found.lanes[0].q.reshape(-1, 3, 2)
     lengths = np.linalg.norm(np.diff(places, axis=1, prepend=0.0), axis=2)
     expected = np.broadcast_to(PARAMETERS["lengths"], lengths.shape)
@@ -83,12 +80,11 @@ def test_rods_keep_their_lengths_along_a_run(lanes):
     assert max(found.violations) < 1e-13
 
 
-def test_energy_error_is_bounded(lanes):
-    stages, found = lanes
+def test_energy_error_is_bounded(found):
     lane = found.lanes[-1]
     energy = invariants(CHAIN, lane.t, lane.q, lane.v)["energy"]
     start = CHAIN.energy(0.0, CHAIN.q0, CHAIN.v0)
-    assert np.max(np.abs(energy - start)) < {2: 4e-3, 3: 1.6e-7}[stages]
+    assert np.max(np.abs(energy - start)) < 1.6e-7
 
 
 def test_default_chain_hangs_on_one_line_at_rest():

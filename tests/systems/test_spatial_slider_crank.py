@@ -7,7 +7,6 @@ from scipy.integrate import quad
 from nhjax.systems import SpatialSliderCrank
 from support.flow import flow
 from support.library_motion import library_motion
-from support.long import long
 from support.mechanisms import (
     assert_motion,
     assert_order,
@@ -53,9 +52,9 @@ def reference():
     return {"q": q, "v": v, "multiplier": multiplier}
 
 
-@pytest.fixture(scope="module", params=(long(2), 3))
-def lanes(request):
-    return request.param, runs(MACHINE, request.param, COUNTS, END)
+@pytest.fixture(scope="module")
+def found():
+    return runs(MACHINE, 3, COUNTS, END)
 
 
 def test_acceleration_and_multiplier_follow_from_the_crank():
@@ -101,13 +100,11 @@ def test_crank_takes_the_time_of_the_quadrature(reference):
 
 
 @pytest.mark.parametrize("name", ["q", "v", "multiplier"])
-def test_run_converges_with_method_order(lanes, reference, name):
-    stages, found = lanes
-    assert_order(2 * stages - 2, COUNTS, found.errors(name, reference[name]))
+def test_run_converges_with_method_order(found, reference, name):
+    assert_order(4, COUNTS, found.errors(name, reference[name]))
 
 
-def test_loop_stays_closed_along_a_run(lanes):
-    _, found = lanes
+def test_loop_stays_closed_along_a_run(found):
     lane = found.lanes[0]
     for q, v in zip(lane.q[::5], lane.v[::5], strict=True):
         other_q, other_v = ORACLE.state(q[0], v[0])
