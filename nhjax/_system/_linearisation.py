@@ -19,6 +19,7 @@ from .._numerics import (
     DenseMatrix,
     DiagonalMatrix,
     InverseMatrix,
+    jacobian_sparsity,
     JacobianMatrix,
     least_norm_inverse,
     least_norm_inverse_by_blocks,
@@ -26,11 +27,18 @@ from .._numerics import (
     ReactionMatrix,
     small_einsum,
     sparse_jacobian,
+    SparsityPattern,
     square_jacobian,
     SquareMatrix,
 )
-from ._structure import constraint_pattern, FEWEST_SPARSE
 from ._systems import AbstractMechanicalSystem, check_time_and_state, State
+
+
+# With fewer constraints than this, sparse matrices save little. With four in a row, a
+# step takes a third of its time with dense matrices.
+_FEWEST_SPARSE = 4
+# A block may hold at most this part of all constraints.
+_LARGEST_BLOCK = 1 / 4
 
 
 class Linearisation(eqx.Module):
@@ -231,8 +239,8 @@ def constraint_matrices(
     metric = square_jacobian(lambda u: system.fibre_derivative(t, q, u, args), u)
     fibre_hessian_inverse = metric.inverse()
     pattern = None
-    if may_be_sparse and num_constraints >= FEWEST_SPARSE and metric.is_diagonal:
-        pattern = constraint_pattern(system, t, q, u, args)
+    if may_be_sparse and num_constraints >= _FEWEST_SPARSE and metric.is_diagonal:
+        pattern = _constraint_pattern(system, t, q, u, args)
     if pattern is None:
         slopes = DenseMatrix(jax.jacrev(system.constraint, argnums=2)(t, q, u, args))
     else:
@@ -318,3 +326,23 @@ def continuous_multiplier(
     check_time_and_state("continuous_multiplier", t, y, "system, ")
     t = jnp.asarray(t, y.p.dtype)
     return linearise(system, t, y.q, system.fibre_coordinate(y), args).multiplier
+
+
+def _constraint_pattern(
+    system: AbstractMechanicalSystem,
+    t: FloatScalar,
+    q: PyTree[Array],
+    u: Float[Array, " n"],
+    args: Args,
+) -> SparsityPattern | None:
+    """Find the sparsity pattern of B = ∂Φ/∂u; None if B is better stored dense.
+
+    B is dense if constraints are redundant, if they are of both kinds, or if each
+    shares coordinates with many others, so that B K⁻¹ Bᵀ is full.
+    """
+    kinds = [system.nonholonomic, system.holonomic]
+    if system.constraints == "redundant" or None not in kinds:
+        return None
+    entries = jacobian_sparsity(lambda u: system.constraint(t, q, u, args), u)
+    pattern = SparsityPattern(entries)
+    return pattern if pattern.group <= _LARGEST_BLOCK * len(entries) else None

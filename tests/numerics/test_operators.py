@@ -15,9 +15,9 @@ from nhjax._numerics import (
     DenseMatrix,
     DiagonalMatrix,
     max_norm,
-    Pattern,
     sparse_jacobian,
     SparseMatrix,
+    SparsityPattern,
     square_jacobian,
 )
 from nhjax._system import linearise
@@ -138,9 +138,11 @@ def test_diagonal_operator_acts_as_dense_matrix():
 
 
 def test_derivative_of_diagonal_inverse_equals_dense():
-    rate = jax.jvp(lambda m: DiagonalMatrix(m).inverse().as_matrix(), (M,), (U,))[1]
-    full = jnp.diag(M), jnp.diag(U)
-    full_rate = jax.jvp(lambda m: DenseMatrix(m).inverse().entries, *zip(full))[1]
+    _, rate = jax.jvp(lambda m: DiagonalMatrix(m).inverse().as_matrix(), (M,), (U,))
+    full, change = jnp.diag(M), jnp.diag(U)
+    _, full_rate = jax.jvp(
+        lambda m: DenseMatrix(m).inverse().entries, (full,), (change,)
+    )
     np.testing.assert_allclose(rate, full_rate, atol=1e-16)
 
 
@@ -185,7 +187,7 @@ def sparse_and_dense(name, count=None):
     places = PLACES[name]
     shape = places.shape if count is None else (count, *places.shape)
     full = np.where(places, np.random.default_rng(2).normal(size=shape), 0.0)
-    pattern = Pattern(places)
+    pattern = SparsityPattern(places)
     taken = np.take_along_axis(
         full,
         np.broadcast_to(pattern.columns.T, (*shape[:-1], len(pattern.columns))),
@@ -281,7 +283,7 @@ def test_block_tridiagonal_inverse_of_several_unknowns_per_row_equals_dense():
 
 def test_absolute_of_inverse_of_springs_in_a_row_is_exact():
     entries = np.eye(ROWS, ROWS + 1) - np.eye(ROWS, ROWS + 1, 1)
-    pattern = Pattern(NEIGHBOURS)
+    pattern = SparsityPattern(NEIGHBOURS)
     values = entries[np.arange(ROWS), pattern.columns]
     sparse = SparseMatrix(jnp.asarray(values), pattern)
     weights = DiagonalMatrix(jnp.ones(ROWS + 1))
