@@ -125,12 +125,20 @@ def _atom(value: Any) -> Hashable:
     return (cls, value) if isinstance(value, _PLAIN) else _Unrepeatable()
 
 
+def _key_name(key: Any) -> Hashable:
+    """Return what is compared of a key of a mapping.
+
+    Keys that are equal may still differ: 0.0 and -0.0, or objects of the user.
+    """
+    return (type(key), key) if isinstance(key, _PLAIN) else _Identity(id(key), key)
+
+
 def _parts(value: Any) -> Iterator[Part]:
     """Yield the values inside a value, each with its owner and its name there."""
     if isinstance(value, types.FunctionType):
         yield from _read_by(value)
     elif isinstance(value, _MAPPINGS):
-        yield from ((value, (type(key), key), x) for key, x in list(value.items()))
+        yield from ((value, _key_name(key), x) for key, x in list(value.items()))
     elif isinstance(value, (*_SEQUENCES, np.ndarray)):
         yield from ((value, index, x) for index, x in enumerate(list(value)))
     elif isinstance(value, type):
@@ -244,6 +252,9 @@ class Captured:
             if ignored and (place in ignored or (id(owner), ...) in ignored):
                 continue
             content = atom = _atom(value)
+            if isinstance(atom, _Unrepeatable):
+                # A function that stores a tracer has another one after tracing.
+                content = _Identity(id(value), value)
             has_objects = isinstance(value, np.ndarray) and value.dtype.hasobject
             if has_objects or not _is_leaf(type(value)):
                 content = _Identity(id(value), value)
@@ -320,8 +331,6 @@ def _remember_changes(key: _Key, before: Captured, functions: Any) -> None:
     for one, other in ((before, after), (after, before)):
         for place, (owner, content) in one.contents.items():
             there = other.contents.get(place)
-            if isinstance(content, _Unrepeatable):
-                continue
             if there is None and isinstance(owner, list | set | deque):
                 # The container grows, so that its next element would again be new.
                 place = (id(owner), ...)
