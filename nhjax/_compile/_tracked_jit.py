@@ -30,9 +30,9 @@ import numpy as np
 from ._garbage_collection import rare_collections
 
 
-# Where a value was read: the identity of its owner, and a name or index.
+# The place of a value: the identity of its owner, and a name or index.
 Place: TypeAlias = tuple[int, Hashable]
-# A value inside another one, after its owner and its name there.
+# The owner of a value, its name in the owner, and the value.
 Part: TypeAlias = tuple[object, Hashable, Any]
 T = TypeVar("T")
 
@@ -48,7 +48,8 @@ _PLAIN = (bool, int, str, bytes, type(None), type(Ellipsis), np.dtype)
 _LEAVES = (*_PLAIN, *_NUMBERS, *_ARRAYS, jax.core.Tracer)
 _MAPPINGS = (dict, types.MappingProxyType)
 _SEQUENCES = (list, tuple, deque, set, frozenset)
-# Values of these classes are compared by their parts, though libraries define them.
+# Values of these classes are compared part by part, although libraries define the
+# classes.
 _CONTAINERS = (*_MAPPINGS, *_SEQUENCES, types.MethodType, partial)
 _CONTAINERS += (types.SimpleNamespace, argparse.Namespace, eqx.Module)
 
@@ -126,7 +127,7 @@ def _atom(value: Any) -> Hashable:
 
 
 def _parts(value: Any) -> Iterator[Part]:
-    """Yield the values inside a value, each with its owner and its name there."""
+    """Yield the values inside a value, each with its owner and its name in it."""
     if isinstance(value, types.FunctionType):
         yield from _read_by(value)
     elif isinstance(value, _MAPPINGS):
@@ -227,8 +228,8 @@ class Captured:
     """The values that functions read, except at the ignored places.
 
     - `atoms`: the values in a fixed order, each with the number of its owner and its
-      name there. Objects have numbers in the order of the search, so that equal
-      functions that were made again have equal atoms.
+      name in the owner. Objects have numbers in the order of the search, so that a new
+      function equal to an old one has equal atoms.
     - `contents`: the owner and the content of each place; the content of an object with
       parts is its identity. The owners are kept, so that none reuses an identity.
     """

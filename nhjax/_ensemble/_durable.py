@@ -140,10 +140,10 @@ class Lock:
 class Journal:
     """The journal of a store: one line of JSON for each finished chunk.
 
-    Process 0 appends to the journal. Every other process appends to a part of its own,
-    which it locks while it runs. A run begins and ends with a single journal: process 0
-    first appends the parts that an interrupted run has left, and finally writes all
-    lines in the order of chunks. `lines` has the lines that this process has written.
+    Process 0 appends to the journal. Every other process appends to its own part, which
+    it locks while it runs. A run begins and ends with a single journal: process 0 first
+    appends the parts that an interrupted run has left, and finally writes all lines in
+    the order of chunks. `lines` has the lines that this process has written.
     """
 
     def __init__(self, folder: Path, index: int):

@@ -49,7 +49,7 @@ class Checkpoint(eqx.Module):
     bit if all of them save a checkpoint (the last one need not) and otherwise the same
     output, with the same releases on the same machine. Otherwise they repeat it up to
     round-off. Samples by `SaveAt(ts=...)` and dense output count times from the start
-    of their own run.
+    of their run.
 
     !!! example
 

@@ -150,7 +150,7 @@ class AbstractMethod(eqx.Module):
 
     @property
     def hypotheses(self) -> Hypotheses:
-        """Find which of H1, H2 and H3 hold, which systems with constraints need."""
+        """Find which of the hypotheses H1, H2 and H3 hold."""
         return _order_conditions.hypotheses(self._tableau())
 
     @property
@@ -190,7 +190,7 @@ class AbstractMethod(eqx.Module):
 
         The difference is a multiple of the divided difference over all nodes. As a
         quadrature it vanishes for polynomials of degree less than s - 1, so that it
-        measures how well the nodes resolve a function. Of several coinciding nodes only
+        measures how well the nodes resolve a function. If several nodes coincide, only
         the first has a weight. Returns None if there is only one distinct node.
         """
         nodes, first = np.unique(self.c, return_index=True)

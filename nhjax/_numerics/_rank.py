@@ -162,9 +162,9 @@ def least_norm_inverse_by_blocks(
 ) -> Float[Array, "l l"]:
     """Compute a generalised inverse of C that solves the last equations first.
 
-    The `first` equations have zero unknowns as far as they follow from the other
-    equations. Apart from this, each of the two parts of x has the least norm of
-    `least_norm_inverse`. If no equation of one part follows from the other part, the
+    The unknowns of the `first` equations are zero as far as these equations follow from
+    the other equations. Apart from this, each of the two parts of x has the least norm
+    of `least_norm_inverse`. If no equation of one part follows from the other part, the
     result is `least_norm_inverse`.
     """
     if first in (0, matrix.shape[0]):

@@ -573,7 +573,7 @@ def inner_programs(equation: Any) -> Iterator[tuple[Any, int]]:
     """
     params, name = equation.params, equation.primitive.name
     if name == "while":
-        # The operands of the body, without those of the predicate.
+        # The operands of the body, without the operands of the predicate.
         yield params["body_jaxpr"].jaxpr, params["cond_nconsts"]
     elif name == "cond":
         for branch in params["branches"]:

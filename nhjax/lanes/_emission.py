@@ -1,4 +1,4 @@
-"""From the graph to LLVM IR: a kernel that computes `width` members at a time.
+"""Emission of LLVM IR from the graph: a kernel that computes `width` members at once.
 
 Three passes over the finished graph come first. `LiveNodes` finds the nodes that the
 results need. `mark_divergent` finds the values that differ between members; the other
@@ -10,8 +10,8 @@ uniform become jumps. Where the predicate is divergent, members that do not take
 are masked: they compute along, but what they compute is discarded. `_Memory` writes
 loads and stores.
 
-A kernel allocates nothing but its scratch memory: on the stack up to 64 kB, by `malloc`
-above that. Programs that need more than 64 MB are refused.
+A kernel allocates only its scratch memory: up to 64 kB on the stack, and more by
+`malloc`. Programs that need more than 64 MB are refused.
 """
 
 import numpy as np

@@ -178,7 +178,7 @@ def log(x: Value) -> Value:
     k, m = exponent_and_mantissa(x)
     result = _log_of(k, m - 1.0, 0.0)
     result = where(x.equals(0.0), -math.inf, where(x < 0.0, math.nan, result))
-    # NaN and infinity stay as they are.
+    # NaN and infinity are returned unchanged.
     return where(x < math.inf, result, x)
 
 
@@ -331,7 +331,7 @@ def cbrt(x: Value) -> Value:
     return with_sign(where((size < math.inf) & (size > 0.0), root, size), x)
 
 
-# For large arguments the polynomial is in 1 / (x + 2) minus this.
+# For large arguments, the variable of the polynomial is 1 / (x + 2) - _CENTRE.
 _CENTRE = 0.229
 _TWO_OVER_ROOT_PI = 1.1283791670955126
 _ITS_REST = 1.533545961316588e-17

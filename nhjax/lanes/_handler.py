@@ -65,7 +65,7 @@ PROGRAM = {
 # The data that the threads of a call share: the numbers of blocks begun and done, the
 # number of threads that hold the job, the number of threads of the pool, the number of
 # blocks, the last member, whether a block failed, the addresses of the data, and the
-# program. The first two change all the time, and have cache lines of their own.
+# program. The first two change often, and each has its own cache line.
 JOB = {
     "begun": "i64",
     "padding_1": "[7 x i64]",
@@ -359,7 +359,7 @@ def handler_ir(
         writes.
     - `width`: the number of members that it computes at once.
     - `is_batched`: whether the results have members, along the leading axis. Otherwise
-        there is one member. A program without results does nothing.
+        there is one member. A program without results is empty.
     """
     values = {
         "kernel": "@kernel",

@@ -1,4 +1,4 @@
-"""From LLVM IR to native code: parsed, optimised, compiled and loaded by llvmlite.
+"""Compilation of LLVM IR to native code, which llvmlite optimises and loads.
 
 llvmlite is imported when a function of this module first needs it, so that the package
 can be imported without llvmlite.
@@ -143,7 +143,7 @@ def load(code: bytes, name: str, symbol: str, imports: dict[str, int]) -> int:
 
 @lru_cache(maxsize=1)
 def _linker() -> Any:
-    # llvmlite frees nothing when Python exits, so that this lives as long as XLA.
+    # llvmlite does not free this when Python exits, so that it lives as long as XLA.
     return _llvm().create_lljit_compiler(
         _machine(host(), _GENERATION_OF_SHORT), use_jit_link=True
     )

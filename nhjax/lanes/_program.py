@@ -46,7 +46,7 @@ from ._native import host, host_width, load, object_code, version
 
 
 def compile_single(program: Any, is_brief: bool = False) -> str:
-    """Compile a program for a single run, and return the name to call it by.
+    """Compile a program for a single run, and return its name for calls.
 
     With `is_brief` it is compiled in less time, to slower code.
 
@@ -128,9 +128,9 @@ def llvm_ir(
 # Scans of at most this length are unrolled.
 LONGEST_UNROLLED_SCAN = 8
 # Programs with more nodes than this are refused, unless they have fewer than 40 nodes
-# for each of JAX's operations. LLVM takes about 10 s for so many nodes, and minutes for
-# more. XLA keeps loops over arrays: it takes a few seconds where arrays are large, but
-# longer than LLVM where there are many small ones.
+# for each of JAX's operations. LLVM takes about 10 s for this number of nodes, and
+# minutes for more. XLA keeps loops over arrays: it takes a few seconds where arrays are
+# large, but longer than LLVM where there are many small ones.
 MOST_NODES, NODES_PER_OPERATION = 100_000, 40
 
 OPERATIONS: dict[str, Operation] = {

@@ -427,7 +427,7 @@ def polynomial(x: Value, coefficients: Sequence[float]) -> Value:
     """Evaluate a polynomial with the given coefficients, lowest power first.
 
     As in Estrin's scheme, the even and the odd powers are evaluated separately, each in
-    the same way: fewer products wait for one another than in Horner's scheme.
+    the same way: the chain of dependent products is shorter than in Horner's scheme.
     """
     powers = [x]
     while 2 ** len(powers) < len(coefficients):

@@ -40,12 +40,13 @@ class BallInBowl(AbstractConstrainedGroupExample):
     bowl is (λ₁, λ₂, 0) + μ ∇Φ [N].
 
     Energy is not conserved, but the moving energy E - Ω (m (x ẏ - y ẋ) + k m a² (R ω)₃)
-    is. Of a flat bowl, κ = 0, it is the `TurntableBall`.
+    is. For a flat bowl, κ = 0, the system is the `TurntableBall`.
 
     **Parameters:** `mass` m [kg]; `radius` a of the ball [m]; `inertia_ratio` k, its
     moment of inertia over m a² [1], 2/5 for a solid ball; `curvature` κ [1/m] of the
     surface on which the centre moves, at its lowest point; `rate` Ω of the bowl [1/s];
-    `gravity` g [m/s²]; `shape`, "paraboloid" or "sphere"; `retraction`, that of SO(3).
+    `gravity` g [m/s²]; `shape`, "paraboloid" or "sphere"; `retraction`, the
+    retraction of SO(3).
 
     **Source:** Routh, *Advanced Rigid Dynamics*; Borisov, Mamaev and Kilin, *The
     rolling motion of a ball on a surface* (2002); Dalla Via, Fassò and Sansonetto, *On
@@ -121,7 +122,7 @@ class BallInBowl(AbstractConstrainedGroupExample):
         spin: ArrayLike = 0.0,
         **parameters: Any,
     ) -> "BallInBowl":
-        """Make a rolling ball with its centre at (x, y), which moves at (ẋ, ẏ).
+        """Create a rolling ball with its centre at (x, y), which moves at (ẋ, ẏ).
 
         `spin` is the part of the angular velocity along the normal n; `parameters` are
         those of the class. In a sphere the ball is in the lower half.
@@ -142,7 +143,7 @@ class BallInBowl(AbstractConstrainedGroupExample):
     def circling(
         cls, radius_of_path: ArrayLike, path_rate: ArrayLike, **parameters: Any
     ) -> "BallInBowl":
-        """Make a ball that goes round steadily on a horizontal circle about the axis.
+        """Create a ball that goes round steadily on a horizontal circle about the axis.
 
         The circle of its centre has the radius `radius_of_path` [m], and the rate is
         `path_rate` [1/s]; the balance of moments determines the spin. `parameters` are

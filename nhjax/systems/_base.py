@@ -27,7 +27,7 @@ def parameter(value: ArrayLike) -> Array:
     """Convert a parameter of an example to an array, which is a leaf.
 
     A Python or NumPy scalar becomes a weakly-typed float, so that it takes part in
-    float32 and float64 arithmetic alike, strict dtype promotion included.
+    float32 and float64 arithmetic, also with strict dtype promotion.
     """
     if isinstance(value, (int, float, np.number)):
         return jnp.asarray(float(value))

@@ -88,7 +88,7 @@ class NonholonomicParticle(AbstractConstrainedExample):
         return np.array([x, y, z]), np.array([dx, dy, y * dx]), np.array([multiplier])
 
     def invariants(self, t: FloatScalarLike, q: Array, v: Array) -> dict[str, Array]:
-        """Compute the energy, and those of the driver y and the passenger (x, z)."""
+        """Compute the energies: total, of driver y, and of passenger (x, z)."""
         driver = 0.5 * (self.mass * v[1] ** 2 + self.stiffness * q[1] ** 2)
         passenger = 0.5 * self.mass * (v[0] ** 2 + v[2] ** 2)
         passenger = passenger + 0.5 * self.stiffness * q[0] ** 2

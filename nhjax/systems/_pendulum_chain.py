@@ -84,7 +84,7 @@ class PendulumChain(AbstractExample):
         lengths: ArrayLike | tuple[float, ...] = 1.0,
         gravity: ArrayLike = 9.81,
     ) -> "PendulumChain":
-        """Make a chain whose rods form `angles` with the downward vertical."""
+        """Create a chain whose rods form `angles` with the downward vertical."""
         angle = jnp.atleast_1d(coordinates(angles))
         rate = _one_each(angle.size, "rates", rates)
         length = _one_each(angle.size, "lengths", lengths)

@@ -1,4 +1,4 @@
-"""What planar mechanisms share: rotations, and the kinetic energy of rigid bodies."""
+"""Functions for planar mechanisms: rotations and kinetic energy of rigid bodies."""
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float

@@ -27,7 +27,7 @@ class Rattleback(AbstractRollingBody):
     s = h e₃ - A γ / √(γ·(A γ)),  A = diag(a², b², c²),  γ = Rᵀ e₃,
 
     with q = (R, x): the attitude, a quaternion, and the position of the centre of mass
-    [m]; (v, ω) are their body velocities [m/s, 1/s]. The body axes are those of the
+    [m]; (v, ω) are their body velocities [m/s, 1/s]. The body axes are the axes of the
     ellipsoid, the third one upward at rest, and s is the lowest point, seen from the
     centre of mass. Φ is its height, and φ the horizontal velocity at the contact; their
     multipliers are the force of the plane in space [N]. The third axis is a principal
@@ -37,9 +37,9 @@ class Rattleback(AbstractRollingBody):
     With `damping` σ the air exerts the torque -σω, and energy is not conserved.
 
     **Parameters:** `mass` m [kg]; `semiaxes` (a, b, c) of the ellipsoid and `depth` h
-    of the centre of mass below that of the ellipsoid [m]; `moments` (J₁₁, J₂₂, J₃₃) and
-    `product` J₁₂ of inertia about the centre of mass [kg m²]; `gravity` g [m/s²];
-    `damping` σ [N m s] or None; `retraction`, that of SE(3).
+    of the centre of mass below the centre of the ellipsoid [m]; `moments` (J₁₁, J₂₂,
+    J₃₃) and `product` J₁₂ of inertia about the centre of mass [kg m²]; `gravity` g
+    [m/s²]; `damping` σ [N m s] or None; `retraction`, the retraction of SE(3).
 
     **Source:** Kane and Levinson, *Realistic mathematical modeling of the rattleback*,
     International Journal of Non-Linear Mechanics 17 (1982), whose parameters are the
@@ -104,11 +104,11 @@ class Rattleback(AbstractRollingBody):
         tilts: tuple[float, float] | Array = (0.0, 0.0),
         **parameters: Any,
     ) -> "Rattleback":
-        """Make a stone that spins at the rate ω₃ = `spin` about its own third axis.
+        """Create a stone that spins at the rate ω₃ = `spin` about its own third axis.
 
         `tilts` are the angles (α, β) of Kane and Levinson in degrees: it is turned
         about the horizontal first axis by α, and then about its second one by -β.
-        `parameters` are those of the class.
+        `parameters` are the parameters of the class.
         """
         lean, pitch = 0.5 * jnp.deg2rad(coordinates(tilts))
         zero = jnp.zeros_like(lean)

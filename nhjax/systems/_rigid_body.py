@@ -28,7 +28,7 @@ class FreeRigidBody(AbstractExample):
     angular velocity along the principal axes.
 
     **Parameters:** `moments` (I₁, I₂, I₃), the principal moments of inertia [kg m²];
-    `retraction`, that of SO(3).
+    `retraction`, the retraction of SO(3).
 
     **Source:** Euler; Landau and Lifshitz, *Mechanics*, section 37.
 

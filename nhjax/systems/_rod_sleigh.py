@@ -82,9 +82,9 @@ class RodSleigh(AbstractNonholonomicExample):
         length: ArrayLike = 1.0,
         angle: ArrayLike = 0.4,
     ) -> "RodSleigh":
-        """Make a sleigh that slides along its blade with `speed` while it turns.
+        """Create a sleigh that slides along its blade with `speed` while it turns.
 
-        `position` is that of the blade, `rod` the direction of the rod.
+        `position` is the position of the blade, `rod` the direction of the rod.
         """
         length, rod_angle = parameter(length), parameter(rod)
         heading = rod_angle + parameter(angle)
@@ -133,7 +133,8 @@ class RodSleigh(AbstractNonholonomicExample):
     def exact(self, t: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Compute (q, v, λ) at `t`, for consistent data, a turning rod and cos β != 0.
 
-        λ is (nonholonomic, holonomic); the motion is that of `equivalent_sleigh`.
+        λ is (nonholonomic, holonomic); the motion is the same as of
+        `equivalent_sleigh`.
         """
         self._consistent_data()
         tangency = jax.jvp(

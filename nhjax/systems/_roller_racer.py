@@ -79,10 +79,10 @@ class RollerRacer(AbstractGaitMachine):
         angle_rate: ArrayLike = 0.0,
         **parameters: Any,
     ) -> "RollerRacer":
-        """Make a racer with its seat at the origin and moving ahead at `speed`, θ = 0.
+        """Create a racer with the seat at the origin, moving ahead at `speed`, θ = 0.
 
-        Its turning follows from the constraints. `parameters` are those of the class;
-        without a `gait` among them the pivot moves freely.
+        Its turning rate follows from the constraints. `parameters` are the parameters
+        of the class; without a `gait` among them the pivot moves freely.
         """
         merged: dict[str, Any] = {"gait": None} | parameters
         behind, ahead = cls(**merged).distances
@@ -111,7 +111,7 @@ class RollerRacer(AbstractGaitMachine):
         speed: ArrayLike = 0.0,
         **parameters: Any,
     ) -> "RollerRacer":
-        """Make a racer with the gait φ = amplitude sin(rate t + phase)."""
+        """Create a racer with the gait φ = amplitude sin(rate t + phase)."""
         gait = Sinusoid(amplitude, rate, phase)
         angle, angle_rate = gait.at_start()
         return cls.rolling(speed, angle, angle_rate, gait=gait, **parameters)

@@ -1,4 +1,4 @@
-"""What all rigid bodies that roll on a horizontal plane share."""
+"""The common base of all rigid bodies that roll on a horizontal plane."""
 
 import abc
 import dataclasses
@@ -90,8 +90,8 @@ class AbstractRollingBody(AbstractConstrainedGroupExample):
     def plane_symmetry(self, q: Pose) -> Float[Array, "3 6"]:
         """Compute the generators of the motions of the plane, as body velocities.
 
-        They are the translations along the axes of x and y, and the turn about that of
-        z, under which the system is symmetric whatever the shape of the body.
+        They are the translations along x and y and the rotation about z. The system has
+        these symmetries for every shape of the body.
         """
         motions = jnp.eye(6, dtype=q.dtype)[jnp.array([0, 1, 5])]
         back = self.manifold.inverse(q)

@@ -90,7 +90,7 @@ class Snakeboard(AbstractGaitMachine):
         joint_rates: ArrayLike | tuple[float, ...] = (0.0, 0.0, 0.0),
         **parameters: Any,
     ) -> "Snakeboard":
-        """Make a board at the origin whose centre moves ahead at `speed`, θ = 0.
+        """Create a board at the origin whose centre moves ahead at `speed`, θ = 0.
 
         Its sideways velocity and its turning follow from the constraints. `parameters`
         are those of the class; without a `gait` among them the joints move freely.
@@ -120,7 +120,7 @@ class Snakeboard(AbstractGaitMachine):
         speed: ArrayLike = 0.0,
         **parameters: Any,
     ) -> "Snakeboard":
-        """Make a board with the gait (ψ, φ_b, φ_f) = amplitudes sin(rates t + phases).
+        """Create a board with gait (ψ, φ_b, φ_f) = amplitudes sin(rates t + phases).
 
         It starts at t = 0 at the origin, its centre ahead at `speed`.
         """
@@ -153,9 +153,9 @@ class Snakeboard(AbstractGaitMachine):
         return jnp.concatenate([jnp.zeros_like(v[:3]), torques])
 
     def invariants(self, t: FloatScalarLike, q: Array, v: Array) -> dict[str, Array]:
-        """Compute the energy and the momenta of the joints, which no torque moves.
+        """Compute the energy and the momenta of the joints, for joints without torques.
 
-        With a gait nothing is conserved.
+        With a gait there are no conserved quantities.
         """
         if self.gait is not None:
             return {}

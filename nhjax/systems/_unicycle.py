@@ -27,7 +27,7 @@ class Unicycle(AbstractConstrainedGroupExample):
     its left. The heading turns uniformly.
 
     **Parameters:** `mass` m [kg], `inertia` I about the vertical [kg m²], `spring` k
-    [N/m]; `retraction`, that of SE(2).
+    [N/m]; `retraction`, the retraction of SE(2).
 
     **Source:** Martín de Diego and Sato Martín de Almagro, *High-order geometric
     methods for nonholonomic mechanical systems*, fourth numerical experiment (there

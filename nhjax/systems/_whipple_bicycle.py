@@ -50,8 +50,8 @@ class WhippleBicycle(AbstractNonholonomicExample):
     the rear and on the front wheel, and the force z on the front wheel.
 
     `steering` is the torque on the steer axis as a function (t, q, v, args):
-    `SteerTorque()`, `LeanToSteer()`, one of your own, or None for a bicycle that nobody
-    controls, whose energy is conserved.
+    `SteerTorque()`, `LeanToSteer()`, your own function, or None for an uncontrolled
+    bicycle, whose energy is conserved.
 
     **Parameters:** `wheelbase` w, `trail` c [m], `tilt` λ of the steer axis [rad],
     `gravity` g [m/s²]; of the wheels `rear_radius`, `front_radius` [m],
@@ -130,10 +130,10 @@ class WhippleBicycle(AbstractNonholonomicExample):
         steer: ArrayLike = 0.0,
         **parameters: Any,
     ) -> "WhippleBicycle":
-        """Make a bicycle that rolls at the `speed` of the rear wheel, its radius times
-        its rate, with the given lean and steer and their rates.
+        """Create a bicycle that rolls, with the given lean, steer and their rates.
 
-        Pitch and all other rates follow from the constraints.
+        `speed` is the radius of the rear wheel times its rate. Pitch
+        and all other rates follow from the constraints.
         """
         given = (lean, steer, lean_rate, steer_rate, speed)
         bicycle = cls(**parameters)
@@ -179,7 +179,7 @@ class WhippleBicycle(AbstractNonholonomicExample):
         return jnp.concatenate(velocities)
 
     def holonomic(self, t: FloatScalarLike, q: Array, args: Args) -> Array:
-        """Compute how far below the ground the front wheel's lowest point is."""
+        """Compute the depth of the front wheel's lowest point below the ground."""
         return contact_point(*_wheels(self, q)[1], _frames(self, q)[1])[2:]
 
     def force(self, t: FloatScalarLike, q: Array, v: Array, args: Args) -> Array:
@@ -327,7 +327,7 @@ def _rolling_start(
 ) -> tuple[Array, Array, Array]:
     """Compute (q0, v0): the pitch by Newton's method, the other rates linearly.
 
-    The third result tells whether both wheels touch the ground.
+    The third result is whether both wheels touch the ground.
     """
 
     def at(pitch):
