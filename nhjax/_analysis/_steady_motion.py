@@ -118,10 +118,10 @@ def steady_motion(
     - `t`: the time at which functions that depend on time are taken.
     - `y`: a state from which the search starts.
     - `args`: passed on to the functions of the system.
-    - `positions`, `velocities`: the indices of what is to be steady. Leave out what
-        follows from the rest: positions that holonomic constraints tie, velocities that
-        follow from nonholonomic ones, and a speed whose rate vanishes with the others
-        because energy is conserved.
+    - `positions`, `velocities`: the indices that must be steady. Leave out indices that
+        follow from the others: positions that follow from holonomic constraints,
+        velocities that follow from nonholonomic constraints, and a speed that is
+        constant because energy is conserved.
     - `symmetry`: generators of symmetries, as `linear_stability` takes them, in place
         of `positions` and `velocities`.
     - `held_positions`, `held_velocities`: the indices of what keeps its value in `y`.

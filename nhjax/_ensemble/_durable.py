@@ -1,6 +1,6 @@
 """Files that survive a crash: atomic writes, locks, and a journal of finished chunks.
 
-A file is either complete or absent, whatever interrupts the writing. A lock ends with
+A file is either complete or absent, even if writing it is interrupted. A lock ends with
 the process that holds it.
 """
 

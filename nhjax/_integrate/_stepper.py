@@ -82,7 +82,7 @@ Log = TypeVar("Log")
 
 
 class RunEnd(NamedTuple, Generic[Rows, Log]):
-    """The end of a run: its state and time, the saved rows, and the log reported.
+    """The end of a run: its state and time, the saved rows, and the log.
 
     The `log` is None for a stepper without a log.
     """

@@ -401,9 +401,9 @@ class PartitionedRungeKutta(AbstractMethod):
 
     The nodes c_i = Σ_j a_ij and the symplectic conjugate â_ij = b_j (1 - a_ji / b_i)
     follow from the tableau. The float64 coefficients are taken as exact, and conditions
-    on them are checked to 1e-13. (With 12 or more stages the defect of the first order
-    condition that fails can be as small as that, and `orders` is then too high.) For
-    systems with constraints the tableau must satisfy H1, H2 and H3.
+    on them are checked to 1e-13. (With 12 or more stages, the first order condition
+    that fails can have a defect below 1e-13; `orders` is then too high.) For systems
+    with constraints the tableau must satisfy H1, H2 and H3.
 
     !!! example
 

@@ -7,10 +7,10 @@ them is an `AbstractOperator`. The classes differ in how they store the entries:
 - `DenseMatrix` stores all entries, `DiagonalMatrix` only the diagonal.
 - `SparseMatrix` stores the entries of a Jacobian B whose rows have few entries, in
   places that are known when the program is traced. `WeightedTranspose` is diag(w) Bᵀ.
-- `BlockTridiagonalInverse` stores the factors of a block tridiagonal matrix such as
-  B K⁻¹ Bᵀ, whose inverse it is.
+- `BlockTridiagonalInverse` is the inverse of a block tridiagonal matrix such as B K⁻¹
+  Bᵀ, stored as its factors.
 
-Code outside this file does not ask for the class of an operator: it calls the methods.
+Code outside this file does not check the class of an operator: it calls the methods.
 """
 
 from abc import abstractmethod
@@ -284,7 +284,7 @@ class WeightedTranspose(AbstractOperator):
         return self.weights[:, None] * self.matrix.as_matrix().T
 
     def first_columns(self, count: int) -> "WeightedTranspose":
-        """Return the matrix of the first columns, which must be all columns."""
+        """Return the first `count` columns; only the count of all is supported."""
         assert count == self.matrix.pattern.shape[0]
         return self
 

@@ -65,10 +65,10 @@ def uses_first_order_terms(
 
 
 def _forces_have_slopes(stages: StageEquations) -> bool:
-    """Return whether forces can be differentiated by velocities in forward mode.
+    """Return whether forces have forward-mode derivatives in the velocities.
 
-    Callbacks cannot, nor can functions with a custom rule for reverse mode only. No
-    other part of a step needs this derivative.
+    Callbacks and functions with a custom rule for reverse mode only do not have them.
+    No other part of a step needs this derivative.
     """
 
     def force(u):

@@ -231,8 +231,8 @@ def check_third_argument(
 ) -> None:
     """Raise a `TypeError` if a function of a system takes a variable it never gets.
 
-    The functions of a Lagrangian system receive v, and those of a Hamiltonian system p.
-    Holonomic constraints receive neither. `letter` is "v" or "p".
+    The functions of a Lagrangian system receive v, and the functions of a Hamiltonian
+    system receive p. Holonomic constraints receive neither. `letter` is "v" or "p".
     """
     signature = _signature(function)
     given = [] if signature is None else _positional_names(signature)[2:3]

@@ -63,7 +63,7 @@ def release(value: ArrayValue) -> None:
         value.buffer.holders -= 1
 
 
-# Larger arrays are kept in memory where there is a choice.
+# Larger arrays are kept in memory if both places are possible.
 MOST_IN_REGISTERS = 128
 # At most this many numbers are loaded, stored or computed one by one.
 MOST_ONE_BY_ONE = 4096

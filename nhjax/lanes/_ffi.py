@@ -8,8 +8,8 @@ its size. Names may change: the names here are those of version 0.3, and version
 the same fields at the same offsets. A test compares them with the installed header.
 """
 
-# The lowest version of the interface that has all that the handler uses. A runtime
-# refuses a handler that requires a newer version than its own.
+# The lowest version of the interface that has all fields that the handler uses. A
+# runtime refuses a handler that requires a newer version than its own.
 MAJOR, MINOR = 0, 1
 
 # Values of the interface's enumerations.

@@ -72,7 +72,7 @@ class Region:
 class Node:
     """A node of the graph: a number that is computed, or a statement.
 
-    `attr` is what the operation needs besides its arguments: the value of a constant,
+    `attr` is the data of the operation besides its arguments: the value of a constant,
     the address of a load, the loop of a parameter. The fields from `is_live` on belong
     to the passes over the finished graph: whether the node is needed, whether it
     differs between members, whether a uniform value is needed as a vector too, and the
@@ -164,7 +164,7 @@ class Graph:
     def constant(self, value: Any, dtype: str, is_structural: bool = False) -> Node:
         """Return the node of a constant.
 
-        A product with a structural zero is zero whatever the other factor is.
+        A product with a structural zero is zero for every value of the other factor.
         Structural zeros come from padding and from tangents that do not exist.
         """
         value = np.dtype(dtype).type(value)
@@ -217,7 +217,7 @@ class Graph:
     def statement(
         self, op: str, args: tuple[Node, ...], dtype: str = "", attr: Any = None
     ) -> Node:
-        """Create a node that stays where it is: a statement, or a result of one."""
+        """Create a node that is not moved: a statement, or a statement's result."""
         return Node(op, args, dtype, self.region, self.next_number(), attr)
 
     def op(self, op: str, *args: Node, dtype: str | None = None) -> Node:

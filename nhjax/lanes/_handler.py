@@ -8,7 +8,7 @@ once in a process, because compiling it with each program took 20 to 50 ms.
 A call is divided into blocks, of as many members as the kernel computes at once. The
 caller's thread runs blocks, and so do threads of XLA's pool where this pays:
 
-- An atomic counter hands out blocks, to the caller and to its helpers alike.
+- An atomic counter assigns blocks to the caller and to its helpers.
 - The caller asks the pool for helpers: for fewer than the pool has threads, because it
     works itself, and for so few that each works longer than it takes to wake it.
 - At the end the caller waits for the blocks that helpers have begun. It does not wait
@@ -20,8 +20,8 @@ caller's thread runs blocks, and so do threads of XLA's pool where this pays:
 
 Several devices of one process share the pool, and so do several threads of Python. For
 this reason all programs of the process share a counter of the threads that are working
-in blocks. If there are as many as the pool has threads, no helper is asked for; if
-there are more, helpers leave after a block.
+in blocks. If their number equals the number of threads of the pool, a call starts no
+helper; if it is larger, helpers leave after a block.
 """
 
 import time

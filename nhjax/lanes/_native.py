@@ -39,7 +39,7 @@ _PASSES = 1
 # was 6 percent slower, and a long kernel 2 percent faster.
 _LONG_TEXT = 1_000_000
 _GENERATION_OF_SHORT, _GENERATION_OF_LONG = 2, 1
-# The level of both for programs that are wanted quickly: no optimisation.
+# The level of both for programs that must compile quickly: no optimisation.
 _QUICK = 0
 
 
@@ -175,7 +175,7 @@ def _compiled(
     # The types and constants of modules in the global context are never freed.
     context = llvm.create_context()
     module, *others = [llvm.parse_assembly(text, context) for text in texts]
-    # Without these, the passes would use the layout of no particular machine.
+    # Without these, the passes would use a generic layout instead of this machine's.
     for part in (module, *others):
         part.triple = machine.triple
         part.data_layout = str(machine.target_data)

@@ -234,7 +234,7 @@ def atan(x: Value) -> Value:
 def atan2(y: Value, x: Value) -> Value:
     """Return the angle from the first axis of the point (x, y)."""
     a, b = absolute(y), absolute(x)
-    # Two infinities have the angle of equal numbers; two zeros have 0 or pi.
+    # For two infinities the angle is as for equal numbers; for two zeros it is 0 or pi.
     are_infinite = a.equals(math.inf) & b.equals(math.inf)
     a, b = where(are_infinite, 1.0, a), where(are_infinite, 1.0, b)
     scale = where((a > 2.0**1000) | (b > 2.0**1000), 0.25, 1.0)

@@ -78,7 +78,7 @@ class CarAxis(AbstractExample):
 
     @classmethod
     def level(cls, **parameters: ArrayLike) -> "CarAxis":
-        """Create a level axle on springs at their rest length, as the published one.
+        """Create a level axle on springs at their rest length, as in the source.
 
         It moves sideways at the rate at which the line of the wheels turns at t = 0.
         `parameters` are the parameters of the class.

@@ -21,8 +21,8 @@ class ChaplyginSphere(AbstractRollingBody):
     [m/s, 1/s]. Φ is the height of the contact, and φ the horizontal velocity there;
     their multipliers are the force of the plane in space [N].
 
-    The angular momentum about the contact, R K with K = I ω + m r² (ω - (ω·γ) γ), does
-    not change in space, so that |K|² and K·γ are constant too, and the system is
+    The angular momentum about the contact, R K with K = I ω + m r² (ω - (ω·γ) γ), is
+    constant in space, so that |K|² and K·γ are constant too, and the system is
     integrable.
 
     **Parameters:** `mass` m [kg]; `radius` r [m]; `moments` (I₁, I₂, I₃) about the
@@ -91,7 +91,7 @@ class ChaplyginSphere(AbstractRollingBody):
         }
 
     def points(self, t: FloatScalarLike, q: Array) -> dict[str, Array]:
-        """Compute where the centre, the contact and the three poles are [m].
+        """Compute the positions of the centre, contact and three poles [m].
 
         The poles are where the principal axes leave the sphere.
         """

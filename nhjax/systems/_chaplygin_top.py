@@ -106,7 +106,7 @@ class ChaplyginTop(AbstractRollingBody):
         return self.contact_momentum(q, v) @ s, v[5] * jnp.sqrt(weighted)
 
     def points(self, t: FloatScalarLike, q: Array) -> dict[str, Array]:
-        """Compute where the centres, the contact and the pole are [m].
+        """Compute the positions of the centres, the contact and the pole [m].
 
         The pole is where the third axis leaves the sphere.
         """

@@ -29,15 +29,16 @@ class FlyballGovernor(AbstractExample):
 
     with q = (φ, β₁, β₂, s): the angle of the shaft, the angles of the rods below the
     horizontal [rad], and the height of the slider [m], which turns with the shaft.
-    Along u_k = ± cos β_k e(φ) - sin β_k e_z lie from its hinge at the radius a and the
-    height h the centre c_k = ½ l u_k of a rod and its ball b_k = l u_k.
+    The hinges are at the radius a and the height h. From its hinge, each rod points
+    along u_k = ± cos β_k e(φ) - sin β_k e_z; its centre is at c_k = ½ l u_k, and its
+    ball at b_k = l u_k.
 
     A coupler of length d ties the middle of each rod to the slider at the radius a. It
-    either is a rigid rod (`couplers="rods"`), V = 0 and Φ_k = d_k² - d² with d_k the
+    is either a rigid rod (`couplers="rods"`), V = 0 and Φ_k = d_k² - d² with d_k the
     distance of its ends, or a spring with a damper (`"springs"`), V = Σ K/2 (d_k - d)²
-    and forces -C ḋ_k, for which the published ones are stiff.
+    and forces -C ḋ_k, for which the published parameters are stiff.
 
-    In `args` may be a torque on the shaft [N m], a scalar.
+    `args` may contain a torque on the shaft [N m], a scalar.
 
     **Parameters:** `shaft_inertia` J_s, `slider_inertia` J_m, `rod_inertias` (A, B)
     along and across a rod [kg m²]; `slider_mass` m, `rod_mass` m_r, `ball_mass` M [kg];

@@ -9,7 +9,7 @@ from jaxtyping import Array, Float
 class Frame(NamedTuple):
     """A rigid motion: a point c of the body is at origin + rotation c in space.
 
-    A rate of it has the same two parts.
+    The rate of a motion has the same two parts.
     """
 
     rotation: Float[Array, "3 3"]

@@ -22,8 +22,8 @@ class HeavyTop(AbstractExample):
     ℓ = m/2 |ω × X|² + ½ (J₁ω₁² + J₂ω₂² + J₃ω₃²) - m g e₃·(R X),
 
     with q the attitude R, a quaternion, ω the body angular velocity along the principal
-    axes, and X the centre of mass in the body, seen from the pivot. It is Lagrange's
-    top where J₁ = J₂ and X lies on the third axis, as by default.
+    axes, and X the centre of mass in the body, seen from the pivot. If J₁ = J₂ and X
+    lies on the third axis, as by default, it is Lagrange's top.
 
     **Parameters:** `mass` m [kg], `moments` (J₁, J₂, J₃) about the centre of mass
     [kg m²], `centre` X [m], `gravity` g [m/s²]; `retraction`, the retraction of SO(3).

@@ -21,7 +21,7 @@ from ._rolling_body import AbstractRollingBody
 
 
 class Rattleback(AbstractRollingBody):
-    """A stone of the shape of an ellipsoid, with inertia askew, that rolls on a plane.
+    """A rolling stone, an ellipsoid whose axes of inertia are not its own axes.
 
     ℓ = m/2 |v|² + ½ ω·(J ω) - m g z,  Φ = z + e₃·(R s),  φ = (R (v + ω × s))₁₂,
     s = h e₃ - A γ / √(γ·(A γ)),  A = diag(a², b², c²),  γ = Rᵀ e₃,
@@ -150,13 +150,13 @@ class Rattleback(AbstractRollingBody):
         return jnp.concatenate([jnp.zeros_like(v[:3]), -damping * v[3:]])
 
     def invariants(self, t: FloatScalarLike, q: Array, v: Array) -> dict[str, Array]:
-        """Compute the conserved quantities: the energy, and none with damping."""
+        """Compute the conserved quantities: the energy, or with damping none."""
         if self.damping is not None:
             return {}
         return {"energy": self.energy(t, q, v)}
 
     def points(self, t: FloatScalarLike, q: Array) -> dict[str, Array]:
-        """Compute where the centre of mass, the contact and the two ends are [m]."""
+        """Compute the positions of the centre of mass, contact and both ends [m]."""
         middle = jnp.zeros_like(q[4:]).at[2].set(self.depth)
         tip = jnp.zeros_like(middle).at[0].set(self.semiaxes[0].astype(q.dtype))
         return {

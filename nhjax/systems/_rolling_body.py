@@ -108,10 +108,10 @@ class AbstractRollingBody(AbstractConstrainedGroupExample):
         angular_velocity: tuple[float, ...] | Array,
         contact: tuple[float, float] | Array = (0.0, 0.0),
     ) -> Self:
-        """Make the same body with other initial data, which are consistent.
+        """Create the same body with other, consistent initial data.
 
         `attitude` is a quaternion, `angular_velocity` ω is in body axes, and `contact`
-        is where on the plane the body touches it.
+        is the point of the plane where the body touches it.
         """
         quaternion = coordinates(attitude)
         quaternion = quaternion / jnp.sqrt(quaternion @ quaternion)

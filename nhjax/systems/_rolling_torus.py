@@ -82,7 +82,7 @@ class RollingTorus(AbstractRollingBody):
     def steady(
         cls, tilt: ArrayLike, turn_rate: ArrayLike, **parameters: Any
     ) -> "RollingTorus":
-        """Create a torus that goes round steadily at the rate Ω = `turn_rate` [1/s].
+        """Create a torus that turns steadily at the rate Ω = `turn_rate` [1/s].
 
         `tilt` θ [rad] is the angle of the axle to the vertical. The angular velocity is
         (0, Ω sin θ, ω₃) along the axes (horizontal, upward in the plane of the disc,
@@ -115,8 +115,8 @@ class RollingTorus(AbstractRollingBody):
 
         `tilt` [rad] is the angle of the axle to the vertical, below π/2, and
         `radius_of_path` the radius [m] of the circle of the centre, towards the middle
-        of which the torus leans; it is 0 where the centre rests. `parameters` are those
-        of the class.
+        of which the torus leans. It is 0 if the centre rests. `parameters` are the
+        parameters of the class.
         """
         angle, path = parameter(tilt), parameter(radius_of_path)
         _require_between("tilt", angle, 0.5 * jnp.pi, "π/2")
@@ -124,7 +124,7 @@ class RollingTorus(AbstractRollingBody):
         body = cls(**parameters)
         sin, cos = jnp.sin(angle), jnp.cos(angle)
         height = body.radius * sin + body.tube_radius
-        # Minus ω₃ over Ω, of the velocity of the centre.
+        # The value of -ω₃ / Ω, from the velocity of the centre.
         roll = path - body.tube_radius * sin * cos
         roll = roll / (body.radius + body.tube_radius * sin)
         momentum = body.diametral_inertia * cos + body.axial_inertia * roll
@@ -167,7 +167,7 @@ class RollingTorus(AbstractRollingBody):
         return {"energy": self.energy(t, q, v)}
 
     def points(self, t: FloatScalarLike, q: Array) -> dict[str, Array]:
-        """Compute where the centre, the contact and a point of the rim are [m].
+        """Compute the positions of the centre, contact and a point of the rim [m].
 
         The point of the rim is on the first body axis, in the middle of the tube.
         """

@@ -115,6 +115,6 @@ def _gudermannian(x):
 
 
 def _sech(x):
-    # 1/cosh overflows on its way to the zero that a long motion tends to.
+    # 1/cosh tends to zero in a long motion, but cosh overflows.
     decay = np.exp(-np.abs(x))
     return 2 * decay / (1 + decay**2)

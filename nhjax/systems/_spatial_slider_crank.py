@@ -160,5 +160,5 @@ class SpatialSliderCrank(AbstractExample):
 
 
 def _along(x: Array) -> Float[Array, " 3"]:
-    """Make the point at x on the x-axis."""
+    """Create the point at x on the x-axis."""
     return jnp.stack([x, jnp.zeros_like(x), jnp.zeros_like(x)])

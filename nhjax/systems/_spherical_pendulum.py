@@ -124,7 +124,7 @@ class SphericalPendulum(AbstractExample):
 def _height(
     q0: np.ndarray, v0: np.ndarray, length: float, g: float
 ) -> Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]:
-    """Make the function that computes (z, ż) of times.
+    """Create the function that computes (z, ż) at given times.
 
     l²ż² is a cubic in z with the leading coefficient 2g and the roots z₁ <= z₂ <= z₃.
     In powers of z - z₀ its small roots keep their digits.

@@ -32,7 +32,7 @@ class TurntableBall(AbstractConstrainedGroupExample):
     the ball, and its mass is one. The constraints are affine, so that energy is not
     conserved, but the moving energy E - Ω(x v_y - y v_x) is.
 
-    The constraints speak of (ω_ξ, ω_η, ω_ζ), which is
+    The constraints contain (ω_ξ, ω_η, ω_ζ), which is
 
     - with `frame="space"` (the default) the spatial angular velocity Rω: the physical
         ball;
@@ -175,8 +175,8 @@ class TurntableBall(AbstractConstrainedGroupExample):
     ) -> tuple[tuple[np.ndarray, np.ndarray], np.ndarray, np.ndarray]:
         """Compute (q, v, λ) at `t`, for consistent data and a = b = c.
 
-        All but the attitude in closed form; the attitude from the known angular
-        velocity by a linear equation, to round-off.
+        The attitude is the solution of a linear equation with the known angular
+        velocity, to round-off. All other values have closed formulas.
         """
         (quaternion, (x0, y0)), v0 = self._consistent_data()
         a, b, c = np.asarray(self.moments, dtype=np.float64)

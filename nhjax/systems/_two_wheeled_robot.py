@@ -150,7 +150,7 @@ class TwoWheeledRobot(AbstractNonholonomicExample):
         }
 
     def _centres(self, q: Array) -> tuple[Array, Array, Array]:
-        """Compute where the platform's centre and the right and left wheel are."""
+        """Compute the positions of the platform's centre, right and left wheel."""
         cos, sin = jnp.cos(q[2]), jnp.sin(q[2])
         aside = self.half_track * jnp.stack([-sin, cos])
         centre = q[:2] + self.offset * jnp.stack([cos, sin])

@@ -178,7 +178,7 @@ class UnicycleInCoordinates(AbstractConstrainedExample):
 def _lagrangian(
     unicycle: Unicycle | UnicycleInCoordinates, q: Array, v: Array
 ) -> Array:
-    # The turn is the same for body and for spatial velocities.
+    # The rotation is the same for body and for spatial velocities.
     translation = 0.5 * unicycle.mass * (v[0] ** 2 + v[1] ** 2)
     rotation = 0.5 * unicycle.inertia * v[2] ** 2
     return translation + rotation - 0.5 * unicycle.spring * (q[0] ** 2 + q[1] ** 2)

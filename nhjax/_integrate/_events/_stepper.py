@@ -86,8 +86,8 @@ class ReplayedIteration(eqx.Module):
     - `which`: the index of the event at the end of the iteration, or -1.
     - `size`: the size of the step.
     - `scale`: the size of the condition of that event in the step.
-    - `is_active`: whether it took a step or met an event without one. Otherwise the
-        iteration was idle.
+    - `is_active`: whether the iteration took a step or handled an event without a step.
+        Otherwise the iteration was idle.
     - `was_truncated`: whether the iteration before it was discarded, because there is
         an event in the step.
     """
@@ -163,7 +163,7 @@ class EventStepper(AbstractStepper[EventCarry, ReplayedIteration]):
         """Return the stepper for the user's events in a run that starts at y.
 
         **Raises:** `TypeError`, `ShapeError` or `DTypeError` for a function of an event
-        that returns something wrong.
+        that returns a wrong type, shape or dtype.
         """
         given = plain.time(0), y, plain.args
         conditions = Conditions.of(events, *given)
