@@ -17,9 +17,9 @@ class ChaplyginSphere(AbstractRollingBody):
     φ = (R (v - r ω × γ))₁₂,  γ = Rᵀ e₃,
 
     with q = (R, x): the attitude, a quaternion, and the position of the centre, which
-    is that of mass [m]; (v, ω) are their body velocities along the principal axes [m/s,
-    1/s]. Φ is the height of the contact, and φ the horizontal velocity there; their
-    multipliers are the force of the plane in space [N].
+    is also the centre of mass [m]; (v, ω) are their body velocities along the principal
+    axes [m/s, 1/s]. Φ is the height of the contact, and φ the horizontal velocity
+    there; their multipliers are the force of the plane in space [N].
 
     The angular momentum about the contact, R K with K = I ω + m r² (ω - (ω·γ) γ), does
     not change in space, so that |K|² and K·γ are constant too, and the system is

@@ -23,8 +23,8 @@ class ChaplyginTop(AbstractRollingBody):
     φ = (R (v + ω × s))₁₂,  s = a e₃ - r γ,  γ = Rᵀ e₃,
 
     with q = (R, x): the attitude, a quaternion, and the position of the centre of mass
-    [m]; (v, ω) are their body velocities along the principal axes [m/s, 1/s]. The
-    centre of mass is below that of the sphere by a where the third axis is upward. The
+    [m]; (v, ω) are their body velocities along the principal axes [m/s, 1/s]. If the
+    third axis is upward, the centre of mass is below the centre of the sphere by a. The
     contact is s, seen from the centre of mass; Φ is its height, and φ the horizontal
     velocity there. The multipliers are the force of the plane in space [N].
 

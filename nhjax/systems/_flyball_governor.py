@@ -27,10 +27,11 @@ class FlyballGovernor(AbstractExample):
     L = (J_s + J_m)/2 φ̇² + m/2 ṡ² - m g s + Σ_{k=1,2} (m_r/2 |ċ_k|² + M/2 |ḃ_k|²
     + B/2 |u̇_k|² + A/2 φ̇² sin² β_k - g (m_r c_k + M b_k) · e_z) - V,
 
-    with q = (φ, β₁, β₂, s): the angle of the shaft and those of the rods below the
-    horizontal [rad], and the height of the slider [m], which turns with the shaft.
-    Along u_k = ± cos β_k e(φ) - sin β_k e_z lie from its hinge at the radius a and the
-    height h the centre c_k = ½ l u_k of a rod and its ball b_k = l u_k.
+    with q = (φ, β₁, β₂, s): the angle of the shaft and the angles of the rods below the
+    horizontal [rad], and the height of the slider [m], which turns with the shaft. Each
+    rod has the direction u_k = ± cos β_k e(φ) - sin β_k e_z, and its hinge is at the
+    radius a and the height h. Seen from the hinge, the centre of the rod is c_k = ½ l
+    u_k, and its ball is b_k = l u_k.
 
     A coupler of length d ties the middle of each rod to the slider at the radius a. It
     either is a rigid rod (`couplers="rods"`), V = 0 and Φ_k = d_k² - d² with d_k the

@@ -22,8 +22,8 @@ class NonholonomicParticle(AbstractConstrainedExample):
 
     L = m/2 (ẋ² + ẏ² + ż²) - k/2 (x² + y²),  Φ = ż - y ẋ,  q = (x, y, z).
 
-    The driver y is a harmonic oscillator; in the time s with ds = ν dt/√(1 + y²),
-    ν² = k/m, so is the passenger x.
+    The driver y is a harmonic oscillator. The passenger x is a harmonic oscillator in
+    the rescaled time s with ds = ν dt/√(1 + y²), ν² = k/m.
 
     **Parameters:** `mass` m [kg], `stiffness` k [N/m]; lengths are in metres and Φ
     has a unit slope of 1/m before y.

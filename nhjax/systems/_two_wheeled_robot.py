@@ -26,8 +26,9 @@ class TwoWheeledRobot(AbstractNonholonomicExample):
 
     q = (x, y, θ, φ_R, φ_L): the middle r of the axle [m], the heading, and the angles
     of the right and of the left wheel [rad], which grow as the robot goes ahead. The
-    centre of mass of the platform is c = r + d e, those of the wheels are w = r ∓ b n,
-    with the heading e and n to its left. The wheels roll and do not slip sideways:
+    centre of mass of the platform is c = r + d e, and the centres of the wheels
+    are w = r ∓ b n, with the unit vectors e along the heading and n to its left. The
+    wheels roll and do not slip sideways:
 
     Φ = (n·ṙ, e·ṙ + b θ̇ - ρ φ̇_R, e·ṙ - b θ̇ - ρ φ̇_L).
 
