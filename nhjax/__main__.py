@@ -101,8 +101,8 @@ def _parser() -> argparse.ArgumentParser:
 
 def _add_options(parser: argparse.ArgumentParser, function: Callable) -> None:
     parameters = inspect.signature(function).parameters
-    # Runs of one length in time can be told to be as long as so many steps; those of
-    # one length in steps have an option of their own for that.
+    # Studies that set the length in time also accept it as a number of steps. Studies
+    # that set it in steps have their own option for this.
     length = (
         parser.add_mutually_exclusive_group() if "final_time" in parameters else None
     )
@@ -114,7 +114,7 @@ def _add_options(parser: argparse.ArgumentParser, function: Callable) -> None:
         keywords = dict(_OPTIONS[name])
         keywords["help"] += told
         group = length if length and name == "final_time" else parser
-        # The defaults stay where they are: in the study.
+        # The study itself supplies the defaults.
         group.add_argument(
             f"--{name.replace('_', '-')}", default=argparse.SUPPRESS, **keywords
         )
@@ -142,7 +142,7 @@ def _add_options(parser: argparse.ArgumentParser, function: Callable) -> None:
     parser.add_argument(
         "--quick",
         action="store_true",
-        help="a small form of the study; options that are given count",
+        help="a small form of the study; other options override its values",
     )
     parser.add_argument(
         "--progress",

@@ -29,7 +29,7 @@ class DTypeError(TypeError):
 
 
 class NonFiniteError(ValueError):
-    """Raised if an argument, or a user's function at it, is infinite or NaN."""
+    """Raised if an argument, or the value of a user's function, is infinite or NaN."""
 
 
 class ConstraintViolationError(ValueError):
@@ -75,11 +75,10 @@ class IntegrationError(RuntimeError):
 
 @contextlib.contextmanager
 def naming(called: str, function: Any, args: Any = ...) -> Iterator[None]:
-    """Add a note to what is raised while a function of the user is traced.
+    """Add a note to exceptions that are raised while a user's function is traced.
 
-    The note names the function as it is `called`, with its file and line, and says what
-    helps if that is known. `args` is what the user gave as such, if the function takes
-    it.
+    The note names the function by `called`, with its file and line, and gives advice
+    for known errors. `args` is the user's argument `args`, if the function receives it.
     """
     try:
         yield
@@ -108,7 +107,7 @@ _ADVICE = (
         jax.errors.NonConcreteBooleanIndexError,
         "write `jnp.where(condition, a, 0.0)` in place of `a[condition]`.",
     ),
-    # The functions of `math` ask for a number, which raises the second of these.
+    # The functions of `math` need a number, which raises the second of these errors.
     (
         (jax.errors.TracerArrayConversionError, jax.errors.ConcretizationTypeError),
         "use functions of `jax.numpy` in place of those of `numpy` and `math`, and "
@@ -118,7 +117,7 @@ _ADVICE = (
 
 
 def _about_args(error: Exception, args: Any) -> str:
-    """Say what `args` is if an error looks as though it were something else."""
+    """Describe `args` if the error suggests that the function expects other `args`."""
     if args is None and "NoneType" in str(error):
         return " Here `args` is None: has `args=...` been left out of the call?"
     if isinstance(error, KeyError) and isinstance(args, dict):
@@ -140,7 +139,7 @@ def _place(function: Any) -> str:
 
 
 def is_traced(*arrays: object) -> bool:
-    """Tell whether any of the arrays has no value yet (inside jit, vmap or grad)."""
+    """Return whether any of the arrays is traced (inside jit, vmap or grad)."""
     return any(isinstance(x, Tracer) for x in arrays)
 
 
@@ -152,11 +151,11 @@ def check_choice(name: str, value: Any, choices: tuple[str, ...]) -> None:
 
 
 class Check(NamedTuple):
-    """A condition, and the exception that says what is wrong where it fails.
+    """A condition, and the exception to raise if it fails.
 
-    `error(*values)` makes the exception from values as NumPy arrays, also in a compiled
-    program. It should be defined at the top level of a module: with a function that is
-    made anew for every check, an eager `vmap` would compile anew at each call.
+    `error(*values)` creates the exception from NumPy arrays, also in a compiled
+    program. Define it at the top level of a module: if each check created a new
+    function, an eager `vmap` would compile again at each call.
     """
 
     ok: Bool[Array, ""] | np.bool_ | bool
@@ -167,12 +166,13 @@ class Check(NamedTuple):
 def require(tree: T, *checks: Check) -> T:
     """Return `tree` if all checks hold; otherwise raise for the first that fails.
 
-    With concrete values the exception is raised here and now. With traced ones it is
+    With concrete values the exception is raised immediately. With traced values it is
     raised when the compiled program runs, as a runtime error of JAX with the same
-    message, which under `vmap` begins with the first member that fails. The returned
-    tree must be used afterwards: `jax.jit` drops checks whose result is not used.
+    message, which under `vmap` begins with the index of the first member that fails.
+    The returned tree must be used afterwards: `jax.jit` drops checks whose result is
+    not used.
     """
-    # The message is about values alone, so that their derivatives are dropped.
+    # The message needs only values, so that their derivatives are dropped.
     checks = tuple(
         Check(check.ok, check.error, _without_tangents(check.values))
         for check in checks
@@ -186,9 +186,9 @@ def require(tree: T, *checks: Check) -> T:
 
 
 def hold(*checks: Check) -> Bool[Array, ""] | None:
-    """Tell in a compiled program whether all checks hold; None if that is known.
+    """Return whether all checks hold, as a traced value; None if this is known already.
 
-    With concrete values an exception is raised for the first that fails.
+    If a check of concrete values fails, its exception is raised.
     """
     later = _undecided(checks)
     if not later:
@@ -197,7 +197,7 @@ def hold(*checks: Check) -> Bool[Array, ""] | None:
 
 
 def _undecided(checks: tuple[Check, ...]) -> list[Check]:
-    """Return the checks of traced values; raise for the first other one that fails."""
+    """Return the checks of traced values; raise for the first failed concrete check."""
     later = []
     for check in checks:
         if is_traced(check.ok, *jax.tree.leaves(check.values)):
@@ -231,12 +231,12 @@ def _first_error(bad: np.ndarray, values: tuple[np.ndarray, list]) -> Exception:
 
 
 def member_name(index: tuple[int, ...]) -> int | tuple[int, ...] | None:
-    """Write an index into a batch as users would; it is None without a batch."""
+    """Format an index into a batch as users would write it; None without a batch."""
     return index if len(index) > 1 else (index[0] if index else None)
 
 
 # This function is compiled as a whole, since an eager `vmap` would compile the
-# call-back anew at each call.
+# call-back again at each call.
 @eqx.filter_jit
 def raise_where(
     tree: T,
@@ -247,8 +247,8 @@ def raise_where(
     """Return `tree`; where `bad` holds, raise when the compiled program runs.
 
     The exception is `error(bad, values)`, called with NumPy arrays on the host; under
-    `vmap` all of them have the batch as leading axes. Only a call-back can put numbers
-    into a message, and only one of our own sees the members of a batch.
+    `vmap` all of them have the batch as leading axes. A message with numbers needs a
+    call-back, and this call-back receives all members of a batch.
     """
     # The same array often belongs to several checks.
     leaves, treedef = jax.tree.flatten(values)
@@ -266,14 +266,15 @@ def raise_where(
 
     rest = [None if eqx.is_array(leaf) else leaf for leaf in leaves]
     passed = _passes(on_host)(bad, *arrays)
-    # Whatever part of the tree is used must wait for the verdict.
+    # Every part of the tree must depend on the check, so that `jax.jit` keeps the
+    # check.
     dynamic, static = eqx.partition(tree, eqx.is_array)
     dynamic = jax.tree.map(lambda x: jnp.where(passed, x, jnp.zeros_like(x)), dynamic)
     return eqx.combine(dynamic, static)
 
 
 def _passes(on_host: Callable[..., Any]) -> Callable[..., Bool[Array, ""]]:
-    """Make a function of (bad, *arrays) that is True unless `bad`, where it raises.
+    """Create a function of (bad, *arrays) that returns True, or raises if `bad`.
 
     The exception is raised by `on_host(bad, *arrays)`, called on the host.
     """
@@ -284,7 +285,7 @@ def _passes(on_host: Callable[..., Any]) -> Callable[..., Bool[Array, ""]]:
 
     @passes.defjvp
     def _(primals, tangents):
-        # A call-back would take no tangents.
+        # JAX cannot differentiate a call-back.
         del tangents
         passed = passes(*primals)
         zero: Any = np.zeros(passed.shape, jax.dtypes.float0)
@@ -294,7 +295,7 @@ def _passes(on_host: Callable[..., Any]) -> Callable[..., Bool[Array, ""]]:
 
 
 def _one_result_of_batch(on_host: Callable[..., Any]) -> Callable[..., Bool[Array, ""]]:
-    """Wrap the function of `_passes`, so that a batch has one result for all members.
+    """Wrap the function of `_passes`, so that a batch has one common result.
 
     If each member had its own result, `vmap` would call the host even if all members
     are good.
@@ -326,24 +327,24 @@ def _within_a_compiled_program() -> Iterator[None]:
     yield
 
 
-# XLA prints the frames of Python from that of the deepest entry of a traceback outwards
-# to the main program, among them some twenty frames of JAX. The frame of a generator
-# that waits has no frames outside of it, so that nothing else is printed.
+# XLA prints the Python frames from the deepest entry of a traceback outwards to the
+# main program, including about twenty frames of JAX. The frame of a suspended generator
+# has no outer frames, so that only this frame is printed.
 _NOWHERE: Any = _within_a_compiled_program()
 next(_NOWHERE)
 
 
 def _short_traceback() -> TracebackType:
-    """Make a traceback of one entry, that of the waiting generator above."""
+    """Create a traceback with one entry, the suspended generator above."""
     frame = _NOWHERE.gi_frame
     return TracebackType(None, frame, frame.f_lasti, frame.f_lineno)
 
 
 class _Once(logging.Filter):
-    """A filter that drops what JAX logs of a call-back that raised our exception.
+    """A filter that drops the log entries of JAX for exceptions of `raise_where`.
 
-    JAX logs such exceptions before it raises them. The user would read the message
-    twice.
+    JAX logs such exceptions before it raises them, so that the user would read the
+    message twice.
     """
 
     def filter(self, record: logging.LogRecord) -> bool:

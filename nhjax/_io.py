@@ -63,7 +63,7 @@ def save(path: str | os.PathLike[str], tree: Any) -> None:
 
     **Arguments:**
 
-    - `path`: the name of the file, used as it is; .npz is the usual suffix.
+    - `path`: the name of the file, used without change; .npz is the usual suffix.
     - `tree`: an `nhjax.State`, `nhjax.Solution` (without dense output) or
         `nhjax.Checkpoint`, or tuples, lists and dictionaries of these, of arrays,
         numbers and strings.
@@ -200,7 +200,7 @@ def installed_version() -> str:
 
 
 def _read(path: Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
-    """Read all entries; the checksums of the .npz detect damaged ones."""
+    """Read all entries; the checksums of the .npz file detect damaged entries."""
     # A file that NumPy opens itself stays open if it is damaged.
     with open(path, "rb") as opened:
         # For other files NumPy assumes pickled objects, and advises to load them.

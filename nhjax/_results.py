@@ -75,7 +75,7 @@ class RESULTS(eqx.Enumeration, metaclass=_Named):
         + ", or more iterations; where stiff forces magnify round-off, a `tolerance` "
         "of the stage solver. None of these helps in two cases. Forces "
         + JUMPS
-        + " And if constraints become dependent during the step, such as those of a "
+        + " And if constraints become dependent during the step, for instance in a "
         "linkage whose bars lie in one line, the multipliers and the further motion "
         "are not determined."
     )
@@ -90,12 +90,11 @@ class RESULTS(eqx.Enumeration, metaclass=_Named):
         "the functions of the system along the trajectory, or try a smaller `dt`."
     )
     left_chart = (
-        "A step turned so far that it left the chart of the retraction (a rotation "
-        "near π for Cayley and near 2π for Exponential, from the origin of the chart, "
-        "which is in the middle of a step or at its start), or its iteration left "
-        "it: with Cayley and two stages, a step of about one radian may have no "
-        "solution. Use a smaller `dt`, `retraction=nhjax.Exponential()`, or more "
-        "stages."
+        "A step, or its iteration, left the chart of the retraction: it turned by an "
+        "angle near π (Cayley) or 2π (Exponential) from the origin of the chart, which "
+        "is in the middle of a step or at its start. With Cayley and two stages, a "
+        "step of about one radian may have no solution. Use a smaller `dt`, "
+        "`retraction=nhjax.Exponential()`, or more stages."
     )
     lost_constraints = (
         "Constraints are violated at the end of a step, although as many hold as were "

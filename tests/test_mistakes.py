@@ -941,7 +941,7 @@ SAVING = [
         lambda: ANY_SAVEAT(t1=5.0),
         ValueError,
         "SaveAt: `t1` must be True or False, got 5.0",
-        "Save at given times by `ts`",
+        "To save at given times, pass `ts`",
     ),
     row(
         "gave the start of the run where a flag belongs",

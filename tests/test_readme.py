@@ -92,8 +92,8 @@ def test_verdicts_on_the_paper_are_those_of_the_result():
     starts = {
         "q and p are of order": ["NonholonomicParticle", "Unicycle"],
         "CVT: erratic": ["At h = π/10", "At h = 1/10"],
-        "chaotic ensemble: the energy walks": ["The energy walks at random"],
-        "its mean square goes as": ["μ(E) goes as h^4", "μ(E) goes as h^10"],
+        "chaotic ensemble: the energy error": ["The energy follows a random walk"],
+        "its mean square is proportional": ["μ(E) goes as h^4", "μ(E) goes as h^10"],
         "no gain over SPARK and DLA": ["No gain over SPARK and DLA"],
         "ball on a turntable": ["The three linear", "The moving energy"],
     }

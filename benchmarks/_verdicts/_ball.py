@@ -78,15 +78,15 @@ def _linear(short, tolerances: dict) -> Claim:
     ours = max(float(np.max(run.largest_linear_errors())) for run in short.runs)
     below = all(x < max(t, 1e-14) for t, x in by_tolerance.items())
     return Claim(
-        "The three linear integrals are kept; the solver alone brings an error in, "
-        "lower than its tolerance (7.5)",
+        "The three linear integrals are kept; the only error comes from the solver, "
+        "and is below its tolerance (7.5)",
         "largest error for tolerances 1e-3, 1e-6, 1e-9, 1e-12 and round-off: "
         + ", ".join(f"{x:.0e}" for x in by_tolerance.values())
         + f" (simplified Newton; with exact Newton {max(exact.values()):.0e} at most)",
         command(PART),
         CONFIRMED if below and ours < 1e-13 else REFUTED,
         f"{ours:.0e} in the study, whose solver ends at round-off (the paper: fsolve "
-        "with 1e-12); Newton's own steps keep them whatever the tolerance",
+        "with 1e-12); steps by Newton's method keep them at any tolerance",
     )
 
 
@@ -133,11 +133,12 @@ def _frames() -> dict[str, float]:
 def _principal_axes(apart: dict[str, float]) -> Claim:
     return Claim(
         "ξ, η, ζ are the principal axes of the ball, and Φ has ω along them (7.5)",
-        f"distance at t = 5 of a ball with the body's ω in Φ from one with that of "
-        f"space: {apart['equal']:.0e} for a = b = c, {apart['unequal']:.1e} for (a, b, "
-        "c) = (0.3, 0.4, 0.5)",
+        f"distance at t = 5 of a ball with the body's ω in Φ from a ball with the "
+        f"ω of space in Φ: {apart['equal']:.0e} for a = b = c, "
+        f"{apart['unequal']:.1e} for (a, b, c) = (0.3, 0.4, 0.5)",
         command(PART),
         PRINT if apart["equal"] < 1e-8 < apart["unequal"] else DEPENDS,
         "a ball that rolls has the angular velocity of space in Φ; harmless where "
-        "a = b = c, which is all that the paper computes, and another system elsewhere",
+        "a = b = c, which is all that the paper computes, but a different system "
+        "for other a, b, c",
     )

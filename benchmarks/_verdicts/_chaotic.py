@@ -74,12 +74,12 @@ def _ten_times_as_long(members: int, final_time: float) -> Claim:
     tenths = [float(np.mean(x)) for x in np.array_split(squares, 10, axis=1)]
     walks = tenths[-1] > 1.5 * tenths[0]
     return Claim(
-        "Does DLA walk at random later? (no claim of the paper)",
+        "Does the energy of DLA follow a random walk later? (no claim of the paper)",
         f"μ in the tenths of t <= {long:g}, h = {h:g}: "
         + ", ".join(f"{x:.1e}" for x in tenths),
         command(PART),
         OURS,
-        "it does" if walks else "it does not walk at all in this time",
+        "it does" if walks else "no random walk is visible in this time",
     )
 
 
@@ -200,7 +200,8 @@ def _grows(fits: dict, stages) -> Claim:
     text, values = _exponents(fits, ("propagated",), stages)
     walks = all(0.6 < x < 1.3 for x in values)
     return Claim(
-        "The energy walks at random: its mean squared error grows with time (7.3)",
+        "The energy follows a random walk: its mean squared error grows with time "
+        "(7.3)",
         f"α in μ = A + D t^α, t <= 1e4, h = {STEP_SIZES[0]:g} and {STEP_SIZES[1]:g}: "
         + text,
         command(PART),
@@ -224,11 +225,13 @@ def _closures(curves: dict, fits: dict, stages, final_time: float) -> Claim:
     )
     return Claim(
         "The same with the other closures (not in the paper)",
-        f"α as above: {text}; μ of the symmetric closure over that of the paper's in "
-        f"the second half, h = {STEP_SIZES[0]:g}, {stages_text(stages)}: {ratios}",
+        f"α as above: {text}; μ of the symmetric closure divided by μ of the "
+        f"paper's closure in the second half, h = {STEP_SIZES[0]:g}, "
+        f"{stages_text(stages)}: {ratios}",
         command(PART),
         OURS,
-        "the symmetric closure walks as the paper's does (α <= "
+        "the random walk of the symmetric closure is like that of the paper's closure "
+        "(α <= "
         f"{max(values[:half]):.1f}), the consistent one drifts (α up to "
         f"{max(values[half:]):.1f}; a steady drift has 2)",
     )
@@ -252,9 +255,9 @@ def _against(curves: dict, fits: dict, s: int, final_time: float) -> Claim:
         verdict, why = (
             DEPENDS,
             (
-                "early on the paper's method has the smaller error, but it walks "
-                f"faster: late in the run its μ is up to {max(late):.1f} times that of "
-                "the others"
+                "early on the paper's method has the smaller error, but its random "
+                f"walk is faster: late in the run its μ is up to {max(late):.1f} "
+                "times that of the others"
             ),
         )
     else:
@@ -264,9 +267,9 @@ def _against(curves: dict, fits: dict, s: int, final_time: float) -> Claim:
     why += f"; {RECONSTRUCTED}"
     return Claim(
         f"No gain over SPARK and DLA, but no loss either (7.3), s = {s}",
-        "μ of the paper's method over that of the other, t in 10..200 / the second "
-        f"half of t <= {final_time:g} (in brackets growth of the other's μ): "
-        + "; ".join(texts),
+        "μ of the paper's method divided by μ of the other method, t in 10..200 / the "
+        f"second half of t <= {final_time:g} (in brackets: growth of μ of the other "
+        "method): " + "; ".join(texts),
         command(PART),
         verdict,
         why,
@@ -282,5 +285,6 @@ def _projected(fits: dict) -> Claim:
         + " and ".join(f"{f.ratio:.0e}-fold" for f in x),
         command(PART),
         OURS,
-        "a method without geometry drifts, α = 2, and ends with the largest μ",
+        "a method without geometric structure drifts, α = 2, and ends with the "
+        "largest μ",
     )  # fmt: skip

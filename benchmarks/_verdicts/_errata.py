@@ -107,7 +107,7 @@ def found(quick: bool) -> Found:
                 PRINT if falls else DEPENDS,
                 "(dτ)* maps covectors, D₂h is a vector: η = dτ H = D₂h gives H"
                 if form == "dual"
-                else "the derivative of dτ_Ξ H by Ξ, as the theorem itself has it",
+                else "the derivative of dτ_Ξ H by Ξ is meant, as in the theorem itself",
             )
         )
     signs = all(abs(x - (-1) ** (s - 1)) < 1e-6 for s, x in stability.items())
@@ -148,7 +148,7 @@ def order_of_tableaux() -> tuple[Claim, dict[str, dict[str, float]]]:
         f"order of a pendulum on a slide, without constraints, {text}",
         command(PART),
         PRINT if differ else DEPENDS,
-        "the pair has order conditions of its own, those of trees with two colours",
+        "the pair has its own order conditions, for trees with two colours",
     )
     return claim, numbers
 

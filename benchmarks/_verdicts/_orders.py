@@ -72,7 +72,7 @@ def _order_claims(study, where: str) -> list[Claim]:
             f"{stages_text(stages)}: {orders_text(carried)}",
             f"nhjax run {study.name}",
             CONFIRMED if near(carried, own) else REFUTED,
-            "and λ computed anew from (q, p) is of order 2s - 2: "
+            "and λ recomputed from (q, p) is of order 2s - 2: "
             + orders_text(continuous),
         ),
     ]
@@ -163,7 +163,7 @@ def _local(quick: bool) -> Found:
                 + f" ({stages_text(stages)})",
                 command(PART),
                 CONFIRMED if stages_good else REFUTED,
-                "so the constraints are rightly imposed on the p^i",
+                "so it is right to impose the constraints on the p^i",
             ),
         ],
         {"local_orders": {"stages": stages, **orders}},
@@ -228,7 +228,7 @@ def _inconsistent(quick: bool) -> Found:
         name = list(cases)[-1]
         ours = orders_from_wrong_multiplier(*cases[name], stages, "symmetric")
         text += (
-            "; with the symmetric closure, which does not remember λ, "
+            "; with the symmetric closure, which does not carry λ from step to step, "
             f"{name}: {orders_text(ours)}"
         )
         rows += [

@@ -96,8 +96,9 @@ def _coincidences() -> Found:
                 f"{of('SPARK 3, Lobatto-3')}",
                 command(PART),
                 OURS if same else REFUTED,
-                "SPARK has s multipliers of its own in each step where the paper's "
-                f"method carries one on; they differ by their errors; {RECONSTRUCTED}",
+                "SPARK computes s multipliers in each step, while the paper's method "
+                f"carries one multiplier from step to step; they differ by "
+                f"their errors; {RECONSTRUCTED}",
             ),
         ],
         {"coincidences": apart},
@@ -117,8 +118,8 @@ def _closures(quick: bool) -> Found:
     return Found(
         [
             Claim(
-                "A multiplier that is carried on grows on attracting motions; the "
-                "symmetric closure remembers q and p alone",
+                "The error of a multiplier that is carried from step to step grows on "
+                "attracting motions; the symmetric closure carries only q and p",
                 f"Chaplygin's sleigh, s = 4, h = 0.1, |E - E_0| in the last fifth of t "
                 f"<= {length:g}: " + ", ".join(f"{k} {x:.1e}" for k, x in last.items()),
                 "python -m benchmarks.closures",
@@ -152,9 +153,8 @@ def _charts(quick: bool) -> Found:
                 + ", ".join(f"{k} {x:.1e}" for k, x in energy.items()),
                 "python -m benchmarks.charts",
                 OURS if gain else REFUTED,
-                "reversible to round-off, and "
-                + ("less" if less else "no less")
-                + " drift of the energy for it",
+                "reversible to round-off, and the energy "
+                + ("drifts less" if less else "does not drift less"),
             )
         ],
         {"charts": [row._asdict() for row in rows]},
@@ -206,7 +206,7 @@ def _derivatives(quick: bool) -> Found:
                 "of the method",
                 "order of dx(3)/dk on the particle: "
                 + f"{orders_text(orders)} ({stages_text(stages)})"
-                + f"; reverse mode less forward mode: {max(gap):.0e}",
+                + f"; reverse mode minus forward mode: {max(gap):.0e}",
                 command(PART),
                 OURS if good else REFUTED,
                 "by the implicit function theorem at each step, against the derivative "

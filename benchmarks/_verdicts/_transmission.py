@@ -118,12 +118,13 @@ def _large_step(by_epsilon: dict[float, CVTEnergy]) -> Claim:
     erratic = min(ratios) > 1.5 * (LARGE / H) ** 2
     return Claim(
         "At h = π/10 the energy is erratic, the step too big (7.2; Lobatto-2)",
-        "largest |E - E_0| (over that at h = 1/10): " + "; ".join(texts),
+        "largest |E - E_0| (in brackets: ratio to the error at h = 1/10): "
+        + "; ".join(texts),
         "nhjax run cvt-energy",
         CONFIRMED if erratic else REFUTED,
-        f"order 2 explains a factor {(LARGE / H) ** 2:.1f}, and there is more in all "
-        f"four; but no drift either: the largest error of the run is {max(growth):.2f} "
-        "times that of its first fifth at most",
+        f"order 2 explains a factor {(LARGE / H) ** 2:.1f}, and all four errors "
+        f"grow by more; but there is no drift: the largest error of the run is "
+        f"{max(growth):.2f} times that of its first fifth at most",
     )
 
 
@@ -167,7 +168,7 @@ def _more_stages(high: dict) -> Claim:
         "nhjax run cvt-energy --stages 3 4",
         DEPENDS if drifting else CONFIRMED,
         f"with the paper's closure the energy grows {growth[3, 'propagated']:.1f}-fold "
-        "at s = 3, where R_A(∞) = +1 lets errors of λ add up; by the symmetric "
+        "at s = 3, where R_A(∞) = +1 lets errors of λ add up; with the symmetric "
         f"closure {growth[3, 'symmetric']:.1f}-fold",
     )
 

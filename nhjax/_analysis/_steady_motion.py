@@ -108,8 +108,9 @@ def steady_motion(
 
     If these equations have a family of solutions, the result is the one to which
     Newton's method with least-norm increments converges. The `held_...` arguments
-    select another one, for instance one with a given speed or lean. The increments have
-    no component along the symmetries, except where held coordinates require it.
+    select another solution, for instance a motion with a given speed or lean. The
+    increments have no component along the symmetries, except where held coordinates
+    require it.
 
     **Arguments:**
 
@@ -117,10 +118,10 @@ def steady_motion(
     - `t`: the time at which functions that depend on time are taken.
     - `y`: a state from which the search starts.
     - `args`: passed on to the functions of the system.
-    - `positions`, `velocities`: the indices of what is to be steady. Leave out what
-        follows from the rest: positions that holonomic constraints tie, velocities that
-        follow from nonholonomic ones, and a speed whose rate vanishes with the others
-        because energy is conserved.
+    - `positions`, `velocities`: the indices that must be steady. Leave out indices that
+        follow from the others: positions that follow from holonomic constraints,
+        velocities that follow from nonholonomic constraints, and a speed that is
+        constant because energy is conserved.
     - `symmetry`: generators of symmetries, as `linear_stability` takes them, in place
         of `positions` and `velocities`.
     - `held_positions`, `held_velocities`: the indices of what keeps its value in `y`.
@@ -130,11 +131,11 @@ def steady_motion(
 
     **Returns:** a consistent `State`. With `symmetry`, a pair of the state and the
     rates c of the generators, shape (k,), whose unit is the unit of the velocity
-    divided by that of the generator. Pass the state to `linear_stability` with the same
-    `symmetry`. Both results are twice differentiable with respect to `y` and `args` by
-    the implicit function theorem, if the steady motion is unique for the held values,
-    or unique up to ignorable coordinates. In other families the derivative is that of
-    one more Newton increment.
+    divided by the unit of the generator. Pass the state to `linear_stability` with the
+    same `symmetry`. Both results are twice differentiable with respect to `y` and
+    `args` by the implicit function theorem, if the steady motion is unique for the held
+    values, or unique up to ignorable coordinates. In other families the derivative is
+    the derivative of one more Newton increment.
 
     **Raises:** `NewtonError` if no steady motion is found near `y`. `ValueError` or
     `TypeError` if an index is wrong. `ValueError` if neither or both of the two ways
@@ -228,7 +229,7 @@ class SteadyMotionResult(NamedTuple):
 
     @property
     def checks(self) -> tuple[Check, ...]:
-        """Return the check that a steady motion was found."""
+        """Return the check that the iteration found a steady motion."""
         values = (self.num_iterations, self.residual, self.state)
         return (Check(self.converged, _not_found, values),)
 

@@ -21,9 +21,9 @@ _outside: tuple[int, int, int] = gc.get_threshold()
 def rare_collections() -> Iterator[None]:
     """Make Python look for cyclic garbage less often inside the block.
 
-    The thresholds are those of the whole process: the first thread that enters such a
-    block sets them, and the last thread that leaves restores them. Where the collector
-    is switched off, or runs even less often, nothing changes.
+    The thresholds apply to the whole process: the first thread that enters such a block
+    sets them, and the last thread that leaves restores them. If the collector is
+    switched off, or already runs less often, the block has no effect.
     """
     global _inside, _outside
     with _lock:

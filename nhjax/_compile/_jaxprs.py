@@ -50,7 +50,7 @@ ARITHMETIC_AND_SHAPES = (*ELEMENTWISE, *_REDUCING, *_SHAPING, *_MOVING)
 _ARITHMETIC = {"add", "add_any", "div", "mul", "neg", "sub"}
 # nhjax's own operation, which is lowered to arithmetic and shapes.
 SMALL_PRODUCT = "small_product"
-# These operations contain programs, whose operations are checked in turn.
+# These operations contain programs; the operations of these programs are checked too.
 CALLING = """
     checkpoint closed_call custom_jvp_call custom_vjp_call jit remat2
 """.split()  # noqa: SIM905

@@ -69,8 +69,8 @@ def as_cpu_kernel(
 
     - `function`, `args`: the function, and its arguments: trees of arrays and other
         objects.
-    - `programs`: a cache of traced programs. With it the function is traced once for
-        each kind of arguments, and must depend on nothing else.
+    - `programs`: a cache of traced programs. With it, the function is traced once for
+        each kind of arguments, and must not depend on other values.
     - `is_brief`: whether the program runs once and for a short time. Then it is
         compiled in less time, to slower code.
     """

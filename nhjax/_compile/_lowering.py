@@ -177,7 +177,8 @@ def _as_one_kernel(ctx, *operands, program):
     run = jax.extend.core.jaxpr_as_fun(program)
 
     def call(*operands):
-        # XLA would remove operands without elements, so that they are left out here.
+        # XLA would remove operands without elements, so the kernel does not receive
+        # them.
         is_full = [x.size > 0 for x in operands]
         full, empty = partition_list(is_full, operands)
 

@@ -30,9 +30,9 @@ import numpy as np
 from ._garbage_collection import rare_collections
 
 
-# Where a value was read: the identity of its owner, and a name or index.
+# The place of a value: the identity of its owner, and a name or index.
 Place: TypeAlias = tuple[int, Hashable]
-# A value inside another one, after its owner and its name there.
+# The owner of a value, its name in the owner, and the value.
 Part: TypeAlias = tuple[object, Hashable, Any]
 T = TypeVar("T")
 
@@ -48,7 +48,8 @@ _PLAIN = (bool, int, str, bytes, type(None), type(Ellipsis), np.dtype)
 _LEAVES = (*_PLAIN, *_NUMBERS, *_ARRAYS, jax.core.Tracer)
 _MAPPINGS = (dict, types.MappingProxyType)
 _SEQUENCES = (list, tuple, deque, set, frozenset)
-# Values of these classes are compared by their parts, though libraries define them.
+# Values of these classes are compared part by part, although libraries define the
+# classes.
 _CONTAINERS = (*_MAPPINGS, *_SEQUENCES, types.MethodType, partial)
 _CONTAINERS += (types.SimpleNamespace, argparse.Namespace, eqx.Module)
 
@@ -125,12 +126,20 @@ def _atom(value: Any) -> Hashable:
     return (cls, value) if isinstance(value, _PLAIN) else _Unrepeatable()
 
 
+def _key_name(key: Any) -> Hashable:
+    """Return what is compared of a key of a mapping.
+
+    Keys that are equal may still differ: 0.0 and -0.0, or objects of the user.
+    """
+    return (type(key), key) if isinstance(key, _PLAIN) else _Identity(id(key), key)
+
+
 def _parts(value: Any) -> Iterator[Part]:
-    """Yield the values inside a value, each with its owner and its name there."""
+    """Yield the values inside a value, each with its owner and its name in it."""
     if isinstance(value, types.FunctionType):
         yield from _read_by(value)
     elif isinstance(value, _MAPPINGS):
-        yield from ((value, (type(key), key), x) for key, x in list(value.items()))
+        yield from ((value, _key_name(key), x) for key, x in list(value.items()))
     elif isinstance(value, (*_SEQUENCES, np.ndarray)):
         yield from ((value, index, x) for index, x in enumerate(list(value)))
     elif isinstance(value, type):
@@ -227,8 +236,8 @@ class Captured:
     """The values that functions read, except at the ignored places.
 
     - `atoms`: the values in a fixed order, each with the number of its owner and its
-      name there. Objects have numbers in the order of the search, so that equal
-      functions that were made again have equal atoms.
+      name in the owner. Objects have numbers in the order of the search, so that a new
+      function equal to an old one has equal atoms.
     - `contents`: the owner and the content of each place; the content of an object with
       parts is its identity. The owners are kept, so that none reuses an identity.
     """
@@ -244,6 +253,9 @@ class Captured:
             if ignored and (place in ignored or (id(owner), ...) in ignored):
                 continue
             content = atom = _atom(value)
+            if isinstance(atom, _Unrepeatable):
+                # A function that stores a tracer has another one after tracing.
+                content = _Identity(id(value), value)
             has_objects = isinstance(value, np.ndarray) and value.dtype.hasobject
             if has_objects or not _is_leaf(type(value)):
                 content = _Identity(id(value), value)
@@ -320,8 +332,6 @@ def _remember_changes(key: _Key, before: Captured, functions: Any) -> None:
     for one, other in ((before, after), (after, before)):
         for place, (owner, content) in one.contents.items():
             there = other.contents.get(place)
-            if isinstance(content, _Unrepeatable):
-                continue
             if there is None and isinstance(owner, list | set | deque):
                 # The container grows, so that its next element would again be new.
                 place = (id(owner), ...)

@@ -1,6 +1,6 @@
 """Files that survive a crash: atomic writes, locks, and a journal of finished chunks.
 
-A file is either complete or absent, whatever interrupts the writing. A lock ends with
+A file is either complete or absent, even if writing it is interrupted. A lock ends with
 the process that holds it.
 """
 
@@ -140,10 +140,10 @@ class Lock:
 class Journal:
     """The journal of a store: one line of JSON for each finished chunk.
 
-    Process 0 appends to the journal. Every other process appends to a part of its own,
-    which it locks while it runs. A run begins and ends with a single journal: process 0
-    first appends the parts that an interrupted run has left, and finally writes all
-    lines in the order of chunks. `lines` has the lines that this process has written.
+    Process 0 appends to the journal. Every other process appends to its own part, which
+    it locks while it runs. A run begins and ends with a single journal: process 0 first
+    appends the parts that an interrupted run has left, and finally writes all lines in
+    the order of chunks. `lines` has the lines that this process has written.
     """
 
     def __init__(self, folder: Path, index: int):

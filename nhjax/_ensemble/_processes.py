@@ -15,8 +15,8 @@ from jax.experimental.multihost_utils import process_allgather
 # Data are padded to vectors of at least this many bytes, in powers of two, so that few
 # programs are compiled for them.
 _MIN_BYTES = 1024
-# The time between two collective operations while processes run chunks of their own.
-# On the CPU, a collective operation fails after a process has waited for 30 minutes.
+# The time between two collective operations while processes run separate chunks. On the
+# CPU, a collective operation fails after a process has waited for 30 minutes.
 _SECONDS = 60.0
 
 

@@ -298,7 +298,8 @@ def _states_of_chunk(
     if len(layout.devices) == 1:
         return ChunkResult(codes, steps, reduce(values, counts))
     if layout.is_fixed:
-        # Every device reduces all members, so that the order is that of one device.
+        # Every device reduces all members, so that the order is the same as on one
+        # device.
         everywhere = _on_each_device(layout, reduce, jax.P(), jax.P())
         return ChunkResult(codes, steps, everywhere(values, counts))
 
@@ -319,7 +320,7 @@ def _states_of_chunk(
 def merged_states(reductions: Any, one: Any, other: Any) -> Any:
     """Merge the states of reductions of two sets of members.
 
-    A program of its own rounds in the same way, wherever the states come from.
+    A separate program rounds in the same way for all sources of the states.
     """
     return each_reduction(_merge, reductions, one, other)
 
@@ -375,7 +376,8 @@ def first_failure(value: Any) -> tuple[Int[Array, ""], Int[Array, ""]]:
     """Return the code of the first failure in a value, and its step.
 
     It searches every `nhjax.Solution` and `nhjax.RESULTS` in the value. Without a
-    failure the code is that of success. The step is -1 if it is not known.
+    failure, the result is the code of `RESULTS.successful`. The step is -1 if it is not
+    known.
     """
     codes, steps = [], []
     nodes = jax.tree.leaves(
@@ -440,7 +442,7 @@ def without_addresses(text: str) -> str:
 def call_description(
     made: dict[str, Any], text: str, out: bool = False, **others: Any
 ) -> dict[str, Any]:
-    """Describe what all processes that run a job together must have in common.
+    """Describe the data that must agree in all processes of a common job.
 
     This is a manifest, a digest of the text of the program, whether there is an `out`,
     and `others`.

@@ -105,9 +105,9 @@ class Variance(AbstractReduction):
     """The variance over the members of an ensemble, for every number `run` returns.
 
     It is Σ (x_j - mean)² / (n - ddof), by the update of Chan, Golub and LeVeque (1983,
-    *Algorithms for computing the sample variance*), which includes Welford's as the
-    case of one additional member. With δ the difference of the means of two sets of n_a
-    and n_b members,
+    *Algorithms for computing the sample variance*), which for one additional member is
+    Welford's update. If δ is the difference of the means of two sets of n_a and n_b
+    members,
 
     mean = mean_a + δ n_b/n,   S = S_a + S_b + δ² n_a n_b/n.
 

@@ -86,9 +86,9 @@ def initial_state(
     - `keep_q`, `keep_v`, `keep_p`: the components of q, and of the v or p that was
         given, that the projection must not change: an index, a name or a sequence of
         them, known when tracing. The other components are then the nearest, in the same
-        metric, that satisfy the constraints. Indices count the numbers of `q` (of a
-        tuple, the numbers of all its parts in order) or the components of `v` or `p`.
-        Names are in the `coordinates` of the system. If the kept components determine a
+        metric, that satisfy the constraints. An index is a position in the flattened
+        `q` (for a tuple, in all its parts joined in order) or in `v` or `p`. A name is
+        an entry of the `coordinates` of the system. If the kept components determine a
         constraint and violate it, the error names both.
     - `throw`: whether to raise if there is no consistent state. If false, all numbers
         of the state are then NaN, and `integrate` reports it as not finite; under

@@ -51,11 +51,11 @@ class Kept(NamedTuple):
 
     @property
     def argument(self) -> str:
-        """Return the name of the argument of `initial_state` that chose them."""
+        """Return the argument of `initial_state` that selected these components."""
         return f"keep_{self.letter}"
 
     def restored(self, tree: T, given: T) -> T:
-        """Return `tree` with its kept numbers replaced by those of `given`."""
+        """Return `tree` with its kept numbers replaced by the numbers of `given`."""
         if not self.indices:
             return tree
         is_kept = np.zeros(sum(x.size for x in jax.tree.leaves(tree)), bool)
@@ -225,7 +225,7 @@ Vector = Float[Array, " n"]
 class Fixed(NamedTuple):
     """The combinations of constraints that the kept components determine.
 
-    Each row belongs to a constraint, divided by the size of its derivatives.
+    Each row belongs to one constraint and is divided by the size of its derivatives.
 
     - `sizes`: the sizes of the derivatives of the constraints.
     - `projector`: the projector onto the combinations that are constant, to first
@@ -257,8 +257,8 @@ class Nearest(NamedTuple):
 def project_position(system, t, q, u, args, kept: Kept, given: PyTree[Array]):
     """Project q onto Γ = 0: find the stationary point of ½ ξᵀ M ξ on Γ(t, q τ(ξ)) = 0.
 
-    M is the mass matrix at (t, q, u). The `kept` numbers of q τ(ξ) are equal to those
-    of `given`. The `x` of the result is q τ(ξ).
+    M is the mass matrix at (t, q, u). The `kept` numbers of q τ(ξ) are equal to the
+    same numbers of `given`. The `x` of the result is q τ(ξ).
     """
     manifold = system.manifold_of(q)
     mass = system.metric(t, q, u, args)
@@ -282,7 +282,7 @@ def project_position(system, t, q, u, args, kept: Kept, given: PyTree[Array]):
     terms = jnp.full(len(kept.indices), max_norm(*jax.tree.leaves(q)))
     nearest = _nearest_keeping(mass, gamma, held, zero, sizes, terms, is_redundant)
     # A condition such as w = 1 on a unit quaternion has zero derivative where it holds,
-    # so that convergence of the search does not imply it.
+    # so that the search can converge although the condition is violated.
     moved = manifold.act(q, nearest.x)
     size = max_norm(*jax.tree.leaves(stop_gradient((q, moved))))
     off = max_norm(stop_gradient(held(nearest.x)))
@@ -294,7 +294,7 @@ def project_fibre_coordinate(system, t, q, u, args, kept: Kept, given: Vector):
     """Project u: find the stationary point w of ½ (w-u)ᵀ K (w-u) on Φ(t, q, w) = 0.
 
     K is the metric on the fibre at (t, q, u). The `kept` components of v or p,
-    whichever the user gave, are equal to those of `given`.
+    whichever the user gave, are equal to the same components of `given`.
     """
 
     def phi(w):

@@ -95,7 +95,8 @@ from ._stepper import (
 METHODS = LobattoIIIAB, Gauss, PartitionedRungeKutta
 
 # A call outside of transformations warns if the estimated error of a step, relative to
-# the change of the state in it, exceeds this. For large steps it tends to one.
+# the change of the state in it, exceeds this value. For large steps this ratio tends to
+# one.
 _TOO_LARGE_ERROR = 0.9
 
 _TOO_LARGE = (
@@ -207,8 +208,8 @@ def integrate(
         The functions of `system` and `saveat` may read globals and variables of
         enclosing functions, which become constants of the compiled program. Outside of
         transformations, a call traces the functions again if one of these has changed.
-        `nhjax.LagrangianSystem` says what is tracked, and what to do under a `jax.jit`
-        of your own.
+        See `nhjax.LagrangianSystem` for the tracked values, and for calls inside your
+        own `jax.jit`.
 
     !!! example
 
@@ -482,7 +483,7 @@ def _advancing(t0: FloatScalar, dt: FloatScalar) -> Check:
     # Concrete values are compared on the host with NumPy, which is ten times faster.
     numpy: Any = jnp if is_traced(t0, dt) else np
     first, h = numpy.asarray(t0), numpy.asarray(dt)
-    # Infinite numbers have a check of their own.
+    # Infinite numbers are checked separately.
     with np.errstate(over="ignore", invalid="ignore"):
         ok = first + h != first
     return Check(ok, _standstill_error, (first, h))
@@ -649,9 +650,9 @@ def _all_steps(
 
     noise = None
     if isinstance(y0, State):
-        # The noise has a kernel of its own: a loop over steps is compiled to faster
-        # code without another loop before it, and in a batch of runs from one state
-        # this kernel is not batched.
+        # The noise has its own kernel: a loop over steps is compiled to faster code
+        # without another loop before it, and in a batch of runs from one state this
+        # kernel is not batched.
         plain = loop.stepper.plain
         u = plain.system.fibre_coordinate(y0)
         given = plain.time(0), y0.q, u, y0.multiplier, plain.args

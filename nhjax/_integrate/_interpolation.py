@@ -28,8 +28,8 @@ def interpolate(
     """Compute the state at t + θ h, inside a step that starts at t.
 
     The configuration q is the value of the continuous collocation polynomial u(t), and
-    the momentum p that of the mixed polynomial v(t) of the paper's appendix. Both
-    polynomials are integrals of the Lagrange basis on the nodes c_i.
+    the momentum p is the value of the mixed polynomial v(t) of the paper's appendix.
+    Both polynomials are integrals of the Lagrange basis on the nodes c_i.
     """
     start, time = record.start, t + theta * h
     weights = method.integrated_basis(theta)

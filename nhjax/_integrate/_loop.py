@@ -19,7 +19,7 @@ from ._stepper import AbstractCarry, AbstractStepper, StepResult
 class Loop(eqx.Module):
     """The time loop of a run: its stepper, what it saves, and its progress meter.
 
-    An adjoint calls `step` for k = 0, ..., num_iterations - 1 in turn, and calls
+    An adjoint calls `step` for k = 0, ..., num_iterations - 1 in order, and calls
     `write` to put the rows that each iteration returns into buffers, which start as
     `empty_rows`.
     """

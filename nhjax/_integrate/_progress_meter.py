@@ -13,8 +13,8 @@ from jaxtyping import Array, Int
 class AbstractProgressMeter(eqx.Module):
     """A progress meter, which shows how many steps of a run are done.
 
-    The compiled time loop calls it on the host. For a meter of your own, write a
-    subclass with `update`.
+    The compiled time loop calls it on the host. For your own meter, write a subclass
+    with `update`.
     """
 
     @abstractmethod
@@ -31,7 +31,7 @@ class AbstractProgressMeter(eqx.Module):
 
     @property
     def silent(self) -> bool:
-        """Return whether the meter shows nothing, so that the loop need not call it."""
+        """Return whether the meter has no display; the loop then does not call it."""
         return False
 
     def report(self, k: Int[Array, ""], num_steps: int) -> None:
@@ -54,7 +54,7 @@ class AbstractProgressMeter(eqx.Module):
 
 
 class NoProgressMeter(AbstractProgressMeter):
-    """A progress meter that shows nothing, the default of `integrate`.
+    """A progress meter without a display, the default of `integrate`.
 
     !!! example
 
@@ -64,7 +64,7 @@ class NoProgressMeter(AbstractProgressMeter):
 
     @property
     def silent(self) -> bool:
-        """Return True: this meter shows nothing."""
+        """Return True: this meter has no display."""
         return True
 
     def update(self, done: int, total: int) -> None:
@@ -134,7 +134,7 @@ class TqdmProgressMeter(AbstractProgressMeter):
             del self._open.bars[total]
 
     def close(self) -> None:
-        """Close the open bars as they are."""
+        """Close all open bars at their current values."""
         for bar in self._open.bars.values():
             bar.close()
         self._open.bars.clear()

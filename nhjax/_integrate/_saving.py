@@ -1,4 +1,4 @@
-"""What a run saves: the choice of the user, and the buffers that the steps write to."""
+"""The saved data of a run: the user's choice, and the buffers for it."""
 
 import reprlib
 from collections.abc import Callable, Sequence
@@ -46,11 +46,11 @@ class SaveAt(eqx.Module):
     run, unless `dense` needs one. The samples at `ts` are computed after the run, from
     the records of the steps that contain them.
 
-    **Raises:** `ValueError` if nothing is saved, a flag is not a bool, `steps` is not a
-    bool or an int >= 1, `ts` is not a sorted vector, or `ts` and `steps` are given
-    together; `DTypeError` if `ts` is not real; `TypeError` if `fn` is not a function of
-    (t, y, args). `integrate` raises a `TypeError` if `fn` returns something that is not
-    an array or a tree of arrays.
+    **Raises:** `ValueError` if no output is selected, a flag is not a bool, `steps` is
+    not a bool or an int >= 1, `ts` is not a sorted vector, or `ts` and `steps` are
+    given together; `DTypeError` if `ts` is not real; `TypeError` if `fn` is not a
+    function of (t, y, args). `integrate` raises a `TypeError` if `fn` returns something
+    that is not an array or a tree of arrays.
 
     !!! example
 
@@ -88,8 +88,8 @@ class SaveAt(eqx.Module):
                 advice = ""
                 if name in ("t0", "t1"):
                     advice = (
-                        " Save at given times by `ts`. A run starts at the `t0` of "
-                        "`integrate`, and ends after `num_steps` steps of `dt`."
+                        " To save at given times, pass `ts`. A run starts at the `t0` "
+                        "of `integrate`, and ends after `num_steps` steps of `dt`."
                     )
                 raise ValueError(
                     f"SaveAt: `{name}` must be True or False, got {flag!r}.{advice}"
@@ -123,7 +123,7 @@ class SaveAt(eqx.Module):
     def checks(
         self, t0: FloatScalar, dt: FloatScalar, num_steps: int | IntScalar
     ) -> list[Check]:
-        """Return the checks of `ts` for a run; raise if the run saves nothing."""
+        """Return the checks of `ts` for a run; raise if the run saves no data."""
         if self.num_saved(num_steps) == 0 and not (self.dense or self.checkpoint):
             raise ValueError(
                 f"SaveAt: `steps={self.steps}` saves nothing in a run of {num_steps} "
@@ -249,7 +249,7 @@ def record_places(
     if dense or sampled is None:
         return RecordPlaces(length, jnp.arange(length + 1, dtype=jnp.int32))
     # There is one row for each sample, and samples in the same step share the row of
-    # the first. There may be more steps than samples, and more samples than steps.
+    # the first. There may be more steps than samples, or more samples than steps.
     number = sampled.shape[0]
     slots = jnp.full((length + 1,), number, jnp.int32)
     first = slots.at[sampled].min(jnp.arange(number, dtype=jnp.int32))
@@ -257,7 +257,7 @@ def record_places(
 
 
 class Saving(eqx.Module):
-    """What the iterations of a run save, and where in the buffers they save it.
+    """The data that the iterations of a run save, and their places in the buffers.
 
     A run saves the value of `fn` at the state after every `stride`-th step (after none
     if `stride` is 0), which makes `num_saved` entries. It keeps `num_records` records

@@ -57,7 +57,7 @@ class Solution(eqx.Module):
     - `events`: an `nhjax.EventLog` of the events of the run if `event` was given; None
         otherwise. Then `stats` also has `num_events`, and `num_steps` is the number of
         nodes that were reached. After an event that ends the run, all entries of `ts`
-        and `ys`, and `t1`, are those of the event.
+        and `ys`, and `t1`, are the time and state of the event.
 
     Under `vmap` every array has a leading axis for the members of the batch.
     """
@@ -146,8 +146,8 @@ class Solution(eqx.Module):
         **Returns:** an `xarray.Dataset`.
 
         **Raises:** `ImportError` without xarray (`pip install "nhjax[xarray]"`);
-        `RuntimeError` under `jit` and `vmap`; `ValueError` if nothing was saved, or for
-        names that do not fit.
+        `RuntimeError` under `jit` and `vmap`; `ValueError` if the run saved no states,
+        or for names that do not fit.
 
         !!! example
 

@@ -1,10 +1,9 @@
 """The stepper protocol, by which the time loop advances, and the plain stepper.
 
-A stepper has a carry of its own, which goes from one iteration of the loop to the next:
-`init` makes it, `advance` performs one iteration, and `finish` returns the end of the
-run. The plain stepper takes one step of the method in each iteration. The stepper of
-runs with events, in the room `_events`, is built on it. The loop and the adjoints work
-with any stepper.
+A stepper has its own loop carry: `init` creates it, `advance` performs one iteration,
+and `finish` returns the end of the run. The plain stepper takes one step of the method
+in each iteration. The stepper of runs with events, in the room `_events`, is built on
+it. The loop and the adjoints work with any stepper.
 """
 
 from abc import abstractmethod
@@ -58,7 +57,7 @@ class AbstractCarry(eqx.Module):
 
 
 class StepResult(NamedTuple):
-    """What one iteration of the time loop offers to save.
+    """The data that one iteration of the time loop can save.
 
     - `t`: the time that the iteration reached.
     - `record`: the record of the step, for interpolation.
@@ -66,7 +65,7 @@ class StepResult(NamedTuple):
     - `row`: the index of the output row that the iteration fills, equal to the number
         of steps if it fills none. It is None if iteration k always fills row k.
     - `log_entry`, `log_slot`: an entry for the log of the stepper and its index there,
-        equal to the length of the log if nothing is logged. They are None for a stepper
+        equal to the length of the log if there is no entry. They are None for a stepper
         without a log.
     """
 
@@ -83,7 +82,7 @@ Log = TypeVar("Log")
 
 
 class RunEnd(NamedTuple, Generic[Rows, Log]):
-    """The end of a run: its state and time, the saved rows, and the log reported.
+    """The end of a run: its state and time, the saved rows, and the log.
 
     The `log` is None for a stepper without a log.
     """
@@ -95,7 +94,7 @@ class RunEnd(NamedTuple, Generic[Rows, Log]):
 
 
 C = TypeVar("C", bound=AbstractCarry)
-# What a reverse replay knows about an iteration besides its state.
+# The data that a reverse replay has about an iteration, besides its state.
 R = TypeVar("R")
 
 
@@ -237,7 +236,7 @@ class PlainStepper(AbstractStepper[PlainCarry, None]):
 
     @property
     def log_length(self) -> int:
-        """Return 0: nothing is logged."""
+        """Return 0: this stepper has no log."""
         return 0
 
     def with_round_off(self, round_off: RoundOff) -> "PlainStepper":
@@ -308,7 +307,7 @@ class PlainStepper(AbstractStepper[PlainCarry, None]):
     def one_step(
         self, step_state: StepState, t: FloatScalar, h: FloatScalar, skip: BoolScalar
     ) -> StepOutcome:
-        """Take one step of size h from t. A negative h goes back."""
+        """Take one step of size h from t. A negative h integrates backwards in time."""
         start = step_state.differentiated_in_state()
         given = self.system, t, h, start, self.args, self.invariants, self.round_off
         arguments = StepArguments(*given)

@@ -29,7 +29,7 @@ class AbstractLieGroup(eqx.Module):
     configuration (paper, section 5). Velocities and momenta are left-trivialised: they
     are vectors of 𝔤 and 𝔤*.
 
-    To define a group of your own, write a subclass with `dim`, `identity`, `check`,
+    To define your own group, write a subclass with `dim`, `identity`, `check`,
     `compose`, `inverse`, `retract` and `local`. All other methods follow from these by
     automatic differentiation, and can be overridden with closed forms. An element is a
     pytree of arrays. The retraction must satisfy τ(0) = e and dτ_0 = I.

@@ -150,7 +150,7 @@ class AbstractMethod(eqx.Module):
 
     @property
     def hypotheses(self) -> Hypotheses:
-        """Find which of H1, H2 and H3 hold, which systems with constraints need."""
+        """Find which of the hypotheses H1, H2 and H3 hold."""
         return _order_conditions.hypotheses(self._tableau())
 
     @property
@@ -190,7 +190,7 @@ class AbstractMethod(eqx.Module):
 
         The difference is a multiple of the divided difference over all nodes. As a
         quadrature it vanishes for polynomials of degree less than s - 1, so that it
-        measures how well the nodes resolve a function. Of several coinciding nodes only
+        measures how well the nodes resolve a function. If several nodes coincide, only
         the first has a weight. Returns None if there is only one distinct node.
         """
         nodes, first = np.unique(self.c, return_index=True)
@@ -401,9 +401,9 @@ class PartitionedRungeKutta(AbstractMethod):
 
     The nodes c_i = Σ_j a_ij and the symplectic conjugate â_ij = b_j (1 - a_ji / b_i)
     follow from the tableau. The float64 coefficients are taken as exact, and conditions
-    on them are checked to 1e-13. (With 12 or more stages the defect of the first order
-    condition that fails can be as small as that, and `orders` is then too high.) For
-    systems with constraints the tableau must satisfy H1, H2 and H3.
+    on them are checked to 1e-13. (With 12 or more stages, the first order condition
+    that fails can have a defect below 1e-13; `orders` is then too high.) For systems
+    with constraints the tableau must satisfy H1, H2 and H3.
 
     !!! example
 

@@ -61,7 +61,8 @@ class Hypotheses(NamedTuple):
 def simplifying_assumptions(t: Tableau) -> SimplifyingAssumptions:
     """Find the largest p, q, r and Q for which B(p), C(q), D(r) and CĈ(Q) hold.
 
-    The first three are conditions on (a, b, c), the last is one on the pair (a, â).
+    The first three are conditions on (a, b, c); the last is a condition on the pair (a,
+    â).
 
     **Arguments:**
 

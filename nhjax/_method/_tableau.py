@@ -32,7 +32,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
 
-# A context of its own, independent of a user's `mpmath.mp.dps`. With 60 digits, order
+# A separate context, independent of a user's `mpmath.mp.dps`. With 60 digits, order
 # conditions can be checked to 1e-40 with 20 digits to spare.
 CONTEXT = mpmath.MPContext()
 CONTEXT.dps = 60
@@ -74,8 +74,8 @@ class Tableau:
         a_hat = CONTEXT.matrix(s, s)
         for i in range(s):
             for j in range(s):
-                # If a_ji = b_i (hypothesis H1') the entry is exactly zero, which
-                # b_j - b_j a_ji / b_i would miss by one unit of the last digit.
+                # If a_ji = b_i (hypothesis H1') the entry is exactly zero, but b_j -
+                # b_j a_ji / b_i would differ from zero by one unit of the last digit.
                 if a[j, i] != b[i]:
                     a_hat[i, j] = b[j] * (1 - a[j, i] / b[i])
         return a_hat

@@ -145,7 +145,7 @@ def _forces(
     solved: dict[Any, Any],
     frame: Any,
 ) -> list[Any]:
-    """Compute the coordinates' generalised forces from those of the speeds.
+    """Compute generalised forces for the coordinates from forces for the speeds.
 
     For velocities v(q, u, q') the force of q is F·(∂v/∂u ∂u/∂q' + ∂v/∂q').
     """

@@ -3,7 +3,7 @@
 For matrices of a few rows, calling a library of linear algebra is too expensive. Inside
 a time loop the calls cost more than the arithmetic. They cannot be compiled into one
 kernel with the operations around them, and a batch of them runs one by one.
-`small_einsum` and `inverse` are made of elementary operations up to a limit of size;
+`small_einsum` and `inverse` consist of elementary operations up to a limit of size;
 `with_small_products` rewrites the products in the functions of a user.
 """
 
@@ -80,7 +80,8 @@ def _contract_axes(dimension_numbers, a: Array, b: Array) -> Array:
 def inverse(matrix: Float[Array, "n *n"]) -> Float[Array, "n *n"]:
     """Invert a small matrix; the result is not finite if there is no inverse.
 
-    An array of one axis is the diagonal of a diagonal matrix, and so is the result.
+    An array with one axis is the diagonal of a diagonal matrix. Its result has one axis
+    too.
     """
     size = matrix.shape[0]
     # Systems with one constraint, and a matrix of size 1, are the most common ones.

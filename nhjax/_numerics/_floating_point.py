@@ -37,8 +37,8 @@ def largest_column(*arrays: Float[Array, "_ n"]) -> tuple[FloatScalar, Int[Array
 
     The last bits of each bit pattern are replaced by the index of its column, so that
     one maximum finds both; the value loses these bits. A search for the column after
-    the maximum took a tenth of the time of a step. If some numbers are NaN, the column
-    is one that contains NaN.
+    the maximum took a tenth of the time of a step. If some numbers are NaN, the result
+    is a column that contains NaN.
     """
     columns = arrays[0].shape[1]
     mask = (1 << max(columns - 1, 0).bit_length()) - 1

@@ -42,7 +42,7 @@ class AbstractImplicitFunction(eqx.Module, Generic[Arguments, Solution]):
 
     Call it with its arguments, a tree. It is differentiable with respect to them, but
     not to its own fields. JAX never differentiates `solve`: derivatives of every order
-    are those of `tangent`.
+    come from `tangent`.
 
     - `programs`: a cache of traced programs; None if the function is part of a larger
         program. With a cache, the rule of derivatives finds the program of `solve` that

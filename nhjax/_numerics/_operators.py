@@ -4,13 +4,13 @@ A step multiplies vectors by four kinds of matrices. With N = ∂p/∂u, a mass 
 the Jacobian B of the constraints these are N⁻¹, B, K⁻¹ Bᵀ and (B K⁻¹ Bᵀ)⁻¹. Each of
 them is an `AbstractOperator`. The classes differ in how they store the entries:
 
-- `DenseMatrix` stores all entries, `DiagonalMatrix` those on the diagonal.
+- `DenseMatrix` stores all entries, `DiagonalMatrix` only the diagonal.
 - `SparseMatrix` stores the entries of a Jacobian B whose rows have few entries, in
   places that are known when the program is traced. `WeightedTranspose` is diag(w) Bᵀ.
-- `BlockTridiagonalInverse` stores the factors of a block tridiagonal matrix such as
-  B K⁻¹ Bᵀ, whose inverse it is.
+- `BlockTridiagonalInverse` is the inverse of a block tridiagonal matrix such as B K⁻¹
+  Bᵀ, stored as its factors.
 
-Code outside this file does not ask for the class of an operator: it calls the methods.
+Code outside this file does not check the class of an operator: it calls the methods.
 """
 
 from abc import abstractmethod
@@ -207,7 +207,7 @@ class SparseMatrix(AbstractOperator):
         return SparseMatrix(self.values[k], self.pattern)
 
     def stacked_after(self, first: AbstractOperator) -> "SparseMatrix":
-        """Return the stack of another matrix and those of this stack."""
+        """Return a stack of another matrix followed by the matrices of this stack."""
         assert isinstance(first, SparseMatrix)
         values = jnp.concatenate([first.values[None], self.values])
         return SparseMatrix(values, self.pattern)
@@ -284,7 +284,7 @@ class WeightedTranspose(AbstractOperator):
         return self.weights[:, None] * self.matrix.as_matrix().T
 
     def first_columns(self, count: int) -> "WeightedTranspose":
-        """Return the matrix of the first columns, which must be all columns."""
+        """Return the first `count` columns; only the count of all is supported."""
         assert count == self.matrix.pattern.shape[0]
         return self
 
@@ -301,7 +301,7 @@ class BlockTridiagonalInverse(AbstractOperator):
     """The inverse of a block tridiagonal matrix, by the factors of its elimination.
 
     There are q unknowns and q residuals for each row of the pattern, of shape (q, l) or
-    in one vector. Blocks are eliminated from the first to the last: with D_k, L_k, U_k
+    in one vector. Blocks are eliminated from the first to the last. D_k, L_k, U_k are
     the blocks of row k, and
 
     P_k = D_k - L_k P_{k-1}⁻¹ U_{k-1},
@@ -357,8 +357,8 @@ class BlockTridiagonalInverse(AbstractOperator):
     ) -> BoolScalar:
         """Return whether left @ right, whose computed inverse this is, is singular.
 
-        It counts as singular if a pivot is round-off beside the diagonal entries of its
-        rows. The two factors are B and diag(w) Bᵀ.
+        It counts as singular if a pivot is round-off compared with the diagonal entries
+        of its rows. The two factors are B and diag(w) Bᵀ.
         """
         assert isinstance(left, SparseMatrix)
         assert isinstance(right, WeightedTranspose)
@@ -445,8 +445,8 @@ def full_jacobian(
 
 def _unit_vectors(u: Float[Array, " n"]) -> Float[Array, "n n"]:
     # The compiler of `nhjax.lanes` knows that zeros which pad an array stay zero in any
-    # product. It does not know this of the zeros of `jnp.eye`, since the other factor
-    # might be infinite.
+    # product. It cannot assume this for the zeros of `jnp.eye`, because the other
+    # factor might be infinite.
     n, one, zero = u.shape[0], jnp.ones((1,), u.dtype), jnp.zeros((), u.dtype)
     rows = [jax.lax.pad(one, zero, [(k, n - 1 - k, 0)]) for k in range(n)]
     return jnp.stack(rows)
@@ -457,7 +457,7 @@ def sparse_jacobian(
     u: Float[Array, " n"],
     pattern: "SparsityPattern",
 ) -> SparseMatrix:
-    """Compute the Jacobian of a function whose sparsity is that of `pattern`.
+    """Compute the Jacobian of a function with the sparsity pattern `pattern`.
 
     One tangent serves for all columns of a colour (Curtis, Powell and Reid, 1974).
     """

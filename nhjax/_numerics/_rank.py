@@ -134,7 +134,7 @@ def _negligible(dtype: jnp.dtype) -> float:
 
 
 # Away from a solution, dependent equations are dependent only up to the distance from
-# it. Singular values below this part of the largest one count as zero there.
+# it. There, singular values below this fraction of the largest one count as zero.
 NEARLY_DEPENDENT = 1e-4
 
 
@@ -145,7 +145,7 @@ def least_norm_inverse(
 
     If C x = b has solutions, X b is the one with the least Σ C_aa x_a². With
     D = diag(C_aa)^(-1/2) it is X = D (D C D)⁺ D. Eigenvalues of D C D count as zero if
-    they are round-off, or below the part `negligible` of the largest one. If some
+    they are round-off, or less than `negligible` times the largest one. If some
     constraints are scaled, only their multipliers are scaled.
     """
     if matrix.shape[0] == 0:
@@ -162,9 +162,9 @@ def least_norm_inverse_by_blocks(
 ) -> Float[Array, "l l"]:
     """Compute a generalised inverse of C that solves the last equations first.
 
-    The `first` equations have zero unknowns as far as they follow from the other
-    equations. Apart from this, each of the two parts of x has the least norm of
-    `least_norm_inverse`. If no equation of one part follows from the other part, the
+    The unknowns of the `first` equations are zero as far as these equations follow from
+    the other equations. Apart from this, each of the two parts of x has the least norm
+    of `least_norm_inverse`. If no equation of one part follows from the other part, the
     result is `least_norm_inverse`.
     """
     if first in (0, matrix.shape[0]):

@@ -69,7 +69,7 @@ def _may_be_index(dtype: Any) -> bool:
 def _followed(
     program: Any, consts: Sequence[Any], inputs: Sequence[_Value], n: int
 ) -> list[_Value]:
-    """Return the sets of a program's results, given those of its inputs."""
+    """Return the sets of a program's results from the sets of its inputs."""
     values = dict(zip(program.invars, inputs, strict=True))
     for variable, const in zip(program.constvars, consts, strict=True):
         values[variable] = (np.zeros((*variable.aval.shape, n), bool), const)

@@ -69,7 +69,7 @@ class StageUnknowns(eqx.Module):
     holonomic: Float[Array, "s k"]
     end_acceleration: Float[Array, " a"]
     end_multiplier: Float[Array, " e"]
-    # A `PyTree`, because None is an empty tree.
+    # The type is `PyTree`, so that None, an empty tree, is allowed.
     impulse: PyTree[Float[Array, " i"]] = None
 
 
@@ -571,8 +571,8 @@ def stage_residual(
 ) -> tuple[Float[Array, " k"], Evaluation]:
     """Evaluate all equations of a step (the paper's four summaries) in one vector.
 
-    A stage solver of your own looks for the stages at which the vector vanishes; see
-    the page on extending in the documentation.
+    Your own stage solver looks for the stages at which the vector vanishes; see the
+    page on extending in the documentation.
 
     **Arguments:**
 

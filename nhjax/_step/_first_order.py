@@ -65,10 +65,10 @@ def uses_first_order_terms(
 
 
 def _forces_have_slopes(stages: StageEquations) -> bool:
-    """Return whether forces can be differentiated by velocities in forward mode.
+    """Return whether forces have forward-mode derivatives in the velocities.
 
-    Callbacks cannot, nor can functions with a custom rule for reverse mode only. No
-    other part of a step needs this derivative.
+    Callbacks and functions with a custom rule for reverse mode only do not have them.
+    No other part of a step needs this derivative.
     """
 
     def force(u):
@@ -180,7 +180,7 @@ def _weighted(
 def _times(
     matrix: Float[Array, "... k n"], z: Float[Array, "r n *c"]
 ) -> Float[Array, "r k *c"]:
-    """Multiply each row of z by the same matrix, or by its own matrix of a stack."""
+    """Multiply all rows of z by one matrix, or each row by its own matrix."""
     own, rest = "i"[: matrix.ndim - 2], "c"[: z.ndim - 2]
     return small_einsum(f"{own}kn,in{rest}->ik{rest}", matrix, z)
 
@@ -235,7 +235,7 @@ def momenta_of_forces(
 ) -> tuple[Float[Array, "s n c"], Float[Array, "r n c"]]:
     """Compute the momenta of stages and nodes from forces at the stages, for h = 1.
 
-    The chart transports forces from stage to stage, which is a term of order h too.
+    The chart transports forces from stage to stage, which adds a term of order h.
     """
     a_hat, b = stages.coefficients("a_hat"), stages.coefficients("b")
     if stages.manifold.is_flat:

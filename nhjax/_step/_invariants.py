@@ -24,8 +24,8 @@ from .._system import (
 )
 
 
-# An impulse changes an invariant by at most this fraction of its part that belongs to
-# the motion. Near rest this part is small, and no impulse might correct the error.
+# An impulse changes an invariant by at most this fraction of Σ |u ∂I/∂u|. Near rest
+# this sum is small, and no impulse might correct the error.
 _LARGEST_PART = 0.1
 # With an indefinite mass matrix, ω·M⁻¹ω can vanish although ω does not. If ω·M⁻¹ω is
 # less than this fraction of its bound Σ_ij |M⁻¹_ij| ω_i², a step has no impulse. All
@@ -295,8 +295,8 @@ class InvariantCorrection(eqx.Module):
         matrix = errors[:, None] * gram + (1 - a)[:, None] * one
         # If one function follows from others, the matrix is singular.
         solved = inverse(matrix + eps**0.5 * one)
-        # The ratio of the impulses to those of the definite matrix of the row sums, for
-        # the same errors. With one function it is Σ (row sum) ω² / |g|.
+        # The ratio of the impulses to the impulses of the definite matrix of the row
+        # sums, for the same errors. With one function it is Σ (row sum) ω² / |g|.
         squares = at_start.covectors**2 + covectors**2
         roots = jnp.sqrt(jnp.sum(at_start.row_sums[None] * squares, axis=1))
         gain = roots[:, None] * solved * (errors * roots)[None]

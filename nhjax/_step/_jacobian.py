@@ -76,7 +76,7 @@ def simplified_newton_update(
     if stages.invariants is not None:
         # The impulses come before the constraints, so that the constraints see the
         # change by the impulses. If a system is nearly at rest, the work of the
-        # reactions on this change is not small.
+        # reactions on this change is not negligible.
         error = invariant_errors(stages, x_next)
         x_next = factors.correct_impulses(stages, x_next, error)
     if stages.constrained:

@@ -372,5 +372,5 @@ def _kinematic_scale(
         (q,),
         (uneven_perturbations(q),),
     )[1]
-    # If a constraint has no finite slope, this says nothing about its round-off.
+    # If a constraint has no finite slope, this does not measure its round-off.
     return jnp.where(jnp.isfinite(change), jnp.abs(change), 0)

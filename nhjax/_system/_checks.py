@@ -155,7 +155,7 @@ def check_state(
 def _names(num_nonholonomic: int, num_holonomic: int) -> list[str]:
     """List the names of all constraints, such as "nonholonomic[0]" or "holonomic[2]".
 
-    The order is that of the rows of the Jacobian ∂Φ/∂u and of the multipliers.
+    The order is the order of the rows of the Jacobian ∂Φ/∂u and of the multipliers.
     """
     return [f"nonholonomic[{a}]" for a in range(num_nonholonomic)] + [
         f"holonomic[{a}]" for a in range(num_holonomic)

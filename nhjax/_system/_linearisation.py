@@ -37,7 +37,7 @@ from ._systems import AbstractMechanicalSystem, check_time_and_state, State
 # With fewer constraints than this, sparse matrices save little. With four in a row, a
 # step takes a third of its time with dense matrices.
 _FEWEST_SPARSE = 4
-# A block may hold at most this part of all constraints.
+# A block may hold at most this fraction of all constraints.
 _LARGEST_BLOCK = 1 / 4
 
 
@@ -74,7 +74,7 @@ class Linearisation(eqx.Module):
 
     @property
     def momentum_inverse(self) -> SquareMatrix:
-        """Return N⁻¹: the inverse mass matrix, or one for a Hamiltonian system."""
+        """Return N⁻¹: the inverse mass matrix, or for Hamiltonian systems identity."""
         if self.fibre_coordinate_name == "v":
             return self.fibre_hessian_inverse
         return DiagonalMatrix(jnp.ones_like(self.acceleration))
@@ -99,7 +99,7 @@ class Linearisation(eqx.Module):
 
     @property
     def is_unique(self) -> Bool[Array, " l"]:
-        """Return which multipliers are unique; with redundant constraints, not all."""
+        """Return which multipliers are unique: all, without redundant constraints."""
         if not self.is_redundant:
             return jnp.ones(self.violation.shape, bool)
         # The product C C⁻ projects onto the range of C.
@@ -312,7 +312,7 @@ def continuous_multiplier(
     - `args`: passed on to the functions of the system.
 
     **Returns:** an array of shape (m + k,) for m nonholonomic and k holonomic
-    constraints, in units of force over those of D2Φ.
+    constraints, in units of force divided by the units of D2Φ.
 
     **Raises:** `TypeError` if `y` is not a `State`.
 

@@ -177,7 +177,8 @@ def noise_near(
     `like` has the structure, shapes and dtype of its results; see `measured_noise`.
     """
     (t, q, u), n = stop_gradient((t, q, u)), u.shape[0]
-    # Angles are reduced to the first turn: those of many turns have more round-off.
+    # Angles are reduced to the first turn, because angles of many turns have more
+    # round-off.
     q = manifold.wrapped(q, manifold.no_compensation(q))
     return measured_noise(
         lambda z: function(t + z[0], manifold.act(q, z[1 : n + 1]), u + z[n + 1 :]),

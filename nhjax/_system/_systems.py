@@ -338,9 +338,9 @@ class LagrangianSystem(AbstractMechanicalSystem):
     Values that the functions read besides their arguments (globals, variables of
     enclosing functions, attributes of objects) are compiled in. `integrate` and
     `initial_state` compare them from call to call and compile again if one has changed.
-    A `jax.jit` of your own does not: pass values that change in `args`, or as array
-    fields of an `equinox.Module`. Changes of these never recompile. `docs/systems.md`
-    has the details.
+    Your own `jax.jit` does not: pass values that change in `args`, or as array fields
+    of an `equinox.Module`. Changes of these never recompile. `docs/systems.md` has the
+    details.
 
     **Arguments:**
 
@@ -595,7 +595,7 @@ class HamiltonianSystem(AbstractMechanicalSystem):
     def energy(self, t: FloatScalarLike, y: State, args: Args = None) -> FloatScalar:
         """Compute the energy H(t, q, p) of a state.
 
-        The arguments are those of `LagrangianSystem.energy`.
+        The arguments are the same as for `LagrangianSystem.energy`.
         """
         check_time_and_state("energy", t, y)
         return self.call("hamiltonian", t, y.q, y.p, args)

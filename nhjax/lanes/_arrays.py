@@ -2,7 +2,7 @@
 
 Each operation takes the builder, the equation and the arrays of its operands, and
 returns arrays. Where the indices are known, numbers are moved while the graph is built,
-at no cost at run time. Where an index is not known, the array goes to memory, and the
+at no cost at run time. If an index is not known, the array is stored in memory, and the
 operation becomes loads and stores.
 """
 

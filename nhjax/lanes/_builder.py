@@ -1,12 +1,12 @@
-"""From a jaxpr to the graph: equation by equation, including inner programs.
+"""Conversion of a jaxpr to the graph: equation by equation, with inner programs.
 
 An array is either in registers, as a NumPy array of nodes, or in memory. Large arrays
 are in memory, and so are arrays that are read or updated at an index that is not known.
 `Builder.run` interprets a jaxpr: for each equation it calls the operation that
 `_elementwise`, `_arrays` or `_control_flow` provides for the primitive.
 
-Loads and stores are statements in the order of the program. A store needs an array that
-nothing else uses: `hold` and `release` count the users, and an array with other users
+Loads and stores are statements in the order of the program. A store needs an array
+without other users: `hold` and `release` count the users, and an array with other users
 is copied first.
 """
 
@@ -63,7 +63,7 @@ def release(value: ArrayValue) -> None:
         value.buffer.holders -= 1
 
 
-# Larger arrays are kept in memory where there is a choice.
+# Larger arrays are kept in memory if both places are possible.
 MOST_IN_REGISTERS = 128
 # At most this many numbers are loaded, stored or computed one by one.
 MOST_ONE_BY_ONE = 4096
@@ -332,7 +332,7 @@ class Builder:
             bind(variable, value)
         for equation, last in zip(jaxpr.eqns, self.last_uses(jaxpr), strict=True):
             values = [read(variable) for variable in equation.invars]
-            # An array that nothing else uses may be overwritten by the equation.
+            # The equation may overwrite an array that has no other users.
             for variable in last:
                 release(env.pop(variable))
             self.path.append(id(equation))

@@ -400,7 +400,7 @@ def loop(
     carried: list[ArrayValue] = []
     for value, is_there in zip(inits, in_memory, strict=True):
         carried.append(memory.owned(value) if is_there else memory.registers(value))
-        # An array may be carried twice, and then needs two copies.
+        # A loop may carry the same array twice, and then needs two copies.
         hold(carried[-1])
     for value in carried:
         release(value)
@@ -489,7 +489,7 @@ class _Attempt:
         return out.reshape(value.shape)
 
     def _take_over(self, values: list[ArrayValue]) -> None:
-        """Make the values of an iteration those with which the next one starts."""
+        """Make the values of an iteration the initial values of the next iteration."""
         memory = self.builder.memory
         own = [v.buffer for v in self.carried if isinstance(v, InMemory)]
         ready: list[ArrayValue] = []
@@ -511,7 +511,7 @@ class _Attempt:
         self.loop.end([self.outs[position] for position in self.varying])
 
     def wrong(self) -> list[int]:
-        """List the numbers that were assumed to be constant and are not."""
+        """List the numbers that change although they were assumed constant."""
         return [p for p, node in self.fixed.items() if self.outs[p] is not node]
 
     def results(self) -> list[ArrayValue]:
@@ -569,11 +569,11 @@ def updated_inputs(jaxpr: Any) -> frozenset[int]:
 def inner_programs(equation: Any) -> Iterator[tuple[Any, int]]:
     """List the inner programs of an equation, and where their operands start.
 
-    Constants of loops are listed too, which does no harm.
+    Constants of loops are listed too, which is harmless.
     """
     params, name = equation.params, equation.primitive.name
     if name == "while":
-        # The operands of the body, without those of the predicate.
+        # The operands of the body, without the operands of the predicate.
         yield params["body_jaxpr"].jaxpr, params["cond_nconsts"]
     elif name == "cond":
         for branch in params["branches"]:

@@ -2,8 +2,8 @@
 
 A kernel calls a function such as `@nhjax.exp.f64x8`, and `definitions` returns the text
 of all functions that a kernel calls. Errors are below 2 ulp everywhere, and the values
-at infinities, zeros and NaN are those of C. All formulas are for float64; float32 is
-converted to float64 and back, so that nearly all results are the nearest float32.
+at infinities, zeros and NaN are the same as in C. All formulas are for float64; float32
+is converted to float64 and back, so that nearly all results are the nearest float32.
 Infinite and NaN arguments take no longer than others, so that a failed member does not
 slow down the other members of its vector.
 """

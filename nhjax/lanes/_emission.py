@@ -1,4 +1,4 @@
-"""From the graph to LLVM IR: a kernel that computes `width` members at a time.
+"""Emission of LLVM IR from the graph: a kernel that computes `width` members at once.
 
 Three passes over the finished graph come first. `LiveNodes` finds the nodes that the
 results need. `mark_divergent` finds the values that differ between members; the other
@@ -7,11 +7,11 @@ are needed as vectors too.
 
 Then `_Regions` writes the nodes region by region. Loops and branches whose predicate is
 uniform become jumps. Where the predicate is divergent, members that do not take part
-are masked: they compute along, but what they compute is discarded. `_Memory` writes
-loads and stores.
+are masked: they compute too, but their results are discarded. `_Memory` writes loads
+and stores.
 
-A kernel allocates nothing but its scratch memory: on the stack up to 64 kB, by `malloc`
-above that. Programs that need more than 64 MB are refused.
+A kernel allocates only its scratch memory: up to 64 kB on the stack, and more by
+`malloc`. Programs that need more than 64 MB are refused.
 """
 
 import numpy as np
@@ -50,8 +50,8 @@ def emit(
 ) -> tuple[str, dict[tuple[str, str, int], None]]:
     """Write the kernel of a graph.
 
-    Returns the text of its module, in which the definitions of elementary functions
-    are missing, and the functions that are wanted, as `definitions` takes them.
+    Returns the text of its module, without the definitions of elementary functions, and
+    the list of these functions, in the form that `definitions` takes.
     """
     live = LiveNodes(results)
     if width > 1:
@@ -59,7 +59,7 @@ def emit(
         mark_broadcast(live)
     else:
         for buffer in live.buffers:
-            # The address of such an operand depends on the member all the same.
+            # The address of such an operand still depends on the member.
             buffer.is_divergent = buffer.kind == "operand" and is_batched[buffer.place]
     writer = Writer(width, contract)
     writer.lines.extend(_members(width))
@@ -72,7 +72,7 @@ def emit(
 
 
 def _members(width: int) -> list[str]:
-    """Write the numbers of the members; those beyond the last one repeat it."""
+    """Write the numbers of the members; numbers beyond the last member repeat it."""
     if width == 1:
         return ["  %members = add i64 %first, 0"]
     lines, whole, kind = [], "poison", vector("i64", width)
@@ -250,7 +250,7 @@ def _is_masked(inner: Region, outer: Region) -> bool:
 
 
 def mark_broadcast(live: LiveNodes) -> None:
-    """Mark the uniform nodes that are needed as a vector too."""
+    """Mark the uniform nodes that some instruction needs as a vector."""
     for node in live.nodes:
         op = node.op
         if op in ("param", "result"):
@@ -423,7 +423,7 @@ class _Regions:
     def _leave(
         self, loop: LoopInfo, tag: str, active: str, results: "_LoopResults"
     ) -> None:
-        """Store the values of members that leave the loop, and go on with the others.
+        """Store the values of members that leave the loop; the others continue.
 
         Members that have left keep computing, masked, until the last member leaves:
         this is cheaper than stopping them.
@@ -529,7 +529,7 @@ class _LoopResults:
     def __init__(
         self, writer: Writer, memory: "_Memory", loop: LoopInfo, is_partial: bool
     ):
-        """Reserve the memory; `is_partial` says that not all members enter the loop."""
+        """Reserve the memory; `is_partial`: some members may skip the loop."""
         self.writer = writer
         self.slots: list[tuple[Node, Node, str]] = []
         for result in loop.results:
@@ -538,7 +538,7 @@ class _LoopResults:
             index = result.attr[1]
             slot = memory.slot(result.dtype)
             if is_partial:
-                # Members that do not enter the loop need some value.
+                # Members that do not enter the loop need an arbitrary value.
                 self._write(result, self._in_memory(loop.inits[index]), slot)
             self.slots.append((result, loop.params[index], slot))
 

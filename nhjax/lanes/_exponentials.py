@@ -100,7 +100,7 @@ def tanh(x: Value) -> Value:
     """Return the hyperbolic tangent of x, as (exp(2x) - 1) / (exp(2x) + 1)."""
     double = absolute(x) * 2.0
     _, above, unit = _expm1_parts(where(double > 44.0, 44.0, double))
-    # exp(2x) - 1 was divided by 2^n. So is the 2 by which exp(2x) + 1 is larger.
+    # exp(2x) - 1 was divided by 2^n, so 2^(1 - n) is added to get exp(2x) + 1.
     high, low = two_sum(above[0], unit * 2.0)
     return with_sign(rounded_quotient(above, (high, low + above[1])), x)
 
@@ -178,7 +178,7 @@ def log(x: Value) -> Value:
     k, m = exponent_and_mantissa(x)
     result = _log_of(k, m - 1.0, 0.0)
     result = where(x.equals(0.0), -math.inf, where(x < 0.0, math.nan, result))
-    # NaN and infinity stay as they are.
+    # NaN and infinity are returned unchanged.
     return where(x < math.inf, result, x)
 
 
@@ -292,7 +292,7 @@ def pow(x: Value, y: Value) -> Value:
     high = where(is_zero, -math.inf, where(is_finite, high, size))
     low = where(is_finite & (size > 0.0), low, 0.0)
     power, y1 = y * high, leading_bits(y, 26)
-    # Results that overflow have no low part, and neither has NaN.
+    # Overflowing results and NaN have no low part.
     is_moderate = absolute(power) < 750.0
     power = where(is_moderate, y1 * high, power)
     rest = where(is_moderate, (y - y1) * high + y * low, 0.0)
@@ -331,7 +331,7 @@ def cbrt(x: Value) -> Value:
     return with_sign(where((size < math.inf) & (size > 0.0), root, size), x)
 
 
-# For large arguments the polynomial is in 1 / (x + 2) minus this.
+# For large arguments, the variable of the polynomial is 1 / (x + 2) - _CENTRE.
 _CENTRE = 0.229
 _TWO_OVER_ROOT_PI = 1.1283791670955126
 _ITS_REST = 1.533545961316588e-17
@@ -342,7 +342,7 @@ def erf(x: Value) -> Value:
     size = absolute(x)
     z = size * size
     near = size * _TWO_OVER_ROOT_PI + size * (polynomial(z, ERF) + _ITS_REST)
-    # From 6 on it is 1 to the last digit.
+    # For x >= 6, erf(x) is 1 to the last digit.
     size = where(size > 6.0, 6.0, size)
     beyond = polynomial(1.0 / (size + 2.0) - _CENTRE, ERFC) * exp(-(size * size))
     return with_sign(where(z < 1.0, near, 1.0 - beyond), x)

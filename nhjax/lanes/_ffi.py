@@ -1,16 +1,15 @@
 """The structures of XLA's foreign function interface, and its errors, in LLVM IR.
 
-The structures are those of the header `xla/ffi/api/c_api.h` in `jax.ffi.include_dir()`,
-as LLVM types, which have the layout of the platform's C compiler. The listed fields
-keep their offsets: within a major version of the interface structures only grow at the
-end, so that code compiled with an older header keeps working, and each structure
-contains its size. Names may change: the names here are those of version 0.3, and
-version 0.5 has the same fields at the same offsets. A test compares them with the
-installed header.
+The structures come from the header `xla/ffi/api/c_api.h` in `jax.ffi.include_dir()`, as
+LLVM types, which have the layout of the platform's C compiler. The listed fields keep
+their offsets: within a major version of the interface structures only grow at the end,
+so that code compiled with an older header keeps working, and each structure contains
+its size. Names may change: the names here are those of version 0.3, and version 0.5 has
+the same fields at the same offsets. A test compares them with the installed header.
 """
 
-# The lowest version of the interface that has all that the handler uses. A runtime
-# refuses a handler that requires a newer version than its own.
+# The lowest version of the interface that has all fields that the handler uses. A
+# runtime refuses a handler that requires a newer version than its own.
 MAJOR, MINOR = 0, 1
 
 # Values of the interface's enumerations.

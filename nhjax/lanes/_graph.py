@@ -11,8 +11,8 @@ of loops. It never leaves the side of a branch in which it was created, because 
 side may not be taken.
 
 `simplify` folds constants and removes operations, but never changes a result: rounding,
-infinities, NaN and -0.0 stay as they are. Only a structural zero makes a product zero
-whatever the other factor is.
+infinities, NaN and -0.0 are unchanged. Only a structural zero makes a product zero for
+every value of the other factor.
 
 The order of this file: the data (regions, nodes, memory), `Graph`, the rules of
 simplification, and the builders of loops and branches.
@@ -72,7 +72,7 @@ class Region:
 class Node:
     """A node of the graph: a number that is computed, or a statement.
 
-    `attr` is what the operation needs besides its arguments: the value of a constant,
+    `attr` is the data of the operation besides its arguments: the value of a constant,
     the address of a load, the loop of a parameter. The fields from `is_live` on belong
     to the passes over the finished graph: whether the node is needed, whether it
     differs between members, whether a uniform value is needed as a vector too, and the
@@ -164,7 +164,7 @@ class Graph:
     def constant(self, value: Any, dtype: str, is_structural: bool = False) -> Node:
         """Return the node of a constant.
 
-        A product with a structural zero is zero whatever the other factor is.
+        A product with a structural zero is zero for every value of the other factor.
         Structural zeros come from padding and from tangents that do not exist.
         """
         value = np.dtype(dtype).type(value)
@@ -217,7 +217,7 @@ class Graph:
     def statement(
         self, op: str, args: tuple[Node, ...], dtype: str = "", attr: Any = None
     ) -> Node:
-        """Create a node that stays where it is: a statement, or a result of one."""
+        """Create a node that is not moved: a statement, or a statement's result."""
         return Node(op, args, dtype, self.region, self.next_number(), attr)
 
     def op(self, op: str, *args: Node, dtype: str | None = None) -> Node:
@@ -276,7 +276,7 @@ class Buffer:
 
     The kind is "operand", "result", "constant" or "scratch". Operands and constants are
     only read, results are only written, scratch memory is read and written. `is_fixed`
-    says that nothing more is stored.
+    means that there are no more stores.
     """
 
     __slots__ = (
@@ -325,7 +325,7 @@ def _round_away(a: Any) -> Any:
     return whole + np.copysign(np.where(np.abs(a - whole) >= 0.5, 1, 0), a)
 
 
-# The functions that fold constants, with the results of the compiled program.
+# The functions that fold constants. Their results equal the compiled program's.
 _FOLDS: dict[str, Callable[..., Any]] = {
     "add": np.add,
     "sub": np.subtract,
@@ -384,7 +384,7 @@ def _is(node: Node, value: float) -> bool:
 
 
 def _is_no_summand(node: Node) -> bool:
-    """Return whether adding a number changes nothing; +0.0 changes -0.0."""
+    """Return whether adding a number is a no-op; adding +0.0 changes -0.0."""
     if node.op == "zero":
         return True
     if node.op != "const" or node.attr != 0:

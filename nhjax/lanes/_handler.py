@@ -8,7 +8,7 @@ once in a process, because compiling it with each program took 20 to 50 ms.
 A call is divided into blocks, of as many members as the kernel computes at once. The
 caller's thread runs blocks, and so do threads of XLA's pool where this pays:
 
-- An atomic counter hands out blocks, to the caller and to its helpers alike.
+- An atomic counter assigns blocks to the caller and to its helpers.
 - The caller asks the pool for helpers: for fewer than the pool has threads, because it
     works itself, and for so few that each works longer than it takes to wake it.
 - At the end the caller waits for the blocks that helpers have begun. It does not wait
@@ -20,8 +20,8 @@ caller's thread runs blocks, and so do threads of XLA's pool where this pays:
 
 Several devices of one process share the pool, and so do several threads of Python. For
 this reason all programs of the process share a counter of the threads that are working
-in blocks. If there are as many as the pool has threads, no helper is asked for; if
-there are more, helpers leave after a block.
+in blocks. If their number equals the number of threads of the pool, a call starts no
+helper; if it is larger, helpers leave after a block.
 """
 
 import time
@@ -65,7 +65,7 @@ PROGRAM = {
 # The data that the threads of a call share: the numbers of blocks begun and done, the
 # number of threads that hold the job, the number of threads of the pool, the number of
 # blocks, the last member, whether a block failed, the addresses of the data, and the
-# program. The first two change all the time, and have cache lines of their own.
+# program. The first two change often, and each has its own cache line.
 JOB = {
     "begun": "i64",
     "padding_1": "[7 x i64]",
@@ -359,7 +359,7 @@ def handler_ir(
         writes.
     - `width`: the number of members that it computes at once.
     - `is_batched`: whether the results have members, along the leading axis. Otherwise
-        there is one member. A program without results does nothing.
+        there is one member. A program without results is empty.
     """
     values = {
         "kernel": "@kernel",

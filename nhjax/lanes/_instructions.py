@@ -147,7 +147,7 @@ def _extremum(writer: Writer, node: Node, width: int, args: list[str]) -> str:
         return _intrinsic(writer, sign + node.op, dtype, width, args)
     for index, arg in enumerate(node.args):
         if arg.is_constant and arg.attr != 0 and not np.isnan(arg.attr):
-            # Signed zeros and NaN cannot matter then.
+            # Then signed zeros and NaN need no special case.
             known, other = args[index], args[1 - index]
             order = "ogt" if is_max else "olt"
             wins = writer.value(f"fcmp {order} {kind} {known}, {other}")
@@ -237,7 +237,7 @@ _SHIFTS = {
 
 
 def _shift(writer: Writer, node: Node, width: int, args: list[str]) -> str:
-    """Shift integers as XLA does, also by as many bits as they have, or more.
+    """Shift integers as XLA does, also by their number of bits or more.
 
     Such a shift gives zero; an arithmetic shift to the right gives sign bits.
     """

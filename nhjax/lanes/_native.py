@@ -1,4 +1,4 @@
-"""From LLVM IR to native code: parsed, optimised, compiled and loaded by llvmlite.
+"""Compilation of LLVM IR to native code, which llvmlite optimises and loads.
 
 llvmlite is imported when a function of this module first needs it, so that the package
 can be imported without llvmlite.
@@ -39,7 +39,7 @@ _PASSES = 1
 # was 6 percent slower, and a long kernel 2 percent faster.
 _LONG_TEXT = 1_000_000
 _GENERATION_OF_SHORT, _GENERATION_OF_LONG = 2, 1
-# The level of both for programs that are wanted quickly: no optimisation.
+# The level of both for programs that must compile quickly: no optimisation.
 _QUICK = 0
 
 
@@ -143,7 +143,7 @@ def load(code: bytes, name: str, symbol: str, imports: dict[str, int]) -> int:
 
 @lru_cache(maxsize=1)
 def _linker() -> Any:
-    # llvmlite frees nothing when Python exits, so that this lives as long as XLA.
+    # llvmlite does not free this when Python exits, so that it lives as long as XLA.
     return _llvm().create_lljit_compiler(
         _machine(host(), _GENERATION_OF_SHORT), use_jit_link=True
     )
@@ -175,7 +175,7 @@ def _compiled(
     # The types and constants of modules in the global context are never freed.
     context = llvm.create_context()
     module, *others = [llvm.parse_assembly(text, context) for text in texts]
-    # Without these, the passes would use the layout of no particular machine.
+    # Without these, the passes would use a generic layout instead of this machine's.
     for part in (module, *others):
         part.triple = machine.triple
         part.data_layout = str(machine.target_data)

@@ -1,4 +1,4 @@
-"""The whole way of a program, from a jaxpr to a name that XLA can call.
+"""Compilation of a program, from a jaxpr to a name that XLA can call.
 
 `compile_batched` and `compile_single` build the graph of a program (`build_graph`),
 write its kernel (`llvm_ir`), compile it together with a handler, and register the
@@ -46,7 +46,7 @@ from ._native import host, host_width, load, object_code, version
 
 
 def compile_single(program: Any, is_brief: bool = False) -> str:
-    """Compile a program for a single run, and return the name to call it by.
+    """Compile a program for a single run, and return its name for calls.
 
     With `is_brief` it is compiled in less time, to slower code.
 
@@ -115,7 +115,7 @@ def llvm_ir(
 
     The text of an LLVM module with the function `i1 kernel(ptr operands, ptr results,
     i64 first, i64 last)`. It computes the members from `first` to `first + width - 1`;
-    those beyond `last` repeat `last`. It returns whether it failed, because there was
+    members beyond `last` repeat `last`. It returns whether it failed, because there was
     no scratch memory.
 
     **Raises:** `Unsupported` if the program cannot be compiled.
@@ -128,9 +128,9 @@ def llvm_ir(
 # Scans of at most this length are unrolled.
 LONGEST_UNROLLED_SCAN = 8
 # Programs with more nodes than this are refused, unless they have fewer than 40 nodes
-# for each of JAX's operations. LLVM takes about 10 s for so many nodes, and minutes for
-# more. XLA keeps loops over arrays: it takes a few seconds where arrays are large, but
-# longer than LLVM where there are many small ones.
+# for each of JAX's operations. LLVM takes about 10 s for this number of nodes, and
+# minutes for more. XLA keeps loops over arrays: it takes a few seconds where arrays are
+# large, but longer than LLVM where there are many small ones.
 MOST_NODES, NODES_PER_OPERATION = 100_000, 40
 
 OPERATIONS: dict[str, Operation] = {
@@ -200,7 +200,7 @@ _programs: dict[str, int] = {}
 _workers = ctypes.c_int64(0)
 
 # One program is compiled at a time: LLVM must not be used by two threads at once, and
-# if two threads want the same program, the second finds it compiled.
+# if two threads request the same program, the second thread finds it compiled.
 _lock = threading.RLock()
 
 
@@ -238,7 +238,7 @@ def register_kernel(
     is_batched: bool,
     is_brief: bool = False,
 ) -> str:
-    """Compile and register a kernel, unless that has been done, and return its name.
+    """Compile and register a kernel, unless this has been done, and return its name.
 
     **Arguments:**
 
@@ -283,7 +283,7 @@ def _shared_handler() -> int:
 
 
 def is_quick() -> bool:
-    """Return whether JAX is set to optimise little, so that programs compile sooner."""
+    """Return whether JAX is configured for fast compilation and little optimisation."""
     return bool(jax.config.read("jax_disable_most_optimizations"))
 
 

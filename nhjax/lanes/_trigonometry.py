@@ -94,8 +94,8 @@ def _reduction_of_large() -> str:
     high = (upper & ~_LOWEST_BITS).cast("uitofp", "double") * scale
     low = ((upper & _LOWEST_BITS) << 53) | (lower >> 11)
     low = low.cast("uitofp", "double") * 2.0**-53 * scale
-    # Two signs enter: the sign of r, where |n| pi / 2 is larger than |x|, and that of
-    # x.
+    # Two signs enter: the sign of r, where |n| pi / 2 is larger than |x|, and the sign
+    # of x.
     is_left = bits < 0
     sign = where(is_negative, -(2**63), 0) ^ (bits & -(2**63))
     quadrant = n.cast("trunc", "i64")
@@ -118,7 +118,7 @@ _REDUCED_LARGE_DEFINITION = _reduction_of_large()
 
 _PER_HALF_PI = 0.6366197723675814
 # pi / 2 in three parts. The first two have 38 bits: their products with integers up to
-# 2^15 are exact, and n is not larger for the largest argument below.
+# 2^15 are exact, and |n| <= 2^15 up to the argument _LARGEST_DIRECT.
 _HALF_PI_PARTS = (1.5707963267923333, 2.5633441515839558e-12, 1.0562999066987428e-23)
 _LARGEST_DIRECT = 51471.0
 
@@ -202,7 +202,7 @@ class _Angle(NamedTuple):
     rest: Value
 
     def after(self, low: int, middle: int, high: int, sign: float) -> Value:
-        """Return a multiple of pi / 4, selected by that of the angle, +- arctan(t)."""
+        """Return k pi / 4 +- arctan(t), with k selected by the range of the angle."""
         multiples = zip(*(_QUARTERS[i] for i in (low, middle, high)), strict=True)
         first, second = (
             where(self.is_low, x, where(self.is_high, z, y)) for x, y, z in multiples
@@ -234,7 +234,7 @@ def atan(x: Value) -> Value:
 def atan2(y: Value, x: Value) -> Value:
     """Return the angle from the first axis of the point (x, y)."""
     a, b = absolute(y), absolute(x)
-    # Two infinities have the angle of equal numbers; two zeros have 0 or pi.
+    # For two infinities the angle is as for equal numbers; for two zeros it is 0 or pi.
     are_infinite = a.equals(math.inf) & b.equals(math.inf)
     a, b = where(are_infinite, 1.0, a), where(are_infinite, 1.0, b)
     scale = where((a > 2.0**1000) | (b > 2.0**1000), 0.25, 1.0)

@@ -6,9 +6,9 @@ text and returns the name of the result; the code that writes kernels works on t
 level, since it writes 10^4 instructions and more.
 
 Formulas are written with `Value`, a name with its type. Its operators append
-instructions, so that Python's `(x - n * a) * b` writes what it says. The functions
-below `Value` are the arithmetic that the elementary functions share: polynomials, and
-double-double numbers.
+instructions, so that the Python expression `(x - n * a) * b` writes its instructions.
+The functions below `Value` are the common arithmetic of the elementary functions:
+polynomials, and double-double numbers.
 """
 
 import struct
@@ -221,7 +221,7 @@ class Writer:
         usual: tuple["Value", ...],
         rare: Callable[[], tuple["Value", ...]],
     ) -> tuple["Value", ...]:
-        """Return `usual`, but the results of `rare()` for the members of `is_rare`.
+        """Return the results of `rare()` for members of `is_rare`, otherwise `usual`.
 
         The instructions of `rare` are skipped at run time if there is no such member.
         """
@@ -427,7 +427,7 @@ def polynomial(x: Value, coefficients: Sequence[float]) -> Value:
     """Evaluate a polynomial with the given coefficients, lowest power first.
 
     As in Estrin's scheme, the even and the odd powers are evaluated separately, each in
-    the same way: fewer products wait for one another than in Horner's scheme.
+    the same way: the chain of dependent products is shorter than in Horner's scheme.
     """
     powers = [x]
     while 2 ** len(powers) < len(coefficients):

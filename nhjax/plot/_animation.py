@@ -132,8 +132,8 @@ def _times(ts: Any) -> np.ndarray:
 def _positions(points: Any, count: int) -> dict[str, np.ndarray]:
     if not isinstance(points, Mapping) or not points:
         raise TypeError(
-            "`points` must be positions by name, such as those that the method "
-            f"`points` of a machine computes, got {type(points).__name__}."
+            "`points` must be positions by name, for instance the result of the "
+            f"method `points` of a machine, got {type(points).__name__}."
         )
     moving = {name: np.asarray(x, float) for name, x in points.items()}
     dimensions = {x.shape[-1] if x.ndim else 0 for x in moving.values()}

@@ -281,8 +281,8 @@ def new_axes(ax: "Axes | None", projection: str | None = None) -> "Axes":
                 f"{type(ax).__name__}."
             )
         return ax
-    # Imported only here, because drawing into given axes must not choose a backend of
-    # matplotlib.
+    # The import is here, because drawing into the user's axes must not choose a backend
+    # of matplotlib.
     from matplotlib import pyplot as plt
 
     keywords = {} if projection is None else {"projection": projection}

@@ -25,8 +25,8 @@ QUICK: Mapping[str, Mapping[str, Any]] = MappingProxyType(
     }
 )
 # For each study: the seconds to compile a program, the seconds per step of a trajectory
-# (both measured on two cores of 2 GHz), and whether each pair (s, h) has a program of
-# its own; otherwise each s has one.
+# (both measured on two cores of 2 GHz), and whether each pair (s, h) is compiled
+# separately; otherwise each s is.
 _COSTS: Mapping[str, tuple[float, float, bool]] = MappingProxyType(
     {
         "particle-order": (4.0, 1e-5, False),

@@ -118,7 +118,7 @@ class BallInvariants(AbstractStudyResult):
         return slopes(self.dt, np.array(errors), floor=POSITION_FLOOR)
 
     def parameters(self) -> dict[str, Any]:
-        """Return every parameter of the computation, initial data included."""
+        """Return every parameter of the computation, including initial data."""
         return {
             "stages": self.stages,
             "dt": self.dt,
@@ -263,7 +263,7 @@ def ball_invariants(
         at the end of the run with the smallest step, which must be a whole number of
         steps of every other run.
     - `closure`: the closure of the multipliers, as for `nhjax.LobattoIIIAB`; by default
-        that of the paper.
+        the closure of the paper.
     - `retraction`: `"cayley"`, as in the paper, or `"exponential"`.
     - `progress`: whether to show a progress bar for each s on the standard error
         stream.

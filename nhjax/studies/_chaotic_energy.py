@@ -101,7 +101,7 @@ class ChaoticEnergy(AbstractStudyResult):
         return slopes(self.dt, means)
 
     def parameters(self) -> dict[str, Any]:
-        """Return every parameter of the computation, initial data included."""
+        """Return every parameter of the computation, including initial data."""
         return {
             "stages": self.stages,
             "dt": self.dt,
@@ -228,7 +228,7 @@ def chaotic_energy(
     - `final_time`: the length of each run.
     - `members`: J of the paper; the ensemble has J + 1 members.
     - `closure`: the closure of the multipliers, as for `nhjax.LobattoIIIAB`; by default
-        that of the paper.
+        the closure of the paper.
     - `times`: the times at which to report μ, averaged over a window of ±5; by default
         the times 10, 50, 100 and 200 within the run, or its end for a shorter run.
     - `save_every`: the number of steps between saved energies.

@@ -92,7 +92,7 @@ class CVTEnergy(AbstractStudyResult):
     runs: list[CVTRun]
 
     def parameters(self) -> dict[str, Any]:
-        """Return every parameter of the computation, initial data included."""
+        """Return every parameter of the computation, including initial data."""
         regimes = dict.fromkeys(run.regime for run in self.runs)
         examples = {name: REGIMES[name](self.epsilon) for name in regimes}
         return {
@@ -139,7 +139,7 @@ class CVTEnergy(AbstractStudyResult):
         return data
 
     def table(self) -> str:
-        """Format a table of energy errors by fifths of a run, with E_d, E_p ranges."""
+        """Format a table of the energy errors in each fifth of a run, with ranges."""
         header = ["regime", "s", "h"]
         header += [f"max|E-E0| {i}/5" for i in range(1, 6)]
         header += ["range of ΔE_d", "range of ΔE_p", "run s"]
@@ -227,7 +227,7 @@ def cvt_energy(
     - `dt`: the step sizes h.
     - `final_time`: the length of each run, to the nearest whole step.
     - `closure`: the closure of the multipliers, as for `nhjax.LobattoIIIAB`; by default
-        that of the paper.
+        the closure of the paper.
     - `epsilon`: the perturbation ε of the pendulum.
     - `short_time`: the duration that the figures of the short term show.
     - `progress`: whether to show a progress bar for each s and h on the standard error

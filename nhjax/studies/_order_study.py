@@ -112,7 +112,7 @@ class AbstractOrderStudy(AbstractStudyResult):
         return last
 
     def parameters(self) -> dict[str, Any]:
-        """Return every parameter of the computation, initial data included."""
+        """Return every parameter of the computation, including initial data."""
         return {
             "stages": self.stages,
             "dt": self.dt,
@@ -230,8 +230,8 @@ class AbstractOrderStudy(AbstractStudyResult):
 
     def _expected(self, s: int) -> tuple[int, ...]:
         order = 2 * s - 2
-        # Only the propagated closure reports a multiplier of its own, λ = Λ^s; the
-        # other closures report λ_c.
+        # Only the propagated closure reports its own multiplier, λ = Λ^s; the other
+        # closures report λ_c.
         own = s - s % 2 if self.closure == "propagated" else order
         return tuple(own if name == "multiplier" else order for name in self.quantities)
 

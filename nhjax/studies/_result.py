@@ -40,7 +40,7 @@ class AbstractStudyResult(abc.ABC):
 
     @abc.abstractmethod
     def parameters(self) -> dict[str, Any]:
-        """Return every parameter of the computation, initial data included."""
+        """Return every parameter of the computation, including initial data."""
 
     @abc.abstractmethod
     def summary(self) -> dict[str, Any]:
@@ -198,8 +198,9 @@ def slopes(
 ) -> np.ndarray:
     """Compute observed orders in the shape of `errors`, with NaN for undefined ones.
 
-    The first row is NaN, because it has no larger step size to compare with. So are
-    orders that involve errors at or below `floor`, which are round-off.
+    The first row is NaN, because it has no larger step size to compare with. Orders
+    that involve errors at or below `floor` are NaN too, because these errors are
+    round-off.
     """
     above = errors > floor
     order = np.full(errors.shape, np.nan)

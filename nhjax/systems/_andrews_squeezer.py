@@ -26,9 +26,9 @@ class AndrewsSqueezer(AbstractExample):
     with q = (β, θ, γ, φ, δ, Ω, ε) [rad]. The bodies K1 to K7 have the angles β,
     β + θ, γ, φ + δ, δ, Ω + ε and ε. Each turns about its inner joint: K1 about the
     origin O, K2 about the end of K1, K3 about B, K5 and K7 about A, K4 about the end
-    of K5, K6 about that of K7. c_k are the centres of mass and P_k the outer ends, of
-    which those of K2, K3, K4 and K6 are one joint P. A spring pulls at the point D of
-    K3 from C; a motor turns K1 with the torque M, a thousand revolutions a minute
+    of K5, K6 about the end of K7. c_k are the centres of mass and P_k the outer ends,
+    and the ends of K2, K3, K4 and K6 meet in one joint P. A spring pulls at the point D
+    of K3 from C; a motor turns K1 with the torque M, a thousand revolutions a minute
     within 0.03 s.
 
     **Parameters:** `masses` m_k [kg] and `inertias` I_k about the centres [kg m²], of

@@ -35,17 +35,18 @@ class BallInBowl(AbstractConstrainedGroupExample):
     centre of the ball x [m], v = (ω₁, ω₂, ω₃, ẋ, ẏ, ż) with the body angular velocity
     [1/s]. The centre moves on Φ = 0, a paraboloid (ε = 0) or a sphere of radius 1/κ
     (ε = 1) with its lowest point at the origin; the bowl is the parallel surface at the
-    distance a below, and n is its normal. The constraints φ say that the ball does not
-    slip at x - a n, and are affine. With the multipliers (λ₁, λ₂, μ) the force of the
-    bowl is (λ₁, λ₂, 0) + μ ∇Φ [N].
+    distance a below, and n is its normal. The constraints φ, which are affine, mean
+    that the ball does not slip at x - a n. With the multipliers (λ₁, λ₂, μ) the force
+    of the bowl is (λ₁, λ₂, 0) + μ ∇Φ [N].
 
     Energy is not conserved, but the moving energy E - Ω (m (x ẏ - y ẋ) + k m a² (R ω)₃)
-    is. Of a flat bowl, κ = 0, it is the `TurntableBall`.
+    is. For a flat bowl, κ = 0, the system is the `TurntableBall`.
 
     **Parameters:** `mass` m [kg]; `radius` a of the ball [m]; `inertia_ratio` k, its
     moment of inertia over m a² [1], 2/5 for a solid ball; `curvature` κ [1/m] of the
     surface on which the centre moves, at its lowest point; `rate` Ω of the bowl [1/s];
-    `gravity` g [m/s²]; `shape`, "paraboloid" or "sphere"; `retraction`, that of SO(3).
+    `gravity` g [m/s²]; `shape`, "paraboloid" or "sphere"; `retraction`, the
+    retraction of SO(3).
 
     **Source:** Routh, *Advanced Rigid Dynamics*; Borisov, Mamaev and Kilin, *The
     rolling motion of a ball on a surface* (2002); Dalla Via, Fassò and Sansonetto, *On
@@ -121,7 +122,7 @@ class BallInBowl(AbstractConstrainedGroupExample):
         spin: ArrayLike = 0.0,
         **parameters: Any,
     ) -> "BallInBowl":
-        """Make a rolling ball with its centre at (x, y), which moves at (ẋ, ẏ).
+        """Create a rolling ball with its centre at (x, y), which moves at (ẋ, ẏ).
 
         `spin` is the part of the angular velocity along the normal n; `parameters` are
         those of the class. In a sphere the ball is in the lower half.
@@ -142,7 +143,7 @@ class BallInBowl(AbstractConstrainedGroupExample):
     def circling(
         cls, radius_of_path: ArrayLike, path_rate: ArrayLike, **parameters: Any
     ) -> "BallInBowl":
-        """Make a ball that goes round steadily on a horizontal circle about the axis.
+        """Create a ball that moves steadily on a horizontal circle about the axis.
 
         The circle of its centre has the radius `radius_of_path` [m], and the rate is
         `path_rate` [1/s]; the balance of moments determines the spin. `parameters` are
@@ -199,7 +200,7 @@ class BallInBowl(AbstractConstrainedGroupExample):
         }
 
     def points(self, t: FloatScalarLike, q: Element) -> dict[str, Array]:
-        """Compute where the centre, the contact and the pole of the ball are [m].
+        """Compute the positions of the centre, contact and pole of the ball [m].
 
         The pole is where the third body axis leaves the ball.
         """
@@ -212,7 +213,7 @@ class BallInBowl(AbstractConstrainedGroupExample):
 
 
 def _steady_spin(ball: BallInBowl, rate: Array) -> Array:
-    """Compute the spin with which a ball that moves along a circle stays on it.
+    """Compute the spin that keeps a moving ball on its circle.
 
     a n × F = -I ω' is along the path, and ω turns with the ball at the given rate. The
     ball is on the first axis, without spin.

@@ -27,7 +27,7 @@ def parameter(value: ArrayLike) -> Array:
     """Convert a parameter of an example to an array, which is a leaf.
 
     A Python or NumPy scalar becomes a weakly-typed float, so that it takes part in
-    float32 and float64 arithmetic alike, strict dtype promotion included.
+    float32 and float64 arithmetic, also with strict dtype promotion.
     """
     if isinstance(value, (int, float, np.number)):
         return jnp.asarray(float(value))
@@ -89,7 +89,7 @@ def require_consistent(name: str, violation: ArrayLike, scale: ArrayLike) -> Non
     """Raise where `name` violates a constraint by more than the rounding of `scale`.
 
     A closed-form solution uses the constraint to drop velocities: for data that violate
-    it the formula would silently answer for other data.
+    it, the formula would silently give the solution of other data.
     """
     largest = np.max(np.abs(np.asarray(violation)))
     sizes = np.asarray(scale)
@@ -106,7 +106,8 @@ def given_forces(
 ) -> Array:
     """Return the forces in `args` as an array; they are zero where it is None.
 
-    Raise a `ShapeError` unless they have the given shape. `what` says what they are.
+    Raise a `ShapeError` unless they have the given shape. `what` describes them in
+    messages.
     """
     if args is None:
         return jnp.zeros(shape, dtype)
@@ -172,7 +173,7 @@ class AbstractExample(eqx.Module):
         return momentum @ v - value
 
     def initial_state(self, dtype: DTypeLike | None = None) -> State:
-        """Make the consistent state at (`q0`, `v0`).
+        """Create the consistent state at (`q0`, `v0`).
 
         `dtype` defaults to JAX's default float.
         """

@@ -78,10 +78,10 @@ class CarAxis(AbstractExample):
 
     @classmethod
     def level(cls, **parameters: ArrayLike) -> "CarAxis":
-        """Make a level axle on springs at their rest length, as the published one.
+        """Create a level axle on springs at their rest length, as in the source.
 
         It moves sideways at the rate at which the line of the wheels turns at t = 0.
-        `parameters` are those of the class.
+        `parameters` are the parameters of the class.
         """
         axis = cls(**parameters)
         height, zero = axis.rest_length, jnp.zeros_like(axis.rest_length)
@@ -111,7 +111,7 @@ class CarAxis(AbstractExample):
         return jnp.stack([self._wheel(t, q) @ q[:2], axle @ axle - self.length**2])
 
     def invariants(self, t: FloatScalarLike, q: Array, v: Array) -> dict[str, Array]:
-        """Return nothing: the road does work, and the springs do not dissipate it."""
+        """Return an empty dictionary: the road does work on the system."""
         return {}
 
     def points(self, t: FloatScalarLike, q: Array) -> dict[str, Array]:

@@ -48,8 +48,8 @@ class CarWithTrailers(AbstractNonholonomicExample):
     one number for all or n of them, `trailer_length` d from hitch to axle,
     `trailer_hitch` h, the distance of the hitch behind the axle of the vehicle in
     front, `trailer_centre` of mass ahead of the axle [m], `trailer_mass` [kg] and
-    `trailer_inertia` about the centre [kg m²]. The defaults are those of no car in
-    particular. `v0` is by default that of a speed of 5 m/s at `q0`.
+    `trailer_inertia` about the centre [kg m²]. The default values do not describe a
+    particular car. By default, `v0` belongs to a speed of 5 m/s at `q0`.
 
     **Source:** Laumond, *Controllability of a multibody mobile robot* (1993), and
     Rouchon, Fliess, Lévine and Martin, *Flatness and motion planning: the car with n
@@ -113,10 +113,10 @@ class CarWithTrailers(AbstractNonholonomicExample):
         steer: ArrayLike = 0.3,
         **parameters: Any,
     ) -> "CarWithTrailers":
-        """Make a car on a circle, with the trailers in their steady positions.
+        """Create a car on a circle, with the trailers in their steady positions.
 
-        `speed` is that of the rear axle. All headings go on turning at the same rate,
-        and nothing else changes.
+        `speed` is the speed of the rear axle. All headings turn at the same constant
+        rate, and the angles between them stay constant.
         """
         car = cls(num_trailers, **parameters)
         speed, steer = parameter(speed), parameter(steer)
@@ -218,7 +218,7 @@ class CarWithTrailers(AbstractNonholonomicExample):
 
 
 def _axles(car: CarWithTrailers, q: Array) -> list[Float[Array, "2"]]:
-    """Compute the rear and the front axle of the car and those of the trailers."""
+    """Compute the axles: rear and front of the car, and one of each trailer."""
     axle, along = q[:2], direction(q[2])
     axles = [axle, axle + car.wheelbase * along]
     for i, (length, hitch) in enumerate(_hitches(car, q.dtype)):

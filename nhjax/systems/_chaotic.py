@@ -78,7 +78,7 @@ class ChaoticSystem(AbstractConstrainedExample):
     def ensemble(
         self, members: int, dtype: DTypeLike | None = None
     ) -> tuple[Array, Array]:
-        """Make initial data (q0, v0), each of shape (J + 1, n), on one energy surface.
+        """Create initial data (q0, v0) of shape (J + 1, n), all with the same energy.
 
         `members` is the paper's J: row j = 0..J has q_1 = cos(jπ/2J) and
         v_2 = sin(jπ/2J). For m = 3 these are the paper's data, of energy 3.06; for
@@ -93,7 +93,7 @@ class ChaoticSystem(AbstractConstrainedExample):
         return jnp.asarray(q0, dtype), jnp.asarray(v0, dtype)
 
     def _member(self, angles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Make initial data at `angles` on the circle q_1² + v_2² = 1."""
+        """Create initial data at `angles` on the circle q_1² + v_2² = 1."""
         q = np.ones((*angles.shape, 2 * self.m + 1))
         q[..., 0] = np.cos(angles)
         q[..., 1 : self.m + 1] = np.arange(self.m, 0, -1) / 5

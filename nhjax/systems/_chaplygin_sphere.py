@@ -17,17 +17,17 @@ class ChaplyginSphere(AbstractRollingBody):
     φ = (R (v - r ω × γ))₁₂,  γ = Rᵀ e₃,
 
     with q = (R, x): the attitude, a quaternion, and the position of the centre, which
-    is that of mass [m]; (v, ω) are their body velocities along the principal axes [m/s,
-    1/s]. Φ is the height of the contact, and φ the horizontal velocity there; their
-    multipliers are the force of the plane in space [N].
+    is also the centre of mass [m]; (v, ω) are their body velocities along the principal
+    axes [m/s, 1/s]. Φ is the height of the contact, and φ the horizontal velocity
+    there; their multipliers are the force of the plane in space [N].
 
-    The angular momentum about the contact, R K with K = I ω + m r² (ω - (ω·γ) γ), does
-    not change in space, so that |K|² and K·γ are constant too, and the system is
+    The angular momentum about the contact, R K with K = I ω + m r² (ω - (ω·γ) γ), is
+    constant in space, so that |K|² and K·γ are constant too, and the system is
     integrable.
 
     **Parameters:** `mass` m [kg]; `radius` r [m]; `moments` (I₁, I₂, I₃) about the
-    centre [kg m²]; `gravity` g [m/s²], which presses the sphere on the plane and does
-    nothing else; `retraction`, that of SE(3).
+    centre [kg m²]; `gravity` g [m/s²], which only presses the sphere on the plane;
+    `retraction`, the retraction of SE(3).
 
     **Source:** Chaplygin, *On a ball's rolling on a horizontal plane* (1903), in
     English in Regular and Chaotic Dynamics 7 (2002).
@@ -91,7 +91,7 @@ class ChaplyginSphere(AbstractRollingBody):
         }
 
     def points(self, t: FloatScalarLike, q: Array) -> dict[str, Array]:
-        """Compute where the centre, the contact and the three poles are [m].
+        """Compute the positions of the centre, contact and three poles [m].
 
         The poles are where the principal axes leave the sphere.
         """

@@ -1,4 +1,4 @@
-"""Chaplygin's top: a sphere whose centre of mass is beside its centre."""
+"""Chaplygin's top: a sphere whose centre of mass is not at its centre."""
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -23,18 +23,18 @@ class ChaplyginTop(AbstractRollingBody):
     φ = (R (v + ω × s))₁₂,  s = a e₃ - r γ,  γ = Rᵀ e₃,
 
     with q = (R, x): the attitude, a quaternion, and the position of the centre of mass
-    [m]; (v, ω) are their body velocities along the principal axes [m/s, 1/s]. The
-    centre of mass is below that of the sphere by a where the third axis is upward. The
+    [m]; (v, ω) are their body velocities along the principal axes [m/s, 1/s]. If the
+    third axis is upward, the centre of mass is below the centre of the sphere by a. The
     contact is s, seen from the centre of mass; Φ is its height, and φ the horizontal
     velocity there. The multipliers are the force of the plane in space [N].
 
-    Where I₁ = I₂ it is Routh's sphere, which is integrable: beside the energy it
+    If I₁ = I₂, it is Routh's sphere, which is integrable: besides the energy it
     conserves Jellett's integral K·s, with the angular momentum K about the contact, and
     Routh's integral ω₃ √(I₁I₃ + m (I₁ (s₁² + s₂²) + I₃ s₃²)).
 
     **Parameters:** `mass` m [kg]; `radius` r [m]; `offset` a [m], of either sign;
     `moments` (I₁, I₂, I₃) about the centre of mass [kg m²]; `gravity` g [m/s²];
-    `retraction`, that of SE(3).
+    `retraction`, the retraction of SE(3).
 
     **Source:** Routh, *Advanced Rigid Dynamics*; Chaplygin, *On a motion
     of a heavy body of revolution on a horizontal plane* (1897), in English in Regular
@@ -106,7 +106,7 @@ class ChaplyginTop(AbstractRollingBody):
         return self.contact_momentum(q, v) @ s, v[5] * jnp.sqrt(weighted)
 
     def points(self, t: FloatScalarLike, q: Array) -> dict[str, Array]:
-        """Compute where the centres, the contact and the pole are [m].
+        """Compute the positions of the centres, the contact and the pole [m].
 
         The pole is where the third axis leaves the sphere.
         """

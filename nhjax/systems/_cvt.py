@@ -46,12 +46,12 @@ class ContinuouslyVariableTransmission(AbstractConstrainedExample):
 
     @classmethod
     def low(cls, epsilon: ArrayLike = 0.5) -> "ContinuouslyVariableTransmission":
-        """Make the example with the paper's low energy: the driver oscillates."""
+        """Create the example with the paper's low energy: the driver oscillates."""
         return cls(epsilon, v0=(0.0, 0.6 * math.sqrt(10.0), 0.0))
 
     @classmethod
     def high(cls, epsilon: ArrayLike = 0.5) -> "ContinuouslyVariableTransmission":
-        """Make the example with the paper's high energy: the driver rotates."""
+        """Create the example with the paper's high energy: the driver rotates."""
         return cls(epsilon, v0=(0.0, math.sqrt(8.0), 0.0))
 
     def lagrangian(self, t: FloatScalarLike, q: Array, v: Array, args: Args) -> Array:

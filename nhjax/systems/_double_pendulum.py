@@ -61,7 +61,7 @@ class DoublePendulum(AbstractExample):
         lengths: ArrayLike | tuple[float, float] = (1.0, 1.0),
         gravity: ArrayLike = 1.0,
     ) -> "DoublePendulum":
-        """Make a pendulum whose rods form `angles` with the downward vertical."""
+        """Create a pendulum whose rods form `angles` with the downward vertical."""
         angle, rate = coordinates(angles), coordinates(rates)
         length = coordinates(lengths)
         sin, cos = jnp.sin(angle), jnp.cos(angle)

@@ -27,17 +27,18 @@ class FlyballGovernor(AbstractExample):
     L = (J_s + J_m)/2 φ̇² + m/2 ṡ² - m g s + Σ_{k=1,2} (m_r/2 |ċ_k|² + M/2 |ḃ_k|²
     + B/2 |u̇_k|² + A/2 φ̇² sin² β_k - g (m_r c_k + M b_k) · e_z) - V,
 
-    with q = (φ, β₁, β₂, s): the angle of the shaft and those of the rods below the
-    horizontal [rad], and the height of the slider [m], which turns with the shaft.
-    Along u_k = ± cos β_k e(φ) - sin β_k e_z lie from its hinge at the radius a and the
-    height h the centre c_k = ½ l u_k of a rod and its ball b_k = l u_k.
+    with q = (φ, β₁, β₂, s): the angle of the shaft and the angles of the rods below the
+    horizontal [rad], and the height of the slider [m], which turns with the shaft. Each
+    rod has the direction u_k = ± cos β_k e(φ) - sin β_k e_z, and its hinge is at the
+    radius a and the height h. Seen from the hinge, the centre of the rod is c_k = ½ l
+    u_k, and its ball is b_k = l u_k.
 
     A coupler of length d ties the middle of each rod to the slider at the radius a. It
-    either is a rigid rod (`couplers="rods"`), V = 0 and Φ_k = d_k² - d² with d_k the
+    is either a rigid rod (`couplers="rods"`), V = 0 and Φ_k = d_k² - d² with d_k the
     distance of its ends, or a spring with a damper (`"springs"`), V = Σ K/2 (d_k - d)²
-    and forces -C ḋ_k, for which the published ones are stiff.
+    and forces -C ḋ_k, for which the published parameters are stiff.
 
-    In `args` may be a torque on the shaft [N m], a scalar.
+    `args` may contain a torque on the shaft [N m], a scalar.
 
     **Parameters:** `shaft_inertia` J_s, `slider_inertia` J_m, `rod_inertias` (A, B)
     along and across a rod [kg m²]; `slider_mass` m, `rod_mass` m_r, `ball_mass` M [kg];
@@ -108,10 +109,10 @@ class FlyballGovernor(AbstractExample):
         angle_rate: ArrayLike = 0.0,
         **parameters: Any,
     ) -> "FlyballGovernor":
-        """Make a governor with both rods at `angle`, the shaft turning at `rate`.
+        """Create a governor with both rods at `angle`, the shaft turning at `rate`.
 
         The slider hangs below the middles of the rods, at the length of the couplers.
-        `parameters` are those of the class.
+        `parameters` are the parameters of the class.
         """
         governor = cls(**parameters)
         dtype = governor.q0.dtype
@@ -144,7 +145,7 @@ class FlyballGovernor(AbstractExample):
         )
 
     def lagrangian(self, t: FloatScalarLike, q: Array, v: Array, args: Args) -> Array:
-        """Compute the Lagrangian, kinetic energy less that of weight and springs."""
+        """Compute the Lagrangian, kinetic minus potential energy."""
         hinges_and_rods, rates = jax.jvp(self._rods, (q,), (v,))
         axial, transverse = self.rod_inertias.astype(v.dtype)
         inertia = self.shaft_inertia + self.slider_inertia

@@ -32,8 +32,8 @@ class FourBar(AbstractExample):
     (l₄, 0). The bars are uniform, I = m l²/12 about their centres c. By default it is
     a crank-rocker of 1 kg/m whose crank makes full turns.
 
-    **Parameters:** `lengths` (l₁, l₂, l₃, l₄) [m], the last that of the ground;
-    `masses` (m₁, m₂, m₃) [kg]; `gravity` g [m/s²]; `torque` M on the crank [N m].
+    **Parameters:** `lengths` (l₁, l₂, l₃, l₄) [m], the last for the ground; `masses`
+    (m₁, m₂, m₃) [kg]; `gravity` g [m/s²]; `torque` M on the crank [N m].
 
     **Source:** García de Jalón and Bayo, *Kinematic and Dynamic Simulation of Multibody
     Systems* (1994); for `parallelogram`, the problem "N four-bar mechanism" of
@@ -67,9 +67,9 @@ class FourBar(AbstractExample):
 
     @classmethod
     def turning(cls, angle: ArrayLike, rate: ArrayLike, **parameters: Any) -> "FourBar":
-        """Make a linkage with the crank at `angle` and `rate`, the coupler above.
+        """Create a linkage with the crank at `angle` and `rate`, the coupler above.
 
-        `parameters` are those of the class.
+        `parameters` are the parameters of the class.
         """
         first, second, third, ground = cls(**parameters).lengths
         theta, dtheta = parameter(angle), parameter(rate)
@@ -79,7 +79,7 @@ class FourBar(AbstractExample):
         distance = jnp.sqrt(square)
         cosine = (square + second**2 - third**2) / (2 * distance * second)
         require_possible(
-            abs(cosine) < 1, f"`angle` {angle} leaves the bars too short to close."
+            abs(cosine) < 1, f"At `angle` {angle} the bars are too short to close."
         )
         coupler = jnp.arctan2(side[1], side[0]) + jnp.arccos(cosine)
         arm = second * direction(coupler) - side
@@ -93,7 +93,7 @@ class FourBar(AbstractExample):
 
     @classmethod
     def parallelogram(cls) -> "FourBar":
-        """Make the benchmark of one loop: bars of 1 m and 1 kg that fall to the right.
+        """Create the benchmark of one loop: bars of 1 m and 1 kg that fall right.
 
         The crank is upright, and its end moves at 1 m/s. With all bars horizontal,
         first after 0.71 s, the loop may fold: the constraints are dependent there.
@@ -109,7 +109,7 @@ class FourBar(AbstractExample):
         )
 
     def lagrangian(self, t: FloatScalarLike, q: Array, v: Array, args: Args) -> Array:
-        """Compute the Lagrangian, kinetic energy less that of the weight."""
+        """Compute the Lagrangian, kinetic minus potential energy."""
         centres, velocities = jax.jvp(self._centres, (q,), (v,))
         masses, lengths = self.masses.astype(q.dtype), self.lengths.astype(q.dtype)
         inertias = masses * lengths[:3] ** 2 / 12

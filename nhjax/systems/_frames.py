@@ -7,16 +7,16 @@ from jaxtyping import Array, Float
 
 
 class Frame(NamedTuple):
-    """A rigid motion: what is at c in the body goes to origin + rotation c in space.
+    """A rigid motion: a point c of the body is at origin + rotation c in space.
 
-    A rate of it has the same two parts.
+    The rate of a motion has the same two parts.
     """
 
     rotation: Float[Array, "3 3"]
     origin: Float[Array, "3"]
 
     def move(self, point: Float[Array, "3"]) -> Float[Array, "3"]:
-        """Compute where a point of the body goes, or how fast for a rate."""
+        """Compute the position of a point of the body, or for a rate its velocity."""
         return self.origin + self.rotation @ point
 
 

@@ -1,4 +1,4 @@
-"""Joints that move as given functions of time, which machines propel themselves by."""
+"""Joints that move as given functions of time, and so propel a machine."""
 
 import abc
 from collections.abc import Callable

@@ -22,11 +22,11 @@ class HeavyTop(AbstractExample):
     ℓ = m/2 |ω × X|² + ½ (J₁ω₁² + J₂ω₂² + J₃ω₃²) - m g e₃·(R X),
 
     with q the attitude R, a quaternion, ω the body angular velocity along the principal
-    axes, and X the centre of mass in the body, seen from the pivot. It is Lagrange's
-    top where J₁ = J₂ and X lies on the third axis, as by default.
+    axes, and X the centre of mass in the body, seen from the pivot. If J₁ = J₂ and X
+    lies on the third axis, as by default, it is Lagrange's top.
 
     **Parameters:** `mass` m [kg], `moments` (J₁, J₂, J₃) about the centre of mass
-    [kg m²], `centre` X [m], `gravity` g [m/s²]; `retraction`, that of SO(3).
+    [kg m²], `centre` X [m], `gravity` g [m/s²]; `retraction`, the retraction of SO(3).
 
     **Source:** Lagrange (1788); Arnold, *Mathematical Methods of Classical Mechanics*,
     section 30.
@@ -115,9 +115,9 @@ class HeavyTopSE3(AbstractExample):
     with q = (R, x): the attitude, a quaternion, and the position of the centre of mass;
     (v, ω) are their body velocities, and X is the centre of mass in the body, seen from
     the pivot. The three constraints are holonomic, and their multiplier is the force of
-    the pivot in space. Its motion is that of `HeavyTop` with the same parameters.
+    the pivot in space. It moves like `HeavyTop` with the same parameters.
 
-    **Parameters:** those of `HeavyTop`; `retraction`, that of SE(3).
+    **Parameters:** the parameters of `HeavyTop`; `retraction`, the retraction of SE(3).
 
     **Source:** as for `HeavyTop`; Brüls and Cardona, *On the use of Lie group time
     integrators in multibody dynamics* (2010), for the formulation.

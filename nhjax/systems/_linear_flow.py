@@ -84,7 +84,7 @@ def rotation(quaternion: np.ndarray) -> np.ndarray:
 
 
 def _product_matrix(omega: np.ndarray, side: float) -> np.ndarray:
-    """Make the matrix of the product with (0, ω) from the right (1) or left (-1)."""
+    """Create the matrix of the product with (0, ω) from the right (1) or left (-1)."""
     a, b, c = omega
     zero = np.zeros_like(a)
     rows = (

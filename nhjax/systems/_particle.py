@@ -22,8 +22,8 @@ class NonholonomicParticle(AbstractConstrainedExample):
 
     L = m/2 (ẋ² + ẏ² + ż²) - k/2 (x² + y²),  Φ = ż - y ẋ,  q = (x, y, z).
 
-    The driver y is a harmonic oscillator; in the time s with ds = ν dt/√(1 + y²),
-    ν² = k/m, so is the passenger x.
+    The driver y is a harmonic oscillator. The passenger x is a harmonic oscillator in
+    the rescaled time s with ds = ν dt/√(1 + y²), ν² = k/m.
 
     **Parameters:** `mass` m [kg], `stiffness` k [N/m]; lengths are in metres and Φ
     has a unit slope of 1/m before y.
@@ -88,7 +88,7 @@ class NonholonomicParticle(AbstractConstrainedExample):
         return np.array([x, y, z]), np.array([dx, dy, y * dx]), np.array([multiplier])
 
     def invariants(self, t: FloatScalarLike, q: Array, v: Array) -> dict[str, Array]:
-        """Compute the energy, and those of the driver y and the passenger (x, z)."""
+        """Compute the energies: total, of driver y, and of passenger (x, z)."""
         driver = 0.5 * (self.mass * v[1] ** 2 + self.stiffness * q[1] ** 2)
         passenger = 0.5 * self.mass * (v[0] ** 2 + v[2] ** 2)
         passenger = passenger + 0.5 * self.stiffness * q[0] ** 2

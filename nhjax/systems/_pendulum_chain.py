@@ -18,7 +18,7 @@ from ._base import (
 
 
 class PendulumChain(AbstractExample):
-    """Point masses on rods in a vertical plane, each rod hanging from the mass before.
+    """Point masses on rods in a vertical plane; each rod hangs from the previous mass.
 
     L = Σ m_k (½ |ṙ_k|² - g y_k),  Φ_k = |r_k - r_{k-1}|² - l_k²,  k = 1, ..., n,
 
@@ -84,7 +84,7 @@ class PendulumChain(AbstractExample):
         lengths: ArrayLike | tuple[float, ...] = 1.0,
         gravity: ArrayLike = 9.81,
     ) -> "PendulumChain":
-        """Make a chain whose rods form `angles` with the downward vertical."""
+        """Create a chain whose rods form `angles` with the downward vertical."""
         angle = jnp.atleast_1d(coordinates(angles))
         rate = _one_each(angle.size, "rates", rates)
         length = _one_each(angle.size, "lengths", lengths)

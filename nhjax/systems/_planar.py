@@ -1,4 +1,4 @@
-"""What planar mechanisms share: rotations, and the kinetic energy of rigid bodies."""
+"""Functions for planar mechanisms: rotations and kinetic energy of rigid bodies."""
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float
@@ -26,7 +26,7 @@ def kinetic_energy(
 ) -> Float[Array, ""]:
     """Sum ½ m |ċ|² + ½ I ω² over bodies, from velocities of centres and turning rates.
 
-    `inertias` are those about the centres of mass.
+    `inertias` are the moments of inertia about the centres of mass.
     """
     moving = masses @ jnp.sum(velocities**2, axis=1)
     return 0.5 * (moving + inertias @ rates**2)

@@ -21,13 +21,13 @@ from ._rolling_body import AbstractRollingBody
 
 
 class Rattleback(AbstractRollingBody):
-    """A stone of the shape of an ellipsoid, with inertia askew, that rolls on a plane.
+    """A rolling stone, an ellipsoid whose axes of inertia are not its own axes.
 
     ℓ = m/2 |v|² + ½ ω·(J ω) - m g z,  Φ = z + e₃·(R s),  φ = (R (v + ω × s))₁₂,
     s = h e₃ - A γ / √(γ·(A γ)),  A = diag(a², b², c²),  γ = Rᵀ e₃,
 
     with q = (R, x): the attitude, a quaternion, and the position of the centre of mass
-    [m]; (v, ω) are their body velocities [m/s, 1/s]. The body axes are those of the
+    [m]; (v, ω) are their body velocities [m/s, 1/s]. The body axes are the axes of the
     ellipsoid, the third one upward at rest, and s is the lowest point, seen from the
     centre of mass. Φ is its height, and φ the horizontal velocity at the contact; their
     multipliers are the force of the plane in space [N]. The third axis is a principal
@@ -37,9 +37,9 @@ class Rattleback(AbstractRollingBody):
     With `damping` σ the air exerts the torque -σω, and energy is not conserved.
 
     **Parameters:** `mass` m [kg]; `semiaxes` (a, b, c) of the ellipsoid and `depth` h
-    of the centre of mass below that of the ellipsoid [m]; `moments` (J₁₁, J₂₂, J₃₃) and
-    `product` J₁₂ of inertia about the centre of mass [kg m²]; `gravity` g [m/s²];
-    `damping` σ [N m s] or None; `retraction`, that of SE(3).
+    of the centre of mass below the centre of the ellipsoid [m]; `moments` (J₁₁, J₂₂,
+    J₃₃) and `product` J₁₂ of inertia about the centre of mass [kg m²]; `gravity` g
+    [m/s²]; `damping` σ [N m s] or None; `retraction`, the retraction of SE(3).
 
     **Source:** Kane and Levinson, *Realistic mathematical modeling of the rattleback*,
     International Journal of Non-Linear Mechanics 17 (1982), whose parameters are the
@@ -104,11 +104,11 @@ class Rattleback(AbstractRollingBody):
         tilts: tuple[float, float] | Array = (0.0, 0.0),
         **parameters: Any,
     ) -> "Rattleback":
-        """Make a stone that spins at the rate ω₃ = `spin` about its own third axis.
+        """Create a stone that spins at the rate ω₃ = `spin` about its own third axis.
 
         `tilts` are the angles (α, β) of Kane and Levinson in degrees: it is turned
         about the horizontal first axis by α, and then about its second one by -β.
-        `parameters` are those of the class.
+        `parameters` are the parameters of the class.
         """
         lean, pitch = 0.5 * jnp.deg2rad(coordinates(tilts))
         zero = jnp.zeros_like(lean)
@@ -150,13 +150,13 @@ class Rattleback(AbstractRollingBody):
         return jnp.concatenate([jnp.zeros_like(v[:3]), -damping * v[3:]])
 
     def invariants(self, t: FloatScalarLike, q: Array, v: Array) -> dict[str, Array]:
-        """Compute the conserved quantities: the energy, and none with damping."""
+        """Compute the conserved quantities: the energy, or with damping none."""
         if self.damping is not None:
             return {}
         return {"energy": self.energy(t, q, v)}
 
     def points(self, t: FloatScalarLike, q: Array) -> dict[str, Array]:
-        """Compute where the centre of mass, the contact and the two ends are [m]."""
+        """Compute the positions of the centre of mass, contact and both ends [m]."""
         middle = jnp.zeros_like(q[4:]).at[2].set(self.depth)
         tip = jnp.zeros_like(middle).at[0].set(self.semiaxes[0].astype(q.dtype))
         return {

@@ -28,7 +28,7 @@ class FreeRigidBody(AbstractExample):
     angular velocity along the principal axes.
 
     **Parameters:** `moments` (I₁, I₂, I₃), the principal moments of inertia [kg m²];
-    `retraction`, that of SO(3).
+    `retraction`, the retraction of SO(3).
 
     **Source:** Euler; Landau and Lifshitz, *Mechanics*, section 37.
 
@@ -83,8 +83,8 @@ class FreeRigidBody(AbstractExample):
     def exact(self, t: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Compute (q, v, λ) at time `t`; λ is empty without constraints.
 
-        ω by Jacobi's elliptic functions; the attitude follows from ω by a linear
-        equation, to round-off.
+        ω is given by Jacobi's elliptic functions; the attitude follows from ω by a
+        linear equation, to round-off.
         """
         quaternion, omega0, moments = on_host((self.q0, self.v0, self.moments))
         angular_velocity, rate = _euler_solution(moments, omega0)
@@ -100,8 +100,8 @@ def _euler_solution(
 ) -> tuple[Callable[[np.ndarray], np.ndarray], float]:
     """Find the solution ω(t) of Euler's equations, and a bound of its rate and size.
 
-    With 3 the axis that ω turns about in the body, the largest or the smallest one, and
-    2 the middle one, ω₁, ω₂, ω₃ are multiples of cn, sn, dn.
+    Let 3 be the axis that ω turns about in the body, the largest or the smallest one,
+    and 2 the middle one: then ω₁, ω₂, ω₃ are multiples of cn, sn, dn.
     """
     size = float(np.linalg.norm(omega0))
     gaps = np.roll(moments, -1) - np.roll(moments, 1)
@@ -137,7 +137,7 @@ def _euler_solution(
 def _cn_sn_dn_axes(moments: np.ndarray, omega0: np.ndarray) -> list[int]:
     """Find the axes 1, 2, 3 of the solution by cn, sn, dn."""
     low, middle, high = np.argsort(moments)
-    # The sign of L² - 2E I₂ tells on which side of the separatrix ω is.
+    # The sign of L² - 2E I₂ gives the side of the separatrix on which ω is.
     excess = moments * (moments - moments[middle]) * omega0**2
     around_high = excess[high] + excess[low] > 0
     if around_high:

@@ -1,4 +1,4 @@
-"""A sleigh of two point masses on a rod: both kinds of constraints together."""
+"""A sleigh of two point masses on a rod, with both kinds of constraints."""
 
 import math
 
@@ -28,12 +28,12 @@ class RodSleigh(AbstractNonholonomicExample):
 
     the nonholonomic constraint Φ = n·ṙ₁ and the holonomic one Φ_hol = |r₂ - r₁|² - l².
     The blade makes the angle β with the rod; its normal n is (r₂ - r₁)/l turned by
-    β + π/2. For β = 0 this is the `ChaplyginSleigh`. For other angles the reactions of
-    the two constraints act on one another: n is not orthogonal to the rod.
+    β + π/2. For β = 0 this is the `ChaplyginSleigh`. For other angles n is not
+    orthogonal to the rod, so that the reactions of the two constraints are coupled.
 
     The body moves as if the blade stood where the perpendicular from the centre of mass
-    meets the line through the blade's contact along n: every velocity that the one
-    blade permits, the other does.
+    meets the line through the blade's contact along n: both positions of the blade
+    permit the same velocities.
 
     **Parameters:** `mass1` m₁ and `mass2` m₂ [kg], `length` l [m], `angle` β [rad].
 
@@ -82,9 +82,9 @@ class RodSleigh(AbstractNonholonomicExample):
         length: ArrayLike = 1.0,
         angle: ArrayLike = 0.4,
     ) -> "RodSleigh":
-        """Make a sleigh that slides along its blade with `speed` while it turns.
+        """Create a sleigh that slides along its blade with `speed` while it turns.
 
-        `position` is that of the blade, `rod` the direction of the rod.
+        `position` is the position of the blade, `rod` the direction of the rod.
         """
         length, rod_angle = parameter(length), parameter(rod)
         heading = rod_angle + parameter(angle)
@@ -133,7 +133,8 @@ class RodSleigh(AbstractNonholonomicExample):
     def exact(self, t: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Compute (q, v, λ) at `t`, for consistent data, a turning rod and cos β != 0.
 
-        λ is (nonholonomic, holonomic); the motion is that of `equivalent_sleigh`.
+        λ is (nonholonomic, holonomic); the motion is the same as of
+        `equivalent_sleigh`.
         """
         self._consistent_data()
         tangency = jax.jvp(
@@ -166,7 +167,7 @@ class RodSleigh(AbstractNonholonomicExample):
         )
 
     def equivalent_sleigh(self) -> ChaplyginSleigh:
-        """Make the Chaplygin sleigh with the same motion, its contact moved along n."""
+        """Create the Chaplygin sleigh of the same motion, its contact moved along n."""
         rod, swing = self.q0[2:] - self.q0[:2], self.v0[2:] - self.v0[:2]
         heading = jnp.arctan2(rod[1], rod[0]) + self.angle
         turn_rate = (rod[0] * swing[1] - rod[1] * swing[0]) / self.length**2
@@ -182,6 +183,6 @@ class RodSleigh(AbstractNonholonomicExample):
         )
 
     def _shift(self) -> Array:
-        """Compute how far the centre of mass lies to the side of the blade, along n."""
+        """Compute the signed distance of the centre of mass from the blade, along n."""
         offset = self.mass2 / (self.mass1 + self.mass2) * self.length
         return -offset * jnp.sin(self.angle)

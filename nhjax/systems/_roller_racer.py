@@ -29,11 +29,11 @@ class RollerRacer(AbstractGaitMachine):
 
     with q = (x, y, θ, φ): the axle r₁ [m] and the heading θ [rad] of the seat, and the
     angle φ of the handlebar relative to it [rad]; e is the unit vector at an angle, and
-    n₁, n₂ are those across the two bodies. The centres of mass lie at the axles, d₁
-    behind and d₂ ahead of the pivot. Where d₁ cos φ + d₂ = 0 the turning is not
-    determined by the constraints.
+    n₁, n₂ are the unit vectors across the two bodies. The centres of mass lie at the
+    axles, d₁ behind and d₂ ahead of the pivot. Where d₁ cos φ + d₂ = 0 the turning is
+    not determined by the constraints.
 
-    The pivot either is prescribed by a `gait`, Γ = φ - gait(t), or with `gait=None`
+    The pivot is either prescribed by a `gait`, Γ = φ - gait(t), or with `gait=None` it
     moves freely under the torque [N m] in `args`, a scalar or `None`. By default it
     swings as a sine, which drives the seat from rest.
 
@@ -79,10 +79,10 @@ class RollerRacer(AbstractGaitMachine):
         angle_rate: ArrayLike = 0.0,
         **parameters: Any,
     ) -> "RollerRacer":
-        """Make a racer with its seat at the origin and moving ahead at `speed`, θ = 0.
+        """Create a racer with the seat at the origin, moving ahead at `speed`, θ = 0.
 
-        Its turning follows from the constraints. `parameters` are those of the class;
-        without a `gait` among them the pivot moves freely.
+        Its turning rate follows from the constraints. `parameters` are the parameters
+        of the class; without a `gait` among them the pivot moves freely.
         """
         merged: dict[str, Any] = {"gait": None} | parameters
         behind, ahead = cls(**merged).distances
@@ -111,7 +111,7 @@ class RollerRacer(AbstractGaitMachine):
         speed: ArrayLike = 0.0,
         **parameters: Any,
     ) -> "RollerRacer":
-        """Make a racer with the gait φ = amplitude sin(rate t + phase)."""
+        """Create a racer with the gait φ = amplitude sin(rate t + phase)."""
         gait = Sinusoid(amplitude, rate, phase)
         angle, angle_rate = gait.at_start()
         return cls.rolling(speed, angle, angle_rate, gait=gait, **parameters)

@@ -1,4 +1,4 @@
-"""What all rigid bodies that roll on a horizontal plane share."""
+"""The common base of all rigid bodies that roll on a horizontal plane."""
 
 import abc
 import dataclasses
@@ -90,8 +90,8 @@ class AbstractRollingBody(AbstractConstrainedGroupExample):
     def plane_symmetry(self, q: Pose) -> Float[Array, "3 6"]:
         """Compute the generators of the motions of the plane, as body velocities.
 
-        They are the translations along the axes of x and y, and the turn about that of
-        z, under which the system is symmetric whatever the shape of the body.
+        They are the translations along x and y and the rotation about z. The system has
+        these symmetries for every shape of the body.
         """
         motions = jnp.eye(6, dtype=q.dtype)[jnp.array([0, 1, 5])]
         back = self.manifold.inverse(q)
@@ -108,10 +108,10 @@ class AbstractRollingBody(AbstractConstrainedGroupExample):
         angular_velocity: tuple[float, ...] | Array,
         contact: tuple[float, float] | Array = (0.0, 0.0),
     ) -> Self:
-        """Make the same body with other initial data, which are consistent.
+        """Create the same body with other, consistent initial data.
 
         `attitude` is a quaternion, `angular_velocity` ω is in body axes, and `contact`
-        is where on the plane the body touches it.
+        is the point of the plane where the body touches it.
         """
         quaternion = coordinates(attitude)
         quaternion = quaternion / jnp.sqrt(quaternion @ quaternion)

@@ -73,7 +73,7 @@ class VerticalRollingDisc(AbstractConstrainedExample):
     def invariants(self, t: FloatScalarLike, q: Array, v: Array) -> dict[str, Array]:
         """Compute the energy, both rates, and φ̇ times the centre of the circle.
 
-        The circle is that on which the contact moves.
+        The circle is the path of the contact.
         """
         speed = self.radius * v[2]
         return {

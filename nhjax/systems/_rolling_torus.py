@@ -35,7 +35,7 @@ class RollingTorus(AbstractRollingBody):
 
     **Parameters:** `mass` m [kg]; `radius` a of the circle in the middle of the tube,
     and `tube_radius` r [m]; `diametral_inertia` I and `axial_inertia` J about the
-    centre [kg m²]; `gravity` g [m/s²]; `retraction`, that of SE(3).
+    centre [kg m²]; `gravity` g [m/s²]; `retraction`, the retraction of SE(3).
 
     **Source:** Routh, *Advanced Rigid Dynamics*, article 244; McDonald and
     McDonald, *The rolling motion of a disk on a horizontal plane* (2001); Moffatt,
@@ -82,12 +82,12 @@ class RollingTorus(AbstractRollingBody):
     def steady(
         cls, tilt: ArrayLike, turn_rate: ArrayLike, **parameters: Any
     ) -> "RollingTorus":
-        """Make a torus that goes round steadily at the rate Ω = `turn_rate` [1/s].
+        """Create a torus that turns steadily at the rate Ω = `turn_rate` [1/s].
 
         `tilt` θ [rad] is the angle of the axle to the vertical. The angular velocity is
         (0, Ω sin θ, ω₃) along the axes (horizontal, upward in the plane of the disc,
         axle), and the balance of moments about the contact determines ω₃.
-        `parameters` are those of the class.
+        `parameters` are the parameters of the class.
         """
         angle, rate = parameter(tilt), parameter(turn_rate)
         require_possible(
@@ -111,12 +111,12 @@ class RollingTorus(AbstractRollingBody):
     def circling(
         cls, tilt: ArrayLike, radius_of_path: ArrayLike, **parameters: Any
     ) -> "RollingTorus":
-        """Make a torus whose centre moves steadily on a circle, or rests.
+        """Create a torus whose centre moves steadily on a circle, or rests.
 
         `tilt` [rad] is the angle of the axle to the vertical, below π/2, and
         `radius_of_path` the radius [m] of the circle of the centre, towards the middle
-        of which the torus leans; it is 0 where the centre rests. `parameters` are those
-        of the class.
+        of which the torus leans. It is 0 if the centre rests. `parameters` are the
+        parameters of the class.
         """
         angle, path = parameter(tilt), parameter(radius_of_path)
         _require_between("tilt", angle, 0.5 * jnp.pi, "π/2")
@@ -124,7 +124,7 @@ class RollingTorus(AbstractRollingBody):
         body = cls(**parameters)
         sin, cos = jnp.sin(angle), jnp.cos(angle)
         height = body.radius * sin + body.tube_radius
-        # Minus ω₃ over Ω, of the velocity of the centre.
+        # The value of -ω₃ / Ω, from the velocity of the centre.
         roll = path - body.tube_radius * sin * cos
         roll = roll / (body.radius + body.tube_radius * sin)
         momentum = body.diametral_inertia * cos + body.axial_inertia * roll
@@ -156,7 +156,8 @@ class RollingTorus(AbstractRollingBody):
     def symmetry(self, q: Array) -> Float[Array, "4 6"]:
         """Compute the generators of all symmetries, as body velocities.
 
-        They are those of the plane, and the turn of the torus about its axle.
+        They are the symmetries of the plane, and the rotation of the torus about its
+        axle.
         """
         spin = jnp.zeros((1, 6), q.dtype).at[0, 5].set(1)
         return jnp.concatenate([self.plane_symmetry(q), spin])
@@ -166,9 +167,9 @@ class RollingTorus(AbstractRollingBody):
         return {"energy": self.energy(t, q, v)}
 
     def points(self, t: FloatScalarLike, q: Array) -> dict[str, Array]:
-        """Compute where the centre, the contact and a point of the rim are [m].
+        """Compute the positions of the centre, contact and a point of the rim [m].
 
-        The point of the rim is that of the first body axis, in the middle of the tube.
+        The point of the rim is on the first body axis, in the middle of the tube.
         """
         rim = jnp.zeros_like(q[4:]).at[0].set(self.radius.astype(q.dtype))
         return {

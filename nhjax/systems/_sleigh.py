@@ -25,8 +25,8 @@ class ChaplyginSleigh(AbstractConstrainedExample):
     Φ = -sin θ ẋ + cos θ ẏ,  q = (x, y, θ),
 
     with (x, y) the contact of the blade, so that the mass matrix depends on θ. With
-    u the speed along the blade and I = J + ma², u̇ = aθ̇² and Iθ̈ = -mauθ̇: every motion
-    tends to a straight one that leads with the centre of mass.
+    u the speed along the blade and I = J + ma², u̇ = aθ̇² and Iθ̈ = -mauθ̇: every
+    motion tends to a straight motion with the centre of mass in front.
 
     **Parameters:** `mass` m [kg], `inertia` J about the centre of mass [kg m²],
     `offset` a of the centre of mass ahead of the blade [m].
@@ -115,6 +115,6 @@ def _gudermannian(x):
 
 
 def _sech(x):
-    # 1/cosh overflows on its way to the zero that a long motion tends to.
+    # 1/cosh tends to zero in a long motion, but cosh overflows.
     decay = np.exp(-np.abs(x))
     return 2 * decay / (1 + decay**2)

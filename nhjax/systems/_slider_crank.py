@@ -72,9 +72,9 @@ class SliderCrank(AbstractExample):
     def turning(
         cls, angle: ArrayLike, rate: ArrayLike, **parameters: Any
     ) -> "SliderCrank":
-        """Make a mechanism with the crank at `angle` and `rate`, the slider ahead.
+        """Create a mechanism with the crank at `angle` and `rate`, the slider ahead.
 
-        `parameters` are those of the class.
+        `parameters` are the parameters of the class.
         """
         engine = cls(**parameters)
         theta, dtheta = parameter(angle), parameter(rate)
@@ -98,7 +98,7 @@ class SliderCrank(AbstractExample):
         )
 
     def lagrangian(self, t: FloatScalarLike, q: Array, v: Array, args: Args) -> Array:
-        """Compute the Lagrangian, kinetic energy less that of the weight."""
+        """Compute the Lagrangian, kinetic minus potential energy."""
         centres, velocities = jax.jvp(self._centres, (q,), (v,))
         lengths = jnp.stack([self.crank_length, self.rod_length]).astype(q.dtype)
         masses = jnp.stack([self.crank_mass, self.rod_mass]).astype(q.dtype)

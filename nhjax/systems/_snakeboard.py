@@ -30,14 +30,14 @@ class Snakeboard(AbstractGaitMachine):
 
     with q = (x, y, θ, ψ, φ_b, φ_f): the centre [m] and heading [rad] of the board, and
     the angles of rotor, rear and front axle relative to it [rad]. The axles lie l
-    behind and ahead of the centre, and do not slip sideways. Where φ_b = φ_f = π/2 the
+    behind and ahead of the centre, and do not slip sideways. If φ_b = φ_f = π/2, the
     constraints are dependent.
 
-    The joints either are prescribed by a `gait`, Γ = (ψ, φ_b, φ_f) - gait(t), or with
-    `gait=None` move freely under the torques (τ_ψ, τ_b, τ_f) [N m] in `args`, of shape
-    (3,) or `None`. By default the rotor turns to and fro in step with the steering,
-    which drives the board ahead from rest; other ratios of the frequencies turn it on
-    the spot or park it.
+    The joints are either prescribed by a `gait`, Γ = (ψ, φ_b, φ_f) - gait(t), or with
+    `gait=None` they move freely under the torques (τ_ψ, τ_b, τ_f) [N m] in `args`, of
+    shape (3,) or `None`. By default the rotor turns to and fro in step with the
+    steering, which drives the board ahead from rest; other ratios of the frequencies
+    turn it on the spot or park it.
 
     **Parameters:** `mass` m [kg]; `inertia` J of the board, `rotor_inertia` J_r and
     `axle_inertia` J_w about the vertical [kg m²]; `half_length` l [m]; `gait`, a
@@ -90,10 +90,11 @@ class Snakeboard(AbstractGaitMachine):
         joint_rates: ArrayLike | tuple[float, ...] = (0.0, 0.0, 0.0),
         **parameters: Any,
     ) -> "Snakeboard":
-        """Make a board at the origin whose centre moves ahead at `speed`, θ = 0.
+        """Create a board at the origin whose centre moves ahead at `speed`, θ = 0.
 
-        Its sideways velocity and its turning follow from the constraints. `parameters`
-        are those of the class; without a `gait` among them the joints move freely.
+        Its sideways velocity and its turning rate follow from the constraints.
+        `parameters` are the parameters of the class; without a `gait` among them the
+        joints move freely.
         """
         merged: dict[str, Any] = {"gait": None} | parameters
         board, angles = cls(**merged), coordinates(joints)
@@ -120,9 +121,9 @@ class Snakeboard(AbstractGaitMachine):
         speed: ArrayLike = 0.0,
         **parameters: Any,
     ) -> "Snakeboard":
-        """Make a board with the gait (ψ, φ_b, φ_f) = amplitudes sin(rates t + phases).
+        """Create a board with gait (ψ, φ_b, φ_f) = amplitudes sin(rates t + phases).
 
-        It starts at t = 0 at the origin, its centre ahead at `speed`.
+        It starts at t = 0 at the origin, and its centre moves ahead at `speed`.
         """
         gait = Sinusoid(amplitudes, rates, phases)
         joints, joint_rates = gait.at_start()
@@ -153,9 +154,9 @@ class Snakeboard(AbstractGaitMachine):
         return jnp.concatenate([jnp.zeros_like(v[:3]), torques])
 
     def invariants(self, t: FloatScalarLike, q: Array, v: Array) -> dict[str, Array]:
-        """Compute the energy and the momenta of the joints, which no torque moves.
+        """Compute the energy and the momenta of the joints, for joints without torques.
 
-        With a gait nothing is conserved.
+        With a gait there are no conserved quantities.
         """
         if self.gait is not None:
             return {}

@@ -88,9 +88,9 @@ class SpatialSliderCrank(AbstractExample):
     def turning(
         cls, angle: ArrayLike, rate: ArrayLike, **parameters: Any
     ) -> "SpatialSliderCrank":
-        """Make a mechanism with the crank at `angle` and `rate`, the slider at x > 0.
+        """Create a mechanism with the crank at `angle` and `rate`, the slider at x > 0.
 
-        `parameters` are those of the class.
+        `parameters` are the parameters of the class.
         """
         machine = cls(**parameters)
         length = machine.rod_length.astype(machine.axle.dtype)
@@ -118,7 +118,7 @@ class SpatialSliderCrank(AbstractExample):
         return LagrangianSystem(self.lagrangian, holonomic=self.holonomic)
 
     def lagrangian(self, t: FloatScalarLike, q: Array, v: Array, args: Args) -> Array:
-        """Compute the Lagrangian, kinetic energy less that of the weight."""
+        """Compute the Lagrangian, kinetic minus potential energy."""
         centre, velocity = jax.jvp(self._rod_centre, (q,), (v,))
         rates = jnp.stack([v[1] * jnp.cos(q[2]), v[2], v[1] * jnp.sin(q[2])])
         axial, transverse = self.rod_inertias.astype(v.dtype)
@@ -160,5 +160,5 @@ class SpatialSliderCrank(AbstractExample):
 
 
 def _along(x: Array) -> Float[Array, " 3"]:
-    """Make the point at x on the x-axis."""
+    """Create the point at x on the x-axis."""
     return jnp.stack([x, jnp.zeros_like(x), jnp.zeros_like(x)])

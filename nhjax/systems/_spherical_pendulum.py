@@ -64,7 +64,7 @@ class SphericalPendulum(AbstractExample):
         length: ArrayLike = 1.0,
         gravity: ArrayLike = 1.0,
     ) -> "SphericalPendulum":
-        """Make a pendulum at `angle` to the downward vertical and at an azimuth."""
+        """Create a pendulum at `angle` to the downward vertical and at an azimuth."""
         sin, cos = jnp.sin(parameter(angle)), jnp.cos(parameter(angle))
         east, north = jnp.cos(parameter(azimuth)), jnp.sin(parameter(azimuth))
         swing, turn = cos * parameter(angle_rate), sin * parameter(azimuth_rate)
@@ -108,7 +108,7 @@ class SphericalPendulum(AbstractExample):
         height = _height(q0, v0, length, g)
 
         def matrix(times):
-            # 2λ/m = (3gz - 2E)/l², of the orbit's tension.
+            # 2λ/m = (3gz - 2E)/l², from the tension of the rod on this orbit.
             stiffness = (3 * g * height(times)[0] - 2 * energy) / length**2
             zero, one = np.zeros_like(stiffness), np.ones_like(stiffness)
             return np.moveaxis(np.array([[zero, one], [stiffness, zero]]), -1, 0)
@@ -124,7 +124,7 @@ class SphericalPendulum(AbstractExample):
 def _height(
     q0: np.ndarray, v0: np.ndarray, length: float, g: float
 ) -> Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]:
-    """Make the function that computes (z, ż) of times.
+    """Create the function that computes (z, ż) at given times.
 
     l²ż² is a cubic in z with the leading coefficient 2g and the roots z₁ <= z₂ <= z₃.
     In powers of z - z₀ its small roots keep their digits.

@@ -27,11 +27,11 @@ class Suslov(AbstractConstrainedGroupExample):
 
     with q the attitude, a quaternion, and ω the body angular velocity; the axes have
     I₁₂ = 0. If the axis e₃ is not a principal axis, every motion tends to a steady
-    rotation about an axis in the plane of e₁ and e₂: the dynamics attract, though
+    rotation about an axis in the plane of e₁ and e₂: the motion is attracting, although
     energy is conserved.
 
     **Parameters:** `moments` (I₁₁, I₂₂, I₃₃) and `products` (I₁₃, I₂₃) of inertia
-    [kg m²]; `retraction`, that of SO(3).
+    [kg m²]; `retraction`, the retraction of SO(3).
 
     **Source:** Suslov (1902); Bloch, *Nonholonomic Mechanics and Control* (2003),
     chapter 8.
@@ -86,9 +86,9 @@ class Suslov(AbstractConstrainedGroupExample):
     def exact(self, t: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Compute (q, v, λ) at `t`, for consistent data and `products` != 0.
 
-        With √I₁₁ ω₁ = √(2E) cos α and √I₂₂ ω₂ = √(2E) sin α, α̇ = κ cos(α - α*): ω is
-        made of tanh and sech. The attitude follows from ω by a linear equation, to
-        round-off.
+        With √I₁₁ ω₁ = √(2E) cos α and √I₂₂ ω₂ = √(2E) sin α, α̇ = κ cos(α - α*): the
+        components of ω are tanh and sech functions. The attitude follows from ω by a
+        linear equation, to round-off.
         """
         quaternion, v0 = self._consistent_data()
         I1, I2, _ = np.asarray(self.moments, dtype=np.float64)

@@ -32,7 +32,7 @@ class TurntableBall(AbstractConstrainedGroupExample):
     the ball, and its mass is one. The constraints are affine, so that energy is not
     conserved, but the moving energy E - Ω(x v_y - y v_x) is.
 
-    The constraints speak of (ω_ξ, ω_η, ω_ζ), which is
+    The constraints contain (ω_ξ, ω_η, ω_ζ), which is
 
     - with `frame="space"` (the default) the spatial angular velocity Rω: the physical
         ball;
@@ -45,7 +45,7 @@ class TurntableBall(AbstractConstrainedGroupExample):
 
     **Parameters:** `radius` r [m]; `moments` (a, b, c), the principal moments of
     inertia over (mass times r²) [1], 2/5 for a solid ball; `rate` Ω of the table
-    [1/s]; `frame`; `retraction`, that of SO(3).
+    [1/s]; `frame`; `retraction`, the retraction of SO(3).
 
     **Source:** Martín de Diego and Sato Martín de Almagro, *High-order geometric
     methods for nonholonomic mechanical systems*, fifth numerical experiment; Fassò and
@@ -94,9 +94,9 @@ class TurntableBall(AbstractConstrainedGroupExample):
         spin: float | Array = 0.0,
         **parameters: Any,
     ) -> "TurntableBall":
-        """Make a rolling ball at `position` (x, y) with `velocity` (v_x, v_y).
+        """Create a rolling ball at `position` (x, y) with `velocity` (v_x, v_y).
 
-        `spin` is ω_ζ; `parameters` are those of the class.
+        `spin` is ω_ζ; `parameters` are the parameters of the class.
         """
         ball = cls(**parameters)
         x, y = coordinates(position)
@@ -143,8 +143,8 @@ class TurntableBall(AbstractConstrainedGroupExample):
     ) -> dict[str, Array]:
         """Compute the moving energy and the momentum about the contact, in space.
 
-        Of a homogeneous ball the components of that momentum are r(1 + a) times those
-        of `first_integrals` (r²a for the third).
+        For a homogeneous ball, the components of this momentum are r(1 + a) times the
+        components of `first_integrals` (r²a for the third).
         """
         x, y = q[1]
         energy = self.energy(t, q, v)
@@ -175,8 +175,8 @@ class TurntableBall(AbstractConstrainedGroupExample):
     ) -> tuple[tuple[np.ndarray, np.ndarray], np.ndarray, np.ndarray]:
         """Compute (q, v, λ) at `t`, for consistent data and a = b = c.
 
-        All but the attitude in closed form; the attitude from the known angular
-        velocity by a linear equation, to round-off.
+        The attitude is the solution of a linear equation with the known angular
+        velocity, to round-off. All other values have closed formulas.
         """
         (quaternion, (x0, y0)), v0 = self._consistent_data()
         a, b, c = np.asarray(self.moments, dtype=np.float64)

@@ -26,8 +26,9 @@ class TwoWheeledRobot(AbstractNonholonomicExample):
 
     q = (x, y, θ, φ_R, φ_L): the middle r of the axle [m], the heading, and the angles
     of the right and of the left wheel [rad], which grow as the robot goes ahead. The
-    centre of mass of the platform is c = r + d e, those of the wheels are w = r ∓ b n,
-    with the heading e and n to its left. The wheels roll and do not slip sideways:
+    centre of mass of the platform is c = r + d e, and the centres of the wheels
+    are w = r ∓ b n, with the unit vectors e along the heading and n to its left. The
+    wheels roll and do not slip sideways:
 
     Φ = (n·ṙ, e·ṙ + b θ̇ - ρ φ̇_R, e·ṙ - b θ̇ - ρ φ̇_L).
 
@@ -92,7 +93,7 @@ class TwoWheeledRobot(AbstractNonholonomicExample):
         heading: ArrayLike = 0.0,
         **parameters: Any,
     ) -> "TwoWheeledRobot":
-        """Make a robot that rolls with the speed of the middle of its axle [m/s]."""
+        """Create a robot that rolls with the speed of the middle of its axle [m/s]."""
         robot = cls(**parameters)
         ahead, turn = parameter(speed), parameter(turn_rate)
         zero, angle = jnp.zeros_like(ahead), parameter(heading)
@@ -149,7 +150,7 @@ class TwoWheeledRobot(AbstractNonholonomicExample):
         }
 
     def _centres(self, q: Array) -> tuple[Array, Array, Array]:
-        """Compute where the platform's centre and the right and left wheel are."""
+        """Compute the positions of the platform's centre, right and left wheel."""
         cos, sin = jnp.cos(q[2]), jnp.sin(q[2])
         aside = self.half_track * jnp.stack([-sin, cos])
         centre = q[:2] + self.offset * jnp.stack([cos, sin])

@@ -27,7 +27,7 @@ class Unicycle(AbstractConstrainedGroupExample):
     its left. The heading turns uniformly.
 
     **Parameters:** `mass` m [kg], `inertia` I about the vertical [kg m²], `spring` k
-    [N/m]; `retraction`, that of SE(2).
+    [N/m]; `retraction`, the retraction of SE(2).
 
     **Source:** Martín de Diego and Sato Martín de Almagro, *High-order geometric
     methods for nonholonomic mechanical systems*, fourth numerical experiment (there
@@ -178,7 +178,7 @@ class UnicycleInCoordinates(AbstractConstrainedExample):
 def _lagrangian(
     unicycle: Unicycle | UnicycleInCoordinates, q: Array, v: Array
 ) -> Array:
-    # The turn is the same for body and for spatial velocities.
+    # The rotation is the same for body and for spatial velocities.
     translation = 0.5 * unicycle.mass * (v[0] ** 2 + v[1] ** 2)
     rotation = 0.5 * unicycle.inertia * v[2] ** 2
     return translation + rotation - 0.5 * unicycle.spring * (q[0] ** 2 + q[1] ** 2)

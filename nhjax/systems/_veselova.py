@@ -23,12 +23,12 @@ class Veselova(AbstractConstrainedGroupExample):
     ℓ = ½ ω·Jω - w·γ,  φ = γ·ω,  γ = Rᵀ e₃,
 
     with q the attitude R, a quaternion, ω the body angular velocity, and γ the vertical
-    seen from the body. Without weight the horizontal part of the angular momentum in
-    space is conserved besides the energy, and the problem is integrable.
+    seen from the body. Without weight, the horizontal part of the angular momentum in
+    space is conserved in addition to the energy, and the problem is integrable.
 
     **Parameters:** `inertia` J, the matrix of inertia about the fixed point [kg m²];
-    `weight` w = m g X [N m], with X the centre of mass in the body; `retraction`, that
-    of SO(3).
+    `weight` w = m g X [N m], with X the centre of mass in the body; `retraction`, the
+    retraction of SO(3).
 
     **Source:** Veselov and Veselova, "Integrable nonholonomic systems on Lie groups",
     Math. Notes 44 (1988).

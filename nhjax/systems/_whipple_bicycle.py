@@ -1,4 +1,4 @@
-"""The Whipple bicycle, which rolls on both wheels: both kinds of constraints."""
+"""The Whipple bicycle, which rolls on both wheels, with both kinds of constraints."""
 
 import math
 from collections.abc import Callable
@@ -40,9 +40,9 @@ class WhippleBicycle(AbstractNonholonomicExample):
     rider, the front frame and the front wheel, in the axes of the source: x forward, y
     to the right, z down.
 
-    q = (x, y, ψ, φ, θ, δ, θ_R, θ_F): where the rear wheel touches the ground [m], yaw,
-    lean (to the right), pitch of the rear frame, steer (to the right) and the angles of
-    the wheels relative to their frames [rad]; a wheel that rolls forward has a negative
+    q = (x, y, ψ, φ, θ, δ, θ_R, θ_F): the contact point of the rear wheel [m], yaw, lean
+    (to the right), pitch of the rear frame, steer (to the right) and the angles of the
+    wheels relative to their frames [rad]; a wheel that rolls forward has a negative
     rate. The coordinates imply that the rear wheel touches the ground. The holonomic
     constraint is the depth of the front wheel's lowest point below the ground, and Φ
     are the horizontal velocities in space of the points of the rear and of the front
@@ -50,8 +50,8 @@ class WhippleBicycle(AbstractNonholonomicExample):
     the rear and on the front wheel, and the force z on the front wheel.
 
     `steering` is the torque on the steer axis as a function (t, q, v, args):
-    `SteerTorque()`, `LeanToSteer()`, one of your own, or None for a bicycle that nobody
-    controls, whose energy is conserved.
+    `SteerTorque()`, `LeanToSteer()`, your own function, or None for an uncontrolled
+    bicycle, whose energy is conserved.
 
     **Parameters:** `wheelbase` w, `trail` c [m], `tilt` λ of the steer axis [rad],
     `gravity` g [m/s²]; of the wheels `rear_radius`, `front_radius` [m],
@@ -130,10 +130,10 @@ class WhippleBicycle(AbstractNonholonomicExample):
         steer: ArrayLike = 0.0,
         **parameters: Any,
     ) -> "WhippleBicycle":
-        """Make a bicycle that rolls at the `speed` of the rear wheel, its radius times
-        its rate, with the given lean and steer and their rates.
+        """Create a bicycle that rolls, with the given lean, steer and their rates.
 
-        Pitch and all other rates follow from the constraints.
+        `speed` is the radius of the rear wheel times its rate. Pitch
+        and all other rates follow from the constraints.
         """
         given = (lean, steer, lean_rate, steer_rate, speed)
         bicycle = cls(**parameters)
@@ -167,7 +167,7 @@ class WhippleBicycle(AbstractNonholonomicExample):
             x, y, z = angular_velocity(frames[i], rates[i], spin)
             turning = inertia @ jnp.stack([x * x, y * y, z * z, 2 * x * z])
             kinetic = 0.5 * (mass * (velocity @ velocity) + turning)
-            # Down is positive, so a body gains energy as z grows.
+            # z points down, so that the term m g z is positive in L.
             value = value + kinetic + mass * self.gravity * frames[i].move(centre)[2]
         return value
 
@@ -179,7 +179,7 @@ class WhippleBicycle(AbstractNonholonomicExample):
         return jnp.concatenate(velocities)
 
     def holonomic(self, t: FloatScalarLike, q: Array, args: Args) -> Array:
-        """Compute how far below the ground the front wheel's lowest point is."""
+        """Compute the depth of the front wheel's lowest point below the ground."""
         return contact_point(*_wheels(self, q)[1], _frames(self, q)[1])[2:]
 
     def force(self, t: FloatScalarLike, q: Array, v: Array, args: Args) -> Array:
@@ -194,9 +194,9 @@ class WhippleBicycle(AbstractNonholonomicExample):
         return {"energy": self.energy(t, q, v)} if self.steering is None else {}
 
     def points(self, t: FloatScalarLike, q: Array) -> dict[str, Float[Array, "3"]]:
-        """Compute the points that one would draw, with z upwards and y to the left.
+        """Compute points for drawing, with z upwards and y to the left.
 
-        `head` is the point of the steer axis as high as the centre of the rear frame.
+        `head` is the point of the steer axis at the height of the rear frame's centre.
         """
         rear, front = _frames(self, q)
         rear_wheel, front_wheel = _wheels(self, q)
@@ -254,7 +254,7 @@ def _wheels(bicycle: WhippleBicycle, q: Array) -> tuple[_Wheel, _Wheel]:
 
 
 def _frames(bicycle: WhippleBicycle, q: Array) -> tuple[Frame, Frame]:
-    """Compute where the rear and the front frame are, from the upright bicycle."""
+    """Compute the positions of the rear and front frame, from the upright bicycle."""
     x, y, yaw, lean, pitch, steer = q[:6]
     rotation = about_z(yaw) @ about_x(lean) @ about_y(pitch)
     hub, radius = _wheels(bicycle, q)[0]
@@ -286,7 +286,7 @@ class SteerTorque(eqx.Module):
     """
 
     def __call__(self, t: FloatScalarLike, q: Array, v: Array, args: Args) -> Array:
-        """Return the torque, which is `args`, or zero where that is None."""
+        """Return the torque `args`, or zero if `args` is None."""
         return given_forces(args, (), v.dtype, "a torque on the steer axis")
 
 
@@ -327,7 +327,7 @@ def _rolling_start(
 ) -> tuple[Array, Array, Array]:
     """Compute (q0, v0): the pitch by Newton's method, the other rates linearly.
 
-    The third result tells whether both wheels touch the ground.
+    The third result is whether both wheels touch the ground.
     """
 
     def at(pitch):

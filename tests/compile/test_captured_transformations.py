@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jax.core import Tracer
 
 import nhjax
 from nhjax._compile._tracked_jit import Captured, MOST_ENTRIES
@@ -29,6 +30,19 @@ class Scaled(eqx.Module):
 
     def __call__(self, t, q, v, args):
         return falling(v, q, self.scale * GRAVITY)
+
+
+class Label:
+    """A key that equals all others, with a value of its own."""
+
+    def __init__(self, value):
+        self.value = value
+
+    def __hash__(self):
+        return 1
+
+    def __eq__(self, other):
+        return isinstance(other, Label)
 
 
 class Planet:
@@ -142,6 +156,28 @@ def test_value_changed_by_tracing_causes_no_retrace():
     np.testing.assert_allclose(end(lagrangian)[0], -1.5, rtol=1e-13)
 
 
+@pytest.mark.parametrize("kind", ["closed-over variable", "list"])
+def test_tracer_stored_by_earlier_trace_causes_no_retrace(kind):
+    calls, last, kept = [], None, [None]
+
+    def lagrangian(t, q, v, args):
+        nonlocal last
+        calls.append(1)
+        if kind == "list":
+            kept[0] = q
+        else:
+            last = q
+        return falling(v, q, 1.0)
+
+    counts = []
+    for _ in range(4):
+        end(lagrangian)
+        counts.append(len(calls))
+    first, second, third = np.diff(counts)
+    assert first == second == third < counts[0] / 2
+    assert isinstance(kept[0] if kind == "list" else last, Tracer)
+
+
 def test_captured_values_with_cycles_or_without_hash_are_compared():
     circle: list[Any] = [1.0]
     circle.append({"again": circle, 3: {1, 2}, (1, 2): bytearray(b"x")})
@@ -165,6 +201,13 @@ def kinds_of_values():
     pairs: list[Any] = [[1.0], [1.0]]
     zero: list[float] = [0.0]
     whole: list[float] = [1]
+    by_sign: dict[float, int] = {0.0: 1}
+    by_label = {Label(1.0): 1}
+
+    def replace_key(mapping, key):
+        mapping.clear()
+        mapping[key] = 1
+
     return {
         "array of objects": (objects, lambda: inner.append(2.0)),
         "set": (numbers := {1}, lambda: numbers.add(2)),
@@ -173,6 +216,8 @@ def kinds_of_values():
         "sign of zero": (zero, lambda: zero.__setitem__(0, -0.0)),
         "type of number": (whole, lambda: whole.__setitem__(0, 1.0)),
         "identity": (pairs, lambda: pairs.__setitem__(1, pairs[0])),
+        "sign of a key": (by_sign, lambda: replace_key(by_sign, -0.0)),
+        "key equal to another": (by_label, lambda: replace_key(by_label, Label(2.0))),
         "level of a key": (nested, lambda: nested.update(c=nested["a"].pop("c"))),
     }
 

@@ -290,7 +290,7 @@ def signs_at(
     y = with_continuous_multiplier(system, stepper.method, t, y, args)
     values = conditions(t, y, args)
     small = float(jnp.finfo(values.dtype).eps) ** 0.5
-    # An infinite rate, such as that of a root, does not make a condition zero.
+    # An infinite rate, as of a square root at zero, does not make a condition zero.
     near = jnp.isfinite(rate) & (jnp.abs(values) <= small * jnp.abs(rate * dt))
     at_zero = near | ((jnp.abs(values) <= bound) & ~jnp.isnan(rate))
     value = jnp.where(at_zero, rate * jnp.sign(dt), values)
@@ -319,8 +319,8 @@ def with_continuous_multiplier(
 class EventOutcome(NamedTuple):
     """The outcome of the action of an event.
 
-    - `step_state`: the state with which the run goes on.
-    - `signs`: the signs of the conditions there.
+    - `step_state`: the state from which the run continues.
+    - `signs`: the signs of the conditions at this state.
     - `pending`: the conditions that a reset has carried across zero.
     - `result`: whether the run goes on, ends or fails.
     """

@@ -291,7 +291,7 @@ class Bracket(eqx.Module):
     def with_point(
         self, theta: FloatScalar, values: Float[Array, " e"], crossed: Bool[Array, " e"]
     ) -> "Bracket":
-        """Shorten the interval by a point in it, where `crossed` have crossed zero."""
+        """Shorten the interval at θ; `crossed` marks functions that crossed zero."""
         is_upper = jnp.any(crossed)
         same = is_upper == self.is_upper
 

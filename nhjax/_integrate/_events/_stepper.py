@@ -78,15 +78,16 @@ class EventCarry(AbstractCarry):
 
 
 class ReplayedIteration(eqx.Module):
-    """What a reverse replay knows about an iteration besides its state.
+    """The data that a reverse replay has about an iteration, besides its state.
 
-    - `node`, `offset`, `num_events`: where it started, as in `EventLoopState`.
+    - `node`, `offset`, `num_events`: the start of the iteration, as in
+      `EventLoopState`.
     - `row`: the number of output rows that were filled before.
-    - `which`: the index of the event that it ended at, -1 for none.
+    - `which`: the index of the event at the end of the iteration, or -1.
     - `size`: the size of the step.
     - `scale`: the size of the condition of that event in the step.
-    - `is_active`: whether it took a step or met an event without one. Otherwise it did
-        nothing.
+    - `is_active`: whether the iteration took a step or handled an event without a step.
+        Otherwise the iteration was idle.
     - `was_truncated`: whether the iteration before it was discarded, because there is
         an event in the step.
     """
@@ -162,7 +163,7 @@ class EventStepper(AbstractStepper[EventCarry, ReplayedIteration]):
         """Return the stepper for the user's events in a run that starts at y.
 
         **Raises:** `TypeError`, `ShapeError` or `DTypeError` for a function of an event
-        that returns something wrong.
+        that returns a wrong type, shape or dtype.
         """
         given = plain.time(0), y, plain.args
         conditions = Conditions.of(events, *given)
@@ -359,7 +360,7 @@ class EventStepper(AbstractStepper[EventCarry, ReplayedIteration]):
         return step((arguments, self.conditions))
 
     def blank_result(self, carry: EventCarry) -> StepResult:
-        """Return the result of an iteration that did nothing."""
+        """Return the result of an idle iteration."""
         t, y, zero = (
             self.plain.time(0),
             carry.step_state.state,
@@ -483,7 +484,7 @@ class EventReverseReplay(AbstractReverseReplay[EventCarry, ReplayedIteration]):
 
     @property
     def after_end(self) -> ReplayedIteration:
-        """Return the place at the end of the run, as that of an idle iteration."""
+        """Return the place at the end of the run, as an idle iteration has it."""
         end = self.end.place
         never = jnp.zeros((), bool)
         return ReplayedIteration(
@@ -578,7 +579,7 @@ class EventReverseReplay(AbstractReverseReplay[EventCarry, ReplayedIteration]):
             signs=ConditionSigns(start.signs.sign, scales, at_zero),
             pending=is_one & (replay.size == 0),
         )
-        # An iteration that did nothing is repeated as one after the end of the run.
+        # An idle iteration is repeated as an iteration after the end of the run.
         ended = RESULTS.event_occurred
         result = RESULTS.where(replay.is_active, RESULTS.successful, ended)
         return EventCarry(step_state, result, self.start.stats, place)
