@@ -163,7 +163,7 @@ def _progress(rules: _Rules, before: _Progress, sizes: UpdateNorms) -> _Progress
     """Update the progress of an iteration by an increment; decide whether it ends."""
     increment = sizes.increment
     first = jnp.where(before.iterations == 0, increment, before.first)
-    # UpdateNorms are compared without quotients, whose latencies would add up.
+    # Norms are compared without quotients, whose latencies would add up.
     found = jnp.maximum(rules.scale + rules.round_off, sizes.iterate)
     has_size = found > 0
     measure = jnp.where(has_size, found, before.first)
