@@ -24,9 +24,9 @@ from .._custom_types import BoolScalar, FloatScalar
 class RankCondition(NamedTuple):
     """The derivatives of constraints at a configuration, which must have full rank.
 
-    The `jacobian` has k rows of DΓ, or m + k rows of D2Φ and DΓ. `counts` says whether
-    its rank matters. At the starting values of Newton's method it matters only if the
-    method fails; otherwise the method has moved to another configuration.
+    The `jacobian` has k rows of DΓ, or m + k rows of D2Φ and DΓ. Its rank matters only
+    if `is_active`. The rank at the starting values of Newton's method is active only if
+    the method fails; otherwise the method has moved to another configuration.
     """
 
     jacobian: Float[Array, "l n"]
@@ -40,7 +40,7 @@ class RankCondition(NamedTuple):
 
 
 def active_ranks(ranks: list[RankCondition]) -> list[RankCondition]:
-    """Keep at most one matrix of each shape, namely the one whose rank matters.
+    """Keep at most one matrix of each shape, namely the active one.
 
     Singular values are more expensive than all else here, so that they are computed for
     as few matrices as possible.
@@ -50,7 +50,7 @@ def active_ranks(ranks: list[RankCondition]) -> list[RankCondition]:
         other = merged.setdefault(rank.jacobian.shape, rank)
         if other is not rank:
             merged[rank.jacobian.shape] = jax.tree.map(
-                lambda x, y, counts=rank.is_active: jnp.where(counts, x, y), rank, other
+                lambda x, y, active=rank.is_active: jnp.where(active, x, y), rank, other
             )
     return list(merged.values())
 
