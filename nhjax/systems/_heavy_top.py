@@ -115,7 +115,7 @@ class HeavyTopSE3(AbstractExample):
     with q = (R, x): the attitude, a quaternion, and the position of the centre of mass;
     (v, ω) are their body velocities, and X is the centre of mass in the body, seen from
     the pivot. The three constraints are holonomic, and their multiplier is the force of
-    the pivot in space. Its motion is that of `HeavyTop` with the same parameters.
+    the pivot in space. It moves like `HeavyTop` with the same parameters.
 
     **Parameters:** those of `HeavyTop`; `retraction`, that of SE(3).
 
