@@ -206,7 +206,7 @@ def page() -> str:
     for machine in machines.machines():
         traced = " and ".join(name.replace("_", " ") for name in machine.traced)
         drawn.append(
-            (machine.example, f"the machine at some times, and the path of {traced}")
+            (machine.example, f"the machine at some times, and the path of: {traced}")
         )
     parts = [OPENING.format(count=len(drawn))]
     for example, caption in drawn:

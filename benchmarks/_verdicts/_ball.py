@@ -138,7 +138,6 @@ def _principal_axes(apart: dict[str, float]) -> Claim:
         f"{apart['unequal']:.1e} for (a, b, c) = (0.3, 0.4, 0.5)",
         command(PART),
         PRINT if apart["equal"] < 1e-8 < apart["unequal"] else DEPENDS,
-        "a ball that rolls has the angular velocity of space in Φ; harmless where "
-        "a = b = c, which is all that the paper computes, but a different system "
-        "for other a, b, c",
+        "a ball that rolls has the angular velocity of space in Φ; this "
+        "makes no difference for a = b = c, the only case that the paper computes",
     )

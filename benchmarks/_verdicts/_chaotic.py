@@ -167,7 +167,7 @@ def _power(curves: dict, s: int) -> Claim:
         verdict = PRINT if right else REFUTED
         why = (
             f"the measured power is {expected} = 4(s - 1), the square of an error of "
-            f"order {2 * s - 2}; curves over h^{printed} cannot fall together"
+            f"order {2 * s - 2}; curves divided by h^{printed} cannot coincide"
         )
     shown = f"μ(E) goes as h^{printed or expected}"
     return Claim(

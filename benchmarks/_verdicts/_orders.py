@@ -236,7 +236,8 @@ def _inconsistent(quick: bool) -> Found:
             for n, x in zip(stages, ours, strict=True)
         ]
     claim = Claim(
-        "λ_0 must be that of the continuous problem (5, hypothesis of the theorems)",
+        "λ_0 must be the multiplier of the continuous problem (5, hypothesis of the "
+        "theorems)",
         f"order of (q, p) from λ_0 wrong by 0.3, {stages_text(stages)}: {text}",
         command(PART),
         CONFIRMED if falls else REFUTED,

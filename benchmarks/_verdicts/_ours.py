@@ -97,8 +97,8 @@ def _coincidences() -> Found:
                 command(PART),
                 OURS if same else REFUTED,
                 "SPARK computes s multipliers in each step, while the paper's method "
-                f"carries one multiplier from step to step; they differ by "
-                f"their errors; {RECONSTRUCTED}",
+                f"carries one multiplier from step to step; their "
+                f"results differ by as much as their errors; {RECONSTRUCTED}",
             ),
         ],
         {"coincidences": apart},

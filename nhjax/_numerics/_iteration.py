@@ -20,9 +20,9 @@ Aux = TypeVar("Aux")
 # iteration that spirals towards the solution.
 NOISE_UNITS = 400
 # At the first increment that fails to fall, this many units of round-off are treated as
-# noise. At each further one this level grows by one of the two factors below. The
-# factor is smaller for iterations that may be slow, since their increments may rise and
-# fall before they have converged.
+# noise. At each further such increment, this level grows by one of the two factors
+# below. The factor is smaller for iterations that may be slow, since their increments
+# may rise and fall before they have converged.
 _FIRST_UNITS = 30.0
 _GROWTH, _GROWTH_IF_SLOW = 30.0, 2.0
 # An iteration diverges if an increment is larger by this factor than x and the first
@@ -163,7 +163,7 @@ def _progress(rules: _Rules, before: _Progress, sizes: UpdateNorms) -> _Progress
     """Update the progress of an iteration by an increment; decide whether it ends."""
     increment = sizes.increment
     first = jnp.where(before.iterations == 0, increment, before.first)
-    # Norms are compared without quotients, whose latencies would add up.
+    # The norms are compared without divisions, because their latencies would add up.
     found = jnp.maximum(rules.scale + rules.round_off, sizes.iterate)
     has_size = found > 0
     measure = jnp.where(has_size, found, before.first)

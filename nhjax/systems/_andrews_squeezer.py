@@ -18,7 +18,7 @@ from ._planar import kinetic_energy, turned
 
 
 class AndrewsSqueezer(AbstractExample):
-    """Seven rigid bodies in a plane, joined to three loops and driven by a motor.
+    """Seven rigid bodies in a plane that form three loops and are driven by a motor.
 
     L = Σ (m_k/2 |ċ_k|² + I_k/2 ω_k²) - c₀/2 (|D - C| - l₀)²,
     Φ = (P₂ - P₃, P₂ - P₄, P₂ - P₆),  Q = (M, 0, 0, 0, 0, 0, 0),
@@ -28,8 +28,8 @@ class AndrewsSqueezer(AbstractExample):
     origin O, K2 about the end of K1, K3 about B, K5 and K7 about A, K4 about the end
     of K5, K6 about the end of K7. c_k are the centres of mass and P_k the outer ends,
     and the ends of K2, K3, K4 and K6 meet in one joint P. A spring pulls at the point D
-    of K3 from C; a motor turns K1 with the torque M, a thousand revolutions a minute
-    within 0.03 s.
+    of K3 from C; a motor turns K1 with the torque M,
+    and K1 reaches a thousand revolutions a minute within 0.03 s.
 
     **Parameters:** `masses` m_k [kg] and `inertias` I_k about the centres [kg m²], of
     shape (7,); `arms`, the vectors from the inner joint to the outer end, and

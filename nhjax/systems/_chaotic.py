@@ -14,7 +14,7 @@ from ._base import AbstractConstrainedExample, coordinates
 class ChaoticSystem(AbstractConstrainedExample):
     """A chaotic system of n = 2m + 1 coupled oscillators, m >= 2.
 
-    With indices from 1,
+    With indices that start at 1,
 
     L = ½ |v|² - ½ (|q|² + q²_{m+2} q²_{m+3} + Σ_{i=1..m} q²_{1+i} q²_{m+1+i}),
     Φ = v_1 + Σ_{i=m+2..n} q_i v_i, in dimensionless units.

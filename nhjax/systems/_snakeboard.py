@@ -22,7 +22,7 @@ from ._planar import direction
 
 
 class Snakeboard(AbstractGaitMachine):
-    """A board on two steered axles, which a rotor and the steering propel.
+    """A board on two steered axles, propelled by a rotor and by the steering.
 
     L = m/2 (ẋ² + ẏ²) + J/2 θ̇² + J_r/2 (θ̇ + ψ̇)² + J_w/2 ((θ̇ + φ̇_b)² + (θ̇ + φ̇_f)²),
     Φ = (-sin(θ + φ_b) ẋ + cos(θ + φ_b) ẏ - l cos φ_b θ̇,
