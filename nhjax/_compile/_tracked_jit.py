@@ -41,7 +41,7 @@ T = TypeVar("T")
 MOST_ENTRIES = 2000
 # These libraries may be installed from a working copy, outside of the usual folders.
 _LIBRARIES = ("equinox", "jax", "jaxlib", "jaxtyping", "nhjax", "numpy")
-# Python 3.12 reads a global in the body of a class inside a function by the last one.
+# Since Python 3.12 the last one reads globals in a class body inside a function.
 _GLOBAL_LOADS = ("LOAD_GLOBAL", "LOAD_NAME", "LOAD_FROM_DICT_OR_GLOBALS")
 _NUMBERS, _ARRAYS = (float, complex), (np.ndarray, np.generic)
 _PLAIN = (bool, int, str, bytes, type(None), type(Ellipsis), np.dtype)
@@ -270,7 +270,7 @@ class _Key:
 # _MOST, all are dropped, and programs that are still used are traced once more.
 _MOST = 1000
 _changed_by_tracing: dict[Place, object] = {}
-# The key with which a program was traced, by the key as it was after tracing.
+# From the key after tracing to the key with which the program was traced.
 _key_before_tracing: dict[_Key, _Key] = {}
 
 
@@ -313,8 +313,7 @@ def tracked_jit(*tracked: str) -> Callable[[Callable[..., T]], Callable[..., T]]
 
 
 def _remember_changes(key: _Key, before: Captured, functions: Any) -> None:
-    """Ignore the places that tracing changed from now on, and find the program by the
-    key as it is after tracing too.
+    """Ignore the places that tracing changed, and store the program under the new key.
     """
     after = Captured(functions, _changed_by_tracing)
     changed = {}

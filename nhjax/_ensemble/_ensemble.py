@@ -26,7 +26,7 @@ from ._store import CheckpointedReductionSink, ZarrSink
 # A chunk of this many members for each device keeps all cores busy. It is smaller if
 # the values of the members would take more than this many bytes.
 _MEMBERS, _BYTES = 1024, 2**26
-# Names of files of other programs, which `out` does not make.
+# Suffixes of files of other programs, which `out` does not create.
 _FILES = (".nc", ".nc4", ".h5", ".hdf5", ".csv", ".npy", ".npz", ".mat", ".pkl")
 # The shortest time between two updates of a progress meter.
 _SECONDS = 0.1

@@ -83,7 +83,8 @@ class Checkpoint(eqx.Module):
 class Origin(NamedTuple):
     """The origin of the times t_k = t0 + (first_step + k) dt + shift of a run.
 
-    The shift is zero unless the step size differs from that before the checkpoint.
+    The shift is zero unless the step size differs from the step size before the
+    checkpoint.
     """
 
     t0: FloatScalar

@@ -1,8 +1,8 @@
 """The functions `integrate` and `step`: checks, the compiled run, and its solution.
 
 `integrate` checks its arguments and calls `run`, which is compiled. `run` builds the
-stepper, what it saves and the time loop, lets the adjoint run the loop, and makes the
-solution of its end.
+stepper, the output buffers and the time loop. The adjoint runs the loop, and `run`
+converts its end to a solution.
 """
 
 import reprlib
@@ -149,13 +149,13 @@ def integrate(
     - `method`: such as `nhjax.LobattoIIIAB(stages=3)`; `Gauss` only without
         constraints.
     - `y0`: a consistent state, from `nhjax.initial_state` or an earlier `Solution`.
-        Only the propagated closure uses its multiplier. Or the `Checkpoint` of an
-        earlier run, which then continues bit for bit as if it had been longer.
-    - `dt`: the step size, a scalar, in units of time; negative to go back.
+        Only the propagated closure uses its multiplier. It may also be the `Checkpoint`
+        of an earlier run, which then continues bit for bit.
+    - `dt`: the step size, a scalar, in units of time; negative to integrate backwards.
     - `num_steps`: the number of steps, an int >= 1; see below for arrays.
     - `t0`: the time of `y0`, 0 by default. A checkpoint has its own time.
     - `args`: passed on to the functions of the system. Arrays and floats in it are
-        traced, so that other values do not recompile. Anything else is static.
+        traced, so that other values do not recompile. All other values are static.
 
     **Other arguments:**
 
@@ -296,7 +296,7 @@ def step(
 
     - `system`, `method`: as for `nhjax.integrate`.
     - `t`: the time of `y`.
-    - `dt`: the step size, a scalar, in units of time; negative to go back.
+    - `dt`: the step size, a scalar, in units of time; negative to integrate backwards.
     - `y`: a consistent state, from `nhjax.initial_state`, a `Solution` or an earlier
         step.
     - `args`: passed on to the functions of the system, for instance controls that are
@@ -679,7 +679,7 @@ def _output(
     end: RunEnd[Any, Any],
     sampled: Int[Array, " k"] | None,
 ) -> tuple[PyTree[Array], PyTree[Array]]:
-    """Join what was saved at the start, on the way and at the end: times and values."""
+    """Join the output of the start, the steps and the end: times and values."""
     saving, args, ts = loop.saving, loop.stepper.plain.args, saveat.ts
     saved, records = end.rows
     pieces = []

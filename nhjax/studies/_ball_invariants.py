@@ -57,8 +57,8 @@ class BallRun:
     - `integrals`: shape (k + 1, 4), the three linear first integrals and the moving
         energy.
     - `positions`: (x, y), shape (k + 1, 2).
-    - `circle_deviation`: the distance from the exact position at the final time that
-        all step sizes have in common.
+    - `circle_deviation`: the distance from the exact position at the common final time
+        of all step sizes.
     - `timing`: of the program that runs all step sizes with this s side by side.
     """
 

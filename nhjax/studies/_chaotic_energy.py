@@ -58,7 +58,7 @@ class ChaoticRun:
 
     - `mu`, `mu_error`: the mean squared energy error μ(E, k) at the saved times, and
         its standard error σ/√N over the N members.
-    - `windows`, `windows_error`: the same of averages over windows in time.
+    - `windows`, `windows_error`: the same for averages over windows in time.
     """
 
     stages: int

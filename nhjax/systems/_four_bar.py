@@ -79,7 +79,7 @@ class FourBar(AbstractExample):
         distance = jnp.sqrt(square)
         cosine = (square + second**2 - third**2) / (2 * distance * second)
         require_possible(
-            abs(cosine) < 1, f"At `angle` {angle} the bars are too short to close."
+            abs(cosine) < 1, f"`angle` {angle} leaves the bars too short to close."
         )
         coupler = jnp.arctan2(side[1], side[0]) + jnp.arccos(cosine)
         arm = second * direction(coupler) - side
