@@ -402,7 +402,7 @@ TRACING = [
         TracerArrayConversionError,
         "This was raised by `lagrangian(t, q, v, args)`",
         "test_mistakes.py:",
-        "functions of `jax.numpy` in place of those of `numpy` and `math`",
+        "functions of `jax.numpy` in place of `numpy` and `math`",
     ),
     row(
         "used `math` in a constraint",
@@ -411,7 +411,7 @@ TRACING = [
         ),
         ConcretizationTypeError,
         "`nonholonomic(t, q, v, args)`",
-        "functions of `jax.numpy` in place of those of `numpy` and `math`",
+        "functions of `jax.numpy` in place of `numpy` and `math`",
     ),
     row(
         "wrote an `if` on a position in a force",

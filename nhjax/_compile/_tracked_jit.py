@@ -313,8 +313,7 @@ def tracked_jit(*tracked: str) -> Callable[[Callable[..., T]], Callable[..., T]]
 
 
 def _remember_changes(key: _Key, before: Captured, functions: Any) -> None:
-    """Ignore the places that tracing changed, and store the program under the new key.
-    """
+    """Ignore the places that tracing changed, and store the program under a new key."""
     after = Captured(functions, _changed_by_tracing)
     changed = {}
     for one, other in ((before, after), (after, before)):
@@ -323,7 +322,8 @@ def _remember_changes(key: _Key, before: Captured, functions: Any) -> None:
             if isinstance(content, _Unrepeatable):
                 continue
             if there is None and isinstance(owner, list | set | deque):
-                # The container grows, so that its next element would again be new.
+                # The container grows, so that at the next call it has a new element
+                # again.
                 place = (id(owner), ...)
             if there is None or there[1] != content:
                 changed[place] = owner

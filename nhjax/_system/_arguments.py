@@ -191,7 +191,7 @@ def check_signature(
     """Raise a `TypeError` unless a user's function takes `arguments`.
 
     The function is called by position, so its arguments may have other names. It is
-    refused if two of the expected names are in the places of others.
+    refused if expected names are interchanged.
 
     **Arguments:**
 
@@ -285,7 +285,7 @@ def check_coordinates(owner: Any) -> None:
     if len(set(names)) != len(names):
         raise ValueError(
             f"{type(owner).__name__}: `coordinates` has a name twice: {names}. Give "
-            "each coordinate a name of its own."
+            "each coordinate its own name."
         )
 
 

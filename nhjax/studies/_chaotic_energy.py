@@ -196,7 +196,7 @@ class ChaoticEnergy(AbstractStudyResult):
         return f"μ scales as {found}, averaged over the times"
 
     def figures(self) -> "dict[str, Figure]":
-        """Draw μ against time, normalised by the measured power and as in the paper."""
+        """Draw μ against time, normalised by the measured and by the paper's power."""
         title = f"J = {self.members}, {self.closure} closure"
         return {self.name: _figure(self.runs, title)}
 
