@@ -100,7 +100,7 @@ _ADVICE = (
     ),
     (
         jax.errors.TracerIntegerConversionError,
-        "convert lists and NumPy arrays that such an array indexes to JAX arrays, "
+        "to index a list or a NumPy array by them, convert it to a JAX array, "
         "`jnp.asarray(table)[i]`; the number of a `range` must be an int.",
     ),
     (

@@ -85,7 +85,7 @@ def ensemble(
     - `progress_meter`: shows the number of finished members; by default a bar on the
         standard error stream if that is a terminal.
     - `resume`: whether to resume an existing store; otherwise it is refused.
-    - `units`: units of the arrays in the store, by their names there.
+    - `units`: units of the arrays in the store, by the names of the arrays.
 
     **Returns:** an `nhjax.EnsembleOutcome` with `values` or `statistics`, or with
     neither if values were written to `out`.

@@ -42,8 +42,8 @@ class RankCondition(NamedTuple):
 def active_ranks(ranks: list[RankCondition]) -> list[RankCondition]:
     """Keep at most one matrix of each shape, namely the one whose rank matters.
 
-    Singular values are more expensive than all else here, so that they are computed for
-    as few matrices as possible.
+    Singular values are more expensive than all other operations here, so that they are
+    computed for as few matrices as possible.
     """
     merged: dict[tuple[int, ...], RankCondition] = {}
     for rank in ranks:

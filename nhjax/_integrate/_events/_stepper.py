@@ -519,7 +519,7 @@ class EventReverseReplay(AbstractReverseReplay[EventCarry, ReplayedIteration]):
         entry = jax.tree.map(lambda x: x[last], self.log)
         active = (i < end.num_iterations) & ~following.was_truncated
         at_event = active & (following.num_events > 0) & (entry.iteration == i)
-        # The rest of a step after its last event is a step of another iteration.
+        # After the last event in a step, another iteration takes the rest of the step.
         is_rest = (following.num_events > 0) & (entry.node_after == following.node - 1)
         offset = jnp.where(is_rest, entry.offset_after, 0)
         offset = jnp.where(at_event, entry.offset, offset)
