@@ -270,7 +270,7 @@ class _Key:
 # _MOST, all are dropped, and programs that are still used are traced once more.
 _MOST = 1000
 _changed_by_tracing: dict[Place, object] = {}
-# From the key after tracing to the key with which the program was traced.
+# This maps the key after tracing to the key with which the program was traced.
 _key_before_tracing: dict[_Key, _Key] = {}
 
 

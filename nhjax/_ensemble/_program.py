@@ -404,7 +404,7 @@ def first_failure(value: Any) -> tuple[Int[Array, ""], Int[Array, ""]]:
 
 
 def results_as_codes(value: Any) -> Any:
-    """Replace `RESULTS` by their codes, except the one of a solution."""
+    """Replace `RESULTS` by their codes, except in a solution."""
     if isinstance(value, Solution):
         return value
     return jax.tree.map(
