@@ -59,7 +59,8 @@ class BallRun:
     - `positions`: (x, y), shape (k + 1, 2).
     - `circle_deviation`: the distance from the exact position at the common final time
         of all step sizes.
-    - `timing`: of the program that runs all step sizes with this s side by side.
+    - `timing`: the times of the program that runs all step sizes with this s side by
+      side.
     """
 
     stages: int

@@ -47,7 +47,8 @@ class CVTRun:
     """The energies of one run, at every step.
 
     - `energies`: shape (k + 1, 3): total, driver and passenger.
-    - `timing`: of the program that runs all regimes with this s and h side by side.
+    - `timing`: the times of the program that runs all regimes with this s and h side by
+      side.
     """
 
     regime: str

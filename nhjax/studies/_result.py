@@ -110,7 +110,7 @@ def compile_and_run(function: Callable[..., Any], *args: Any) -> tuple[Any, Timi
 def meter(
     progress: bool, description: str, unit: str = "step"
 ) -> AbstractProgressMeter:
-    """Create a progress bar on the standard error stream, or none."""
+    """Create a progress bar on the standard error stream, or no bar."""
     return TqdmProgressMeter(description, unit) if progress else NoProgressMeter()
 
 

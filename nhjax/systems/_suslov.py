@@ -21,7 +21,7 @@ from ._sleigh import _sech as sech
 
 
 class Suslov(AbstractConstrainedGroupExample):
-    """A rigid body that may not turn about an axis fixed in it, on SO(3).
+    """A rigid body that cannot turn about an axis fixed in it, on SO(3).
 
     ℓ = ½ ω·Iω,  φ = ω₃,
 

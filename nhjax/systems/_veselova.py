@@ -18,7 +18,7 @@ _INERTIA = ((1.0, 0.1, 0.2), (0.1, 1.4, -0.15), (0.2, -0.15, 0.8))
 
 
 class Veselova(AbstractConstrainedGroupExample):
-    """A rigid body that may not turn about an axis fixed in space, on SO(3).
+    """A rigid body that cannot turn about an axis fixed in space, on SO(3).
 
     ℓ = ½ ω·Jω - w·γ,  φ = γ·ω,  γ = Rᵀ e₃,
 
