@@ -48,8 +48,8 @@ _PLAIN = (bool, int, str, bytes, type(None), type(Ellipsis), np.dtype)
 _LEAVES = (*_PLAIN, *_NUMBERS, *_ARRAYS, jax.core.Tracer)
 _MAPPINGS = (dict, types.MappingProxyType)
 _SEQUENCES = (list, tuple, deque, set, frozenset)
-# Values of these classes are compared part by part, although libraries define the
-# classes.
+# Values of these classes are compared part by part, although the classes belong to
+# libraries.
 _CONTAINERS = (*_MAPPINGS, *_SEQUENCES, types.MethodType, partial)
 _CONTAINERS += (types.SimpleNamespace, argparse.Namespace, eqx.Module)
 
@@ -154,10 +154,10 @@ def _parts(value: Any) -> Iterator[Part]:
 
 
 def _read_by(function: types.FunctionType) -> Iterator[Part]:
-    """Yield what a function closes over, its defaults, and the globals that it reads.
+    """Yield the closed-over values, defaults and read globals of a function.
 
     The globals of libraries are assumed to stay the same. If a value is a module of the
-    user, its variables with the name of an attribute in the code follow.
+    user, the variables of the module that the code reads as attributes follow.
     """
     variables, attributes = _names(function.__code__)
     found: list[Part] = []

@@ -576,7 +576,7 @@ def run(
     _check_saved(saveat.fn, t0, state, args)
     # Arrays that the user's functions close over become leaves, for derivatives.
     system = closure_converted(system, t0, state, args)
-    # The type checker takes the property `plain` for a field.
+    # The type checker sees the property `plain` as a field.
     plain = PlainStepper(  # pyright: ignore[reportCallIssue]
         system=system,
         method=method,

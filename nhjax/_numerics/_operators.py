@@ -479,7 +479,7 @@ def sparse_jacobian(
 
 
 class SparsityPattern:
-    """The places of the entries of a sparse matrix B, and what follows from them.
+    """The places of the entries of a sparse matrix B, and derived quantities.
 
     - `columns`: entry e of row a is in column `columns[e, a]`, shape (w, l); it exists
         where `present` is true.

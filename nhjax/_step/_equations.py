@@ -162,7 +162,7 @@ class StageEquations(eqx.Module):
 
     @property
     def constrained(self) -> bool:
-        """Return whether there are constraints, and so multipliers."""
+        """Return whether there are constraints, and therefore multipliers."""
         return self.multiplier.shape[0] > 0
 
     @property

@@ -49,7 +49,8 @@ from ._round_off import PART
 from ._step import AbstractStageSolver, FrozenNewtonMap
 
 
-# If the residual is larger than this, relative to the momenta, there is no solution.
+# If the residual is larger than this, relative to the momenta, the iterate is no
+# solution.
 _GROSS = 1e-6
 
 

@@ -195,8 +195,8 @@ def check_signature(
 
     **Arguments:**
 
-    - `owner`, `name`: the names, in the message, of the object or function of nhjax
-        that receives the function, and of the argument that passes it.
+    - `owner`, `name`: two names for the message: the object or function of nhjax that
+        receives the function, and the argument.
     - `function`: the function.
     - `arguments`: the names of its arguments, in their order.
     """

@@ -155,7 +155,7 @@ def check_state(
 def _names(num_nonholonomic: int, num_holonomic: int) -> list[str]:
     """List the names of all constraints, such as "nonholonomic[0]" or "holonomic[2]".
 
-    The order is the order of the rows of the Jacobian ∂Φ/∂u and of the multipliers.
+    The rows of the Jacobian ∂Φ/∂u and the multipliers have the same order.
     """
     return [f"nonholonomic[{a}]" for a in range(num_nonholonomic)] + [
         f"holonomic[{a}]" for a in range(num_holonomic)

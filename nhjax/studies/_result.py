@@ -248,7 +248,7 @@ def draw_envelope(
 
 @contextlib.contextmanager
 def colour_blind_safe() -> Iterator[None]:
-    """Use colours that everyone can distinguish for figures drawn and saved inside."""
+    """Use colours that everyone can distinguish, for the figures drawn in the block."""
     import matplotlib
     from cycler import cycler
 

@@ -344,7 +344,7 @@ class EventStepper(AbstractStepper[EventCarry, ReplayedIteration]):
         start = carry.step_state.differentiated_in_state()
         given = plain.args, plain.invariants, plain.round_off
         arguments = StepArguments(plain.system, t, h, start, *given)
-        # The type checker takes the property `programs` for a field.
+        # The type checker sees the property `programs` as a field.
         step = ImplicitTruncatedStep(  # pyright: ignore[reportCallIssue]
             step=ImplicitStep(
                 method=plain.method,
