@@ -1114,7 +1114,7 @@ RUNS = [
         lambda: run(Q),
         TypeError,
         "`y0` must be an nhjax.State",
-        "Make one with nhjax.initial_state",
+        "Create one with nhjax.initial_state",
     ),
     row(
         "went on from a solution in place of its last state",

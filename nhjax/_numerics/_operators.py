@@ -594,7 +594,7 @@ def block_tridiagonal_inverse(
     count = -(-size // (3 * g)) * 3
     ordered = static_take(products, pattern.order)
     ordered = jnp.pad(ordered, (*[(0, 0)] * 4, (0, count * g - size)))
-    # Axes: equation, unknown, sum, column, block of three, which of the three, row.
+    # Axes: equation, unknown, sum, column, group of three blocks, block in it, row.
     split = ordered.reshape(q, q, 3, g, count // 3, 3, g)
 
     def diagonal(offset):
