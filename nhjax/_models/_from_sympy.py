@@ -550,7 +550,7 @@ def parameter_defaults(
                 f"are {', '.join(known) or 'none'}."
             )
         if not eqx.is_array_like(value) or jnp.iscomplexobj(value):
-            # For instance a number of SymPy.
+            # The value may be, for instance, a number of SymPy.
             value = _number(name, value)
         value = float(value) if isinstance(value, numbers.Real) else value
         values[name] = jnp.asarray(value)

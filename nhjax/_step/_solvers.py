@@ -84,9 +84,9 @@ class SimplifiedNewton(AbstractStageSolver):
     `Solution.stats["num_newton_steps"]` counts these steps. A program that contains
     both methods takes longer to compile, and runs slower even if the fallback is never
     used. For this reason a plain call of `integrate` first runs without the fallback,
-    and repeats the run with it if a step was not solved. In a program of your own
-    (`jax.jit`, `jax.vmap`, `jax.grad`), a step that is not solved ends the run, unless
-    you ask for the fallback.
+    and repeats the run with it if a step was not solved. In your own transformed
+    program (`jax.jit`, `jax.vmap`, `jax.grad`), a step that is not solved ends the run,
+    unless you ask for the fallback.
 
     **Arguments:**
 

@@ -167,7 +167,7 @@ class CVTEnergy(AbstractStudyResult):
                 name = f"{run.regime}, s = {run.stages}, h = {run.dt:.4g}"
                 grown.append(f"{name} ({growth:.1f}-fold)")
         if not grown:
-            return "the energy error of no run grows after its first fifth"
+            return "the energy error does not grow after the first fifth of any run"
         return f"the energy error grows after the first fifth in: {'; '.join(grown)}"
 
     def figures(self) -> "dict[str, Figure]":

@@ -60,8 +60,8 @@ class Event(eqx.Module):
         from which the run continues: a pair (q, v), for a Hamiltonian system (q, p), or
         a `State`. It must satisfy the constraints.
     - `terminate`: end the run at the event, after its reset. The default is True
-        without a `reset`, and False with one. With False and no `reset`, events are
-        only reported.
+        without a `reset`, and False with a `reset`. With False and no `reset`, events
+        are only reported.
     - `max_events`: the number of events that a run has room for, an int >= 1. The
         limits of several events add up; exceeding the total ends the run with
         `RESULTS.too_many_events`. With `terminate` it is 1.
