@@ -1759,7 +1759,7 @@ FILES = [
         "gave an ensemble the name of a file of NetCDF",
         lambda folder: nhjax.ensemble(lambda x: x, MEMBERS, out=folder / "x.nc"),
         ValueError,
-        "but it names a folder, in which programs that read .nc find nothing",
+        "but it names a folder, in which programs that read .nc find no file",
         "`xarray.open_zarr`",
     ),
     row(

@@ -225,7 +225,7 @@ def _check_folder(out: Any) -> None:
     if suffix in _FILES:
         raise ValueError(
             f"`out` is {os.fspath(out)!r}, but it names a folder, in which programs "
-            f"that read {suffix} find nothing: use a name without suffix or with "
+            f"that read {suffix} find no file: use a name without suffix or with "
             ".zarr, which `xarray.open_zarr` opens."
         )
 

@@ -284,7 +284,7 @@ class WeightedTranspose(AbstractOperator):
         return self.weights[:, None] * self.matrix.as_matrix().T
 
     def first_columns(self, count: int) -> "WeightedTranspose":
-        """Return the first `count` columns; only the count of all is supported."""
+        """Return the first `count` columns; `count` must include all columns."""
         assert count == self.matrix.pattern.shape[0]
         return self
 

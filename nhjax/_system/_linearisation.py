@@ -74,7 +74,7 @@ class Linearisation(eqx.Module):
 
     @property
     def momentum_inverse(self) -> SquareMatrix:
-        """Return N⁻¹: the inverse mass matrix, or for Hamiltonian systems identity."""
+        """Return N⁻¹: inverse mass matrix or, for Hamiltonian systems, the identity."""
         if self.fibre_coordinate_name == "v":
             return self.fibre_hessian_inverse
         return DiagonalMatrix(jnp.ones_like(self.acceleration))

@@ -180,7 +180,7 @@ class BallInBowl(AbstractConstrainedGroupExample):
         return self.bowl.value(q[1])
 
     def invariants(self, t: FloatScalarLike, q: Element, v: Array) -> dict[str, Array]:
-        """Compute the conserved quantities: one, or three in a sphere.
+        """Compute the moving energy, and in a sphere two more conserved quantities.
 
         In a sphere `normal_spin` κ a (R ω)·n - Ω (1 + κ a) n₃ and `vertical_momentum`
         k m a² (R ω)₃ - κ a m (x ẏ - y ẋ) are conserved too.

@@ -93,7 +93,7 @@ class FourBar(AbstractExample):
 
     @classmethod
     def parallelogram(cls) -> "FourBar":
-        """Create the benchmark of one loop: bars of 1 m and 1 kg that fall right.
+        """Create the benchmark of one loop: bars of 1 m, 1 kg, falling to the right.
 
         The crank is upright, and its end moves at 1 m/s. With all bars horizontal,
         first after 0.71 s, the loop may fold: the constraints are dependent there.
