@@ -322,8 +322,7 @@ def _remember_changes(key: _Key, before: Captured, functions: Any) -> None:
             if isinstance(content, _Unrepeatable):
                 continue
             if there is None and isinstance(owner, list | set | deque):
-                # The container grows, so that at the next call it has a new element
-                # again.
+                # The container grows with each call, so all its elements are ignored.
                 place = (id(owner), ...)
             if there is None or there[1] != content:
                 changed[place] = owner
