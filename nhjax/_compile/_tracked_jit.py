@@ -157,7 +157,8 @@ def _read_by(function: types.FunctionType) -> Iterator[Part]:
     """Yield the closed-over values, defaults and read globals of a function.
 
     The globals of libraries are assumed to stay the same. If a value is a module of the
-    user, the variables of the module that the code reads as attributes follow.
+    user, yield also the variables of the module whose names occur as attributes in the
+    code.
     """
     variables, attributes = _names(function.__code__)
     found: list[Part] = []
