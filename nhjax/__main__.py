@@ -55,7 +55,7 @@ def _run(
                 )
             dt = options.get("dt", inspect.signature(function).parameters["dt"].default)
             options["final_time"] = length_in_steps * max(dt)
-        # Before hours of computing, not after them.
+        # Create the folder before the computation, so that an error appears at once.
         out.mkdir(parents=True, exist_ok=True)
         if not json_output:
             print(plan(study, function, options), end="\n\n", flush=True)
@@ -192,7 +192,7 @@ _OPTIONS: dict[str, dict[str, Any]] = {
         "type": _number,
         "nargs": "+",
         "metavar": "T",
-        "help": "when to report the error (default: 10 50 100 200, as far as it goes)",
+        "help": "when to report the error (default: 10 50 100 200, within the run)",
     },
     "save_every": {
         "type": int,

@@ -86,7 +86,7 @@ def naming(called: str, function: Any, args: Any = ...) -> Iterator[None]:
         note = f"This was raised by `{called}`{_place(function)}, called by nhjax."
         for kind, advice in _ADVICE:
             if isinstance(error, kind):
-                note += f" It is given arrays of JAX without values: {advice}"
+                note += f" It receives JAX arrays without values: {advice}"
                 break
         error.add_note(note + _about_args(error, args))
         raise
@@ -100,8 +100,8 @@ _ADVICE = (
     ),
     (
         jax.errors.TracerIntegerConversionError,
-        "make a list or an array of NumPy that is indexed by one of them an array of "
-        "JAX, `jnp.asarray(table)[i]`; the number of a `range` must be an int.",
+        "to index a list or a NumPy array by them, convert it to a JAX array, "
+        "`jnp.asarray(table)[i]`; the number of a `range` must be an int.",
     ),
     (
         jax.errors.NonConcreteBooleanIndexError,
@@ -110,8 +110,8 @@ _ADVICE = (
     # The functions of `math` need a number, which raises the second of these errors.
     (
         (jax.errors.TracerArrayConversionError, jax.errors.ConcretizationTypeError),
-        "use functions of `jax.numpy` in place of those of `numpy` and `math`, and "
-        "leave out `float` and `int`.",
+        "use functions of `jax.numpy` in place of `numpy` and `math`, and leave out "
+        "`float` and `int`.",
     ),
 )
 

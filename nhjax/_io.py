@@ -33,7 +33,7 @@ from ._system import State
 _VERSION = 1
 _HEADER = "nhjax"
 
-# The suffixes of other formats, and what writes them.
+# The suffixes of other formats, and the functions that write them.
 _XARRAY = "`sol.to_xarray()` and the methods of its result"
 _OTHER_FORMATS = {
     **dict.fromkeys((".nc", ".nc4", ".h5", ".hdf5", ".zarr"), _XARRAY),
@@ -59,7 +59,7 @@ def save(path: str | os.PathLike[str], tree: Any) -> None:
     stored, so that files do not depend on the versions of Python, JAX and equinox.
 
     The file is written under a temporary name and then renamed. If this is interrupted,
-    an existing file of that name stays as it was.
+    an existing file of that name is not changed.
 
     **Arguments:**
 

@@ -23,8 +23,7 @@ FALLBACK = (
 EVENT_OCCURRED = "An event ended the run, as requested; this is not a failure."
 
 
-# The metaclass of an enumeration looks up the text of a result, with which a result is
-# printed.
+# When a result is printed, the metaclass of its enumeration looks up its text.
 class _Named(type(eqx.Enumeration)):
     """An enumeration whose items have texts that begin with their names."""
 
@@ -97,10 +96,10 @@ class RESULTS(eqx.Enumeration, metaclass=_Named):
         "`retraction=nhjax.Exponential()`, or more stages."
     )
     lost_constraints = (
-        "Constraints are violated at the end of a step, although as many hold as were "
-        "independent at its start: the redundant constraints contradict each other, or "
-        "more of them became independent. Leave out constraints that do not always "
-        "follow from the others."
+        "Constraints are violated at the end of a step, although the step enforced as "
+        "many as were independent at its start: the redundant constraints contradict "
+        "each other, or more of them became independent. Leave out constraints that "
+        "do not always follow from the others."
     )
     inconsistent_start = (
         "The initial state violates the constraints at `t0`, its q is not an element "

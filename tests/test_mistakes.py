@@ -409,7 +409,7 @@ TRACING = [
         TracerArrayConversionError,
         "This was raised by `lagrangian(t, q, v, args)`",
         "test_mistakes.py:",
-        "functions of `jax.numpy` in place of those of `numpy` and `math`",
+        "functions of `jax.numpy` in place of `numpy` and `math`",
     ),
     row(
         "used `math` in a constraint",
@@ -418,7 +418,7 @@ TRACING = [
         ),
         ConcretizationTypeError,
         "`nonholonomic(t, q, v, args)`",
-        "functions of `jax.numpy` in place of those of `numpy` and `math`",
+        "functions of `jax.numpy` in place of `numpy` and `math`",
     ),
     row(
         "wrote an `if` on a position in a force",
@@ -1121,7 +1121,7 @@ RUNS = [
         lambda: run(Q),
         TypeError,
         "`y0` must be an nhjax.State",
-        "Make one with nhjax.initial_state",
+        "Create one with nhjax.initial_state",
     ),
     row(
         "went on from a solution in place of its last state",
@@ -1766,7 +1766,7 @@ FILES = [
         "gave an ensemble the name of a file of NetCDF",
         lambda folder: nhjax.ensemble(lambda x: x, MEMBERS, out=folder / "x.nc"),
         ValueError,
-        "but it names a folder, in which programs that read .nc find nothing",
+        "but it names a folder, in which programs that read .nc find no file",
         "`xarray.open_zarr`",
     ),
     row(

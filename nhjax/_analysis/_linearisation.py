@@ -165,7 +165,7 @@ def _constraints(system, t, y, args, x):
 def perturb(
     system: AbstractMechanicalSystem, y: State, x: Float[Array, " x"]
 ) -> tuple[PyTree[Array], Float[Array, " n"]]:
-    """Return (q τ(ξ), u + w), the state perturb by x = (ξ, w)."""
+    """Return (q τ(ξ), u + w), the state perturbed by x = (ξ, w)."""
     xi, w = jnp.split(x, 2)
     return system.manifold_of(y.q).act(y.q, xi), system.fibre_coordinate(y) + w
 
@@ -284,8 +284,8 @@ def independent_basis(
 ) -> PermittedPerturbations:
     """Compute the basis of the permitted perturbations for chosen coordinates.
 
-    Each basis vector changes one chosen coordinate by one, and no other chosen one. The
-    left inverse extracts the chosen coordinates of a perturbation.
+    Each basis vector changes one chosen coordinate by one, and no other chosen
+    coordinate. The left inverse extracts the chosen coordinates of a perturbation.
     """
     dim, dtype = position_jacobian.shape[1], position_jacobian.dtype
     count, others = len(positions), len(velocities)
@@ -333,7 +333,8 @@ class SymmetryConditions(NamedTuple):
         are not defined.
     - `independent`: whether the generators are independent.
     - `on_constraints`: the rates at which generators violate the constraints.
-    - `drift`: the motion minus the combination of generators, an entry a component.
+    - `drift`: the motion minus the combination of generators, one entry for each
+      component.
     - `bracket`: the brackets of the motion and the generators.
     - `closed`: the rates at which generators leave their span in the moving frame.
 

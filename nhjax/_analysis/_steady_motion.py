@@ -87,9 +87,9 @@ def steady_motion(
 ) -> State | tuple[State, Float[Array, " k"]]:
     """Find a steady motion, or relative equilibrium, near a given state.
 
-    There are two ways to define steady. With `positions` and `velocities`, the result
-    is a consistent state at which the rates of the chosen positions and of the chosen
-    velocities vanish,
+    There are two ways to define a steady motion. With `positions` and `velocities`, the
+    result is a consistent state at which the rates of the chosen positions and of the
+    chosen velocities vanish,
 
     v_j = 0 for j in `positions`,   u̇_i = 0 for i in `velocities`,
 
@@ -125,8 +125,8 @@ def steady_motion(
     - `symmetry`: generators of symmetries, as `linear_stability` takes them, in place
         of `positions` and `velocities`.
     - `held_positions`, `held_velocities`: the indices of what keeps its value in `y`.
-        On a group a position is held if ξ has no such component in q τ(ξ), where q is
-        the configuration of `y`.
+        On a group a position is held if this component of ξ is zero in q τ(ξ), where q
+        is the configuration of `y`.
     - `max_iterations`: the largest number of iterations.
 
     **Returns:** a consistent `State`. With `symmetry`, a pair of the state and the

@@ -3,9 +3,9 @@
 `fits_one_kernel` decides by the kinds and sizes of operations whether XLA can compile a
 program to a single kernel of the CPU. `cse_dce` removes repeated operations
 (common-subexpression elimination) and unused operations (dead-code elimination). This
-pays because derivatives compute the function on the way, so that a traced program
-contains much of it several times, and all that transforms and compiles programs would
-work on each copy.
+saves time, because derivatives also compute the function itself: a traced program
+contains many operations several times, and each transformation and the compiler would
+process every copy.
 """
 
 import itertools
@@ -23,8 +23,8 @@ from jaxtyping import PyTree
 # kernel. Calls into libraries (products of matrices, factorisations, transforms),
 # sorting, scattering and callbacks are not in the lists.
 #
-# These operations act element by element, which `_sparsity` relies on: no other may
-# be listed here.
+# These operations act element by element, and `_sparsity` relies on this: do not list
+# other operations here.
 ELEMENTWISE = """
     abs acos acosh add add_any and asin asinh atan atan2 atanh
     bitcast_convert_type cbrt ceil clamp convert_element_type cos cosh div eq erf

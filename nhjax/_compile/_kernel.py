@@ -134,7 +134,7 @@ kernel.is_high = never_high
 @kernel.def_impl
 def _run(*operands, program, is_brief):
     if jax.config.jax_disable_jit:  # pyright: ignore[reportAttributeAccessIssue]
-        # A kernel that was traced before. `jax.jit` would call this very rule again.
+        # A kernel that was traced before. `jax.jit` would call this same rule again.
         return jax.extend.core.jaxpr_as_fun(program)(*operands)
     run = partial(kernel.bind, program=program, is_brief=is_brief)
     return jax.jit(run)(*operands)
@@ -203,7 +203,7 @@ def kernel_jvp(operands, tangents, *, program, is_brief=False):
 
 
 def _fixed_part(program) -> tuple[list[Any], list[bool]]:
-    """Find the operations that depend on no operand, and mark the results that do."""
+    """Find the operations that depend on no operand, and mark such results."""
     traced = [isinstance(const, jax.core.Tracer) for const in program.consts]
     varying = {
         *program.jaxpr.invars,

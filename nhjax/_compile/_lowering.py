@@ -28,7 +28,7 @@ from ._jaxprs import fits_one_kernel, LARGEST_REDUCTION, rms_array_size
 from ._kernel import kernel, merge_lists, partition_list
 
 
-# In the order in which they are tried.
+# The engines, in the order in which they are tried.
 ENGINES = ("lanes", "kernels", "xla")
 
 
@@ -72,11 +72,11 @@ def record_engine(engine: str, reason: str, members: int | None) -> None:
 def engines(function: Callable[..., Any], *args: Any) -> tuple[EngineUse, ...]:
     """Return which engines compile the programs of `function(*args)` on a CPU, and why.
 
-    The function is compiled, but not run. On the CPU nhjax itself compiles an ensemble,
-    which is a run under `jax.vmap`, where it can, and vectorises over its members
-    (SIMD). The environment variable `NHJAX_ENGINE` selects the first engine that is
-    tried: `lanes` (the default), `kernels` or `xla`. Programs that were compiled before
-    keep their engine until `jax.clear_caches()`.
+    The function is compiled, but not run. On the CPU, nhjax compiles an ensemble (a run
+    under `jax.vmap`) itself if possible, and vectorises over its members (SIMD). The
+    environment variable `NHJAX_ENGINE` selects the first engine that is tried: `lanes`
+    (the default), `kernels` or `xla`. Programs that were compiled before keep their
+    engine until `jax.clear_caches()`.
 
     **Arguments:**
 
@@ -96,7 +96,7 @@ def engines(function: Callable[..., Any], *args: Any) -> tuple[EngineUse, ...]:
     """
     token = _uses.set(uses := [])
     try:
-        # A new function, so that JAX does not return a cached result.
+        # This is a new function, so that JAX does not return a cached result.
         jax.jit(lambda *args: function(*args)).lower(*args)
     finally:
         _uses.reset(token)
@@ -129,7 +129,7 @@ def reason_against_lanes() -> str | None:
 
 
 def reason_against_kernel(program: Any) -> str | None:
-    """Return why XLA is not asked for a single kernel, or `None` if it is."""
+    """Return why XLA does not compile a single kernel, or `None` if it does."""
     if chosen_engine() == "xla":
         return "chosen"
     # The dtype of random keys has no attribute `kind`, which gives None here.
@@ -141,8 +141,9 @@ def reason_against_kernel(program: Any) -> str | None:
     return None
 
 
-# Measured on the gallery's systems with 2 to 8 stages, and on larger ones: nhjax's own
-# compiler is faster below this root mean square of array sizes, and XLA above it.
+# Measurements on the gallery's systems with 2 to 8 stages, and on larger systems, show
+# that nhjax's own compiler is faster below this root mean square of array sizes, and
+# XLA above it.
 _SMALL_ARRAYS = 40
 
 
@@ -201,7 +202,7 @@ def _as_one_kernel(ctx, *operands, program):
 
 
 def _tied(operands: tuple[Any, ...]) -> list[Any]:
-    """Return the same operands, in a form in which XLA cannot find one to be unused.
+    """Return the same operands, in a form that XLA cannot recognise as unused.
 
     XLA aborts if a parameter of a marked call is unused, even if this turns out only
     after all simplifications. For this reason every small operand is made to depend on

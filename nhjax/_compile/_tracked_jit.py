@@ -41,15 +41,15 @@ T = TypeVar("T")
 MOST_ENTRIES = 2000
 # These libraries may be installed from a working copy, outside of the usual folders.
 _LIBRARIES = ("equinox", "jax", "jaxlib", "jaxtyping", "nhjax", "numpy")
-# Python 3.12 reads a global in the body of a class inside a function by the last one.
+# Since Python 3.12 the last one reads globals in a class body inside a function.
 _GLOBAL_LOADS = ("LOAD_GLOBAL", "LOAD_NAME", "LOAD_FROM_DICT_OR_GLOBALS")
 _NUMBERS, _ARRAYS = (float, complex), (np.ndarray, np.generic)
 _PLAIN = (bool, int, str, bytes, type(None), type(Ellipsis), np.dtype)
 _LEAVES = (*_PLAIN, *_NUMBERS, *_ARRAYS, jax.core.Tracer)
 _MAPPINGS = (dict, types.MappingProxyType)
 _SEQUENCES = (list, tuple, deque, set, frozenset)
-# Values of these classes are compared part by part, although libraries define the
-# classes.
+# Values of these classes are compared part by part, although the classes belong to
+# libraries.
 _CONTAINERS = (*_MAPPINGS, *_SEQUENCES, types.MethodType, partial)
 _CONTAINERS += (types.SimpleNamespace, argparse.Namespace, eqx.Module)
 
@@ -162,10 +162,11 @@ def _parts(value: Any) -> Iterator[Part]:
 
 
 def _read_by(function: types.FunctionType) -> Iterator[Part]:
-    """Yield what a function closes over, its defaults, and the globals that it reads.
+    """Yield the closed-over values, defaults and read globals of a function.
 
     The globals of libraries are assumed to stay the same. If a value is a module of the
-    user, its variables with the name of an attribute in the code follow.
+    user, yield also the variables of the module whose names occur as attributes in the
+    code.
     """
     variables, attributes = _names(function.__code__)
     found: list[Part] = []
@@ -281,7 +282,7 @@ class _Key:
 # _MOST, all are dropped, and programs that are still used are traced once more.
 _MOST = 1000
 _changed_by_tracing: dict[Place, object] = {}
-# The key with which a program was traced, by the key as it was after tracing.
+# This maps the key after tracing to the key with which the program was traced.
 _key_before_tracing: dict[_Key, _Key] = {}
 
 
@@ -324,16 +325,14 @@ def tracked_jit(*tracked: str) -> Callable[[Callable[..., T]], Callable[..., T]]
 
 
 def _remember_changes(key: _Key, before: Captured, functions: Any) -> None:
-    """Ignore the places that tracing changed from now on, and find the program by the
-    key as it is after tracing too.
-    """
+    """Ignore the places that tracing changed, and store the program under a new key."""
     after = Captured(functions, _changed_by_tracing)
     changed = {}
     for one, other in ((before, after), (after, before)):
         for place, (owner, content) in one.contents.items():
             there = other.contents.get(place)
             if there is None and isinstance(owner, list | set | deque):
-                # The container grows, so that its next element would again be new.
+                # The container grows with each call, so all its elements are ignored.
                 place = (id(owner), ...)
             if there is None or there[1] != content:
                 changed[place] = owner

@@ -25,8 +25,8 @@ Line = dict[str, Any]
 def write(path: Path, content: bytes) -> None:
     """Write a file atomically: write and sync a temporary file, then rename it.
 
-    The temporary name is derived from `path`, so that the next run overwrites what an
-    interrupted run has left.
+    The temporary name is derived from `path`, so that the next run overwrites the
+    leftover of an interrupted run.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     with open(_temporary(path), "wb") as file:
@@ -70,7 +70,7 @@ def sync_folder(folder: Path) -> None:
 
 @contextmanager
 def explaining(what: str) -> Iterator[None]:
-    """Put `what`, which says what failed, before the message of an `OSError`."""
+    """Put `what`, the name of the failed action, before the message of an `OSError`."""
     try:
         yield
     except OSError as error:

@@ -26,7 +26,7 @@ from ._store import CheckpointedReductionSink, ZarrSink
 # A chunk of this many members for each device keeps all cores busy. It is smaller if
 # the values of the members would take more than this many bytes.
 _MEMBERS, _BYTES = 1024, 2**26
-# Names of files of other programs, which `out` does not make.
+# Suffixes of files of other programs, which `out` does not create.
 _FILES = (".nc", ".nc4", ".h5", ".hdf5", ".csv", ".npy", ".npz", ".mat", ".pkl")
 # The shortest time between two updates of a progress meter.
 _SECONDS = 0.1
@@ -85,7 +85,7 @@ def ensemble(
     - `progress_meter`: shows the number of finished members; by default a bar on the
         standard error stream if that is a terminal.
     - `resume`: whether to resume an existing store; otherwise it is refused.
-    - `units`: units of the arrays in the store, by their names there.
+    - `units`: units of the arrays in the store, by the names of the arrays.
 
     **Returns:** an `nhjax.EnsembleOutcome` with `values` or `statistics`, or with
     neither if values were written to `out`.
@@ -225,7 +225,7 @@ def _check_folder(out: Any) -> None:
     if suffix in _FILES:
         raise ValueError(
             f"`out` is {os.fspath(out)!r}, but it names a folder, in which programs "
-            f"that read {suffix} find nothing: use a name without suffix or with "
+            f"that read {suffix} find no file: use a name without suffix or with "
             ".zarr, which `xarray.open_zarr` opens."
         )
 

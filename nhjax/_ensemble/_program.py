@@ -170,7 +170,8 @@ class Members:
         made = hashlib.sha256()
         for x in self._leaves:
             made.update(f"{x.dtype.str}{x.shape}".encode())
-            # In blocks, because a copy of a whole memory-mapped array may not fit.
+            # This reads blocks, because a copy of a whole memory-mapped array may not
+            # fit.
             for start in range(0, len(x), 65536):
                 made.update(np.ascontiguousarray(x[start : start + 65536]).tobytes())
         return made.hexdigest()
@@ -403,7 +404,7 @@ def first_failure(value: Any) -> tuple[Int[Array, ""], Int[Array, ""]]:
 
 
 def results_as_codes(value: Any) -> Any:
-    """Replace `RESULTS` by their codes, except the one of a solution."""
+    """Replace `RESULTS` by their codes, except in a solution."""
     if isinstance(value, Solution):
         return value
     return jax.tree.map(
@@ -423,7 +424,7 @@ def _is_result(x: Any) -> bool:
 
 
 def manifest(job: Job, **others: Any) -> dict[str, Any]:
-    """Describe the parameters of a job as JSON; `others` depend on what is kept."""
+    """Describe the parameters of a job as JSON; `others` depend on the kept results."""
     return {
         "format": FORMAT,
         "nhjax": installed_version(),

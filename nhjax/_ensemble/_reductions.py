@@ -24,7 +24,7 @@ class AbstractReduction(eqx.Module):
     """A statistic of the members of an ensemble that is computed chunk by chunk.
 
     To define your own reduction, write a subclass with the four methods below. JAX
-    traces all of them except `finish`. A value is what `run` returns for one member,
+    traces all of them except `finish`. A value is the result of `run` for one member,
     with `None` in place of its `nhjax.RESULTS`. A state is any tree of arrays with
     fixed shapes. `merge` must be associative up to round-off, and the state that `init`
     returns must be its neutral element.
@@ -58,7 +58,7 @@ class Mean(AbstractReduction):
     """The mean over the members of an ensemble, for every number that `run` returns.
 
     mean = (1/n) Σ x_j. The sums are double-double numbers (Hida, Li, Bailey, 2001), so
-    that the result has one rounding error, whatever the size of the chunks.
+    that the result has one rounding error for any size of the chunks.
 
     **Arguments:**
 

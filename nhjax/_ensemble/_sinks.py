@@ -290,7 +290,7 @@ class ReductionSink(AbstractSink):
         return self._packed(self.state, self.failures)
 
     def restore(self, first_chunk: int, packed: bytes) -> None:
-        """Continue before a chunk with what `packed` has written."""
+        """Continue before a chunk from the bytes that `packed` returned."""
         self.first_chunk = first_chunk
         state, self.failures = self._unpacked(packed)
         self.state = self._placed(state)

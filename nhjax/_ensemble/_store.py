@@ -75,7 +75,8 @@ class ZarrSink(AbstractSink):
                 for name, (dims, x) in self.variables.items()
             },
         )
-        # Before anything is compared or written, so that a missing package is reported.
+        # This comes before all comparisons and writes, so that a missing package is
+        # reported.
         self.encoder, self.lock = self._encoder(self.variables), durable.Lock()
         self.program = program_text(job)
         job.processes.check_same_call(
@@ -552,7 +553,7 @@ class _ZarrEncoder:
                 name,
                 shape=shape,
                 dtype=dtype,
-                # An axis may have length 0, but a chunk may not.
+                # An axis may have length 0, but a chunk must not.
                 chunks=(rows, *(max(1, size) for size in shape[1:])),
                 dimension_names=dims,
                 attributes=attributes.get(name, {}),

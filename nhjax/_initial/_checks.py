@@ -37,8 +37,8 @@ class Found(NamedTuple):
     - `regularity`, `compatibility`: the reciprocal condition numbers of the metric on
         the fibre and of the compatibility matrix.
     - `ranks`, `deficient`: the constraint derivatives whose rank is checked, and
-        whether each lacks full rank. Redundant constraints lack it only where a row is
-        zero.
+        whether each lacks full rank. For redundant constraints, the rank is deficient
+        only if a row is zero.
     - `allowed`, `allowed_positions`, `allowed_off_group`: the bounds on violations.
     - `legendre_solved`: whether the Legendre transform was inverted.
     - `projected`: whether the projection onto the constraints has converged.

@@ -85,11 +85,11 @@ def initial_state(
         solve for constraints linear or affine in v, Newton's method for others).
     - `keep_q`, `keep_v`, `keep_p`: the components of q, and of the v or p that was
         given, that the projection must not change: an index, a name or a sequence of
-        them, known when tracing. The other components are then the nearest, in the same
-        metric, that satisfy the constraints. An index is a position in the flattened
-        `q` (for a tuple, in all its parts joined in order) or in `v` or `p`. A name is
-        an entry of the `coordinates` of the system. If the kept components determine a
-        constraint and violate it, the error names both.
+        them, known when tracing. The projection then finds the nearest values of the
+        other components, in the same metric, that satisfy the constraints. An index is
+        a position in the flattened `q` (for a tuple, in all its parts joined in order)
+        or in `v` or `p`. A name is an entry of the `coordinates` of the system. If the
+        kept components determine a constraint and violate it, the error names both.
     - `throw`: whether to raise if there is no consistent state. If false, all numbers
         of the state are then NaN, and `integrate` reports it as not finite; under
         `vmap` the other members of an ensemble are not affected. Wrong types and shapes
@@ -123,7 +123,7 @@ def initial_state(
         >>> [float(x) for x in y0.v]
         [1.0, 1.0, 0.0]
 
-    A disc that rolls at exactly 3 m/s, for which its roll rate has to be 3 rad/s:
+    A disc that rolls at exactly 3 m/s, for which its roll rate must be 3 rad/s:
 
         >>> disc = nhjax.systems.VerticalRollingDisc(radius=1.0).system
         >>> v = jnp.array([3.0, 0.0, 0.0, 0.0])

@@ -1,8 +1,8 @@
 """The projection of a configuration and a velocity onto the constraints.
 
 A projection finds the nearest point on the constraints in the kinetic metric. The user
-may choose components of q, v or p that it keeps; the others are then the nearest among
-the points that have the kept components.
+may choose components of q, v or p that it keeps; the result is then the nearest among
+the points with the kept components.
 """
 
 import operator
@@ -394,8 +394,9 @@ def _left_basis(
 ) -> tuple[Float[Array, "l l"], Float[Array, " l"]]:
     """Find orthonormal combinations of rows, and which of them are active.
 
-    The combinations are the columns of the first result. The second result is one for
-    active combinations, whose singular value exceeds `negligible`, and otherwise zero.
+    The combinations are the columns of the first result. The second result has a one
+    for each active combination, whose singular value exceeds `negligible`, and a zero
+    for each other combination.
     """
     missing = jnp.zeros(max(matrix.shape[0] - matrix.shape[1], 0), matrix.dtype)
     left, singular, _ = jnp.linalg.svd(matrix)

@@ -83,7 +83,8 @@ class Checkpoint(eqx.Module):
 class Origin(NamedTuple):
     """The origin of the times t_k = t0 + (first_step + k) dt + shift of a run.
 
-    The shift is zero unless the step size differs from that before the checkpoint.
+    The shift is zero unless the step size differs from the step size before the
+    checkpoint.
     """
 
     t0: FloatScalar
@@ -117,8 +118,8 @@ def time_of(y0: State | Checkpoint, t0: FloatScalarLike | None) -> FloatScalarLi
 
 
 _ADVICE = (
-    "Make one with nhjax.initial_state; the last state of a solution is "
-    "`jax.tree.map(lambda x: x[-1], sol.ys)`, the first of a machine of the gallery "
+    "Create one with nhjax.initial_state. The last state of a solution is "
+    "`jax.tree.map(lambda x: x[-1], sol.ys)`. For an example of the gallery, use "
     "`machine.initial_state()`."
 )
 

@@ -34,8 +34,8 @@ from .._system import (
 
 # Rates of change are checked at the initial state and at this many states near it.
 _SAMPLES, _SPREAD = 3, 0.3
-# Newton iterations that move these states onto constraints on velocities, which may be
-# nonlinear.
+# The number of Newton iterations that move these states onto constraints on velocities,
+# which may be nonlinear.
 _ITERATIONS = 5
 # Rates of change below this many units of round-off per step are ignored.
 _UNITS = 1e3

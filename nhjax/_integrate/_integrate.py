@@ -1,8 +1,8 @@
 """The functions `integrate` and `step`: checks, the compiled run, and its solution.
 
 `integrate` checks its arguments and calls `run`, which is compiled. `run` builds the
-stepper, what it saves and the time loop, lets the adjoint run the loop, and makes the
-solution of its end.
+stepper, the output buffers and the time loop. The adjoint runs the loop, and `run`
+converts its end to a solution.
 """
 
 import reprlib
@@ -149,13 +149,13 @@ def integrate(
     - `method`: such as `nhjax.LobattoIIIAB(stages=3)`; `Gauss` only without
         constraints.
     - `y0`: a consistent state, from `nhjax.initial_state` or an earlier `Solution`.
-        Only the propagated closure uses its multiplier. Or the `Checkpoint` of an
-        earlier run, which then continues bit for bit as if it had been longer.
-    - `dt`: the step size, a scalar, in units of time; negative to go back.
+        Only the propagated closure uses its multiplier. It may also be the `Checkpoint`
+        of an earlier run, which then continues bit for bit.
+    - `dt`: the step size, a scalar, in units of time; negative to integrate backwards.
     - `num_steps`: the number of steps, an int >= 1; see below for arrays.
     - `t0`: the time of `y0`, 0 by default. A checkpoint has its own time.
     - `args`: passed on to the functions of the system. Arrays and floats in it are
-        traced, so that other values do not recompile. Anything else is static.
+        traced, so that other values do not recompile. All other values are static.
 
     **Other arguments:**
 
@@ -259,7 +259,7 @@ def integrate(
     if not _is_tracing() and leaves_steps_to_newton(stage_solver) and is_unsolved(sol):
         used_newton = True
         warnings.warn(_TAKEN_OVER.format(int(sol.stats["failed_step"])), stacklevel=2)
-        # The meter has already shown the run.
+        # The progress meter has already shown this run, so the repeated run has none.
         solver = replace(stage_solver, fallback=True)
         solver_options = SolverOptions(solver, adjoint, NoProgressMeter())
         sol = run(system, method, y0, grid, args, options, solver_options)
@@ -296,7 +296,7 @@ def step(
 
     - `system`, `method`: as for `nhjax.integrate`.
     - `t`: the time of `y`.
-    - `dt`: the step size, a scalar, in units of time; negative to go back.
+    - `dt`: the step size, a scalar, in units of time; negative to integrate backwards.
     - `y`: a consistent state, from `nhjax.initial_state`, a `Solution` or an earlier
         step.
     - `args`: passed on to the functions of the system, for instance controls that are
@@ -576,7 +576,7 @@ def run(
     _check_saved(saveat.fn, t0, state, args)
     # Arrays that the user's functions close over become leaves, for derivatives.
     system = closure_converted(system, t0, state, args)
-    # The type checker takes the property `plain` for a field.
+    # The type checker sees the property `plain` as a field.
     plain = PlainStepper(  # pyright: ignore[reportCallIssue]
         system=system,
         method=method,
@@ -677,7 +677,7 @@ def _output(
     end: RunEnd[Any, Any],
     sampled: Int[Array, " k"] | None,
 ) -> tuple[PyTree[Array], PyTree[Array]]:
-    """Join what was saved at the start, on the way and at the end: times and values."""
+    """Join the output of the start, the steps and the end: times and values."""
     saving, args, ts = loop.saving, loop.stepper.plain.args, saveat.ts
     saved, records = end.rows
     pieces = []

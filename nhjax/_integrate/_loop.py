@@ -17,7 +17,7 @@ from ._stepper import AbstractCarry, AbstractStepper, StepResult
 
 
 class Loop(eqx.Module):
-    """The time loop of a run: its stepper, what it saves, and its progress meter.
+    """The time loop of a run: its stepper, its output, and its progress meter.
 
     An adjoint calls `step` for k = 0, ..., num_iterations - 1 in order, and calls
     `write` to put the rows that each iteration returns into buffers, which start as
@@ -34,7 +34,7 @@ class Loop(eqx.Module):
         return self.stepper.num_iterations
 
     def with_round_off(self, round_off: RoundOff) -> "Loop":
-        """Return the same loop, whose steps know the round-off of the system."""
+        """Return the same loop with the measured round-off of the system."""
         return replace(self, stepper=self.stepper.with_round_off(round_off))
 
     def step(
@@ -95,7 +95,7 @@ class Loop(eqx.Module):
         return eqx.tree_at(lambda x: x.step_state.state, carry, state)
 
     def no_rows(self, carry: AbstractCarry) -> Rows:
-        """Return rows of zeros, of an iteration after the end, which `write` drops."""
+        """Return the rows of an iteration after the end: zeros, which `write` drops."""
         rows = jax.tree.map(
             lambda x: jnp.zeros(x.shape, x.dtype), self.row_shapes(carry)
         )

@@ -95,7 +95,7 @@ class TqdmProgressMeter(AbstractProgressMeter):
     **Arguments:**
 
     - `description`: the text before the bar.
-    - `unit`: what is counted, in the singular: `"member"` for `nhjax.ensemble`.
+    - `unit`: the unit of the count, in the singular: `"member"` for `nhjax.ensemble`.
 
     !!! example
 

@@ -218,7 +218,7 @@ class Rows(NamedTuple):
     - `record`: the record of the step for interpolation; None if none is kept.
     - `log`: an entry of the stepper's log; None without a log.
     - `row`: the index of the output row, if it can differ from the index of the
-        iteration; otherwise None, as in buffers.
+        iteration, otherwise None; in buffers None.
     - `log_slot`: the index of the entry in the log; None without a log and in buffers.
     """
 
@@ -282,7 +282,7 @@ class Saving(eqx.Module):
         places: RecordPlaces,
         log_length: int,
     ) -> "Saving":
-        """Return the choice that `saveat` makes, whose function is `fn`."""
+        """Return the choice of `saveat`, with the function `fn`."""
         needs_length = saveat.steps or places.slots is not None
         length = static_length(num_steps) if needs_length else 0
         return cls(
@@ -296,13 +296,13 @@ class Saving(eqx.Module):
         )
 
     def saved(self, t: FloatScalar, y: State, args: Args) -> PyTree[Array]:
-        """Compute the entry that is saved of a state: its time, and `fn` at it."""
+        """Compute the saved entry of a state: its time and the value of `fn`."""
         return t, jax.tree.map(jnp.asarray, self.fn(t, y, args))
 
     def row_of_state(
         self, t: FloatScalar, y: State, args: Args, k: Int[Array, ""]
     ) -> PyTree[Array] | None:
-        """Compute what row k saves of the state y at t, if it saves anything."""
+        """Compute the saved data of row k for the state y at t, if there are any."""
 
         def save():
             return self.saved(t, y, args)
@@ -317,7 +317,7 @@ class Saving(eqx.Module):
     def row_of_record(
         self, record: StepRecord, is_good: BoolScalar
     ) -> StepRecord | None:
-        """Return the record to save of a step, if records are saved.
+        """Return the record of a step, if records are saved.
 
         After a failure, records describe a system at rest, so that dense output stays
         at the last good state.
@@ -338,7 +338,7 @@ class Saving(eqx.Module):
     def empty(self, row: Rows) -> Rows:
         """Return buffers of zeros for all rows that are saved, and for one extra row.
 
-        `row` is what one iteration saves, as arrays or as their shapes.
+        `row` is the saved data of one iteration, as arrays or as their shapes.
         """
 
         def buffers(length, tree):
@@ -379,7 +379,7 @@ class Saving(eqx.Module):
     def read(
         self, buffers: Rows, k: Int[Array, ""], log_slot: Int[Array, ""] | None = None
     ) -> Rows:
-        """Read output row k and an entry of the log, from where `write` puts them."""
+        """Read output row k and an entry of the log, where `write` stored them."""
 
         def get(buffer, slot):
             return jax.tree.map(lambda x: x[slot], buffer)

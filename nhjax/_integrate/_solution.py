@@ -64,7 +64,8 @@ class Solution(eqx.Module):
 
     t0: Float[Array, ""]
     t1: Float[Array, ""]
-    # `PyTree` includes None, the empty tree: type checkers do not ask users to test it.
+    # `PyTree` includes None, the empty tree: so type checkers do not require users to
+    # test for None.
     ts: PyTree[Float[Array, " k"]]
     ys: PyTree[Array]
     stats: dict[str, Any]

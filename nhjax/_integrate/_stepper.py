@@ -122,8 +122,8 @@ class AbstractStepper(eqx.Module, Generic[C, R]):
     def init(self, y0: State | Checkpoint, noise: FunctionNoise | None) -> C:
         """Return the carry before the first iteration.
 
-        The `noise` of the functions of the system is needed for a state. A checkpoint
-        already holds the quantities that follow from it.
+        To start from a state, the `noise` of the functions of the system is needed. A
+        checkpoint already holds the quantities that follow from it.
         """
 
     @abstractmethod
@@ -147,9 +147,9 @@ class AbstractStepper(eqx.Module, Generic[C, R]):
     def finish(
         self, carry: C, rows: Rows, log: PyTree[Array] | None, given: Any
     ) -> RunEnd[Rows, Any]:
-        """Return the end of the run, from the last carry and all that was saved.
+        """Return the end of the run, from the last carry and all saved rows.
 
-        If the run failed, the derivatives with respect to all that was `given` are NaN.
+        If the run failed, the derivatives with respect to all `given` values are NaN.
         """
 
     @abstractmethod
@@ -172,13 +172,13 @@ class AbstractReverseReplay(eqx.Module, Generic[C, R]):
     @property
     @abstractmethod
     def after_end(self) -> R:
-        """Return what `back` needs to know for the last iteration."""
+        """Return the data that `back` needs for the last iteration."""
 
     @abstractmethod
     def back(
         self, following: R, step_state: StepState, i: Int[Array, ""]
     ) -> tuple[R, StepState]:
-        """Find what iteration i did and the state it started from.
+        """Find the data of iteration i and the state from which it started.
 
         `following` and `step_state` belong to the iteration after it.
         """
@@ -337,7 +337,7 @@ class PlainStepper(AbstractStepper[PlainCarry, None]):
         return carry, StepResult(self.time(i + 1), outcome.record, good)
 
     def blank_result(self, carry: AbstractCarry) -> StepResult:
-        """Return the result of no step, with zeros at the stages."""
+        """Return an empty step result, with zeros at the stages."""
         state = carry.step_state.state
 
         def at_stages(x: Array) -> Array:
@@ -377,8 +377,8 @@ class PlainStepper(AbstractStepper[PlainCarry, None]):
     ) -> Checkpoint:
         """Return the checkpoint after the last step.
 
-        `end` is the last state with the derivatives that the checkpoint is to have, and
-        `round_off` the one that the run started with.
+        `end` is the last state with the derivatives for the checkpoint, and `round_off`
+        is the value from the start of the run.
         """
         origin, last = self.origin, carry.step_state
         return Checkpoint(
@@ -401,7 +401,7 @@ class PlainReverseReplay(AbstractReverseReplay[PlainCarry, None]):
 
     @property
     def after_end(self) -> None:
-        """Return None: only the state needs to be known."""
+        """Return None: the replay needs only the state."""
         return None
 
     def back(
@@ -496,8 +496,8 @@ def is_consistent(
 
     A consistent state lies on the group and satisfies the constraints, and the Legendre
     transform maps its v to its p. `violations` are the constraint violations that count
-    as round-off. The bound on the errors detects a state of another system, and one of
-    which a single part was changed by hand. It is large enough for the perturbations of
+    as round-off. The bound on the errors detects a state of another system, and a state
+    in which only one part was changed. It is large enough for the perturbations of
     finite differences.
     """
     y, lin = start.state, start.lin

@@ -5,8 +5,8 @@ Most of these coefficients are zero. Multiplying by the zeros costs less than sl
 vectors and concatenating them again: the derivative of a slice must be padded, and
 loops over concatenated parts branch. On SO(3) the bilinear maps reduce the time of a
 step by one quarter, and the time of its gradient by one third (measured). They reduce
-the compile times by as much. A number that is not finite spreads to all entries of a
-product.
+the compile times by the same fractions. A number that is not finite spreads to all
+entries of a product.
 """
 
 import equinox as eqx

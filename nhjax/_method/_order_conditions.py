@@ -186,8 +186,8 @@ def stability_at_infinity(t: Tableau) -> float:
 
     **Returns:**
 
-    A float: `inf` if the numerator has the higher degree (R is unbounded), 0 if the
-    denominator has.
+    A float: `inf` if the numerator has the higher degree (R is unbounded), and 0 if the
+    denominator has the higher degree.
 
     !!! example
 

@@ -9,8 +9,8 @@ Numerical Integration", II.1.2). The symplectic conjugate is â_ij = b_j (1 - a_
 (ibid., VI.4.1); the conjugate of Lobatto IIIA is Lobatto IIIB.
 
 For dense output, the Lagrange basis is expanded in Legendre polynomials of x = 2θ - 1,
-ℓ_j(θ) = Σ_n K_nj P_n(x). The coefficients K_nj are of order one for every s, where
-monomials would cancel. The integral of the basis is
+ℓ_j(θ) = Σ_n K_nj P_n(x). The coefficients K_nj are of order one for every s, whereas
+the coefficients of monomials would cancel. The integral of the basis is
 
     ∫_0^θ ℓ_j = θ K_0j - 2 θ (1 - θ) Σ_{n>=1} K_nj P_n'(x) / (n (n + 1)),
 

@@ -135,8 +135,8 @@ def from_sympy(
     **Arguments:**
 
     - `lagrangian`: L, an expression in the coordinates, their time derivatives and
-        `dynamicsymbols._t`. Or a `LagrangesMethod`, which defines all other arguments
-        except `parameters`. Or a `KanesMethod` with bodies: its kinematical
+        `dynamicsymbols._t`. It may also be a `LagrangesMethod`, which defines all other
+        arguments except `parameters`, or a `KanesMethod` with bodies: its kinematical
         differential equations replace speeds by rates of coordinates, its loads become
         forces, and its configuration and velocity constraints become constraints.
     - `coordinates`: the functions q(t), a list of `dynamicsymbols`, in the order of q.
@@ -144,8 +144,9 @@ def from_sympy(
         or equations.
     - `holonomic`: expressions in q and t that must be zero; or equations.
     - `forces`: generalised forces, as a list with one for each coordinate, or as a
-        dictionary by coordinates or their names. Or a list of pairs of a point and a
-        force, or a frame and a torque, as for `LagrangesMethod`, together with `frame`.
+        dictionary by coordinates or their names. It may also be a list of pairs of a
+        point and a force, or a frame and a torque, as for `LagrangesMethod`, together
+        with `frame`.
     - `parameters`: values of the remaining symbols, by symbol or name. Symbols without
         a value must be in `args` at run time.
     - `frame`: the inertial frame for forces at points and torques on frames.
@@ -549,7 +550,7 @@ def parameter_defaults(
                 f"are {', '.join(known) or 'none'}."
             )
         if not eqx.is_array_like(value) or jnp.iscomplexobj(value):
-            # For instance a number of SymPy.
+            # The value may be, for instance, a number of SymPy.
             value = _number(name, value)
         value = float(value) if isinstance(value, numbers.Real) else value
         values[name] = jnp.asarray(value)

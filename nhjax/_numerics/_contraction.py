@@ -20,7 +20,7 @@ from jaxtyping import Array, Float
 from .._compile import LARGEST_REDUCTION, LONGEST_SUM, small_product
 
 
-# Matrices with more rows are inverted by a library: a kernel may not sum more numbers
+# Matrices with more rows are inverted by a library: a kernel must not sum more numbers
 # than the entries of a matrix of this size.
 LARGEST = math.isqrt(LARGEST_REDUCTION)
 # A library computes larger products, and sums longer than `LONGEST_SUM`, too, so that

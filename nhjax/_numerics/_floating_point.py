@@ -14,7 +14,7 @@ from .._custom_types import FloatScalar, FloatScalarLike
 
 
 def max_norm(*arrays: Array) -> FloatScalar:
-    """Compute max |x| over one or more arrays; NaN if a number is, 0 if all are empty.
+    """Compute max |x| over arrays: NaN if any number is NaN, 0 if all are empty.
 
     The maximum is taken over the bit patterns, which have the same order as the
     nonnegative numbers, with NaN above infinity. A maximum of floats that propagates

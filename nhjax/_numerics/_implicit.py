@@ -1,4 +1,4 @@
-"""The derivatives of what is computed by iterations or is not defined everywhere.
+"""Derivatives of values that are computed by iterations or not defined everywhere.
 
 `AbstractImplicitFunction` has the one rule of derivatives of all steps: they follow
 from the solution by the implicit function theorem, not from the iterations. Below it
@@ -198,8 +198,8 @@ def _minus(xs: list[Array], ys: list[Array]) -> list[Array]:
 def _depending_on_all(xs: list[Array]) -> list[Array]:
     """Return the same arrays, such that each of them depends on all of them.
 
-    Then differentiation takes either all of them for constants or none. JAX cannot
-    transpose a linear equation if it takes only a part of b for constant.
+    Then differentiation treats either all or none of them as constants. JAX cannot
+    transpose a linear equation if it treats only a part of b as constant.
     """
     zero = 0 * sum(x.reshape(-1)[0] for x in xs)
     return [x + zero for x in xs]
@@ -327,8 +327,8 @@ def _with_zero_tangents_jvp(primals, tangents):
     given = jax.tree.leaves((rates, others))
     if not given:
         return leaves, rates
-    # This zero is an empty sum of a tangent. JAX takes zeros that depend on no tangent
-    # for the absence of a tangent.
+    # This zero is an empty sum of a tangent. JAX interprets zeros that depend on no
+    # tangent as the absence of a tangent.
     zero = jnp.sum(jnp.ravel(given[0])[:0])
     return leaves, [
         jnp.zeros_like(x) + zero.astype(x.dtype) if rate is None else rate
@@ -365,8 +365,8 @@ def nan_gradient_unless(ok: BoolScalar, tree: X, parameters: PyTree[Any]) -> X:
     """Return the same values, with derivatives that are NaN where `ok` is false.
 
     The derivatives with respect to all `parameters` are NaN, whether or not the values
-    depend on them. A cotangent of zero stays zero, so that a loss that leaves out a
-    member that failed has a derivative.
+    depend on them. A cotangent of zero stays zero, so that a loss has a derivative if
+    it leaves out failed members.
     """
     parameters = eqx.filter(parameters, eqx.is_inexact_array)
     return jax.tree.map(
@@ -402,7 +402,7 @@ def _value_jvp(primals, tangents):
 def nan_tangent_unless(ok: BoolScalar, dx: Array) -> Array:
     """Return a tangent, but NaN where `ok` is false and the tangent is not zero.
 
-    This function is not linear. JAX must take it for linear to transpose it, so it is
+    This function is not linear. JAX must treat it as linear to transpose it, so it is
     written as a linear solve, whose transpose does the same to a cotangent.
     """
 

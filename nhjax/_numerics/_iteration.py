@@ -35,8 +35,8 @@ _LARGEST_NOISE = 1e5
 class UpdateNorms(NamedTuple):
     """The sizes of an increment and of the iterate that it leads to, in the same unit.
 
-    `noise`, where it is known, is the change of the iterate if the data of the problem
-    changed by its own size; round-off changes the data by units of round-off.
+    `noise`, if it is known, is the change of the iterate per relative change of the
+    data of the problem. Round-off is a relative change of a few units of round-off.
     """
 
     increment: FloatScalar

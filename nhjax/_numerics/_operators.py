@@ -45,7 +45,7 @@ class AbstractOperator(eqx.Module):
 
     @abstractmethod
     def as_matrix(self) -> Float[Array, "..."]:
-        """Return all entries as an array, zeros included."""
+        """Return all entries as an array, including zeros."""
 
 
 class DenseMatrix(AbstractOperator):
@@ -96,7 +96,7 @@ class DenseMatrix(AbstractOperator):
     def is_definite(self) -> BoolScalar:
         """Return whether a symmetric matrix is positive or negative definite.
 
-        It is if all pivots of the elimination without row exchanges have one sign.
+        This holds if all pivots of the elimination without row exchanges have one sign.
         """
         rows = jnp.arange(self.entries.shape[0])
 
@@ -114,7 +114,7 @@ class DenseMatrix(AbstractOperator):
     def is_nearly_singular(
         self, left: AbstractOperator, right: AbstractOperator
     ) -> BoolScalar:
-        """Return whether left @ right, whose computed inverse this is, is singular.
+        """Return whether left @ right, whose inverse is `self`, is singular.
 
         It counts as singular if it is singular up to round-off.
         """
@@ -171,7 +171,7 @@ class DiagonalMatrix(AbstractOperator):
         return DiagonalMatrix(jnp.abs(self.diagonal))
 
     def as_matrix(self) -> Float[Array, "n n"]:
-        """Return all entries as an array, zeros included."""
+        """Return all entries as an array, including zeros."""
         return jnp.diag(self.diagonal)
 
     def inverse(self) -> "DiagonalMatrix":
@@ -192,7 +192,7 @@ class DiagonalMatrix(AbstractOperator):
 
 
 class SparseMatrix(AbstractOperator):
-    """A matrix B, or a stack with entries in the same places, by the entries of rows.
+    """A matrix B, or a stack with entries in the same places, stored row by row.
 
     Entry e of row a has the value `values[..., e, a]`.
     """
@@ -238,7 +238,7 @@ class SparseMatrix(AbstractOperator):
         return SparseMatrix(jnp.abs(self.values), self.pattern)
 
     def as_matrix(self) -> Float[Array, "l n"]:
-        """Return all entries of one matrix as an array, zeros included."""
+        """Return all entries of one matrix as an array, including zeros."""
         return self.rmatvec(jnp.eye(self.pattern.shape[0], dtype=self.values.dtype))
 
     def weighted_transpose(self, weights: AbstractOperator) -> "WeightedTranspose":
@@ -280,11 +280,11 @@ class WeightedTranspose(AbstractOperator):
         return WeightedTranspose(jnp.abs(self.weights), self.matrix.absolute())
 
     def as_matrix(self) -> Float[Array, "n l"]:
-        """Return all entries of one matrix as an array, zeros included."""
+        """Return all entries of one matrix as an array, including zeros."""
         return self.weights[:, None] * self.matrix.as_matrix().T
 
     def first_columns(self, count: int) -> "WeightedTranspose":
-        """Return the first `count` columns; only the count of all is supported."""
+        """Return the first `count` columns; `count` must include all columns."""
         assert count == self.matrix.pattern.shape[0]
         return self
 
@@ -347,7 +347,7 @@ class BlockTridiagonalInverse(AbstractOperator):
         return _EstimatedAbsolute(self)
 
     def as_matrix(self) -> Float[Array, "c c"]:
-        """Return all entries as an array, zeros included."""
+        """Return all entries as an array, including zeros."""
         q = self.inverses.shape[1] // self.pattern.group
         unit_vectors = jnp.eye(q * self.pattern.shape[0], dtype=self.inverses.dtype)
         return jax.vmap(self.matvec, out_axes=1)(unit_vectors)
@@ -355,7 +355,7 @@ class BlockTridiagonalInverse(AbstractOperator):
     def is_nearly_singular(
         self, left: AbstractOperator, right: AbstractOperator
     ) -> BoolScalar:
-        """Return whether left @ right, whose computed inverse this is, is singular.
+        """Return whether left @ right, whose inverse is `self`, is singular.
 
         It counts as singular if a pivot is round-off compared with the diagonal entries
         of its rows. The two factors are B and diag(w) Bᵀ.
@@ -479,7 +479,7 @@ def sparse_jacobian(
 
 
 class SparsityPattern:
-    """The places of the entries of a sparse matrix B, and what follows from them.
+    """The places of the entries of a sparse matrix B, and derived quantities.
 
     - `columns`: entry e of row a is in column `columns[e, a]`, shape (w, l); it exists
         where `present` is true.
@@ -594,7 +594,7 @@ def block_tridiagonal_inverse(
     count = -(-size // (3 * g)) * 3
     ordered = static_take(products, pattern.order)
     ordered = jnp.pad(ordered, (*[(0, 0)] * 4, (0, count * g - size)))
-    # Axes: equation, unknown, sum, column, block of three, which of the three, row.
+    # Axes: equation, unknown, sum, column, group of three blocks, block in it, row.
     split = ordered.reshape(q, q, 3, g, count // 3, 3, g)
 
     def diagonal(offset):

@@ -1,10 +1,10 @@
 """The rank of small matrices, and inverses of matrices without full rank.
 
-Constraints are independent if the rows of their Jacobian B are. A `RankCondition` is a
-Jacobian whose rank must be full, `reciprocal_condition` measures how close the rows are
-to being dependent, and `dependent_rows` lists the rows for an error message. Where
-redundant constraints are allowed, `least_norm_inverse` replaces the inverse of
-C = B K⁻¹ Bᵀ: it solves C x = b with the least norm of x.
+Constraints are independent if the rows of their Jacobian B are independent. A
+`RankCondition` is a Jacobian whose rank must be full, `reciprocal_condition` measures
+how close the rows are to being dependent, and `dependent_rows` lists the rows for an
+error message. Where redundant constraints are allowed, `least_norm_inverse` replaces
+the inverse of C = B K⁻¹ Bᵀ: it solves C x = b with the least norm of x.
 """
 
 from typing import NamedTuple
@@ -42,8 +42,8 @@ class RankCondition(NamedTuple):
 def active_ranks(ranks: list[RankCondition]) -> list[RankCondition]:
     """Keep at most one matrix of each shape, namely the active one.
 
-    Singular values are more expensive than all else here, so that they are computed for
-    as few matrices as possible.
+    Singular values are more expensive than all other operations here, so that they are
+    computed for as few matrices as possible.
     """
     merged: dict[tuple[int, ...], RankCondition] = {}
     for rank in ranks:
@@ -128,7 +128,7 @@ def _negligible(dtype: jnp.dtype) -> float:
     """Return the size of eigenvalues of a scaled matrix that count as zero.
 
     An eigenvalue that is zero is computed as a few units of round-off. Constraints that
-    are so close to being dependent cannot be told from dependent ones.
+    are so close to being dependent cannot be distinguished from dependent constraints.
     """
     return float(jnp.finfo(dtype).eps) ** 0.75
 

@@ -1,7 +1,8 @@
 """The sparsity pattern of a Jacobian, found from the program of the function.
 
-Each element of an array on the way has the set of inputs that it depends on. These sets
-are propagated through the operations of the program, from the inputs to the results.
+Each element of an intermediate array has the set of inputs that it depends on. These
+sets are propagated through the operations of the program, from the inputs to the
+results.
 """
 
 import functools

@@ -18,7 +18,8 @@ from .._manifold import AbstractLieGroup
 from .._numerics import two_sum
 
 
-# Vectors and covectors of the Lie algebra: one, and one for each stage or node.
+# Vectors and covectors of the Lie algebra: a single one, or a row for each stage or
+# node.
 Vector: TypeAlias = Float[Array, " n"]
 
 

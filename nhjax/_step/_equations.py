@@ -46,7 +46,7 @@ class StageUnknowns(eqx.Module):
     """The unknowns of one step: stage velocities, node coordinates and multipliers.
 
     An unknown that the system or the closure of the multiplier does not have is an
-    array without entries.
+    empty array.
 
     - `velocity`: H^1..H^s, the stage velocities in the chart (V^i on R^n).
     - `momentum`: the stage momenta in the body frame, for Hamiltonian systems. For
@@ -162,7 +162,7 @@ class StageEquations(eqx.Module):
 
     @property
     def constrained(self) -> bool:
-        """Return whether there are constraints, and so multipliers."""
+        """Return whether there are constraints, and therefore multipliers."""
         return self.multiplier.shape[0] > 0
 
     @property
@@ -626,8 +626,8 @@ def unknown_units(stages: StageEquations, lin: Linearisation) -> list[FloatScala
     """Return the size of each field of `StageUnknowns` that changes u by one.
 
     Multipliers are measured by their effect h N⁻¹ R δΛ on u.
-    The round-off of a multiplier grows like 1 / h: measured by its own size, it could
-    not be told from an iteration that does not converge.
+    The round-off of a multiplier grows like 1 / h: measured relative to its own size,
+    it would look like an iteration that does not converge.
     """
     h = jnp.abs(stages.h)
     one = jnp.ones_like(h)

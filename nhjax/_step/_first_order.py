@@ -28,7 +28,7 @@ from ._equations import (
 # The part of the Jacobian that simplified Newton inverts; None selects the faster one.
 JacobianName: TypeAlias = Literal["leading", "first_order"] | None
 
-# The terms pay if the iterations that they save cost more time than the terms: up to
+# The terms are worthwhile if the saved iterations cost more time than the terms: up to
 # this many stages, coordinates, and entries of the responses of stages to multipliers,
 # and without holonomic constraints. Larger programs of one trajectory are no longer
 # compiled as scalars, and become several times slower.

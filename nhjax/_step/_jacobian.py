@@ -378,7 +378,7 @@ def _sparse_factors(
     lin: Linearisation,
     pattern: SparsityPattern,
 ) -> StageJacobianFactors:
-    """Compute the factors for constraints each of which uses few coordinates."""
+    """Compute the factors if each constraint uses few coordinates."""
     nodes = sparse_constraint_jacobian(stages, x, pattern)
     rows = nodes.stacked_after(lin.jacobian)
     reaction = rows.weighted_transpose(lin.fibre_hessian_inverse)
@@ -451,7 +451,7 @@ def _first_order_factors(
 def _reactions(
     stages: StageEquations, jacobian: Float[Array, "s l n"]
 ) -> Float[Array, "s n c"]:
-    """Compute the reactions at the stages to each unknown of the closure, each Λ."""
+    """Compute the reactions at the stages to each unknown of the closure and each Λ."""
     m, one = stages.num_nonholonomic, jnp.eye(len(jacobian), dtype=jacobian.dtype)
     weights = stages.closure_weights("E")
     parts = [
@@ -465,7 +465,7 @@ def _reactions(
 def _with_mass_at_end(
     lin: Linearisation, terms: FirstOrderTerms, jacobian: Float[Array, "l n"]
 ) -> Linearisation:
-    """Replace the mass matrix and constraints of a linearisation by those at the end.
+    """Replace the mass matrix and constraints of a linearisation by their end values.
 
     Otherwise u̇ and λ_c at the end would converge no faster than without these terms.
     """

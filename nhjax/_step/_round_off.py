@@ -90,7 +90,7 @@ def magnifications(method: AbstractMethod) -> tuple[float, float]:
     the error of a single constraint. The factor is the largest Euclidean norm of a row
     of the inverse of R E for nonholonomic constraints, and of (A Â, b) for holonomic
     constraints; see `StageEquations`. Pseudo-inverses are used, because a method that
-    is not meant for one of the two kinds can have a singular matrix for it.
+    does not support one of the two kinds of constraints can have a singular matrix.
 
     **Returns:** the factor for nonholonomic and the factor for holonomic constraints.
     """

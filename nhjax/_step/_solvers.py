@@ -49,7 +49,8 @@ from ._round_off import PART
 from ._step import AbstractStageSolver, FrozenNewtonMap
 
 
-# Where the residual is larger than this, relative to the momenta, there is no solution.
+# If the residual is larger than this, relative to the momenta, the iterate is no
+# solution.
 _GROSS = 1e-6
 
 
@@ -83,9 +84,9 @@ class SimplifiedNewton(AbstractStageSolver):
     `Solution.stats["num_newton_steps"]` counts these steps. A program that contains
     both methods takes longer to compile, and runs slower even if the fallback is never
     used. For this reason a plain call of `integrate` first runs without the fallback,
-    and repeats the run with it if a step was not solved. In a program of your own
-    (`jax.jit`, `jax.vmap`, `jax.grad`), a step that is not solved ends the run, unless
-    you ask for the fallback.
+    and repeats the run with it if a step was not solved. In your own transformed
+    program (`jax.jit`, `jax.vmap`, `jax.grad`), a step that is not solved ends the run,
+    unless you ask for the fallback.
 
     **Arguments:**
 
@@ -97,11 +98,11 @@ class SimplifiedNewton(AbstractStageSolver):
         False, or None, the default, which means only in plain calls. Derivatives of a
         run with the fallback use the exact Jacobian, as with `nhjax.Newton()`.
     - `jacobian`: `"leading"`; or `"first_order"`, which includes the terms of order h;
-        or None, the default, which includes them if they reduce the run time. This is
-        so with s <= 5 stages, n <= 6 coordinates and m constraints with
-        s (s - 1) n m <= 100, all nonholonomic. The terms are not available for
-        Hamiltonian systems, redundant constraints, and so many constraints that they
-        are stored as sparse matrices.
+        or None, the default, which includes them if they reduce the run time. They do
+        so with s <= 5 stages, n <= 6 coordinates and m constraints with s (s - 1) n m
+        <= 100, all nonholonomic. The terms are not available for Hamiltonian systems,
+        redundant constraints, and so many constraints that they are stored as sparse
+        matrices.
 
     !!! example
 
@@ -362,8 +363,8 @@ def _kinematic_scale(
 ) -> Float[Array, " m"]:
     """Estimate the change of nonholonomic constraints if positions move by their size.
 
-    One direction of the move is enough for an estimate. Moving each coordinate on its
-    own would need one derivative per coordinate.
+    One direction of the move is enough for an estimate. Moving each coordinate
+    separately would need one derivative per coordinate.
     """
     system, t, args = stages.system, stages.t, stages.args
     u = x0.momentum[0] if stages.hamiltonian else x0.velocity[0]

@@ -480,7 +480,7 @@ def error_ratios(
     n^j of the stages. A second quadrature leaves out the last node. The difference of
     the two is the same sum with the weights `method.embedded_difference`. The first
     ratio divides the difference in positions per h by the change of the state. The
-    second ratio divides the difference in fibre coordinates by it. See
+    second ratio divides the difference in fibre coordinates by the same change. See
     `estimated_error`.
 
     **Arguments:**

@@ -192,12 +192,12 @@ def check_signature(
     """Raise a `TypeError` unless a user's function takes `arguments`.
 
     The function is called by position, so its arguments may have other names. It is
-    refused if two of the expected names are in the places of others.
+    refused if expected names are interchanged.
 
     **Arguments:**
 
-    - `owner`, `name`: the names, in the message, of the object or function of nhjax
-        that receives the function, and of the argument that passes it.
+    - `owner`, `name`: two names for the message: the object or function of nhjax that
+        receives the function, and the argument.
     - `function`: the function.
     - `arguments`: the names of its arguments, in their order.
     """
@@ -293,7 +293,7 @@ def check_coordinates(owner: Any) -> None:
     if len(set(names)) != len(names):
         raise ValueError(
             f"{type(owner).__name__}: `coordinates` has a name twice: {names}. Give "
-            "each coordinate a name of its own."
+            "each coordinate its own name."
         )
 
 

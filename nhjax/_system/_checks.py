@@ -37,7 +37,7 @@ def require_manifold(
 def require_names(
     system: AbstractMechanicalSystem, name: str, manifold: AbstractLieGroup
 ) -> None:
-    """Raise a `ShapeError` unless the system names all of its coordinates, or none."""
+    """Raise a `ShapeError` if the numbers of names and of coordinates differ."""
     names = system.coordinates
     if names is not None and len(names) != manifold.dim:
         raise ShapeError(
@@ -155,7 +155,7 @@ def check_state(
 def _names(num_nonholonomic: int, num_holonomic: int) -> list[str]:
     """List the names of all constraints, such as "nonholonomic[0]" or "holonomic[2]".
 
-    The order is the order of the rows of the Jacobian ∂Φ/∂u and of the multipliers.
+    The rows of the Jacobian ∂Φ/∂u and the multipliers have the same order.
     """
     return [f"nonholonomic[{a}]" for a in range(num_nonholonomic)] + [
         f"holonomic[{a}]" for a in range(num_holonomic)
@@ -190,7 +190,7 @@ def dependence_error(
     elif zero:
         advice = (
             f"{names[zero[0]]} has no gradient there; rewrite it so that its gradient "
-            "is nonzero where it vanishes."
+            "is nonzero where the constraint holds."
         )
     elif _rank(rows[:m]) + _rank(rows[m:]) > _rank(rows):
         advice = (

@@ -50,11 +50,11 @@ class Linearisation(eqx.Module):
 
     N u̇ - R λ = ad*_v p + free force - ∂t p - D1p v,    B u̇ = -∂t Φ - D1Φ v,
 
-    These equations determine C λ, with the Delassus matrix C = B N⁻¹ R, which the paper
-    calls the compatibility matrix C^{ab} (section 3), and so the multiplier λ. For a
-    Lagrangian system N is the mass matrix M = D2D2L, R = Bᵀ, and u̇ is the acceleration.
-    For a Hamiltonian system N = 1 and R = (D2D2H)⁻¹ Bᵀ. In both cases N⁻¹ R = K⁻¹ Bᵀ
-    with the fibre Hessian K = D2D2L or D2D2H.
+    These equations determine C λ, and therefore the multiplier λ. Here C = B N⁻¹ R is
+    the Delassus matrix, which the paper calls the compatibility matrix C^{ab} (section
+    3). For a Lagrangian system N is the mass matrix M = D2D2L, R = Bᵀ, and u̇ is the
+    acceleration. For a Hamiltonian system N = 1 and R = (D2D2H)⁻¹ Bᵀ. In both cases N⁻¹
+    R = K⁻¹ Bᵀ with the fibre Hessian K = D2D2L or D2D2H.
 
     The Jacobian of the stage equations has the same matrices. Inverses are computed
     once, and later computations multiply by them: the matrices are tiny, and a
@@ -74,7 +74,7 @@ class Linearisation(eqx.Module):
 
     @property
     def momentum_inverse(self) -> SquareMatrix:
-        """Return N⁻¹: the inverse mass matrix, or for Hamiltonian systems identity."""
+        """Return N⁻¹: inverse mass matrix or, for Hamiltonian systems, the identity."""
         if self.fibre_coordinate_name == "v":
             return self.fibre_hessian_inverse
         return DiagonalMatrix(jnp.ones_like(self.acceleration))

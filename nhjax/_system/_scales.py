@@ -148,7 +148,7 @@ def function_noise(
 
     Only the shape of the multiplier is used.
     """
-    # A closure, because `args` may contain objects that are not arrays.
+    # This is a closure, because `args` may contain objects that are not arrays.
     positions = jax.eval_shape(lambda: system.position_constraint(t, q, args))
     system, args = stop_gradient((system, args))
 

@@ -622,8 +622,8 @@ def with_frames(system: S, q: PyTree[Array]) -> tuple[S, PyTree[Array]]:
 
     A frame holds the sine and cosine of an angle. With it, the methods of the system
     rotate vectors between body and plane without trigonometric functions. They accept
-    positions with and without frames; the user's functions receive positions without.
-    On a manifold without frames the system and q are returned unchanged.
+    positions with and without frames; the user's functions receive positions without
+    frames. On a manifold without frames the system and q are returned unchanged.
     """
     # The methods of a subclass may not support frames.
     if type(system) not in (LagrangianSystem, HamiltonianSystem):

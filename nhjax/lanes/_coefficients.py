@@ -1,7 +1,7 @@
 """Coefficients of polynomials, lowest power first.
 
 They interpolate at Chebyshev's nodes, and are computed and printed by
-`python tests/support/approximations.py`. `tests/lanes` judges their errors.
+`python tests/support/approximations.py`. `tests/lanes` checks their errors.
 """
 
 # (sin(x) / x - 1) / x**2 in x**2, for |x| up to pi / 4.

@@ -136,7 +136,7 @@ def _write(builder: Builder, target: Any, value: ArrayValue) -> list:
 
 
 def _shared(one: ArrayValue, other: ArrayValue) -> ArrayValue | None:
-    """Return the array that both sides return, if it is the same one."""
+    """Return the result of both sides, if both return the same array."""
     if isinstance(one, InMemory) and isinstance(other, InMemory):
         return one if one.buffer is other.buffer else None
     if isinstance(one, InMemory) or isinstance(other, InMemory):

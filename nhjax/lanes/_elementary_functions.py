@@ -45,7 +45,7 @@ from ._writer import (
 
 
 def definitions(wanted: Iterable[tuple[str, str, int]]) -> str:
-    """Return the definitions of functions and of all that they call, each once.
+    """Return the definitions of functions and of the functions they call, each once.
 
     A function is given by the name of JAX's primitive, the dtype and the width.
     """

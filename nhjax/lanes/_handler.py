@@ -9,8 +9,8 @@ A call is divided into blocks, of as many members as the kernel computes at once
 caller's thread runs blocks, and so do threads of XLA's pool where this pays:
 
 - An atomic counter assigns blocks to the caller and to its helpers.
-- The caller asks the pool for helpers: for fewer than the pool has threads, because it
-    works itself, and for so few that each works longer than it takes to wake it.
+- The caller asks the pool for helpers: fewer than the pool has threads, because the
+    caller works too, and so few that the work of each takes longer than waking it.
 - At the end the caller waits for the blocks that helpers have begun. It does not wait
     for helpers that have not started: there may be none, because the pool has no free
     thread, or because this process was forked and has no pool any more. A call

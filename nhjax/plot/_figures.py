@@ -39,7 +39,8 @@ def trajectory(
     - `sol`: a `Solution` with saved states; for a batch, one path is drawn for each
         member.
     - `coordinates`: the indices of two or three entries of q. On a group, they index
-        the flattened numbers of an element; on a product, of all factors in turn.
+        the flattened numbers of an element; on a product, the numbers of all factors
+        are joined in order.
     - `names`: the names of the coordinates, for the labels of the axes.
     - `ax`: the axes to draw into; three coordinates need a 3d projection.
     - `style`: passed on to `Axes.plot`.

@@ -26,7 +26,7 @@ QUICK: Mapping[str, Mapping[str, Any]] = MappingProxyType(
 )
 # For each study: the seconds to compile a program, the seconds per step of a trajectory
 # (both measured on two cores of 2 GHz), and whether each pair (s, h) is compiled
-# separately; otherwise each s is.
+# separately, instead of each s.
 _COSTS: Mapping[str, tuple[float, float, bool]] = MappingProxyType(
     {
         "particle-order": (4.0, 1e-5, False),

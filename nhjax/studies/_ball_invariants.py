@@ -57,9 +57,10 @@ class BallRun:
     - `integrals`: shape (k + 1, 4), the three linear first integrals and the moving
         energy.
     - `positions`: (x, y), shape (k + 1, 2).
-    - `circle_deviation`: the distance from the exact position at the final time that
-        all step sizes have in common.
-    - `timing`: of the program that runs all step sizes with this s side by side.
+    - `circle_deviation`: the distance from the exact position at the common final time
+        of all step sizes.
+    - `timing`: the times of the program that runs all step sizes with this s side by
+      side.
     """
 
     stages: int
@@ -260,8 +261,8 @@ def ball_invariants(
     - `stages`: the numbers of stages s.
     - `dt`: the step sizes h.
     - `num_steps`: the length of every run in steps, at least 5. Positions are compared
-        at the end of the run with the smallest step, which must be a whole number of
-        steps of every other run.
+        at the end of the run with the smallest step. This time must be a whole number
+        of steps in every other run.
     - `closure`: the closure of the multipliers, as for `nhjax.LobattoIIIAB`; by default
         the closure of the paper.
     - `retraction`: `"cayley"`, as in the paper, or `"exponential"`.

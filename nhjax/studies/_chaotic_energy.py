@@ -58,7 +58,7 @@ class ChaoticRun:
 
     - `mu`, `mu_error`: the mean squared energy error μ(E, k) at the saved times, and
         its standard error σ/√N over the N members.
-    - `windows`, `windows_error`: the same of averages over windows in time.
+    - `windows`, `windows_error`: the same for averages over windows in time.
     """
 
     stages: int
@@ -196,7 +196,7 @@ class ChaoticEnergy(AbstractStudyResult):
         return f"μ scales as {found}, averaged over the times"
 
     def figures(self) -> "dict[str, Figure]":
-        """Draw μ against time, normalised by the measured power and as in the paper."""
+        """Draw μ against time, normalised by the measured and by the paper's power."""
         title = f"J = {self.members}, {self.closure} closure"
         return {self.name: _figure(self.runs, title)}
 

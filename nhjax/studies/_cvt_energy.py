@@ -47,7 +47,8 @@ class CVTRun:
     """The energies of one run, at every step.
 
     - `energies`: shape (k + 1, 3): total, driver and passenger.
-    - `timing`: of the program that runs all regimes with this s and h side by side.
+    - `timing`: the times of the program that runs all regimes with this s and h side by
+      side.
     """
 
     regime: str
@@ -166,7 +167,7 @@ class CVTEnergy(AbstractStudyResult):
                 name = f"{run.regime}, s = {run.stages}, h = {run.dt:.4g}"
                 grown.append(f"{name} ({growth:.1f}-fold)")
         if not grown:
-            return "the energy error of no run grows after its first fifth"
+            return "the energy error does not grow after the first fifth of any run"
         return f"the energy error grows after the first fifth in: {'; '.join(grown)}"
 
     def figures(self) -> "dict[str, Figure]":

@@ -110,7 +110,7 @@ def compile_and_run(function: Callable[..., Any], *args: Any) -> tuple[Any, Timi
 def meter(
     progress: bool, description: str, unit: str = "step"
 ) -> AbstractProgressMeter:
-    """Create a progress bar on the standard error stream, or none."""
+    """Create a progress bar on the standard error stream, or no bar."""
     return TqdmProgressMeter(description, unit) if progress else NoProgressMeter()
 
 
@@ -248,7 +248,7 @@ def draw_envelope(
 
 @contextlib.contextmanager
 def colour_blind_safe() -> Iterator[None]:
-    """Use colours that everyone can distinguish for figures drawn and saved inside."""
+    """Use colours that everyone can distinguish, for the figures drawn in the block."""
     import matplotlib
     from cycler import cycler
 

@@ -131,7 +131,7 @@ class AndrewsSqueezer(AbstractExample):
         return jnp.zeros_like(v).at[0].set(self.torque.astype(v.dtype))
 
     def invariants(self, t: FloatScalarLike, q: Array, v: Array) -> dict[str, Array]:
-        """Compute the energy less the work M β of the motor, which is conserved."""
+        """Compute the energy minus the work M β of the motor, which is conserved."""
         return {"energy_less_work": self.energy(t, q, v) - self.torque * q[0]}
 
     def points(self, t: FloatScalarLike, q: Array) -> dict[str, Array]:

@@ -125,7 +125,7 @@ class BallInBowl(AbstractConstrainedGroupExample):
         """Create a rolling ball with its centre at (x, y), which moves at (ẋ, ẏ).
 
         `spin` is the part of the angular velocity along the normal n; `parameters` are
-        those of the class. In a sphere the ball is in the lower half.
+        the parameters of the class. In a sphere the ball is in the lower half.
         """
         ball = cls(**parameters)
         x, y = coordinates(position)
@@ -147,7 +147,7 @@ class BallInBowl(AbstractConstrainedGroupExample):
 
         The circle of its centre has the radius `radius_of_path` [m], and the rate is
         `path_rate` [1/s]; the balance of moments determines the spin. `parameters` are
-        those of the class.
+        the parameters of the class.
         """
         path, rate = parameter(radius_of_path), parameter(path_rate)
         require_positive(radius_of_path=path)
@@ -180,7 +180,7 @@ class BallInBowl(AbstractConstrainedGroupExample):
         return self.bowl.value(q[1])
 
     def invariants(self, t: FloatScalarLike, q: Element, v: Array) -> dict[str, Array]:
-        """Compute the conserved quantities: the moving energy, and more in a sphere.
+        """Compute the moving energy, and in a sphere two more conserved quantities.
 
         In a sphere `normal_spin` κ a (R ω)·n - Ω (1 + κ a) n₃ and `vertical_momentum`
         k m a² (R ω)₃ - κ a m (x ẏ - y ẋ) are conserved too.

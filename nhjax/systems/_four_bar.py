@@ -79,7 +79,7 @@ class FourBar(AbstractExample):
         distance = jnp.sqrt(square)
         cosine = (square + second**2 - third**2) / (2 * distance * second)
         require_possible(
-            abs(cosine) < 1, f"At `angle` {angle} the bars are too short to close."
+            abs(cosine) < 1, f"`angle` {angle} leaves the bars too short to close."
         )
         coupler = jnp.arctan2(side[1], side[0]) + jnp.arccos(cosine)
         arm = second * direction(coupler) - side
@@ -93,7 +93,7 @@ class FourBar(AbstractExample):
 
     @classmethod
     def parallelogram(cls) -> "FourBar":
-        """Create the benchmark of one loop: bars of 1 m and 1 kg that fall right.
+        """Create the benchmark of one loop: bars of 1 m, 1 kg, falling to the right.
 
         The crank is upright, and its end moves at 1 m/s. With all bars horizontal,
         first after 0.71 s, the loop may fold: the constraints are dependent there.
@@ -126,7 +126,7 @@ class FourBar(AbstractExample):
         return jnp.zeros_like(v).at[0].set(self.torque.astype(v.dtype))
 
     def invariants(self, t: FloatScalarLike, q: Array, v: Array) -> dict[str, Array]:
-        """Compute the energy less the work M θ₁ of the torque, which is conserved."""
+        """Compute the energy minus the work M θ₁ of the torque, which is conserved."""
         return {"energy_less_work": self.energy(t, q, v) - self.torque * q[0]}
 
     def points(self, t: FloatScalarLike, q: Array) -> dict[str, Array]:

@@ -25,8 +25,8 @@ class NonholonomicParticle(AbstractConstrainedExample):
     The driver y is a harmonic oscillator. The passenger x is a harmonic oscillator in
     the rescaled time s with ds = ν dt/√(1 + y²), ν² = k/m.
 
-    **Parameters:** `mass` m [kg], `stiffness` k [N/m]; lengths are in metres and Φ
-    has a unit slope of 1/m before y.
+    **Parameters:** `mass` m [kg], `stiffness` k [N/m]; lengths are in metres, and the
+    factor y in Φ stands for y times 1 m⁻¹.
 
     **Source:** Martín de Diego and Sato Martín de Almagro, *High-order geometric
     methods for nonholonomic mechanical systems*, first numerical experiment (there

@@ -125,7 +125,7 @@ class PendulumChain(AbstractExample):
 
 
 def _one_each(number: int, name: str, value: ArrayLike | tuple[float, ...]) -> Array:
-    """Convert to an array of one value for each link, from one for all or an array."""
+    """Convert one value for all links, or an array, to an array of all links."""
     array = coordinates(value)
     if array.shape == ():
         return jnp.full((number,), array)

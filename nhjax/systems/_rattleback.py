@@ -21,7 +21,7 @@ from ._rolling_body import AbstractRollingBody
 
 
 class Rattleback(AbstractRollingBody):
-    """A rolling stone, an ellipsoid whose axes of inertia are not its own axes.
+    """A stone, an ellipsoid with skew axes of inertia, that rolls on a plane.
 
     ℓ = m/2 |v|² + ½ ω·(J ω) - m g z,  Φ = z + e₃·(R s),  φ = (R (v + ω × s))₁₂,
     s = h e₃ - A γ / √(γ·(A γ)),  A = diag(a², b², c²),  γ = Rᵀ e₃,

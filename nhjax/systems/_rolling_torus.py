@@ -30,7 +30,7 @@ class RollingTorus(AbstractRollingBody):
     velocity at the contact. The multipliers are the force of the plane in space [N].
     With r = 0, the default, it is a disc of zero thickness: Euler's disc without slip.
 
-    The axle may not be vertical. In a steady motion the centre moves on a circle, or
+    The axle must not be vertical. In a steady motion the centre moves on a circle, or
     rests, at a constant tilt: `steady`, `circling`.
 
     **Parameters:** `mass` m [kg]; `radius` a of the circle in the middle of the tube,

@@ -27,8 +27,8 @@ class Suslov(AbstractConstrainedGroupExample):
 
     with q the attitude, a quaternion, and ω the body angular velocity; the axes have
     I₁₂ = 0. If the axis e₃ is not a principal axis, every motion tends to a steady
-    rotation about an axis in the plane of e₁ and e₂: the motion is attracting, although
-    energy is conserved.
+    rotation about an axis in the plane of e₁ and e₂: these rotations are attracting,
+    although energy is conserved.
 
     **Parameters:** `moments` (I₁₁, I₂₂, I₃₃) and `products` (I₁₃, I₂₃) of inertia
     [kg m²]; `retraction`, the retraction of SO(3).

@@ -76,7 +76,7 @@ def test_integrate_with_state_of_another_system_raises(y0):
     oscillator = HarmonicOscillator(q0=(1.0, 0.0, 0.0), v0=(0.0, 1.0, 0.0))
     with pytest.raises(nhjax.ShapeError, match=r"`y0.multiplier`.*\(1,\).*\(0,\)"):
         run(y0, oscillator.system)
-    with pytest.raises(TypeError, match=r"got \(Array.*of type tuple. Make one with"):
+    with pytest.raises(TypeError, match=r"got \(Array.*of type tuple. Create one with"):
         run((Q, V))
 
 

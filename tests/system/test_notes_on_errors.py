@@ -47,7 +47,7 @@ def by_mask(t, q, v, args):
     return jnp.sum(q[q > 0])
 
 
-NUMPY = "functions of `jax.numpy` in place of those of `numpy` and `math`"
+NUMPY = "functions of `jax.numpy` in place of `numpy` and `math`"
 ADVICE = {
     by_numpy: NUMPY,
     by_math: NUMPY,
@@ -266,7 +266,7 @@ def test_note_on_function_of_run_names_it_with_line_and_remedy(called, how):
         TRANSFORMATIONS[how](end)(nhjax.initial_state(system, Q, V))
     assert f"`{called}`" in note_of(error)
     assert place_of(function) in note_of(error)
-    assert "arrays of JAX without values" in note_of(error)
+    assert "JAX arrays without values" in note_of(error)
 
 
 def test_note_on_partial_function_names_the_function_inside():

@@ -60,8 +60,8 @@ class Event(eqx.Module):
         from which the run continues: a pair (q, v), for a Hamiltonian system (q, p), or
         a `State`. It must satisfy the constraints.
     - `terminate`: end the run at the event, after its reset. The default is True
-        without a `reset`, and False with one. With False and no `reset`, events are
-        only reported.
+        without a `reset`, and False with a `reset`. With False and no `reset`, events
+        are only reported.
     - `max_events`: the number of events that a run has room for, an int >= 1. The
         limits of several events add up; exceeding the total ends the run with
         `RESULTS.too_many_events`. With `terminate` it is 1.
@@ -161,8 +161,8 @@ class ConditionSigns(eqx.Module):
     """The sign of each condition where a step starts.
 
     - `sign`: the sign, 0 if it is not known.
-    - `value`: the value of the condition, or its rate along the run where `at_zero`:
-        there the condition is zero and takes the sign of its rate.
+    - `value`: the value of the condition, or its rate along the run if `at_zero`: then
+        the condition is zero and takes the sign of its rate.
     """
 
     sign: Float[Array, " e"]
@@ -368,7 +368,7 @@ class EventActions(eqx.Module):
     def only_end(self) -> bool:
         """Return whether every event ends the run and none resets the state.
 
-        Then no log is kept on the way.
+        The run then keeps no log.
         """
         return all(self.terminates) and not any(self.resets)
 

@@ -17,7 +17,7 @@ class EventLog(eqx.Module):
     - `before`, `after`: the states at the events before and after their resets, each a
         `State` with a leading axis of length e.
 
-    Entries that no event has filled are infinite, and -1 in `which`.
+    Unused entries are infinite, and -1 in `which`.
     """
 
     num: Int[Array, ""]

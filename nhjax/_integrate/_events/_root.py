@@ -30,7 +30,7 @@ class TruncatedStep(NamedTuple):
     - `h`: its size.
     - `fired`: the index of the event that it ends at, -1 if it is the whole step.
     - `values`: the conditions at its end.
-    - `crossed`: those that have crossed zero in it.
+    - `crossed`: the conditions that crossed zero in the step.
     """
 
     outcome: StepOutcome
@@ -264,10 +264,10 @@ class Bracket(eqx.Module):
     """An interval of θ in which the first of several functions crosses zero.
 
     At the lower end no function has crossed zero, and at the upper end the `crossed`
-    ones have. The next point follows Chandrupatla (1997): inverse quadratic
-    interpolation if the last three points allow it, and otherwise bisection. It needs
-    about as few evaluations as Newton's method, and at most about three times as many
-    as bisection.
+    functions have crossed zero. The next point follows Chandrupatla (1997): inverse
+    quadratic interpolation if the last three points allow it, and otherwise bisection.
+    It needs about as many evaluations as Newton's method, and at most about three times
+    as many as bisection.
 
     - `new`, `other`, `old`: the newest point, the other end, and the point before. Each
         is θ and the values of all functions there.

@@ -38,7 +38,7 @@ from ._root import ImplicitTruncatedStep, TruncatedStep
 
 
 class EventLoopState(eqx.Module):
-    """The place that a run with events has come to.
+    """The current place of a run with events.
 
     Derivatives pass through `offset` alone.
 
@@ -190,7 +190,7 @@ class EventStepper(AbstractStepper[EventCarry, ReplayedIteration]):
         return replace(self, plain=self.plain.with_round_off(round_off))
 
     def time(self, place: EventLoopState) -> FloatScalar:
-        """Compute the time that a run has come to."""
+        """Compute the current time of a run."""
         return self.plain.time(place.node) + place.offset
 
     def init(self, y0: State | Checkpoint, noise: FunctionNoise | None) -> EventCarry:
@@ -223,7 +223,7 @@ class EventStepper(AbstractStepper[EventCarry, ReplayedIteration]):
         i: Int[Array, ""],
         replay: ReplayedIteration | None = None,
     ) -> tuple[EventCarry, StepResult]:
-        """Advance to the next node or event. A run that has ended stays where it is.
+        """Advance to the next node or event. A run that has ended does not change.
 
         With `replay` the step has the size and the event that are known.
         """
@@ -292,7 +292,7 @@ class EventStepper(AbstractStepper[EventCarry, ReplayedIteration]):
     def _attempt(
         self, carry: EventCarry, replay: ReplayedIteration | None
     ) -> AttemptedStep:
-        """Take the rest of a step, or as far as the event that is known to be in it."""
+        """Take the rest of a step, or the part up to an event that is known."""
         before, plain = carry.place, self.plain
         alive = (carry.result == RESULTS.successful) & (before.node < plain.num_steps)
         at_once = jnp.any(before.pending)
@@ -311,7 +311,7 @@ class EventStepper(AbstractStepper[EventCarry, ReplayedIteration]):
         meets = (is_kept | (alive & at_once)) & (which >= 0)
         reached = tree_where(is_kept, step.outcome.step_state, carry.step_state)
         size = jnp.where(is_kept, step.h, 0)
-        # Without this an event could be met again and again at the same time.
+        # Without this, an event could occur repeatedly at the same time.
         at_last = (before.num_events > 0) & before.signs.at_zero[which]
         small = 16 * float(jnp.finfo(t.dtype).eps) * jnp.abs(plain.dt)
         again = is_kept & at_last & (jnp.abs(size) <= small)
@@ -344,7 +344,7 @@ class EventStepper(AbstractStepper[EventCarry, ReplayedIteration]):
         start = carry.step_state.differentiated_in_state()
         given = plain.args, plain.invariants, plain.round_off
         arguments = StepArguments(plain.system, t, h, start, *given)
-        # The type checker takes the property `programs` for a field.
+        # The type checker sees the property `programs` as a field.
         step = ImplicitTruncatedStep(  # pyright: ignore[reportCallIssue]
             step=ImplicitStep(
                 method=plain.method,
@@ -417,7 +417,7 @@ def _place_after(
     The events that are `pending` come before a node at the same time.
     """
     here = before.offset + attempt.size
-    # A rest of a step that is only round-off is left out.
+    # If the rest of a step is only round-off, it is skipped.
     small = 4 * float(jnp.finfo(dt.dtype).eps)
     at_end = attempt.fires & ~ends & (jnp.abs(dt - here) <= small * jnp.abs(dt))
     at_end = at_end & ~jnp.any(pending)
@@ -442,7 +442,7 @@ def _statistics_after(
     ends: BoolScalar,
     failed: BoolScalar,
 ) -> Statistics:
-    """Return the statistics after an iteration, with which the run may end."""
+    """Return the statistics after an iteration, which may end the run."""
     node, outcome = carry.place.node, attempt.step.outcome
     taken, kept = attempt.is_taken, attempt.is_kept
     stats = updated_statistics(carry.stats, outcome, taken, kept, node)
@@ -506,7 +506,7 @@ class EventReverseReplay(AbstractReverseReplay[EventCarry, ReplayedIteration]):
     def back(
         self, following: ReplayedIteration, step_state: StepState, i: Int[Array, ""]
     ) -> tuple[ReplayedIteration, StepState]:
-        """Find what iteration i did and the state it started from.
+        """Find the data of iteration i and the state from which it started.
 
         Iterations are undone last to first, and `following` says where the next one
         started. If the last entry of the log that is left has the number of this
@@ -519,7 +519,7 @@ class EventReverseReplay(AbstractReverseReplay[EventCarry, ReplayedIteration]):
         entry = jax.tree.map(lambda x: x[last], self.log)
         active = (i < end.num_iterations) & ~following.was_truncated
         at_event = active & (following.num_events > 0) & (entry.iteration == i)
-        # The rest of a step after its last event is a step of another iteration.
+        # After the last event in a step, another iteration takes the rest of the step.
         is_rest = (following.num_events > 0) & (entry.node_after == following.node - 1)
         offset = jnp.where(is_rest, entry.offset_after, 0)
         offset = jnp.where(at_event, entry.offset, offset)
