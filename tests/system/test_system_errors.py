@@ -103,7 +103,7 @@ def test_error_inside_function_of_system_keeps_its_message():
     ],
 )
 def test_function_of_system_with_other_argument_names_is_accepted(name, function):
-    assert getattr(system_with(**{name: function}), name) is function
+    assert getattr(system_with(**{name: function}), name).function is function
 
 
 def test_partial_function_with_arguments_in_wrong_order_is_refused():

@@ -143,7 +143,7 @@ def test_parallelogram_falls_as_a_pendulum_does():
 def test_parallelogram_at_a_singular_configuration_fails():
     linkage = FourBar.parallelogram()
     system, start = linkage.system, linkage.initial_state()
-    message = "constraints become dependent in the course of the step"
+    message = "constraints become dependent during the step"
     with pytest.raises(nhjax.IntegrationError, match=message):
         nhjax.integrate(
             system,
