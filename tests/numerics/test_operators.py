@@ -318,7 +318,7 @@ def test_definite_matrices_are_distinguished_from_indefinite_ones(size):
         pytest.param([1.0, 0.0], False, id="singular"),
     ],
 )
-def test_definite_diagonal_matrix_has_entries_of_one_sign(diagonal, expected):
+def test_diagonal_matrix_with_entries_of_one_sign_is_definite(diagonal, expected):
     assert bool(DiagonalMatrix(jnp.array(diagonal)).is_definite()) is expected
 
 

@@ -137,7 +137,7 @@ def test_run_converges_with_method_order(found):
 
 
 @pytest.mark.long
-def test_constraints_hold_to_round_off_and_moving_energy_stays(found):
+def test_constraints_hold_to_round_off_and_moving_energy_is_conserved(found):
     ball = BALLS["paraboloid"]
     # Of 2 J; the coarsest runs take four times the duration.
     largest = (2e-6, 1e-7, 6e-9)

@@ -54,7 +54,7 @@ def test_exact_solution_agrees_with_the_index_reduced_ode(example, t):
 
 
 @over(SOLVED)
-def test_exact_velocity_is_the_derivative_of_the_exact_position(example):
+def test_exact_velocity_equals_derivative_of_exact_position(example):
     # A long time, where quadratures and linear flows take many panels.
     t, h = 40.0, 1e-3
     q = {k: ravel_pytree(example.exact(t + k * h)[0])[0] for k in (-2, -1, 1, 2)}

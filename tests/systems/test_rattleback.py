@@ -131,7 +131,7 @@ def test_run_converges_with_method_order(found, errors_at):
 
 
 @pytest.mark.long
-def test_constraints_hold_to_round_off_and_energy_stays(found):
+def test_constraints_hold_to_round_off_and_energy_is_conserved(found):
     assert np.max(found.violation) < 1e-13
     drift = drifts(STONES["default"], found)["energy"]
     # Of 0.02 J of the spin; the coarsest runs take four times the duration.

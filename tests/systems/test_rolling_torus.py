@@ -157,7 +157,7 @@ def test_run_converges_with_method_order(tumbling):
 
 
 @pytest.mark.long
-def test_constraints_hold_to_round_off_and_energy_stays(tumbling):
+def test_constraints_hold_to_round_off_and_energy_is_conserved(tumbling):
     body, found = tumbling
     # Of 12 J; the coarsest runs take four times the duration.
     largest = (2e-5, 1e-6, 5e-8)

@@ -143,7 +143,7 @@ def test_exact_solution_agrees_with_the_index_reduced_ode(example, t):
 
 
 @over(SOLVED)
-def test_exact_velocity_is_the_derivative_of_the_exact_position(example):
+def test_exact_velocity_equals_derivative_of_exact_position(example):
     # A long time, where the quadratures take many panels; five-point difference.
     t, h = (3.0 if isinstance(example, Appell) else 40.0), 1e-3
     q = {k: example.exact(t + k * h)[0] for k in (-2, -1, 1, 2)}
@@ -227,7 +227,7 @@ def test_chaotic_ensemble_equals_the_paper():
     assert jnp.count_nonzero(v0.at[:, 1].set(0.0)) == 0
 
 
-def test_chaotic_default_is_the_middle_of_the_ensemble():
+def test_chaotic_default_equals_the_middle_of_the_ensemble():
     chaotic = ChaoticSystem(m=4)
     q0, v0 = chaotic.ensemble(2)
     np.testing.assert_allclose(chaotic.q0, q0[1], rtol=0, atol=2e-16)
