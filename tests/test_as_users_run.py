@@ -40,5 +40,5 @@ def lines():
 
 
 @pytest.mark.parametrize("name", as_users_run.FEATURES)
-def test_a_feature_with_flags_of_users_and_shapes_checked(name, lines):
+def test_feature_runs_with_user_flags_and_checked_shapes(name, lines):
     assert name in lines, [line for line in lines if line.startswith(f"{name}:")]

@@ -32,7 +32,7 @@ def initial_states(name, members=MEMBERS):
 
 
 @pytest.mark.parametrize("name", PROBLEMS)
-def test_heyoka_has_the_equations_of_the_other_competitors(name):
+def test_heyoka_equations_equal_other_competitors(name):
     pairs = _heyoka.equations(name)
     field = hy.cfunc([right for _, right in pairs], [left for left, _ in pairs])
     for y in initial_states(name)[2]:
@@ -41,7 +41,7 @@ def test_heyoka_has_the_equations_of_the_other_competitors(name):
 
 
 @pytest.mark.parametrize("name", PROBLEMS)
-def test_heyoka_has_the_accelerations_of_the_library(name):
+def test_heyoka_accelerations_equal_nhjax(name):
     problem = PROBLEMS[name]
     pairs = _heyoka.equations(name)
     field = hy.cfunc([right for _, right in pairs], [left for left, _ in pairs])
@@ -55,7 +55,7 @@ def test_heyoka_has_the_accelerations_of_the_library(name):
 
 
 @pytest.mark.parametrize("name", PROBLEMS)
-def test_a_run_of_heyoka_ends_at_the_reference(name):
+def test_heyoka_run_ends_at_the_reference(name):
     y0 = initial_states(name, 1)[2]
     run, _ = _heyoka.heyoka_run(name, "single", y0, 20.0)(1e-14)
     expected = extrapolated(PROBLEMS[name], y0, 20.0, 0.2)
@@ -63,7 +63,7 @@ def test_a_run_of_heyoka_ends_at_the_reference(name):
 
 
 @pytest.mark.parametrize("layout", _heyoka.layouts(MEMBERS, THREADS))
-def test_every_layout_of_an_ensemble_ends_at_the_reference(layout):
+def test_heyoka_ensemble_in_each_layout_ends_at_the_reference(layout):
     y0 = initial_states("chaotic")[2]
     run, seconds = _heyoka.heyoka_run("chaotic", layout, y0, 2.0, THREADS)(1e-13)
     expected = extrapolated(PROBLEMS["chaotic"], y0, 2.0, 0.2)
@@ -74,7 +74,7 @@ def test_every_layout_of_an_ensemble_ends_at_the_reference(layout):
 
 
 @pytest.mark.long
-def test_the_errors_of_heyoka_follow_its_tolerance():
+def test_heyoka_errors_decrease_with_its_tolerance():
     runs = [*heyoka_runs(Case("CVT", 2.0, 3), limit=6, longest=math.inf)]
     assert all(math.isfinite(run.compile) for run in runs)
     ladder = [run for run in runs if run.method == "heyoka batch"]

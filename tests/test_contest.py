@@ -15,7 +15,7 @@ def case_of(ladders):
     return Measured("chaotic", 20.0, 101, runs)
 
 
-def test_the_fastest_form_of_every_competitor_counts():
+def test_contest_counts_the_fastest_form_of_each_competitor():
     case = case_of(
         {
             "nhjax s=4": [(2.0, 1e-4), (8.0, 1e-12)],
@@ -45,7 +45,7 @@ def test_the_fastest_form_of_every_competitor_counts():
     assert contest_table(case).splitlines()[-1].endswith("| 0.25 (0.25) |")
 
 
-def test_a_case_without_competitors_has_a_table():
+def test_contest_without_competitors_has_a_table():
     case = case_of({"nhjax s=4": [(2.0, 1e-4), (8.0, 1e-12)]})
     assert all(not outcome["others"] for outcome in contests(case))
     assert contest_table(case).count("\n") == 4

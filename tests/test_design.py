@@ -39,7 +39,7 @@ COMPLETE |= {"RecursiveCheckpointAdjoint", "Event"}
 
 
 @pytest.mark.parametrize("name", sorted({*SIGNATURES} | COMPLETE))
-def test_signature_on_the_page_has_the_arguments_and_defaults_of_the_code(name):
+def test_signature_on_the_design_page_equals_the_code(name):
     written, parameters = SIGNATURES[name], inspect.signature(getattr(nhjax, name))
     positional = [*written.args, *written.kwonlyargs]
     names = {x.arg for x in positional}
@@ -52,7 +52,7 @@ def test_signature_on_the_page_has_the_arguments_and_defaults_of_the_code(name):
             assert eval(ast.unparse(value), dict(vars(nhjax))) == expected, argument.arg
 
 
-def test_results_and_statistics_are_on_the_page():
+def test_results_and_statistics_are_on_the_design_page():
     oscillator = nhjax.systems.HarmonicOscillator()
     sol = nhjax.integrate(
         oscillator.system,

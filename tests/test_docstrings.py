@@ -35,7 +35,7 @@ def _public_objects():
 
 
 @pytest.mark.parametrize("example", list(_examples()), ids=lambda test: test.name)
-def test_example(example):
+def test_docstring_example_prints_as_shown(example):
     report = []
     runner = doctest.DocTestRunner(optionflags=doctest.ELLIPSIS)
     runner.run(example, out=report.append)
@@ -47,14 +47,14 @@ def test_example(example):
     list(_public_objects()),
     ids=[name for name, _ in _public_objects()],
 )
-def test_public_objects_are_documented(name, value):
+def test_docstring_of_every_public_object_exists(name, value):
     text = value.__doc__ or ""
     assert text.strip(), name
     # What Python would write in place of a docstring.
     assert not text.startswith(f"{getattr(value, '__name__', name)}("), name
 
 
-def test_there_are_examples():
+def test_docstring_examples_are_collected():
     tested = {test.name for test in _examples()}
     for module, name in (
         ("_integrate._integrate", "integrate"),

@@ -28,11 +28,11 @@ def _run(title):
 
 # What the page asserts itself is the comparison with what nhjax has.
 @pytest.mark.parametrize("title", ["A group", "A retraction", "A method"])
-def test_own_groups_and_methods_work(title):
+def test_own_group_retraction_or_method_on_the_page_runs(title):
     _run(title)
 
 
-def test_own_stage_solver_works_and_says_where_it_failed():
+def test_own_stage_solver_runs_and_reports_its_failures():
     names = _run("A stage solver")
     particle = names["particle"]
     sol = nhjax.integrate(
@@ -47,17 +47,17 @@ def test_own_stage_solver_works_and_says_where_it_failed():
     assert bool(sol.result == nhjax.RESULTS.nonlinear_max_iterations)
 
 
-def test_own_adjoint_works():
+def test_own_adjoint_on_the_page_runs():
     _run("An adjoint")
 
 
-def test_own_progress_meter_is_told():
+def test_own_progress_meter_receives_progress():
     heard = _run("A progress meter")["heard"]
     assert sorted(heard)[-1] == (1000, 1000)
     assert 50 < len(heard) < 200
 
 
-def test_every_section_with_code_is_run_here():
+def test_extending_page_sections_with_code_are_all_tested():
     with_code = {title for title, blocks in SECTIONS.items() if blocks}
     assert with_code == {
         "A group",

@@ -25,7 +25,7 @@ def results_of(tmp_path_factory):
 
 
 @pytest.mark.parametrize("fit", ["sleigh", "ball"])
-def test_fit_recovers_the_truth_from_every_start(results_of, fit):
+def test_fit_of_parameters_from_every_start_recovers_the_truth(results_of, fit):
     results = results_of("fitting")[fit]
     truth, estimates, bars = (
         np.array(results[key]) for key in ("truth", "estimates", "bars")
@@ -46,7 +46,7 @@ def test_fit_recovers_the_truth_from_every_start(results_of, fit):
     assert np.all(np.ptp(of_one_experiment, axis=1) < 1e-3 * bars.min(axis=0))
 
 
-def test_network_learns_the_potential_to_what_noise_allows(results_of):
+def test_learned_potential_is_as_accurate_as_noise_permits(results_of):
     results = results_of("learning_potential")
     loss = np.array(results["loss"])
     spread = np.sqrt(2 / results["num_data"])
@@ -74,7 +74,7 @@ def test_steering_reaches_the_pose_with_stationary_effort(results_of):
     assert np.all(np.array(results["last_steps"]) < 1e-3)
 
 
-def test_rattleback_turns_back_by_design(results_of):
+def test_rattleback_designed_by_gradient_reverses_its_spin(results_of):
     results = results_of("rattleback")
     assert results["first"] > 2
     assert results["last"] < -2

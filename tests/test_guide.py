@@ -16,12 +16,12 @@ PAGES = (
 
 @pytest.mark.usefixtures("closed_figures")
 @pytest.mark.parametrize("name", long_but(sorted({*PAGES} - {"machines"}), PAGES))
-def test_blocks_run_as_printed(name, tmp_path, monkeypatch):
+def test_guide_page_code_runs_as_printed(name, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     run_page(name)
 
 
-def test_every_page_with_code_is_run_by_a_test():
+def test_guide_pages_with_code_are_all_tested():
     tests = "".join(
         path.read_text(encoding="utf-8") for path in Path(__file__).parent.rglob("*.py")
     )

@@ -8,7 +8,7 @@ import numpy as np
 from benchmarks._high_precision import evaluate, to_float
 
 
-def test_function_is_evaluated_in_fifty_digits():
+def test_high_precision_function_has_fifty_digits():
     x = jnp.array([0.3, 1.7])
 
     def function(x):
@@ -25,7 +25,7 @@ def test_function_is_evaluated_in_fifty_digits():
             assert abs(got - wanted) < mpmath.mpf(10) ** -45
 
 
-def test_function_of_derivatives_agrees_with_float64():
+def test_high_precision_gradient_agrees_with_float64():
     def energy(x):
         return jnp.sum(jnp.sqrt(1 + x**2) * jnp.cos(x[::-1])) / (1 + x @ x)
 

@@ -1811,12 +1811,12 @@ def check(mistake: Mistake, *given: Any) -> None:
 
 
 @pytest.mark.parametrize("mistake", MISTAKES, ids=lambda mistake: mistake.what)
-def test_mistake_is_answered_by_message_with_remedy(mistake):
+def test_mistake_raises_message_with_remedy(mistake):
     check(mistake)
 
 
 @pytest.mark.parametrize("mistake", FILES, ids=lambda mistake: mistake.what)
-def test_mistake_with_files_is_answered_by_message_with_remedy(mistake, tmp_path):
+def test_mistake_with_files_raises_message_with_remedy(mistake, tmp_path):
     check(mistake, tmp_path)
     assert [path.name for path in tmp_path.iterdir() if path.suffix == ".nc"] == []
 

@@ -9,5 +9,5 @@ pytestmark = pytest.mark.long
 
 
 @pytest.mark.parametrize("name", sorted(NOTEBOOKS.keys() - FITS))
-def test_notebook(name, tmp_path):
+def test_notebook_runs_without_error(name, tmp_path):
     run_notebook(name, tmp_path)

@@ -25,21 +25,21 @@ def _definitions(text):
 
 
 @pytest.mark.parametrize(("file", "function"), sorted(set(STOPS)))
-def test_stop_of_followed_call_exists(file, function):
+def test_followed_call_function_exists(file, function):
     assert function in _definitions((ROOT / file).read_text(encoding="utf-8"))
 
 
-def test_every_row_of_followed_call_is_read():
+def test_followed_call_table_rows_are_all_read():
     rows = [line for line in PAGE.splitlines() if line.startswith("| `")]
     assert len(STOPS) == len(rows) > 40
 
 
-def test_every_file_named_in_followed_call_exists():
+def test_followed_call_files_all_exist():
     files = set(re.findall(r"`((?:nhjax|tests|docs)/[\w/]+\.py)`", PAGE))
     assert files
     assert [file for file in files if not (ROOT / file).is_file()] == []
 
 
-def test_missing_function_of_followed_call_is_noticed():
+def test_followed_call_definitions_are_read_from_source():
     text = "class A:\n    def f(self): ...\n\ndef g(): ...\n"
     assert _definitions(text) == {"A", "A.f", "g"}

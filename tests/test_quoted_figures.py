@@ -9,19 +9,19 @@ from support.pages import assert_agree, page, quoted, results, rows_of
 @pytest.mark.parametrize(
     ("printed", "value"), [("0.72", 0.7249), ("9e-16", 8.6e-16), ("600", 598.0)]
 )
-def test_a_rounded_number_agrees_with_its_value(printed, value):
+def test_quoted_figure_that_is_rounded_agrees_with_its_value(printed, value):
     assert_agree([printed], [value])
 
 
 @pytest.mark.parametrize(
     ("printed", "value"), [("0.72", 0.7251), ("9e-16", 9.6e-16), ("60", 55.0)]
 )
-def test_another_number_does_not_agree(printed, value):
+def test_quoted_figure_of_another_value_does_not_agree(printed, value):
     with pytest.raises(AssertionError):
         assert_agree([printed], [value])
 
 
-def test_a_figure_that_is_not_found_once_is_refused():
+def test_quoted_figure_found_twice_raises():
     with pytest.raises(AssertionError, match="found 2 times"):
         quoted("3 s and\n4 s", "{} s")
 
@@ -30,7 +30,7 @@ def test_a_figure_that_is_not_found_once_is_refused():
 COLUMNS = [(1, "diffrax"), (1, "heyoka"), (101, "diffrax"), (101, "heyoka")]
 
 
-def test_ratios_of_the_contest_are_those_of_the_result():
+def test_contest_ratios_quoted_agree_with_the_result():
     contests = {
         (case["name"], case["members"], case["t"], line["accuracy"]): line["best"]
         for case in results("work_precision")["cases"]
@@ -46,7 +46,7 @@ def test_ratios_of_the_contest_are_those_of_the_result():
                 assert_agree([cell], [best[library]["ratio_seconds"]])
 
 
-def test_the_floor_is_that_of_the_result():
+def test_floor_times_quoted_agree_with_the_result():
     one, many = results("floor")["rows"]
     text = page("performance")
     single, batch = rows_of(text, "chaotic system, n = 7, s = 3, h = 0.1")
@@ -61,7 +61,7 @@ def test_the_floor_is_that_of_the_result():
     assert_agree(quoted(text, sentence), [both, ours / both])
 
 
-def test_ratios_of_engines_are_those_of_the_result():
+def test_engine_ratios_quoted_agree_with_the_result():
     rows = results("engines")["rows"]
     ratios = {row["system"]: row["ratio"] for row in rows}
     snakeboard = ratios.pop("Snakeboard")
@@ -75,13 +75,13 @@ def test_ratios_of_engines_are_those_of_the_result():
     assert_agree(quoted(text, sentence), [min(compiled), max(compiled)])
 
 
-def test_the_growth_with_coordinates_is_that_of_the_result():
+def test_growth_with_coordinates_quoted_agrees_with_the_result():
     sentence = "from 7 to 101 coordinates of the chaotic system it grows as n^{}"
     fitted = results("scaling")["n"]["step"]["fitted"]
     assert_agree(quoted(page("performance"), sentence), [fitted])
 
 
-def test_costs_of_ensembles_are_those_of_the_result():
+def test_ensemble_costs_quoted_agree_with_the_result():
     found = results("ensembles")
     text = page("ensembles")
     million = next(row for row in found["rows"] if row["members"] == 1_000_000)
@@ -106,7 +106,7 @@ def test_costs_of_ensembles_are_those_of_the_result():
     assert_agree([median, least, most], [np.median(ratios), min(ratios), max(ratios)])
 
 
-def test_costs_of_derivatives_are_those_of_the_result():
+def test_gradient_costs_quoted_agree_with_the_result():
     found = results("gradients")
     text = page("derivatives")
     times = [row[1] for row in rows_of(text, "derivative", "time")]
@@ -135,7 +135,7 @@ def test_costs_of_derivatives_are_those_of_the_result():
                 assert_agree([cell], [error])
 
 
-def test_the_worst_ratios_of_closures_are_those_of_the_result():
+def test_closure_worst_ratios_quoted_agree_with_the_result():
     last = {}
     for row in results("closures")["rows"]:
         energy = row["energy_last"]
@@ -161,7 +161,7 @@ def test_the_worst_ratios_of_closures_are_those_of_the_result():
     assert_agree(ratios, [symmetric, consistent])
 
 
-def test_what_invariants_cost_is_what_the_result_has():
+def test_invariant_costs_and_errors_quoted_agree_with_the_result():
     found = results("invariants")
     rows, text = found["rows"], page("invariants")
     kept = [row["energy"][1] for row in rows]
@@ -190,7 +190,7 @@ def test_what_invariants_cost_is_what_the_result_has():
     assert_agree(quoted(text, sentence), measured)
 
 
-def test_long_runs_of_machines_are_those_of_the_result():
+def test_long_runs_of_machines_quoted_agree_with_the_result():
     columns = ("dt", "duration", "first tenth", "all", "violation")
     rows = rows_of(page("machines"), "machine", "power of")
     for row, measured in zip(rows, results("long_runs")["rows"], strict=True):
@@ -199,7 +199,7 @@ def test_long_runs_of_machines_are_those_of_the_result():
         assert_agree(row[2:], [measured[column] for column in columns])
 
 
-def test_first_calls_of_models_from_sympy_are_those_of_the_result():
+def test_sympy_first_call_times_quoted_agree_with_the_result():
     rows = rows_of(page("sympy"), "model", "n")
     for row, measured in zip(rows, results("sympy_models")["rows"], strict=True):
         assert (row[0], row[2]) == (measured["model"], measured["kind"])
@@ -213,7 +213,7 @@ def test_first_calls_of_models_from_sympy_are_those_of_the_result():
 STEEP = ("Kepler", "Morse", "wall", "body, exponential")
 
 
-def test_accepted_steps_are_as_near_to_solutions_as_the_result_has():
+def test_accepted_step_errors_quoted_agree_with_the_result():
     kinds = [
         f"{x} {y}" for x in ("simplified", "newton") for y in ("residual", "violation")
     ]
@@ -240,7 +240,7 @@ def test_accepted_steps_are_as_near_to_solutions_as_the_result_has():
     assert sum(row["apart"] for row in steep) == 4
 
 
-def test_steps_near_rest_are_judged_as_the_result_has():
+def test_steps_near_rest_quoted_agree_with_the_result():
     rows = results("near_rest")["rows"]
     text = page("solvers")
     systems = {row["system"] for row in rows}
@@ -254,7 +254,7 @@ def test_steps_near_rest_are_judged_as_the_result_has():
     assert sum(row["wrongly refused"] for row in rows) == 3
 
 
-def test_what_the_chart_in_the_middle_gains_is_what_the_result_has():
+def test_chart_in_the_middle_gains_quoted_agree_with_the_result():
     energies = {}
     for row in results("charts")["rows"]:
         key = row["system"], row["retraction"], row["stages"]

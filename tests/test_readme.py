@@ -13,7 +13,7 @@ README = (ROOT / "README.md").read_text(encoding="utf-8")
 
 
 @pytest.mark.usefixtures("closed_figures")
-def test_python_blocks_run_as_printed(tmp_path, monkeypatch):
+def test_readme_python_blocks_run_as_printed(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     namespace = {}
     for block in blocks(README, "python"):
@@ -25,7 +25,7 @@ def test_python_blocks_run_as_printed(tmp_path, monkeypatch):
     assert (tmp_path / "energy.png").stat().st_size > 0
 
 
-def test_commands_are_those_of_the_continuous_integration():
+def test_readme_commands_are_run_by_continuous_integration():
     commands = [line for block in blocks(README, "bash") for line in block.splitlines()]
     assert commands[-1].startswith("pytest")
     run = (ROOT / ".ci" / "run").read_text(encoding="utf-8").splitlines()
@@ -34,7 +34,7 @@ def test_commands_are_those_of_the_continuous_integration():
     assert run[-1] == commands[-1]
 
 
-def test_linked_files_exist():
+def test_readme_linked_files_exist():
     for target in re.findall(r"\]\(([^)#:]+)\)|`(notebooks/[^`]+)`", README):
         assert (ROOT / (target[0] or target[1])).is_file()
 
@@ -47,7 +47,7 @@ def claims(start):
     return found
 
 
-def test_the_violation_of_constraints_is_that_of_the_result():
+def test_readme_constraint_violation_agrees_with_the_result():
     (claim,) = claims("Φ = 0 holds at the nodes")
     (measured,) = re.findall(r": (\S+)$", claim["measured"])
     members, time, printed = quoted(
@@ -58,7 +58,7 @@ def test_the_violation_of_constraints_is_that_of_the_result():
     assert float(printed) == float(measured)
 
 
-def test_the_comparison_with_other_libraries_is_that_of_the_result():
+def test_readme_ratios_to_other_libraries_agree_with_the_result():
     (case,) = (
         case
         for case in results("work_precision")["cases"]
@@ -73,7 +73,7 @@ def test_the_comparison_with_other_libraries_is_that_of_the_result():
     assert_agree(slower, [x["heyoka"]["ratio_seconds"] for x in best])
 
 
-def test_the_memory_of_an_ensemble_is_that_of_the_result():
+def test_readme_ensemble_memory_agrees_with_the_result():
     rows = results("ensembles")["rows"]
     million = next(row for row in rows if row["members"] == 1_000_000)
     steps, memory = quoted(README, "A million members of {} steps take {} MB")
@@ -81,13 +81,13 @@ def test_the_memory_of_an_ensemble_is_that_of_the_result():
     assert_agree([memory], [million["megabytes"]])
 
 
-def test_the_eigenvalues_of_the_bicycle_are_those_of_the_page_on_machines():
+def test_readme_bicycle_eigenvalues_agree_with_the_machines_page():
     sentence = "eigenvalues to {} ([`docs/machines"
     (measured,) = quoted(page("machines"), "eigenvalues {};")
     assert_agree(quoted(README, sentence), [float(measured)])
 
 
-def test_verdicts_on_the_paper_are_those_of_the_result():
+def test_readme_verdicts_agree_with_the_result():
     verdicts = dict(rows_of(README, "claim of the paper"))
     starts = {
         "q and p are of order": ["NonholonomicParticle", "Unicycle"],

@@ -62,6 +62,6 @@ def test_result_without_value_prints_that_it_is_traced(capsys):
     assert str(shape) == "nhjax.RESULTS<unknown>"
 
 
-def test_result_that_is_none_is_refused():
+def test_result_of_a_wrong_number_raises():
     with pytest.raises(ValueError, match="must be an enumeration item"):
         RESULTS[3]  # pyright: ignore

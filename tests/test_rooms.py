@@ -21,13 +21,13 @@ def test_every_module_is_in_a_room():
     assert {rooms.room(module) for module in SOURCES} - {""} == set(rooms.ROOMS)
 
 
-def test_imports_point_down():
+def test_imports_of_rooms_point_down():
     assert [
         f"{i.importer}:{i.line} -> {i.imported}" for i in rooms.upward(IMPORTS)
     ] == []
 
 
-def test_rooms_form_no_circle():
+def test_imports_between_rooms_have_no_cycle():
     pairs = [
         (rooms.room(i.importer), rooms.room(i.imported))
         for i in rooms.between_rooms(IMPORTS)
@@ -35,11 +35,11 @@ def test_rooms_form_no_circle():
     assert rooms.circle(pairs) is None
 
 
-def test_modules_form_no_circle():
+def test_imports_between_modules_have_no_cycle():
     assert rooms.circle((i.importer, i.imported) for i in IMPORTS) is None
 
 
-def test_rooms_are_entered_by_the_door():
+def test_imports_from_another_room_use_its_init():
     """What is inside of a folder is imported from its `__init__` alone."""
     around = [
         f"{i.importer}:{i.line} -> {i.imported}"
@@ -54,7 +54,7 @@ def test_room_has_at_most_five_floors(room):
     assert rooms.num_floors(IMPORTS, room) <= 5
 
 
-def test_floors_of_made_up_room_are_its_longest_chain_of_imports():
+def test_floors_of_made_up_room_equal_its_longest_import_chain():
     found = _made_up(
         _low="from ._a import x",
         _low___a="from ._b import x\nfrom ._c import x",
@@ -67,11 +67,11 @@ def test_floors_of_made_up_room_are_its_longest_chain_of_imports():
 
 
 @pytest.mark.parametrize("room", rooms.ROOMS)
-def test_a_room_says_what_it_is_for(room):
+def test_room_docstring_states_its_purpose(room):
     assert rooms.purpose(SOURCES[room]).endswith(".")
 
 
-def test_the_page_is_that_of_the_imports():
+def test_rooms_page_equals_generated_page():
     page = (rooms.DOCS / "rooms.md").read_text(encoding="utf-8")
     assert page == rooms.page(SOURCES), "run `python docs/rooms.py`"
 
@@ -85,7 +85,7 @@ def _made_up(**modules):
     return rooms.read_imports({"": "", **texts})
 
 
-def test_an_arrow_that_points_up_is_found():
+def test_upward_import_of_made_up_package_is_detected():
     found = _made_up(
         _low="from ._inner import x",
         _low___inner="def f():\n    from .._high import y",
@@ -111,19 +111,19 @@ def test_an_arrow_that_points_up_is_found():
         "if TYPE_CHECKING:\n    from ._high import x",
     ],
 )
-def test_every_form_of_import_is_read(text):
+def test_import_in_every_form_is_read(text):
     sources = {"": "", "_low": text, "_high": "x = 1"}
     found = rooms.read_imports(sources, "pkg")
     assert rooms.upward(found, FLOORS)
     assert not rooms.upward(found, FLOORS[::-1])
 
 
-def test_the_public_names_are_above_all_rooms():
+def test_import_from_the_package_itself_is_upward():
     found = _made_up(_low="from . import x")
     assert rooms.upward(found, FLOORS)
 
 
-def test_imports_that_point_down_are_let_pass():
+def test_downward_imports_of_made_up_package_are_accepted():
     found = _made_up(
         _low="import numpy\nfrom numpy import _high",
         _high="from ._low import x",
@@ -134,12 +134,12 @@ def test_imports_that_point_down_are_let_pass():
     assert rooms.Import("_high._inner", "_high._other", 2) in found
 
 
-def test_a_way_around_the_door_is_found():
+def test_import_that_bypasses_the_init_is_detected():
     found = _made_up(_low="", _low___inner="", _high="from ._low._inner import x")
     assert [i.imported for i in rooms.between_rooms(found)] == ["_low._inner"]
 
 
-def test_a_circle_is_found():
+def test_import_cycle_is_detected():
     chain = [("a", "b"), ("b", "c"), ("a", "c")]
     assert rooms.circle(chain) is None
     assert rooms.circle([*chain, ("c", "a")]) == ["a", "b", "c", "a"]
@@ -153,14 +153,14 @@ INTERNAL = re.compile(
 )
 
 
-def test_what_leans_on_internals_is_on_their_page():
+def test_modules_with_jax_internals_are_listed_on_their_page():
     page = (rooms.DOCS / "jax_internals.md").read_text(encoding="utf-8")
     leaning = {module for module, text in SOURCES.items() if INTERNAL.search(text)}
     named = re.findall(r"`((?:\w+/)?_\w+)\.py`", page)
     assert leaning == {name.replace("/", ".") for name in named}
 
 
-def test_no_test_imports_from_another():
+def test_test_files_do_not_import_each_other():
     """What several tests need is in `tests/support` and in `conftest.py`."""
     folder = Path(__file__).parent
     tests = {path.stem: path for path in folder.rglob("test_*.py")}
@@ -198,7 +198,7 @@ def test_deepest_stack_has_most_frames():
     assert rooms.deepest([rooms.Stack(frames[:2]), stack]) == stack
 
 
-def test_measuring_leaves_operations_as_they_were():
+def test_measuring_stacks_restores_patched_operations():
     before = jax.extend.core.primitives.atan2_p.bind
     rooms.stacks(nhjax, "plain")
     assert jax.extend.core.primitives.atan2_p.bind == before

@@ -39,23 +39,23 @@ def _written():
 
 
 @pytest.mark.parametrize("name", sorted(result_codes()))
-def test_every_way_in_which_a_run_can_end_is_explained(name):
+def test_result_of_every_kind_is_on_the_troubleshooting_page(name):
     assert f"| `{name}` |" in _section("A run that ended early")
 
 
-def test_every_exception_is_there():
+def test_exception_of_every_kind_is_on_the_troubleshooting_page():
     for name, value in vars(nhjax).items():
         if inspect.isclass(value) and issubclass(value, Exception):
             assert f"`{name}`" in PAGE, name
 
 
-def test_quoted_messages_are_those_of_the_package():
+def test_messages_quoted_on_the_page_exist_in_the_package():
     known = _written() + " ".join(vars(nhjax))
     parts = list(_quoted())
     assert len(parts) > 50
     assert [part for part in parts if part not in known and part != "TypeError"] == []
 
 
-def test_the_code_runs():
+def test_troubleshooting_page_code_runs():
     (failure,) = run_page("troubleshooting")["sol"].failures()
     assert failure[0] == 1

@@ -23,7 +23,7 @@ from benchmarks.verdicts import DOCS, filled, PAGE, table
 from nhjax import systems
 
 
-def test_methods_of_others_have_their_orders():
+def test_baseline_methods_converge_with_known_orders():
     orders = baseline_orders(counts=(24, 48), time=2.0)
     assert list(orders) == list(BASELINE_ORDERS)
     np.testing.assert_allclose(
@@ -34,9 +34,7 @@ def test_methods_of_others_have_their_orders():
 @pytest.mark.parametrize(
     ("closure", "expected"), [("propagated", (2, 2)), ("symmetric", (4, 6))]
 )
-def test_order_from_wrong_multiplier_falls_to_two_where_it_is_propagated(
-    closure, expected
-):
+def test_order_from_wrong_multiplier_is_two_if_propagated(closure, expected):
     found = orders_from_wrong_multiplier(*rolling(), (3, 4), closure)
     np.testing.assert_allclose(found, expected, atol=0.05)
 
@@ -61,7 +59,7 @@ def test_leapfrog_satisfies_the_discrete_lagrange_dalembert_equations():
         assert abs(nat.direction(0.5 * (left + right)) @ (right - left)) < 1e-14
 
 
-def test_methods_that_coincide_do():
+def test_baseline_methods_that_are_equivalent_coincide():
     apart = distances(systems.NonholonomicParticle(), num_steps=20)
     assert apart["DLA, SPARK 2"] < 1e-13
     assert apart["leapfrog, Lobatto-2"] < 1e-13
@@ -69,7 +67,7 @@ def test_methods_that_coincide_do():
 
 
 @pytest.mark.parametrize("alpha", [1.0, 2.0])
-def test_growth_finds_the_power_of_time(alpha):
+def test_growth_of_a_power_law_is_its_exponent(alpha):
     times = np.arange(5.0, 1e4, 5.0)
     mu = 1e-5 + 1e-3 * (times / 1e4) ** alpha
     found = growth(in_stretches(times, mu, 0.1 * mu, 1e4))
@@ -78,17 +76,17 @@ def test_growth_finds_the_power_of_time(alpha):
     assert growth(Curve(times, 0 * times + 1.0, times)).alpha == 0.0
 
 
-def test_stability_at_infinity_alternates():
+def test_stability_at_infinity_alternates_in_sign():
     found = [stability_at_infinity(s) for s in (2, 3, 4, 5)]
     np.testing.assert_allclose(found, [-1, 1, -1, 1], atol=1e-7)
 
 
-def test_bars_do_not_end_cells():
+def test_verdict_table_escapes_vertical_bars():
     line = table([Claim("|E|", "1", "x", "confirmed", "y")]).splitlines()[-1]
     assert line == "| \\|E\\| | 1 | `x` | **confirmed**: y |"
 
 
-def test_the_page_has_the_tables_of_the_result_and_its_figures():
+def test_verdicts_page_has_tables_and_figures_of_the_result():
     record = json.loads((RESULTS / "verdicts.json").read_text(encoding="utf-8"))
     claims = {
         part: [Claim(**claim) for claim in lines]
@@ -102,7 +100,7 @@ def test_the_page_has_the_tables_of_the_result_and_its_figures():
         assert found.suffix != ".png" or found.stat().st_size < 150_000
 
 
-def test_verdicts_that_rest_on_spark_say_that_it_is_reconstructed():
+def test_verdicts_about_spark_state_that_it_is_reconstructed():
     record = json.loads((RESULTS / "verdicts.json").read_text(encoding="utf-8"))
     lines = [line for part in record["claims"].values() for line in part]
     resting = [x for x in lines if "SPARK" in x["claim"] + x["measured"]]

@@ -20,7 +20,7 @@ PROJECT = tomllib.loads((pages.ROOT / "pyproject.toml").read_text(encoding="utf-
 ]
 
 
-def test_site_builds_strictly_with_a_page_for_each_public_name(tmp_path):
+def test_website_builds_with_a_page_for_each_public_name(tmp_path):
     site = build(tmp_path)
     assert complaints(site) == []
     for space in ("nhjax", "nhjax.systems", "nhjax.plot"):
@@ -30,7 +30,7 @@ def test_site_builds_strictly_with_a_page_for_each_public_name(tmp_path):
             assert any(anchor in path.read_text(encoding="utf-8") for path in found)
 
 
-def test_name_that_is_new_or_gone_or_listed_twice_is_refused(monkeypatch):
+def test_website_with_missing_unknown_or_repeated_name_raises(monkeypatch):
     names = api.GROUPS["Events"]["names"]
     monkeypatch.setitem(api.GROUPS, "Events", {"names": names[1:]})
     with pytest.raises(ValueError, match=r"missing are \['nhjax.Event'\]"):
@@ -43,7 +43,7 @@ def test_name_that_is_new_or_gone_or_listed_twice_is_refused(monkeypatch):
         api.documented()
 
 
-def test_files_from_outside_and_missing_pictures_are_found(tmp_path):
+def test_website_external_files_and_missing_pictures_are_detected(tmp_path):
     (tmp_path / "a.html").write_text(
         '<a href="https://example.com">d</a><script src="https://example.com/f.js">'
         '</script><img alt="" src="gone.png"><img src=a.html>'
@@ -58,14 +58,14 @@ def test_files_from_outside_and_missing_pictures_are_found(tmp_path):
 
 
 @pytest.mark.parametrize("place", PAGES)
-def test_rows_of_tables_have_as_many_cells_as_their_heads(place):
+def test_website_table_rows_have_as_many_cells_as_the_header(place):
     # A bar ends a cell, as in |Φ|, also in code; the generator drops what is too much.
     for table in re.findall(r"(?:^\|.*\n)+", PAGES[place], re.MULTILINE):
         counts = {len(re.findall(r"(?<!\\)\|", row)) for row in table.splitlines()}
         assert len(counts) == 1, table
 
 
-def test_notebook_that_was_run_shows_what_it_printed_and_drew(tmp_path):
+def test_website_notebook_shows_its_text_and_figures(tmp_path):
     outputs = [
         {"output_type": "stream", "name": "stdout", "text": ["one\n"]},
         {"output_type": "stream", "name": "stderr", "text": "a warning"},
@@ -85,7 +85,7 @@ def test_notebook_that_was_run_shows_what_it_printed_and_drew(tmp_path):
     assert text.endswith("```text\none\ntwo\n```\n")
 
 
-def test_every_page_is_in_the_navigation():
+def test_website_navigation_contains_every_page():
     settings = pages.ROOT / "docs" / "website" / "zensical.toml"
     nav = tomllib.loads(settings.read_text(encoding="utf-8"))["project"]["nav"]
     for place in pages.sources():
@@ -93,7 +93,7 @@ def test_every_page_is_in_the_navigation():
             assert f"'{place}'" in str(nav)
 
 
-def test_the_gallery_has_every_system_with_a_small_picture():
+def test_website_gallery_has_a_small_picture_of_each_system():
     assert gallery.page() == PAGES["gallery.md"], "run python docs/gallery.py"
     for name, value in api.public_names("nhjax.systems").items():
         if hasattr(value, "initial_state"):
@@ -102,7 +102,7 @@ def test_the_gallery_has_every_system_with_a_small_picture():
     assert sum(drawn) < 1e6
 
 
-def test_versions_promised_by_the_page_are_those_of_the_package():
+def test_website_supported_versions_equal_package_metadata():
     python = PROJECT["requires-python"].removeprefix(">=")
     (jax,) = [x for x in PROJECT["dependencies"] if x.startswith("jax>=")]
     expected = f"needs Python {python} and JAX {jax.removeprefix('jax>=')}, or"

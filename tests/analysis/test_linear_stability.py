@@ -166,7 +166,7 @@ def test_linear_stability_with_singular_mass_matrix_raises():
         nhjax.linear_stability(system, 0.0, y)
 
 
-def test_linear_stability_in_single_precision_and_under_vmap_works():
+def test_linear_stability_in_single_precision_or_vmap_is_accurate():
     def frequencies(gravity):
         pendulum = SphericalPendulum(
             gravity=gravity, q0=(0.0, 0.0, -1.0), v0=(0.0, 0.0, 0.0)

@@ -61,6 +61,6 @@ def test_symmetry_that_violates_constraints_raises():
 @pytest.mark.parametrize(
     "chosen", [{"positions": (0,), "velocities": (0, 1)}, {"must_be_steady": False}]
 )
-def test_symmetry_with_other_choices_raises(chosen):
+def test_symmetry_with_conflicting_arguments_raises(chosen):
     with pytest.raises(ValueError, match=r"Pass either `symmetry`|With `symmetry`"):
         nhjax.linear_stability(FREE, 0.0, PLANE, symmetry=turn, **chosen)

@@ -94,14 +94,14 @@ def pushed_forward(function):
 
 
 @pytest.mark.parametrize("transform", [plain, jax.jit, one_of_a_batch])
-def test_function_that_closes_over_transformed_value_works(transform):
+def test_function_that_closes_over_transformed_value_runs(transform):
     for g in (1.0, 3.0):
         got = transform(reached_with)(jnp.asarray(g))
         np.testing.assert_allclose(got, -0.5 * g, rtol=1e-13)
 
 
 @pytest.mark.parametrize("transform", [jax.grad, pushed_forward])
-def test_function_that_closes_over_differentiated_value_works(transform):
+def test_function_that_closes_over_differentiated_value_has_gradient(transform):
     def square(x):
         return reached_with(x**2)
 
@@ -125,7 +125,7 @@ def test_tracer_of_earlier_transformation_is_not_reused():
         np.testing.assert_allclose((value, rate), (-0.5 * g, -0.5), rtol=1e-13)
 
 
-def test_globals_under_jit_of_user_are_those_of_the_trace(monkeypatch):
+def test_globals_under_jit_of_user_keep_their_values_at_tracing(monkeypatch):
     function = jax.jit(lambda x: x + reached_of(reads_global))
     first = float(function(0.0))
     monkeypatch.setitem(globals(), "GRAVITY", 3.0)

@@ -25,7 +25,7 @@ def results(program, *args):
     return jax.extend.core.jaxpr_as_fun(program)(*(args or (X,)))
 
 
-def test_repeated_operations_are_removed():
+def test_operations_that_are_repeated_are_removed():
     def function(x):
         return jnp.sin(2 * x) + jnp.cos(jnp.sin(2 * x)), jnp.sin(2 * x)
 
@@ -44,7 +44,7 @@ def test_unused_operations_of_jaxpr_are_removed():
     assert operations(cse_dce(program_of(function))) == ["sin"]
 
 
-def test_results_that_are_operands_or_constants_stay():
+def test_results_that_are_operands_or_constants_are_kept():
     def function(x):
         return x, jnp.sin(x), 1.0, jnp.sin(x)
 
@@ -67,7 +67,7 @@ def test_results_that_are_operands_or_constants_stay():
         lambda x: (jnp.take(x, 7, fill_value=0.0), jnp.take(x, 7, fill_value=-0.0)),
     ],
 )
-def test_operations_that_differ_stay(function):
+def test_operations_that_differ_are_kept(function):
     program = program_of(function)
     short = cse_dce(program)
     assert operations(short) == operations(program)
@@ -139,7 +139,7 @@ def test_simplified_jaxprs_have_the_same_derivatives(function):
         np.testing.assert_array_equal(of(cost(cse_dce(program)))(X), expected)
 
 
-def test_operations_with_effects_stay(capfd):
+def test_operations_with_effects_are_kept(capfd):
     def function(x):
         jax.debug.print("seen {}", x[0])
         jax.debug.print("seen {}", x[0])
@@ -150,7 +150,7 @@ def test_operations_with_effects_stay(capfd):
     assert capfd.readouterr().out.count("seen -1.0") == 2
 
 
-def test_operations_under_other_settings_of_jax_stay():
+def test_operations_under_other_settings_of_jax_are_kept():
     def function(key):
         with jax.threefry_partitionable(False):
             one = jax.random.bits(key, (2,))
@@ -196,7 +196,7 @@ def test_named_results_come_from_one_operation():
     np.testing.assert_array_equal(results(cse_dce(program))[0], function(X))
 
 
-def test_jaxpr_that_occurs_many_times_stays_one():
+def test_jaxpr_shared_by_many_calls_stays_shared():
     function = lambda x: jnp.sin(x) * jnp.sin(x)  # noqa: E731
     for _ in range(14):
         inner = jax.jit(function)

@@ -55,7 +55,7 @@ def cost(function, axes, k):
 
 @pytest.mark.parametrize("axes", AXES)
 @pytest.mark.parametrize("compiled", [False, True])
-def test_batched_call_computes_what_its_members_do(axes, compiled):
+def test_ensemble_call_of_kernel_equals_its_members(axes, compiled):
     got = jax.vmap(in_kernel, in_axes=axes)
     got = jax.jit(got) if compiled else got
     assert_same(got(*operands(axes)), jax.vmap(wanders, axes)(*operands(axes)))
@@ -73,7 +73,7 @@ def test_batched_call_computes_what_its_members_do(axes, compiled):
     ],
     ids=["grad", "jvp", "linearize", "hessian", "reverse over reverse"],
 )
-def test_batched_call_has_derivatives_of_its_members(axes, transform):
+def test_ensemble_call_of_kernel_has_gradients_of_its_members(axes, transform):
     """An operand that the members share has the sum of their gradients."""
     g, x, k = operands(axes)
     got = jax.jit(transform(cost(in_kernel, axes, k)))(g, x)
@@ -92,7 +92,7 @@ def batched(shape, inner, outer, dtype):
 
 @pytest.mark.parametrize("outer", [(0, None, None), (None, 0, None), (0, 1, None)])
 @pytest.mark.parametrize("inner", [(None, 0, None), (0, 1, None), (0, None, 0)])
-def test_batched_call_under_vmap_is_one_batch(outer, inner):
+def test_ensemble_call_under_vmap_is_one_batch(outer, inner):
     types = ("float64", "float64", "int32")
     given = map(batched, ((), (2,), ()), inner, outer, types)
 
@@ -104,13 +104,13 @@ def test_batched_call_under_vmap_is_one_batch(outer, inner):
 
 
 @pytest.mark.parametrize("members", [0, 1])
-def test_batched_call_of_few_or_no_members_computes_each(members):
+def test_ensemble_call_of_few_or_no_members_computes_each(members):
     g, x = jnp.ones(members), jnp.ones((members, 2))
     got = jax.jit(jax.vmap(in_kernel, (0, 0, None)))(g, x, K[1])
     assert_same(got, jax.vmap(wanders, (0, 0, None))(g, x, K[1]))
 
 
-def test_batched_call_with_empty_operands_computes():
+def test_ensemble_call_with_empty_operands_equals_jax():
     def function(x, empty):
         return 2 * x, jnp.sin(empty)
 
@@ -121,14 +121,14 @@ def test_batched_call_with_empty_operands_computes():
     assert_same(run(lambda *x: as_cpu_kernel(function, *x)), run(function))
 
 
-def test_function_that_kernels_refuse_is_batched_by_jax(monkeypatch):
+def test_ensemble_call_of_unsupported_function_is_batched_by_jax(monkeypatch):
     monkeypatch.setenv("NHJAX_ENGINE", "xla")
     (use,) = nhjax.engines(jax.vmap(in_kernel, (0, 0, None)), *operands((0, 0, None)))
     assert use == nhjax.EngineUse("xla", "chosen", 4)
 
 
 @pytest.mark.usefixtures("engine")
-def test_batched_call_with_operations_that_jax_expands_computes():
+def test_ensemble_call_with_operations_that_jax_expands_equals_jax():
     # Since JAX 0.12 a search in a table is such an operation.
     table = jnp.linspace(0.0, 1.0, 9)
 
@@ -148,7 +148,7 @@ def test_batched_call_with_operations_that_jax_expands_computes():
     np.testing.assert_allclose(jacobian, jnp.diag(slopes), rtol=1e-14)
 
 
-def test_kernel_with_little_optimisation_has_other_code():
+def test_kernel_with_little_optimisation_has_different_code():
     # All but the last of these copies are superfluous.
     copies = [re.sub(r"%(value|tripled|._at)", rf"%\1_{k}", TRIPLE) for k in range(20)]
     text = kernel_ir("".join(copies))

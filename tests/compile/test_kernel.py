@@ -58,12 +58,12 @@ def assert_same(got, expected):
 
 @pytest.mark.usefixtures("engine")
 @pytest.mark.parametrize("compiled", [False, True])
-def test_kernel_computes_what_its_function_does(compiled):
+def test_kernel_of_a_function_equals_it(compiled):
     function = jax.jit(in_kernel) if compiled else in_kernel
     assert_same(function(*OPERANDS), pendulum(*OPERANDS))
 
 
-def test_engine_is_that_of_the_environment(engine):
+def test_engine_chosen_by_environment_variable_is_used(engine):
     (use,) = nhjax.engines(in_kernel, *OPERANDS)
     assert (use.engine, use.members) == (engine, None)
     text = jax.jit(lambda *x: in_kernel(*x)).lower(*OPERANDS).as_text()
@@ -180,7 +180,7 @@ def is_large(x):
 @pytest.mark.parametrize(
     "function", [sorts, scatters, multiplies, sums_much, factorises, is_large]
 )
-def test_function_that_kernels_refuse_is_computed_by_xla(function):
+def test_kernel_of_unsupported_function_is_computed_by_xla(function):
     x = jnp.linspace(0.0, 1.0, 7)
     program = jax.jit(lambda x: as_cpu_kernel(function, x))
     assert MARK not in program.lower(x).as_text()
@@ -195,7 +195,7 @@ def test_random_keys_as_operands_are_computed_by_xla():
     assert_same(jax.random.key_data(got), jax.random.key_data(key))
 
 
-def test_kernel_with_printing_prints(capfd):
+def test_kernel_with_debug_print_prints(capfd):
     def loud(x):
         jax.debug.print("x = {}", x)
         return 2 * x

@@ -21,7 +21,7 @@ def outcome():
     return nhjax.ensemble(start, starts(), chunk_size=4)
 
 
-def test_ensemble_values_in_chunks_equal_those_of_vmap(outcome):
+def test_ensemble_values_in_chunks_equal_vmap(outcome):
     expected = jax.jit(jax.vmap(start))(starts())
     assert isinstance(outcome.values, nhjax.Solution)
     assert jax.tree.structure(outcome.values) == jax.tree.structure(expected)
@@ -33,7 +33,7 @@ def test_ensemble_values_in_chunks_equal_those_of_vmap(outcome):
     jax.tree.map(close, outcome.values, expected)
 
 
-def test_ensemble_with_failing_members_lists_them_and_runs_the_others(outcome):
+def test_ensemble_with_failing_members_lists_them_and_runs_others(outcome):
     assert outcome.failed.tolist() == list(BAD)
     assert outcome.failed_step.tolist() == [0, 0]
     whole = [(index, step, reason) for index, step, reason in outcome.values.failures()]

@@ -3,7 +3,7 @@
 from support.pages import run_page
 
 
-def test_ensembles_page_code_runs(tmp_path, monkeypatch):
+def test_ensemble_page_code_runs(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     namespace = run_page("ensembles")
     assert namespace["again"].values.ys.q.shape == (1, 1, 7)

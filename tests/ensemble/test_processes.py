@@ -114,7 +114,7 @@ def whole(tmp_path_factory):
     return content(path)
 
 
-def test_processes_statistics_and_values_equal_those_of_one_process(outputs, tmp_path):
+def test_ensemble_on_two_processes_equals_one_process(outputs, tmp_path):
     assert outputs[0][:2] == outputs[1][:2]
     alone = processes.summary(tmp_path)
     assert ast.literal_eval(outputs[0][0]) == alone
@@ -126,13 +126,13 @@ def test_processes_statistics_and_values_equal_those_of_one_process(outputs, tmp
         np.testing.assert_allclose(x, y, rtol=1e-14, atol=1e-30)
 
 
-def test_processes_if_one_is_killed_raise_in_the_other(outputs):
+def test_ensemble_on_two_processes_raises_if_one_is_killed(outputs):
     assert outputs[0][2].startswith("Another of the 2 processes has ended or cannot be")
     assert len(outputs[1]) == 2
 
 
 @pytest.mark.long
-def test_processes_resume_of_killed_stores_writes_the_same_bytes(
+def test_ensemble_on_two_processes_resumed_writes_the_same_bytes(
     outputs, folder, whole, monkeypatch
 ):
     monkeypatch.setattr(nhjax._ensemble._ensemble, "_SECONDS", 0.0)
@@ -164,7 +164,7 @@ def test_processes_resume_of_killed_stores_writes_the_same_bytes(
     assert not left.exists()
 
 
-def test_processes_with_different_calls_raise_in_all():
+def test_ensemble_on_two_processes_with_different_calls_raises():
     calls = {"out": False}, {"out": False, "reduce": "Mean()"}
 
     class Scripted(_processes.Processes):
@@ -176,13 +176,13 @@ def test_processes_with_different_calls_raise_in_all():
             Scripted().check_same_call(call)
 
 
-def test_processes_with_different_numbers_of_devices_raise():
+def test_ensemble_on_processes_with_unequal_devices_raises():
     _processes.check_equal_devices([0, 1, 1, 0])
     with pytest.raises(ValueError, match="process 0 has 2, process 1 has 1"):
         _processes.check_equal_devices([0, 0, 1])
 
 
-def test_processes_with_unequal_shares_exchange_equally_often(monkeypatch):
+def test_ensemble_on_processes_with_unequal_shares_finishes(monkeypatch):
     """Threads replace processes; an unmatched exchange would wait forever."""
     monkeypatch.setattr(_processes, "_SECONDS", 0.004)
     barrier, sent, exchanges = threading.Barrier(3), {}, [0, 0, 0]

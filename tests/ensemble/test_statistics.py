@@ -42,7 +42,9 @@ def exact(x):
 
 
 @pytest.mark.parametrize("name", ["small", "large"])
-def test_mean_and_variance_in_chunks_equal_those_of_fractions(name, statistics, data):
+def test_ensemble_mean_and_variance_in_chunks_equal_exact_fractions(
+    name, statistics, data
+):
     for column in range(2):
         mean, variance = exact(data[name][:, column])
         got = [statistics[x][name][column] for x in ("mean", "variance")]
@@ -51,13 +53,13 @@ def test_mean_and_variance_in_chunks_equal_those_of_fractions(name, statistics, 
         np.testing.assert_allclose(got[1], variance, rtol=1e-15)
 
 
-def test_minimum_and_maximum_in_chunks_equal_those_of_numpy(statistics, data):
+def test_ensemble_minimum_and_maximum_in_chunks_equal_numpy(statistics, data):
     for name, x in data.items():
         assert np.array_equal(statistics["least"][name], x.min(axis=0))
         assert np.array_equal(statistics["largest"][name], x.max(axis=0))
 
 
-def test_histogram_and_quantiles_in_chunks_equal_those_of_numpy(statistics, data):
+def test_ensemble_histogram_and_quantiles_in_chunks_equal_numpy(statistics, data):
     found, x = statistics["histogram"], data["small"]
     for column in range(2):
         counts = np.histogram(x[:, column], found.edges)[0]
@@ -72,7 +74,7 @@ def test_histogram_and_quantiles_in_chunks_equal_those_of_numpy(statistics, data
         np.testing.assert_allclose(found.quantile(fraction), expected, atol=0.02)
 
 
-def test_quantile_outside_of_the_edges_raises():
+def test_ensemble_quantile_outside_the_edges_raises():
     found = nhjax.ensemble(
         lambda x: x, jnp.array([0.0, 1.0, 5.0]), reduce=nhjax.Histogram([0.5, 2.0])
     ).statistics
@@ -81,7 +83,7 @@ def test_quantile_outside_of_the_edges_raises():
         found.quantile(0.01)
 
 
-def test_statistics_of_infinity_and_nan_propagate_them():
+def test_ensemble_statistics_of_infinity_and_nan_propagate_them():
     x = np.ones((5, 3))
     x[1, 0], x[2, 1], x[3, 1], x[4, 2] = np.inf, np.inf, -np.inf, np.nan
     got = nhjax.ensemble(
@@ -96,7 +98,7 @@ def test_statistics_of_infinity_and_nan_propagate_them():
     assert got[2].above.tolist() == [1, 1, 0]
 
 
-def test_statistics_of_integers_and_booleans_are_computed():
+def test_ensemble_statistics_of_integers_and_booleans_are_computed():
     got = nhjax.ensemble(
         lambda i: (i, i > 1),
         lambda i: i,
@@ -127,19 +129,19 @@ class Product(nhjax.AbstractReduction):
         return float(state)
 
 
-def test_reduction_of_a_user_is_applied_in_chunks():
+def test_ensemble_reduction_of_a_user_is_applied_in_chunks():
     got = nhjax.ensemble(
         lambda x: x, jnp.arange(1.0, 6.0), reduce=Product(), chunk_size=2
     )
     assert got.statistics == 120.0
 
 
-def test_variance_of_one_member_raises():
+def test_ensemble_variance_of_one_member_raises():
     with pytest.raises(ValueError, match="more than 1 members"):
         nhjax.ensemble(lambda x: x, jnp.ones(1), reduce=nhjax.Variance())
 
 
 @pytest.mark.parametrize("edges", [[1.0], [0.0, 0.0], [0.0, np.nan], [[0.0, 1.0]]])
-def test_histogram_with_invalid_edges_raises(edges):
+def test_ensemble_histogram_with_invalid_edges_raises(edges):
     with pytest.raises(ValueError, match="`edges` must"):
         nhjax.Histogram(edges)

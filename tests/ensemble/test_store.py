@@ -76,7 +76,7 @@ def store(tmp_path, whole):
     return tmp_path / "store"
 
 
-def test_store_of_solutions_opens_in_xarray_with_labels(tmp_path):
+def test_ensemble_store_of_solutions_opens_in_xarray_with_labels(tmp_path):
     options = {"out": tmp_path / "s", "units": {"time": "s", "value": "J"}}
     outcome = nhjax.ensemble(start, starts(), chunk_size=4, **options)
     expected = nhjax.ensemble(start, starts(), chunk_size=4)
@@ -97,7 +97,7 @@ def test_store_of_solutions_opens_in_xarray_with_labels(tmp_path):
         np.testing.assert_array_equal(data.stats_num_steps, steps)
 
 
-def test_store_with_units_by_coordinate_labels_as_to_xarray(tmp_path):
+def test_ensemble_store_with_units_has_the_labels_of_to_xarray(tmp_path):
     system = nhjax.LagrangianSystem(
         lambda t, q, v, args: 0.5 * v @ v - q[1], coordinates=("x", "angle")
     )
@@ -120,7 +120,7 @@ def test_store_with_units_by_coordinate_labels_as_to_xarray(tmp_path):
         assert data.p.units == single.p.units == "N s"
 
 
-def test_store_of_a_tree_opens_in_xarray(store):
+def test_ensemble_store_of_a_tree_opens_in_xarray(store):
     with xarray.open_zarr(store) as data:
         x = np.linspace(0.5, 1.5, COUNT)
         np.testing.assert_allclose(data.powers, np.stack([x**0, x, x**2], axis=1))
@@ -132,7 +132,9 @@ class Killed(BaseException):
     """Simulates the end of the process."""
 
 
-def test_store_interrupted_at_any_operation_resumes(tmp_path, whole, monkeypatch):
+def test_ensemble_store_interrupted_at_any_operation_resumes(
+    tmp_path, whole, monkeypatch
+):
     """Each run ends at another file operation, without the last bytes."""
     fsync, replace, folder = os.fsync, os.replace, tmp_path / "store"
     left, ran = [0], []
@@ -176,7 +178,7 @@ test_store.call(sys.argv[1], count=800)
 """
 
 
-def test_store_of_a_killed_run_resumes_to_the_same_bytes(tmp_path):
+def test_ensemble_store_of_a_killed_run_resumes_to_the_same_bytes(tmp_path):
     root = Path(__file__).parents[2]
     places = os.pathsep.join([str(root), str(root / "tests")])
     command = [sys.executable, "-c", SCRIPT, str(tmp_path / "killed")]
@@ -195,7 +197,7 @@ def test_store_of_a_killed_run_resumes_to_the_same_bytes(tmp_path):
     assert content(tmp_path / "killed") == content(tmp_path / "whole")
 
 
-def test_store_that_is_finished_runs_no_chunk(store, whole, capsys):
+def test_ensemble_store_that_is_finished_runs_no_chunk(store, whole, capsys):
     call(store, progress_meter=nhjax.TextProgressMeter())
     assert capsys.readouterr().out == ""
     assert content(store) == whole
@@ -220,7 +222,7 @@ def test_store_that_is_finished_runs_no_chunk(store, whole, capsys):
         ),
     ],
 )
-def test_store_resumed_with_other_parameters_raises_with_the_difference(
+def test_ensemble_store_resumed_with_other_parameters_raises(
     options, message, store, whole
 ):
     with pytest.raises(ValueError, match=f"another run. Differences: .*{message}"):
@@ -228,7 +230,7 @@ def test_store_resumed_with_other_parameters_raises_with_the_difference(
     assert content(store) == whole
 
 
-def test_store_resumed_with_other_arrays_raises(store):
+def test_ensemble_store_resumed_with_other_arrays_raises(store):
     with pytest.raises(ValueError, match="the arrays of `members`"):
         nhjax.ensemble(run, np.ones(COUNT), out=store, chunk_size=CHUNK)
     own = store.with_name("own")
@@ -237,7 +239,7 @@ def test_store_resumed_with_other_arrays_raises(store):
         call(own, power(jnp.array([0.0, 1.0, 2.5])))
 
 
-def test_store_with_damaged_chunk_raises_and_reruns_it_once_deleted(store, whole):
+def test_ensemble_store_with_damaged_chunk_raises_until_deleted(store, whole):
     path = store / "powers" / "c" / "3" / "0"
     path.write_bytes(path.read_bytes()[:-1] + b"x")
     with pytest.raises(ValueError, match=r"powers/c/3/0.*members 12 to 15"):
@@ -248,19 +250,19 @@ def test_store_with_damaged_chunk_raises_and_reruns_it_once_deleted(store, whole
 
 
 @pytest.mark.parametrize("name", ["zarr.json", "program.txt", "chunks.jsonl"])
-def test_store_with_missing_file_raises(name, store):
+def test_ensemble_store_with_missing_file_raises(name, store):
     (store / "manifest" / name).unlink()
     with pytest.raises(ValueError, match=f"has no 'manifest/{name}'"):
         call(store)
 
 
-def test_store_with_damaged_manifest_raises(store):
+def test_ensemble_store_with_damaged_manifest_raises(store):
     (store / "manifest" / "zarr.json").write_text("{")
     with pytest.raises(ValueError, match=r"a damaged 'manifest/zarr\.json'"):
         call(store)
 
 
-def test_store_with_damaged_journal_raises_with_the_line(store):
+def test_ensemble_store_with_damaged_journal_raises_with_the_line(store):
     journal = store / "manifest" / "chunks.jsonl"
     lines = journal.read_text().splitlines()
     journal.write_text("\n".join([lines[0][:-5], *lines[1:], ""]))
@@ -268,7 +270,7 @@ def test_store_with_damaged_journal_raises_with_the_line(store):
         call(store)
 
 
-def test_store_on_full_disk_raises_and_keeps_finished_chunks(
+def test_ensemble_store_on_full_disk_raises_and_keeps_finished_chunks(
     tmp_path, whole, monkeypatch
 ):
     left = [30]
@@ -288,7 +290,7 @@ def test_store_on_full_disk_raises_and_keeps_finished_chunks(
     assert content(tmp_path / "store") == whole
 
 
-def test_store_in_unusable_folder_raises(tmp_path, monkeypatch):
+def test_ensemble_store_in_unusable_folder_raises(tmp_path, monkeypatch):
     (tmp_path / "file").write_text("")
     with pytest.raises(FileExistsError, match="is a file: `out` names a folder"):
         call(tmp_path / "file")
@@ -308,7 +310,7 @@ def test_store_in_unusable_folder_raises(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("name", ["lock", "chunks-1.jsonl"])
-def test_store_locked_by_another_process_raises(name, store, whole):
+def test_ensemble_store_locked_by_another_process_raises(name, store, whole):
     """The lock is that of the store, or that of a process which still runs."""
     fcntl = pytest.importorskip("fcntl")
     with open(store / "manifest" / name, "w") as locked:
@@ -319,13 +321,13 @@ def test_store_locked_by_another_process_raises(name, store, whole):
     assert content(store) == whole
 
 
-def test_store_on_system_without_fcntl_raises(tmp_path, monkeypatch):
+def test_ensemble_store_on_system_without_fcntl_raises(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "fcntl", None)
     with pytest.raises(RuntimeError, match="has no module `fcntl`"):
         call(tmp_path / "store")
 
 
-def test_store_on_a_file_system_without_locks_warns(tmp_path, monkeypatch):
+def test_ensemble_store_on_a_file_system_without_locks_warns(tmp_path, monkeypatch):
     fcntl = pytest.importorskip("fcntl")
 
     def flock(opened, how):
@@ -336,7 +338,7 @@ def test_store_on_a_file_system_without_locks_warns(tmp_path, monkeypatch):
         call(tmp_path / "store")
 
 
-def test_store_interrupted_by_ctrl_c_resumes(tmp_path, whole):
+def test_ensemble_store_interrupted_by_ctrl_c_resumes(tmp_path, whole):
     class Interrupting(nhjax.AbstractProgressMeter):
         def update(self, done, total):
             raise KeyboardInterrupt
@@ -352,7 +354,7 @@ def test_store_interrupted_by_ctrl_c_resumes(tmp_path, whole):
     assert content(folder) == whole
 
 
-def test_store_without_zarr_raises_with_the_extra(tmp_path, monkeypatch):
+def test_ensemble_store_without_zarr_raises_with_the_extra(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "zarr", None)
     with pytest.raises(ImportError, match=r'pip install "nhjax\[ensemble\]"'):
         call(tmp_path / "store")
@@ -375,7 +377,7 @@ def test_store_without_zarr_raises_with_the_extra(tmp_path, monkeypatch):
         ),
     ],
 )
-def test_store_with_unsupported_values_or_units_raises(
+def test_ensemble_store_with_unsupported_values_or_units_raises(
     options, error, message, tmp_path
 ):
     with pytest.raises(error, match=message):
@@ -388,7 +390,7 @@ def test_ensemble_with_units_but_no_store_raises():
         call(None, units={"time": "s"})
 
 
-def test_statistics_in_a_folder_resume_where_they_were_interrupted(
+def test_ensemble_statistics_in_a_folder_resume_after_interruption(
     tmp_path, monkeypatch
 ):
     reduce = {"mean": nhjax.Mean(), "variance": nhjax.Variance()}

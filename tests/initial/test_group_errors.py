@@ -179,7 +179,7 @@ def test_projection_onto_unreachable_constraint_is_refused():
         nhjax.initial_state(system, jnp.ones(2), jnp.zeros(2), project=True)
 
 
-def test_initial_state_with_dependent_holonomic_constraints_is_refused():
+def test_initial_state_with_redundant_holonomic_constraints_is_refused():
     system = nhjax.LagrangianSystem(
         lambda t, q, v, args: 0.5 * v @ v,
         holonomic=lambda t, q, args: jnp.stack([q[0], 2.0 * q[0]]),

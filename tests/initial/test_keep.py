@@ -524,7 +524,7 @@ def test_projection_with_kept_components_under_jit_and_vmap_agrees():
         )
 
 
-def test_projection_with_kept_components_has_derivatives_of_differences():
+def test_projection_with_kept_components_has_gradients_of_differences():
     q, v = jnp.array([0.3, 0.5, 0.9]), jnp.array([0.1, 0.2, 0.3])
 
     @jax.jit
@@ -544,7 +544,7 @@ def test_projection_with_kept_components_has_derivatives_of_differences():
     np.testing.assert_array_equal(forward[4], jnp.eye(7)[4])
 
 
-def test_projection_with_kept_components_on_group_has_derivatives_of_differences():
+def test_projection_with_kept_components_on_group_has_exact_gradients():
     system = plane_body(nhjax.Cayley())
 
     @jax.jit
@@ -688,7 +688,7 @@ def test_kept_velocity_that_excludes_nonlinear_constraint_is_refused():
         )
 
 
-def test_kept_velocities_that_violate_constraint_give_nan_member_without_throw():
+def test_kept_velocities_that_violate_constraint_without_throw_are_nan():
     v = jnp.array([[3.0, -1.0, 9.0, 0.0], [3.0, 1.0, 3.0, 0.0]])
 
     def start(v):
@@ -742,7 +742,7 @@ ON_SO3 = nhjax.LagrangianSystem(
         ),
     ],
 )
-def test_wrong_choice_of_kept_components_names_argument(options, exception, message):
+def test_kept_components_of_wrong_choice_name_the_argument(options, exception, message):
     v = jnp.array([3.0, -1.0, 3.0, 0.0])
     with pytest.raises(exception, match=message):
         nhjax.initial_state(BLADE, jnp.zeros(4), v, **{"project": True, **options})

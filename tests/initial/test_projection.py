@@ -149,7 +149,7 @@ def test_redundant_constraints_under_jit_are_named():
 
 
 @pytest.mark.parametrize("project", [False, True])
-def test_constraint_given_in_both_kinds_is_named(project):
+def test_redundant_constraint_given_in_both_kinds_is_named(project):
     system = nhjax.LagrangianSystem(
         lambda t, q, v, args: 0.5 * v @ v,
         nonholonomic=lambda t, q, v, args: jnp.stack([v[0], q @ v]),
@@ -165,7 +165,7 @@ def test_constraint_given_in_both_kinds_is_named(project):
         )
 
 
-def test_three_dependent_constraints_are_enumerated():
+def test_redundant_constraints_that_are_three_are_listed():
     system = nhjax.HamiltonianSystem(
         lambda t, q, p, args: 0.5 * p @ p,
         nonholonomic=lambda t, q, p, args: jnp.stack([p[0], p[1], p[2], p[0] - p[2]]),

@@ -42,7 +42,7 @@ def particles(y0, dt):
 
 @pytest.mark.parametrize("y", [0.0, 0.3, 1.0, 2.0, 3.0, 5.0, 8.0])
 @pytest.mark.parametrize("dt", [0.05, 0.1])
-def test_invariant_on_constraints_takes_as_many_sweeps_as_energy(dt, y):
+def test_invariant_on_constraints_needs_as_many_sweeps_as_energy(dt, y):
     energy, found = particles(particle_at(y).initial_state(), dt)
     for sol in (energy, found):
         assert sol.result == nhjax.RESULTS.successful
@@ -210,7 +210,7 @@ def test_invariant_impulses_exclude_directions_of_reactions():
 
 @pytest.mark.parametrize("stages", long_but((2,), (2, 3)))
 @pytest.mark.parametrize("closure", ["symmetric", "propagated"])
-def test_steps_there_and_back_return_to_the_start(closure, stages):
+def test_invariant_steps_forwards_and_back_return_to_the_start(closure, stages):
     @jax.jit
     def run(y0, dt):
         options = {"num_steps": 40, "invariants": substituted_energy}
@@ -275,7 +275,7 @@ def test_invariant_gradients_on_constraints_match_finite_differences(name):
 
 
 @pytest.mark.parametrize("scale", [1e-8, long(1e8)])
-def test_badly_scaled_masses_and_constraints_change_neither_sweeps_nor_accuracy(scale):
+def test_invariant_run_in_other_units_has_equal_sweeps_and_accuracy(scale):
     """Units of mass and of the constraint: the motion does not depend on them."""
 
     def run(mass, unit):
@@ -298,7 +298,7 @@ def test_badly_scaled_masses_and_constraints_change_neither_sweeps_nor_accuracy(
     assert abs(counts[1] - counts[0]) < 0.1 * counts[0]
 
 
-def test_members_of_an_ensemble_take_the_steps_of_single_runs():
+def test_invariant_ensemble_members_take_the_steps_of_single_runs():
     starts = [particle_at(y).initial_state() for y in (0.5, 2.0, 6.0)]
     y0 = jax.tree.map(lambda *x: jnp.stack(x), *starts)
 

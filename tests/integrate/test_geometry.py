@@ -276,7 +276,7 @@ def largest_by_fifth(error):
         ("high", 2, "propagated", [2.6e-2, 2.6e-2, 2.6e-2, 2.6e-2, 2.5e-2]),
     ],
 )
-def test_energy_error_of_the_cvt_by_fifths_of_the_run(
+def test_energy_error_of_the_cvt_in_each_fifth_equals_reference(
     regime, stages, closure, expected
 ):
     # Measured once with an independent implementation (dense Newton).
@@ -295,7 +295,7 @@ def test_energy_error_of_the_cvt_by_fifths_of_the_run(
         ("high", 4, "symmetric", 2.2e-7, 1.6e-7),
     ],
 )
-def test_energy_error_of_the_cvt_in_the_first_and_last_fifth(
+def test_energy_error_of_the_cvt_at_both_ends_equals_reference(
     regime, stages, closure, first, last
 ):
     # Measured once with an independent implementation (dense Newton).
@@ -324,7 +324,9 @@ def test_energy_of_the_cvt_with_four_propagated_stages_does_not_drift(regime):
         ("high", (-5.3e-3, 1.26e-2), (-2.5e-2, 1.3e-3)),
     ],
 )
-def test_range_of_the_energies_of_driver_and_passenger(regime, driver, passenger):
+def test_energy_ranges_of_driver_and_passenger_equal_reference(
+    regime, driver, passenger
+):
     _, driver_error, passenger_error = cvt_errors(regime, 2, "propagated")
     for error, expected in ((driver_error, driver), (passenger_error, passenger)):
         np.testing.assert_allclose([error.min(), error.max()], expected, rtol=0.1)

@@ -132,7 +132,7 @@ def test_text_progress_meter_prints_about_ten_lines(total, capsys):
     assert len(set(lines)) == len(lines)
 
 
-def test_no_progress_meter_is_silent(capfd):
+def test_progress_meter_that_is_off_is_silent(capfd):
     run(progress_meter=nhjax.NoProgressMeter())
     jax.effects_barrier()
     assert capfd.readouterr() == ("", "")

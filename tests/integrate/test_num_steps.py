@@ -72,7 +72,7 @@ def test_num_steps_of_another_value_does_not_retrace(saveat, adjoint):
 
 
 @pytest.mark.parametrize("num_steps", [1, 2, 33])
-def test_num_steps_traced_gives_results_of_static(num_steps):
+def test_num_steps_traced_equals_static(num_steps):
     got, expected = run(num_steps), static(num_steps)
     assert_trees_equal(
         (got.ys, got.ts, got.t1), (expected.ys, expected.ts, expected.t1)

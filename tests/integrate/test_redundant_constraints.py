@@ -368,7 +368,7 @@ def test_redundant_constraints_for_an_instant_only_fail():
         nhjax.integrate(system, nhjax.LobattoIIIAB(2), y0, dt=0.1, num_steps=2)
 
 
-def test_redundant_nonholonomic_constraint_of_holonomic_ones_is_named():
+def test_redundant_nonholonomic_rate_of_holonomic_constraint_raises():
     system = nhjax.LagrangianSystem(
         lambda t, q, v, args: 0.5 * v @ v,
         nonholonomic=lambda t, q, v, args: jnp.stack([v[0], q @ v]),

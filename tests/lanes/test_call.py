@@ -44,18 +44,18 @@ def triple():
 
 
 @pytest.mark.parametrize("members", [0, 1, WIDTH - 1, WIDTH, WIDTH + 1, 100_000])
-def test_kernel_of_any_number_of_members_computes_each(triple, members):
+def test_lanes_kernel_of_any_number_of_members_computes_each(triple, members):
     x = jnp.arange(members, dtype=jnp.float64)
     np.testing.assert_array_equal(call(triple, x), 3 * np.arange(members))
 
 
-def test_kernel_with_subnormal_numbers_flushes_as_xla(triple):
+def test_lanes_kernel_with_subnormal_numbers_flushes_as_xla(triple):
     """XLA flushes them to zero, in the threads of its pool and in the caller's."""
     x = jnp.full(100_000, 5e-324)
     np.testing.assert_array_equal(call(triple, x), jax.jit(lambda x: 3 * x)(x))
 
 
-def test_kernel_without_scratch_memory_raises_in_jax():
+def test_lanes_kernel_without_scratch_memory_raises_in_jax():
     def sums(x):
         # Too many numbers for the stack.
         places = jnp.zeros(3000)
@@ -77,7 +77,7 @@ def test_kernel_without_scratch_memory_raises_in_jax():
 
 
 @pytest.mark.parametrize("members", [1, WIDTH + 1, 1000])
-def test_kernel_with_shared_operand_reads_it_for_each_member(members):
+def test_lanes_kernel_with_shared_operand_reads_it_for_each_member(members):
     name = lanes.register_kernel(kernel_ir(SHARED), 2, 1, WIDTH, True)
     x = jnp.arange(members, dtype=jnp.float64)
     shared = jnp.full(1, 5.0)
@@ -85,7 +85,7 @@ def test_kernel_with_shared_operand_reads_it_for_each_member(members):
 
 
 @pytest.mark.parametrize("members", [0, 1, 1000])
-def test_arrays_without_elements(members):
+def test_lanes_arrays_without_elements_in_call_are_computed(members):
     """A kernel that does not touch its arrays, which have no elements."""
     kernel = kernel_ir("")
     name = lanes.register_kernel(kernel, 1, 1, WIDTH, True)
@@ -93,18 +93,18 @@ def test_arrays_without_elements(members):
     assert call(name, x).shape == (members, 0)
 
 
-def test_kernel_without_batch_computes_one_member():
+def test_lanes_kernel_without_batch_computes_one_member():
     name = lanes.register_kernel(kernel_ir(TRIPLE, width=1), 1, 1, 1, False)
     np.testing.assert_array_equal(call(name, jnp.full(1, 2.0)), [6.0])
 
 
-def test_kernel_with_wrong_number_of_arrays_raises_in_jax(triple):
+def test_lanes_kernel_with_wrong_number_of_arrays_raises_in_jax(triple):
     x = jnp.ones(3)
     with pytest.raises(jax.errors.JaxRuntimeError, match="unexpected numbers"):
         call(triple, x, x)
 
 
-def test_kernel_registered_twice_is_compiled_once(triple):
+def test_lanes_kernel_registered_twice_is_compiled_once(triple):
     before = lanes.compiled_code()
     assert lanes.register_kernel(kernel_ir(TRIPLE), 1, 1, WIDTH, True) == triple
     assert lanes.compiled_code() == before
@@ -114,7 +114,7 @@ def test_kernel_registered_twice_is_compiled_once(triple):
     assert len(names | {triple}) == 4
 
 
-def test_compiled_code_after_new_kernel_grows():
+def test_lanes_compiled_code_after_new_kernel_grows():
     before = lanes.compiled_code()
     unused = "@grows = global i32 0\n"
     lanes.register_kernel(kernel_ir(TRIPLE, before=unused), 1, 1, WIDTH, True)
@@ -123,7 +123,7 @@ def test_compiled_code_after_new_kernel_grows():
     assert after.bytes > before.bytes
 
 
-def test_kernel_of_a_million_characters_compiles():
+def test_lanes_kernel_of_a_million_characters_compiles():
     """Its code is generated at another level than that of shorter modules."""
     comment = f"; {'.' * 1_000_000}\n"
     name = lanes.register_kernel(kernel_ir(TRIPLE, before=comment), 1, 1, WIDTH, True)
@@ -131,12 +131,12 @@ def test_kernel_of_a_million_characters_compiles():
     np.testing.assert_array_equal(call(name, x), 3 * x)
 
 
-def test_kernel_with_invalid_ir_raises():
+def test_lanes_kernel_with_invalid_ir_raises():
     with pytest.raises(RuntimeError, match="parsing"):
         lanes.register_kernel("this is not LLVM IR", 1, 1, WIDTH, True)
 
 
-def test_kernel_wanted_by_several_threads_is_compiled_once():
+def test_lanes_kernel_requested_by_several_threads_is_compiled_once():
     kernel = kernel_ir(TRIPLE, before="@at_once = global i32 0\n")
     before = lanes.compiled_code().programs
     start, names = threading.Barrier(8), []
@@ -158,36 +158,36 @@ def test_kernel_wanted_by_several_threads_is_compiled_once():
     assert lanes.compiled_code().programs == before + 1
 
 
-def test_kernel_called_from_more_threads_than_the_pool_finishes():
+def test_lanes_kernel_called_from_more_threads_than_the_pool_finishes():
     assert printed("many_callers", NPROC="2") == "calls: 160"
 
 
 @pytest.mark.parametrize("threads", [1, 2, 4])
-def test_kernel_uses_at_most_the_threads_of_the_pool(threads):
+def test_lanes_kernel_uses_at_most_the_threads_of_the_pool(threads):
     # The pool's threads take part if they are there: the blocks last for 0.8 s in all.
     assert printed("threads", 1, NPROC=str(threads)) == f"most: {threads}"
 
 
-def test_kernel_on_several_devices_shares_the_pool():
+def test_lanes_kernel_on_several_devices_shares_the_pool():
     flags = "--xla_force_host_platform_device_count=2"
     most = int(printed("threads", 2, NPROC="4", XLA_FLAGS=flags).split()[-1])
     # The second device's own thread may come when there are four at work.
     assert 2 <= most <= 5
 
 
-def test_kernel_in_forked_process_finishes():
+def test_lanes_kernel_in_forked_process_finishes():
     assert printed("forked") == "child: 0"
 
 
 @pytest.mark.long
-def test_kernel_in_executable_from_jax_cache_runs(tmp_path):
+def test_lanes_kernel_in_executable_from_jax_cache_runs(tmp_path):
     assert printed("cached", tmp_path) == "hits: 0"
     assert list(tmp_path.iterdir())
     assert printed("cached", tmp_path) != "hits: 0"
 
 
 @pytest.mark.long
-def test_kernel_in_saved_executable_runs_or_is_refused(tmp_path):
+def test_lanes_kernel_in_saved_executable_runs_or_is_refused(tmp_path):
     path = tmp_path / "executable"
     printed("saved", path)
     assert printed("loaded", path, "registered") == "ran"

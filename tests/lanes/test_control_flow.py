@@ -18,7 +18,7 @@ from support.lanes_samples import (
 
 
 @WIDTHS
-def test_loop_that_members_leave_one_by_one_keeps_their_results(width):
+def test_lanes_loop_that_members_leave_one_by_one_keeps_results(width):
     def function(times, x):
         return repeated(times, lambda k, x: jnp.sin(x) + k.astype(float), x)
 
@@ -30,7 +30,7 @@ def test_loop_that_members_leave_one_by_one_keeps_their_results(width):
 
 
 @WIDTHS
-def test_inner_loop_of_finished_member_does_not_run(width):
+def test_lanes_inner_loop_of_finished_member_does_not_run(width):
     def function(times, x):
         def body(k, x):
             x = lax.while_loop(lambda y: (y > 1) | (k >= times), lambda y: y / 2, x)
@@ -50,7 +50,7 @@ def test_inner_loop_of_finished_member_does_not_run(width):
 
 
 @WIDTHS
-def test_loop_in_branch_runs_for_members_of_the_branch(width):
+def test_lanes_loop_in_branch_runs_for_members_of_the_branch(width):
     def function(p, x):
         def endless_elsewhere(x):
             return lax.while_loop(lambda y: (y < 50) | ~p, lambda y: y + 1, x)
@@ -63,7 +63,7 @@ def test_loop_in_branch_runs_for_members_of_the_branch(width):
 
 
 @WIDTHS
-def test_uniform_loop_in_branch_of_no_member_does_not_run(width):
+def test_lanes_uniform_loop_in_branch_of_no_member_does_not_run(width):
     """Its predicate is one for all lanes, so that no mask could end it."""
 
     def function(p, x):
@@ -81,14 +81,14 @@ def test_uniform_loop_in_branch_of_no_member_does_not_run(width):
 
 
 @WIDTHS
-def test_uniform_value_after_divergent_loop_is_divergent(width):
+def test_lanes_uniform_value_after_divergent_loop_is_divergent(width):
     def function(times):
         return repeated(times, lambda k, x: x + k.astype(float), jnp.zeros(()))
 
     assert_as_jax(function, width, count(12))
 
 
-def test_branch_with_uniform_predicate_is_a_jump():
+def test_lanes_branch_with_uniform_predicate_is_a_jump():
     def function(p, x):
         return lax.cond(p, lambda x: jnp.sin(x), lambda x: jnp.exp(x), x)
 

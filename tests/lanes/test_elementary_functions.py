@@ -36,7 +36,9 @@ def rounded():
 
 @pytest.mark.parametrize("dtype", DTYPES)
 @pytest.mark.parametrize("op", OPS)
-def test_elementary_function_errs_by_less_than_two_ulps(op, dtype, native, rounded):
+def test_lanes_elementary_function_errs_by_less_than_two_ulps(
+    op, dtype, native, rounded
+):
     given = ulps.arguments(op, 0, 1500, DTYPES[dtype])
     exact = ulps.exact_values(op, given)
     # Conversions of float32 leave little more than the last rounding.
@@ -75,14 +77,16 @@ HARD = {
 
 
 @pytest.mark.parametrize("op", HARD)
-def test_elementary_function_at_hard_arguments_errs_by_less_than_two_ulps(op, native):
+def test_lanes_elementary_function_at_hard_arguments_errs_by_less_than_two_ulps(
+    op, native
+):
     given = [np.array(HARD[op], np.float64)]
     got = native(symbol(op, "float64", 8), *given)
     assert ulps.errors(got, ulps.exact_values(op, given)).max() < 2
 
 
 @pytest.mark.parametrize("dtype", DTYPES)
-def test_remainder_of_any_arguments_is_exact(dtype, native):
+def test_lanes_remainder_of_any_arguments_is_exact(dtype, native):
     given = ulps.arguments("rem", 3, 20000, DTYPES[dtype])
     got = native(symbol("rem", dtype, 8), *given)
     np.testing.assert_array_equal(got, np.fmod(*given))
@@ -114,7 +118,7 @@ def _specials(dtype):
 @pytest.mark.parametrize("width", WIDTHS)
 @pytest.mark.parametrize("dtype", DTYPES)
 @pytest.mark.parametrize("op", OPS)
-def test_elementary_function_at_special_values_equals_c(op, dtype, width, native):
+def test_lanes_elementary_function_at_special_values_equals_c(op, dtype, width, native):
     values = _specials(DTYPES[dtype])
     given = [values]
     if op in ulps.BINARY:
@@ -134,18 +138,18 @@ LARGEST_ERRORS = {"LOG_LONG": -66, "CBRT": -18}
 
 
 @pytest.mark.parametrize("name", approximations.APPROXIMATIONS)
-def test_polynomial_coefficients_are_as_accurate_as_float64(name):
+def test_lanes_polynomial_coefficients_are_as_accurate_as_float64(name):
     coefficients = getattr(_coefficients, name)
     bound = 2.0 ** LARGEST_ERRORS.get(name, -55)
     assert approximations.worst_error(name, coefficients) < bound
 
 
-def test_polynomial_coefficients_equal_computed_ones():
+def test_lanes_polynomial_coefficients_equal_computed_ones():
     source = inspect.getsource(_coefficients)
     assert source == approximations.module()
 
 
-def test_definitions_of_all_functions_define_each_once():
+def test_lanes_definitions_of_all_functions_contain_each_once():
     names = re.findall(
         r"^(?:define|declare).*?@([\w.]+)", definitions(EVERYTHING), re.M
     )
@@ -154,7 +158,7 @@ def test_definitions_of_all_functions_define_each_once():
     assert {symbol(*key) for key in EVERYTHING} <= set(names)
 
 
-def test_sine_and_cosine_of_one_argument_are_one_call():
+def test_lanes_sine_and_cosine_of_one_argument_are_one_call():
     """LLVM merges the calls: the two cost what one does."""
     both = "\n".join(
         [
@@ -184,7 +188,7 @@ TRIPLES = [
 
 @pytest.mark.parametrize("width", [1, 2, 8])
 @pytest.mark.parametrize("triple", TRIPLES)
-def test_elementary_functions_on_any_platform_call_no_library(triple, width):
+def test_lanes_elementary_functions_on_any_platform_call_no_library(triple, width):
     """Nor is one needed by a processor without special instructions."""
     keys = [(op, dtype, width) for op in OPS for dtype in DTYPES]
     text = definitions(keys).replace("define internal", "define")
@@ -192,7 +196,7 @@ def test_elementary_functions_on_any_platform_call_no_library(triple, width):
 
 
 @pytest.mark.parametrize("triple", TRIPLES)
-def test_call_of_a_library_is_found(triple):
+def test_lanes_call_of_an_outside_library_is_detected(triple):
     text = """
         define double @other(double %x) {
           %y = call double @llvm.sin.f64(double %x)
@@ -223,12 +227,12 @@ def _parsed(text, triple):
     return module, machine
 
 
-def test_definition_of_one_function_is_complete():
+def test_lanes_definition_of_one_function_is_complete():
     for op in OPS:
         Native(definitions([(op, "float64", 2)]), [symbol(op, "float64", 2)])
 
 
-def test_elementary_function_without_formula_is_not_supported():
+def test_lanes_elementary_function_without_formula_is_not_supported():
     assert "sqrt" not in SUPPORTED
     with pytest.raises(KeyError):
         definitions([("lgamma", "float64", 4)])

@@ -82,7 +82,9 @@ def test_random_program_in_lanes_equals_jax(program, seed, width, batched):
 
 @pytest.mark.long
 @fuzzed(max(EXAMPLES // 4, 1))
-def test_random_program_with_arrays_in_memory_equals_jax(program, seed, width, batched):
+def test_lanes_random_program_with_arrays_in_memory_equals_jax(
+    program, seed, width, batched
+):
     names = [name for name in sys.modules if name.startswith("nhjax.lanes.")]
     with pytest.MonkeyPatch.context() as patch:
         # Nearly all arrays of these programs are large then, and copied in loops.

@@ -131,7 +131,7 @@ def in_header(struct):
 
 
 @pytest.mark.parametrize("struct", _ffi.STRUCTS)
-def test_ffi_fields_have_offsets_of_the_header(struct):
+def test_lanes_ffi_fields_have_offsets_of_the_header(struct):
     fields = _ffi.STRUCTS[struct]
     stores = "\n".join(
         f"""
@@ -153,7 +153,7 @@ def test_ffi_fields_have_offsets_of_the_header(struct):
         assert name == expected or name not in checked
 
 
-def test_ffi_arguments_have_sizes_of_the_header():
+def test_lanes_ffi_arguments_have_sizes_of_the_header():
     for struct in _ffi.STRUCTS:
         if not struct.endswith("_Args") or struct == "XLA_FFI_Args":
             continue
@@ -163,7 +163,7 @@ def test_ffi_arguments_have_sizes_of_the_header():
         assert size == ctypes.sizeof(in_header(struct))
 
 
-def test_handler_metadata_claims_the_lowest_version(program):
+def test_lanes_handler_metadata_claims_the_lowest_version(program):
     metadata = Runtime().metadata(program.handler)
     version = metadata.api_version
     assert (version.major_version, version.minor_version) == (0, 1)
@@ -172,7 +172,7 @@ def test_handler_metadata_claims_the_lowest_version(program):
 
 
 @pytest.mark.parametrize("members", [0, 1, WIDTH - 1, WIDTH, WIDTH + 1, 1001])
-def test_handler_without_helpers_runs_all_blocks(program, members):
+def test_lanes_handler_without_helpers_runs_all_blocks(program, members):
     runtime = Runtime(threads=4)
     program.triples(runtime, members)
     blocks = -(-members // WIDTH)
@@ -184,14 +184,14 @@ def test_handler_without_helpers_runs_all_blocks(program, members):
     assert program.held() == 0
 
 
-def test_handler_with_tasks_in_its_own_thread_finishes(program):
+def test_lanes_handler_with_tasks_in_its_own_thread_finishes(program):
     runtime = Runtime(threads=4, schedule=lambda task: task() is None)
     program.triples(runtime, 1001)
     assert runtime.offers == 3
     assert program.held() == 0
 
 
-def test_handler_with_tasks_in_threads_finishes(program):
+def test_lanes_handler_with_tasks_in_threads_finishes(program):
     threads = []
 
     def start(task):
@@ -208,7 +208,7 @@ def test_handler_with_tasks_in_threads_finishes(program):
     assert program.held() == 0
 
 
-def test_handler_with_pool_that_refuses_tasks_finishes(program):
+def test_lanes_handler_with_pool_that_refuses_tasks_finishes(program):
     runtime = Runtime(threads=4, schedule=lambda task: False)
     program.triples(runtime, 1001)
     # After the first refusal no more is asked; each error is destroyed.
@@ -218,7 +218,7 @@ def test_handler_with_pool_that_refuses_tasks_finishes(program):
     assert program.held() == 0
 
 
-def test_handler_without_pool_finishes(program):
+def test_lanes_handler_without_pool_finishes(program):
     runtime = Runtime(threads=None)
     program.triples(runtime, 1001)
     assert runtime.offers == 0
@@ -227,7 +227,7 @@ def test_handler_without_pool_finishes(program):
     assert program.held() == 0
 
 
-def test_handler_with_interface_without_pool_asks_no_helper(program):
+def test_lanes_handler_with_interface_without_pool_asks_no_helper(program):
     runtime = Runtime(threads=4)
     runtime.api.struct_size = ffi_runtime.STRUCTS[
         "XLA_FFI_Api"
@@ -237,14 +237,14 @@ def test_handler_with_interface_without_pool_asks_no_helper(program):
 
 
 @pytest.mark.parametrize("threads", [-1, 0, 1])
-def test_handler_with_pool_of_one_thread_asks_no_helper(program, threads):
+def test_lanes_handler_with_pool_of_one_thread_asks_no_helper(program, threads):
     runtime = Runtime(threads=threads)
     program.triples(runtime, 1001)
     assert runtime.offers == 0
 
 
 @pytest.mark.parametrize("others", [1, 2, 3, 7])
-def test_handler_with_busy_threads_asks_as_many_helpers_as_fit(program, others):
+def test_lanes_handler_with_busy_threads_asks_helpers_that_fit(program, others):
     runtime = Runtime(threads=4)
     WORKERS.value = others
     program.triples(runtime, 1001)
@@ -254,7 +254,7 @@ def test_handler_with_busy_threads_asks_as_many_helpers_as_fit(program, others):
     assert program.held() == 0
 
 
-def test_helper_with_too_many_threads_leaves(program):
+def test_lanes_helper_with_too_many_threads_returns(program):
     x, y = np.arange(1001.0), np.full(1001, -1.0)
     seen = []
 
@@ -273,7 +273,7 @@ def test_helper_with_too_many_threads_leaves(program):
     assert program.held() == 0
 
 
-def test_handler_before_first_call_asks_for_helpers():
+def test_lanes_handler_before_first_call_asks_for_helpers():
     runtime = Runtime(threads=4)
     program = Program()
     program.step.value = 1
@@ -281,7 +281,7 @@ def test_handler_before_first_call_asks_for_helpers():
     assert runtime.offers == 3
 
 
-def test_handler_of_short_program_asks_no_helper(program):
+def test_lanes_handler_of_short_program_asks_no_helper(program):
     program.step.value = 1_000
     program.triples(Runtime(threads=1), 1)
     runtime = Runtime(threads=8)
@@ -293,7 +293,7 @@ def test_handler_of_short_program_asks_no_helper(program):
     runtime.run_tasks()
 
 
-def test_handler_of_slower_call_asks_helpers_after_first_block(program):
+def test_lanes_handler_of_slower_call_asks_helpers_after_first_block(program):
     program.step.value = 1_000
     program.triples(Runtime(threads=1), 1)
     program.step.value = 1_000_000
@@ -305,7 +305,7 @@ def test_handler_of_slower_call_asks_helpers_after_first_block(program):
     runtime.run_tasks()
 
 
-def test_handler_with_wrong_number_of_arrays_returns_error(program):
+def test_lanes_handler_with_wrong_number_of_arrays_returns_error(program):
     runtime = Runtime()
     x, y = np.ones(3), np.zeros(3)
     error = runtime.call(program.handler, [x, x], [y])
@@ -315,7 +315,7 @@ def test_handler_with_wrong_number_of_arrays_returns_error(program):
     np.testing.assert_array_equal(y, 0.0)
 
 
-def test_handler_without_memory_for_job_returns_error():
+def test_lanes_handler_without_memory_for_job_returns_error():
     text = _handler.shared_handler_ir()
     declared = "declare ptr @malloc(i64)"
     assert declared in text
@@ -329,7 +329,7 @@ def test_handler_without_memory_for_job_returns_error():
     assert runtime.messages[error] == (8, "no memory to share a call's blocks")
 
 
-def test_handler_of_failed_block_returns_error():
+def test_lanes_handler_of_failed_block_returns_error():
     # The first block finds some.
     kernel = """
 define i1 @kernel(ptr %operands, ptr %results, i64 %first, i64 %last) {
@@ -351,7 +351,7 @@ define i1 @kernel(ptr %operands, ptr %results, i64 %first, i64 %last) {
     assert WORKERS.value == 0
 
 
-def test_handler_without_batch_runs_once():
+def test_lanes_handler_without_batch_runs_once():
     program = Program(is_batched=False)
     runtime = Runtime(threads=4)
     x, y = np.full(3, 2.0), np.zeros(3)
@@ -361,7 +361,7 @@ def test_handler_without_batch_runs_once():
     assert runtime.offers == 0
 
 
-def test_handler_without_results_does_nothing():
+def test_lanes_handler_without_results_does_nothing():
     kernel = "define i1 @kernel(ptr %operands, ptr %results, i64 %first, i64 %last) {"
     handler = _handler.handler_ir(1, 0, WIDTH, True)
     texts = [f"{kernel} unreachable }}", handler, _handler.shared_handler_ir()]

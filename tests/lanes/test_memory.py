@@ -20,7 +20,7 @@ from support.lanes_samples import (
 
 
 @WIDTHS
-def test_masked_store_leaves_other_members_unchanged(width):
+def test_lanes_masked_store_leaves_other_members_unchanged(width):
     def function(times, x):
         rows = jnp.full((60, 3), jnp.nan)
         return repeated(
@@ -31,7 +31,7 @@ def test_masked_store_leaves_other_members_unchanged(width):
 
 
 @WIDTHS
-def test_stores_in_branches_go_to_members_of_the_branch(width):
+def test_lanes_stores_in_branches_change_only_members_of_the_branch(width):
     def function(p, i, x):
         x = repeated(3, lambda k, x: x.at[k + i].add(1.0), x)
         x = lax.cond(p, lambda x: x.at[i].set(7.0), lambda x: x.at[i + 1].mul(3.0), x)
@@ -41,7 +41,7 @@ def test_stores_in_branches_go_to_members_of_the_branch(width):
 
 
 @WIDTHS
-def test_scatter_with_function_applies_it_at_an_index(width):
+def test_lanes_scatter_with_function_applies_it_at_an_index(width):
     def function(i, x):
         x = x.at[1].apply(jnp.sin)
         x = x.at[jnp.stack([i, i + 1])].apply(lambda x: 2 * x + 1, mode="drop")
@@ -52,7 +52,7 @@ def test_scatter_with_function_applies_it_at_an_index(width):
 
 
 @WIDTHS
-def test_array_updated_twice_keeps_both_versions(width):
+def test_lanes_array_updated_twice_keeps_both_versions(width):
     def function(i, x):
         changed = x.at[i].set(7.0)
         again = changed.at[i + 1].set(8.0)
@@ -62,7 +62,7 @@ def test_array_updated_twice_keeps_both_versions(width):
 
 
 @WIDTHS
-def test_array_used_after_loop_is_not_changed_by_it(width):
+def test_lanes_array_used_after_loop_is_not_changed_by_it(width):
     def function(x):
         def body(k, state):
             old, new = state
@@ -77,7 +77,7 @@ def test_array_used_after_loop_is_not_changed_by_it(width):
 
 
 @WIDTHS
-def test_arrays_swapped_in_loop_keep_their_values(width):
+def test_lanes_arrays_swapped_in_loop_keep_their_values(width):
     def function(times, x, y):
         def body(k, state):
             x, y, z = state
@@ -89,7 +89,7 @@ def test_arrays_swapped_in_loop_keep_their_values(width):
 
 
 @WIDTHS
-def test_scan_rows_of_changing_array_keep_their_values(width):
+def test_lanes_scan_rows_of_changing_array_keep_their_values(width):
     def function(i, x):
         def step(x, k):
             return x.at[k + i].add(1.0), x
@@ -100,7 +100,7 @@ def test_scan_rows_of_changing_array_keep_their_values(width):
 
 
 @WIDTHS
-def test_large_arrays_are_copied_by_loops(width):
+def test_lanes_large_arrays_in_loops_are_copied(width):
     def function(i, x):
         whole = jnp.concatenate([x, x[::-1] * 2, jnp.zeros((3, 60))])
         part = lax.dynamic_slice(whole, (i, i), (4, 50)).T
@@ -111,7 +111,7 @@ def test_large_arrays_are_copied_by_loops(width):
 
 
 @WIDTHS
-def test_constant_array_at_divergent_index_is_read(width):
+def test_lanes_constant_array_at_divergent_index_is_read(width):
     table = np.sin(np.linspace(0, 3, 400))
 
     def function(i, x):
@@ -125,7 +125,7 @@ def test_constant_array_at_divergent_index_is_read(width):
 
 
 @WIDTHS
-def test_shared_operands_in_memory_are_read(width):
+def test_lanes_shared_operands_in_memory_are_read(width):
     def function(x, table, i):
         return jnp.asarray(table)[i] + x, table, x * table.sum()
 
@@ -140,7 +140,7 @@ def test_shared_operands_in_memory_are_read(width):
 
 
 @WIDTHS
-def test_operand_that_is_a_result_is_copied(width):
+def test_lanes_operand_that_is_a_result_is_copied(width):
     def function(x, y, z):
         return y, x, x, z, z.at[3].set(1.0)
 
@@ -148,7 +148,7 @@ def test_operand_that_is_a_result_is_copied(width):
 
 
 @WIDTHS
-def test_arrays_without_elements(width):
+def test_lanes_arrays_without_elements_in_memory_equal_jax(width):
     def function(x):
         nothing = x[:0]
         carry, rows = lax.scan(lambda c, y: (c + y, c), x, jnp.zeros((0, 3)))
@@ -166,7 +166,7 @@ def test_arrays_without_elements(width):
 
 
 @WIDTHS
-def test_scratch_memory_larger_than_stack_is_allocated(width):
+def test_lanes_scratch_memory_larger_than_stack_is_allocated(width):
     def function(i, x):
         rows = jnp.zeros((3000, 3))
         rows = repeated(40, lambda k, rows: rows.at[i + k].set(x), rows)

@@ -29,7 +29,7 @@ TARGETS = {
 
 
 @pytest.mark.parametrize("name", TARGETS)
-def test_kernel_and_handler_compile_for_each_platform(name):
+def test_lanes_kernel_and_handler_compile_for_each_platform(name):
     target, register = TARGETS[name]
     texts = [VECTORS, _handler.handler_ir(1, 1, 8, True), _handler.shared_handler_ir()]
     made = texts, _handler.HANDLER, target
@@ -40,7 +40,7 @@ def test_kernel_and_handler_compile_for_each_platform(name):
 
 
 @pytest.mark.parametrize("cpu", ["skylake-avx512", "sapphirerapids", "znver4"])
-def test_kernel_with_avx512_uses_512_bit_vectors(cpu):
+def test_lanes_kernel_with_avx512_uses_512_bit_vectors(cpu):
     """These prefer vectors of 256 bits for what the compiler makes vectors of."""
     machine = _native.Target(LINUX, cpu)
     text = _native.assembly([VECTORS], "kernel", machine)
@@ -48,13 +48,13 @@ def test_kernel_with_avx512_uses_512_bit_vectors(cpu):
     assert "%ymm" not in text
 
 
-def test_kernel_with_fma_contracts_products_and_sums():
+def test_lanes_kernel_with_fma_contracts_products_and_sums():
     for name, has_fma in [("x86-64", False), ("x86-64-v3", True), ("aarch64", True)]:
         text = _native.assembly([VECTORS], "kernel", TARGETS[name][0])
         assert bool(re.search(r"\bvfmadd|\bfmla", text)) == has_fma
 
 
-def test_host_width_equals_elements_of_vector_registers():
+def test_lanes_host_width_equals_elements_of_vector_registers():
     width = lanes.host_width(jnp.float64)
     assert width in (2, 4, 8)
     assert lanes.host_width(jnp.float32) == 2 * width
@@ -68,20 +68,22 @@ def run(*command):
     return subprocess.run(command, capture_output=True, text=True, check=True).stdout
 
 
-def test_compiler_on_this_machine_is_available():
+def test_lanes_compiler_on_this_machine_is_available():
     assert lanes.is_available()
 
 
 @pytest.mark.parametrize(
     ("system", "machine"), [("win32", "AMD64"), ("linux", "riscv64"), ("linux", "i686")]
 )
-def test_compiler_on_other_platforms_is_not_available(monkeypatch, system, machine):
+def test_lanes_compiler_on_other_platforms_is_not_available(
+    monkeypatch, system, machine
+):
     monkeypatch.setattr(_native.sys, "platform", system)
     monkeypatch.setattr(_native.platform, "machine", lambda: machine)
     assert not _native.is_available.__wrapped__()
 
 
-def test_package_without_llvmlite_runs_without_compiler():
+def test_lanes_import_without_llvmlite_has_no_compiler():
     """Nor does the import of nhjax import llvmlite where it is."""
     out = run(sys.executable, lane_processes.__file__, "without_llvmlite")
     assert out == "imported: False available: False\n"

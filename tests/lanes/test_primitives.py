@@ -234,7 +234,7 @@ _INEXACT = """
 """.split()  # noqa: SIM905
 
 
-def test_primitives_that_kernels_contain_have_cases():
+def test_lanes_primitives_in_kernels_all_have_cases():
     names = [
         *_jaxprs.ELEMENTWISE,
         *_jaxprs._REDUCING,
@@ -281,19 +281,19 @@ def _assert_close(got, expected, is_inexact, message):
         (lambda x: jnp.tile(x, 9000) * jnp.arange(27000.0), "one by one"),
     ],
 )
-def test_unsupported_program_raises_with_reason(function, reason):
+def test_lanes_unsupported_program_raises_with_reason(function, reason):
     with pytest.raises(Unsupported, match=reason):
         lanes_run.run_batched(function, 4, np.ones((2, 3)))
 
 
-def test_program_with_too_many_nodes_raises(monkeypatch):
+def test_lanes_program_with_too_many_nodes_raises(monkeypatch):
     monkeypatch.setattr(_program, "MOST_NODES", 100)
     lanes_run.run_batched(lambda x: jnp.sin(x), 4, np.ones((2, 10)))
     with pytest.raises(Unsupported, match="more than 120 operations"):
         lanes_run.run_batched(lambda x: jnp.outer(x, x), 4, np.ones((2, 20)))
 
 
-def test_primitive_with_unknown_parameters_is_named():
+def test_lanes_primitive_with_unknown_parameters_is_named():
     program = jax.make_jaxpr(lambda x: lax.rev(x, (0,)))(np.zeros(3))
     (equation,) = program.eqns
     params = {f"{key}_elsewhere": value for key, value in equation.params.items()}
@@ -303,7 +303,7 @@ def test_primitive_with_unknown_parameters_is_named():
         _program.build_graph(program.replace(jaxpr=jaxpr))
 
 
-def test_program_with_effects_raises():
+def test_lanes_program_with_effects_raises():
     def function(x):
         jax.debug.print("{}", x)
         return x

@@ -35,7 +35,7 @@ print("works alone")
 """
 
 
-def test_modules_of_the_compiler_import_nothing_else_of_nhjax():
+def test_lanes_modules_import_no_other_module_of_nhjax():
     outside = [
         f"{found.importer}:{found.line} -> {found.imported}"
         for found in IMPORTS
@@ -45,13 +45,13 @@ def test_modules_of_the_compiler_import_nothing_else_of_nhjax():
     assert outside == []
 
 
-def test_compiler_without_nhjax_compiles_and_runs():
+def test_lanes_compiler_without_nhjax_compiles_and_runs():
     command = [sys.executable, "-c", ALONE, str(FOLDER)]
     run = subprocess.run(command, capture_output=True, text=True, check=False)
     assert run.stdout == "works alone\n", run.stderr
 
 
-def test_chains_of_imports_in_the_compiler_have_at_most_five_modules():
+def test_lanes_import_chains_have_at_most_five_modules():
     # The door is the first module of a chain.
     assert 1 + rooms.num_floors(IMPORTS, "lanes") <= 5
 
@@ -59,7 +59,7 @@ def test_chains_of_imports_in_the_compiler_have_at_most_five_modules():
 README = (FOLDER / "README.md").read_text(encoding="utf-8")
 
 
-def test_readme_of_the_compiler_names_functions_that_exist():
+def test_lanes_readme_names_functions_that_exist():
     stops = re.findall(r"^\| `(_\w+)\.py` \| `([\w.]+)` \|", README, re.MULTILINE)
     assert len(stops) > 15
     for file, name in stops:
@@ -68,7 +68,7 @@ def test_readme_of_the_compiler_names_functions_that_exist():
         assert re.search(pattern, SOURCES[f"lanes.{file}"], re.MULTILINE), name
 
 
-def test_readme_of_the_compiler_has_an_example_that_runs(capsys):
+def test_lanes_readme_example_runs(capsys):
     (example,) = re.findall(r"```python\n(.*?)```", README, re.DOTALL)
     expected = re.search(r"# (\[.*\])", example)
     exec(example, {})
@@ -76,7 +76,7 @@ def test_readme_of_the_compiler_has_an_example_that_runs(capsys):
     assert capsys.readouterr().out.strip() == expected[1]
 
 
-def test_readme_of_the_compiler_quotes_the_ir_of_its_example():
+def test_lanes_readme_quotes_the_ir_of_its_example():
     (example,) = re.findall(r"```python\n(.*?)```", README, re.DOTALL)
     space = {}
     exec(example, space)
@@ -88,7 +88,7 @@ def test_readme_of_the_compiler_quotes_the_ir_of_its_example():
         assert line.split("...")[0] in text
 
 
-def test_readme_of_the_compiler_lists_all_its_files_and_functions():
+def test_lanes_readme_lists_all_files_and_functions():
     files = {module.removeprefix("lanes.") for module in SOURCES if "lanes." in module}
     last = README[README.index("## The files") :]
     assert files <= set(re.findall(r"`(_\w+)`", last))

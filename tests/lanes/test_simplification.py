@@ -11,7 +11,7 @@ from support.lanes_samples import (
 )
 
 
-def test_product_with_zero_of_data_keeps_nan():
+def test_lanes_product_with_zero_of_data_keeps_nan():
     def function(x):
         return x * 0.0, x - x, 0.0 / x, x + 0.0
 
@@ -24,7 +24,7 @@ def test_product_with_zero_of_data_keeps_nan():
         np.testing.assert_array_equal(*signs)
 
 
-def test_product_with_structural_zero_is_removed():
+def test_lanes_product_with_structural_zero_is_removed():
     def function(x):
         return jnp.pad(x, (1, 1)) * jnp.concatenate([x, x])[:5] + jnp.zeros(5)
 
@@ -34,7 +34,7 @@ def test_product_with_structural_zero_is_removed():
     assert text.count("fadd") == 0
 
 
-def test_unused_operations_are_removed():
+def test_lanes_unused_operations_are_removed():
     def function(x):
         unused = repeated(5, lambda k, y: jnp.sin(y), x)
         return x * 2, (unused, x)[1]
@@ -45,7 +45,7 @@ def test_unused_operations_are_removed():
     assert "nhjax.sin" not in text
 
 
-def test_loop_invariant_operations_are_hoisted():
+def test_lanes_loop_invariant_operations_are_hoisted():
     def function(x):
         return repeated(5, lambda k, y: y + jnp.sin(x), x)
 
@@ -56,7 +56,7 @@ def test_loop_invariant_operations_are_hoisted():
     assert call < loop
 
 
-def test_nested_loops_are_built_in_linear_time():
+def test_lanes_nested_loops_are_built_in_linear_time():
     """A loop is made anew when a number turns out not to be constant, but once."""
     depth, made = 6, []
 

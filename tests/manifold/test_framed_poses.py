@@ -34,7 +34,7 @@ def assert_frame_belongs_to_angle(g):
 
 @with_retractions
 @pytest.mark.parametrize("size", [1e-9, 0.1, 1.0, 2.5])
-def test_framed_pose_after_act_has_the_frame_of_its_angle(group, size):
+def test_group_framed_pose_after_act_has_the_frame_of_its_angle(group, size):
     moved = group.act(framed(group, POSE), size * XI)
     np.testing.assert_allclose(moved.pose, group.act(POSE, size * XI), atol=1e-15)
     assert_frame_belongs_to_angle(moved)
@@ -44,7 +44,7 @@ def test_framed_pose_after_act_has_the_frame_of_its_angle(group, size):
 
 
 @with_retractions
-def test_framed_pose_tangent_is_its_derivative(group):
+def test_group_framed_pose_tangent_equals_its_derivative(group):
     place, eta = framed(group, POSE), jnp.array([0.2, 0.5, -1.1])
     tangent = group.tangent(place, eta)
     np.testing.assert_allclose(tangent.pose, group.tangent(POSE, eta), atol=1e-15)
@@ -54,7 +54,7 @@ def test_framed_pose_tangent_is_its_derivative(group):
 
 
 @with_retractions
-def test_framed_pose_left_gradient_equals_pose_gradient(group):
+def test_group_framed_pose_left_gradient_equals_pose_gradient(group):
     def function(q):
         x, y, angle = unframed(q)
         return x**2 * jnp.sin(angle) + y * jnp.cos(2 * angle)
@@ -64,7 +64,7 @@ def test_framed_pose_left_gradient_equals_pose_gradient(group):
     np.testing.assert_allclose(found, plain, rtol=0, atol=2e-15)
 
 
-def test_framed_pose_in_a_product_group_replaces_each_pose():
+def test_group_product_with_framed_poses_replaces_each_pose():
     group = ProductGroup(SO3(), ProductGroup(SE2(), Euclidean(2)))
     xi = jnp.linspace(-0.4, 0.5, group.dim)
     q = (jnp.array([0.6, 0.0, 0.8, 0.0]), (POSE, jnp.array([0.1, 0.2])))
@@ -77,7 +77,7 @@ def test_framed_pose_in_a_product_group_replaces_each_pose():
             np.testing.assert_allclose(ours, theirs, rtol=0, atol=1e-15)
 
 
-def test_framed_element_without_planar_poses_is_unchanged():
+def test_group_element_without_planar_poses_is_unchanged_by_framing():
     q = jnp.array([0.6, 0.0, 0.8, 0.0])
     assert framed(SO3(), q) is q
     assert unframed(q) is q

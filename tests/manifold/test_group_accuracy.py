@@ -278,7 +278,7 @@ def test_group_maps_in_single_precision_keep_dtype(group):
     assert distance(single.astype(float), double) < 1e-6
 
 
-def test_group_is_flat_only_without_curvature():
+def test_group_without_curvature_is_flat():
     assert Euclidean(2).is_flat
     assert SO2(Exponential()).is_flat
     assert ProductGroup(Euclidean(2), SO2(Exponential())).is_flat

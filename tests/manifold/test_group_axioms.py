@@ -86,7 +86,7 @@ def test_group_local_of_opposite_quaternions_is_equal(retraction):
 
 
 @over(SIMPLE)
-def test_retraction_agrees_with_the_matrix_function(group):
+def test_group_retraction_agrees_with_the_matrix_function(group):
     xi = chart(group)
     matrix = batched(lambda x: group.matrix(group.retract(x)))(xi)
     hat = np.asarray(batched(group.hat)(xi))
@@ -95,7 +95,7 @@ def test_retraction_agrees_with_the_matrix_function(group):
 
 
 @over(SIMPLE)
-def test_retraction_of_tiny_vectors_keeps_relative_accuracy(group):
+def test_group_retraction_of_tiny_vectors_keeps_relative_accuracy(group):
     xi = 1e-200 * directions(group, range(4), 5)
     back = batched(lambda x: group.local(group.retract(x)))(xi)
     np.testing.assert_allclose(back, xi, rtol=1e-14)

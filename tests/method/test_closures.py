@@ -53,7 +53,7 @@ def test_stability_at_infinity_of_classical_tableaux_is_exact():
 
 
 @pytest.mark.parametrize("s", STAGES)
-def test_multiplier_order_of_each_closure_is_the_theoretical_one(s: int):
+def test_multiplier_order_of_each_closure_equals_theory(s: int):
     assert LobattoIIIAB(s, "propagated").multiplier_order == (
         s if s % 2 == 0 else s - 1
     )

@@ -58,7 +58,7 @@ def test_order_in_exact_rationals_of_lobatto_pair_with_three_stages_is_four():
     assert order_of(a, b) == 4
 
 
-def test_order_in_exact_rationals_of_equal_distances_is_two():
+def test_order_in_exact_rationals_of_equidistant_nodes_is_two():
     # Nodes 0, 1/3, 2/3, 1: the quadrature and the collocation have order 4.
     a = exact(
         [
@@ -105,7 +105,7 @@ def test_order_with_constraints_agrees_with_runs(name):
 
 
 @pytest.mark.long
-def test_order_with_constraints_without_collocation_is_what_runs_show():
+def test_order_with_constraints_without_collocation_agrees_with_runs():
     # The proof in docs/closures.md is about collocation.
     b = [1 / 6, 2 / 3, 1 / 6]
     a = [[0, 0, 0], [0.2, 0.4, -0.1], b]

@@ -5,7 +5,7 @@ import numpy as np
 from support.pages import run_page
 
 
-def test_sympy_page_when_its_code_runs_gives_the_printed_results():
+def test_sympy_page_code_when_run_gives_the_printed_results():
     namespace = run_page("sympy")
     sol, model = namespace["sol"], namespace["model"]
     assert sol.coordinates == ("x", "y", "θ")

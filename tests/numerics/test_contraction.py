@@ -92,7 +92,7 @@ def test_small_einsum_of_wrong_shapes_raises():
         small_einsum("ij,jk->ik", jnp.ones((2, 1)), jnp.ones((3, 2)))
 
 
-def test_small_products_of_jaxpr_are_written_out():
+def test_small_products_of_jaxpr_are_expanded():
     def function(x, y):
         inner = jax.jit(lambda x: x @ y)
         batch = jnp.einsum("bij,bjk->bki", inner(x), y)
@@ -132,7 +132,7 @@ def test_derivative_of_inverse_equals_formula():
     np.testing.assert_allclose(np.sum(gradient * rate), expected, rtol=1e-12)
 
 
-def test_sum_over_members_of_batch_is_not_written_out():
+def test_sum_over_members_of_batch_is_not_expanded():
     """The gradient by an operand that all members share has a term for each member."""
     matrix, vectors = jnp.ones((40, 40)), jnp.arange(40000.0).reshape(1000, 40)
 

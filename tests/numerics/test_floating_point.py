@@ -26,7 +26,7 @@ def test_largest_column_of_matrices_contains_their_largest_number(columns, dtype
     np.testing.assert_allclose(value, max_norm(*matrices), rtol=lost)
 
 
-def test_largest_column_with_infinity_or_nan_is_the_column_of_that_number():
+def test_largest_column_with_infinity_or_nan_is_its_column():
     matrix = jnp.asarray([[1.0, -jnp.inf, 2.0]])
     value, column = largest_column(matrix)
     assert (float(value), int(column)) == (float("inf"), 1)
@@ -37,7 +37,7 @@ def test_largest_column_with_infinity_or_nan_is_the_column_of_that_number():
     assert float(value) == 0.0
 
 
-def test_uneven_perturbations_have_the_size_of_the_numbers_and_do_not_cancel():
+def test_uneven_perturbations_have_the_size_of_the_numbers():
     q = (jnp.full(3, -2.0), jnp.full((2, 2), 2.0))
     changes = uneven_perturbations(q)
     assert [x.shape for x in changes] == [(3,), (2, 2)]

@@ -29,14 +29,14 @@ def circling(rate, angle, units):
 
 @pytest.mark.parametrize("angle", [0.7, 1.4, 1.9, 2.6])
 @pytest.mark.parametrize("rate", [0.3, 0.5, 0.7])
-def test_iteration_that_spirals_is_not_stopped_as_noise(rate, angle):
+def test_iteration_that_spirals_converges(rate, angle):
     solved = circling(rate, angle, 400)
     assert solved.converged
     # What is left of the error is of the size of what is believed to be noise.
     assert float(jnp.max(jnp.abs(solved.x))) < 100 * np.finfo(float).eps / (1 - rate)
 
 
-def test_iteration_ends_with_increments_that_are_noise():
+def test_iteration_with_increments_of_noise_ends():
     def sweep(k):
         # Some 150 units of round-off, with both signs.
         return k + 1, UpdateNorms(150 * 2.2e-16 * (1.5 + jnp.sin(k))), None

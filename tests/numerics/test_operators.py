@@ -297,7 +297,7 @@ def test_absolute_of_inverse_of_springs_in_a_row_is_exact():
 
 
 @pytest.mark.parametrize("size", [1, 2, 5, 30])
-def test_definite_matrices_are_told_from_indefinite_ones(size):
+def test_definite_matrices_are_distinguished_from_indefinite_ones(size):
     numbers = np.random.default_rng(size)
     for _ in range(20):
         q, _ = np.linalg.qr(numbers.normal(size=(size, size)))
@@ -318,7 +318,7 @@ def test_definite_matrices_are_told_from_indefinite_ones(size):
         pytest.param([1.0, 0.0], False, id="singular"),
     ],
 )
-def test_definite_diagonal_matrix_has_entries_of_one_sign(diagonal, expected):
+def test_diagonal_matrix_with_entries_of_one_sign_is_definite(diagonal, expected):
     assert bool(DiagonalMatrix(jnp.array(diagonal)).is_definite()) is expected
 
 
@@ -394,7 +394,7 @@ def class_queries(text, names):
 
 
 @pytest.mark.parametrize("room", ["_step", "_system", "_initial", "_analysis"])
-def test_no_room_asks_for_class_of_operator(room):
+def test_operator_class_is_not_queried_by_other_rooms(room):
     found = [
         f"{path.name}:{line}"
         for path in (PACKAGE / room).rglob("*.py")
@@ -403,7 +403,7 @@ def test_no_room_asks_for_class_of_operator(room):
     assert found == []
 
 
-def test_only_file_of_operators_asks_for_their_class():
+def test_operator_class_is_queried_only_in_its_own_file():
     asking = {
         path.name
         for path in PACKAGE.rglob("*.py")
@@ -421,5 +421,5 @@ def test_only_file_of_operators_asks_for_their_class():
         "isinstance(x, (int, jax.Array))",
     ],
 )
-def test_query_for_class_of_operator_is_found(text):
+def test_operator_class_query_in_source_is_detected(text):
     assert class_queries(text, CLASSES | ARRAYS) == [1]

@@ -54,7 +54,7 @@ def test_slow_iteration_of_stages_is_not_accepted():
         swing(stage_solver=nhjax.SimplifiedNewton(fallback=False), throw=True)
 
 
-def test_diverging_iteration_of_stages_has_result_of_its_own():
+def test_diverging_iteration_of_stages_returns_divergence_result():
     sol = swing(dt=3.0, stage_solver=nhjax.SimplifiedNewton(fallback=False))
     assert sol.result == RESULTS.nonlinear_divergence
     assert int(sol.stats["num_iterations"]) < 100
@@ -115,7 +115,7 @@ def test_message_of_step_unsolved_by_newton_does_not_recommend_newton(solver):
     assert "if all forces are smooth, try 0.015" in message
 
 
-def test_friction_smoothed_as_message_says_brings_body_to_rest():
+def test_friction_smoothed_as_the_message_advises_stops_the_body():
     system = nhjax.LagrangianSystem(
         lambda t, q, v, args: 0.5 * v @ v,
         force=lambda t, q, v, args: -jnp.tanh(v / 0.01),
@@ -134,7 +134,7 @@ def test_friction_smoothed_as_message_says_brings_body_to_rest():
     assert abs(float(sol.ys.v[0, 0])) < 1e-10
 
 
-def test_num_newton_steps_of_plain_call_without_need_is_zero():
+def test_num_newton_steps_of_run_without_fallback_is_zero():
     assert int(swing(dt=0.1).stats["num_newton_steps"]) == 0
 
 
@@ -180,7 +180,7 @@ def test_newton_with_round_off_magnified_by_stiff_forces_accepts_steps():
         np.testing.assert_allclose(sol.ys.q[0, 0] - 1, 1e-5 * np.cos(phase), atol=1e-6)
 
 
-def test_fallback_that_is_not_a_flag_raises():
+def test_fallback_that_is_not_a_bool_raises():
     with pytest.raises(TypeError, match="`fallback` must be True or False"):
         nhjax.SimplifiedNewton(fallback="no")  # pyright: ignore[reportArgumentType]
 
@@ -220,7 +220,7 @@ def test_accepted_steps_from_random_starts_are_solved(name):
     ("name", "stages"),
     [("KnifeEdge", 2), long("Appell", 3), long("SphericalPendulum", 4)],
 )
-def test_accepted_steps_near_rest_are_solved_and_none_is_refused(name, stages):
+def test_accepted_steps_near_rest_are_all_solved(name, stages):
     rows = list(near_rest.near_rest(name, stages, near_rest.examples()[name], 1))
     assert sum(row["accepted"] for row in rows) > 100
     assert sum(row["accepted judged"] for row in rows) > 0

@@ -52,7 +52,7 @@ def slope_of(function, coarse=32):
 
 
 @every_method
-def test_simplifying_assumptions_hold_up_to_their_orders_and_no_further(name):
+def test_simplifying_assumptions_hold_exactly_up_to_their_orders(name):
     m = METHODS[name]
     a, a_hat, b, c, s, r = m.a, m.a_hat, m.b, m.c, m.stages, m.r
     assert r >= 0
@@ -71,7 +71,7 @@ def test_simplifying_assumptions_hold_up_to_their_orders_and_no_further(name):
 
 
 @every_method
-def test_kernel_is_the_slope_of_the_node_polynomial_and_orthogonal_to_degree_r(name):
+def test_kernel_equals_node_polynomial_slope_and_is_orthogonal(name):
     m = METHODS[name]
     w = m.kernel
     slopes = [np.prod([x - y for y in np.delete(m.c, i)]) for i, x in enumerate(m.c)]
@@ -83,7 +83,7 @@ def test_kernel_is_the_slope_of_the_node_polynomial_and_orthogonal_to_degree_r(n
 
 
 @pytest.mark.parametrize("s", range(2, 9))
-def test_kernel_of_lobatto_is_the_legendre_polynomial_at_the_nodes(s):
+def test_kernel_of_lobatto_equals_legendre_polynomial_at_the_nodes(s):
     m = METHODS[f"Lobatto, s = {s}"]
     assert (m.p, m.r) == (2 * s - 2, s - 2)
     c = in_digits(m).c
@@ -118,7 +118,7 @@ OPERATIONS = {f.__name__: f for f in (multiplied, integrated, preimages)}
 
 @every_method
 @pytest.mark.parametrize("operation", OPERATIONS)
-def test_operation_keeps_the_class_and_gains_no_more(operation, name):
+def test_operation_on_error_class_keeps_the_class_sharply(operation, name):
     m = METHODS[name]
     sharp = False
     for l in range(m.r + 1, 2 * m.r + 2):
@@ -134,7 +134,7 @@ def test_operation_keeps_the_class_and_gains_no_more(operation, name):
 
 
 @every_method
-def test_solution_of_the_constraints_is_unique_up_to_the_kernel(name):
+def test_solution_of_constraints_is_unique_up_to_the_kernel(name):
     m = METHODS[name]
     x = m.member(m.r + 1, 0)
     g = m.c * (m.a @ x)
@@ -145,7 +145,7 @@ def test_solution_of_the_constraints_is_unique_up_to_the_kernel(name):
 
 
 @every_method
-def test_defects_of_the_exact_motion_are_in_the_class(name):
+def test_defects_of_the_exact_motion_are_in_the_error_class(name):
     m = METHODS[name]
     for k in range(m.r + 1, 2 * m.r + 3):
         assert m.contains(k, m.defect(k, conjugate=True))
@@ -158,7 +158,7 @@ def test_defects_of_the_exact_motion_are_in_the_class(name):
 
 
 @pytest.mark.parametrize("name", ["Lobatto, s = 3", "Lobatto, s = 5", "quarters"])
-def test_moments_of_smooth_data_have_the_slopes_of_the_class(name):
+def test_moments_of_smooth_data_have_slopes_of_the_error_class(name):
     m = in_digits(METHODS[name])
     r, zero = m.r, MP.mpf(0)
     parts = [m.member(k, 10 + k) for k in range(2 * r + 4)]
@@ -199,7 +199,7 @@ def assert_stage_errors_are_in_the_class(m, errors):
 
 
 @every_stages
-def test_errors_of_a_symmetric_step_are_in_the_class_and_its_end_is_exact(s):
+def test_errors_of_a_symmetric_step_are_in_the_error_class(s):
     m = lobatto(s)
     errors = at_two_sizes(lambda h: steps.Step(m, h, (-1) ** s).errors())
     assert_stage_errors_are_in_the_class(m, errors)
@@ -235,7 +235,7 @@ def test_symmetric_closure_on_other_nodes_has_an_unknown_of_order_r_plus_2(name)
 
 
 @pytest.mark.parametrize("s", [3, long(4)])
-def test_multiplier_at_the_start_may_be_wrong_by_the_power_s_minus_1(s):
+def test_multiplier_error_at_start_of_order_s_minus_1_keeps_end_order(s):
     # One power less in it costs one power at the end.
     m = lobatto(s)
 
@@ -251,7 +251,7 @@ def test_multiplier_at_the_start_may_be_wrong_by_the_power_s_minus_1(s):
 
 
 @pytest.mark.parametrize("s", [2, 3, long(4)])
-def test_symmetric_step_is_the_same_from_far_starting_values(s):
+def test_symmetric_step_from_far_starting_values_is_the_same(s):
     m = lobatto(s)
     step = steps.Step(m, MP.mpf(1) / 32, (-1) ** s)
     *_, multipliers, nu, x = step.solve()
@@ -281,7 +281,7 @@ def differences(s, first, second):
 
 
 @every_stages
-def test_sensitivity_to_the_first_multiplier_is_of_order_s_and_its_square_of_order_3(s):
+def test_sensitivity_to_first_multiplier_has_orders_s_and_3(s):
     both = differences(s, MP.mpf(10) ** -18, MP.mpf(10) ** -9)
     coarse, fine = at_two_sizes(both)
     linear, quadratic = (
@@ -292,7 +292,7 @@ def test_sensitivity_to_the_first_multiplier_is_of_order_s_and_its_square_of_ord
 
 
 @pytest.mark.parametrize("s", [4, long(5)])
-def test_first_multiplier_wrong_by_a_constant_changes_the_end_by_the_power_3(s):
+def test_multiplier_error_at_start_that_is_constant_has_order_3_at_end(s):
     m, wrong = lobatto(s), np.array([MP.mpf("0.3"), MP.mpf("-0.2")])
 
     def change(h):
@@ -307,7 +307,7 @@ def test_first_multiplier_wrong_by_a_constant_changes_the_end_by_the_power_3(s):
 
 @every_stages
 @pytest.mark.parametrize("chart", ["start", "middle"])
-def test_two_quadratures_of_a_step_on_a_group_are_consistent(chart, s):
+def test_quadratures_of_a_step_on_a_group_are_consistent(chart, s):
     m = lobatto(s)
     errors = at_two_sizes(lambda h: steps.turn_errors(m, h, (-1) ** s, chart))
     assert_stage_errors_are_in_the_class(m, errors)
@@ -351,7 +351,7 @@ def fresh_start():
 
 
 @pytest.mark.parametrize("s", [long(2), 3, long(4)])
-def test_step_of_the_library_is_the_step_in_50_digits(s):
+def test_step_of_the_library_equals_step_in_50_digits(s):
     h = 0.125
     Q, _, _, _, p, _, _, _, _ = steps.Step(lobatto(s), MP.mpf(h), (-1) ** s).solve()
     y = nhjax.step(FRESH, nhjax.LobattoIIIAB(s), T0, h, fresh_start())
@@ -360,7 +360,7 @@ def test_step_of_the_library_is_the_step_in_50_digits(s):
 
 
 @pytest.mark.parametrize("chart", [long("start"), "middle"])
-def test_step_of_the_library_on_a_group_is_the_step_in_50_digits(chart):
+def test_step_of_the_library_on_a_group_equals_step_in_50_digits(chart):
     group, h, s = nhjax.SO3(), 0.125, 3
     inertia = jnp.array(steps.INERTIA.astype(float))
 
@@ -411,7 +411,7 @@ def reduced(t, q, v):
         ],
     ),
 )
-def test_order_on_the_fresh_system_is_2s_minus_2(s, closure):
+def test_order_on_an_independent_system_is_2s_minus_2(s, closure):
     counts = {2: (32, 64, 128), 3: (16, 32, 64), 4: (12, 16, 24), 5: (8, 12)}[s]
     method = nhjax.LobattoIIIAB(s, closure)
     errors = {"q": [], "p": [], "multiplier": []}

@@ -85,7 +85,7 @@ def run(example, stages, dt, **solver):
     )(example.initial_state())
 
 
-def test_first_order_terms_in_large_steps_of_sleigh_solve_what_leading_part_does_not():
+def test_first_order_terms_solve_large_steps_where_leading_part_fails():
     sleigh = systems.ChaplyginSleigh()
     leading = run(sleigh, 5, 0.5, jacobian="leading")
     assert leading.result == nhjax.RESULTS.nonlinear_max_iterations
@@ -180,7 +180,7 @@ def test_first_order_terms_with_forces_of_infinite_slope_solve_steps(force, like
     np.testing.assert_allclose(sol.ys.v, leading.ys.v, rtol=0, atol=1e-13)
 
 
-def test_first_order_terms_that_are_not_available_raise():
+def test_first_order_terms_that_are_unavailable_raise():
     wrong: Any = "exact"
     with pytest.raises(ValueError, match="jacobian must be one of 'leading'"):
         nhjax.SimplifiedNewton(jacobian=wrong)

@@ -85,7 +85,7 @@ def body(form, retraction):
         long("hamiltonian", "cayley", "middle"),
     ],
 )
-def test_step_equations_with_frames_are_those_of_plain_positions(
+def test_group_step_equations_with_frames_equal_plain_positions(
     form, retraction, chart
 ):
     system, y0 = body(form, retraction)
@@ -128,7 +128,7 @@ class WithAMomentum(nhjax.LagrangianSystem):
 
 
 @pytest.mark.parametrize("own", ["group", "system"])
-def test_system_functions_of_a_subclass_with_frames_receive_plain_positions(own):
+def test_group_subclass_functions_with_frames_receive_plain_positions(own):
     kind = WithAMomentum if own == "system" else nhjax.LagrangianSystem
 
     def run(kind, group):

@@ -384,7 +384,7 @@ def test_cvt_energy_with_fractional_number_of_steps_rounds_it():
     assert len(result.runs[0].times) == 1 + round(40 / math.pi)
 
 
-def test_envelope_of_oscillation_with_nan_bounds_every_finite_value():
+def test_envelope_of_oscillation_with_nan_bounds_all_finite_values():
     times = np.linspace(0.0, 1.0, 1003)
     values = np.sin(300.0 * times)
     values[500] = np.nan

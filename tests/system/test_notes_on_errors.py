@@ -210,7 +210,7 @@ def test_note_on_forgotten_args_names_hamiltonian():
         ((1.0,), TypeError, "Here `args` is a tuple of 1."),
     ],
 )
-def test_note_on_other_args_says_what_they_are(args, exception, advice):
+def test_note_on_wrong_args_describes_them(args, exception, advice):
     with pytest.raises(exception) as error:
         started(FREE, args)
     assert note_of(error).endswith(advice)
@@ -279,7 +279,7 @@ def test_note_on_partial_function_names_the_function_inside():
     assert place_of(lagrangian) in note_of(error)
 
 
-def test_note_on_error_of_own_function_leaves_message_alone():
+def test_note_on_error_of_own_function_keeps_the_message():
     def lagrangian(t, q, v, args):
         raise RuntimeError("my own words")
 

@@ -65,7 +65,7 @@ def lanes(request):
     return request.param, runs(SQUEEZER, request.param, COUNTS, END)
 
 
-def test_acceleration_and_multiplier_are_those_of_the_published_equations():
+def test_acceleration_and_multiplier_equal_published_equations():
     rng = np.random.default_rng(0)
     for _ in range(6):
         q = np.asarray(SQUEEZER.q0) + rng.normal(size=7)
@@ -74,7 +74,7 @@ def test_acceleration_and_multiplier_are_those_of_the_published_equations():
         assert_motion(found, andrews.motion(q, v), 1e-12)
 
 
-def test_initial_values_are_the_published_ones():
+def test_squeezer_initial_values_equal_published_ones():
     np.testing.assert_allclose(andrews.constraints(SQUEEZER.q0), 0, rtol=0, atol=1e-16)
     found = library_motion(SQUEEZER, 0.0, SQUEEZER.q0, SQUEEZER.v0)
     expected = [*PUBLISHED_ACCELERATION, 0, 0, 0, 0, 0]
@@ -106,7 +106,7 @@ def test_published_solution_has_nine_digits(reference):
     np.testing.assert_allclose(reference["v"], PUBLISHED_V, rtol=6e-8)
 
 
-def test_published_end_has_six_digits_of_the_acceleration_and_multiplier():
+def test_published_end_has_six_digits_of_acceleration_and_multiplier():
     # By the published equations, at the published angles and velocities.
     q, v = np.array(PUBLISHED_Q), np.array(PUBLISHED_V)
     acceleration, multiplier = andrews.motion(q, v)
@@ -129,7 +129,7 @@ def test_constraints_hold_to_round_off_along_a_run(lanes):
         np.testing.assert_allclose(andrews.jacobian(q) @ v, 0, rtol=0, atol=5e-12)
 
 
-def test_energy_is_the_work_of_the_motor(lanes):
+def test_energy_gain_equals_the_work_of_the_motor(lanes):
     stages, found = lanes
     lane = found.lanes[-1]
     balance = [
@@ -144,7 +144,7 @@ def test_energy_is_the_work_of_the_motor(lanes):
     assert drift < (3e-4 if stages == 2 else 2e-9), drift
 
 
-def test_points_lie_on_the_bodies():
+def test_squeezer_points_lie_on_the_bodies():
     points = SQUEEZER.points(0.0, SQUEEZER.q0)
     bars = {("O", "K1"): 7e-3, ("K1", "P"): 28e-3, ("B", "P"): 35e-3, ("A", "K5"): 4e-2}
     bars |= {("K5", "P"): 2e-2, ("A", "K7"): 4e-2, ("K7", "P"): 2e-2}
@@ -155,7 +155,7 @@ def test_points_lie_on_the_bodies():
     np.testing.assert_array_equal(points["C"], [0.014, 0.072])
 
 
-def test_system_in_single_precision_stays_in_it():
+def test_system_in_single_precision_keeps_dtype():
     assert_single_precision(SQUEEZER)
 
 
@@ -169,6 +169,6 @@ def test_system_in_single_precision_stays_in_it():
         ({"stiffness": 0.0}, r"`stiffness` must be positive, got 0"),
     ],
 )
-def test_parameter_out_of_range_is_named(parameters, message):
+def test_squeezer_parameter_out_of_range_raises(parameters, message):
     with pytest.raises(ValueError, match=message):
         AndrewsSqueezer(**parameters)

@@ -93,7 +93,7 @@ def random_balls(ball, number):
 
 
 @over(BALLS)
-def test_accelerations_and_forces_are_those_of_newton_and_euler(ball):
+def test_accelerations_and_forces_equal_newton_euler(ball):
     oracle, balls = newton_euler(ball), list(random_balls(ball, 10))
     q, v = stack([(ball.q0, ball.v0) for ball in balls])
     slope, multiplier, violation = accelerations(ball.system, q, v)
@@ -137,7 +137,7 @@ def test_run_converges_with_method_order(found):
 
 
 @pytest.mark.long
-def test_constraints_hold_to_round_off_and_moving_energy_stays(found):
+def test_constraints_hold_to_round_off_and_moving_energy_is_conserved(found):
     ball = BALLS["paraboloid"]
     # Of 2 J; the coarsest runs take four times the duration.
     largest = (2e-6, 1e-7, 6e-9)
@@ -147,7 +147,7 @@ def test_constraints_hold_to_round_off_and_moving_energy_stays(found):
 
 
 @over(BALLS)
-def test_invariants_are_constant_by_the_independent_equations(ball):
+def test_invariants_are_constant_by_independent_equations(ball):
     moving = BallInBowl.rolling(
         (0.4, -0.2),
         (0.7, 0.9),
@@ -173,7 +173,7 @@ def test_invariants_are_constant_by_the_independent_equations(ball):
     assert np.ptp(energies) > 1e-3, "the bowl does no work"
 
 
-def test_flat_bowl_equals_the_turntable():
+def test_ball_in_flat_bowl_equals_ball_on_turntable():
     table = TurntableBall.rolling((0.4, -0.2), (0.7, 0.9), 2.0, radius=0.1, rate=1.3)
     ball = BallInBowl.rolling((0.4, -0.2), (0.7, 0.9), 2.0, curvature=0.0, rate=1.3)
     x, w, R = newton_euler(ball).trajectory(*start_of(ball), [1.5])
@@ -193,7 +193,7 @@ CIRCLING = {
 
 
 @over(CIRCLING)
-def test_accelerations_are_those_of_the_steady_circle(ball):
+def test_accelerations_on_steady_circle_are_exact(ball):
     rate = float(ball.v0[4] / ball.q0[1][0])
     q, v = stack([(ball.q0, ball.v0)])
     slope, _, _ = accelerations(ball.system, q, v)
@@ -206,7 +206,7 @@ def test_accelerations_are_those_of_the_steady_circle(ball):
 
 
 @pytest.mark.long
-def test_runs_stay_on_the_circle_to_the_order_of_the_method():
+def test_run_on_steady_circle_converges_with_method_order():
     ball = CIRCLING["paraboloid"]
 
     def errors_at(t, y, _):
@@ -219,7 +219,7 @@ def test_runs_stay_on_the_circle_to_the_order_of_the_method():
 
 
 @pytest.mark.parametrize("shape", ["paraboloid", "sphere"])
-def test_small_circles_have_the_frequencies_of_small_oscillations(shape):
+def test_ball_on_small_circle_has_frequency_of_oscillations(shape):
     k, a, kappa, rate, g = 0.4, 0.1, 1.5, 1.0, 9.81
     frequency = 2.1
     ball = BallInBowl.circling(1e-5, frequency, shape=shape)
@@ -230,7 +230,7 @@ def test_small_circles_have_the_frequencies_of_small_oscillations(shape):
     assert np.polyval(terms, frequency) == pytest.approx(0.0, abs=1e-8 * size)
 
 
-def test_points_are_on_the_ball_and_on_the_bowl():
+def test_bowl_points_are_on_the_ball_and_on_the_bowl():
     ball = BALLS["paraboloid"]
     points = ball.points(0.0, ball.q0)
     assert set(points) == {"centre", "contact", "pole"}
@@ -276,6 +276,6 @@ def test_system_computes_in_precision_of_the_state():
         ),
     ],
 )
-def test_parameter_out_of_range_is_named(build, message):
+def test_ball_in_bowl_parameter_out_of_range_raises(build, message):
     with pytest.raises(ValueError, match=message):
         build()

@@ -18,7 +18,7 @@ GAINS = np.array([-3.0, 5.0])
 STEERED = LeanToSteer(*GAINS)
 
 
-def test_rider_steering_into_the_fall_applies_its_torque():
+def test_rider_that_steers_into_the_fall_adds_its_torque():
     parameters = oracle.BENCHMARK
 
     def found(*where):
@@ -36,7 +36,7 @@ def test_rider_steering_into_the_fall_applies_its_torque():
     np.testing.assert_allclose(acceleration, linear, rtol=1e-6)
 
 
-def test_default_lean_to_steer_stabilises_slow_running():
+def test_rider_with_default_gains_stabilises_slow_bicycle():
     gains = (float(LeanToSteer().lean_gain), float(LeanToSteer().lean_rate_gain))
     for speed in (2.0, 3.0, 4.0, 5.0, 6.0):
         steered = oracle.linear_motion(oracle.BENCHMARK, speed, gains)
@@ -115,21 +115,21 @@ def checks(stages):
 
 @pytest.mark.long
 @each_bicycle
-def test_constraints_hold_in_a_run_of_five_seconds(stages):
+def test_constraints_in_a_run_of_five_seconds_hold(stages):
     _, slip, depth, _ = checks(stages)
     np.testing.assert_allclose(slip, 0.0, atol=2e-13)
     np.testing.assert_allclose(depth, 0.0, atol=2e-15)
 
 
 @pytest.mark.long
-def test_energy_stays_in_a_run_of_five_seconds():
+def test_energy_in_a_run_of_five_seconds_is_conserved():
     energy, _, _, start = checks(3)
     # The library of benchmarks allows 1e-5.
     assert np.max(np.abs(energy / start - 1)) < 5e-7
 
 
 @pytest.mark.long
-def test_energy_equals_the_work_of_the_rider():
+def test_energy_gain_equals_the_work_of_the_rider():
     bicycle = BICYCLES[2]
     q, v, _ = reference(2)
     power = np.array([rider(0.0, *x) * x[1][5] for x in zip(q, v, strict=True)])

@@ -36,7 +36,7 @@ EIGENVALUES = (
 WEAVE, CAPSIZE = 4.29238253634111, 6.02426201538837
 
 
-def test_linear_equations_of_the_oracle_equal_meijaards():
+def test_linear_equations_of_the_oracle_equal_published_ones():
     for matrix, printed in zip(
         oracle.canonical(oracle.BENCHMARK), MATRICES, strict=True
     ):
@@ -96,13 +96,13 @@ def printed_eigenvalues():
 
 
 @pytest.mark.long
-def test_eigenvalues_are_those_of_table_2_of_meijaard(multipliers):
+def test_eigenvalues_of_the_bicycle_equal_published_ones(multipliers):
     found = multipliers(np.arange(11.0), 0.015)
     np.testing.assert_allclose(found, printed_eigenvalues(), rtol=0, atol=2e-12)
 
 
 @pytest.mark.long
-def test_small_steps_have_derivatives_also_at_rest(multipliers):
+def test_eigenvalues_of_small_steps_equal_published_ones(multipliers):
     # At rest the derivatives of multipliers are smaller than their round-off, which
     # grows like 1 / h.
     found = multipliers(np.arange(11.0), 0.004)

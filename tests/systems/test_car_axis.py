@@ -47,7 +47,7 @@ def found():
     return runs(AXIS, 3, COUNTS, END)
 
 
-def test_acceleration_and_multiplier_follow_newtons_equations():
+def test_acceleration_and_multiplier_equal_newtons_equations():
     rng = np.random.default_rng(0)
     for _ in range(6):
         t, y = rng.uniform(0, 2), START[:4] + 0.3 * rng.normal(size=4)
@@ -56,7 +56,7 @@ def test_acceleration_and_multiplier_follow_newtons_equations():
         assert_motion(found, (acceleration, multiplier), 1e-13)
 
 
-def test_other_equations_reproduce_the_published_solution(reference):
+def test_independent_equations_reproduce_the_published_solution(reference):
     np.testing.assert_allclose(reference["q"], PUBLISHED_Q, rtol=0, atol=2e-12)
     np.testing.assert_allclose(reference["v"], PUBLISHED_V, rtol=0, atol=2e-11)
     # The published multiplier is not that of the published state beyond 1e-10.
@@ -88,7 +88,7 @@ def test_constraints_hold_to_round_off_along_a_run(found):
     np.testing.assert_allclose(along, 0.0, rtol=0, atol=1e-15)
 
 
-def test_energy_is_the_work_of_the_road(found, reference):
+def test_energy_gain_equals_the_work_of_the_road(found, reference):
     end = found.lanes[-1]
     gained = AXIS.energy(END, jnp.asarray(end.q[-1]), jnp.asarray(end.v[-1]))
     gained = gained - AXIS.energy(0.0, AXIS.q0, AXIS.v0)
@@ -96,7 +96,7 @@ def test_energy_is_the_work_of_the_road(found, reference):
     assert gained == pytest.approx(reference["work"], rel=0, abs=bound)
 
 
-def test_level_axle_of_other_parameters_is_consistent():
+def test_level_axle_with_other_parameters_is_consistent():
     axis = CarAxis.level(length=1.3, rest_length=0.4, amplitude=0.2, rate=7.0)
     assert axis.initial_state().multiplier.shape == (2,)
     published = CarAxis.level()
@@ -104,7 +104,7 @@ def test_level_axle_of_other_parameters_is_consistent():
     np.testing.assert_array_equal(published.v0, AXIS.v0)
 
 
-def test_points_are_those_of_wheels_and_ends():
+def test_car_axis_points_are_at_wheels_and_ends():
     t = 0.1
     points = AXIS.points(t, AXIS.q0)
     wheel = 0.1 * np.sin(1.0)
@@ -118,7 +118,7 @@ def test_car_axis_has_no_invariants():
     assert AXIS.invariants(0.0, AXIS.q0, AXIS.v0) == {}
 
 
-def test_system_in_single_precision_stays_in_it():
+def test_system_in_single_precision_keeps_dtype():
     assert_single_precision(AXIS)
 
 
@@ -134,6 +134,6 @@ def test_system_in_single_precision_stays_in_it():
         ({"q0": (0.0,)}, r"`q0` must have shape \(4,\)"),
     ],
 )
-def test_parameter_out_of_range_is_named(parameters, message):
+def test_car_axis_parameter_out_of_range_raises(parameters, message):
     with pytest.raises(ValueError, match=message):
         CarAxis(**parameters)

@@ -45,7 +45,7 @@ def some_car(num_trailers, seed, same_trailers=False):
     ("num_trailers", "seed", "same"),
     [(0, 1, False), (3, 2, False), (3, 3, False), (2, 4, True)],
 )
-def test_accelerations_and_forces_of_the_ground_are_those_of_the_reduced_equations(
+def test_accelerations_and_ground_forces_equal_reduced_equations(
     num_trailers, seed, same
 ):
     car = some_car(num_trailers, seed, same)
@@ -63,7 +63,7 @@ def test_accelerations_and_forces_of_the_ground_are_those_of_the_reduced_equatio
 
 
 @pytest.mark.parametrize("speed", [4.0, -1.5])
-def test_velocity_of_a_speed_and_a_steer_rate_does_not_slip(speed):
+def test_velocity_from_speed_and_steer_rate_does_not_slip(speed):
     car = some_car(3, 5)
     v = car.velocity(car.q0, speed, 0.4)
     slips = car.constraint(0.0, car.q0, v, None)
@@ -76,7 +76,7 @@ def test_velocity_of_a_speed_and_a_steer_rate_does_not_slip(speed):
 
 
 @pytest.mark.parametrize("steer", [0.4, -0.25, 0.0])
-def test_turning_car_keeps_moving_on_circles(steer):
+def test_car_in_a_turn_moves_on_circles(steer):
     car = CarWithTrailers.turning(
         3, 6.0, steer, trailer_length=(3.0, 2.0, 4.0), trailer_hitch=(1.0, 0.0, 0.5)
     )
@@ -154,7 +154,7 @@ def test_energy_equals_the_work_of_the_controls():
     assert end - energy[0] == pytest.approx(work, rel=1e-6)
 
 
-def test_without_controls_both_invariants_stay_and_no_axle_slips():
+def test_invariants_without_controls_are_conserved_and_no_axle_slips():
     car = driven()
     _, states, _ = runs(3, free=True)
     q, v = states.q[0], states.v[0]
@@ -184,7 +184,7 @@ def test_system_computes_in_precision_of_the_state(dtype):
     assert {value.dtype for value in values} == {jnp.dtype(dtype)}
 
 
-def test_points_lie_along_the_train():
+def test_car_points_lie_along_the_train():
     car = CarWithTrailers(2, q0=(1.0, 2.0, 0.0, 0.3, 0.0, np.pi / 2))
     expected = {
         "rear_axle": (1.0, 2.0),
@@ -232,6 +232,6 @@ def test_gradients_in_every_parameter_are_not_zero():
         (lambda: CarWithTrailers(v0=(0.0,) * 4), r"`v0` must have shape \(5,\)"),
     ],
 )
-def test_parameter_out_of_range_is_named(build, message):
+def test_car_parameter_out_of_range_raises(build, message):
     with pytest.raises(ValueError, match=message):
         build()

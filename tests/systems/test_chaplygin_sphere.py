@@ -58,7 +58,7 @@ def found():
 
 
 @pytest.mark.parametrize("ball", SPHERES.values(), ids=SPHERES)
-def test_accelerations_and_forces_are_those_of_newton_and_euler(ball):
+def test_accelerations_and_forces_equal_newton_euler(ball):
     states = list(random_states(20, tilt=3.0))
     assert_newton_and_euler(ball, newton_euler(ball), states, accelerations)
 
@@ -72,7 +72,7 @@ def test_run_converges_with_method_order(found):
 
 
 @pytest.mark.long
-def test_order_is_the_same_against_chaplygins_equations(found):
+def test_run_converges_to_chaplygins_equations_with_method_order(found):
     ball = SPHERES["default"]
     field, velocity = chaplygin(ball)
     q0, v0 = ball.q0, ball.v0
@@ -89,7 +89,7 @@ def test_order_is_the_same_against_chaplygins_equations(found):
 
 
 @pytest.mark.long
-def test_constraints_hold_to_round_off_and_invariants_stay(found):
+def test_constraints_hold_to_round_off_and_invariants_are_conserved(found):
     # Of 2 to 14 in SI units; the coarsest runs take four times the duration.
     largest = (1e-5, 5e-7, 3e-8)
     assert np.max(found.violation) < 1e-13
@@ -97,7 +97,7 @@ def test_constraints_hold_to_round_off_and_invariants_stay(found):
         assert np.all(drift < largest), (name, drift)
 
 
-def test_invariants_are_constant_by_the_independent_equations():
+def test_invariants_are_constant_by_independent_equations():
     ball = SPHERES["small"].rolling((0.7, -0.3, 0.5, 0.4), (1.0, -2.0, 3.0))
     start = np.asarray(ball.q0[:4]), np.asarray(ball.v0[3:])
     first = ball.invariants(0.0, ball.q0, ball.v0)
@@ -115,7 +115,7 @@ def test_invariants_are_constant_by_the_independent_equations():
             assert value == pytest.approx(expected, abs=1e-12)
 
 
-def test_points_are_on_the_sphere_and_on_the_plane():
+def test_chaplygin_sphere_points_are_on_the_sphere_and_plane():
     ball = SPHERES["small"].rolling((0.7, -0.3, 0.5, 0.4), (1.0, 0.0, 0.0), (0.5, 0.2))
     points = ball.points(0.0, ball.q0)
     assert set(points) == {"centre", "contact", "pole_1", "pole_2", "pole_3"}
@@ -148,6 +148,6 @@ def test_system_computes_in_precision_of_the_state():
         ),
     ],
 )
-def test_parameter_out_of_range_is_named(build, message):
+def test_chaplygin_sphere_parameter_out_of_range_raises(build, message):
     with pytest.raises(ValueError, match=message):
         build()

@@ -36,7 +36,7 @@ def found():
 
 
 @pytest.mark.parametrize("top", TOPS.values(), ids=TOPS)
-def test_accelerations_and_forces_are_those_of_newton_and_euler(top):
+def test_accelerations_and_forces_equal_newton_euler(top):
     states = list(random_states(20, tilt=3.0))
     assert_newton_and_euler(top, newton_euler(top), states, accelerations)
 
@@ -50,7 +50,7 @@ def test_run_converges_with_method_order(found):
 
 
 @pytest.mark.long
-def test_constraints_hold_to_round_off_and_energy_stays(found):
+def test_constraints_hold_to_round_off_and_energy_is_conserved(found):
     # Of 12 J; the coarsest runs take four times the duration.
     largest = (3e-6, 2e-7, 1e-8)
     assert np.max(found.violation) < 1e-13
@@ -58,7 +58,7 @@ def test_constraints_hold_to_round_off_and_energy_stays(found):
     assert np.all(drift < largest), drift
 
 
-def test_integrals_of_routh_are_constant_by_the_independent_equations():
+def test_invariants_of_routh_by_independent_equations_are_constant():
     top = TOPS["Routh"]
     oracle, moments = newton_euler(top), np.asarray(top.moments)
     jellett, routh = map(float, top.integrals_of_routh(top.q0, top.v0))
@@ -77,7 +77,7 @@ def test_integrals_of_routh_are_constant_by_the_independent_equations():
 
 
 @pytest.mark.long
-def test_runs_keep_the_integrals_of_routh_at_least_to_the_order_of_the_method(found):
+def test_invariant_errors_of_routh_converge_with_method_order(found):
     top = TOPS["Routh"]
     start = np.array(top.integrals_of_routh(top.q0, top.v0))
     errors = []
@@ -90,7 +90,7 @@ def test_runs_keep_the_integrals_of_routh_at_least_to_the_order_of_the_method(fo
     assert np.all(orders > 3.7), (orders, errors)
 
 
-def test_without_offset_it_is_chaplygins_sphere():
+def test_chaplygin_top_without_offset_equals_chaplygin_sphere():
     numbers = (1.6, 0.3), ((0.05, 0.03, 0.07), 3.0)
     top = ChaplyginTop(*numbers[0], 0.0, *numbers[1])
     ball = ChaplyginSphere(*numbers[0], *numbers[1])
@@ -103,7 +103,7 @@ def test_without_offset_it_is_chaplygins_sphere():
         np.testing.assert_allclose(one, other, rtol=0, atol=1e-12)
 
 
-def test_points_are_on_the_sphere_and_on_the_plane():
+def test_chaplygin_top_points_are_on_the_sphere_and_on_the_plane():
     top = TOPS["uneven"].rolling((0.7, -0.3, 0.5, 0.4), (1.0, 0.0, 0.0), (0.5, 0.2))
     points = top.points(0.0, top.q0)
     assert set(points) == {"centre_of_mass", "centre", "contact", "pole"}
@@ -138,6 +138,6 @@ def test_system_computes_in_precision_of_the_state():
         (lambda: ChaplyginTop(offset=0.1).initial_state(), "constraint"),
     ],
 )
-def test_parameter_out_of_range_is_named(build, message):
+def test_chaplygin_top_parameter_out_of_range_raises(build, message):
     with pytest.raises(ValueError, match=message):
         build()

@@ -43,7 +43,7 @@ def found():
     return runs(RIGID, 3, COUNTS, END)
 
 
-def test_rigid_governor_accelerates_by_kanes_equations():
+def test_rigid_governor_acceleration_equals_kanes_equations():
     rng = np.random.default_rng(0)
     for _ in range(6):
         turn, spin, rate, torque = rng.normal(size=4) * [1, 4, 2, 3]
@@ -54,7 +54,7 @@ def test_rigid_governor_accelerates_by_kanes_equations():
         assert_motion(found, expected, 1e-11)
 
 
-def test_published_springs_accelerate_the_governor_by_kanes_equations():
+def test_elastic_governor_acceleration_equals_kanes_equations():
     rng = np.random.default_rng(1)
     for _ in range(6):
         q = np.asarray(SPRUNG.q0) + 0.1 * rng.normal(size=4)
@@ -70,7 +70,7 @@ def test_run_converges_with_method_order(found, reference, name):
     assert_order(4, COUNTS, found.errors(name, reference[name]))
 
 
-def test_couplers_keep_their_length_along_a_run(found):
+def test_governor_couplers_keep_their_length_along_a_run(found):
     assert max(found.violations) < 1e-14
     lane = found.lanes[0]
     for q in lane.q[::6]:
@@ -80,7 +80,7 @@ def test_couplers_keep_their_length_along_a_run(found):
             assert np.linalg.norm(coupler) == pytest.approx(0.55, rel=1e-14)
 
 
-def test_energy_and_momentum_are_conserved(found):
+def test_energy_and_momentum_of_the_governor_are_conserved(found):
     lane = found.lanes[-1]
     values = invariants(RIGID, lane.t, lane.q, lane.v)
     start = RIGID.invariants(0.0, RIGID.q0, RIGID.v0)
@@ -98,7 +98,7 @@ def test_energy_and_momentum_are_conserved(found):
 
 
 @pytest.mark.long
-def test_stiff_springs_and_a_motor_move_as_kanes_equations_say():
+def test_governor_with_stiff_springs_and_motor_moves_by_kanes_equations():
     def field(_, y):
         q, v = np.split(y, 2)
         a = governor.sprung_acceleration(SPRUNG_PARAMETERS, q, v, TORQUE)
@@ -120,7 +120,7 @@ def test_stiff_springs_and_a_motor_move_as_kanes_equations_say():
     np.testing.assert_allclose(gained, TORQUE * lane.t, rtol=0, atol=1e-12)
 
 
-def test_default_is_the_published_start():
+def test_governor_defaults_equal_the_published_start():
     data = FlyballGovernor.turning(np.pi / 6, 2 * np.pi)
     published = FlyballGovernor()
     np.testing.assert_allclose(data.q0, published.q0, rtol=0, atol=2e-16)
@@ -128,7 +128,7 @@ def test_default_is_the_published_start():
     assert published.initial_state().multiplier.shape == (2,)
 
 
-def test_points_are_those_of_hinges_and_balls():
+def test_governor_points_are_at_hinges_and_balls():
     points = FlyballGovernor().points(0.0, FlyballGovernor().q0)
     np.testing.assert_allclose(points["hinge_2"], [-0.05, 0.0, 1.0], atol=1e-16)
     ball = [0.05 + np.sqrt(0.75), 0.0, 0.5]
@@ -136,7 +136,7 @@ def test_points_are_those_of_hinges_and_balls():
 
 
 @pytest.mark.parametrize("example", [RIGID, SPRUNG], ids=["rods", "springs"])
-def test_system_in_single_precision_stays_in_it(example):
+def test_system_in_single_precision_keeps_dtype(example):
     assert_single_precision(example)
 
 
@@ -149,11 +149,11 @@ def test_system_in_single_precision_stays_in_it(example):
         ({"couplers": "ropes"}, r'`couplers` must be "rods" or "springs", got \'ropes'),
     ],
 )
-def test_parameter_out_of_range_is_named(parameters, message):
+def test_governor_parameter_out_of_range_raises(parameters, message):
     with pytest.raises(ValueError, match=message):
         FlyballGovernor(**parameters)
 
 
-def test_couplers_too_short_for_the_shaft_raise():
+def test_governor_with_too_short_couplers_raises():
     with pytest.raises(ValueError, match=r"`coupler_length` 0\.3 does not reach"):
         FlyballGovernor.turning(0.1, 1.0, coupler_length=0.3)

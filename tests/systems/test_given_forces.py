@@ -33,7 +33,7 @@ MACHINES = {
 
 
 @pytest.mark.parametrize(("example", "forces", "same"), MACHINES.values(), ids=MACHINES)
-def test_force_args_are_accepted_in_their_shape_only(example, forces, same):
+def test_force_args_of_right_shape_change_the_force(example, forces, same):
     def force(args):
         return example.force(0.0, example.q0, example.v0, args)
 

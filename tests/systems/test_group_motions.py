@@ -36,7 +36,7 @@ from support.group_oracle import (
 )
 
 
-def test_unicycle_is_the_same_on_the_group_and_in_coordinates():
+def test_unicycle_on_the_group_equals_unicycle_in_coordinates():
     unicycle = Unicycle(1.3, 0.4, 2.0, q0=(0.3, -1.0, 2.0), v0=(-0.7, 0.0, 0.6))
     planar = unicycle.in_coordinates()
     assert_close(planar.on_group(), unicycle, rtol=0, atol=1e-15)
@@ -49,7 +49,7 @@ def test_unicycle_is_the_same_on_the_group_and_in_coordinates():
         assert values[name] == pytest.approx(float(value), abs=1e-14)
 
 
-def test_rolling_disc_is_the_vertical_rolling_disc():
+def test_rolling_disc_on_the_group_equals_vertical_rolling_disc():
     disc = SOLVED["rolling disc wide"]
     q, v, multiplier = disc.in_coordinates().exact(1.7)
     (pose, roll), _, body_multiplier = disc.exact(1.7)
@@ -59,7 +59,7 @@ def test_rolling_disc_is_the_vertical_rolling_disc():
     np.testing.assert_allclose(body_multiplier, [0.0, pull], rtol=0, atol=1e-14)
 
 
-def test_centred_ball_turns_in_closed_form():
+def test_ball_circling_the_origin_turns_in_closed_form():
     # For a circle about the origin R = exp(κt ê₃) exp(t (ω₀ - κ e₃)^) R₀.
     rate, moment, t = 1.2, 0.4, 2.3
     kappa = moment * rate / (1 + moment)
@@ -76,7 +76,7 @@ def test_centred_ball_turns_in_closed_form():
 
 
 @pytest.mark.parametrize("frame", ["space", "body"])
-def test_homogeneous_ball_has_the_papers_first_integrals(frame):
+def test_homogeneous_ball_conserves_first_integrals_of_the_paper(frame):
     ball = TurntableBall.rolling((0.7, 0.1), (-0.3, 0.5), 0.4, frame=frame)
     a, r, rate = 0.4, 0.5, 1.2
     start = ball.first_integrals(ball.q0, ball.v0)
@@ -91,7 +91,7 @@ def test_homogeneous_ball_has_the_papers_first_integrals(frame):
     assert ours == pytest.approx(float(papers), abs=1e-14)
 
 
-def test_contact_momentum_is_the_papers_first_integrals():
+def test_contact_momentum_equals_first_integrals_of_the_paper():
     ball = SOLVED["ball tilted"]
     a, r = 0.4, 0.8
     spin, east, north = ball.first_integrals(ball.q0, ball.v0)
@@ -102,7 +102,7 @@ def test_contact_momentum_is_the_papers_first_integrals():
         assert values[name] == pytest.approx(float(value), abs=1e-14)
 
 
-def test_readings_of_the_ball_differ_for_unequal_moments_only():
+def test_ball_in_space_and_body_frame_differs_if_moments_differ():
     def end(moments, frame):
         ball = TurntableBall.rolling(
             (0.5, -0.2), (0.4, 0.3), 0.7, moments=moments, frame=frame
@@ -114,7 +114,7 @@ def test_readings_of_the_ball_differ_for_unequal_moments_only():
     assert np.max(np.abs(end(uneven, "space") - end(uneven, "body"))) > 1e-2
 
 
-def test_heavy_tops_move_alike():
+def test_heavy_top_on_se3_moves_as_on_so3():
     on_so3, on_se3 = GALLERY["heavy top skew"], GALLERY["heavy top skew on SE(3)"]
     quaternion, omega, _, _ = oracle(on_so3, 2.0)
     pose, velocity, pivot_force, _ = oracle(on_se3, 2.0)
@@ -140,11 +140,11 @@ def test_lagranges_top_conserves_its_axis_momentum(top):
     assert top.v0[-1] == pytest.approx(v[-1], abs=1e-11)
 
 
-def test_default_tops_are_the_same():
+def test_heavy_top_defaults_on_so3_and_se3_agree():
     assert_close(HeavyTop().on_se3(), HeavyTopSE3(), rtol=0, atol=1e-16)
 
 
-def test_double_pendulum_moves_like_the_one_in_angles():
+def test_double_pendulum_on_the_group_moves_as_in_angles():
     (m1, m2), (l1, l2), g = (1.0, 0.4), (0.8, 1.3), 2.0
     pendulum = GALLERY["double pendulum uneven"]
 
@@ -169,7 +169,7 @@ def test_double_pendulum_moves_like_the_one_in_angles():
     np.testing.assert_allclose(v, expected.v0, rtol=0, atol=1e-11)
 
 
-def test_rod_sleigh_with_a_straight_blade_is_chaplygins():
+def test_rod_sleigh_with_straight_blade_equals_chaplygin_sleigh():
     rod = SOLVED["rod sleigh straight blade"]
     sleigh = ChaplyginSleigh(1.5, 1.0 * 0.5 / 1.5, 0.5 / 1.5)
     q, v, multiplier = rod.exact(3.0)
@@ -210,7 +210,7 @@ def rod_sleigh_in_reduced_coordinates(sleigh, t):
 @pytest.mark.parametrize(
     "name", ["rod sleigh", "rod sleigh straight blade", "rod sleigh backwards"]
 )
-def test_rod_sleigh_moves_like_the_one_in_reduced_coordinates(name):
+def test_rod_sleigh_moves_as_in_reduced_coordinates(name):
     sleigh = SOLVED[name]
     x, y, angle, speed, turn_rate = rod_sleigh_in_reduced_coordinates(sleigh, 3.0)
     expected = RodSleigh.sliding(
@@ -266,7 +266,7 @@ def test_suslov_ends_in_a_steady_rotation():
         (lambda: RodSleigh(mass2=0.0), r"`mass2` must be positive, got 0"),
     ],
 )
-def test_parameter_out_of_range_is_named(build, message):
+def test_group_system_parameter_out_of_range_raises(build, message):
     with pytest.raises(ValueError, match=message):
         build()
 
@@ -287,6 +287,6 @@ def test_parameter_out_of_range_is_named(build, message):
         (RodSleigh.sliding(1.0, 1.0, angle=np.pi / 2), r"`angle` must not be a right"),
     ],
 )
-def test_exact_solution_names_the_data_it_cannot_solve(example, message):
+def test_exact_solution_of_unsupported_data_raises(example, message):
     with pytest.raises(ValueError, match=message):
         example.exact(1.0)

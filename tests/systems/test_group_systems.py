@@ -54,7 +54,7 @@ def test_exact_solution_agrees_with_the_index_reduced_ode(example, t):
 
 
 @over(SOLVED)
-def test_exact_velocity_is_the_derivative_of_the_exact_position(example):
+def test_exact_velocity_equals_derivative_of_exact_position(example):
     # A long time, where quadratures and linear flows take many panels.
     t, h = 40.0, 1e-3
     q = {k: ravel_pytree(example.exact(t + k * h)[0])[0] for k in (-2, -1, 1, 2)}
@@ -90,7 +90,7 @@ def test_initial_data_satisfy_the_constraints(example):
 
 
 @over(KINDS)
-def test_initial_state_carries_the_multiplier_of_the_continuous_system(example):
+def test_initial_state_has_the_multiplier_of_the_continuous_system(example):
     y0 = example.initial_state()
     expected = acceleration_and_multiplier(example.system, example.q0, example.v0)[1]
     np.testing.assert_allclose(y0.multiplier, expected, rtol=1e-12, atol=1e-13)
@@ -144,7 +144,7 @@ def test_parameters_are_leaves_of_the_system(example):
         HeavyTopSE3,
     ],
 )
-def test_retraction_is_that_of_the_manifold(kind, retraction):
+def test_retraction_of_a_group_example_is_set_in_its_manifold(kind, retraction):
     manifold = kind(retraction=retraction).system.manifold
     factors = getattr(manifold, "factors", (manifold,))
     assert factors[0].retraction == retraction

@@ -33,11 +33,11 @@ from nhjax.systems import (
         (lambda: Rattleback(product=5e-4), "No body has `moments`"),
     ],
 )
-def test_data_without_a_motion_raise(make, message):
+def test_gallery_data_without_a_motion_raise(make, message):
     with pytest.raises(ValueError, match=message):
         make()
 
 
-def test_rider_without_a_torque_adds_no_force():
+def test_rider_without_torque_adds_no_force():
     bicycle = WhippleBicycle(steering=SteerTorque())
     assert float(bicycle.force(0.0, bicycle.q0, bicycle.v0, None)[5]) == 0.0

@@ -157,7 +157,7 @@ def found(case):
     return runs(case.example, 3, COUNTS, END, case.args)
 
 
-def test_free_board_accelerates_by_the_reduced_equations():
+def test_free_snakeboard_accelerates_by_reduced_equations():
     rng = np.random.default_rng(0)
     for _ in range(5):
         place, s, rates, torques = rng.normal(size=3), *(rng.normal(size=(3, 3)))
@@ -169,7 +169,7 @@ def test_free_board_accelerates_by_the_reduced_equations():
         assert_motion(found, expected, 1e-12)
 
 
-def test_driven_board_accelerates_by_the_momentum_equation():
+def test_driven_snakeboard_accelerates_by_momentum_equation():
     rng = np.random.default_rng(1)
     joints = locomotion.Sine(*BOARD_GAIT)
     for _ in range(5):
@@ -182,7 +182,7 @@ def test_driven_board_accelerates_by_the_momentum_equation():
         assert_motion(found, (parts[0], np.concatenate(parts[1:])), 1e-12)
 
 
-def test_free_racer_accelerates_by_the_reduced_equations():
+def test_free_roller_racer_accelerates_by_reduced_equations():
     rng = np.random.default_rng(2)
     for _ in range(5):
         place, (s, rate, torque) = rng.normal(size=3), rng.normal(size=3)
@@ -195,7 +195,7 @@ def test_free_racer_accelerates_by_the_reduced_equations():
         assert_motion(found, expected, 1e-12)
 
 
-def test_driven_racer_accelerates_by_the_reduced_equations():
+def test_driven_roller_racer_accelerates_by_reduced_equations():
     rng = np.random.default_rng(3)
     pivot = locomotion.Sine(*RACER_GAIT)
     for _ in range(5):
@@ -229,7 +229,7 @@ def test_axles_do_not_slip_along_a_run(case, found):
             assert abs(sideways) < 1e-9
 
 
-def test_energy_is_the_work_of_the_joints(case, found, reference):
+def test_energy_gain_equals_the_work_of_the_joints(case, found, reference):
     lane, example = found.lanes[-1], case.example
     gained = example.energy(END, lane.q[-1], lane.v[-1])
     gained = gained - example.energy(0.0, example.q0, example.v0)
@@ -238,7 +238,7 @@ def test_energy_is_the_work_of_the_joints(case, found, reference):
     assert gained == pytest.approx(reference["work"], rel=0, abs=bound)
 
 
-def test_invariants_change_by_the_torques_alone(case, found):
+def test_invariants_change_only_by_the_torques(case, found):
     example, lane = case.example, found.lanes[-1]
     values = invariants(example, lane.t, lane.q, lane.v)
     if case.args is None:
@@ -268,7 +268,7 @@ def test_joints_follow_their_gaits_from_the_start(example):
     assert example.initial_state().multiplier.shape == (2 + rates.size,)
 
 
-def test_gait_may_be_any_function_of_time():
+def test_gait_of_any_function_of_time_is_accepted():
     amplitude, rate, phase = RACER_GAIT
     driven = CASES["driven_racer"].example
     own = RollerRacer(
@@ -281,7 +281,7 @@ def test_gait_may_be_any_function_of_time():
     assert_motion(library_motion(own, 0.0, driven.q0, driven.v0), expected, 1e-15)
 
 
-def test_system_in_single_precision_stays_in_it(case):
+def test_system_in_single_precision_keeps_dtype(case):
     assert_single_precision(case.example)
 
 
@@ -305,6 +305,6 @@ def test_system_in_single_precision_stays_in_it(case):
         ),
     ],
 )
-def test_locomotion_parameter_out_of_range_is_named(build, message):
+def test_locomotion_parameter_out_of_range_raises(build, message):
     with pytest.raises(ValueError, match=message):
         build()

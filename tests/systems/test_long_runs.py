@@ -7,7 +7,7 @@ from nhjax.systems import CarAxis
 
 
 @pytest.mark.parametrize("power", ["", "road"])
-def test_energy_and_the_work_of_the_road_are_balanced(power):
+def test_energy_of_a_long_run_balances_the_work_of_the_road(power):
     row = balance(Case("CarAxis", CarAxis(), 0.01, 1.0, power))
     assert row["violation"] < 1e-13
     assert row["first tenth"] <= row["all"]

@@ -40,7 +40,7 @@ def found():
     return runs(CHAIN, 3, COUNTS, END)
 
 
-def test_acceleration_and_multiplier_follow_from_the_angles():
+def test_acceleration_and_multiplier_equal_equations_in_angles():
     rng = np.random.default_rng(0)
     for _ in range(6):
         angles, rates = rng.uniform(-3, 3, 3), rng.normal(size=3)
@@ -48,7 +48,7 @@ def test_acceleration_and_multiplier_follow_from_the_angles():
         assert_motion(found, ORACLE.motion(angles, rates), 1e-12)
 
 
-def test_chain_of_eight_links_accelerates_as_its_angles_do():
+def test_chain_of_eight_links_accelerates_as_in_angles():
     rng = np.random.default_rng(1)
     angles, rates = rng.uniform(-3, 3, 8), rng.normal(size=8)
     chain = PendulumChain.swinging(angles, rates)
@@ -57,7 +57,7 @@ def test_chain_of_eight_links_accelerates_as_its_angles_do():
     assert_motion(found, oracle.motion(angles, rates), 1e-11)
 
 
-def test_chain_of_two_links_is_the_double_pendulum():
+def test_chain_of_two_links_equals_double_pendulum():
     parameters = {"masses": (1.1, 0.8), "lengths": (0.7, 1.2), "gravity": 2.0}
     double = DoublePendulum.swinging((1.0, -0.5), (0.3, 0.8), **parameters)
     chain = PendulumChain.swinging((1.0, -0.5), (0.3, 0.8), **parameters)
@@ -72,7 +72,7 @@ def test_run_converges_with_method_order(found, reference, name):
     assert_order(4, COUNTS, found.errors(name, reference[name]))
 
 
-def test_rods_keep_their_lengths_along_a_run(found):
+def test_chain_rods_keep_their_lengths_along_a_run(found):
     places = found.lanes[0].q.reshape(-1, 3, 2)
     lengths = np.linalg.norm(np.diff(places, axis=1, prepend=0.0), axis=2)
     expected = np.broadcast_to(PARAMETERS["lengths"], lengths.shape)
@@ -80,14 +80,14 @@ def test_rods_keep_their_lengths_along_a_run(found):
     assert max(found.violations) < 1e-13
 
 
-def test_energy_error_is_bounded(found):
+def test_energy_error_of_the_chain_is_bounded(found):
     lane = found.lanes[-1]
     energy = invariants(CHAIN, lane.t, lane.q, lane.v)["energy"]
     start = CHAIN.energy(0.0, CHAIN.q0, CHAIN.v0)
     assert np.max(np.abs(energy - start)) < 1.6e-7
 
 
-def test_default_chain_hangs_on_one_line_at_rest():
+def test_chain_with_default_data_hangs_straight_at_rest():
     chain = PendulumChain(num_links=4, lengths=(1.0, 0.5, 0.5, 2.0))
     points = chain.points(0.0, chain.q0)
     assert list(points) == ["pivot", "mass_1", "mass_2", "mass_3", "mass_4"]
@@ -97,7 +97,7 @@ def test_default_chain_hangs_on_one_line_at_rest():
     assert not jnp.any(chain.v0)
 
 
-def test_system_in_single_precision_stays_in_it():
+def test_system_in_single_precision_keeps_dtype():
     assert_single_precision(CHAIN)
 
 
@@ -114,6 +114,6 @@ def test_system_in_single_precision_stays_in_it():
         ),
     ],
 )
-def test_parameter_out_of_range_is_named(build, message):
+def test_chain_parameter_out_of_range_raises(build, message):
     with pytest.raises(ValueError, match=message):
         build()

@@ -58,7 +58,7 @@ def found(machine):
     return runs(machine[0], 3, COUNTS, END)
 
 
-def test_acceleration_and_multiplier_follow_from_the_crank(machine):
+def test_acceleration_and_multiplier_equal_crank_equations(machine):
     example, oracle = machine
     rng = np.random.default_rng(0)
     for _ in range(8):
@@ -67,7 +67,7 @@ def test_acceleration_and_multiplier_follow_from_the_crank(machine):
         assert_motion(found, oracle.motion(theta, rate), 1e-12)
 
 
-def test_crank_takes_the_time_of_the_quadrature(machine, reference):
+def test_crank_turns_in_the_time_of_the_quadrature(machine, reference):
     # t = ∫ √(I / 2(E + M θ - V)) dθ, with all that is known of the energy.
     example, oracle = machine
     start, rate = float(example.q0[0]), float(example.v0[0])
@@ -95,7 +95,7 @@ def test_run_converges_with_method_order(found, reference, name):
     assert_order(4, COUNTS, found.errors(name, reference[name]))
 
 
-def test_loop_stays_closed_along_a_run(machine, found):
+def test_linkage_loop_stays_closed_along_a_run(machine, found):
     _, oracle = machine
     assert max(found.violations) < 2e-12
     lane = found.lanes[0]
@@ -105,7 +105,7 @@ def test_loop_stays_closed_along_a_run(machine, found):
         np.testing.assert_allclose(v, other_v, rtol=0, atol=1e-12)
 
 
-def test_energy_is_the_work_of_the_torque(machine, found):
+def test_energy_gain_equals_the_work_of_the_torque(machine, found):
     example, _ = machine
     lane = found.lanes[-1]
     balance = invariants(example, lane.t, lane.q, lane.v)["energy_less_work"]
@@ -114,7 +114,7 @@ def test_energy_is_the_work_of_the_torque(machine, found):
     assert abs(float(example.energy(0.0, lane.q[-1], lane.v[-1]) - start)) > 0.1
 
 
-def test_default_data_are_those_of_turning_cranks():
+def test_linkage_defaults_equal_turning_crank():
     for example, data in (
         (SliderCrank(), SliderCrank.turning(0.0, 60.0)),
         (FourBar(), FourBar.turning(np.pi, 20.0)),
@@ -123,7 +123,7 @@ def test_default_data_are_those_of_turning_cranks():
         np.testing.assert_allclose(data.v0, example.v0, rtol=0, atol=1e-14)
 
 
-def test_parallelogram_falls_as_a_pendulum_does():
+def test_parallelogram_falls_as_a_pendulum():
     # 5/3 θ̈ = -2 g cos θ for bars of 1 m and 1 kg: ½ 5/3 θ̇² = E - 2 g sin θ.
     linkage = FourBar.parallelogram()
     found = runs(linkage, 3, (200,), 0.4)
@@ -157,7 +157,7 @@ def test_parallelogram_at_a_singular_configuration_fails():
     assert flat.dependent == ("Γ[0]",)
 
 
-def test_points_are_those_of_the_joints():
+def test_linkage_points_are_at_the_joints():
     points = SLIDER_CRANK.points(0.0, SLIDER_CRANK.q0)
     assert np.linalg.norm(points["pin"]) == pytest.approx(0.08)
     assert np.linalg.norm(points["slider"] - points["pin"]) == pytest.approx(0.3)
@@ -168,7 +168,7 @@ def test_points_are_those_of_the_joints():
     np.testing.assert_allclose(sides, [0.1, 0.4, 0.3, 0.4], rtol=1e-14)
 
 
-def test_system_in_single_precision_stays_in_it(machine):
+def test_system_in_single_precision_keeps_dtype(machine):
     assert_single_precision(machine[0])
 
 
@@ -190,6 +190,6 @@ def test_system_in_single_precision_stays_in_it(machine):
         ),
     ],
 )
-def test_parameter_out_of_range_is_named(build, message):
+def test_linkage_parameter_out_of_range_raises(build, message):
     with pytest.raises(ValueError, match=message):
         build()

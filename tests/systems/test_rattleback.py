@@ -70,12 +70,12 @@ def errors_at():
 
 
 @pytest.mark.parametrize("stone", STONES.values(), ids=STONES)
-def test_accelerations_and_forces_are_those_of_newton_and_euler(stone):
+def test_accelerations_and_forces_equal_newton_euler(stone):
     body, states = newton_euler(stone), list(random_states(20))
     assert_newton_and_euler(stone, body, states, accelerations)
 
 
-def test_accelerations_are_those_of_the_papers_equations():
+def test_accelerations_equal_equations_of_the_paper():
     stone, rng = STONES["damped"], np.random.default_rng(3)
     tilts, omegas = rng.uniform(-20, 20, (20, 2)), 3 * rng.standard_normal((20, 3))
     states, expected = [], []
@@ -90,7 +90,7 @@ def test_accelerations_are_those_of_the_papers_equations():
     np.testing.assert_allclose(slope[:, 3:] / size, expected / size, rtol=0, atol=1e-11)
 
 
-def test_default_parameters_are_the_papers():
+def test_rattleback_default_parameters_equal_the_paper():
     stone = Rattleback()
     a, b, c, h, M, A, B, C, D, _, g = PAPER
     np.testing.assert_allclose(stone.semiaxes * 100, [a, b, c], rtol=1e-15)
@@ -101,7 +101,7 @@ def test_default_parameters_are_the_papers():
     assert stone.mass == M
 
 
-def test_tilts_are_the_papers_angles():
+def test_rattleback_tilts_equal_angles_of_the_paper():
     stone = Rattleback.spinning(1.0, (8.0, 5.0))
     a, b = np.deg2rad([8.0, 5.0])
     up = matrix_of(stone.q0[:4])[2]
@@ -109,7 +109,7 @@ def test_tilts_are_the_papers_angles():
     np.testing.assert_allclose(up, expected, rtol=0, atol=1e-15)
 
 
-def test_rattleback_at_rest_rocks_at_frequency_of_its_radii_of_curvature():
+def test_rattleback_at_rest_rocks_at_frequency_of_its_curvature():
     a, b, c, h, m, g, e = 0.2, 0.03, 0.02, 0.01, 1.0, 9.81, 1e-5
     rocking = []
     for turn in (*np.eye(2), *-np.eye(2)):
@@ -131,7 +131,7 @@ def test_run_converges_with_method_order(found, errors_at):
 
 
 @pytest.mark.long
-def test_constraints_hold_to_round_off_and_energy_stays(found):
+def test_constraints_hold_to_round_off_and_energy_is_conserved(found):
     assert np.max(found.violation) < 1e-13
     drift = drifts(STONES["default"], found)["energy"]
     # Of 0.02 J of the spin; the coarsest runs take four times the duration.
@@ -190,7 +190,7 @@ def spins(first_reversal):
 
 
 @pytest.mark.long
-def test_spin_reverses_at_the_time_of_the_papers_equations(first_reversal, spins):
+def test_spin_reverses_at_the_time_of_the_paper(first_reversal, spins):
     _, v, _ = spins
     end, state, afterwards = first_reversal
     assert end == pytest.approx(2.38, abs=0.01)
@@ -216,7 +216,7 @@ def test_energy_lost_by_damping_equals_its_power(spins):
     assert damped.invariants(0.0, damped.q0, damped.v0) == {}
 
 
-def test_points_are_on_the_stone_and_on_the_plane():
+def test_rattleback_points_are_on_the_stone_and_on_the_plane():
     stone = Rattleback.spinning(0.0, (7.0, -4.0))
     points = stone.points(0.0, stone.q0)
     assert set(points) == {"centre_of_mass", "contact", "front", "back"}
@@ -258,6 +258,6 @@ def test_system_computes_in_precision_of_the_state():
         ),
     ],
 )
-def test_parameter_out_of_range_is_named(build, message):
+def test_rattleback_parameter_out_of_range_raises(build, message):
     with pytest.raises(ValueError, match=message):
         build()

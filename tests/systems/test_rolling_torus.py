@@ -64,7 +64,7 @@ def tumbling():
 
 
 @over(BODIES)
-def test_accelerations_and_forces_are_those_of_newton_and_euler(body):
+def test_accelerations_and_forces_equal_newton_euler(body):
     oracle = newton_euler(body)
     # About a disc that stands on its rim.
     upright = Rotation.from_rotvec([0.5 * np.pi, 0, 0])
@@ -84,7 +84,7 @@ def steady_rates(body):
 
 
 @over(STEADY)
-def test_accelerations_vanish_in_steady_motion(body):
+def test_accelerations_in_steady_motion_vanish(body):
     _, _, roll, _ = steady_rates(body)
     slope, multiplier, _ = accelerations(body.system, body.q0[None], body.v0[None])
     # In the frame that does not roll with the body.
@@ -143,7 +143,7 @@ def test_steady_motion_solves_the_equations_of_newton_and_euler(body):
 
 @pytest.mark.long
 @pytest.mark.parametrize("name", ["disc", "torus"])
-def test_runs_stay_on_the_circle_to_the_order_of_the_method(name):
+def test_run_on_steady_circle_converges_with_method_order(name):
     found = runs_of_three_stages(STEADY[name], COUNTS, DURATION)
     assert_orders(found, 4, errors_on_the_circle(STEADY[name]), floor=1e-12)
 
@@ -157,7 +157,7 @@ def test_run_converges_with_method_order(tumbling):
 
 
 @pytest.mark.long
-def test_constraints_hold_to_round_off_and_energy_stays(tumbling):
+def test_constraints_hold_to_round_off_and_energy_is_conserved(tumbling):
     body, found = tumbling
     # Of 12 J; the coarsest runs take four times the duration.
     largest = (2e-5, 1e-6, 5e-8)
@@ -182,7 +182,7 @@ def test_disc_with_centre_at_rest_has_moffatts_rate():
     np.testing.assert_allclose(disc.v0[:3], 0.0, rtol=0, atol=1e-14)
 
 
-def test_centre_moves_on_the_circle_that_was_asked_for():
+def test_torus_centre_moves_on_the_given_circle():
     body = STEADY["torus"]
     _, rate, _, _ = steady_rates(body)
     assert jnp.linalg.norm(body.v0[:3]) == pytest.approx(0.6 * abs(rate), rel=1e-14)
@@ -220,7 +220,7 @@ def test_upright_disc_oscillates_at_rouths_frequency(spin):
     assert (expected < 0) == (spin**2 > g / (3 * a))
 
 
-def test_points_are_on_the_body_and_on_the_plane():
+def test_torus_points_are_on_the_body_and_on_the_plane():
     body = BODIES["torus"].rolling((0.5, 0.6, 0.3, 0.2), (0.0, 0.0, 1.0), (0.3, -0.2))
     points = body.points(0.0, body.q0)
     assert set(points) == {"centre", "contact", "rim"}
@@ -264,6 +264,6 @@ def test_steady_motion_is_differentiable_in_its_tilt():
         (lambda: RollingTorus(radius=0.6).initial_state(), "constraint"),
     ],
 )
-def test_parameter_out_of_range_is_named(build, message):
+def test_rolling_torus_parameter_out_of_range_raises(build, message):
     with pytest.raises(ValueError, match=message):
         build()

@@ -57,7 +57,7 @@ def found():
     return runs(MACHINE, 3, COUNTS, END)
 
 
-def test_acceleration_and_multiplier_follow_from_the_crank():
+def test_acceleration_and_multiplier_equal_crank_equations():
     rng = np.random.default_rng(0)
     for _ in range(8):
         theta, rate = rng.uniform(0, 2 * np.pi), 3 * rng.normal()
@@ -65,7 +65,7 @@ def test_acceleration_and_multiplier_follow_from_the_crank():
         assert_motion(found, ORACLE.motion(theta, rate), 1e-12)
 
 
-def test_other_equations_reproduce_the_published_solution():
+def test_independent_equations_reproduce_the_published_solution():
     times = np.array([0.0, *PUBLISHED])[:6]
     ends = flow(velocity_field, [0.0, 6.0], times)[1:]
     places = [ORACLE.state(*end)[0][3] for end in ends]
@@ -76,7 +76,7 @@ def test_other_equations_reproduce_the_published_solution():
     )
 
 
-def test_run_goes_through_the_published_solution():
+def test_run_passes_through_the_published_solution():
     (lane,) = runs(MACHINE, 3, (2000,), 5.0).lanes
     for t, place in PUBLISHED.items():
         (k,) = np.flatnonzero(np.isclose(lane.t, t))
@@ -86,7 +86,7 @@ def test_run_goes_through_the_published_solution():
     assert np.max(np.abs(energy - start)) < 3e-7
 
 
-def test_crank_takes_the_time_of_the_quadrature(reference):
+def test_crank_turns_in_the_time_of_the_quadrature(reference):
     mass, _, height = ORACLE.crank(0.0, 6.0)
     energy = 0.5 * mass * 36 + height
 
@@ -104,7 +104,7 @@ def test_run_converges_with_method_order(found, reference, name):
     assert_order(4, COUNTS, found.errors(name, reference[name]))
 
 
-def test_loop_stays_closed_along_a_run(found):
+def test_slider_crank_loop_stays_closed_along_a_run(found):
     lane = found.lanes[0]
     for q, v in zip(lane.q[::5], lane.v[::5], strict=True):
         other_q, other_v = ORACLE.state(q[0], v[0])
@@ -112,20 +112,20 @@ def test_loop_stays_closed_along_a_run(found):
         np.testing.assert_allclose(v, other_v, rtol=0, atol=1e-12)
 
 
-def test_default_data_are_those_of_a_turning_crank():
+def test_slider_crank_defaults_equal_turning_crank():
     data = SpatialSliderCrank.turning(0.0, 6.0)
     np.testing.assert_allclose(data.q0, MACHINE.q0, rtol=0, atol=1e-15)
     np.testing.assert_allclose(data.v0, MACHINE.v0, rtol=0, atol=1e-14)
 
 
-def test_points_are_those_of_the_joints():
+def test_slider_crank_points_are_at_the_joints():
     points = MACHINE.points(0.0, MACHINE.q0)
     np.testing.assert_allclose(points["pin"], [0.0, 0.1, 0.2], rtol=1e-15)
     np.testing.assert_array_equal(points["axle"], [0.0, 0.1, 0.12])
     assert np.linalg.norm(points["slider"] - points["pin"]) == pytest.approx(0.3)
 
 
-def test_system_in_single_precision_stays_in_it():
+def test_system_in_single_precision_keeps_dtype():
     assert_single_precision(MACHINE)
 
 
@@ -140,6 +140,6 @@ def test_system_in_single_precision_stays_in_it():
         ),
     ],
 )
-def test_parameter_out_of_range_is_named(build, message):
+def test_slider_crank_parameter_out_of_range_raises(build, message):
     with pytest.raises(ValueError, match=message):
         build()

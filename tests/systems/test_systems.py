@@ -143,7 +143,7 @@ def test_exact_solution_agrees_with_the_index_reduced_ode(example, t):
 
 
 @over(SOLVED)
-def test_exact_velocity_is_the_derivative_of_the_exact_position(example):
+def test_exact_velocity_equals_derivative_of_exact_position(example):
     # A long time, where the quadratures take many panels; five-point difference.
     t, h = (3.0 if isinstance(example, Appell) else 40.0), 1e-3
     q = {k: example.exact(t + k * h)[0] for k in (-2, -1, 1, 2)}
@@ -172,7 +172,7 @@ def test_invariants_are_constant_along_the_motion(example):
 @pytest.mark.parametrize(
     ("regime", "driver"), [(CVT.low, 0.8), (CVT.high, 3.0)], ids=["low", "high"]
 )
-def test_cvt_energies_are_those_of_the_paper(regime, driver, epsilon):
+def test_cvt_energies_equal_the_paper(regime, driver, epsilon):
     cvt = regime(epsilon=epsilon)
     assert cvt.driver_energy(cvt.q0, cvt.v0) == pytest.approx(driver, abs=1e-15)
     assert cvt.passenger_energy(cvt.q0, cvt.v0) == pytest.approx(1.0, abs=1e-15)
@@ -216,7 +216,7 @@ def test_chaotic_ensemble_lies_on_one_energy_surface():
     np.testing.assert_array_equal(violations, 0.0)
 
 
-def test_chaotic_ensemble_is_the_papers():
+def test_chaotic_ensemble_equals_the_paper():
     q0, v0 = ChaoticSystem().ensemble(2)
     r = np.sqrt(0.5)
     tail = [0.6, 0.4, 0.2, 1.0, 1.0, 1.0]
@@ -227,7 +227,7 @@ def test_chaotic_ensemble_is_the_papers():
     assert jnp.count_nonzero(v0.at[:, 1].set(0.0)) == 0
 
 
-def test_chaotic_default_is_the_middle_of_the_ensemble():
+def test_chaotic_default_equals_the_middle_of_the_ensemble():
     chaotic = ChaoticSystem(m=4)
     q0, v0 = chaotic.ensemble(2)
     np.testing.assert_allclose(chaotic.q0, q0[1], rtol=0, atol=2e-16)
@@ -246,7 +246,7 @@ def test_system_computes_in_precision_of_the_state(example, dtype):
 
 
 @over(GALLERY)
-def test_initial_state_carries_the_multiplier_of_the_continuous_system(example):
+def test_initial_state_has_the_multiplier_of_the_continuous_system(example):
     y0 = example.initial_state()
     assert y0.q.dtype == jnp.float64
     expected = acceleration_and_multiplier(example, example.q0, example.v0)[1]
@@ -300,7 +300,7 @@ def test_parameter_with_new_value_does_not_recompile():
         (lambda: HarmonicOscillator(mass=0.0), r"`mass` must be positive, got 0"),
     ],
 )
-def test_parameter_out_of_range_is_named(build, message):
+def test_gallery_parameter_out_of_range_raises(build, message):
     with pytest.raises(ValueError, match=message):
         build()
 
@@ -316,12 +316,12 @@ def test_parameter_out_of_range_is_named(build, message):
         (NonholonomicParticle(v0=(0.4, 0.7, 0.5)), r"`v0` violates the constraint"),
     ],
 )
-def test_exact_solution_names_the_data_it_cannot_solve(example, message):
+def test_exact_solution_of_unsupported_data_raises(example, message):
     with pytest.raises(ValueError, match=message):
         example.exact(1.0)
 
 
-def test_appell_exact_solution_ends_at_the_singular_instant():
+def test_exact_solution_of_appell_beyond_singular_instant_raises():
     rising = SOLVED["Appell rising"]
     with pytest.raises(ValueError, match=r"`t` = 9\.0 is beyond the singular instant"):
         rising.exact(9.0)
@@ -335,6 +335,6 @@ def test_sleigh_ends_in_uniform_motion_with_the_centre_of_mass_ahead():
     assert v[2] == multiplier[0] == 0.0
 
 
-def test_exact_driver_needs_an_unperturbed_pendulum():
+def test_exact_driver_of_perturbed_pendulum_raises():
     with pytest.raises(ValueError, match=r"`epsilon` must be 0 .* got 0\.5"):
         CVT().exact_driver(1.0)

@@ -28,7 +28,7 @@ def some_robot(seed):
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_accelerations_and_forces_of_the_ground_are_those_of_the_reduced_equations(
+def test_accelerations_and_ground_forces_equal_reduced_equations(
     seed,
 ):
     robot, speed, turn, torques = some_robot(seed)
@@ -52,7 +52,7 @@ def test_rolling_robot_does_not_slip(seed):
     np.testing.assert_allclose(robot.v0, expected, rtol=1e-14)
 
 
-def test_default_data_roll_without_slip():
+def test_robot_with_default_data_rolls_without_slip():
     default, rolling = TwoWheeledRobot(), TwoWheeledRobot.rolling()
     np.testing.assert_allclose(default.v0, rolling.v0, rtol=1e-15)
     np.testing.assert_array_equal(default.q0, rolling.q0)
@@ -105,7 +105,7 @@ def test_energy_equals_the_work_of_the_motors():
     assert gained == pytest.approx(work, rel=1e-6)
 
 
-def test_without_torques_energy_stays_and_no_wheel_slips():
+def test_run_without_torques_conserves_energy_and_does_not_slip():
     robot = TwoWheeledRobot.rolling(0.8, 1.1, 0.3)
     _, states, _ = runs(3, free=True)
     q, v = states.q[0], states.v[0]
@@ -116,7 +116,7 @@ def test_without_torques_energy_stays_and_no_wheel_slips():
     np.testing.assert_allclose(check(0.0, q, v, None), 0.0, rtol=0, atol=2e-14)
 
 
-def test_robot_with_centre_over_the_axle_moves_on_a_circle():
+def test_robot_with_centre_above_axle_moves_on_a_circle():
     robot = TwoWheeledRobot.rolling(0.8, 1.1, offset=0.0)
     acceleration, multiplier = library_motion(robot, 0.0, robot.q0, robot.v0, None)
     np.testing.assert_allclose(acceleration[2:], 0.0, rtol=0, atol=1e-15)
@@ -139,7 +139,7 @@ def test_system_computes_in_precision_of_the_state(dtype):
     assert {value.dtype for value in values} == {jnp.dtype(dtype)}
 
 
-def test_points_are_in_front_of_and_beside_the_axle():
+def test_robot_points_are_in_front_of_and_beside_the_axle():
     robot = TwoWheeledRobot()
     q = jnp.array([1.0, 2.0, np.pi / 2, 0.0, 0.0])
     expected = {
@@ -177,6 +177,6 @@ def test_gradients_in_every_parameter_are_not_zero():
         ({"q0": (0.0, 0.0)}, r"`q0` must have shape \(5,\), got \(2,\)"),
     ],
 )
-def test_parameter_out_of_range_is_named(parameters, message):
+def test_robot_parameter_out_of_range_raises(parameters, message):
     with pytest.raises(ValueError, match=message):
         TwoWheeledRobot(**parameters)

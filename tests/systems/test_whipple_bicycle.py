@@ -70,7 +70,7 @@ def other_bicycle(seed):
 
 
 @pytest.mark.parametrize("seed", range(6))
-def test_accelerations_and_forces_of_the_ground_are_those_of_kanes_method(seed):
+def test_accelerations_and_ground_forces_equal_kanes_method(seed):
     bicycle, q, v, torque = other_bicycle(seed)
     parameters = oracle.parameters_of(bicycle)
     expected, on_wheels = oracle.accelerations(
@@ -86,7 +86,7 @@ def test_accelerations_and_forces_of_the_ground_are_those_of_kanes_method(seed):
 
 
 @pytest.mark.parametrize("seed", range(2))
-def test_a_running_bicycle_satisfies_the_constraints_and_has_the_given_rates(seed):
+def test_bicycle_with_given_rates_satisfies_its_constraints(seed):
     bicycle, q, v, _ = other_bicycle(seed)
     np.testing.assert_allclose(bicycle.constraint(0.0, q, v, None), 0.0, atol=2e-14)
     np.testing.assert_allclose(bicycle.holonomic(0.0, q, None), 0.0, atol=1e-15)
@@ -110,7 +110,7 @@ def in_their_coordinates(rates):
     return -np.asarray(rates)[2:]
 
 
-def test_the_state_of_table_1_of_basu_mandal_is_consistent():
+def test_published_bicycle_state_is_consistent():
     bicycle = table_1()
     pitch = np.pi - STATE["phi"]
     np.testing.assert_allclose(bicycle.q0[4], pitch, rtol=0, atol=1.5e-13)
@@ -120,7 +120,7 @@ def test_the_state_of_table_1_of_basu_mandal_is_consistent():
     )
 
 
-def test_accelerations_are_those_of_table_1_of_basu_mandal():
+def test_accelerations_of_bicycle_equal_published_ones():
     bicycle = table_1()
     q, v = bicycle.q0, bicycle.v0
     a, _ = library_motion(bicycle, 0.0, q, v, None)
@@ -176,7 +176,7 @@ def test_gradients_in_every_parameter_are_not_zero():
             assert np.all(np.asarray(getattr(gradient, name)) != 0), name
 
 
-def test_points_rotate_with_the_upright_bicycle():
+def test_bicycle_points_rotate_with_the_upright_bicycle():
     bicycle = WhippleBicycle()
     points = bicycle.points(0.0, bicycle.q0)
     expected = {
@@ -201,7 +201,7 @@ def test_points_rotate_with_the_upright_bicycle():
         assert abs(points[f"{end}_contact"][2]) < 1e-15
 
 
-def test_energy_is_an_invariant_only_without_a_torque():
+def test_invariants_without_torque_contain_energy():
     free, steered = WhippleBicycle(), WhippleBicycle(steering=LeanToSteer())
     assert free.invariants(0.0, free.q0, free.v0).keys() == {"energy"}
     assert steered.invariants(0.0, free.q0, free.v0) == {}
@@ -226,6 +226,6 @@ def test_energy_is_an_invariant_only_without_a_torque():
         ({"v0": (1.0, 2.0)}, r"`v0` must have shape \(8,\), got \(2,\)"),
     ],
 )
-def test_parameter_out_of_range_is_named(parameters, message):
+def test_bicycle_parameter_out_of_range_raises(parameters, message):
     with pytest.raises(ValueError, match=message):
         WhippleBicycle(**parameters)
