@@ -132,9 +132,10 @@ def check_system(
     **Returns:** a `SystemReport`. The arguments on which functions depend are found
     from derivatives at three states near the given one.
 
-    **Raises:** as `initial_state` does for wrong types and shapes, also of values that
-    the system's functions return; `ValueError` if a Lagrangian system is given `p`, or
-    a Hamiltonian one `v`; `TypeError` under `jit`, `vmap` or `grad`.
+    **Raises:** the errors of `initial_state` for wrong types and shapes of arguments
+    and of values that the system's functions return; `ValueError` if a Lagrangian
+    system is given `p`, or a Hamiltonian one `v`; `TypeError` under `jit`, `vmap` or
+    `grad`.
 
     !!! example
 

@@ -116,8 +116,9 @@ def linear_stability(
         components of the velocity. On a group, the generator of g -> g exp(εξ), a
         symmetry of the body, is the constant ξ. The generator of g -> exp(εξ) g, a
         symmetry of space, is `manifold.Ad(manifold.inverse(q), xi)`. The velocity must
-        be a combination of the generators. If a rotation turns a translation, include
-        the translations in all directions into which it is turned.
+        be a combination of the generators. If one generator is a rotation and
+        another one a translation that it rotates, include the translations in all
+        directions that this rotation produces.
     - `must_be_steady`: whether to raise if the motion is not steady. Pass False to
         linearise at an instant, for instance along a trajectory.
 

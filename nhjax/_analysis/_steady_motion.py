@@ -124,9 +124,9 @@ def steady_motion(
         constant because energy is conserved.
     - `symmetry`: generators of symmetries, as `linear_stability` takes them, in place
         of `positions` and `velocities`.
-    - `held_positions`, `held_velocities`: the indices of what keeps its value in `y`.
-        On a group a position is held if this component of ξ is zero in q τ(ξ), where q
-        is the configuration of `y`.
+    - `held_positions`, `held_velocities`: the indices of the positions and velocities
+        that keep their values in `y`. On a group a position is held if this component
+        of ξ is zero in q τ(ξ), where q is the configuration of `y`.
     - `max_iterations`: the largest number of iterations.
 
     **Returns:** a consistent `State`. With `symmetry`, a pair of the state and the
@@ -270,7 +270,7 @@ def solve_in_coordinates(
 def solve_along_symmetry(
     system, t, y, args, symmetry, held, max_iterations
 ) -> SteadyMotionResult:
-    """Solve for a state that moves along generators of symmetries, and their rates."""
+    """Solve for a state that moves along symmetries, and for the generators' rates."""
     dim = y.p.shape[0]
 
     def fields(x):

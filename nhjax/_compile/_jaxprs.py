@@ -128,7 +128,8 @@ _REPEATABLE = frozenset(
     (*ARITHMETIC_AND_SHAPES, "dot_general", "gather", SMALL_PRODUCT)
 )
 # The operations whose inner programs are simplified, and the parameters that hold these
-# programs. Other operations with inner programs have rules that rely on them.
+# programs. The inner programs of other operations are not simplified, because the rules
+# of these operations rely on them.
 _INNER = {
     "checkpoint": ("jaxpr",),
     "cond": ("branches",),

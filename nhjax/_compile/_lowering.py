@@ -150,7 +150,7 @@ _SMALL_ARRAYS = 40
 @rare_collections()
 def _lowered(ctx, *operands, program, is_brief):
     if is_exported(ctx):
-        # Another process could not call machine code of this one.
+        # Another process cannot call machine code of this process.
         record_engine("xla", "the program is exported", None)
         return _by_xla(ctx, *operands, program=program, is_brief=is_brief)
     if is_within_kernel():

@@ -424,7 +424,10 @@ def _is_result(x: Any) -> bool:
 
 
 def manifest(job: Job, **others: Any) -> dict[str, Any]:
-    """Describe the parameters of a job as JSON; `others` depend on the kept results."""
+    """Describe the parameters of a job as JSON.
+
+    `others` are further parameters, which depend on the kind of results that are kept.
+    """
     return {
         "format": FORMAT,
         "nhjax": installed_version(),

@@ -454,7 +454,7 @@ def _interpolated_quantile(
     counts: np.ndarray, target: float, edges: np.ndarray
 ) -> float:
     cumulative = np.concatenate([[0], np.cumsum(counts)])
-    # The first bin that is not empty and at whose end the target is reached.
+    # The first nonempty bin for which the count up to its end reaches the target.
     last = int(np.argmax((cumulative[1:] >= target) & (counts > 0)))
     share = (target - cumulative[last]) / counts[last]
     return float(edges[last] + share * (edges[last + 1] - edges[last]))

@@ -339,7 +339,7 @@ class CheckpointedReductionSink(AbstractSink):
 
     def _open(self, resume: bool) -> None:
         """Create the folder, or open it and read the state."""
-        # An interrupted run that has not run a chunk leaves no other files.
+        # If a run is interrupted before its first chunk, it leaves only these files.
         early = {
             self.LOCK,
             self.PROGRAM,

@@ -187,8 +187,8 @@ def resumed(y0: Checkpoint, fresh: StepState) -> StepState:
     """Return the step state from which a resumed run starts.
 
     `fresh` is the step state of a run from `y0.state`. Its linearisation replaces the
-    one of the checkpoint if their matrices differ by more than eps^(1/4), which happens
-    if the run continues with another system or other args.
+    linearisation of the checkpoint if their matrices differ by more than eps^(1/4),
+    which happens if the run continues with another system or other args.
     """
     new, structure = jax.tree.flatten(fresh.lin)
     _check_arrays("linearisation", y0.linearisation, new)

@@ -153,7 +153,7 @@ class SaveAt(eqx.Module):
 
 
 def static_length(num_steps: int | IntScalar) -> int:
-    """Return a number of steps that is known when tracing, as an int for the types."""
+    """Return `num_steps`, which is known when tracing, as an int for type checkers."""
     assert isinstance(num_steps, int)
     return num_steps
 

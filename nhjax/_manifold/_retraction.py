@@ -183,7 +183,8 @@ class Exponential(AbstractRetraction):
     ) -> tuple[FloatScalar | float, FloatScalar | float]:
         """Compute α = (θ/2) cot(θ/2) and γ = (1 - α)/θ² of dτ⁻¹, with θ² = s."""
         c = stumpff(0.25 * s, 4)
-        # By c_1 - c_0 = θ²/4 (c_2 - c_3) at θ²/4, 1 - α is free of cancellation.
+        # The identity c_1 - c_0 = θ²/4 (c_2 - c_3) of the values at θ²/4 avoids
+        # cancellation in 1 - α.
         return c[0] / c[1], 0.25 * (c[2] - c[3]) / c[1]
 
     def in_chart(self, s: FloatScalar) -> BoolScalar:

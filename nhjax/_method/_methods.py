@@ -207,8 +207,8 @@ class AbstractMethod(eqx.Module):
     def carries_multiplier(self) -> bool:
         """Return whether a step passes its last multiplier Λ^s to the next step.
 
-        Only the propagated closure does. The states of a run then have this multiplier,
-        and with the other closures the continuous multiplier.
+        Only steps with the propagated closure do so; the states of a run then have the
+        multiplier Λ^s. With the other closures, states have the continuous multiplier.
         """
         return self.closure == "propagated"
 

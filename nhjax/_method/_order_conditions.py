@@ -245,8 +245,9 @@ def _products(
 ) -> Iterator[tuple[int, np.ndarray]]:
     """Generate all trees with `size` vertices besides the root.
 
-    The branches at the root are taken from `branches[:end]`. Each tree is returned as
-    the product of its branches' γ and the product of `values` and its φ.
+    The branches at the root are taken from `branches[:end]`. For each tree, the
+    function yields the product of the γ of its branches, and `values` times the φ of
+    the tree.
     """
     if size == 0:
         yield 1, values

@@ -81,7 +81,7 @@ def two_sum(
 
 
 def uneven_perturbations(q: PyTree[Array]) -> PyTree[Array]:
-    """Return a perturbation of each number in q, of half its size to its size.
+    """Return a perturbation of each number in q, between half its size and its size.
 
     The perturbations differ and have both signs, so that they hardly cancel in
     differences and sums of a few numbers. A relative perturbation is 1 - x/2 or its
@@ -180,6 +180,6 @@ def measured_noise(
 
 
 def _weights(order: int) -> np.ndarray:
-    """Return the weights of a difference, normalised to keep the deviation of noise."""
+    """Return the weights of a difference that keeps the standard deviation of noise."""
     weights = np.array([(-1.0) ** k * math.comb(order, k) for k in range(order + 1)])
     return weights / np.linalg.norm(weights)

@@ -222,8 +222,9 @@ def root(
 
     - `scale`: the size to which the round-off of x is proportional. It is larger than
         the size of x0 if x is an increment to a larger number.
-    - `judged`: selects the part of an increment whose size ends the iteration.
-        Multipliers have other units and follow from the rest, so they can be left out.
+    - `judged`: selects the part of an increment that must be small to end the
+        iteration. Multipliers have other units and follow from the rest, so they can be
+        left out.
     - `solve`: called as `solve(jacobian, b)` for the increments and for the derivative
         of the root; a dense solve by default.
     - `max_iterations`: the largest number of iterations.

@@ -178,7 +178,7 @@ def _progress(rules: _Rules, before: _Progress, sizes: UpdateNorms) -> _Progress
     more = jnp.minimum(rules.growth * before.believed, rules.noisiest)
     believed = jnp.where(stalls, more, before.believed)
     stagnant = stalls & (increment <= believed * magnified)
-    # A tolerance is relative to x itself, whatever the round-off of x is.
+    # A tolerance is relative to x itself, and does not depend on the round-off of x.
     least = jnp.maximum(rules.least, rules.tolerance_or_eps * sizes.iterate)
     least = jnp.where(has_size, least, rules.tolerance_or_eps * before.first)
     small = increment <= least

@@ -133,8 +133,8 @@ def _negligible(dtype: jnp.dtype) -> float:
     return float(jnp.finfo(dtype).eps) ** 0.75
 
 
-# Away from a solution, dependent equations are dependent only up to the distance from
-# it. There, singular values below this fraction of the largest one count as zero.
+# Equations that are dependent at a solution are only nearly dependent at other points.
+# There, singular values below this fraction of the largest one count as zero.
 NEARLY_DEPENDENT = 1e-4
 
 
@@ -171,8 +171,9 @@ def least_norm_inverse_by_blocks(
         return least_norm_inverse(matrix)
     others = least_norm_inverse(matrix[first:, first:])
     onto = matrix[:first, first:] @ others
-    # Where equations follow from the others, the Schur complement is round-off. It is
-    # compared with a one, the size of the diagonal before.
+    # If an equation follows from the others, its part of the Schur complement is
+    # round-off. The additional block of size one makes `pinv` compare this part with
+    # one, the size of the scaled diagonal before the elimination.
     left = matrix[:first, :first] - onto @ matrix[first:, :first]
     root = _roots(matrix[:first, :first])
     scaled = jax.scipy.linalg.block_diag(

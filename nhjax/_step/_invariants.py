@@ -25,7 +25,7 @@ from .._system import (
 
 
 # An impulse changes an invariant by at most this fraction of Σ |u ∂I/∂u|. Near rest
-# this sum is small, and no impulse might correct the error.
+# this sum is small, and there may be no impulse that corrects the error.
 _LARGEST_PART = 0.1
 # With an indefinite mass matrix, ω·M⁻¹ω can vanish although ω does not. If ω·M⁻¹ω is
 # less than this fraction of its bound Σ_ij |M⁻¹_ij| ω_i², a step has no impulse. All

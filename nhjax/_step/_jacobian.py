@@ -84,8 +84,8 @@ def simplified_newton_update(
         x_next = factors.correct_multipliers(stages, x_next, kinematic, holonomic)
     if stages.end_multiplier_is_unknown:
         # λ_c depends on v_{k+1} at zeroth order: it must be corrected with the new
-        # velocity. Otherwise the two errors feed each other, and the rate of
-        # convergence is only the square root.
+        # velocity. Otherwise the two errors feed each other, and an iteration reduces
+        # them only by the square root of the usual factor.
         x_next = factors.correct_end(stages, x_next, end_residual(stages, x_next))
     return x_next, Evaluation(forces, r_nodes, jnp.asarray(False))
 

@@ -49,7 +49,7 @@ from ._round_off import PART
 from ._step import AbstractStageSolver, FrozenNewtonMap
 
 
-# If the residual is larger than this, relative to the momenta, the iterate is no
+# If the residual is larger than this, relative to the momenta, the iterate is not a
 # solution.
 _GROSS = 1e-6
 

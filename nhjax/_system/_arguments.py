@@ -332,7 +332,7 @@ def _takes(signature: inspect.Signature, arguments: tuple[str, ...]) -> bool:
 
 
 def _confuses(signature: inspect.Signature, arguments: tuple[str, ...]) -> bool:
-    """Return whether two or more of the names are in the places of other names."""
+    """Return whether two or more of the expected names are at wrong positions."""
     pairs = zip(_positional_names(signature), arguments, strict=False)
     moved = [name for name, there in pairs if name != there and name in arguments]
     return len(moved) >= 2

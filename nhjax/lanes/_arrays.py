@@ -585,7 +585,7 @@ def _folded(builder: Builder, op: str, numbers: Iterable[Node]) -> Node | None:
 def _arg(
     op: str, builder: Builder, equation: Any, values: list[ArrayValue]
 ) -> ArrayValue:
-    """Return the index of the first NaN, or of the first extremum without NaN."""
+    """Return the index of the first NaN or, without NaN, of the first extremum."""
     graph = builder.graph
     dtype = dtype_name(equation.params["index_dtype"])
     x = builder.memory.registers(values[0])
@@ -667,7 +667,7 @@ def _small_product(
     shape = [lengths[index] for index in order]
 
     def rows(x: np.ndarray, indices: str) -> np.ndarray:
-        """Repeat the numbers of an operand for each sum, one after the other."""
+        """Return the numbers of an operand as rows, one row for each sum."""
         x = x.transpose([indices.index(index) for index in order if index in indices])
         x = x.reshape([lengths[index] if index in indices else 1 for index in order])
         terms = math.prod(shape[len(result) :])

@@ -449,8 +449,8 @@ class _Attempt:
         self.builder, self.carried = builder, carried
         self.loop = LoopBuilder(builder.graph)
         self.changing = changing
-        # By position: the constants that are assumed not to change, and the positions
-        # of the parameters.
+        # `fixed` has, by position, the constants that are assumed not to change, and
+        # `varying` has the positions of the parameters.
         self.fixed: dict[int, Node] = {}
         self.varying: list[int] = []
         self.outs: list[Node] = []

@@ -57,7 +57,7 @@ def definitions(wanted: Iterable[tuple[str, str, int]]) -> str:
 
 @cache
 def _texts(op: str, dtype: str, width: int) -> dict[str, str]:
-    """Return definitions by name: of a function, and of the functions that it calls."""
+    """Return the definitions of a function and of the functions it calls, by name."""
     writer = Writer(width)
     scalar = scalar_type(dtype)
     names = ["%x", "%y"] if op in _BINARY else ["%x"]
@@ -172,8 +172,8 @@ def rem(x: Value, y: Value) -> Value:
         rest = (a - high) - low
         rest = where(rest < 0.0, rest + b, rest)
     rest = where(a < b, a, rest)
-    # The exact product may be beyond the range of float64 for very large and, where
-    # subnormal numbers are flushed to 0, for very small numbers.
+    # The exact product may overflow for very large numbers. It may underflow for very
+    # small numbers, if the processor replaces subnormal numbers by 0.
     is_long = (ratio > _LARGEST_QUOTIENT) | (a > 2.0**1000) | (b < 2.0**-900)
     is_long = is_long & (a < math.inf) & (b > 0.0) & (a >= b)
 

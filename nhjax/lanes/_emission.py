@@ -72,7 +72,7 @@ def emit(
 
 
 def _members(width: int) -> list[str]:
-    """Write the numbers of the members; numbers beyond the last member repeat it."""
+    """Write the indices of the members, at most the index of the last member."""
     if width == 1:
         return ["  %members = add i64 %first, 0"]
     lines, whole, kind = [], "poison", vector("i64", width)
@@ -240,7 +240,7 @@ def _is_divergent(node: Node) -> bool:
 
 
 def _is_masked(inner: Region, outer: Region) -> bool:
-    """Return whether members that run in a region may be masked in one inside it."""
+    """Return whether members that run in `outer` may be masked in `inner`."""
     region: Region | None = inner
     while region is not None and region is not outer:
         if region.owner is not None and region.owner.attr.predicate.is_divergent:
@@ -635,7 +635,7 @@ class _Memory:
         return buffer.kind == "result" or (is_operand and buffer.is_divergent)
 
     def _starts(self, size: int) -> str:
-        """Return the indices at which members start in an array of arrays of a size."""
+        """Return where members start in an array with `size` numbers per member."""
         if size not in self._members:
             index, by = vector("i64", self.width), splat(str(size), "i64", self.width)
             self._members[size] = self.writer.value(f"mul {index} %members, {by}")

@@ -9,8 +9,9 @@ A call is divided into blocks, of as many members as the kernel computes at once
 caller's thread runs blocks, and so do threads of XLA's pool where this pays:
 
 - An atomic counter assigns blocks to the caller and to its helpers.
-- The caller asks the pool for helpers: fewer than the pool has threads, because the
-    caller works too, and so few that the work of each takes longer than waking it.
+- The caller asks the pool for helpers. Their number is smaller than the number of
+    threads of the pool, because the caller works too. It is so small that the work of
+    each helper takes longer than waking it.
 - At the end the caller waits for the blocks that helpers have begun. It does not wait
     for helpers that have not started: there may be none, because the pool has no free
     thread, or because this process was forked and has no pool any more. A call
@@ -341,8 +342,9 @@ POOL = "\n".join([_POOL_DECLARATIONS, _RUN, _WORK, _WANTED, _ASK, _WAITING])
 # The names of a program's handler, and of the function that all handlers call.
 HANDLER, SHARED_HANDLER = "nhjax.handler", "nhjax.handle"
 
-# The time of a block, in ns, until one has been run: long enough for as many helpers as
-# there are. Longer times are cut off here, so that products do not overflow.
+# The time, in ns, that a block is assumed to take until one has been run: so long that
+# all available helpers are started. Longer times are replaced by this one, so that
+# products do not overflow.
 _LONG = 1 << 30
 
 

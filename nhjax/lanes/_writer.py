@@ -268,7 +268,7 @@ class Value:
         self.name = name
 
     def typed(self) -> str:
-        """Return type and name, as an instruction takes its first operand."""
+        """Return the type and the name, the form of an instruction's first operand."""
         return f"{self.writer.type(self.kind)} {self.name}"
 
     def _other(self, other: "Operand") -> "Value":

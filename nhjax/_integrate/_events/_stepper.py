@@ -111,8 +111,8 @@ class AttemptedStep(NamedTuple):
         happens without a step.
     - `step`: that step.
     - `is_discarded`: whether the step is discarded, since an event was found in it.
-    - `is_kept`: whether the step, of the given `size`, is kept. It led to the state
-        that is `reached`.
+    - `is_kept`, `size`, `reached`: whether the step is kept, its size, and the state
+        that it led to.
     - `which`: the index of the event at its end, -1 if it ended at a node.
     - `values_at_end`: if the step is truncated, the conditions at the end of the whole
         step.
@@ -412,7 +412,7 @@ def _place_after(
     pending: Bool[Array, " e"],
     ends: BoolScalar,
 ) -> EventLoopState:
-    """Return the place after an iteration, with the signs and rows from before it.
+    """Return the place after an iteration; its signs and rows are not updated yet.
 
     The events that are `pending` come before a node at the same time.
     """
@@ -484,7 +484,7 @@ class EventReverseReplay(AbstractReverseReplay[EventCarry, ReplayedIteration]):
 
     @property
     def after_end(self) -> ReplayedIteration:
-        """Return the place at the end of the run, as an idle iteration has it."""
+        """Return the data of an idle iteration at the end of the run."""
         end = self.end.place
         never = jnp.zeros((), bool)
         return ReplayedIteration(
@@ -560,7 +560,7 @@ class EventReverseReplay(AbstractReverseReplay[EventCarry, ReplayedIteration]):
     def carry_before(
         self, replay: ReplayedIteration, step_state: StepState, i: Int[Array, ""]
     ) -> EventCarry:
-        """Return the carry before iteration i, as far as the iteration reads it."""
+        """Return the parts of the carry before iteration i that the iteration reads."""
         # Constants come back as arrays of NumPy.
         start = jax.tree.map(jnp.asarray, self.start.place)
         numbers = jnp.arange(start.pending.shape[0], dtype=jnp.int32)
