@@ -106,8 +106,8 @@ def steady_motion(
     a circle and a precessing top, for which no coordinates of the attitude are
     constant.
 
-    If these equations have a family of solutions, the result is the one to which
-    Newton's method with least-norm increments converges. The `held_...` arguments
+    If these equations have a family of solutions, the result is the solution to
+    which Newton's method with least-norm increments converges. The `held_...` arguments
     select another solution, for instance a motion with a given speed or lean. The
     increments have no component along the symmetries, except where held coordinates
     require it.

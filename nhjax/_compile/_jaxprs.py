@@ -122,8 +122,8 @@ def _sizes_of_product(product: Any) -> Iterator[int]:
         yield size * terms
 
 
-# Only these operations are removed when repeated: they have no state, unlike random
-# numbers, and no parameters that a user chooses.
+# Only these operations are removed when repeated. They have no state (random numbers
+# have one), and no parameters that a user chooses.
 _REPEATABLE = frozenset(
     (*ARITHMETIC_AND_SHAPES, "dot_general", "gather", SMALL_PRODUCT)
 )
@@ -152,8 +152,9 @@ def cse_dce(program: Any) -> Any:
 
 
 class _Simplifier:
-    """The removal of operations; a program that occurs several times is simplified
-    once.
+    """Removes operations from programs.
+
+    A program that occurs several times is simplified once.
     """
 
     def __init__(self):

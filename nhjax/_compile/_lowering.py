@@ -132,7 +132,7 @@ def reason_against_kernel(program: Any) -> str | None:
     """Return why XLA does not compile a single kernel, or `None` if it does."""
     if chosen_engine() == "xla":
         return "chosen"
-    # The dtype of random keys has no attribute `kind`, which gives None here.
+    # The dtype of random keys has no attribute `kind`, so its kind is None here.
     kinds = {getattr(aval.dtype, "kind", None) for aval in program.in_avals}
     if not kinds <= set("fiub"):
         return "an operand is neither a real number nor an integer nor a boolean"

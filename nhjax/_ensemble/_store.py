@@ -553,7 +553,7 @@ class _ZarrEncoder:
                 name,
                 shape=shape,
                 dtype=dtype,
-                # An axis may have length 0, but a chunk must not.
+                # An axis may have length 0, but a chunk must have at least length 1.
                 chunks=(rows, *(max(1, size) for size in shape[1:])),
                 dimension_names=dims,
                 attributes=attributes.get(name, {}),

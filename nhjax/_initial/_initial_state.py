@@ -83,13 +83,14 @@ def initial_state(
     - `project`: replace q by the nearest configuration, and then v by the nearest
         velocity, in the kinetic metric, that satisfies the constraints (one linear
         solve for constraints linear or affine in v, Newton's method for others).
-    - `keep_q`, `keep_v`, `keep_p`: the components of q, and of the v or p that was
-        given, that the projection must not change: an index, a name or a sequence of
-        them, known when tracing. The projection then finds the nearest values of the
-        other components, in the same metric, that satisfy the constraints. An index is
-        a position in the flattened `q` (for a tuple, in all its parts joined in order)
-        or in `v` or `p`. A name is an entry of the `coordinates` of the system. If the
-        kept components determine a constraint and violate it, the error names both.
+    - `keep_q`, `keep_v`, `keep_p`: the components of q, v or p that the projection must
+        not change: an index, a name or a sequence of them, known when tracing. Use
+        `keep_v` with `v`, and `keep_p` with `p`. The projection then finds the nearest
+        values of the other components, in the same metric, that satisfy the
+        constraints. An index is a position in the flattened `q` (for a tuple, in all
+        its parts joined in order) or in `v` or `p`. A name is an entry of the
+        `coordinates` of the system. If the kept components determine a constraint and
+        violate it, the error names both.
     - `throw`: whether to raise if there is no consistent state. If false, all numbers
         of the state are then NaN, and `integrate` reports it as not finite; under
         `vmap` the other members of an ensemble are not affected. Wrong types and shapes

@@ -88,7 +88,7 @@ def checked_keep(
 
     **Arguments:**
 
-    - `letter`: "v" or "p", whichever was given.
+    - `letter`: "v" or "p", the argument that was given.
     - `chosen`: the arguments `keep_q`, `keep_v` and `keep_p` by the letters q, v and p.
     """
     other = "p" if letter == "v" else "v"
@@ -293,8 +293,8 @@ def project_position(system, t, q, u, args, kept: Kept, given: PyTree[Array]):
 def project_fibre_coordinate(system, t, q, u, args, kept: Kept, given: Vector):
     """Project u: find the stationary point w of ½ (w-u)ᵀ K (w-u) on Φ(t, q, w) = 0.
 
-    K is the metric on the fibre at (t, q, u). The `kept` components of v or p,
-    whichever the user gave, are equal to the same components of `given`.
+    K is the metric on the fibre at (t, q, u). The `kept` components of the
+    argument that the user gave, v or p, are equal to the same components of `given`.
     """
 
     def phi(w):

@@ -55,8 +55,8 @@ class DirectAdjoint(AbstractAdjoint):
 
         This differs from the `DirectAdjoint` of diffrax, which nests scans and
         checkpoints up to a maximum number of steps, and which diffrax advises against.
-        Here the number of steps is known, the loop is a plain one, and this adjoint is
-        the default.
+        In nhjax the number of steps is known, a plain loop runs all steps, and this
+        adjoint is the default.
 
     !!! example
 

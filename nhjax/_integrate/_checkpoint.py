@@ -45,11 +45,11 @@ class Checkpoint(eqx.Module):
     Under `vmap` every array has the batch as its leading axis. Derivatives pass through
     `state`, `t0` and `dt`.
 
-    The bits of a result depend on the compiled instructions. Runs in parts repeat a run
-    in one piece bit for bit if all of them save a checkpoint (the last one need not)
-    and otherwise the same output, with the same releases on the same machine. Otherwise
-    they repeat it up to round-off. Samples by `SaveAt(ts=...)` and dense output count
-    times from the start of their run.
+    The bits of a result depend on the compiled instructions. A run in parts repeats a
+    run in one piece bit for bit if all parts save a checkpoint (the last part need not
+    save one) and apart from this the same output, with the same releases on the same
+    machine. Otherwise it repeats the run up to round-off. Samples by `SaveAt(ts=...)`
+    and dense output count times from the start of their run.
 
     !!! example
 

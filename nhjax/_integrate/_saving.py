@@ -212,7 +212,7 @@ def _times(ts: Any) -> Float[Array, " k"]:
 
 
 class Rows(NamedTuple):
-    """The entries that one iteration saves, or the buffers with the entries of all.
+    """The entries that one iteration saves, or buffers for all iterations.
 
     - `saved`: the time and the value of `SaveAt(fn=...)`; None if steps save none.
     - `record`: the record of the step for interpolation; None if none is kept.
@@ -249,7 +249,8 @@ def record_places(
     if dense or sampled is None:
         return RecordPlaces(length, jnp.arange(length + 1, dtype=jnp.int32))
     # There is one row for each sample, and samples in the same step share the row of
-    # the first. There may be more steps than samples, or more samples than steps.
+    # the first sample. There may be more steps than samples, or more samples than
+    # steps.
     number = sampled.shape[0]
     slots = jnp.full((length + 1,), number, jnp.int32)
     first = slots.at[sampled].min(jnp.arange(number, dtype=jnp.int32))

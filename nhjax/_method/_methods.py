@@ -474,9 +474,9 @@ def multiplier_closure_weights(t: Tableau, symmetric: bool) -> ClosureWeights:
     The propagated and the consistent closure have Λ^1 = λ_k and y = (Λ^2, ..., Λ^s), as
     in the equations of the paper. The symmetric closure has y = (ν, Λ^2, ...,
     Λ^{s-1}), Λ^1 = λ_k + ν and Λ^s = λ_{k+1} + σ ν. A step back exchanges the two ends
-    and maps ν to σ ν, so that it retraces the step if σ = ±1. Of these two,
-    σ = -R_A(∞) makes A_{2:,:} E invertible, and σ = R_A(∞) does not,
-    because the solutions of Σ_j a_ij Λ^j = 0, i >= 2, have Λ^s = R_A(∞) Λ^1.
+    and maps ν to σ ν, so that it retraces the step if σ = ±1. Of these two
+    values, only σ = -R_A(∞) makes A_{2:,:} E invertible, because the solutions of
+    Σ_j a_ij Λ^j = 0, i >= 2, have Λ^s = R_A(∞) Λ^1.
 
     **Arguments:**
 

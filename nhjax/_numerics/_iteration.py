@@ -16,8 +16,8 @@ Aux = TypeVar("Aux")
 
 
 # If an iteration may converge slowly, increments that have stopped falling are treated
-# as noise up to this many units of round-off. Larger ones can also come from a slow
-# iteration that spirals towards the solution.
+# as noise up to this many units of round-off. Larger increments can also come from a
+# slow iteration that spirals towards the solution.
 NOISE_UNITS = 400
 # At the first increment that fails to fall, this many units of round-off are treated as
 # noise. At each further such increment, this level grows by one of the two factors

@@ -548,7 +548,7 @@ def _bandwidth(shared: "scipy.sparse.csr_array", order: np.ndarray) -> int:
 
 
 def _raised(x: Array, other: Array) -> Array:
-    """Give x as many axes as another array has, if it has fewer."""
+    """Add leading axes to x, until it has as many axes as another array."""
     return jnp.expand_dims(x, range(max(other.ndim - x.ndim, 0)))
 
 

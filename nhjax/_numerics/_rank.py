@@ -82,7 +82,7 @@ def reciprocal_condition(matrix: Float[Array, "k l"]) -> FloatScalar:
 
 
 def is_deficient(matrix: Float[Array, "k l"]) -> BoolScalar:
-    """Return whether the rows are dependent to round-off; rows with NaN are not."""
+    """Return whether the rows are dependent to round-off, False for rows with NaN."""
     eps = jnp.finfo(matrix.dtype).eps
     return reciprocal_condition(matrix) <= 10 * matrix.shape[1] * eps
 
@@ -143,7 +143,7 @@ def least_norm_inverse(
 ) -> Float[Array, "l l"]:
     """Compute the inverse X of a symmetric C that solves C x = b with the least norm.
 
-    If C x = b has solutions, X b is the one with the least Σ C_aa x_a². With
+    If C x = b has solutions, X b is the solution with the least Σ C_aa x_a². With
     D = diag(C_aa)^(-1/2) it is X = D (D C D)⁺ D. Eigenvalues of D C D count as zero if
     they are round-off, or less than `negligible` times the largest one. If some
     constraints are scaled, only their multipliers are scaled.

@@ -152,7 +152,7 @@ class StageJacobianFactors(eqx.Module):
         """Compute the fibre coordinates u - N⁻¹ r_v of the nodes.
 
         The residual was evaluated at positions that include the `change` of the stage
-        velocities, but with forces that do not.
+        velocities, but with forces that do not include it.
         """
         du = -self.momentum_inverse.matvec(residual)
         if self.first_order is not None:
@@ -210,8 +210,8 @@ class StageJacobianFactors(eqx.Module):
         """Correct the acceleration and λ_c at the end of the step.
 
         The unknowns of the closure change with λ_c, so that the nodes stay the same to
-        leading order. Otherwise their constraints, which have just been solved, would
-        be violated again, which would cost another iteration.
+        leading order. Otherwise the nodes would violate their constraints again, and
+        this would cost another iteration.
         """
         momentum_residual, hidden_residual = residual
         da, dlam = self.end.solve(-momentum_residual, -hidden_residual)
@@ -501,8 +501,8 @@ def update_norms(
 def fibre_coordinate_size(stages: StageEquations, x: StageUnknowns) -> FloatScalar:
     """Return the smaller of the max norms of the stage and node fibre coordinates.
 
-    While an iteration is far from a solution, one of the two can be much larger than
-    any size that is related to the other.
+    While an iteration is far from a solution, one of the two norms can be much larger
+    than the other, and is not a useful size then.
     """
     u = x.momentum if stages.hamiltonian else x.velocity
     return jnp.minimum(max_norm(u), max_norm(x.node_fibre_coordinate))

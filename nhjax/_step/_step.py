@@ -229,9 +229,9 @@ def first_step_state(
 class _ContinuousMultiplier(AbstractImplicitFunction[Any, Float[Array, " l"]]):
     """The continuous multiplier λ_c as a function of (system, t, q, u, args).
 
-    Its derivative is zero where the multiplier is not finite. Otherwise a member that
-    failed would make the derivative of a sum that leaves it out NaN, because NaN times
-    zero is NaN.
+    Its derivative is zero where the multiplier is not finite. Otherwise, if a sum
+    leaves out a failed member, the derivative of the sum would still be NaN, because
+    NaN times zero is NaN.
     """
 
     programs: None = None

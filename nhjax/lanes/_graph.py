@@ -61,8 +61,8 @@ class Region:
     def __init__(self, parent: "Region | None", owner: "Node | None", is_side: bool):
         self.parent, self.owner = parent, owner
         self.depth = 0 if parent is None else parent.depth + 1
-        # The innermost side of a branch around this region, or the root. Only these
-        # have tables of pure nodes.
+        # The innermost side of a branch around this region, or the root. Only sides of
+        # branches and the root have tables of pure nodes.
         self.floor = self if is_side or parent is None else parent.floor
         self.table: dict[Any, Node] = {}
         self.loads: dict[Any, Node] = {}

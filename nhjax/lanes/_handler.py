@@ -353,7 +353,7 @@ def handler_ir(
 ) -> str:
     """Return a module with the handler of the function `@kernel` of another module.
 
-    It refers to the function `SHARED_HANDLER` of the module `shared_handler_ir()`.
+    The handler calls the function `SHARED_HANDLER` of the module `shared_handler_ir()`.
 
     **Arguments:**
 

@@ -107,7 +107,7 @@ def object_code(
 
     - `texts`: the modules, in LLVM IR. They may declare the same functions.
     - `exported`: the only function that is visible from outside.
-    - `target`: the machine, which may be another one.
+    - `target`: the machine, which may differ from the machine of this process.
     - `is_quick`: whether to compile in a third of the time or less, to slower code.
     """
     module, machine = _compiled(texts, exported, target, is_quick)

@@ -129,8 +129,8 @@ def llvm_ir(
 LONGEST_UNROLLED_SCAN = 8
 # Programs with more nodes than this are refused, unless they have fewer than 40 nodes
 # for each of JAX's operations. LLVM takes about 10 s for this number of nodes, and
-# minutes for more. XLA keeps loops over arrays: it takes a few seconds where arrays are
-# large, but longer than LLVM where there are many small ones.
+# minutes for more. XLA keeps loops over arrays: it takes a few seconds for large
+# arrays, but longer than LLVM for many small arrays.
 MOST_NODES, NODES_PER_OPERATION = 100_000, 40
 
 OPERATIONS: dict[str, Operation] = {

@@ -133,7 +133,7 @@ def _reduce(x: Value) -> tuple[Value, DoubleDouble]:
         high = difference - small
         low = (difference - high) - small
     size = absolute(x)
-    # Infinity and NaN already give NaN.
+    # For infinity and NaN, the results are NaN already.
     is_large = (size > _LARGEST_DIRECT) & (size < math.inf)
 
     def otherwise() -> tuple[Value, ...]:

@@ -39,10 +39,10 @@ class Event(eqx.Module):
     """An event: a zero of a function along a trajectory, and the action taken there.
 
     `integrate(..., event=...)` finds the zeros of `cond_fn(t, y, args)` by its sign at
-    the ends of the steps. If the sign changes in a step, the step is repeated with the
-    size θ dt, 0 < θ <= 1, at whose end the function vanishes to round-off. So the state
-    at the event is the end of a step of the method. The size is differentiated by the
-    implicit function theorem. Then the run ends, or continues with the rest of the
+    the ends of the steps. If the sign changes in a step, the step is repeated with a
+    size θ dt, 0 < θ <= 1, so that the function vanishes to round-off at its end. So the
+    state at the event is the end of a step of the method. The size is differentiated by
+    the implicit function theorem. Then the run ends, or continues with the rest of the
     step, after a `reset` of the state if there is one.
 
     If the function is zero at `t0` or right after an event, its sign is the sign of its

@@ -28,7 +28,7 @@ class TruncatedStep(NamedTuple):
 
     - `outcome`: the outcome of the step.
     - `h`: its size.
-    - `fired`: the index of the event that it ends at, -1 if it is the whole step.
+    - `fired`: the index of the event at its end, -1 if the step is not truncated.
     - `values`: the conditions at its end.
     - `crossed`: the conditions that crossed zero in the step.
     """
