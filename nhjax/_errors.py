@@ -107,7 +107,7 @@ _ADVICE = (
         jax.errors.NonConcreteBooleanIndexError,
         "write `jnp.where(condition, a, 0.0)` in place of `a[condition]`.",
     ),
-    # The functions of `math` need a number, which raises the second of these errors.
+    # The functions of `math` need a number: traced values raise the second error here.
     (
         (jax.errors.TracerArrayConversionError, jax.errors.ConcretizationTypeError),
         "use functions of `jax.numpy` in place of `numpy` and `math`, and leave out "

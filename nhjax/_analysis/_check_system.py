@@ -49,8 +49,8 @@ class SystemReport(eqx.Module):
     - `depends_on_time`: the names of the functions that depend on t.
     - `ignorable`: the indices of coordinates that no function depends on near the given
         state. A coordinate whose terms cancel only up to rounding is not found.
-    - `constant`: which of the mass matrix and the Jacobian of the nonholonomic
-        constraints are constant.
+    - `constant`: the names of constant matrices, among the mass matrix and the
+        Jacobian of the nonholonomic constraints.
     """
 
     dimension: int

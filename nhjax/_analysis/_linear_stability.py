@@ -92,7 +92,7 @@ def linear_stability(
     system. Without `symmetry`, X has the velocity as its constant components. It is
     then a translation of ignorable coordinates or a left translation of the group. All
     velocities must be constant (body velocities on a group), or at least the chosen
-    independent ones, as for a bicycle on a circle.
+    independent velocities. A bicycle on a circle is an example of the second case.
 
     About any other motion, A is valid for an instant only, and its eigenvalues do not
     decide stability. `steady_motion` finds steady motions.

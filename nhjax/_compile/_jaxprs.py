@@ -222,7 +222,7 @@ def _is_repeatable(equation: Any) -> bool:
 
 
 def _key(equation: Any, operands: list[Any]) -> Hashable:
-    """Return a key that two operations share only if they compute the same."""
+    """Return a key; operations with equal keys compute the same values."""
     params = tuple((name, _exact(equation.params[name])) for name in equation.params)
     # The context holds settings of JAX, such as the device of the operation.
     context = _exact(getattr(equation, "ctx", None))

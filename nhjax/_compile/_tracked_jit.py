@@ -99,7 +99,10 @@ class _Unrepeatable:
 
 @lru_cache(maxsize=4096)
 def _is_leaf(cls: type) -> bool:
-    """Return whether values of a class have no parts, except arrays of objects."""
+    """Return whether values of a class have no parts.
+
+    Arrays count as values without parts, although arrays of objects have parts.
+    """
     return issubclass(cls, _LEAVES) and not issubclass(cls, enum.Enum)
 
 

@@ -448,8 +448,8 @@ def call_description(
 ) -> dict[str, Any]:
     """Describe the data that must agree in all processes of a common job.
 
-    This is a manifest, a digest of the text of the program, whether there is an `out`,
-    and `others`.
+    The data are a manifest, a digest of the text of the program, a flag for `out`, and
+    `others`.
     """
     run = hashlib.sha256(text.encode()).hexdigest()
     return {"out": out, "reduce": None} | made | {"run": run} | others

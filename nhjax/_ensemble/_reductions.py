@@ -168,7 +168,7 @@ class Variance(AbstractReduction):
         ) -> DoubleDouble:
             dtype, δ = a.high.dtype, _difference(x, y)
             share = other.number.astype(dtype) / jnp.maximum(count, 1).astype(dtype)
-            # In this order, no factor overflows unless the product does.
+            # In this order, no factor overflows unless the whole product overflows.
             between = (δ * share) * (δ * one.number.astype(dtype))
             return add(add(a, b), double_double(between))
 

@@ -518,7 +518,7 @@ def _check_saved(
     )
 
 
-# JAX has an opaque trace state, which can only be compared with another one. In
+# JAX has an opaque trace state, which can only be compared with another state. In
 # releases of JAX in which this function is not public, `_is_tracing` is always True.
 _trace_state = getattr(jax.extend.core, "get_opaque_trace_state", lambda **_: object())
 with jax.ensure_compile_time_eval():

@@ -122,8 +122,9 @@ class AbstractStepper(eqx.Module, Generic[C, R]):
     def init(self, y0: State | Checkpoint, noise: FunctionNoise | None) -> C:
         """Return the carry before the first iteration.
 
-        To start from a state, the `noise` of the functions of the system is needed. A
-        checkpoint already holds the quantities that follow from it.
+        A start from a state needs the `noise` of the functions of the system. A start
+        from a checkpoint does not, because the checkpoint holds the quantities that are
+        computed from the noise.
         """
 
     @abstractmethod

@@ -205,7 +205,7 @@ def stability_at_infinity(t: Tableau) -> float:
 
 
 class _Branch(NamedTuple):
-    """A tree with the edge to its root: its size |τ|, its γ, and Σ_j a_ij φ_j."""
+    """A tree τ and the edge to its root: the numbers |τ|, γ(τ) and Σ_j a_ij φ_j(τ)."""
 
     size: int
     gamma: int

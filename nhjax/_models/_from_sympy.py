@@ -412,7 +412,7 @@ def components(name: str, x: Any, names: tuple[str, ...]) -> tuple[Array, ...]:
 def printer() -> Any:
     """Create SymPy's printer for JAX, modified to print all digits of floats.
 
-    SymPy's own printer prints 15 digits, and integers too large for a type of JAX.
+    SymPy's own printer prints 15 digits, and integers that are too large for JAX.
     """
     base = importlib.import_module("sympy.printing.numpy").JaxPrinter
 

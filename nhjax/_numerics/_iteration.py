@@ -19,10 +19,10 @@ Aux = TypeVar("Aux")
 # as noise up to this many units of round-off. Larger increments can also come from a
 # slow iteration that spirals towards the solution.
 NOISE_UNITS = 400
-# At the first increment that fails to fall, this many units of round-off are treated as
-# noise. At each further such increment, this level grows by one of the two factors
-# below. The factor is smaller for iterations that may be slow, since their increments
-# may rise and fall before they have converged.
+# When an increment fails to fall for the first time, this many units of round-off are
+# treated as noise. Each time that this happens again, the level grows by one of the two
+# factors below. The factor is smaller for iterations that may be slow, since their
+# increments may rise and fall before they have converged.
 _FIRST_UNITS = 30.0
 _GROWTH, _GROWTH_IF_SLOW = 30.0, 2.0
 # An iteration diverges if an increment is larger by this factor than x and the first

@@ -295,8 +295,9 @@ class InvariantCorrection(eqx.Module):
         matrix = errors[:, None] * gram + (1 - a)[:, None] * one
         # If one function follows from others, the matrix is singular.
         solved = inverse(matrix + eps**0.5 * one)
-        # The ratio of the impulses to the impulses of the definite matrix of the row
-        # sums, for the same errors. With one function it is Σ (row sum) ω² / |g|.
+        # The gain is the ratio of the impulses to the impulses that a definite matrix,
+        # the diagonal matrix of the row sums, would give for the same errors. With one
+        # function it is Σ (row sum) ω² / |g|.
         squares = at_start.covectors**2 + covectors**2
         roots = jnp.sqrt(jnp.sum(at_start.row_sums[None] * squares, axis=1))
         gain = roots[:, None] * solved * (errors * roots)[None]

@@ -91,7 +91,7 @@ def simplified_newton_update(
 
 
 class MultiplierResponses(NamedTuple):
-    """The changes of stages and nodes with each unknown of the multipliers.
+    """The changes of stages and nodes for unit changes of the multipliers' unknowns.
 
     The last axis lists these unknowns, h δy of the closure and h δΛ. With the terms of
     order h the responses are stored, since the Schur complement is formed from them.
@@ -465,9 +465,10 @@ def _reactions(
 def _with_mass_at_end(
     lin: Linearisation, terms: FirstOrderTerms, jacobian: Float[Array, "l n"]
 ) -> Linearisation:
-    """Replace the mass matrix and constraints of a linearisation by their end values.
+    """Return a linearisation with mass matrix and constraints at the end of the step.
 
-    Otherwise u̇ and λ_c at the end would converge no faster than without these terms.
+    With the matrices at the start, u̇ and λ_c at the end would converge no faster than
+    without the terms of order h.
     """
     at_start = lin.momentum_inverse.as_matrix()
     change = small_einsum("kl,ln->kn", terms.node_inertia[-1], at_start)

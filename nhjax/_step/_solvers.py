@@ -373,5 +373,5 @@ def _kinematic_scale(
         (q,),
         (uneven_perturbations(q),),
     )[1]
-    # If a constraint has no finite slope, this does not measure its round-off.
+    # If the slope of a constraint is not finite, it does not measure the round-off.
     return jnp.where(jnp.isfinite(change), jnp.abs(change), 0)

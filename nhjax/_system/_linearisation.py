@@ -157,7 +157,7 @@ def _momentum_and_constraint(
 
 
 def _inertial_force(system, q, p: Array, v: Array) -> Array:
-    """Compute ad*_v p, the term of ṗ by which the body momentum turns."""
+    """Compute ad*_v p, the part of ṗ that comes from the motion of the body frame."""
     manifold = system.manifold_of(q)
     return jnp.zeros_like(p) if manifold.is_flat else manifold.ad_dual(v, p)
 

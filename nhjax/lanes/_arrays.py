@@ -227,7 +227,7 @@ SHAPING: dict[str, Operation] = {
 }
 
 
-# No array is that long.
+# This number is larger than any index of an array.
 _FAR = 2**62
 
 
@@ -331,7 +331,8 @@ class _Axes(NamedTuple):
     """The axes of an array on which a window starts at a variable index.
 
     - `indexed`: the axes whose starts are the entries of an index.
-    - `batched`: the axes that go along with the axes `sources` of the array of indices.
+    - `batched`: the batch axes of the array. They belong to the axes `sources` of the
+      array of indices.
     """
 
     indexed: Sequence[int]

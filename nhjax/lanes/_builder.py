@@ -304,7 +304,7 @@ class Builder:
         self.operations, self.unroll = operations, unroll
         # The enclosing equations, which identify the current one.
         self.path: list[int] = []
-        # For each loop, by its path, the numbers that are known to change.
+        # The numbers of each loop that are known to change, by the path of the loop.
         self.changing: dict[tuple[int, ...], set[int]] = {}
         self._last_uses: dict[int, tuple[Any, list[list[Any]]]] = {}
 

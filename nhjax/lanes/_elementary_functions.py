@@ -65,8 +65,8 @@ def _texts(op: str, dtype: str, width: int) -> dict[str, str]:
     writer.result(*results)
     kind = writer.type(scalar)
     result = result_type([kind] * len(results))
-    # A function that only calls another one is inlined. `sin` and `cos` call one common
-    # function, which is not inlined, so that LLVM merges its calls.
+    # A function that only calls another function is inlined. `sin` and `cos` call one
+    # common function, which is not inlined, so that LLVM merges its calls.
     is_call = dtype == "float32" or op in _RESULT_OF_BOTH
     inlining = "noinline" if op == _SIN_AND_COS else "alwaysinline" if is_call else ""
     name, parameters = symbol(op, dtype, width), ", ".join(f"{kind} {x}" for x in names)
