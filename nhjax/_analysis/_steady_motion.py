@@ -364,7 +364,7 @@ def least_norm_root(
 
     - `residual`: the function whose root is computed.
     - `free`: 1 for each unknown that may change, and 0 for the others.
-    - `start`: the values to which the unknowns are increments.
+    - `start`: the values to which the unknowns are added.
     - `groups`: the numbers of unknowns of each kind, in order. Unknowns of one kind
         have the round-off of the largest of them.
     - `max_iterations`: the largest number of iterations.

@@ -38,7 +38,7 @@ class EngineUse(NamedTuple):
     - `engine`: `"lanes"` is nhjax's own compiler, which vectorises over the members of
         an ensemble (SIMD); `"kernels"` is XLA with one kernel for each member; `"xla"`
         is XLA without such kernels.
-    - `reason`: why the engines before it were not used, or that it was chosen.
+    - `reason`: why this engine was used, for instance why earlier engines were not.
     - `members`: the number of members of an ensemble; `None` for a single run.
     """
 
@@ -186,7 +186,8 @@ def _as_one_kernel(ctx, *operands, program):
         def kernel(*full):
             return run(*merge_lists(is_full, _tied(full), map(jnp.zeros_like, empty)))
 
-        # The barrier hides which operands are constants, which XLA would remove too.
+        # XLA would also remove constant operands. The barrier hides that they are
+        # constant.
         return jax.jit(kernel)(*jax.lax.optimization_barrier(full))
 
     token = _within.set(True)

@@ -600,7 +600,10 @@ def _lifted(value: Any, counts: Bool[Array, ""]) -> Any:
 
 
 def _sum_dtype(x: Any) -> Any:
-    """Return the dtype of the mean of `x`: its own, or JAX's default for integers."""
+    """Return the dtype of the mean of `x`: the dtype of `x`, or JAX's default float.
+
+    The default is used for integers.
+    """
     if jnp.issubdtype(x.dtype, jnp.floating):
         return x.dtype
     if jnp.issubdtype(x.dtype, jnp.complexfloating):

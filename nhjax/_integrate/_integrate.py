@@ -169,8 +169,9 @@ def integrate(
         are NaN (zero for a zero cotangent). Other members of a batch are not affected.
     - `progress_meter`: such as `nhjax.TqdmProgressMeter()`.
     - `invariants`: quantities that the steps conserve to round-off at their values in
-        `y0`: `"energy"`, or a function of (t, q, v, args), for a Hamiltonian system of
-        (t, q, p, args), of shape () or (k,). The system itself must conserve them.
+        `y0`: `"energy"`, or a function that returns shape () or (k,). It is called with
+        (t, q, v, args), or (t, q, p, args) for a Hamiltonian system. The system itself
+        must conserve these quantities.
         `docs/invariants.md` describes the method, its cost and its behaviour at rest.
     - `event`: an `nhjax.Event`, or a sequence of them: zeros of functions of the state,
         where the run ends or the state is reset. The first event in time happens first.

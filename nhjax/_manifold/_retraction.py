@@ -210,8 +210,8 @@ def check_retraction(group: str, retraction: object) -> None:
     )
 
 
-# The series is used for s below this value. Above it the recursion is equally accurate,
-# because it divides its rounding errors by s.
+# The series is used for s below this value. Above this value the recursion is equally
+# accurate, because it divides its rounding errors by s.
 _SWITCH = 2.0
 
 # The first omitted term of the series is at most 2e-18, for c_0 at the switch.

@@ -563,7 +563,8 @@ def compressed_products(
     The products are block tridiagonal in the order of the pattern. So each row has
     entries in at most one of the blocks whose numbers are equal modulo three, and the
     columns of these blocks can be added. Entry [i, j, c, b, a] of the result is the
-    entry in row a of the sum of the columns b of all blocks with number c modulo three.
+    entry of product (i, j) in row a and in column b of the block whose number is c
+    modulo three.
     """
     pattern = left.pattern
     place = np.argsort(pattern.order)

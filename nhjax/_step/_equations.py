@@ -56,8 +56,8 @@ class StageUnknowns(eqx.Module):
     - `closure`: y, the unknowns of the closure. The nonholonomic multipliers are
         Λ = (start) λ_k + (end) λ_{k+1} + E y.
     - `holonomic`: the holonomic multipliers Λ^1..Λ^s.
-    - `end_acceleration`, `end_multiplier`: u̇ and λ_c at the end of the step, which only
-        the symmetric closure has.
+    - `end_acceleration`, `end_multiplier`: u̇ and λ_c at the end of the step, which
+        only the symmetric closure has.
     - `impulse`: ε, the impulses at both ends of the step along ∂I/∂v of the invariants
         I; None if the run keeps no invariants.
     """
@@ -541,9 +541,10 @@ def end_position(stages: StageEquations, x: StageUnknowns) -> PyTree[Array]:
 def with_moved_positions(stages: StageEquations, nudge: FloatScalar) -> StageEquations:
     """Return the equations with q_k moved by about `nudge` times its size.
 
-    This move changes the solution. The change per `nudge` estimates the change by the
-    round-off of positions per unit round-off. The coordinates move by different
-    amounts, so that the moves do not cancel in a difference of two coordinates.
+    This move changes the solution. The change divided by `nudge` estimates the effect
+    of the round-off of positions, divided by the unit round-off. The coordinates move
+    by different amounts, so that the moves do not cancel in a difference of two
+    coordinates.
     """
     if stages.manifold.is_flat:
         moves = uneven_perturbations(stages.q)

@@ -259,8 +259,8 @@ class _BodySlopes(NamedTuple):
     """Derivatives at the start of a step, in the body frame.
 
     - `inertia_rate`: the rate of N = ∂p/∂u along the motion.
-    - `momentum`: the derivative of the momentum by the position, less the derivative of
-        the momentum that is transported there.
+    - `momentum`: the derivative of the momentum by the position, minus the derivative
+        of the momentum that the chart transports to this position.
     """
 
     inertia_rate: Float[Array, "n n"]
@@ -270,7 +270,7 @@ class _BodySlopes(NamedTuple):
 class _ChartSlopes(NamedTuple):
     """Derivatives at the start of a step, in its chart.
 
-    - `turning`: the rate at which ∂Π/∂H changes through dτ_y along y = v.
+    - `turning`: the rate of ∂Π/∂H along y = v that comes from the change of dτ_y.
     - `momentum`, `force`, `body_force`: ∂Π/∂y, ∂F/∂H and ∂w/∂H.
     - `base`: the derivative of the constant term of Π by the increment of the step.
     """

@@ -143,7 +143,7 @@ class Memory:
         target_shift: Node | None = None,
         source_shift: Node | None = None,
     ) -> None:
-        """Copy numbers from some indices of a buffer to some indices of another."""
+        """Copy numbers from indices of one buffer to indices of another buffer."""
         if target_view.size <= _LONGEST_UNROLLED:
             numbers = [
                 self.load(source, source_shift, int(i)) for i in source_view.flat

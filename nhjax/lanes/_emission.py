@@ -656,7 +656,7 @@ class _Memory:
     def _address(
         self, buffer: Buffer, index: Node | None, offset: int
     ) -> tuple[str, bool]:
-        """Write the address of a number; return whether each member has its own."""
+        """Write the address of a number; return whether it differs between members."""
         writer, kind = self.writer, memory_type(buffer.dtype)
         pointer = self._bases[buffer]
         if buffer.kind == "scratch" and buffer.is_divergent:

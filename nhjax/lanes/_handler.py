@@ -46,9 +46,9 @@ from ._ffi import (
 
 # The shortest work, in ns, for which a helper is woken. Waking it takes about 10 µs.
 _WORTH_A_HELPER = 50_000
-# The number of times that the caller yields its core before it sleeps. A sleep takes at
-# least 50 µs, and an eighth of the time slept so far, so that the caller is late by at
-# most that part.
+# The number of times that the caller yields its core before it sleeps. The first
+# sleeps take 50 µs. Later sleeps take an eighth of the time slept so far, so that the
+# caller is late by at most an eighth.
 _YIELDS, _SHORTEST_SLEEP, _LONGEST_SLEEP = 100, 50, 10_000
 
 # The description of a program: its kernel, the numbers of its operands and results, the

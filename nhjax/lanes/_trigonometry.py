@@ -94,8 +94,8 @@ def _reduction_of_large() -> str:
     high = (upper & ~_LOWEST_BITS).cast("uitofp", "double") * scale
     low = ((upper & _LOWEST_BITS) << 53) | (lower >> 11)
     low = low.cast("uitofp", "double") * 2.0**-53 * scale
-    # Two signs enter: the sign of r, where |n| pi / 2 is larger than |x|, and the sign
-    # of x.
+    # The sign of the remainder is the product of two signs: the sign of x, and a minus
+    # if |n| pi / 2 is larger than |x|.
     is_left = bits < 0
     sign = where(is_negative, -(2**63), 0) ^ (bits & -(2**63))
     quadrant = n.cast("trunc", "i64")

@@ -411,8 +411,8 @@ def _intrinsic(name: str, *arguments: Value) -> Value:
     return writer.call(f"@{full}", ("double",), *arguments)[0]
 
 
-# A number of about 106 bits: the sum of two float64, the second of which is at most the
-# round-off of the first.
+# A number of about 106 bits: the sum of two float64. The second number is at most the
+# round-off of the first number.
 DoubleDouble: TypeAlias = tuple[Value, Value]
 
 # Adding this rounds to an integer, which then stands in the lowest bits.

@@ -509,9 +509,9 @@ class EventReverseReplay(AbstractReverseReplay[EventCarry, ReplayedIteration]):
         """Find the data of iteration i and the state from which it started.
 
         Iterations are undone last to first, and `following` says where the next one
-        started. If the last entry of the log that is left has the number of this
-        iteration, it ended at that event, and the step back starts from the state
-        `before` the reset.
+        started. If the last remaining entry of the log has the number of this
+        iteration, the iteration ended at that event, and the step back starts from the
+        state `before` the reset.
         """
         plain, end = self.stepper.plain, self.end.place
         i = i.astype(jnp.int32)
