@@ -38,7 +38,7 @@ class EngineUse(NamedTuple):
     - `engine`: `"lanes"` is nhjax's own compiler, which vectorises over the members of
         an ensemble (SIMD); `"kernels"` is XLA with one kernel for each member; `"xla"`
         is XLA without such kernels.
-    - `reason`: why this engine was used, for instance why earlier engines were not.
+    - `reason`: why this engine was used, and why earlier engines were not used.
     - `members`: the number of members of an ensemble; `None` for a single run.
     """
 

@@ -321,7 +321,8 @@ def _states_of_chunk(
 def merged_states(reductions: Any, one: Any, other: Any) -> Any:
     """Merge the states of reductions of two sets of members.
 
-    A separate program rounds in the same way for all sources of the states.
+    This is a separate program, so that the rounding is the same for states from all
+    sources.
     """
     return each_reduction(_merge, reductions, one, other)
 

@@ -392,7 +392,7 @@ def _row_sizes(matrix: Float[Array, "l n"]) -> Float[Array, " l"]:
 def _left_basis(
     matrix: Float[Array, "l n"], negligible: float
 ) -> tuple[Float[Array, "l l"], Float[Array, " l"]]:
-    """Find orthonormal combinations of rows, and which of them are active.
+    """Find orthonormal combinations of rows, and which combinations are active.
 
     The combinations are the columns of the first result. The second result has a one
     for each active combination, whose singular value exceeds `negligible`, and a zero

@@ -123,11 +123,11 @@ def measured_noise(
 
     Very small displacements may be lost next to a constant in the function, and values
     at larger displacements may differ by more than round-off. The function is measured
-    at three distances (5e-14, 2e-11 and 1e-8 in double precision). The largest result
-    is returned, up to the first distance at which the differences decrease with their
-    order, as for a smooth function. The points lie on rays from the point of interest,
-    so that a kink or a jump at this point, such as friction at rest, is not mistaken
-    for round-off.
+    at three distances (5e-14, 2e-11 and 1e-8 in double precision). The search stops
+    at the first distance at which the differences decrease with their order, as for a
+    smooth function. The largest result is returned. The points lie on rays from the
+    point of interest, so that a kink or a jump at this point, such as friction at rest,
+    is not mistaken for round-off.
 
     **Arguments:**
 

@@ -595,7 +595,8 @@ def block_tridiagonal_inverse(
     count = -(-size // (3 * g)) * 3
     ordered = static_take(products, pattern.order)
     ordered = jnp.pad(ordered, (*[(0, 0)] * 4, (0, count * g - size)))
-    # Axes: equation, unknown, sum, column, group of three blocks, block in it, row.
+    # The axes: equation, unknown, sum, column, group of three blocks, block inside the
+    # group, row.
     split = ordered.reshape(q, q, 3, g, count // 3, 3, g)
 
     def diagonal(offset):
@@ -664,7 +665,7 @@ def _runs(index: Sequence[int] | np.ndarray) -> list[np.ndarray]:
             or index[end] - index[end - 1] == index[start + 1] - index[start]
         ):
             end += 1
-        # Slices only go forward, so that a decreasing step ends the run.
+        # Slices only go forward: if the indices decrease, a run has a single index.
         if end > start + 1 and index[start + 1] < index[start]:
             end = start + 1
         runs.append(np.asarray(index[start:end]))

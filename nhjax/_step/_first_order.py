@@ -107,11 +107,11 @@ class FirstOrderTerms(eqx.Module):
     δr_i = N_i δH_i + ∂Π/∂y δy_i - h Σ_j â_ij ∂F/∂H δH_j - ∂base/∂ξ δξ - ...,
     δy_i = h Σ_j a_ij δH_j,
 
-    and the equations of the nodes likewise. The leading part is N δH_i with the mass
-    matrix N at the start of the step. All other terms are of order h: the change of the
-    mass matrix until the stage, N_i = N + h c_i Ṅ, the change of momenta with
-    positions, and the change of forces with velocities. Their derivatives are taken at
-    the start of the step and multiplied by N⁻¹, so that with z_i = N⁻¹ r_i
+    and the equations of the nodes change in the same form. The leading part is N δH_i
+    with the mass matrix N at the start of the step. All other terms are of order h: the
+    change of the mass matrix until the stage, N_i = N + h c_i Ṅ, the change of momenta
+    with positions, and the change of forces with velocities. Their derivatives are
+    taken at the start of the step and multiplied by N⁻¹, so that with z_i = N⁻¹ r_i
 
     δH_i = z_i - N⁻¹ (the terms, applied to z),
 

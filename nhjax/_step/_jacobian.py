@@ -451,7 +451,10 @@ def _first_order_factors(
 def _reactions(
     stages: StageEquations, jacobian: Float[Array, "s l n"]
 ) -> Float[Array, "s n c"]:
-    """Compute the reactions at the stages to each unknown of the closure and each Λ."""
+    """Compute the reactions at the stages for unit values of the multiplier unknowns.
+
+    These are the unknowns of the closure and the holonomic multipliers Λ.
+    """
     m, one = stages.num_nonholonomic, jnp.eye(len(jacobian), dtype=jacobian.dtype)
     weights = stages.closure_weights("E")
     parts = [

@@ -30,7 +30,7 @@ from ._writer import (
 )
 
 
-# Scratch memory is aligned to this many bytes, and so is each array in it.
+# Scratch memory and each array in it are aligned to this many bytes.
 _ALIGNMENT = 64
 _LARGEST_STACK = 2**16
 _LARGEST_SCRATCH = 2**26
@@ -138,8 +138,8 @@ def _module(writer: Writer, size: int) -> str:
 class LiveNodes:
     """The nodes that the results of a program need, by region and in order.
 
-    A store is needed if its memory is read, and a loop if one of its results or a store
-    in it is needed.
+    A store is needed if its memory is read. A loop is needed if one of its results or a
+    store inside it is needed.
     """
 
     def __init__(self, results: list[Buffer]):

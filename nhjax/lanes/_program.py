@@ -243,10 +243,10 @@ def register_kernel(
     **Arguments:**
 
     - `kernel_ir`: a module in LLVM IR with `define i1 @kernel(ptr %operands, ptr
-        %results, i64 %first, i64 %last)`, which computes the members from `%first` on:
-        `width` of them, but none after `%last`. `%operands` and `%results` are arrays
-        of the addresses of the data. Several threads may run it at the same time, on
-        different members.
+        %results, i64 %first, i64 %last)`, which computes `width` members from `%first`
+        on, but no members after `%last`. `%operands` and `%results` are arrays of the
+        addresses of the data. Several threads may run it at the same time, on different
+        members.
     - `num_operands`, `num_results`: the numbers of arrays that it reads and writes.
     - `width`: the number of members that it computes at once.
     - `is_batched`: whether the results have members, along the leading axis. Otherwise

@@ -266,8 +266,8 @@ class Bracket(eqx.Module):
     At the lower end no function has crossed zero, and at the upper end the `crossed`
     functions have crossed zero. The next point follows Chandrupatla (1997): inverse
     quadratic interpolation if the last three points allow it, and otherwise bisection.
-    It needs about as many evaluations as Newton's method, and at most about three times
-    as many as bisection.
+    This method needs about as many evaluations as Newton's method, and at most about
+    three times as many evaluations as bisection.
 
     - `new`, `other`, `old`: the newest point, the other end, and the point before. Each
         is θ and the values of all functions there.

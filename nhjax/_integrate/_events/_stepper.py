@@ -561,7 +561,7 @@ class EventReverseReplay(AbstractReverseReplay[EventCarry, ReplayedIteration]):
         self, replay: ReplayedIteration, step_state: StepState, i: Int[Array, ""]
     ) -> EventCarry:
         """Return the parts of the carry before iteration i that the iteration reads."""
-        # Constants come back as arrays of NumPy.
+        # Constants in `self.start` may be arrays of NumPy.
         start = jax.tree.map(jnp.asarray, self.start.place)
         numbers = jnp.arange(start.pending.shape[0], dtype=jnp.int32)
         is_one = numbers == replay.which
