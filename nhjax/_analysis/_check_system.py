@@ -134,8 +134,8 @@ def check_system(
 
     **Raises:** the errors of `initial_state` for wrong types and shapes of arguments
     and of values that the system's functions return; `ValueError` if a Lagrangian
-    system is given `p`, or a Hamiltonian one `v`; `TypeError` under `jit`, `vmap` or
-    `grad`.
+    system is given `p`, or a Hamiltonian system is given `v`; `TypeError` under `jit`,
+    `vmap` or `grad`.
 
     !!! example
 

@@ -143,7 +143,7 @@ def reason_against_kernel(program: Any) -> str | None:
 
 # Measurements on the gallery's systems with 2 to 8 stages, and on larger systems, show
 # that nhjax's own compiler is faster below this root mean square of array sizes, and
-# XLA above it.
+# that XLA is faster above it.
 _SMALL_ARRAYS = 40
 
 

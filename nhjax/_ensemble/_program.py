@@ -171,7 +171,7 @@ class Members:
         for x in self._leaves:
             made.update(f"{x.dtype.str}{x.shape}".encode())
             # This reads blocks, because a copy of a whole memory-mapped array may not
-            # fit.
+            # fit into memory.
             for start in range(0, len(x), 65536):
                 made.update(np.ascontiguousarray(x[start : start + 65536]).tobytes())
         return made.hexdigest()

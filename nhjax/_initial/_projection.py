@@ -407,7 +407,7 @@ def _left_basis(
 def _active(
     basis: Float[Array, "l l"], active: Float[Array, " l"], sizes: Float[Array, " l"]
 ) -> Float[Array, "l l"]:
-    """Return the matrix that forms the active combinations of rows of these sizes.
+    """Return the matrix that maps rows to their active combinations.
 
     It is the identity if all combinations are active.
     """

@@ -260,7 +260,7 @@ def integrate(
     if not _is_tracing() and leaves_steps_to_newton(stage_solver) and is_unsolved(sol):
         used_newton = True
         warnings.warn(_TAKEN_OVER.format(int(sol.stats["failed_step"])), stacklevel=2)
-        # The progress meter has already shown this run, so the repeated run has none.
+        # The progress meter has already shown this run: the repeated run shows none.
         solver = replace(stage_solver, fallback=True)
         solver_options = SolverOptions(solver, adjoint, NoProgressMeter())
         sol = run(system, method, y0, grid, args, options, solver_options)

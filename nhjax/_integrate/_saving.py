@@ -218,7 +218,7 @@ class Rows(NamedTuple):
     - `record`: the record of the step for interpolation; None if none is kept.
     - `log`: an entry of the stepper's log; None without a log.
     - `row`: the index of the output row, if it can differ from the index of the
-        iteration, otherwise None; in buffers None.
+        iteration. Otherwise, and in buffers, it is None.
     - `log_slot`: the index of the entry in the log; None without a log and in buffers.
     """
 

@@ -242,9 +242,9 @@ class AbstractMethod(eqx.Module):
     def integrated_basis(self, theta: ArrayLike) -> Float[Array, "*batch s"]:
         """Compute ∫_0^θ ℓ_j, the weights of a collocation polynomial at t_k + θ h.
 
-        They are exactly 0 at θ = 0, and for a collocation method exactly `b` at θ = 1,
-        so that dense output agrees with the states at both ends of a step. Arguments,
-        result and errors are the same as for `basis`.
+        The weights are exactly 0 at θ = 0. For a collocation method they are exactly
+        `b` at θ = 1, so that dense output agrees with the states at both ends of a
+        step. Arguments, result and errors are the same as for `basis`.
         """
         return integrated_lagrange(self._tableau(), theta)
 

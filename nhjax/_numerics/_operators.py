@@ -632,8 +632,8 @@ _PERIODS = (1, 2, 3, 4, 6)
 def static_take(x: Array, index: Int[np.ndarray, " k"]) -> Array:
     """Compute `x[..., index]` for known indices, by slices if few are enough.
 
-    The indices of regular structures are arithmetic sequences, or a few such sequences
-    that take turns. A slice can be part of a kernel; an indexed read cannot.
+    The indices of regular structures are arithmetic sequences, or a few interleaved
+    arithmetic sequences. A slice can be part of a kernel; an indexed read cannot.
     """
     if np.array_equal(index, np.arange(x.shape[-1])):
         return x

@@ -193,7 +193,7 @@ def rank_of_gram(matrix: Float[Array, "l l"]) -> Int[Array, ""]:
 
 
 def reciprocal_condition_of_range(matrix: Float[Array, "l l"]) -> FloatScalar:
-    """Compute the ratio of the smallest eigenvalue that is not zero to the largest."""
+    """Divide the smallest nonzero eigenvalue by the largest eigenvalue."""
     if matrix.shape[0] == 0:
         return jnp.ones((), matrix.dtype)
     values, is_kept = _eigenvalues(matrix)

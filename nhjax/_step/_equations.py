@@ -86,9 +86,10 @@ class StageEquations(eqx.Module):
     """The discrete equations of one step from (q_k, p_k, λ_k).
 
     These are the four Summaries of the paper, for the `StageUnknowns` in the chart of
-    the method. Let w^i be the body force at stage i, reactions included, and y^i the
-    coordinates of the stage. Let n^i = Ad^*_{τ(y^i)⁻¹} w^i, let F^i be the same force
-    in the chart, and M the momentum μ_k carried to the origin. The equations are
+    the method. Let w^i be the body force at stage i, including reactions, and let y^i
+    be the coordinates of the stage. Let n^i = Ad^*_{τ(y^i)⁻¹} w^i, let F^i be the same
+    force in the chart, and let M be the momentum μ_k carried to the origin. The
+    equations are
 
     Π^i = base + h Σ â_ij F^j,    μ^i = Ad^*_{τ(y^i)} (M + h Σ a_ij n^j),
 

@@ -247,8 +247,8 @@ class InvariantCorrection(eqx.Module):
 
     a r / g + (1 - a) ε = 0,    g = G_ii,    a = g² / (g² + ϵ S²).
 
-    Here ϵ is the unit round-off and S the size of the terms of I. Unless g is small, a
-    is 1 up to round-off. At rest g vanishes, and no impulse can keep I.
+    Here ϵ is the unit round-off and S is the size of the terms of I. Unless g is small,
+    a is 1 up to round-off. At rest g vanishes, and no impulse can keep I.
 
     With an indefinite mass matrix, G can also be singular away from rest. Then a = 0
     for all functions; see `LEAST_PART`.

@@ -546,8 +546,8 @@ class ImplicitStep(AbstractImplicitFunction[StepArguments, StepOutcome]):
     """A step as a differentiable function of its arguments.
 
     Let G(θ, x) be the Newton iteration of the stage solver on the stages x, with its
-    Jacobian fixed, and θ the arguments of the step. The solution is a fixed point of G,
-    so that
+    Jacobian fixed, and let θ be the arguments of the step. The solution is a fixed
+    point of G, so that
 
     dx = ∂G/∂x dx + ∂G/∂θ dθ,
 

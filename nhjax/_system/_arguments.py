@@ -112,7 +112,7 @@ def configuration(q: Any) -> PyTree[Array]:
 def real_scalar(name: str, x: FloatScalarLike, dtype: Any) -> FloatScalar:
     """Convert a real number (or an integer) to a scalar array of `dtype`.
 
-    Other types raise a `DTypeError`, and arrays that are not scalars a `ShapeError`.
+    Other types raise a `DTypeError`. Arrays that are not scalars raise a `ShapeError`.
     """
     # A concrete number stays concrete inside `jit`.
     if not is_traced(x):

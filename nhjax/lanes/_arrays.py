@@ -532,7 +532,7 @@ GATHERS: dict[str, Operation] = {
 
 
 def _extreme(dtype: str, sign: int) -> Any:
-    """Return the largest number of a dtype, or for the sign -1 the smallest."""
+    """Return the largest number of a dtype, or the smallest number for the sign -1."""
     if is_float(dtype):
         return sign * np.inf
     if dtype == "bool":

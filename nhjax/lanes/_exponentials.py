@@ -125,7 +125,7 @@ def _hyperbolic(x: Value, odd: bool) -> Value:
     """Return sinh(|x|) or cosh(x).
 
     With s = sinh(r), c = cosh(r) and u = 2^-2n, sinh(|x|) is
-    2^(n - 1) ((1 - u) c + (1 + u) s), and cosh(x) the same with -u for u.
+    2^(n - 1) ((1 - u) c + (1 + u) s). The formula of cosh(x) has -u in place of u.
     """
     x = absolute(x)
     exponent, (r, rest) = reduce_by_log2(where(x > 711.0, 711.0, x))

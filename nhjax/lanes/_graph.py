@@ -3,7 +3,7 @@
 A node is one number or one statement: a store, a loop or a branch. Every node lies in a
 region: the root, the body of a loop, or a side of a branch. Within a region nodes are
 ordered by their numbers, which is the order of creation, so that a node comes after its
-arguments and a load after the stores that it must see.
+arguments, and a load comes after the stores that it must see.
 
 Pure nodes are hash-consed: an operation with the same arguments exists once. A pure
 node lies in the deepest region of its arguments, so that invariant code is hoisted out

@@ -5,8 +5,8 @@ or to compute results. Each program has its own handler, which only passes a des
 of the program to a function that all programs share. The shared function is compiled
 once in a process, because compiling it with each program took 20 to 50 ms.
 
-A call is divided into blocks, of as many members as the kernel computes at once. The
-caller's thread runs blocks, and so do threads of XLA's pool where this pays:
+A call is divided into blocks: the members that the kernel computes at once form a
+block. The caller's thread runs blocks. Threads of XLA's pool help if this saves time:
 
 - An atomic counter assigns blocks to the caller and to its helpers.
 - The caller asks the pool for helpers. Their number is smaller than the number of

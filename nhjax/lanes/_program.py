@@ -115,8 +115,8 @@ def llvm_ir(
 
     The text of an LLVM module with the function `i1 kernel(ptr operands, ptr results,
     i64 first, i64 last)`. It computes the members from `first` to `first + width - 1`;
-    members beyond `last` repeat `last`. It returns whether it failed, because there was
-    no scratch memory.
+    members beyond `last` repeat `last`. It returns true if it failed. It fails only if
+    there is no scratch memory.
 
     **Raises:** `Unsupported` if the program cannot be compiled.
     """

@@ -214,8 +214,8 @@ class _Angle(NamedTuple):
 def _angle(a: Value, b: Value) -> _Angle:
     """Return arctan(a / b) for a, b >= 0.
 
-    From 1/2 to 2 the angle is pi / 4 + arctan((a - b) / (a + b)), and above that,
-    pi / 2 - arctan(b / a).
+    For a / b from 1/2 to 2 the angle is pi / 4 + arctan((a - b) / (a + b)). For larger
+    a / b it is pi / 2 - arctan(b / a).
     """
     is_low, is_high = a + a < b, b + b < a
     above = where(is_low, a, where(is_high, -b, a - b))

@@ -56,7 +56,7 @@ class ImplicitTruncatedStep(AbstractImplicitFunction[Given, TruncatedStep]):
     """A step of size h, or of size θ h if it is truncated at the first event.
 
     The size θ h of a truncated step is a root of g(t + θ h, y(θ h)), where g is the
-    condition of the event and y the end of the step, so that
+    condition of the event and y is the end of the step, so that
 
     d(θ h) = - (∂g/∂h)⁻¹ dg,
 
