@@ -268,9 +268,10 @@ def _ranks_judged(
 ) -> tuple[list[BoolScalar], FloatScalar]:
     """Return which ranks are deficient, and the reciprocal condition number of C.
 
-    Redundant constraints are compatible if C has the rank of their derivatives; the
-    number is then one, and otherwise zero. Their ranks are deficient only if all
-    derivatives of a constraint are zero.
+    Redundant constraints are compatible if C has the rank of their derivatives. The
+    condition number that is returned is then one, and it is zero if they are not
+    compatible. Their ranks are deficient only if all derivatives of a constraint are
+    zero.
     """
     jacobian, reaction, _ = lin.dense
     delassus = jacobian @ reaction

@@ -123,8 +123,8 @@ class AbstractStepper(eqx.Module, Generic[C, R]):
         """Return the carry before the first iteration.
 
         A start from a state needs the `noise` of the functions of the system. A start
-        from a checkpoint does not, because the checkpoint holds the quantities that are
-        computed from the noise.
+        from a checkpoint does not need it, because the checkpoint holds the quantities
+        that are computed from the noise.
         """
 
     @abstractmethod
