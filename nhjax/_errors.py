@@ -168,7 +168,7 @@ def require(tree: T, *checks: Check) -> T:
 
     With concrete values the exception is raised immediately. With traced values it is
     raised when the compiled program runs, as a runtime error of JAX with the same
-    message, which under `vmap` begins with the index of the first member that fails.
+    message. Under `vmap` the message begins with the index of the first failed member.
     The returned tree must be used afterwards: `jax.jit` drops checks whose result is
     not used.
     """

@@ -277,7 +277,7 @@ def _check_key(key: Any, where: str) -> str | int:
 
 
 def _add_array(x: Any, arrays: dict[str, np.ndarray], path: str, where: str) -> str:
-    """Add an array under its path, made unique, and return its name."""
+    """Add an array under a unique name, made from its path, and return the name."""
     if isinstance(x, jax.Array) and jnp.issubdtype(x.dtype, jax.dtypes.prng_key):
         raise TypeError(f"{where} is a random key: save `jax.random.key_data` of it.")
     array = np.asarray(x)

@@ -261,9 +261,9 @@ class Saving(eqx.Module):
     """The data that the iterations of a run save, and their places in the buffers.
 
     A run saves the value of `fn` at the state after every `stride`-th step (after none
-    if `stride` is 0), which makes `num_saved` entries. It keeps `num_records` records
-    of steps, and `log_length` entries of the stepper's log. `num_steps` is used only if
-    steps save rows or records.
+    if `stride` is 0). These are `num_saved` entries. The run keeps `num_records`
+    records of steps, and `log_length` entries of the stepper's log. `num_steps` is used
+    only if steps save rows or records.
     """
 
     fn: Callable[[FloatScalar, State, Args], PyTree[Array]]

@@ -57,8 +57,9 @@ _GROSS = 1e-6
 def tolerance_array(tolerance: FloatScalarLike) -> FloatScalarLike:
     """Convert the `tolerance` of a solver to an array.
 
-    A number becomes an array of NumPy on the host: the default solver is made when
-    nhjax is imported, which must not start JAX's backends, nor choose a precision.
+    A number becomes an array of NumPy on the host: the default solver is created when
+    nhjax is imported, and this import must not start JAX's backends or choose a
+    precision.
     """
     if isinstance(tolerance, int | float) and not isinstance(tolerance, bool):
         return np.asarray(float(tolerance))
