@@ -74,7 +74,7 @@ class Processes:
         return self.allgather(data if self.index == 0 else b"")[0]
 
     def check_same_call(self, call: dict[str, Any]) -> None:
-        """Raise in all processes if `call`, a description as JSON, differs in any.
+        """Raise in all processes if `call`, as JSON, differs between processes.
 
         **Raises:** `ValueError` with the name of the first difference.
         """

@@ -234,8 +234,9 @@ def _allowed(
 ) -> tuple[Float[Array, " l"], Float[Array, " k"], FloatScalar]:
     """Bound the violations of velocity and position constraints by round-off.
 
-    The third number bounds the distance to a group. If q and v are small, constants in
-    the constraints can cause larger round-off than q and v, so that it is measured.
+    The third number bounds the distance to a group. The round-off is measured, because
+    constants in the constraints can cause larger round-off than q and v if q and v are
+    small.
     """
     tolerance = jnp.asarray(1e3 * float(jnp.finfo(u.dtype).eps), u.dtype)
     given = system, t, q, u, lin.multiplier, args

@@ -129,7 +129,7 @@ def check_start(
 ) -> State:
     """Return the state of `y0`, which is a state or a checkpoint.
 
-    Raise if `y0` is neither, or belongs to another system.
+    Raise if `y0` is something else, or belongs to another system.
     """
     check_type("y0", y0, (State, Checkpoint), _ADVICE)
     if isinstance(y0, State):

@@ -214,9 +214,11 @@ def _times(ts: Any) -> Float[Array, " k"]:
 class Rows(NamedTuple):
     """The entries that one iteration saves, or buffers for all iterations.
 
-    - `saved`: the time and the value of `SaveAt(fn=...)`; None if steps save none.
-    - `record`: the record of the step for interpolation; None if none is kept.
-    - `log`: an entry of the stepper's log; None without a log.
+    - `saved`: the time and the value of `SaveAt(fn=...)`, or None if the steps of the
+        run save no values.
+    - `record`: the record of the step for interpolation, or None if the run keeps no
+        records.
+    - `log`: an entry of the stepper's log, or None without a log.
     - `row`: the index of the output row, if it can differ from the index of the
         iteration. Otherwise, and in buffers, it is None.
     - `log_slot`: the index of the entry in the log; None without a log and in buffers.

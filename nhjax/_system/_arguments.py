@@ -233,7 +233,8 @@ def check_third_argument(
     """Raise or warn if a function of a system takes a variable that it never gets.
 
     The functions of a Lagrangian system receive v, and the functions of a Hamiltonian
-    system receive p. Holonomic constraints receive neither. `letter` is "v" or "p".
+    system receive p. Holonomic constraints receive neither v nor p. `letter` is "v" or
+    "p".
 
     Constraints and forces only lead to a warning: where the momentum equals the
     velocity, one function can serve both kinds of systems.

@@ -419,7 +419,7 @@ DoubleDouble: TypeAlias = tuple[Value, Value]
 _TO_INTEGER = 1.5 * 2.0**52
 # The bits of 1.0.
 ONE_BITS = 0x3FF0000000000000
-# Half of the last of the leading 26 bits.
+# Half a unit of the last bit among the leading 26 bits.
 _HALF_UNIT = 1 << 26
 
 

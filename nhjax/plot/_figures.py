@@ -239,7 +239,8 @@ def convergence(
 def _against_time(ts: Any, values: Any, ax: "Axes | None", style: Any) -> "Axes":
     ax = new_axes(ax)
     times, values = np.asarray(ts), np.asarray(values)
-    # The members of a batch become columns, because matplotlib draws a line for each.
+    # The members of a batch become columns, because matplotlib draws a line for each
+    # column.
     ax.plot(_columns(times), _columns(values), **style)
     ax.set_xlabel("time $t$")
     return ax

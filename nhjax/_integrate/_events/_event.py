@@ -334,9 +334,9 @@ class EventOutcome(NamedTuple):
 
 
 class EventActions(eqx.Module):
-    """The actions of events: a reset of the state, the end of the run, both or none.
+    """The actions of events: a reset of the state, and the end of the run.
 
-    If an event has both, the reset comes first.
+    An event may have both actions, one or none. The reset comes before the end.
 
     `max_events` is the number of events that the run has room for.
     """
