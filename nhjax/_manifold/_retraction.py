@@ -248,7 +248,7 @@ def _coefficients(n, dtype):
 
 
 def _recursion(s, n):
-    """Compute c_0 by cos, c_1 by sin, the others by s c_k = 1/(k-2)! - c_{k-2}."""
+    """Compute c_0 by cos, c_1 by sin, and c_k by s c_k = 1/(k-2)! - c_{k-2}, k >= 2."""
     theta = jnp.sqrt(s)
     c = [jnp.cos(theta), jnp.sin(theta) / theta]
     for k in range(2, n):

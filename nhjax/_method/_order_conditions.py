@@ -12,9 +12,9 @@ Anal. 33, 1996):
 
 A pair (a, â) with common weights b solves q' = f(q, p), p' = g(q, p). Its order
 conditions belong to rooted trees whose edges have two colours, because a stage computes
-q with a and p with â. Let τ_k be the subtrees at the root of a tree τ, and a^(k) the
-matrix of the colour of the edge to τ_k. With φ_i(τ) = Π_k Σ_j a^(k)_ij φ_j(τ_k), the
-pair has order p if
+q with a and p with â. Let τ_k be the subtrees at the root of a tree τ. The colour of
+the edge to τ_k selects a matrix a^(k), which is a or â. With
+φ_i(τ) = Π_k Σ_j a^(k)_ij φ_j(τ_k), the pair has order p if
 
     Σ_i b_i φ_i(τ) = 1 / γ(τ),    γ(τ) = |τ| Π_k γ(τ_k),
 

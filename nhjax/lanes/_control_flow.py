@@ -2,9 +2,9 @@
 
 A loop carries arrays as parameters, number by number, or leaves them in place in
 memory. Numbers that start as constants are first assumed to stay constant. The body is
-built, and built again without the assumption for those numbers that do change. These
-numbers are remembered, so that building an outer loop again does not multiply the time
-with the depth of nesting.
+built. If some of these numbers change, the body is built again without the assumption
+for them. The changing numbers are remembered, so that building an outer loop again does
+not multiply the time with the depth of nesting.
 
 Short scans are unrolled, unless their body contains loops.
 """

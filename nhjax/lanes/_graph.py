@@ -116,8 +116,8 @@ class Node:
 class LoopInfo:
     """A loop: its parameters with their first and next values, and its predicate.
 
-    The nodes of the region with numbers below `split` are computed before the
-    predicate, the others after it, in iterations that take place.
+    Nodes of the region with numbers below `split` are computed before the predicate.
+    The other nodes are computed after the predicate if it is true.
     """
 
     __slots__ = ("inits", "outs", "params", "predicate", "region", "results", "split")
