@@ -164,7 +164,7 @@ class Members:
         return [_canonical(x[indices]) for x in self._leaves]
 
     def digest(self) -> str:
-        """Compute a digest of the arrays. (The program text contains a function.)"""
+        """Compute a digest of the arrays; the program text identifies a function."""
         if self._leaves is None:
             return "a function"
         made = hashlib.sha256()
