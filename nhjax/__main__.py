@@ -102,7 +102,7 @@ def _parser() -> argparse.ArgumentParser:
 def _add_options(parser: argparse.ArgumentParser, function: Callable) -> None:
     parameters = inspect.signature(function).parameters
     # Studies that set the length in time also accept it as a number of steps. Studies
-    # that set it in steps have their own option for this.
+    # that set the length in steps have their own option for this.
     length = (
         parser.add_mutually_exclusive_group() if "final_time" in parameters else None
     )

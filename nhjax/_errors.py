@@ -107,7 +107,7 @@ _ADVICE = (
         jax.errors.NonConcreteBooleanIndexError,
         "write `jnp.where(condition, a, 0.0)` in place of `a[condition]`.",
     ),
-    # The functions of `math` need a number, which raises the second of these errors.
+    # The functions of `math` need a number: traced values raise the second error here.
     (
         (jax.errors.TracerArrayConversionError, jax.errors.ConcretizationTypeError),
         "use functions of `jax.numpy` in place of `numpy` and `math`, and leave out "
@@ -168,7 +168,7 @@ def require(tree: T, *checks: Check) -> T:
 
     With concrete values the exception is raised immediately. With traced values it is
     raised when the compiled program runs, as a runtime error of JAX with the same
-    message, which under `vmap` begins with the index of the first member that fails.
+    message. Under `vmap` the message begins with the index of the first failed member.
     The returned tree must be used afterwards: `jax.jit` drops checks whose result is
     not used.
     """

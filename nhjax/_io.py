@@ -203,7 +203,7 @@ def _read(path: Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     """Read all entries; the checksums of the .npz file detect damaged entries."""
     # A file that NumPy opens itself stays open if it is damaged.
     with open(path, "rb") as opened:
-        # For other files NumPy assumes pickled objects, and advises to load them.
+        # For other files, NumPy reports pickled objects and recommends loading them.
         if not zipfile.is_zipfile(opened):
             raise ValueError("it is not an .npz")
         opened.seek(0)
@@ -277,7 +277,7 @@ def _check_key(key: Any, where: str) -> str | int:
 
 
 def _add_array(x: Any, arrays: dict[str, np.ndarray], path: str, where: str) -> str:
-    """Add an array under its path, made unique, and return its name."""
+    """Add an array under a unique name, made from its path, and return the name."""
     if isinstance(x, jax.Array) and jnp.issubdtype(x.dtype, jax.dtypes.prng_key):
         raise TypeError(f"{where} is a random key: save `jax.random.key_data` of it.")
     array = np.asarray(x)
@@ -336,7 +336,7 @@ def _to_jax(name: str, array: np.ndarray) -> Array:
 
 
 def _rebuild_results(codes: Array, names: dict[str, int]) -> PyTree[Array]:
-    """Build results from codes by name, because another release may number them."""
+    """Build results from names, because other releases may use other codes."""
     unknown = sorted(set(names) - set(result_codes()))
     if unknown:
         raise ValueError(

@@ -1,4 +1,4 @@
-"""The ways in which a run can end, with messages that say what to do about each."""
+"""The ways in which a run can end, with messages that give advice."""
 
 import functools
 from typing import Any
@@ -40,7 +40,7 @@ class _Named(type(eqx.Enumeration)):
 
 
 def _counted(codes: np.ndarray, names: dict[int, str]) -> str:
-    """Count the results of many runs by name; say which run is the first of each."""
+    """Count the results of many runs by name; add the first run with each result."""
     parts = []
     for code in np.unique(codes):
         where, name = np.argwhere(codes == code), names[int(code)]

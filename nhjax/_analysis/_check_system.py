@@ -49,8 +49,8 @@ class SystemReport(eqx.Module):
     - `depends_on_time`: the names of the functions that depend on t.
     - `ignorable`: the indices of coordinates that no function depends on near the given
         state. A coordinate whose terms cancel only up to rounding is not found.
-    - `constant`: which of the mass matrix and the Jacobian of the nonholonomic
-        constraints are constant.
+    - `constant`: the names of constant matrices, among the mass matrix and the
+        Jacobian of the nonholonomic constraints.
     """
 
     dimension: int
@@ -132,9 +132,10 @@ def check_system(
     **Returns:** a `SystemReport`. The arguments on which functions depend are found
     from derivatives at three states near the given one.
 
-    **Raises:** as `initial_state` does for wrong types and shapes, also of values that
-    the system's functions return; `ValueError` if a Lagrangian system is given `p`, or
-    a Hamiltonian one `v`; `TypeError` under `jit`, `vmap` or `grad`.
+    **Raises:** the errors of `initial_state` for wrong types and shapes of arguments
+    and of values that the system's functions return; `ValueError` if a Lagrangian
+    system is given `p`, or a Hamiltonian system is given `v`; `TypeError` under `jit`,
+    `vmap` or `grad`.
 
     !!! example
 

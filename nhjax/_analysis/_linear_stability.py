@@ -92,7 +92,7 @@ def linear_stability(
     system. Without `symmetry`, X has the velocity as its constant components. It is
     then a translation of ignorable coordinates or a left translation of the group. All
     velocities must be constant (body velocities on a group), or at least the chosen
-    independent ones, as for a bicycle on a circle.
+    independent velocities. A bicycle on a circle is an example of the second case.
 
     About any other motion, A is valid for an instant only, and its eigenvalues do not
     decide stability. `steady_motion` finds steady motions.
@@ -116,8 +116,9 @@ def linear_stability(
         components of the velocity. On a group, the generator of g -> g exp(εξ), a
         symmetry of the body, is the constant ξ. The generator of g -> exp(εξ) g, a
         symmetry of space, is `manifold.Ad(manifold.inverse(q), xi)`. The velocity must
-        be a combination of the generators. If a rotation turns a translation, include
-        the translations in all directions into which it is turned.
+        be a combination of the generators. If one generator is a rotation and
+        another one a translation that it rotates, include the translations in all
+        directions that this rotation produces.
     - `must_be_steady`: whether to raise if the motion is not steady. Pass False to
         linearise at an instant, for instance along a trajectory.
 

@@ -214,7 +214,8 @@ def lift_generators(
     δv = Dξ v + ad_v ξ,    δp = ad*_ξ p - Dξᵀ p,
 
     where Dξ is the derivative of χ -> ξ(q τ(χ)) at zero. A left translation changes
-    neither. A right translation, with constant ξ, changes v by [v, ξ].
+    neither velocities nor momenta. A right translation, with constant ξ, changes v by
+    [v, ξ].
     """
     manifold = system.manifold_of(q)
 

@@ -106,8 +106,8 @@ def steady_motion(
     a circle and a precessing top, for which no coordinates of the attitude are
     constant.
 
-    If these equations have a family of solutions, the result is the one to which
-    Newton's method with least-norm increments converges. The `held_...` arguments
+    If these equations have a family of solutions, the result is the solution to
+    which Newton's method with least-norm increments converges. The `held_...` arguments
     select another solution, for instance a motion with a given speed or lean. The
     increments have no component along the symmetries, except where held coordinates
     require it.
@@ -124,9 +124,9 @@ def steady_motion(
         constant because energy is conserved.
     - `symmetry`: generators of symmetries, as `linear_stability` takes them, in place
         of `positions` and `velocities`.
-    - `held_positions`, `held_velocities`: the indices of what keeps its value in `y`.
-        On a group a position is held if this component of ξ is zero in q τ(ξ), where q
-        is the configuration of `y`.
+    - `held_positions`, `held_velocities`: the indices of the positions and velocities
+        that keep their values in `y`. On a group a position is held if this component
+        of ξ is zero in q τ(ξ), where q is the configuration of `y`.
     - `max_iterations`: the largest number of iterations.
 
     **Returns:** a consistent `State`. With `symmetry`, a pair of the state and the
@@ -270,7 +270,7 @@ def solve_in_coordinates(
 def solve_along_symmetry(
     system, t, y, args, symmetry, held, max_iterations
 ) -> SteadyMotionResult:
-    """Solve for a state that moves along generators of symmetries, and their rates."""
+    """Solve for a state that moves along symmetries, and for the generators' rates."""
     dim = y.p.shape[0]
 
     def fields(x):
@@ -364,7 +364,7 @@ def least_norm_root(
 
     - `residual`: the function whose root is computed.
     - `free`: 1 for each unknown that may change, and 0 for the others.
-    - `start`: the values to which the unknowns are increments.
+    - `start`: the values to which the unknowns are added.
     - `groups`: the numbers of unknowns of each kind, in order. Unknowns of one kind
         have the round-off of the largest of them.
     - `max_iterations`: the largest number of iterations.

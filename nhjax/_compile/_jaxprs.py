@@ -122,13 +122,14 @@ def _sizes_of_product(product: Any) -> Iterator[int]:
         yield size * terms
 
 
-# Only these operations are removed when repeated: they have no state, unlike random
-# numbers, and no parameters that a user chooses.
+# Only these operations are removed when repeated. They have no state (random numbers
+# have one), and no parameters that a user chooses.
 _REPEATABLE = frozenset(
     (*ARITHMETIC_AND_SHAPES, "dot_general", "gather", SMALL_PRODUCT)
 )
 # The operations whose inner programs are simplified, and the parameters that hold these
-# programs. Other operations with inner programs have rules that rely on them.
+# programs. The inner programs of other operations are not simplified, because the rules
+# of these operations rely on them.
 _INNER = {
     "checkpoint": ("jaxpr",),
     "cond": ("branches",),
@@ -151,8 +152,9 @@ def cse_dce(program: Any) -> Any:
 
 
 class _Simplifier:
-    """The removal of operations; a program that occurs several times is simplified
-    once.
+    """Removes operations from programs.
+
+    A program that occurs several times is simplified once.
     """
 
     def __init__(self):
@@ -220,7 +222,7 @@ def _is_repeatable(equation: Any) -> bool:
 
 
 def _key(equation: Any, operands: list[Any]) -> Hashable:
-    """Return a key that two operations share only if they compute the same."""
+    """Return a key; operations with equal keys compute the same values."""
     params = tuple((name, _exact(equation.params[name])) for name in equation.params)
     # The context holds settings of JAX, such as the device of the operation.
     context = _exact(getattr(equation, "ctx", None))

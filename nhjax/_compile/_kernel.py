@@ -223,7 +223,7 @@ def _fixed_part(program) -> tuple[list[Any], list[bool]]:
 
 
 def _part(program, **fields: list[Any]):
-    """Return a program with some of the operations, operands or results of another."""
+    """Return a program with a part of the operations, operands or results replaced."""
     jaxpr = program.jaxpr
     names = jaxpr.debug_info.with_unknown_names()
     return program.replace(jaxpr=jaxpr.replace(debug_info=names, **fields))

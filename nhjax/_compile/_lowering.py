@@ -38,7 +38,7 @@ class EngineUse(NamedTuple):
     - `engine`: `"lanes"` is nhjax's own compiler, which vectorises over the members of
         an ensemble (SIMD); `"kernels"` is XLA with one kernel for each member; `"xla"`
         is XLA without such kernels.
-    - `reason`: why the engines before it were not used, or that it was chosen.
+    - `reason`: why this engine was used, and why earlier engines were not used.
     - `members`: the number of members of an ensemble; `None` for a single run.
     """
 
@@ -132,7 +132,7 @@ def reason_against_kernel(program: Any) -> str | None:
     """Return why XLA does not compile a single kernel, or `None` if it does."""
     if chosen_engine() == "xla":
         return "chosen"
-    # The dtype of random keys has no attribute `kind`, which gives None here.
+    # The dtype of random keys has no attribute `kind`, so its kind is None here.
     kinds = {getattr(aval.dtype, "kind", None) for aval in program.in_avals}
     if not kinds <= set("fiub"):
         return "an operand is neither a real number nor an integer nor a boolean"
@@ -143,14 +143,14 @@ def reason_against_kernel(program: Any) -> str | None:
 
 # Measurements on the gallery's systems with 2 to 8 stages, and on larger systems, show
 # that nhjax's own compiler is faster below this root mean square of array sizes, and
-# XLA above it.
+# that XLA is faster above it.
 _SMALL_ARRAYS = 40
 
 
 @rare_collections()
 def _lowered(ctx, *operands, program, is_brief):
     if is_exported(ctx):
-        # Another process could not call machine code of this one.
+        # Another process cannot call machine code of this process.
         record_engine("xla", "the program is exported", None)
         return _by_xla(ctx, *operands, program=program, is_brief=is_brief)
     if is_within_kernel():
@@ -186,7 +186,8 @@ def _as_one_kernel(ctx, *operands, program):
         def kernel(*full):
             return run(*merge_lists(is_full, _tied(full), map(jnp.zeros_like, empty)))
 
-        # The barrier hides which operands are constants, which XLA would remove too.
+        # XLA would also remove constant operands. The barrier hides that they are
+        # constant.
         return jax.jit(kernel)(*jax.lax.optimization_barrier(full))
 
     token = _within.set(True)

@@ -41,7 +41,8 @@ T = TypeVar("T")
 MOST_ENTRIES = 2000
 # These libraries may be installed from a working copy, outside of the usual folders.
 _LIBRARIES = ("equinox", "jax", "jaxlib", "jaxtyping", "nhjax", "numpy")
-# Since Python 3.12 the last one reads globals in a class body inside a function.
+# Since Python 3.12, LOAD_FROM_DICT_OR_GLOBALS reads globals in a class body inside a
+# function.
 _GLOBAL_LOADS = ("LOAD_GLOBAL", "LOAD_NAME", "LOAD_FROM_DICT_OR_GLOBALS")
 _NUMBERS, _ARRAYS = (float, complex), (np.ndarray, np.generic)
 _PLAIN = (bool, int, str, bytes, type(None), type(Ellipsis), np.dtype)
@@ -83,7 +84,10 @@ def _is_installed(module: str) -> bool:
 
 @dataclass(frozen=True)
 class _Identity:
-    """An object that is compared by its identity, and kept so that none reuses it."""
+    """An object that is compared by its identity.
+
+    It is kept alive, so that no other object gets the same identity.
+    """
 
     number: int
     value: object = field(compare=False)
@@ -95,7 +99,10 @@ class _Unrepeatable:
 
 @lru_cache(maxsize=4096)
 def _is_leaf(cls: type) -> bool:
-    """Return whether values of a class have no parts, except arrays of objects."""
+    """Return whether values of a class have no parts.
+
+    Arrays count as values without parts, although arrays of objects have parts.
+    """
     return issubclass(cls, _LEAVES) and not issubclass(cls, enum.Enum)
 
 
@@ -108,7 +115,7 @@ def _is_open(cls: type) -> bool:
 
 
 def _atom(value: Any) -> Hashable:
-    """Return what is compared of a value, apart from its parts."""
+    """Return the data by which a value is compared, without the values inside it."""
     cls = type(value)
     if _is_open(cls):
         return cls
@@ -127,7 +134,7 @@ def _atom(value: Any) -> Hashable:
 
 
 def _key_name(key: Any) -> Hashable:
-    """Return what is compared of a key of a mapping.
+    """Return the data by which a key of a mapping is compared.
 
     Keys that are equal may still differ: 0.0 and -0.0, or objects of the user.
     """
@@ -240,7 +247,8 @@ class Captured:
       name in the owner. Objects have numbers in the order of the search, so that a new
       function equal to an old one has equal atoms.
     - `contents`: the owner and the content of each place; the content of an object with
-      parts is its identity. The owners are kept, so that none reuses an identity.
+      parts is its identity. The owners are kept alive, so that no other object gets the
+      same identity.
     """
 
     def __init__(self, functions: Any, ignored: Collection[Place] = ()):
@@ -255,7 +263,7 @@ class Captured:
                 continue
             content = atom = _atom(value)
             if isinstance(atom, _Unrepeatable):
-                # A function that stores a tracer has another one after tracing.
+                # A function that stores a tracer stores another tracer after tracing.
                 content = _Identity(id(value), value)
             has_objects = isinstance(value, np.ndarray) and value.dtype.hasobject
             if has_objects or not _is_leaf(type(value)):

@@ -70,7 +70,7 @@ def sync_folder(folder: Path) -> None:
 
 @contextmanager
 def explaining(what: str) -> Iterator[None]:
-    """Put `what`, the name of the failed action, before the message of an `OSError`."""
+    """Put `what`, the name of a failed action, before the message of an `OSError`."""
     try:
         yield
     except OSError as error:

@@ -64,7 +64,8 @@ def ensemble(
 
     - `run`: a function of one member that returns a tree of arrays.
     - `members`: a tree of arrays with the members as leading axis, or a function from
-        the index of a member to the member, which takes no memory. JAX traces it.
+        the index of a member to the member. The function needs no memory for the
+        members, and JAX traces it.
     - `num_members`: the number of members, if `members` is a function.
     - `out`: a folder for a Zarr store. The values of each chunk are written to it, and
         `xarray.open_zarr` opens it. The same call resumes a store that an interrupted

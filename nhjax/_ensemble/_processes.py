@@ -74,7 +74,7 @@ class Processes:
         return self.allgather(data if self.index == 0 else b"")[0]
 
     def check_same_call(self, call: dict[str, Any]) -> None:
-        """Raise in all processes if `call`, a description as JSON, differs in any.
+        """Raise in all processes if `call`, as JSON, differs between processes.
 
         **Raises:** `ValueError` with the name of the first difference.
         """
@@ -125,8 +125,9 @@ def check_equal_devices(owners: list[int]) -> None:
 class PeriodicExchange:
     """Lets processes exchange errors periodically while each runs its own chunks.
 
-    So an error in one process soon ends the others, and no process waits long for a
-    slower one. Each exchange decides how many chunks all of them run before the next.
+    So an error in one process soon ends the other processes, and no process waits long
+    for a slower process. Each exchange decides how many chunks each process runs before
+    the next exchange.
     """
 
     def __init__(self, processes: Processes, num_chunks: int, is_needed: bool):

@@ -164,14 +164,14 @@ class Members:
         return [_canonical(x[indices]) for x in self._leaves]
 
     def digest(self) -> str:
-        """Compute a digest of the arrays; a function is part of the program instead."""
+        """Compute a digest of the arrays; the program text identifies a function."""
         if self._leaves is None:
             return "a function"
         made = hashlib.sha256()
         for x in self._leaves:
             made.update(f"{x.dtype.str}{x.shape}".encode())
             # This reads blocks, because a copy of a whole memory-mapped array may not
-            # fit.
+            # fit into memory.
             for start in range(0, len(x), 65536):
                 made.update(np.ascontiguousarray(x[start : start + 65536]).tobytes())
         return made.hexdigest()
@@ -321,7 +321,8 @@ def _states_of_chunk(
 def merged_states(reductions: Any, one: Any, other: Any) -> Any:
     """Merge the states of reductions of two sets of members.
 
-    A separate program rounds in the same way for all sources of the states.
+    This is a separate program, so that the rounding is the same for states from all
+    sources.
     """
     return each_reduction(_merge, reductions, one, other)
 
@@ -424,7 +425,10 @@ def _is_result(x: Any) -> bool:
 
 
 def manifest(job: Job, **others: Any) -> dict[str, Any]:
-    """Describe the parameters of a job as JSON; `others` depend on the kept results."""
+    """Describe the parameters of a job as JSON.
+
+    `others` are further parameters, which depend on the kind of results that are kept.
+    """
     return {
         "format": FORMAT,
         "nhjax": installed_version(),
@@ -445,8 +449,8 @@ def call_description(
 ) -> dict[str, Any]:
     """Describe the data that must agree in all processes of a common job.
 
-    This is a manifest, a digest of the text of the program, whether there is an `out`,
-    and `others`.
+    The data are a manifest, a digest of the text of the program, a flag for `out`, and
+    `others`.
     """
     run = hashlib.sha256(text.encode()).hexdigest()
     return {"out": out, "reduce": None} | made | {"run": run} | others

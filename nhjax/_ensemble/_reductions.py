@@ -168,7 +168,7 @@ class Variance(AbstractReduction):
         ) -> DoubleDouble:
             dtype, δ = a.high.dtype, _difference(x, y)
             share = other.number.astype(dtype) / jnp.maximum(count, 1).astype(dtype)
-            # In this order, no factor overflows unless the product does.
+            # In this order, no factor overflows unless the whole product overflows.
             between = (δ * share) * (δ * one.number.astype(dtype))
             return add(add(a, b), double_double(between))
 
@@ -454,7 +454,7 @@ def _interpolated_quantile(
     counts: np.ndarray, target: float, edges: np.ndarray
 ) -> float:
     cumulative = np.concatenate([[0], np.cumsum(counts)])
-    # The first bin that is not empty and at whose end the target is reached.
+    # The first nonempty bin for which the count up to its end reaches the target.
     last = int(np.argmax((cumulative[1:] >= target) & (counts > 0)))
     share = (target - cumulative[last]) / counts[last]
     return float(edges[last] + share * (edges[last + 1] - edges[last]))
@@ -600,7 +600,10 @@ def _lifted(value: Any, counts: Bool[Array, ""]) -> Any:
 
 
 def _sum_dtype(x: Any) -> Any:
-    """Return the dtype of the mean of `x`: its own, or JAX's default for integers."""
+    """Return the dtype of the mean of `x`: the dtype of `x`, or JAX's default float.
+
+    The default is used for integers.
+    """
     if jnp.issubdtype(x.dtype, jnp.floating):
         return x.dtype
     if jnp.issubdtype(x.dtype, jnp.complexfloating):

@@ -290,7 +290,7 @@ class ReductionSink(AbstractSink):
         return self._packed(self.state, self.failures)
 
     def restore(self, first_chunk: int, packed: bytes) -> None:
-        """Continue before a chunk from the bytes that `packed` returned."""
+        """Restore the state from packed bytes, to continue with this chunk."""
         self.first_chunk = first_chunk
         state, self.failures = self._unpacked(packed)
         self.state = self._placed(state)
@@ -326,7 +326,7 @@ class ReductionSink(AbstractSink):
         return jax.device_put(state, self.job.layout.devices[0])
 
     def _packed(self, state: Any, failures: FailureList) -> bytes:
-        # Dtypes are included, because they may differ from the neutral state.
+        # Dtypes are included, because the neutral state may have other dtypes.
         leaves = [np.asarray(x) for x in jax.tree.leaves(state)]
         kinds = json.dumps([[x.dtype.name, x.shape] for x in leaves]).encode()
         head = np.int64(len(kinds)).tobytes() + kinds

@@ -339,7 +339,7 @@ class CheckpointedReductionSink(AbstractSink):
 
     def _open(self, resume: bool) -> None:
         """Create the folder, or open it and read the state."""
-        # An interrupted run that has not run a chunk leaves no other files.
+        # If a run is interrupted before its first chunk, it leaves only these files.
         early = {
             self.LOCK,
             self.PROGRAM,
@@ -553,7 +553,7 @@ class _ZarrEncoder:
                 name,
                 shape=shape,
                 dtype=dtype,
-                # An axis may have length 0, but a chunk must not.
+                # An axis may have length 0, but a chunk must have at least length 1.
                 chunks=(rows, *(max(1, size) for size in shape[1:])),
                 dimension_names=dims,
                 attributes=attributes.get(name, {}),

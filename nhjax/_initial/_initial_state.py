@@ -83,13 +83,14 @@ def initial_state(
     - `project`: replace q by the nearest configuration, and then v by the nearest
         velocity, in the kinetic metric, that satisfies the constraints (one linear
         solve for constraints linear or affine in v, Newton's method for others).
-    - `keep_q`, `keep_v`, `keep_p`: the components of q, and of the v or p that was
-        given, that the projection must not change: an index, a name or a sequence of
-        them, known when tracing. The projection then finds the nearest values of the
-        other components, in the same metric, that satisfy the constraints. An index is
-        a position in the flattened `q` (for a tuple, in all its parts joined in order)
-        or in `v` or `p`. A name is an entry of the `coordinates` of the system. If the
-        kept components determine a constraint and violate it, the error names both.
+    - `keep_q`, `keep_v`, `keep_p`: the components of q, v or p that the projection must
+        not change: an index, a name or a sequence of them, known when tracing. Use
+        `keep_v` with `v`, and `keep_p` with `p`. The projection then finds the nearest
+        values of the other components, in the same metric, that satisfy the
+        constraints. An index is a position in the flattened `q` (for a tuple, in all
+        its parts joined in order) or in `v` or `p`. A name is an entry of the
+        `coordinates` of the system. If the kept components determine a constraint and
+        violate it, the error names both.
     - `throw`: whether to raise if there is no consistent state. If false, all numbers
         of the state are then NaN, and `integrate` reports it as not finite; under
         `vmap` the other members of an ensemble are not affected. Wrong types and shapes
@@ -233,8 +234,9 @@ def _allowed(
 ) -> tuple[Float[Array, " l"], Float[Array, " k"], FloatScalar]:
     """Bound the violations of velocity and position constraints by round-off.
 
-    The third number bounds the distance to a group. If q and v are small, constants in
-    the constraints can cause larger round-off than q and v, so that it is measured.
+    The third number bounds the distance to a group. The round-off is measured, because
+    constants in the constraints can cause larger round-off than q and v if q and v are
+    small.
     """
     tolerance = jnp.asarray(1e3 * float(jnp.finfo(u.dtype).eps), u.dtype)
     given = system, t, q, u, lin.multiplier, args
@@ -267,9 +269,10 @@ def _ranks_judged(
 ) -> tuple[list[BoolScalar], FloatScalar]:
     """Return which ranks are deficient, and the reciprocal condition number of C.
 
-    Redundant constraints are compatible if C has the rank of their derivatives; the
-    number is then one, and otherwise zero. Their ranks are deficient only if all
-    derivatives of a constraint are zero.
+    Redundant constraints are compatible if C has the rank of their derivatives. The
+    condition number that is returned is then one, and it is zero if they are not
+    compatible. Their ranks are deficient only if all derivatives of a constraint are
+    zero.
     """
     jacobian, reaction, _ = lin.dense
     delassus = jacobian @ reaction

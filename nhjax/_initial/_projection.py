@@ -88,7 +88,7 @@ def checked_keep(
 
     **Arguments:**
 
-    - `letter`: "v" or "p", whichever was given.
+    - `letter`: "v" or "p", the argument that was given.
     - `chosen`: the arguments `keep_q`, `keep_v` and `keep_p` by the letters q, v and p.
     """
     other = "p" if letter == "v" else "v"
@@ -293,8 +293,8 @@ def project_position(system, t, q, u, args, kept: Kept, given: PyTree[Array]):
 def project_fibre_coordinate(system, t, q, u, args, kept: Kept, given: Vector):
     """Project u: find the stationary point w of ½ (w-u)ᵀ K (w-u) on Φ(t, q, w) = 0.
 
-    K is the metric on the fibre at (t, q, u). The `kept` components of v or p,
-    whichever the user gave, are equal to the same components of `given`.
+    K is the metric on the fibre at (t, q, u). The `kept` components of the
+    argument that the user gave, v or p, are equal to the same components of `given`.
     """
 
     def phi(w):
@@ -392,7 +392,7 @@ def _row_sizes(matrix: Float[Array, "l n"]) -> Float[Array, " l"]:
 def _left_basis(
     matrix: Float[Array, "l n"], negligible: float
 ) -> tuple[Float[Array, "l l"], Float[Array, " l"]]:
-    """Find orthonormal combinations of rows, and which of them are active.
+    """Find orthonormal combinations of rows, and which combinations are active.
 
     The combinations are the columns of the first result. The second result has a one
     for each active combination, whose singular value exceeds `negligible`, and a zero
@@ -407,7 +407,7 @@ def _left_basis(
 def _active(
     basis: Float[Array, "l l"], active: Float[Array, " l"], sizes: Float[Array, " l"]
 ) -> Float[Array, "l l"]:
-    """Return the matrix that forms the active combinations of rows of these sizes.
+    """Return the matrix that maps rows to their active combinations.
 
     It is the identity if all combinations are active.
     """

@@ -55,8 +55,8 @@ class DirectAdjoint(AbstractAdjoint):
 
         This differs from the `DirectAdjoint` of diffrax, which nests scans and
         checkpoints up to a maximum number of steps, and which diffrax advises against.
-        Here the number of steps is known, the loop is a plain one, and this adjoint is
-        the default.
+        In nhjax the number of steps is known, a plain loop runs all steps, and this
+        adjoint is the default.
 
     !!! example
 
@@ -80,22 +80,23 @@ class RecursiveCheckpointAdjoint(AbstractAdjoint):
     """Store some states on the way, recompute the rest: memory O(sqrt(num_steps)).
 
     The steps are divided into `checkpoints` blocks, and each block again, until a block
-    has at most `checkpoints` steps. The reverse pass stores the state at the start of
-    each block of the level that it is in, and the stages of one block of the last
-    level. By default there are two levels. Each level beyond the first costs another
-    forward run. With L levels and num_steps = checkpoints^L the memory is
-    O(L checkpoints).
+    has at most `checkpoints` steps. The reverse pass works in one block of each
+    level at a time. It stores the states at the starts of the smaller blocks inside,
+    and the stages of the current block of the last level. By default there are two
+    levels. Each level beyond the first costs another forward run. With L levels and
+    num_steps = checkpoints^L the memory is O(L checkpoints).
 
     Forward mode, second derivatives and an array `num_steps` work as with
     `DirectAdjoint`.
 
     !!! note
 
-        This differs from the `RecursiveCheckpointAdjoint` of diffrax. There a binomial
-        scheme places checkpoints while the number of steps is not yet known, takes
-        log(max_steps) of them by default, and allows reverse mode only. Here the number
-        of steps is known and blocks have equal length. `checkpoints` is the number of
-        blocks on one level, and the default is faster and needs more memory.
+        This differs from the `RecursiveCheckpointAdjoint` of diffrax. In diffrax a
+        binomial scheme places checkpoints while the number of steps is not yet known,
+        takes log(max_steps) checkpoints by default, and allows reverse mode only. In
+        nhjax the number of steps is known and blocks have equal length. `checkpoints`
+        is the number of blocks on one level, and the default is faster and needs more
+        memory.
 
     **Arguments:**
 

@@ -45,11 +45,11 @@ class Checkpoint(eqx.Module):
     Under `vmap` every array has the batch as its leading axis. Derivatives pass through
     `state`, `t0` and `dt`.
 
-    The bits of a result depend on the compiled instructions. Runs in parts repeat a run
-    in one piece bit for bit if all of them save a checkpoint (the last one need not)
-    and otherwise the same output, with the same releases on the same machine. Otherwise
-    they repeat it up to round-off. Samples by `SaveAt(ts=...)` and dense output count
-    times from the start of their run.
+    The bits of a result depend on the compiled instructions. A run in parts repeats a
+    run in one piece bit for bit if all parts save a checkpoint (the last part need not
+    save one) and apart from this the same output, with the same releases on the same
+    machine. Otherwise it repeats the run up to round-off. Samples by `SaveAt(ts=...)`
+    and dense output count times from the start of their run.
 
     !!! example
 
@@ -129,7 +129,7 @@ def check_start(
 ) -> State:
     """Return the state of `y0`, which is a state or a checkpoint.
 
-    Raise if `y0` is neither, or belongs to another system.
+    Raise if `y0` is something else, or belongs to another system.
     """
     check_type("y0", y0, (State, Checkpoint), _ADVICE)
     if isinstance(y0, State):
@@ -187,8 +187,8 @@ def resumed(y0: Checkpoint, fresh: StepState) -> StepState:
     """Return the step state from which a resumed run starts.
 
     `fresh` is the step state of a run from `y0.state`. Its linearisation replaces the
-    one of the checkpoint if their matrices differ by more than eps^(1/4), which happens
-    if the run continues with another system or other args.
+    linearisation of the checkpoint if their matrices differ by more than eps^(1/4),
+    which happens if the run continues with another system or other args.
     """
     new, structure = jax.tree.flatten(fresh.lin)
     _check_arrays("linearisation", y0.linearisation, new)

@@ -93,7 +93,7 @@ def named_arrays(value: Any, batch: tuple[str, ...]) -> dict[str, Any]:
     **Returns:** a dictionary from names to pairs of the dimensions, starting with
     `batch`, and the array.
     """
-    # This module cannot import `Solution`, which has `stats`.
+    # Only a `Solution` has `stats`. This module cannot import the class itself.
     if not hasattr(value, "stats"):
         return _named(value, batch, "value", None)
     made = {} if value.ts is None else _saved(value.ys, (*batch, "time"))

@@ -169,8 +169,9 @@ def integrate(
         are NaN (zero for a zero cotangent). Other members of a batch are not affected.
     - `progress_meter`: such as `nhjax.TqdmProgressMeter()`.
     - `invariants`: quantities that the steps conserve to round-off at their values in
-        `y0`: `"energy"`, or a function of (t, q, v, args), for a Hamiltonian system of
-        (t, q, p, args), of shape () or (k,). The system itself must conserve them.
+        `y0`: `"energy"`, or a function that returns shape () or (k,). It is called with
+        (t, q, v, args), or (t, q, p, args) for a Hamiltonian system. The system itself
+        must conserve these quantities.
         `docs/invariants.md` describes the method, its cost and its behaviour at rest.
     - `event`: an `nhjax.Event`, or a sequence of them: zeros of functions of the state,
         where the run ends or the state is reset. The first event in time happens first.
@@ -259,7 +260,7 @@ def integrate(
     if not _is_tracing() and leaves_steps_to_newton(stage_solver) and is_unsolved(sol):
         used_newton = True
         warnings.warn(_TAKEN_OVER.format(int(sol.stats["failed_step"])), stacklevel=2)
-        # The progress meter has already shown this run, so the repeated run has none.
+        # The progress meter has already shown this run: the repeated run shows none.
         solver = replace(stage_solver, fallback=True)
         solver_options = SolverOptions(solver, adjoint, NoProgressMeter())
         sol = run(system, method, y0, grid, args, options, solver_options)
@@ -518,7 +519,7 @@ def _check_saved(
     )
 
 
-# JAX has an opaque trace state, which can only be compared with another one. In
+# JAX has an opaque trace state, which can only be compared with another state. In
 # releases of JAX in which this function is not public, `_is_tracing` is always True.
 _trace_state = getattr(jax.extend.core, "get_opaque_trace_state", lambda **_: object())
 with jax.ensure_compile_time_eval():

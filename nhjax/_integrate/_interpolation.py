@@ -121,7 +121,7 @@ def _outside(
 def step_position(
     t: Float[Array, "*k"], t0: FloatScalar, dt: FloatScalar, num_steps: int
 ) -> tuple[Float[Array, "*k"], Bool[Array, "*k"]]:
-    """Return times in units of steps, and which of them lie in the run.
+    """Return times in units of steps, and which of the times lie in the run.
 
     Times outside of the run by round-off count as inside.
     """

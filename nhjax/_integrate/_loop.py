@@ -90,7 +90,7 @@ class Loop(eqx.Module):
         return jax.eval_shape(rows)
 
     def moving(self, carry: AbstractCarry) -> AbstractCarry:
-        """Return the same carry, whose state has tangents wherever the run has some."""
+        """Return the same carry; its state gets zero tangents if the run has any."""
         state = with_zero_tangents(carry.step_state.state, self.stepper)
         return eqx.tree_at(lambda x: x.step_state.state, carry, state)
 

@@ -38,7 +38,7 @@ class AbstractProgressMeter(eqx.Module):
         """Report from inside a traced loop that step `k` is complete."""
         if self.silent:
             return
-        # Each call leaves the compiled program, which is expensive, so there are only
+        # Each call leaves the compiled program. This is expensive, so there are only
         # about a hundred calls per run.
         every = max(1, num_steps // 100)
         done = k + 1

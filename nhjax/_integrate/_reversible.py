@@ -28,7 +28,7 @@ class ReversibleAdjoint(AbstractAdjoint):
     then inverts the step.
 
     The retraced states differ from the states of the run by round-off. If the motion is
-    attracted to a set, as the motion of a sleigh is, it is repelled in reversed time,
+    attracted to a set, like the motion of a sleigh, the set repels it in reversed time,
     and the differences grow as fast as the motion decays. In that case prefer
     `RecursiveCheckpointAdjoint`. This adjoint allows reverse mode and forward over
     reverse mode only: `jax.jvp` needs one of the other two adjoints. It computes

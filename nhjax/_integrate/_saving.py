@@ -153,7 +153,7 @@ class SaveAt(eqx.Module):
 
 
 def static_length(num_steps: int | IntScalar) -> int:
-    """Return a number of steps that is known when tracing, as an int for the types."""
+    """Return `num_steps`, which is known when tracing, as an int for type checkers."""
     assert isinstance(num_steps, int)
     return num_steps
 
@@ -212,13 +212,15 @@ def _times(ts: Any) -> Float[Array, " k"]:
 
 
 class Rows(NamedTuple):
-    """The entries that one iteration saves, or the buffers with the entries of all.
+    """The entries that one iteration saves, or buffers for all iterations.
 
-    - `saved`: the time and the value of `SaveAt(fn=...)`; None if steps save none.
-    - `record`: the record of the step for interpolation; None if none is kept.
-    - `log`: an entry of the stepper's log; None without a log.
+    - `saved`: the time and the value of `SaveAt(fn=...)`, or None if the steps of the
+        run save no values.
+    - `record`: the record of the step for interpolation, or None if the run keeps no
+        records.
+    - `log`: an entry of the stepper's log, or None without a log.
     - `row`: the index of the output row, if it can differ from the index of the
-        iteration, otherwise None; in buffers None.
+        iteration. Otherwise, and in buffers, it is None.
     - `log_slot`: the index of the entry in the log; None without a log and in buffers.
     """
 
@@ -249,7 +251,8 @@ def record_places(
     if dense or sampled is None:
         return RecordPlaces(length, jnp.arange(length + 1, dtype=jnp.int32))
     # There is one row for each sample, and samples in the same step share the row of
-    # the first. There may be more steps than samples, or more samples than steps.
+    # the first sample. There may be more steps than samples, or more samples than
+    # steps.
     number = sampled.shape[0]
     slots = jnp.full((length + 1,), number, jnp.int32)
     first = slots.at[sampled].min(jnp.arange(number, dtype=jnp.int32))
@@ -260,9 +263,9 @@ class Saving(eqx.Module):
     """The data that the iterations of a run save, and their places in the buffers.
 
     A run saves the value of `fn` at the state after every `stride`-th step (after none
-    if `stride` is 0), which makes `num_saved` entries. It keeps `num_records` records
-    of steps, and `log_length` entries of the stepper's log. `num_steps` is used only if
-    steps save rows or records.
+    if `stride` is 0). These are `num_saved` entries. The run keeps `num_records`
+    records of steps, and `log_length` entries of the stepper's log. `num_steps` is used
+    only if steps save rows or records.
     """
 
     fn: Callable[[FloatScalar, State, Args], PyTree[Array]]

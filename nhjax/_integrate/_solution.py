@@ -140,9 +140,9 @@ class Solution(eqx.Module):
             system.
         - `units`: units by the name of a variable, of `time`, or of a coordinate. Units
             of variables and of `time` become the attribute `units`. Units of
-            coordinates become the labels `coordinate_unit`, and divided by the unit of
-            `time` the labels `velocity_unit`. The unit of a momentum does not follow
-            from these.
+            coordinates become the labels `coordinate_unit`. Units of coordinates
+            divided by the unit of `time` become the labels `velocity_unit`. The unit of
+            a momentum does not follow from these units.
 
         **Returns:** an `xarray.Dataset`.
 

@@ -122,8 +122,9 @@ class AbstractStepper(eqx.Module, Generic[C, R]):
     def init(self, y0: State | Checkpoint, noise: FunctionNoise | None) -> C:
         """Return the carry before the first iteration.
 
-        To start from a state, the `noise` of the functions of the system is needed. A
-        checkpoint already holds the quantities that follow from it.
+        A start from a state needs the `noise` of the functions of the system. A start
+        from a checkpoint does not need it, because the checkpoint holds the quantities
+        that are computed from the noise.
         """
 
     @abstractmethod
@@ -329,7 +330,7 @@ class PlainStepper(AbstractStepper[PlainCarry, None]):
         good = alive & (outcome.result == RESULTS.successful)
         step_state = tree_where(good, outcome.step_state, carry.step_state)
         # JAX differentiates the body of a loop repeatedly, until it knows which parts
-        # of the carry have derivatives. This tells it the first time.
+        # of the carry have derivatives. With the next line it knows in the first pass.
         step_state = step_state.differentiated_in_state()
         result = RESULTS.where(alive, outcome.result, carry.result)
         stats = updated_statistics(carry.stats, outcome, alive, good, i)
@@ -444,10 +445,10 @@ def step_back(
     if _is_undone_by_negative_step(stepper, step_state):
         return back_from(step_state)
 
-    # Let y be the end of a step back from z. Each iteration moves z by the difference
-    # between `step_state` and the end of the step forward from y. The two steps undo
-    # each other up to a small error, so this iteration converges far faster than one
-    # that moves y.
+    # Each iteration takes a step back from z to y and a step forward from y, and moves
+    # z by the difference between `step_state` and the end of the forward step. The two
+    # steps undo each other up to a small error, so this iteration converges far faster
+    # than an iteration that moves y.
     target = step_state.state
     manifold = stepper.system.manifold_of(target.q)
     propagated = stepper.method.carries_multiplier

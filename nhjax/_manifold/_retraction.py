@@ -183,7 +183,8 @@ class Exponential(AbstractRetraction):
     ) -> tuple[FloatScalar | float, FloatScalar | float]:
         """Compute α = (θ/2) cot(θ/2) and γ = (1 - α)/θ² of dτ⁻¹, with θ² = s."""
         c = stumpff(0.25 * s, 4)
-        # By c_1 - c_0 = θ²/4 (c_2 - c_3) at θ²/4, 1 - α is free of cancellation.
+        # The identity c_1 - c_0 = θ²/4 (c_2 - c_3) of the values at θ²/4 avoids
+        # cancellation in 1 - α.
         return c[0] / c[1], 0.25 * (c[2] - c[3]) / c[1]
 
     def in_chart(self, s: FloatScalar) -> BoolScalar:
@@ -209,8 +210,8 @@ def check_retraction(group: str, retraction: object) -> None:
     )
 
 
-# The series is used for s below this value. Above it the recursion is equally accurate,
-# because it divides its rounding errors by s.
+# The series is used for s below this value. Above this value the recursion is equally
+# accurate, because it divides its rounding errors by s.
 _SWITCH = 2.0
 
 # The first omitted term of the series is at most 2e-18, for c_0 at the switch.
@@ -247,7 +248,7 @@ def _coefficients(n, dtype):
 
 
 def _recursion(s, n):
-    """Compute c_0 by cos, c_1 by sin, the others by s c_k = 1/(k-2)! - c_{k-2}."""
+    """Compute c_0 by cos, c_1 by sin, and c_k by s c_k = 1/(k-2)! - c_{k-2}, k >= 2."""
     theta = jnp.sqrt(s)
     c = [jnp.cos(theta), jnp.sin(theta) / theta]
     for k in range(2, n):

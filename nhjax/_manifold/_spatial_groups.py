@@ -156,8 +156,8 @@ class SO3(AbstractMotionGroup):
 
     The quaternion is the paper's g = (w, x, y, z). The velocity is the body angular
     velocity ω, with dq/dt = q ∘ (0, ω/2). The matrix `matrix(q)` takes body coordinates
-    to space coordinates. The quaternions q and -q are the same rotation, and `local`
-    returns the same vector for both, the shorter one.
+    to space coordinates. The quaternions q and -q are the same rotation. `local`
+    returns the same vector for both: the shorter of the two possible vectors.
 
     **Arguments:**
 

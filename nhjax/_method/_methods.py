@@ -207,8 +207,8 @@ class AbstractMethod(eqx.Module):
     def carries_multiplier(self) -> bool:
         """Return whether a step passes its last multiplier Λ^s to the next step.
 
-        Only the propagated closure does. The states of a run then have this multiplier,
-        and with the other closures the continuous multiplier.
+        Only steps with the propagated closure do so; the states of a run then have the
+        multiplier Λ^s. With the other closures, states have the continuous multiplier.
         """
         return self.closure == "propagated"
 
@@ -242,9 +242,9 @@ class AbstractMethod(eqx.Module):
     def integrated_basis(self, theta: ArrayLike) -> Float[Array, "*batch s"]:
         """Compute ∫_0^θ ℓ_j, the weights of a collocation polynomial at t_k + θ h.
 
-        They are exactly 0 at θ = 0, and for a collocation method exactly `b` at θ = 1,
-        so that dense output agrees with the states at both ends of a step. Arguments,
-        result and errors are the same as for `basis`.
+        The weights are exactly 0 at θ = 0. For a collocation method they are exactly
+        `b` at θ = 1, so that dense output agrees with the states at both ends of a
+        step. Arguments, result and errors are the same as for `basis`.
         """
         return integrated_lagrange(self._tableau(), theta)
 
@@ -474,9 +474,9 @@ def multiplier_closure_weights(t: Tableau, symmetric: bool) -> ClosureWeights:
     The propagated and the consistent closure have Λ^1 = λ_k and y = (Λ^2, ..., Λ^s), as
     in the equations of the paper. The symmetric closure has y = (ν, Λ^2, ...,
     Λ^{s-1}), Λ^1 = λ_k + ν and Λ^s = λ_{k+1} + σ ν. A step back exchanges the two ends
-    and maps ν to σ ν, so that it retraces the step if σ = ±1. Of these two,
-    σ = -R_A(∞) makes A_{2:,:} E invertible, and σ = R_A(∞) does not,
-    because the solutions of Σ_j a_ij Λ^j = 0, i >= 2, have Λ^s = R_A(∞) Λ^1.
+    and maps ν to σ ν, so that it retraces the step if σ = ±1. Of these two
+    values, only σ = -R_A(∞) makes A_{2:,:} E invertible, because the solutions of
+    Σ_j a_ij Λ^j = 0, i >= 2, have Λ^s = R_A(∞) Λ^1.
 
     **Arguments:**
 

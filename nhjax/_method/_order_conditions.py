@@ -12,9 +12,9 @@ Anal. 33, 1996):
 
 A pair (a, â) with common weights b solves q' = f(q, p), p' = g(q, p). Its order
 conditions belong to rooted trees whose edges have two colours, because a stage computes
-q with a and p with â. Let τ_k be the subtrees at the root of a tree τ, and a^(k) the
-matrix of the colour of the edge to τ_k. With φ_i(τ) = Π_k Σ_j a^(k)_ij φ_j(τ_k), the
-pair has order p if
+q with a and p with â. Let τ_k be the subtrees at the root of a tree τ. The colour of
+the edge to τ_k selects a matrix a^(k), which is a or â. With
+φ_i(τ) = Π_k Σ_j a^(k)_ij φ_j(τ_k), the pair has order p if
 
     Σ_i b_i φ_i(τ) = 1 / γ(τ),    γ(τ) = |τ| Π_k γ(τ_k),
 
@@ -205,7 +205,7 @@ def stability_at_infinity(t: Tableau) -> float:
 
 
 class _Branch(NamedTuple):
-    """A tree with the edge to its root: its size |τ|, its γ, and Σ_j a_ij φ_j."""
+    """A tree τ and the edge to its root: the numbers |τ|, γ(τ) and Σ_j a_ij φ_j(τ)."""
 
     size: int
     gamma: int
@@ -245,8 +245,9 @@ def _products(
 ) -> Iterator[tuple[int, np.ndarray]]:
     """Generate all trees with `size` vertices besides the root.
 
-    The branches at the root are taken from `branches[:end]`. Each tree is returned as
-    the product of its branches' γ and the product of `values` and its φ.
+    The branches at the root are taken from `branches[:end]`. For each tree, the
+    function yields the product of the γ of its branches, and `values` times the φ of
+    the tree.
     """
     if size == 0:
         yield 1, values

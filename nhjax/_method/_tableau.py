@@ -306,7 +306,7 @@ def _newton(f: Callable[[Number], tuple[Number, Number]], guess: float) -> Numbe
 
 
 def _mirrored(right: list[Number], count: int) -> list[Number]:
-    """Build all points, exactly symmetric and increasing, from the positive ones."""
+    """Build all points, symmetric and increasing, from the positive points."""
     centre = [CONTEXT.mpf(0)] if count % 2 else []
     return [-x for x in right] + centre + right[::-1]
 

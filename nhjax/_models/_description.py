@@ -111,7 +111,7 @@ def _nonholonomic(
     solved: dict[Any, Any],
     holonomic: list[Any],
 ) -> list[Any]:
-    """Return the velocity constraints that are not rates of holonomic ones.
+    """Return the velocity constraints that are not rates of holonomic constraints.
 
     Kane's method needs the rates of configuration constraints among its velocity
     constraints. All of these are linear in the speeds.

@@ -412,7 +412,7 @@ def components(name: str, x: Any, names: tuple[str, ...]) -> tuple[Array, ...]:
 def printer() -> Any:
     """Create SymPy's printer for JAX, modified to print all digits of floats.
 
-    SymPy's own printer prints 15 digits, and integers too large for a type of JAX.
+    SymPy's own printer prints 15 digits, and integers that are too large for JAX.
     """
     base = importlib.import_module("sympy.printing.numpy").JaxPrinter
 
@@ -536,7 +536,7 @@ def _by_name(where: str, given: Mapping[Any, Any]) -> dict[str, Any]:
 def parameter_defaults(
     parameters: Mapping[Any, Any], known: tuple[str, ...]
 ) -> dict[str, Array]:
-    """Return the values of parameters by name, as arrays for either precision."""
+    """Return the values of parameters by name, as arrays for both precisions."""
     if not isinstance(parameters, Mapping):
         raise TypeError(
             "from_sympy: `parameters` must be a dictionary of values by symbol or "

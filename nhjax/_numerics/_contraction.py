@@ -84,7 +84,7 @@ def inverse(matrix: Float[Array, "n *n"]) -> Float[Array, "n *n"]:
     too.
     """
     size = matrix.shape[0]
-    # Systems with one constraint, and a matrix of size 1, are the most common ones.
+    # Systems with one constraint, and so a matrix of size 1, are the most common.
     if matrix.ndim == 1 or size == 1:
         return 1 / matrix
     if size == 0:

@@ -81,7 +81,7 @@ def two_sum(
 
 
 def uneven_perturbations(q: PyTree[Array]) -> PyTree[Array]:
-    """Return a perturbation of each number in q, of half its size to its size.
+    """Return a perturbation of each number in q, between half its size and its size.
 
     The perturbations differ and have both signs, so that they hardly cancel in
     differences and sums of a few numbers. A relative perturbation is 1 - x/2 or its
@@ -123,11 +123,11 @@ def measured_noise(
 
     Very small displacements may be lost next to a constant in the function, and values
     at larger displacements may differ by more than round-off. The function is measured
-    at three distances (5e-14, 2e-11 and 1e-8 in double precision). The largest result
-    is returned, up to the first distance at which the differences decrease with their
-    order, as for a smooth function. The points lie on rays from the point of interest,
-    so that a kink or a jump at this point, such as friction at rest, is not mistaken
-    for round-off.
+    at three distances (5e-14, 2e-11 and 1e-8 in double precision). The search stops
+    at the first distance at which the differences decrease with their order, as for a
+    smooth function. The largest result is returned. The points lie on rays from the
+    point of interest, so that a kink or a jump at this point, such as friction at rest,
+    is not mistaken for round-off.
 
     **Arguments:**
 
@@ -180,6 +180,6 @@ def measured_noise(
 
 
 def _weights(order: int) -> np.ndarray:
-    """Return the weights of a difference, normalised to keep the deviation of noise."""
+    """Return the weights of a difference that keeps the standard deviation of noise."""
     weights = np.array([(-1.0) ** k * math.comb(order, k) for k in range(order + 1)])
     return weights / np.linalg.norm(weights)

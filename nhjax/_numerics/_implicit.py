@@ -1,9 +1,9 @@
 """Derivatives of values that are computed by iterations or not defined everywhere.
 
-`AbstractImplicitFunction` has the one rule of derivatives of all steps: they follow
-from the solution by the implicit function theorem, not from the iterations. Below it
-are the linear and nonlinear solves that such functions use, and the helpers that
-change the tangents of trees: to zero, to NaN, or to tangents that JAX can see.
+`AbstractImplicitFunction` has the rule for the derivatives of all steps: they follow
+from the solution by the implicit function theorem, not from the iterations. The rest of
+the file has the linear and nonlinear solves that such functions use, and the helpers
+that change the tangents of trees: to zero, to NaN, or to tangents that JAX can see.
 """
 
 from abc import abstractmethod
@@ -222,8 +222,9 @@ def root(
 
     - `scale`: the size to which the round-off of x is proportional. It is larger than
         the size of x0 if x is an increment to a larger number.
-    - `judged`: selects the part of an increment whose size ends the iteration.
-        Multipliers have other units and follow from the rest, so they can be left out.
+    - `judged`: selects the part of an increment that must be small to end the
+        iteration. Multipliers have other units and follow from the rest, so they can be
+        left out.
     - `solve`: called as `solve(jacobian, b)` for the increments and for the derivative
         of the root; a dense solve by default.
     - `max_iterations`: the largest number of iterations.
@@ -379,9 +380,9 @@ def nan_gradient_unless(ok: BoolScalar, tree: X, parameters: PyTree[Any]) -> X:
 
 @eqx.filter_custom_jvp
 def _value(x: Array, ok: BoolScalar, parameters: PyTree[Array]) -> Array:
-    # Under `vmap`, the result must be batched wherever its derivative is, that is,
-    # wherever `ok` or a parameter is. Therefore it seems to depend on them. The
-    # compiler removes these operations.
+    # Under `vmap`, a leaf of the result must be batched if its derivative is batched,
+    # that is, if `ok` or a parameter is batched. Therefore the operations below make
+    # the result depend on all of them. The compiler removes these operations.
     for leaf in jax.tree.leaves(parameters):
         ok = ok | jnp.any(leaf == 0)
     return jnp.where(ok, x, x)

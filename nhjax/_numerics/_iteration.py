@@ -16,13 +16,13 @@ Aux = TypeVar("Aux")
 
 
 # If an iteration may converge slowly, increments that have stopped falling are treated
-# as noise up to this many units of round-off. Larger ones can also come from a slow
-# iteration that spirals towards the solution.
+# as noise up to this many units of round-off. Larger increments can also come from a
+# slow iteration that spirals towards the solution.
 NOISE_UNITS = 400
-# At the first increment that fails to fall, this many units of round-off are treated as
-# noise. At each further such increment, this level grows by one of the two factors
-# below. The factor is smaller for iterations that may be slow, since their increments
-# may rise and fall before they have converged.
+# When an increment fails to fall for the first time, this many units of round-off are
+# treated as noise. Each time that this happens again, the level grows by one of the two
+# factors below. The factor is smaller for iterations that may be slow, since their
+# increments may rise and fall before they have converged.
 _FIRST_UNITS = 30.0
 _GROWTH, _GROWTH_IF_SLOW = 30.0, 2.0
 # An iteration diverges if an increment is larger by this factor than x and the first
@@ -178,7 +178,7 @@ def _progress(rules: _Rules, before: _Progress, sizes: UpdateNorms) -> _Progress
     more = jnp.minimum(rules.growth * before.believed, rules.noisiest)
     believed = jnp.where(stalls, more, before.believed)
     stagnant = stalls & (increment <= believed * magnified)
-    # A tolerance is relative to x itself, whatever the round-off of x is.
+    # A tolerance is relative to x itself, and does not depend on the round-off of x.
     least = jnp.maximum(rules.least, rules.tolerance_or_eps * sizes.iterate)
     least = jnp.where(has_size, least, rules.tolerance_or_eps * before.first)
     small = increment <= least

@@ -548,7 +548,7 @@ def _bandwidth(shared: "scipy.sparse.csr_array", order: np.ndarray) -> int:
 
 
 def _raised(x: Array, other: Array) -> Array:
-    """Give x as many axes as another array has, if it has fewer."""
+    """Add leading axes to x, until it has as many axes as another array."""
     return jnp.expand_dims(x, range(max(other.ndim - x.ndim, 0)))
 
 
@@ -563,7 +563,8 @@ def compressed_products(
     The products are block tridiagonal in the order of the pattern. So each row has
     entries in at most one of the blocks whose numbers are equal modulo three, and the
     columns of these blocks can be added. Entry [i, j, c, b, a] of the result is the
-    entry in row a of the sum of the columns b of all blocks with number c modulo three.
+    entry of product (i, j) in row a and in column b of the block whose number is c
+    modulo three.
     """
     pattern = left.pattern
     place = np.argsort(pattern.order)
@@ -594,7 +595,8 @@ def block_tridiagonal_inverse(
     count = -(-size // (3 * g)) * 3
     ordered = static_take(products, pattern.order)
     ordered = jnp.pad(ordered, (*[(0, 0)] * 4, (0, count * g - size)))
-    # Axes: equation, unknown, sum, column, group of three blocks, block in it, row.
+    # The axes: equation, unknown, sum, column, group of three blocks, block inside the
+    # group, row.
     split = ordered.reshape(q, q, 3, g, count // 3, 3, g)
 
     def diagonal(offset):
@@ -630,8 +632,8 @@ _PERIODS = (1, 2, 3, 4, 6)
 def static_take(x: Array, index: Int[np.ndarray, " k"]) -> Array:
     """Compute `x[..., index]` for known indices, by slices if few are enough.
 
-    The indices of regular structures are arithmetic sequences, or a few such sequences
-    that take turns. A slice can be part of a kernel; an indexed read cannot.
+    The indices of regular structures are arithmetic sequences, or a few interleaved
+    arithmetic sequences. A slice can be part of a kernel; an indexed read cannot.
     """
     if np.array_equal(index, np.arange(x.shape[-1])):
         return x
@@ -663,7 +665,7 @@ def _runs(index: Sequence[int] | np.ndarray) -> list[np.ndarray]:
             or index[end] - index[end - 1] == index[start + 1] - index[start]
         ):
             end += 1
-        # Slices only go forward, so that a decreasing step ends the run.
+        # Slices only go forward: if the indices decrease, a run has a single index.
         if end > start + 1 and index[start + 1] < index[start]:
             end = start + 1
         runs.append(np.asarray(index[start:end]))

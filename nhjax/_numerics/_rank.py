@@ -82,7 +82,7 @@ def reciprocal_condition(matrix: Float[Array, "k l"]) -> FloatScalar:
 
 
 def is_deficient(matrix: Float[Array, "k l"]) -> BoolScalar:
-    """Return whether the rows are dependent to round-off; rows with NaN are not."""
+    """Return whether the rows are dependent to round-off, False for rows with NaN."""
     eps = jnp.finfo(matrix.dtype).eps
     return reciprocal_condition(matrix) <= 10 * matrix.shape[1] * eps
 
@@ -133,8 +133,8 @@ def _negligible(dtype: jnp.dtype) -> float:
     return float(jnp.finfo(dtype).eps) ** 0.75
 
 
-# Away from a solution, dependent equations are dependent only up to the distance from
-# it. There, singular values below this fraction of the largest one count as zero.
+# Equations that are dependent at a solution are only nearly dependent at other points.
+# There, singular values below this fraction of the largest one count as zero.
 NEARLY_DEPENDENT = 1e-4
 
 
@@ -143,7 +143,7 @@ def least_norm_inverse(
 ) -> Float[Array, "l l"]:
     """Compute the inverse X of a symmetric C that solves C x = b with the least norm.
 
-    If C x = b has solutions, X b is the one with the least Σ C_aa x_a². With
+    If C x = b has solutions, X b is the solution with the least Σ C_aa x_a². With
     D = diag(C_aa)^(-1/2) it is X = D (D C D)⁺ D. Eigenvalues of D C D count as zero if
     they are round-off, or less than `negligible` times the largest one. If some
     constraints are scaled, only their multipliers are scaled.
@@ -171,8 +171,9 @@ def least_norm_inverse_by_blocks(
         return least_norm_inverse(matrix)
     others = least_norm_inverse(matrix[first:, first:])
     onto = matrix[:first, first:] @ others
-    # Where equations follow from the others, the Schur complement is round-off. It is
-    # compared with a one, the size of the diagonal before.
+    # If an equation follows from the others, its part of the Schur complement is
+    # round-off. The additional block of size one makes `pinv` compare this part with
+    # one, the size of the scaled diagonal before the elimination.
     left = matrix[:first, :first] - onto @ matrix[first:, :first]
     root = _roots(matrix[:first, :first])
     scaled = jax.scipy.linalg.block_diag(
@@ -192,7 +193,7 @@ def rank_of_gram(matrix: Float[Array, "l l"]) -> Int[Array, ""]:
 
 
 def reciprocal_condition_of_range(matrix: Float[Array, "l l"]) -> FloatScalar:
-    """Compute the ratio of the smallest eigenvalue that is not zero to the largest."""
+    """Divide the smallest nonzero eigenvalue by the largest eigenvalue."""
     if matrix.shape[0] == 0:
         return jnp.ones((), matrix.dtype)
     values, is_kept = _eigenvalues(matrix)

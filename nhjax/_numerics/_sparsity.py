@@ -235,7 +235,7 @@ def _padded(x: np.ndarray, filled: np.ndarray, config: Any) -> np.ndarray:
 def _gathered(
     params: dict[str, Any], x: np.ndarray, index: np.ndarray | None
 ) -> list[np.ndarray] | None:
-    """Rearrange sets as a gather of single elements along one axis does."""
+    """Rearrange sets like a gather of single elements along one axis."""
     numbers, sizes = params["dimension_numbers"], params["slice_sizes"]
     (axis, *others) = numbers.start_index_map
     if index is None or others or numbers.operand_batching_dims:

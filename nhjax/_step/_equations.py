@@ -56,8 +56,8 @@ class StageUnknowns(eqx.Module):
     - `closure`: y, the unknowns of the closure. The nonholonomic multipliers are
         Λ = (start) λ_k + (end) λ_{k+1} + E y.
     - `holonomic`: the holonomic multipliers Λ^1..Λ^s.
-    - `end_acceleration`, `end_multiplier`: u̇ and λ_c at the end of the step, which only
-        the symmetric closure has.
+    - `end_acceleration`, `end_multiplier`: u̇ and λ_c at the end of the step, which
+        only the symmetric closure has.
     - `impulse`: ε, the impulses at both ends of the step along ∂I/∂v of the invariants
         I; None if the run keeps no invariants.
     """
@@ -86,9 +86,10 @@ class StageEquations(eqx.Module):
     """The discrete equations of one step from (q_k, p_k, λ_k).
 
     These are the four Summaries of the paper, for the `StageUnknowns` in the chart of
-    the method. Let w^i be the body force at stage i, reactions included, and y^i the
-    coordinates of the stage. Let n^i = Ad^*_{τ(y^i)⁻¹} w^i, let F^i be the same force
-    in the chart, and M the momentum μ_k carried to the origin. The equations are
+    the method. Let w^i be the body force at stage i, including reactions, and let y^i
+    be the coordinates of the stage. Let n^i = Ad^*_{τ(y^i)⁻¹} w^i, let F^i be the same
+    force in the chart, and let M be the momentum μ_k carried to the origin. The
+    equations are
 
     Π^i = base + h Σ â_ij F^j,    μ^i = Ad^*_{τ(y^i)} (M + h Σ a_ij n^j),
 
@@ -541,9 +542,10 @@ def end_position(stages: StageEquations, x: StageUnknowns) -> PyTree[Array]:
 def with_moved_positions(stages: StageEquations, nudge: FloatScalar) -> StageEquations:
     """Return the equations with q_k moved by about `nudge` times its size.
 
-    This move changes the solution. The change per `nudge` estimates the change by the
-    round-off of positions per unit round-off. The coordinates move by different
-    amounts, so that the moves do not cancel in a difference of two coordinates.
+    This move changes the solution. The change divided by `nudge` estimates the effect
+    of the round-off of positions, divided by the unit round-off. The coordinates move
+    by different amounts, so that the moves do not cancel in a difference of two
+    coordinates.
     """
     if stages.manifold.is_flat:
         moves = uneven_perturbations(stages.q)

@@ -107,11 +107,11 @@ class FirstOrderTerms(eqx.Module):
     δr_i = N_i δH_i + ∂Π/∂y δy_i - h Σ_j â_ij ∂F/∂H δH_j - ∂base/∂ξ δξ - ...,
     δy_i = h Σ_j a_ij δH_j,
 
-    and the equations of the nodes likewise. The leading part is N δH_i with the mass
-    matrix N at the start of the step. All other terms are of order h: the change of the
-    mass matrix until the stage, N_i = N + h c_i Ṅ, the change of momenta with
-    positions, and the change of forces with velocities. Their derivatives are taken at
-    the start of the step and multiplied by N⁻¹, so that with z_i = N⁻¹ r_i
+    and the equations of the nodes change in the same form. The leading part is N δH_i
+    with the mass matrix N at the start of the step. All other terms are of order h: the
+    change of the mass matrix until the stage, N_i = N + h c_i Ṅ, the change of momenta
+    with positions, and the change of forces with velocities. Their derivatives are
+    taken at the start of the step and multiplied by N⁻¹, so that with z_i = N⁻¹ r_i
 
     δH_i = z_i - N⁻¹ (the terms, applied to z),
 
@@ -259,8 +259,8 @@ class _BodySlopes(NamedTuple):
     """Derivatives at the start of a step, in the body frame.
 
     - `inertia_rate`: the rate of N = ∂p/∂u along the motion.
-    - `momentum`: the derivative of the momentum by the position, less the derivative of
-        the momentum that is transported there.
+    - `momentum`: the derivative of the momentum by the position, minus the derivative
+        of the momentum that the chart transports to this position.
     """
 
     inertia_rate: Float[Array, "n n"]
@@ -270,7 +270,7 @@ class _BodySlopes(NamedTuple):
 class _ChartSlopes(NamedTuple):
     """Derivatives at the start of a step, in its chart.
 
-    - `turning`: the rate at which ∂Π/∂H changes through dτ_y along y = v.
+    - `turning`: the rate of ∂Π/∂H along y = v that comes from the change of dτ_y.
     - `momentum`, `force`, `body_force`: ∂Π/∂y, ∂F/∂H and ∂w/∂H.
     - `base`: the derivative of the constant term of Π by the increment of the step.
     """

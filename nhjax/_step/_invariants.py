@@ -25,7 +25,7 @@ from .._system import (
 
 
 # An impulse changes an invariant by at most this fraction of Σ |u ∂I/∂u|. Near rest
-# this sum is small, and no impulse might correct the error.
+# this sum is small, and there may be no impulse that corrects the error.
 _LARGEST_PART = 0.1
 # With an indefinite mass matrix, ω·M⁻¹ω can vanish although ω does not. If ω·M⁻¹ω is
 # less than this fraction of its bound Σ_ij |M⁻¹_ij| ω_i², a step has no impulse. All
@@ -247,8 +247,8 @@ class InvariantCorrection(eqx.Module):
 
     a r / g + (1 - a) ε = 0,    g = G_ii,    a = g² / (g² + ϵ S²).
 
-    Here ϵ is the unit round-off and S the size of the terms of I. Unless g is small, a
-    is 1 up to round-off. At rest g vanishes, and no impulse can keep I.
+    Here ϵ is the unit round-off and S is the size of the terms of I. Unless g is small,
+    a is 1 up to round-off. At rest g vanishes, and no impulse can keep I.
 
     With an indefinite mass matrix, G can also be singular away from rest. Then a = 0
     for all functions; see `LEAST_PART`.
@@ -295,8 +295,9 @@ class InvariantCorrection(eqx.Module):
         matrix = errors[:, None] * gram + (1 - a)[:, None] * one
         # If one function follows from others, the matrix is singular.
         solved = inverse(matrix + eps**0.5 * one)
-        # The ratio of the impulses to the impulses of the definite matrix of the row
-        # sums, for the same errors. With one function it is Σ (row sum) ω² / |g|.
+        # The gain is the ratio of the impulses to the impulses that a definite matrix,
+        # the diagonal matrix of the row sums, would give for the same errors. With one
+        # function it is Σ (row sum) ω² / |g|.
         squares = at_start.covectors**2 + covectors**2
         roots = jnp.sqrt(jnp.sum(at_start.row_sums[None] * squares, axis=1))
         gain = roots[:, None] * solved * (errors * roots)[None]

@@ -84,14 +84,14 @@ def simplified_newton_update(
         x_next = factors.correct_multipliers(stages, x_next, kinematic, holonomic)
     if stages.end_multiplier_is_unknown:
         # λ_c depends on v_{k+1} at zeroth order: it must be corrected with the new
-        # velocity. Otherwise the two errors feed each other, and the rate of
-        # convergence is only the square root.
+        # velocity. Otherwise the two errors feed each other, and an iteration reduces
+        # them only by the square root of the usual factor.
         x_next = factors.correct_end(stages, x_next, end_residual(stages, x_next))
     return x_next, Evaluation(forces, r_nodes, jnp.asarray(False))
 
 
 class MultiplierResponses(NamedTuple):
-    """The changes of stages and nodes with each unknown of the multipliers.
+    """The changes of stages and nodes for unit changes of the multipliers' unknowns.
 
     The last axis lists these unknowns, h δy of the closure and h δΛ. With the terms of
     order h the responses are stored, since the Schur complement is formed from them.
@@ -152,7 +152,7 @@ class StageJacobianFactors(eqx.Module):
         """Compute the fibre coordinates u - N⁻¹ r_v of the nodes.
 
         The residual was evaluated at positions that include the `change` of the stage
-        velocities, but with forces that do not.
+        velocities, but with forces that do not include it.
         """
         du = -self.momentum_inverse.matvec(residual)
         if self.first_order is not None:
@@ -210,8 +210,8 @@ class StageJacobianFactors(eqx.Module):
         """Correct the acceleration and λ_c at the end of the step.
 
         The unknowns of the closure change with λ_c, so that the nodes stay the same to
-        leading order. Otherwise their constraints, which have just been solved, would
-        be violated again, which would cost another iteration.
+        leading order. Otherwise the nodes would violate their constraints again, and
+        this would cost another iteration.
         """
         momentum_residual, hidden_residual = residual
         da, dlam = self.end.solve(-momentum_residual, -hidden_residual)
@@ -451,7 +451,10 @@ def _first_order_factors(
 def _reactions(
     stages: StageEquations, jacobian: Float[Array, "s l n"]
 ) -> Float[Array, "s n c"]:
-    """Compute the reactions at the stages to each unknown of the closure and each Λ."""
+    """Compute the reactions at the stages for unit values of the multiplier unknowns.
+
+    These are the unknowns of the closure and the holonomic multipliers Λ.
+    """
     m, one = stages.num_nonholonomic, jnp.eye(len(jacobian), dtype=jacobian.dtype)
     weights = stages.closure_weights("E")
     parts = [
@@ -465,9 +468,10 @@ def _reactions(
 def _with_mass_at_end(
     lin: Linearisation, terms: FirstOrderTerms, jacobian: Float[Array, "l n"]
 ) -> Linearisation:
-    """Replace the mass matrix and constraints of a linearisation by their end values.
+    """Return a linearisation with mass matrix and constraints at the end of the step.
 
-    Otherwise u̇ and λ_c at the end would converge no faster than without these terms.
+    With the matrices at the start, u̇ and λ_c at the end would converge no faster than
+    without the terms of order h.
     """
     at_start = lin.momentum_inverse.as_matrix()
     change = small_einsum("kl,ln->kn", terms.node_inertia[-1], at_start)
@@ -501,8 +505,8 @@ def update_norms(
 def fibre_coordinate_size(stages: StageEquations, x: StageUnknowns) -> FloatScalar:
     """Return the smaller of the max norms of the stage and node fibre coordinates.
 
-    While an iteration is far from a solution, one of the two can be much larger than
-    any size that is related to the other.
+    While an iteration is far from a solution, one of the two norms can be much larger
+    than the other, and is not a useful size then.
     """
     u = x.momentum if stages.hamiltonian else x.velocity
     return jnp.minimum(max_norm(u), max_norm(x.node_fibre_coordinate))

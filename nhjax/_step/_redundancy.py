@@ -15,8 +15,8 @@ class Redundancy(eqx.Module):
 
     With C at the start of the step and C⁻ its least-norm inverse, P = C C⁻ projects the
     values of the constraints onto the range of C. The dimension of this range is the
-    number of independent constraints. Near the start of the step P Φ vanishes only
-    where Φ does. The remaining equations are replaced by
+    number of independent constraints. Near the start of the step P Φ = 0 only
+    where Φ = 0. The remaining equations are replaced by
 
     (1 - P) diag(C) h δΛ = 0,
 

@@ -49,7 +49,7 @@ from ._round_off import PART
 from ._step import AbstractStageSolver, FrozenNewtonMap
 
 
-# If the residual is larger than this, relative to the momenta, the iterate is no
+# If the residual is larger than this, relative to the momenta, the iterate is not a
 # solution.
 _GROSS = 1e-6
 
@@ -57,8 +57,9 @@ _GROSS = 1e-6
 def tolerance_array(tolerance: FloatScalarLike) -> FloatScalarLike:
     """Convert the `tolerance` of a solver to an array.
 
-    A number becomes an array of NumPy on the host: the default solver is made when
-    nhjax is imported, which must not start JAX's backends, nor choose a precision.
+    A number becomes an array of NumPy on the host: the default solver is created when
+    nhjax is imported, and this import must not start JAX's backends or choose a
+    precision.
     """
     if isinstance(tolerance, int | float) and not isinstance(tolerance, bool):
         return np.asarray(float(tolerance))
@@ -373,5 +374,5 @@ def _kinematic_scale(
         (q,),
         (uneven_perturbations(q),),
     )[1]
-    # If a constraint has no finite slope, this does not measure its round-off.
+    # If the slope of a constraint is not finite, it does not measure the round-off.
     return jnp.where(jnp.isfinite(change), jnp.abs(change), 0)

@@ -229,9 +229,9 @@ def first_step_state(
 class _ContinuousMultiplier(AbstractImplicitFunction[Any, Float[Array, " l"]]):
     """The continuous multiplier λ_c as a function of (system, t, q, u, args).
 
-    Its derivative is zero where the multiplier is not finite. Otherwise a member that
-    failed would make the derivative of a sum that leaves it out NaN, because NaN times
-    zero is NaN.
+    Its derivative is zero where the multiplier is not finite. Otherwise, if a sum
+    leaves out a failed member, the derivative of the sum would still be NaN, because
+    NaN times zero is NaN.
     """
 
     programs: None = None
@@ -546,8 +546,8 @@ class ImplicitStep(AbstractImplicitFunction[StepArguments, StepOutcome]):
     """A step as a differentiable function of its arguments.
 
     Let G(θ, x) be the Newton iteration of the stage solver on the stages x, with its
-    Jacobian fixed, and θ the arguments of the step. The solution is a fixed point of G,
-    so that
+    Jacobian fixed, and let θ be the arguments of the step. The solution is a fixed
+    point of G, so that
 
     dx = ∂G/∂x dx + ∂G/∂θ dθ,
 

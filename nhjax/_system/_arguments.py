@@ -112,7 +112,7 @@ def configuration(q: Any) -> PyTree[Array]:
 def real_scalar(name: str, x: FloatScalarLike, dtype: Any) -> FloatScalar:
     """Convert a real number (or an integer) to a scalar array of `dtype`.
 
-    Other types raise a `DTypeError`, and arrays that are not scalars a `ShapeError`.
+    Other types raise a `DTypeError`. Arrays that are not scalars raise a `ShapeError`.
     """
     # A concrete number stays concrete inside `jit`.
     if not is_traced(x):
@@ -233,7 +233,8 @@ def check_third_argument(
     """Raise or warn if a function of a system takes a variable that it never gets.
 
     The functions of a Lagrangian system receive v, and the functions of a Hamiltonian
-    system receive p. Holonomic constraints receive neither. `letter` is "v" or "p".
+    system receive p. Holonomic constraints receive neither v nor p. `letter` is "v" or
+    "p".
 
     Constraints and forces only lead to a warning: where the momentum equals the
     velocity, one function can serve both kinds of systems.
@@ -332,7 +333,7 @@ def _takes(signature: inspect.Signature, arguments: tuple[str, ...]) -> bool:
 
 
 def _confuses(signature: inspect.Signature, arguments: tuple[str, ...]) -> bool:
-    """Return whether two or more of the names are in the places of other names."""
+    """Return whether two or more of the expected names are at wrong positions."""
     pairs = zip(_positional_names(signature), arguments, strict=False)
     moved = [name for name, there in pairs if name != there and name in arguments]
     return len(moved) >= 2

@@ -345,7 +345,8 @@ class LagrangianSystem(AbstractMechanicalSystem):
     **Arguments:**
 
     - `lagrangian`: L, called as `lagrangian(t, q, v, args)`, a scalar. On a group it is
-        left-trivialised: `q` is an element, `v` the body velocity in the Lie algebra.
+        left-trivialised: `q` is an element, and `v` is the body velocity in the Lie
+        algebra.
     - `nonholonomic`: Φ, called as `nonholonomic(t, q, v, args)`, of shape () or (m,):
         linear, affine or nonlinear in v, and it may depend on time.
     - `holonomic`: Γ, called as `holonomic(t, q, args)`, of shape () or (k,).
@@ -356,9 +357,10 @@ class LagrangianSystem(AbstractMechanicalSystem):
         constraints that follow from others, also nonholonomic constraints that follow
         from holonomic ones. Many multipliers then have the same reaction. The result
         has the multipliers with the least Σ |λ_a B_a|², where |λ_a B_a| is the size of
-        the reaction of one constraint in the metric M⁻¹, and zero for a nonholonomic
-        constraint that follows from holonomic ones. Reactions are marked as not unique.
-        `docs/systems.md` has the details.
+        the reaction of one constraint in the metric M⁻¹. The multiplier of a
+        nonholonomic constraint is zero if the constraint follows from holonomic
+        constraints. Reactions are marked as not unique. `docs/systems.md` has the
+        details.
     - `coordinates`: a tuple of the names of the n coordinates, for
         `Solution.to_xarray` and for `keep_q`, `keep_v` and `keep_p` of `initial_state`;
         None by default.
@@ -489,7 +491,8 @@ class HamiltonianSystem(AbstractMechanicalSystem):
     **Arguments:**
 
     - `hamiltonian`: H, called as `hamiltonian(t, q, p, args)`, a scalar. On a group it
-        is left-trivialised: `q` is an element, `p` a covector of the Lie algebra.
+        is left-trivialised: `q` is an element, and `p` is a covector of the Lie
+        algebra.
     - `nonholonomic`: Ψ, called as `nonholonomic(t, q, p, args)`, of shape () or (m,).
     - `holonomic`: Γ, called as `holonomic(t, q, args)`, of shape () or (k,).
     - `force`: an external covector F, called as `force(t, q, p, args)`, of shape (n,).
@@ -498,9 +501,10 @@ class HamiltonianSystem(AbstractMechanicalSystem):
         constraints that follow from others, also nonholonomic constraints that follow
         from holonomic ones. Many multipliers then have the same reaction. The result
         has the multipliers with the least Σ |λ_a B_a|², where |λ_a B_a| is the size of
-        the reaction of one constraint in the metric M⁻¹, and zero for a nonholonomic
-        constraint that follows from holonomic ones. Reactions are marked as not unique.
-        `docs/systems.md` has the details.
+        the reaction of one constraint in the metric M⁻¹. The multiplier of a
+        nonholonomic constraint is zero if the constraint follows from holonomic
+        constraints. Reactions are marked as not unique. `docs/systems.md` has the
+        details.
     - `coordinates`: a tuple of the names of the n coordinates, for
         `Solution.to_xarray` and for `keep_q`, `keep_v` and `keep_p` of `initial_state`;
         None by default.

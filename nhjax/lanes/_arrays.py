@@ -227,7 +227,7 @@ SHAPING: dict[str, Operation] = {
 }
 
 
-# No array is that long.
+# This number is larger than any index of an array.
 _FAR = 2**62
 
 
@@ -331,7 +331,8 @@ class _Axes(NamedTuple):
     """The axes of an array on which a window starts at a variable index.
 
     - `indexed`: the axes whose starts are the entries of an index.
-    - `batched`: the axes that go along with the axes `sources` of the array of indices.
+    - `batched`: the batch axes of the array. They belong to the axes `sources` of the
+      array of indices.
     """
 
     indexed: Sequence[int]
@@ -531,7 +532,7 @@ GATHERS: dict[str, Operation] = {
 
 
 def _extreme(dtype: str, sign: int) -> Any:
-    """Return the largest number of a dtype, or for the sign -1 the smallest."""
+    """Return the largest number of a dtype, or the smallest number for the sign -1."""
     if is_float(dtype):
         return sign * np.inf
     if dtype == "bool":
@@ -585,7 +586,7 @@ def _folded(builder: Builder, op: str, numbers: Iterable[Node]) -> Node | None:
 def _arg(
     op: str, builder: Builder, equation: Any, values: list[ArrayValue]
 ) -> ArrayValue:
-    """Return the index of the first NaN, or of the first extremum without NaN."""
+    """Return the index of the first NaN or, without NaN, of the first extremum."""
     graph = builder.graph
     dtype = dtype_name(equation.params["index_dtype"])
     x = builder.memory.registers(values[0])
@@ -667,7 +668,7 @@ def _small_product(
     shape = [lengths[index] for index in order]
 
     def rows(x: np.ndarray, indices: str) -> np.ndarray:
-        """Repeat the numbers of an operand for each sum, one after the other."""
+        """Return the numbers of an operand as rows, one row for each sum."""
         x = x.transpose([indices.index(index) for index in order if index in indices])
         x = x.reshape([lengths[index] if index in indices else 1 for index in order])
         terms = math.prod(shape[len(result) :])

@@ -143,7 +143,7 @@ class Memory:
         target_shift: Node | None = None,
         source_shift: Node | None = None,
     ) -> None:
-        """Copy numbers from some indices of a buffer to some indices of another."""
+        """Copy numbers from indices of one buffer to indices of another buffer."""
         if target_view.size <= _LONGEST_UNROLLED:
             numbers = [
                 self.load(source, source_shift, int(i)) for i in source_view.flat
@@ -304,7 +304,7 @@ class Builder:
         self.operations, self.unroll = operations, unroll
         # The enclosing equations, which identify the current one.
         self.path: list[int] = []
-        # For each loop, by its path, the numbers that are known to change.
+        # The numbers of each loop that are known to change, by the path of the loop.
         self.changing: dict[tuple[int, ...], set[int]] = {}
         self._last_uses: dict[int, tuple[Any, list[list[Any]]]] = {}
 

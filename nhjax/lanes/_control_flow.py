@@ -2,9 +2,9 @@
 
 A loop carries arrays as parameters, number by number, or leaves them in place in
 memory. Numbers that start as constants are first assumed to stay constant. The body is
-built, and built again without the assumption for those numbers that do change. These
-numbers are remembered, so that building an outer loop again does not multiply the time
-with the depth of nesting.
+built. If some of these numbers change, the body is built again without the assumption
+for them. The changing numbers are remembered, so that building an outer loop again does
+not multiply the time with the depth of nesting.
 
 Short scans are unrolled, unless their body contains loops.
 """
@@ -449,8 +449,8 @@ class _Attempt:
         self.builder, self.carried = builder, carried
         self.loop = LoopBuilder(builder.graph)
         self.changing = changing
-        # By position: the constants that are assumed not to change, and the positions
-        # of the parameters.
+        # `fixed` has, by position, the constants that are assumed not to change, and
+        # `varying` has the positions of the parameters.
         self.fixed: dict[int, Node] = {}
         self.varying: list[int] = []
         self.outs: list[Node] = []

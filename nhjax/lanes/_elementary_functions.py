@@ -57,7 +57,7 @@ def definitions(wanted: Iterable[tuple[str, str, int]]) -> str:
 
 @cache
 def _texts(op: str, dtype: str, width: int) -> dict[str, str]:
-    """Return definitions by name: of a function, and of the functions that it calls."""
+    """Return the definitions of a function and of the functions it calls, by name."""
     writer = Writer(width)
     scalar = scalar_type(dtype)
     names = ["%x", "%y"] if op in _BINARY else ["%x"]
@@ -65,8 +65,8 @@ def _texts(op: str, dtype: str, width: int) -> dict[str, str]:
     writer.result(*results)
     kind = writer.type(scalar)
     result = result_type([kind] * len(results))
-    # A function that only calls another one is inlined. `sin` and `cos` call one common
-    # function, which is not inlined, so that LLVM merges its calls.
+    # A function that only calls another function is inlined. `sin` and `cos` call one
+    # common function, which is not inlined, so that LLVM merges its calls.
     is_call = dtype == "float32" or op in _RESULT_OF_BOTH
     inlining = "noinline" if op == _SIN_AND_COS else "alwaysinline" if is_call else ""
     name, parameters = symbol(op, dtype, width), ", ".join(f"{kind} {x}" for x in names)
@@ -172,8 +172,8 @@ def rem(x: Value, y: Value) -> Value:
         rest = (a - high) - low
         rest = where(rest < 0.0, rest + b, rest)
     rest = where(a < b, a, rest)
-    # The exact product may be beyond the range of float64 for very large and, where
-    # subnormal numbers are flushed to 0, for very small numbers.
+    # The exact product may overflow for very large numbers. It may underflow for very
+    # small numbers, if the processor replaces subnormal numbers by 0.
     is_long = (ratio > _LARGEST_QUOTIENT) | (a > 2.0**1000) | (b < 2.0**-900)
     is_long = is_long & (a < math.inf) & (b > 0.0) & (a >= b)
 

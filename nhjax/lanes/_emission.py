@@ -30,7 +30,7 @@ from ._writer import (
 )
 
 
-# Scratch memory is aligned to this many bytes, and so is each array in it.
+# Scratch memory and each array in it are aligned to this many bytes.
 _ALIGNMENT = 64
 _LARGEST_STACK = 2**16
 _LARGEST_SCRATCH = 2**26
@@ -72,7 +72,7 @@ def emit(
 
 
 def _members(width: int) -> list[str]:
-    """Write the numbers of the members; numbers beyond the last member repeat it."""
+    """Write the indices of the members, at most the index of the last member."""
     if width == 1:
         return ["  %members = add i64 %first, 0"]
     lines, whole, kind = [], "poison", vector("i64", width)
@@ -138,8 +138,8 @@ def _module(writer: Writer, size: int) -> str:
 class LiveNodes:
     """The nodes that the results of a program need, by region and in order.
 
-    A store is needed if its memory is read, and a loop if one of its results or a store
-    in it is needed.
+    A store is needed if its memory is read. A loop is needed if one of its results or a
+    store inside it is needed.
     """
 
     def __init__(self, results: list[Buffer]):
@@ -240,7 +240,7 @@ def _is_divergent(node: Node) -> bool:
 
 
 def _is_masked(inner: Region, outer: Region) -> bool:
-    """Return whether members that run in a region may be masked in one inside it."""
+    """Return whether members that run in `outer` may be masked in `inner`."""
     region: Region | None = inner
     while region is not None and region is not outer:
         if region.owner is not None and region.owner.attr.predicate.is_divergent:
@@ -635,7 +635,7 @@ class _Memory:
         return buffer.kind == "result" or (is_operand and buffer.is_divergent)
 
     def _starts(self, size: int) -> str:
-        """Return the indices at which members start in an array of arrays of a size."""
+        """Return where members start in an array with `size` numbers per member."""
         if size not in self._members:
             index, by = vector("i64", self.width), splat(str(size), "i64", self.width)
             self._members[size] = self.writer.value(f"mul {index} %members, {by}")
@@ -656,7 +656,7 @@ class _Memory:
     def _address(
         self, buffer: Buffer, index: Node | None, offset: int
     ) -> tuple[str, bool]:
-        """Write the address of a number; return whether each member has its own."""
+        """Write the address of a number; return whether it differs between members."""
         writer, kind = self.writer, memory_type(buffer.dtype)
         pointer = self._bases[buffer]
         if buffer.kind == "scratch" and buffer.is_divergent:

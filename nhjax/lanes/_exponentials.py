@@ -107,7 +107,7 @@ def tanh(x: Value) -> Value:
 
 def logistic(x: Value) -> Value:
     """Return 1 / (1 + exp(-x))."""
-    # With z = exp(-|x|) it is 1 / (1 + z) or z / (1 + z), for negative x.
+    # With z = exp(-|x|) the result is 1 / (1 + z), or z / (1 + z) if x is negative.
     size = -absolute(x)
     size = where(size < LOWEST, LOWEST, size)
     exponent, (r, rest) = reduce_by_log2(size)
@@ -125,7 +125,7 @@ def _hyperbolic(x: Value, odd: bool) -> Value:
     """Return sinh(|x|) or cosh(x).
 
     With s = sinh(r), c = cosh(r) and u = 2^-2n, sinh(|x|) is
-    2^(n - 1) ((1 - u) c + (1 + u) s), and cosh(x) the same with -u for u.
+    2^(n - 1) ((1 - u) c + (1 + u) s). The formula of cosh(x) has -u in place of u.
     """
     x = absolute(x)
     exponent, (r, rest) = reduce_by_log2(where(x > 711.0, 711.0, x))
@@ -160,7 +160,7 @@ def exponent_and_mantissa(x: Value) -> tuple[Value, Value]:
     is_small = x < _SMALLEST_NORMAL
     bits = where(is_small, x * 2.0**54, x).bits() + (ONE_BITS - _ROOT_HALF_BITS)
     m = ((bits & _MANTISSA_BITS) + _ROOT_HALF_BITS).number()
-    # The integer k + 1023, in the lowest bits of 2^52, is added to 2^52.
+    # With the integer k + 1023 in its lowest bits, 2^52 becomes 2^52 + k + 1023.
     k = ((bits >> 52) | _TWO_52_BITS).number()
     return k - where(is_small, 2.0**52 + 1023 + 54, 2.0**52 + 1023), m
 

@@ -103,8 +103,8 @@ def field(pointer: str, struct: str, *path: str) -> str:
 
     - `pointer`: the address of the structure.
     - `struct`: its name.
-    - `path`: the name of the field; if the field is a structure, followed by the name
-        of a field of it.
+    - `path`: the name of the field. If the field is a structure, the name of a field in
+        this structure follows.
     """
     indices, current = ["i32 0"], struct
     for name in path:

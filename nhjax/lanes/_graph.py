@@ -3,7 +3,7 @@
 A node is one number or one statement: a store, a loop or a branch. Every node lies in a
 region: the root, the body of a loop, or a side of a branch. Within a region nodes are
 ordered by their numbers, which is the order of creation, so that a node comes after its
-arguments and a load after the stores that it must see.
+arguments, and a load comes after the stores that it must see.
 
 Pure nodes are hash-consed: an operation with the same arguments exists once. A pure
 node lies in the deepest region of its arguments, so that invariant code is hoisted out
@@ -61,8 +61,8 @@ class Region:
     def __init__(self, parent: "Region | None", owner: "Node | None", is_side: bool):
         self.parent, self.owner = parent, owner
         self.depth = 0 if parent is None else parent.depth + 1
-        # The innermost side of a branch around this region, or the root. Only these
-        # have tables of pure nodes.
+        # The innermost side of a branch around this region, or the root. Only sides of
+        # branches and the root have tables of pure nodes.
         self.floor = self if is_side or parent is None else parent.floor
         self.table: dict[Any, Node] = {}
         self.loads: dict[Any, Node] = {}
@@ -116,8 +116,8 @@ class Node:
 class LoopInfo:
     """A loop: its parameters with their first and next values, and its predicate.
 
-    The nodes of the region with numbers below `split` are computed before the
-    predicate, the others after it, in iterations that take place.
+    Nodes of the region with numbers below `split` are computed before the predicate.
+    The other nodes are computed after the predicate if it is true.
     """
 
     __slots__ = ("inits", "outs", "params", "predicate", "region", "results", "split")

@@ -5,12 +5,13 @@ or to compute results. Each program has its own handler, which only passes a des
 of the program to a function that all programs share. The shared function is compiled
 once in a process, because compiling it with each program took 20 to 50 ms.
 
-A call is divided into blocks, of as many members as the kernel computes at once. The
-caller's thread runs blocks, and so do threads of XLA's pool where this pays:
+A call is divided into blocks: the members that the kernel computes at once form a
+block. The caller's thread runs blocks. Threads of XLA's pool help if this saves time:
 
 - An atomic counter assigns blocks to the caller and to its helpers.
-- The caller asks the pool for helpers: fewer than the pool has threads, because the
-    caller works too, and so few that the work of each takes longer than waking it.
+- The caller asks the pool for helpers. Their number is smaller than the number of
+    threads of the pool, because the caller works too. It is so small that the work of
+    each helper takes longer than waking it.
 - At the end the caller waits for the blocks that helpers have begun. It does not wait
     for helpers that have not started: there may be none, because the pool has no free
     thread, or because this process was forked and has no pool any more. A call
@@ -45,9 +46,9 @@ from ._ffi import (
 
 # The shortest work, in ns, for which a helper is woken. Waking it takes about 10 µs.
 _WORTH_A_HELPER = 50_000
-# The number of times that the caller yields its core before it sleeps. A sleep takes at
-# least 50 µs, and an eighth of the time slept so far, so that the caller is late by at
-# most that part.
+# The number of times that the caller yields its core before it sleeps. The first
+# sleeps take 50 µs. Later sleeps take an eighth of the time slept so far, so that the
+# caller is late by at most an eighth.
 _YIELDS, _SHORTEST_SLEEP, _LONGEST_SLEEP = 100, 50, 10_000
 
 # The description of a program: its kernel, the numbers of its operands and results, the
@@ -341,8 +342,9 @@ POOL = "\n".join([_POOL_DECLARATIONS, _RUN, _WORK, _WANTED, _ASK, _WAITING])
 # The names of a program's handler, and of the function that all handlers call.
 HANDLER, SHARED_HANDLER = "nhjax.handler", "nhjax.handle"
 
-# The time of a block, in ns, until one has been run: long enough for as many helpers as
-# there are. Longer times are cut off here, so that products do not overflow.
+# The time, in ns, that a block is assumed to take until one has been run: so long that
+# all available helpers are started. Longer times are replaced by this one, so that
+# products do not overflow.
 _LONG = 1 << 30
 
 
@@ -351,7 +353,7 @@ def handler_ir(
 ) -> str:
     """Return a module with the handler of the function `@kernel` of another module.
 
-    It refers to the function `SHARED_HANDLER` of the module `shared_handler_ir()`.
+    The handler calls the function `SHARED_HANDLER` of the module `shared_handler_ir()`.
 
     **Arguments:**
 

@@ -36,7 +36,7 @@ _PLATFORMS = {("linux", "x86_64"), ("linux", "aarch64"), ("darwin", "arm64")}
 _PASSES = 1
 # The levels of the code generator for modules of fewer characters than this, and for
 # longer modules. Level 1 takes half of the time of level 2. With level 1 a short kernel
-# was 6 percent slower, and a long kernel 2 percent faster.
+# was 6 percent slower, and a long kernel was 2 percent faster.
 _LONG_TEXT = 1_000_000
 _GENERATION_OF_SHORT, _GENERATION_OF_LONG = 2, 1
 # The level of both for programs that must compile quickly: no optimisation.
@@ -107,7 +107,7 @@ def object_code(
 
     - `texts`: the modules, in LLVM IR. They may declare the same functions.
     - `exported`: the only function that is visible from outside.
-    - `target`: the machine, which may be another one.
+    - `target`: the machine, which may differ from the machine of this process.
     - `is_quick`: whether to compile in a third of the time or less, to slower code.
     """
     module, machine = _compiled(texts, exported, target, is_quick)

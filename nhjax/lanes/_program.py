@@ -115,8 +115,8 @@ def llvm_ir(
 
     The text of an LLVM module with the function `i1 kernel(ptr operands, ptr results,
     i64 first, i64 last)`. It computes the members from `first` to `first + width - 1`;
-    members beyond `last` repeat `last`. It returns whether it failed, because there was
-    no scratch memory.
+    members beyond `last` repeat `last`. It returns true if it failed. It fails only if
+    there is no scratch memory.
 
     **Raises:** `Unsupported` if the program cannot be compiled.
     """
@@ -129,8 +129,8 @@ def llvm_ir(
 LONGEST_UNROLLED_SCAN = 8
 # Programs with more nodes than this are refused, unless they have fewer than 40 nodes
 # for each of JAX's operations. LLVM takes about 10 s for this number of nodes, and
-# minutes for more. XLA keeps loops over arrays: it takes a few seconds where arrays are
-# large, but longer than LLVM where there are many small ones.
+# minutes for more. XLA keeps loops over arrays: it takes a few seconds for large
+# arrays, but longer than LLVM for many small arrays.
 MOST_NODES, NODES_PER_OPERATION = 100_000, 40
 
 OPERATIONS: dict[str, Operation] = {
@@ -243,10 +243,10 @@ def register_kernel(
     **Arguments:**
 
     - `kernel_ir`: a module in LLVM IR with `define i1 @kernel(ptr %operands, ptr
-        %results, i64 %first, i64 %last)`, which computes the members from `%first` on:
-        `width` of them, but none after `%last`. `%operands` and `%results` are arrays
-        of the addresses of the data. Several threads may run it at the same time, on
-        different members.
+        %results, i64 %first, i64 %last)`, which computes `width` members from `%first`
+        on, but no members after `%last`. `%operands` and `%results` are arrays of the
+        addresses of the data. Several threads may run it at the same time, on different
+        members.
     - `num_operands`, `num_results`: the numbers of arrays that it reads and writes.
     - `width`: the number of members that it computes at once.
     - `is_batched`: whether the results have members, along the leading axis. Otherwise

@@ -94,8 +94,8 @@ def _reduction_of_large() -> str:
     high = (upper & ~_LOWEST_BITS).cast("uitofp", "double") * scale
     low = ((upper & _LOWEST_BITS) << 53) | (lower >> 11)
     low = low.cast("uitofp", "double") * 2.0**-53 * scale
-    # Two signs enter: the sign of r, where |n| pi / 2 is larger than |x|, and the sign
-    # of x.
+    # The sign of the remainder is the product of two signs: the sign of x, and a minus
+    # if |n| pi / 2 is larger than |x|.
     is_left = bits < 0
     sign = where(is_negative, -(2**63), 0) ^ (bits & -(2**63))
     quadrant = n.cast("trunc", "i64")
@@ -133,7 +133,7 @@ def _reduce(x: Value) -> tuple[Value, DoubleDouble]:
         high = difference - small
         low = (difference - high) - small
     size = absolute(x)
-    # Infinity and NaN already give NaN.
+    # For infinity and NaN, the results are NaN already.
     is_large = (size > _LARGEST_DIRECT) & (size < math.inf)
 
     def otherwise() -> tuple[Value, ...]:
@@ -214,8 +214,8 @@ class _Angle(NamedTuple):
 def _angle(a: Value, b: Value) -> _Angle:
     """Return arctan(a / b) for a, b >= 0.
 
-    From 1/2 to 2 the angle is pi / 4 + arctan((a - b) / (a + b)), and above that,
-    pi / 2 - arctan(b / a).
+    For a / b from 1/2 to 2 the angle is pi / 4 + arctan((a - b) / (a + b)). For larger
+    a / b it is pi / 2 - arctan(b / a).
     """
     is_low, is_high = a + a < b, b + b < a
     above = where(is_low, a, where(is_high, -b, a - b))

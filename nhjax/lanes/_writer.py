@@ -268,7 +268,7 @@ class Value:
         self.name = name
 
     def typed(self) -> str:
-        """Return type and name, as an instruction takes its first operand."""
+        """Return the type and the name, the form of an instruction's first operand."""
         return f"{self.writer.type(self.kind)} {self.name}"
 
     def _other(self, other: "Operand") -> "Value":
@@ -411,15 +411,15 @@ def _intrinsic(name: str, *arguments: Value) -> Value:
     return writer.call(f"@{full}", ("double",), *arguments)[0]
 
 
-# A number of about 106 bits: the sum of two float64, the second of which is at most the
-# round-off of the first.
+# A number of about 106 bits: the sum of two float64. The second number is at most the
+# round-off of the first number.
 DoubleDouble: TypeAlias = tuple[Value, Value]
 
 # Adding this rounds to an integer, which then stands in the lowest bits.
 _TO_INTEGER = 1.5 * 2.0**52
 # The bits of 1.0.
 ONE_BITS = 0x3FF0000000000000
-# Half of the last of the leading 26 bits.
+# Half a unit of the last bit among the leading 26 bits.
 _HALF_UNIT = 1 << 26
 
 

@@ -225,7 +225,7 @@ def convergence(
         raise TypeError(f"`order` must be a number or None, got {order!r}.")
     if order is not None:
         # The largest step may not be in the asymptotic regime, and the error of the
-        # smallest may be round-off.
+        # smallest step may be round-off.
         middle = np.argsort(h)[len(h) // 2]
         reference = e[middle] * (h / h[middle]) ** order
         ax.plot(h, reference, linestyle="--", linewidth=0.8, color=line.get_color())
@@ -239,7 +239,8 @@ def convergence(
 def _against_time(ts: Any, values: Any, ax: "Axes | None", style: Any) -> "Axes":
     ax = new_axes(ax)
     times, values = np.asarray(ts), np.asarray(values)
-    # The members of a batch become columns, because matplotlib draws a line for each.
+    # The members of a batch become columns, because matplotlib draws a line for each
+    # column.
     ax.plot(_columns(times), _columns(values), **style)
     ax.set_xlabel("time $t$")
     return ax

@@ -196,7 +196,7 @@ class ChaoticEnergy(AbstractStudyResult):
         return f"μ scales as {found}, averaged over the times"
 
     def figures(self) -> "dict[str, Figure]":
-        """Draw μ against time, normalised by the measured and by the paper's power."""
+        """Draw μ against time, divided by the measured and the paper's power of h."""
         title = f"J = {self.members}, {self.closure} closure"
         return {self.name: _figure(self.runs, title)}
 
@@ -383,7 +383,8 @@ _REDUCTIONS = {
 def _figure(runs: list[ChaoticRun], title: str) -> "Figure":
     """Draw μ against time with standard errors, in a column for each s.
 
-    The upper row is normalised by the measured power of h, the lower as in the paper.
+    In the upper row μ is divided by the measured power of h, and in the lower row by
+    the power of h in the paper.
     """
     from matplotlib.figure import Figure
 

@@ -274,7 +274,7 @@ def particle_order(
     - `dt`: the step sizes h, each of which must divide `final_time`.
     - `final_time`: the time at which the errors are measured.
     - `closure`: the closure of the multipliers, as for `nhjax.LobattoIIIAB`; by default
-        that of the paper.
+        the closure of the paper.
     - `system`: `"particle"`, or `"sleigh"` for Chaplygin's sleigh.
     - `progress`: whether to show a progress bar on the standard error stream.
 
@@ -335,7 +335,7 @@ def unicycle_order(
     - `dt`: the step sizes h, each of which must divide `final_time`.
     - `final_time`: the time at which the errors are measured.
     - `closure`: the closure of the multipliers, as for `nhjax.LobattoIIIAB`; by default
-        that of the paper.
+        the closure of the paper.
     - `retraction`: `"cayley"`, as in the paper, or `"exponential"`.
     - `progress`: whether to show a progress bar on the standard error stream.
 

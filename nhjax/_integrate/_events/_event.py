@@ -39,10 +39,10 @@ class Event(eqx.Module):
     """An event: a zero of a function along a trajectory, and the action taken there.
 
     `integrate(..., event=...)` finds the zeros of `cond_fn(t, y, args)` by its sign at
-    the ends of the steps. If the sign changes in a step, the step is repeated with the
-    size θ dt, 0 < θ <= 1, at whose end the function vanishes to round-off. So the state
-    at the event is the end of a step of the method. The size is differentiated by the
-    implicit function theorem. Then the run ends, or continues with the rest of the
+    the ends of the steps. If the sign changes in a step, the step is repeated with a
+    size θ dt, 0 < θ <= 1, so that the function vanishes to round-off at its end. So the
+    state at the event is the end of a step of the method. The size is differentiated by
+    the implicit function theorem. Then the run ends, or continues with the rest of the
     step, after a `reset` of the state if there is one.
 
     If the function is zero at `t0` or right after an event, its sign is the sign of its
@@ -53,7 +53,8 @@ class Event(eqx.Module):
     **Arguments:**
 
     - `cond_fn`: a function (t, y, args) of a `State` that returns a real scalar. The
-        multiplier of y is the continuous one, as of `nhjax.continuous_multiplier`.
+        multiplier of y is the continuous multiplier, the value of
+        `nhjax.continuous_multiplier`.
     - `direction`: detect zeros where the function increases along the run (True), where
         it decreases (False), or both (None).
     - `reset`: a function (t, y, args) of the state at the event that returns the state
@@ -161,8 +162,8 @@ class ConditionSigns(eqx.Module):
     """The sign of each condition where a step starts.
 
     - `sign`: the sign, 0 if it is not known.
-    - `value`: the value of the condition, or its rate along the run if `at_zero`: then
-        the condition is zero and takes the sign of its rate.
+    - `value`: the value of the condition or, if `at_zero`, its rate along the run.
+    - `at_zero`: whether the condition is zero and takes the sign of its rate.
     """
 
     sign: Float[Array, " e"]
@@ -290,7 +291,8 @@ def signs_at(
     y = with_continuous_multiplier(system, stepper.method, t, y, args)
     values = conditions(t, y, args)
     small = float(jnp.finfo(values.dtype).eps) ** 0.5
-    # An infinite rate, as of a square root at zero, does not make a condition zero.
+    # An infinite rate, such as the rate of a square root at zero, does not make a
+    # condition zero.
     near = jnp.isfinite(rate) & (jnp.abs(values) <= small * jnp.abs(rate * dt))
     at_zero = near | ((jnp.abs(values) <= bound) & ~jnp.isnan(rate))
     value = jnp.where(at_zero, rate * jnp.sign(dt), values)
@@ -332,7 +334,9 @@ class EventOutcome(NamedTuple):
 
 
 class EventActions(eqx.Module):
-    """The action of each event: first its reset, if any, then the end, if it is one.
+    """The actions of events: a reset of the state, and the end of the run.
+
+    An event may have both actions, one or none. The reset comes before the end.
 
     `max_events` is the number of events that the run has room for.
     """

@@ -28,7 +28,7 @@ class TruncatedStep(NamedTuple):
 
     - `outcome`: the outcome of the step.
     - `h`: its size.
-    - `fired`: the index of the event that it ends at, -1 if it is the whole step.
+    - `fired`: the index of the event at its end, -1 if the step is not truncated.
     - `values`: the conditions at its end.
     - `crossed`: the conditions that crossed zero in the step.
     """
@@ -56,7 +56,7 @@ class ImplicitTruncatedStep(AbstractImplicitFunction[Given, TruncatedStep]):
     """A step of size h, or of size θ h if it is truncated at the first event.
 
     The size θ h of a truncated step is a root of g(t + θ h, y(θ h)), where g is the
-    condition of the event and y the end of the step, so that
+    condition of the event and y is the end of the step, so that
 
     d(θ h) = - (∂g/∂h)⁻¹ dg,
 
@@ -266,8 +266,8 @@ class Bracket(eqx.Module):
     At the lower end no function has crossed zero, and at the upper end the `crossed`
     functions have crossed zero. The next point follows Chandrupatla (1997): inverse
     quadratic interpolation if the last three points allow it, and otherwise bisection.
-    It needs about as many evaluations as Newton's method, and at most about three times
-    as many as bisection.
+    This method needs about as many evaluations as Newton's method, and at most about
+    three times as many evaluations as bisection.
 
     - `new`, `other`, `old`: the newest point, the other end, and the point before. Each
         is θ and the values of all functions there.

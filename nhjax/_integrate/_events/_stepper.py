@@ -111,8 +111,8 @@ class AttemptedStep(NamedTuple):
         happens without a step.
     - `step`: that step.
     - `is_discarded`: whether the step is discarded, since an event was found in it.
-    - `is_kept`: whether the step, of the given `size`, is kept. It led to the state
-        that is `reached`.
+    - `is_kept`, `size`, `reached`: whether the step is kept, its size, and the state
+        that it led to.
     - `which`: the index of the event at its end, -1 if it ended at a node.
     - `values_at_end`: if the step is truncated, the conditions at the end of the whole
         step.
@@ -412,7 +412,7 @@ def _place_after(
     pending: Bool[Array, " e"],
     ends: BoolScalar,
 ) -> EventLoopState:
-    """Return the place after an iteration, with the signs and rows from before it.
+    """Return the place after an iteration; its signs and rows are not updated yet.
 
     The events that are `pending` come before a node at the same time.
     """
@@ -484,7 +484,7 @@ class EventReverseReplay(AbstractReverseReplay[EventCarry, ReplayedIteration]):
 
     @property
     def after_end(self) -> ReplayedIteration:
-        """Return the place at the end of the run, as an idle iteration has it."""
+        """Return the data of an idle iteration at the end of the run."""
         end = self.end.place
         never = jnp.zeros((), bool)
         return ReplayedIteration(
@@ -509,9 +509,9 @@ class EventReverseReplay(AbstractReverseReplay[EventCarry, ReplayedIteration]):
         """Find the data of iteration i and the state from which it started.
 
         Iterations are undone last to first, and `following` says where the next one
-        started. If the last entry of the log that is left has the number of this
-        iteration, it ended at that event, and the step back starts from the state
-        `before` the reset.
+        started. If the last remaining entry of the log has the number of this
+        iteration, the iteration ended at that event, and the step back starts from the
+        state `before` the reset.
         """
         plain, end = self.stepper.plain, self.end.place
         i = i.astype(jnp.int32)
@@ -560,8 +560,8 @@ class EventReverseReplay(AbstractReverseReplay[EventCarry, ReplayedIteration]):
     def carry_before(
         self, replay: ReplayedIteration, step_state: StepState, i: Int[Array, ""]
     ) -> EventCarry:
-        """Return the carry before iteration i, as far as the iteration reads it."""
-        # Constants come back as arrays of NumPy.
+        """Return the parts of the carry before iteration i that the iteration reads."""
+        # Constants in `self.start` may be arrays of NumPy.
         start = jax.tree.map(jnp.asarray, self.start.place)
         numbers = jnp.arange(start.pending.shape[0], dtype=jnp.int32)
         is_one = numbers == replay.which
