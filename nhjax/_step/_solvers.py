@@ -5,7 +5,6 @@ increments are round-off, relative to the scale of the step.
 """
 
 from collections.abc import Callable
-from dataclasses import replace
 from typing import NamedTuple
 
 import equinox as eqx
@@ -23,7 +22,6 @@ from .._numerics import (
     jacobian_and_value,
     max_norm,
     NOISE_UNITS,
-    small_einsum,
     Solved,
     uneven_perturbations,
     UpdateNorms,
@@ -215,30 +213,21 @@ class Newton(AbstractStageSolver):
         scale = fibre_coordinate_scale(stages, x0, lin)
 
         eps = float(jnp.finfo(stages.p.dtype).eps)
-        zero = jnp.zeros((), stages.p.dtype)
-        _, position_rate = jax.jvp(
-            lambda nudge: with_moved_positions(stages, nudge).q,
-            (zero,),
-            (jnp.ones_like(zero),),
-        )
+        nudge = eps**0.5
+        moved = with_moved_positions(stages, jnp.asarray(nudge, stages.p.dtype))
 
-        def residual(z_and_nudge):
-            z, nudge = z_and_nudge[:-1], z_and_nudge[-1]
-            q = jax.tree.map(lambda q, dq: q + nudge * dq, stages.q, position_rate)
-            return stage_residual(replace(stages, q=q), unravel(z))
+        def residual(z):
+            return stage_residual(stages, unravel(z))
 
         def iteration(x: StageUnknowns):
             z, _ = ravel_pytree(x)
-            # The last column is the derivative with respect to a move of the positions.
-            # It costs less than a second evaluation at moved positions.
-            jacobian, r, evaluation = jacobian_and_value(residual, jnp.append(z, zero))
-            jacobian, by_move = jacobian[:, :-1], jacobian[:, -1]
+            jacobian, r, evaluation = jacobian_and_value(residual, z)
+            change = stage_residual(moved, x)[0] - r
             # After a change of x by a few units in the last place, the equations differ
             # from the prediction of the Jacobian by their round-off.
             near = z + 8 * eps * uneven_perturbations(z)
-            missed = stage_residual(stages, unravel(near))[0] - r
-            missed = missed - small_einsum("ij,j->i", jacobian, near - z)
-            rights = jnp.stack([r, by_move, missed], axis=1)
+            missed = residual(near)[0] - r - jacobian @ (near - z)
+            rights = jnp.stack([r, change, missed], axis=1)
             dz, *noises = jnp.linalg.solve(jacobian, -rights).T
             x_next = unravel(z + dz)
             # Two kinds of round-off move the stages: the round-off of the positions,
@@ -247,7 +236,7 @@ class Newton(AbstractStageSolver):
             by_positions, by_equations = (
                 increment_size(stages, x, unravel(z + noise), lin) for noise in noises
             )
-            noise = jnp.maximum(by_positions, PART * by_equations / eps)
+            noise = jnp.maximum(by_positions / nudge, PART * by_equations / eps)
             found = UpdateNorms(
                 increment_size(stages, x, x_next, lin),
                 fibre_coordinate_size(stages, x_next),
