@@ -230,9 +230,8 @@ def _closures(curves: dict, fits: dict, stages, final_time: float) -> Claim:
         f"{stages_text(stages)}: {ratios}",
         command(PART),
         OURS,
-        "the random walk of the symmetric closure is like that of the paper's closure "
-        "(α <= "
-        f"{max(values[:half]):.1f}), the consistent one drifts (α up to "
+        "the symmetric closure follows a random walk like the paper's closure (α <= "
+        f"{max(values[:half]):.1f}), and the consistent closure drifts (α up to "
         f"{max(values[half:]):.1f}; a steady drift has 2)",
     )
 
@@ -257,7 +256,7 @@ def _against(curves: dict, fits: dict, s: int, final_time: float) -> Claim:
             (
                 "early on the paper's method has the smaller error, but its random "
                 f"walk is faster: late in the run its μ is up to {max(late):.1f} "
-                "times that of the others"
+                "times the μ of the other methods"
             ),
         )
     else:

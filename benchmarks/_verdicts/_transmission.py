@@ -124,7 +124,7 @@ def _large_step(by_epsilon: dict[float, CVTEnergy]) -> Claim:
         CONFIRMED if erratic else REFUTED,
         f"order 2 explains a factor {(LARGE / H) ** 2:.1f}, and all four errors "
         f"grow by more; but there is no drift: the largest error of the run is "
-        f"{max(growth):.2f} times that of its first fifth at most",
+        f"at most {max(growth):.2f} times the largest error of its first fifth",
     )
 
 

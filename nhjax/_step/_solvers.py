@@ -1,7 +1,6 @@
 """The solvers of the stage equations, simplified Newton and Newton's method.
 
-Both start from values that are correct to first order in h. They stop when their
-increments are round-off, relative to the scale of the step.
+Both stop when their increments are round-off, relative to the scale of the step.
 """
 
 from collections.abc import Callable

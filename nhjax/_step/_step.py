@@ -1,7 +1,8 @@
 """One step of a method, its derivative, and the data that one step passes to the next.
 
 `step` solves the stage equations and computes the state at the end. `ImplicitStep` is
-the same step as a differentiable function.
+the same step as a differentiable function. `AbstractStageSolver` is the interface of
+the solvers of the stage equations.
 """
 
 from abc import abstractmethod
