@@ -144,7 +144,7 @@ def module() -> str:
         '"""Coefficients of polynomials, lowest power first.',
         "",
         "They interpolate at Chebyshev's nodes, and are computed and printed by",
-        "`python tests/support/approximations.py`. `tests/lanes` judges their errors.",
+        "`python tests/support/approximations.py`. `tests/lanes` checks their errors.",
         '"""',
     ]
     for name, given in APPROXIMATIONS.items():
