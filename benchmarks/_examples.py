@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 
 import nhjax
@@ -36,3 +37,52 @@ def suslov_in_a_potential(
     )
     q0 = nhjax.SO3(nhjax.Exponential()).retract(jnp.array([0.2, -0.4, 0.5]))
     return system, nhjax.initial_state(system, q0, jnp.array([0.6, -0.9, 0.0]))
+
+
+def wheeled_inverted_pendulum() -> tuple[Any, Any, Any, Any]:
+    """A robot that balances on two wheels by feedback: six coordinates, no gallery.
+
+    The coordinates are x, y, the heading, the lean and the angles of the wheels.
+    Returns the system, q, v and the gains of the feedback as `args`.
+    """
+    body, base, radius, height, track = 6.0, 1.5, 0.1, 0.35, 0.5
+    inertia = jnp.array([0.05, 0.04, 0.03])
+
+    def centre(q):
+        out = height * jnp.sin(q[3])
+        return jnp.array(
+            [
+                q[0] + out * jnp.cos(q[2]),
+                q[1] + out * jnp.sin(q[2]),
+                height * jnp.cos(q[3]),
+            ]
+        )
+
+    def lagrangian(t, q, v, args):
+        _, velocity = jax.jvp(centre, (q,), (v,))
+        turn, lean = v[2], v[3]
+        spin = jnp.array([-turn * jnp.sin(q[3]), lean, turn * jnp.cos(q[3])])
+        kinetic = body * (velocity @ velocity) + spin @ (inertia * spin)
+        kinetic += base * (v[0] ** 2 + v[1] ** 2) + 0.1 * turn**2
+        kinetic += 0.002 * (v[4] ** 2 + v[5] ** 2)
+        return 0.5 * kinetic - 9.81 * body * centre(q)[2]
+
+    def rolling(t, q, v, args):
+        sine, cosine = jnp.sin(q[2]), jnp.cos(q[2])
+        forwards = 0.5 * radius * (v[4] + v[5])
+        return jnp.array(
+            [
+                cosine * v[1] - sine * v[0],
+                cosine * v[0] + sine * v[1] - forwards,
+                v[2] - radius / track * (v[5] - v[4]),
+            ]
+        )
+
+    def feedback(t, q, v, gains):
+        speed = 0.5 * radius * (v[4] + v[5])
+        torque = gains @ jnp.array([q[3], v[3], speed])
+        return jnp.array([0, 0, 0, -2 * torque, torque + 0.1, torque - 0.1])
+
+    system = nhjax.LagrangianSystem(lagrangian, nonholonomic=rolling, force=feedback)
+    q, v = jnp.array([0, 0, 0.1, 0.05, 0, 0]), jnp.array([0, 0, 0, 0, 0.5, 0.5])
+    return system, q, v, jnp.array([6.0, 1.2, 0.4])

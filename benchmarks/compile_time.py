@@ -18,6 +18,7 @@ import jax.numpy as jnp
 import nhjax
 from nhjax import systems
 
+from ._examples import wheeled_inverted_pendulum
 from ._report import markdown_table, write
 
 
@@ -78,6 +79,44 @@ def compiled(function: Callable[..., Any], *args: Any) -> tuple[Any, list[float]
     return program, [after - before for before, after in itertools.pairwise(times)]
 
 
+def plain_calls() -> list[tuple[str, float]]:
+    """The seconds of the first calls of a user who has written a small machine."""
+    system, q, v, gains = wheeled_inverted_pendulum()
+    method = nhjax.LobattoIIIAB(3)
+    found = []
+
+    def timed(name, call):
+        start = time.process_time()
+        result = jax.block_until_ready(call())
+        found.append((name, time.process_time() - start))
+        return result
+
+    def run(num_steps, gains=gains, **options):
+        return nhjax.integrate(
+            system, method, y0, dt=0.001, num_steps=num_steps, args=gains, **options
+        ).ys
+
+    def end(gains):
+        return jnp.sum(run(100, gains).q ** 2)
+
+    def start():
+        return nhjax.initial_state(system, q, v, args=gains, project=True)
+
+    y0 = timed("`initial_state`", start)
+    timed("`integrate`, 100 steps", lambda: run(100))
+    steps = nhjax.SaveAt(steps=True)
+    timed("150 steps, each saved", lambda: run(150, saveat=steps))
+    timed(
+        "250 steps, every fifth saved", lambda: run(250, saveat=nhjax.SaveAt(steps=5))
+    )
+    timed("gradient", lambda: jax.grad(end)(gains))
+    timed(
+        "`check_system`",
+        lambda: nhjax.check_system(system, q, y0.v, args=gains).mass_condition,
+    )
+    return [*found, ("all", sum(seconds for _, seconds in found))]
+
+
 def main() -> None:
     """Print and save the table."""
     parser = argparse.ArgumentParser(description=__doc__)
@@ -85,6 +124,8 @@ def main() -> None:
     names = parser.parse_args().systems
     jax.config.update("jax_enable_x64", True)
     jax.jit(jnp.sin).lower(0.1).compile()
+    calls = [] if names else plain_calls()
+    jax.clear_caches()
     rows, data = [], []
     for name, system, y0, stages, kind in cases():
         if names and name not in names:
@@ -98,7 +139,13 @@ def main() -> None:
         jax.clear_caches()
     header = ["system", "stages", "program", "trace", "lower", "compile", "all"]
     text = "Seconds of the processor.\n\n" + markdown_table(header, rows)
-    write("compile_time", "Time of the first call", text, {"rows": data})
+    listed = [[name, f"{seconds:.2f}"] for name, seconds in calls]
+    text += (
+        "\n\nPlain calls for a wheeled inverted pendulum with feedback (six "
+        "coordinates, three constraints), one after the other:\n\n"
+    ) + markdown_table(["call", "seconds"], listed)
+    results = {"rows": data, "plain calls": dict(calls)}
+    write("compile_time", "Time of the first call", text, results)
 
 
 if __name__ == "__main__":

@@ -203,7 +203,7 @@ def _undecided(checks: tuple[Check, ...]) -> list[Check]:
         if is_traced(check.ok, *jax.tree.leaves(check.values)):
             later.append(check)
         elif not check.ok:
-            raise check.error(*_on_host(check.values))
+            raise check.error(*on_host(check.values))
     return [check for check in later if is_traced(check.ok) or not check.ok]
 
 
@@ -213,7 +213,13 @@ def _without_tangents(values: PyTree[Any]) -> PyTree[Any]:
     )
 
 
-def _on_host(values: PyTree[Any]) -> PyTree[Any]:
+def on_host(values: T) -> T:
+    """Return a tree with arrays of NumPy, by which comparisons compile nothing.
+
+    A tree with traced arrays is returned as it is.
+    """
+    if is_traced(*jax.tree.leaves(values)):
+        return values
     return jax.tree.map(lambda x: np.asarray(x) if eqx.is_array(x) else x, values)
 
 

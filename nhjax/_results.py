@@ -138,6 +138,10 @@ class RESULTS(eqx.Enumeration, metaclass=_Named):
         "ball that comes to rest: then end the run, or let the reset keep the "
         "motion away from the next event."
     )
+    interrupted = (
+        "The run was interrupted from the keyboard. Its output, statistics and final "
+        "state are those of the steps before."
+    )
 
 
 @functools.cache
@@ -158,6 +162,7 @@ def result_codes() -> dict[str, int]:
         "nonfinite_event",
         "inconsistent_reset",
         "too_many_events",
+        "interrupted",
     )
     # The items are arrays of JAX, while their codes are needed as Python's integers.
     with jax.ensure_compile_time_eval():

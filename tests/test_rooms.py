@@ -178,12 +178,14 @@ def test_test_files_do_not_import_each_other():
     assert found == []
 
 
-@pytest.mark.parametrize("transformation", ["plain", "grad"])
-def test_measured_stacks_lead_from_integrate_to_lagrangian(transformation):
+@pytest.mark.parametrize(
+    ("transformation", "program"), [("plain", "_chunk"), ("grad", "run")]
+)
+def test_measured_stacks_lead_from_integrate_to_lagrangian(transformation, program):
     found = rooms.stacks(nhjax, transformation)
     assert all(stack.frames[0][1] == "integrate" for stack in found)
     inside = rooms.deepest(stack for stack in found if stack.passes(rooms.ITERATION))
-    assert ("_integrate/_integrate.py", "run") in inside.frames
+    assert ("_integrate/_run.py", program) in inside.frames
     assert inside.frames[-1][1] == "__call__"
     assert 10 < len(inside.frames) < 50
     assert 5 < inside.num_files < len(inside.frames)

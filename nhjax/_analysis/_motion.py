@@ -14,6 +14,7 @@ from .._numerics import inverse, nan_unless
 from .._system import (
     AbstractMechanicalSystem,
     all_finite,
+    check_multiplier,
     check_state,
     check_time_and_state,
     check_type,
@@ -172,5 +173,6 @@ def checked_time(
     """Return the time as an array; raise for an invalid system, time or state."""
     check_type("system", system, (LagrangianSystem, HamiltonianSystem))
     check_time_and_state(function, t, y, "system, ")
-    check_state(system, y, args, "y")
+    check_state(system, y, "y")
+    check_multiplier(system, y, args, "y")
     return real_scalar("t", t, y.p.dtype)

@@ -9,9 +9,10 @@ from ._jaxprs import (
     SMALL_PRODUCT as SMALL_PRODUCT,
 )
 from ._kernel import as_cpu_kernel as as_cpu_kernel, TraceCache as TraceCache
+from ._loop_start import started_like as started_like
 from ._lowering import engines as engines, EngineUse as EngineUse
 from ._small_product import (
     LONGEST_SUM as LONGEST_SUM,
     small_product as small_product,
 )
-from ._tracked_jit import tracked_jit as tracked_jit
+from ._tracked_jit import captured_by as captured_by, tracked_jit as tracked_jit

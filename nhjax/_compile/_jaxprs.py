@@ -44,7 +44,7 @@ _SHAPING = """
 # only a part of an array is moved.
 _MOVING = """
     broadcast_in_dim dynamic_slice dynamic_update_slice empty empty2 iota
-    reshape
+    loop_start reshape
 """.split()  # noqa: SIM905
 ARITHMETIC_AND_SHAPES = (*ELEMENTWISE, *_REDUCING, *_SHAPING, *_MOVING)
 _ARITHMETIC = {"add", "add_any", "div", "mul", "neg", "sub"}

@@ -252,6 +252,8 @@ class Captured:
     """
 
     def __init__(self, functions: Any, ignored: Collection[Place] = ()):
+        # The search after tracing must start from the same object.
+        self.functions = functions
         self.atoms: list[Hashable] = []
         self.contents: dict[Place, tuple[object, Hashable]] = {}
         numbers: dict[int, int] = {}
@@ -294,11 +296,20 @@ _changed_by_tracing: dict[Place, object] = {}
 _key_before_tracing: dict[_Key, _Key] = {}
 
 
+def captured_by(*trees: Any) -> Captured:
+    """Return the values that the functions in trees read.
+
+    Programs with the same functions, which are called one after the other, share it.
+    """
+    return Captured(static_parts(list(trees)), _changed_by_tracing)
+
+
 def tracked_jit(*tracked: str) -> Callable[[Callable[..., T]], Callable[..., T]]:
     """Compile like `equinox.filter_jit`; trace again if values that functions read
     change.
 
-    It returns a decorator for a function that is called with positional arguments.
+    It returns a decorator for a function that is called with positional arguments, and
+    with `captured` if the values that its functions read are known.
 
     **Arguments:**
 
@@ -316,15 +327,15 @@ def tracked_jit(*tracked: str) -> Callable[[Callable[..., T]], Callable[..., T]]
                 return function(*args)
 
         @wraps(function)
-        def call(*args: Any) -> T:
-            functions = static_parts([args[position] for position in which])
-            before = Captured(functions, _changed_by_tracing)
+        def call(*args: Any, captured: Captured | None = None) -> T:
+            trees = [args[position] for position in which]
+            before = captured_by(*trees) if captured is None else captured
             key = _Key(tuple(before.atoms))
             key = _key_before_tracing.get(key, key)
             out = compiled(key, *args)
             if key.traces:
                 key.traces.clear()
-                _remember_changes(key, before, functions)
+                _remember_changes(key, before)
             return out
 
         return call
@@ -332,8 +343,9 @@ def tracked_jit(*tracked: str) -> Callable[[Callable[..., T]], Callable[..., T]]
     return decorator
 
 
-def _remember_changes(key: _Key, before: Captured, functions: Any) -> None:
+def _remember_changes(key: _Key, before: Captured) -> None:
     """Ignore the places that tracing changed, and store the program under a new key."""
+    functions = before.functions
     after = Captured(functions, _changed_by_tracing)
     changed = {}
     for one, other in ((before, after), (after, before)):

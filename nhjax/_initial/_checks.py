@@ -15,6 +15,7 @@ from .._errors import (
     IrregularLagrangianError,
     NewtonError,
     NonFiniteError,
+    on_host,
 )
 from .._numerics import RankCondition
 from .._system import (
@@ -144,11 +145,12 @@ def list_checks(
     keep: tuple[Kept, Kept],
 ) -> list[Check]:
     """List the conditions on an initial state, each with its exception."""
-    state, lin = found.state, found.lin
-    singular = 10 * state.v.shape[0] * jnp.finfo(state.v.dtype).eps
     name, given = ("p", p) if v is None else ("v", v)
     words, group = _WORDS[system.generator], f"{system.manifold_of(q)}"
     case = (_Case(found, q, name, given, project, words, group, keep),)
+    found = on_host(found)
+    state, lin = found.state, found.lin
+    singular = 10 * state.v.shape[0] * jnp.finfo(state.v.dtype).eps
     return [
         Check(found.off_group <= found.allowed_off_group, _group_error, case),
         # The negated "<=" lets NaN pass, since another check reports a matrix that is
@@ -169,11 +171,11 @@ def list_checks(
         ),
         Check(~(found.compatibility <= singular), _compatibility_error, case),
         Check(
-            jnp.all(jnp.abs(found.positions) <= found.allowed_positions),
+            (abs(found.positions) <= found.allowed_positions).all(),
             _position_error,
             case,
         ),
-        Check(jnp.all(jnp.abs(lin.violation) <= found.allowed), _violation_error, case),
+        Check((abs(lin.violation) <= found.allowed).all(), _violation_error, case),
         Check(all_finite((lin.acceleration, lin.multiplier)), _force_error, case),
     ]
 

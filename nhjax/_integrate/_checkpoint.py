@@ -46,10 +46,10 @@ class Checkpoint(eqx.Module):
     `state`, `t0` and `dt`.
 
     The bits of a result depend on the compiled instructions. A run in parts repeats a
-    run in one piece bit for bit if all parts save a checkpoint (the last part need not
-    save one) and apart from this the same output, with the same releases on the same
-    machine. Otherwise it repeats the run up to round-off. Samples by `SaveAt(ts=...)`
-    and dense output count times from the start of their run.
+    run in one piece bit for bit if all parts save the same output, with the same
+    releases on the same machine; under `jit` all parts must also save a checkpoint (the
+    last part need not). Otherwise it repeats the run up to round-off. Samples by
+    `SaveAt(ts=...)` and dense output count times from the start of their run.
 
     !!! example
 
@@ -133,10 +133,10 @@ def check_start(
     """
     check_type("y0", y0, (State, Checkpoint), _ADVICE)
     if isinstance(y0, State):
-        check_state(system, y0, args)
+        check_state(system, y0)
         return y0
     y = y0.state
-    check_state(system, y, args, "y0.state")
+    check_state(system, y, "y0.state")
     scalar = jax.ShapeDtypeStruct((), y.p.dtype)
     on_positions = jax.eval_shape(lambda: system.position_constraint(y0.t, y.q, args))
     violations = y.multiplier, on_positions

@@ -1,25 +1,19 @@
-"""The functions `integrate` and `step`: checks, the compiled run, and its solution.
+"""The functions `integrate` and `step`: the checks of their arguments and results.
 
-`integrate` checks its arguments and calls `run`, which is compiled. `run` builds the
-stepper, the output buffers and the time loop. The adjoint runs the loop, and `run`
-converts its end to a solution.
+The run itself is in `_run`.
 """
 
-import reprlib
 import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from functools import partial
 from typing import Any, Literal
 
-import equinox as eqx
 import jax
 import jax.extend
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Int, PyTree
+from jaxtyping import Array
 
-from .._compile import as_cpu_kernel, TraceCache, tracked_jit
 from .._custom_types import (
     Args,
     BoolScalar,
@@ -28,26 +22,21 @@ from .._custom_types import (
     IntScalar,
     PhaseFunction,
 )
-from .._errors import Check, hold, is_traced, naming, require, ShapeError
+from .._errors import Check, hold, is_traced, require, ShapeError
 from .._method import AbstractMethod, Gauss, LobattoIIIAB, PartitionedRungeKutta
-from .._numerics import ClosureConverted, nan_unless
+from .._numerics import nan_unless
 from .._results import RESULTS
 from .._step import (
     AbstractStageSolver,
     is_simplified_alone,
     leaves_steps_to_newton,
-    RoundOff,
     SimplifiedNewton,
-    StepRecord,
 )
 from .._system import (
     AbstractMechanicalSystem,
     check_flag,
     check_type,
-    closure_converted,
     finite,
-    function_noise,
-    FunctionNoise,
     HamiltonianSystem,
     LagrangianSystem,
     parameters,
@@ -55,40 +44,29 @@ from .._system import (
     require_independent,
     State,
 )
-from ._adjoint import AbstractAdjoint, DirectAdjoint
 from ._checkpoint import (
     check_start,
     Checkpoint,
     countable_from,
     MOST_STEPS,
-    start_of,
     time_of,
 )
-from ._conservation import kept_invariants
-from ._events import checked_events, Event, EventStepper
+from ._events import checked_events, Event
 from ._interpolation import (
-    DenseInterpolation,
-    interpolate,
     require_collocation,
-    step_index,
 )
-from ._loop import Loop
+from ._loop import AbstractAdjoint, DirectAdjoint
 from ._progress_meter import AbstractProgressMeter, NoProgressMeter
+from ._run import run, run_in_chunks, RunOptions, SolverOptions, TimeGrid
 from ._saving import (
-    record_places,
-    Rows,
     SaveAt,
-    Saving,
-    stack_saved,
-    static_length,
 )
-from ._solution import is_singular_from_the_start, is_unsolved, raise_failures, Solution
-from ._stepper import (
-    AbstractCarry,
-    AbstractStepper,
-    PlainStepper,
-    reported_statistics,
-    RunEnd,
+from ._solution import (
+    ended_as,
+    is_singular_from_the_start,
+    is_unsolved,
+    raise_failures,
+    Solution,
 )
 
 
@@ -110,6 +88,10 @@ _TAKEN_OVER = (
     "with Newton's method for such steps. This compiles a second program. To compile "
     "only one, pass `stage_solver=nhjax.SimplifiedNewton(fallback=True)` or "
     "`nhjax.Newton()`, or take a smaller `dt`."
+)
+_INTERRUPTED = (
+    "The run was interrupted after {} of {} steps, and the solution ends there. Its "
+    "`result` is `nhjax.RESULTS.interrupted`."
 )
 
 
@@ -187,22 +169,17 @@ def integrate(
 
     !!! note
 
-        If the output has the same shape for any number of steps (`SaveAt` with only
-        `t0`, `t1` and `fn`) and there is no progress meter, then outside of
-        transformations another `num_steps` does not recompile. Under `jit` an int is
-        static. An integer array is traced, and under `vmap` each member may have its
-        own. Reverse mode needs an int, or `ReversibleAdjoint`.
+        Outside of transformations, the host calls a compiled program that takes a
+        chunk of steps. Another `num_steps`, `saveat`, `adjoint` or `progress_meter`
+        does not recompile; there are two programs, one of which keeps the records of
+        steps that `ts` and `dense` need. Ctrl-C ends a run after the current chunk,
+        within about a fifth of a second: `integrate` warns and returns the solution up
+        to there, whose `result` is `nhjax.RESULTS.interrupted`.
 
-        With `steps`, `ts` or `dense`, another `num_steps` recompiles. For runs of many
-        lengths, compile a chunk that leads from state to state, and join the outputs:
-
-            @jax.jit
-            def chunk(y, t):
-                return nhjax.integrate(system, method, y, t0=t, dt=dt, num_steps=100,
-                    saveat=nhjax.SaveAt(steps=True))
-
-            sol = chunk(y, t)
-            y, t = jax.tree.map(lambda x: x[-1], sol.ys), sol.t1
+        Under `jit` an int `num_steps` is static. An integer array is traced, and under
+        `vmap` each member may have its own; then `saveat` must not depend on the
+        number (only `t0`, `t1` and `fn`). Reverse mode needs an int, or
+        `ReversibleAdjoint`.
 
     !!! note
 
@@ -248,14 +225,13 @@ def integrate(
         dt = require(dt, *checks)
     else:
         valid = hold(*checks)
-    # Outside of transformations, `num_steps` is traced if possible, so that changing it
-    # does not recompile.
-    if not isinstance(num_steps, int) or (needed_by is None and not _is_tracing()):
-        num_steps = jnp.asarray(num_steps, jnp.int32)
+    if not isinstance(num_steps, int):
+        num_steps = num_steps.astype(jnp.int32)
     grid = TimeGrid(t0, dt, num_steps)
-    options = RunOptions(saveat, invariants, events)
+    options = RunOptions(saveat.fn, invariants, events)
     solver_options = SolverOptions(stage_solver, adjoint, progress_meter)
-    sol = run(system, method, y0, grid, args, options, solver_options)
+    whole_run = _program_of_run(num_steps)
+    sol = whole_run(system, method, y0, grid, args, options, saveat, solver_options)
     used_newton = not is_simplified_alone(stage_solver)
     if not _is_tracing() and leaves_steps_to_newton(stage_solver) and is_unsolved(sol):
         used_newton = True
@@ -263,10 +239,13 @@ def integrate(
         # The progress meter has already shown this run: the repeated run shows none.
         solver = replace(stage_solver, fallback=True)
         solver_options = SolverOptions(solver, adjoint, NoProgressMeter())
-        sol = run(system, method, y0, grid, args, options, solver_options)
+        sol = whole_run(system, method, y0, grid, args, options, saveat, solver_options)
     if valid is not None:
         sol = _invalid_unless(valid, sol)
-    if throw:
+    if not _is_tracing() and ended_as(sol, "interrupted"):
+        done = int(sol.stats["num_steps"])
+        warnings.warn(_INTERRUPTED.format(done, num_steps), stacklevel=2)
+    elif throw:
         _require_constraints(sol, system, t0, state, args)
         sol = raise_failures(sol, dt, used_newton)
     _warn_of_errors(sol, dt)
@@ -339,6 +318,15 @@ def step(
     if throw:
         return end
     return nan_unless(sol.result == RESULTS.successful, end)
+
+
+def _program_of_run(num_steps: int | IntScalar) -> Callable[..., Solution]:
+    """Choose between one program for the whole run and chunks of steps."""
+    # With `jax.disable_jit`, nothing is compiled, and the user wants to step through.
+    no_jit = jax.config.jax_disable_jit  # pyright: ignore[reportAttributeAccessIssue]
+    if _is_tracing() or no_jit or not isinstance(num_steps, int):
+        return run
+    return run_in_chunks
 
 
 def _warn_of_errors(sol: Solution, dt: FloatScalar) -> None:
@@ -498,27 +486,6 @@ def _standstill_error(first: Any, h: Any) -> ValueError:
     )
 
 
-def _check_saved(
-    fn: Callable[[Any, Any, Any], PyTree[Array]], t: FloatScalar, y: Any, args: Args
-) -> None:
-    """Raise a `TypeError` unless `SaveAt(fn=...)` returns a tree of arrays."""
-    with naming("SaveAt: fn(t, y, args)", fn, args):
-        leaves = jax.tree.leaves(eqx.filter_eval_shape(fn, t, y, args))
-    wrong = [
-        leaf
-        for leaf in leaves
-        if not (isinstance(leaf, jax.ShapeDtypeStruct) or eqx.is_array_like(leaf))
-    ]
-    if leaves and not wrong:
-        return
-    got = "None: is a `return` missing?"
-    if wrong:
-        got = f"{reprlib.repr(wrong[0])} of type {type(wrong[0]).__name__}."
-    raise TypeError(
-        f"SaveAt: `fn(t, y, args)` must return an array, or a tree of arrays, got {got}"
-    )
-
-
 # JAX has an opaque trace state, which can only be compared with another state. In
 # releases of JAX in which this function is not public, `_is_tracing` is always True.
 _trace_state = getattr(jax.extend.core, "get_opaque_trace_state", lambda **_: object())
@@ -531,196 +498,3 @@ with jax.ensure_compile_time_eval():
 def _is_tracing() -> bool:
     """Return whether this is called inside a transformation such as jit or vmap."""
     return _trace_state(convention="nhjax") != _NOT_TRACING
-
-
-class TimeGrid(eqx.Module):
-    """The nodes t_k = t0 + k dt of a run, for k = 0, ..., num_steps."""
-
-    t0: FloatScalar
-    dt: FloatScalar
-    num_steps: int | IntScalar
-
-
-class RunOptions(eqx.Module):
-    """The user's options that contain functions: outputs, invariants and events.
-
-    The fields are the arguments of `integrate` of the same names. `events` is the
-    argument `event` as a tuple.
-    """
-
-    saveat: SaveAt
-    invariants: str | Callable[..., Any] | None
-    events: tuple[Event, ...] | None
-
-
-class SolverOptions(eqx.Module):
-    """The options for how steps are solved, differentiated and reported."""
-
-    stage_solver: AbstractStageSolver
-    adjoint: AbstractAdjoint
-    meter: AbstractProgressMeter
-
-
-@tracked_jit("system", "args", "options")
-def run(
-    system: AbstractMechanicalSystem,
-    method: AbstractMethod,
-    y0: State | Checkpoint,
-    grid: TimeGrid,
-    args: Args,
-    options: RunOptions,
-    solver_options: SolverOptions,
-) -> Solution:
-    """Integrate with arguments that have been checked, and return the solution."""
-    t0, saveat = grid.t0, options.saveat
-    state, origin = start_of(y0, t0, grid.dt)
-    _check_saved(saveat.fn, t0, state, args)
-    # Arrays that the user's functions close over become leaves, for derivatives.
-    system = closure_converted(system, t0, state, args)
-    # The type checker sees the property `plain` as a field.
-    plain = PlainStepper(  # pyright: ignore[reportCallIssue]
-        system=system,
-        method=method,
-        stage_solver=solver_options.stage_solver,
-        origin=origin,
-        dt=grid.dt,
-        args=args,
-        invariants=kept_invariants(options.invariants, system, t0, state, args),
-        programs=TraceCache(),
-        round_off=None,
-        num_steps=grid.num_steps,
-    )
-    sampled = _sampled_steps(saveat, grid)
-    places = record_places(saveat.dense, sampled, grid.num_steps)
-    stepper: AbstractStepper[Any, Any] = plain
-    if options.events is not None:
-        stepper = EventStepper.of(options.events, plain, state)
-    fn = ClosureConverted(saveat.fn, t0, state, args)
-    saving = Saving.of(saveat, fn, grid.num_steps, places, stepper.log_length)
-    loop = Loop(stepper, saving, solver_options.meter)
-    adjoint = solver_options.adjoint
-    round_off, start, carry, rows = _all_steps(adjoint, loop, y0, saveat.checkpoint)
-    given = (system, y0, t0, grid.dt, args), options.events
-    end = loop.stepper.finish(carry, (rows.saved, rows.record), rows.log, given)
-    ts, ys = _output(saveat, loop, grid, start, end, sampled)
-    interpolation, checkpoint, records = None, None, end.rows[1]
-    if saveat.dense and records is not None:
-        interpolation = _interpolation(plain, grid, records)
-    if saveat.checkpoint:
-        checkpoint = plain.checkpoint(round_off, carry, end.state)
-    return Solution(
-        t0=t0,
-        t1=end.t,
-        ts=ts,
-        ys=ys,
-        stats=reported_statistics(carry.stats, method),
-        result=carry.result,
-        interpolation=interpolation,
-        checkpoint=checkpoint,
-        coordinates=system.coordinates,
-        events=end.log,
-    )
-
-
-def _sampled_steps(saveat: SaveAt, grid: TimeGrid) -> Int[Array, " k"] | None:
-    """Find the steps in which the times of `SaveAt(ts=...)` lie; None without these."""
-    if saveat.ts is None:
-        return None
-    length = static_length(grid.num_steps)
-    return jax.vmap(lambda t: step_index(t, grid.t0, grid.dt, length))(saveat.ts)
-
-
-def _all_steps(
-    adjoint: AbstractAdjoint, loop: Loop, y0: State | Checkpoint, checkpoint: bool
-) -> tuple[RoundOff, State, AbstractCarry, Rows]:
-    """Take all steps.
-
-    Return the measured round-off, the first state, the last carry and the saved rows.
-    """
-
-    def start(loop: Loop, y0: State | Checkpoint, noise: FunctionNoise | None):
-        first = loop.stepper.init(y0, noise)
-        plain = loop.stepper.plain
-        return plain.round_off_at(y0, first.step_state, noise), first
-
-    def steps(loop: Loop, started: tuple[RoundOff, AbstractCarry] | None, *given: Any):
-        round_off, first = start(loop, *given) if started is None else started
-        loop = loop.with_round_off(round_off)
-        run = adjoint.run(loop, loop.moving(first))
-        return round_off, first.step_state.state, *run
-
-    noise = None
-    if isinstance(y0, State):
-        # The noise has its own kernel: a loop over steps is compiled to faster code
-        # without another loop before it, and in a batch of runs from one state this
-        # kernel is not batched.
-        plain = loop.stepper.plain
-        u = plain.system.fibre_coordinate(y0)
-        given = plain.time(0), y0.q, u, y0.multiplier, plain.args
-        given = plain.system, *given
-        noise = as_cpu_kernel(function_noise, *given, is_brief=True)
-        if not checkpoint:
-            return as_cpu_kernel(steps, loop, None, y0, noise)
-    # A compiler that knows the start of a loop, such as zeros in its matrices, rounds
-    # differently in the loop. The barrier hides the start, so that a resumed run takes
-    # its steps by the same instructions.
-    started = as_cpu_kernel(start, loop, y0, noise)
-    given, rest = eqx.partition((loop, started), eqx.is_array)
-    loop, started = eqx.combine(jax.lax.optimization_barrier(given), rest)
-    return as_cpu_kernel(steps, loop, started)
-
-
-def _output(
-    saveat: SaveAt,
-    loop: Loop,
-    grid: TimeGrid,
-    start: State,
-    end: RunEnd[Any, Any],
-    sampled: Int[Array, " k"] | None,
-) -> tuple[PyTree[Array], PyTree[Array]]:
-    """Join the output of the start, the steps and the end: times and values."""
-    saving, args, ts = loop.saving, loop.stepper.plain.args, saveat.ts
-    saved, records = end.rows
-    pieces = []
-    if saveat.t0:
-        pieces.append(_one(saving.saved(grid.t0, start, args)))
-    if saveat.steps:
-        pieces.append(jax.tree.map(lambda x: x[:-1], saved))
-    if ts is not None and sampled is not None and saving.record_slots is not None:
-        row = saving.record_slots[sampled]
-        records = jax.tree.map(lambda x: x[row], records)
-        pieces.append(jax.vmap(partial(_sample, loop))(ts, sampled, records))
-    if saveat.saves_end(grid.num_steps):
-        pieces.append(_one(saving.saved(end.t, end.state, args)))
-    return stack_saved(pieces) if pieces else (None, None)
-
-
-def _interpolation(
-    stepper: PlainStepper, grid: TimeGrid, records: StepRecord
-) -> DenseInterpolation:
-    """Return the dense output, from the records of all steps."""
-    return DenseInterpolation(
-        system=stepper.system,
-        method=stepper.method,
-        num_steps=static_length(grid.num_steps),
-        t0=grid.t0,
-        dt=grid.dt,
-        records=jax.tree.map(lambda x: x[:-1], records),
-        args=stepper.args,
-    )
-
-
-def _one(saved: PyTree[Array]) -> PyTree[Array]:
-    """Return an entry of the output with a time axis of length one."""
-    return jax.tree.map(lambda x: x[None], saved)
-
-
-def _sample(
-    loop: Loop, t: FloatScalar, k: Int[Array, ""], record: StepRecord
-) -> PyTree[Array]:
-    """Compute the output at a time t inside step k."""
-    run = loop.stepper.plain
-    start, h = run.time(k), run.dt
-    theta = (t - start) / h
-    y = interpolate(run.system, run.method, record, start, h, theta, run.args)
-    return loop.saving.saved(t, y, run.args)

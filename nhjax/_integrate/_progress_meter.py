@@ -13,8 +13,9 @@ from jaxtyping import Array, Int
 class AbstractProgressMeter(eqx.Module):
     """A progress meter, which shows how many steps of a run are done.
 
-    The compiled time loop calls it on the host. For your own meter, write a subclass
-    with `update`.
+    Outside of transformations it is called between chunks of steps. Inside them, the
+    compiled time loop calls it on the host. For your own meter, write a subclass with
+    `update`.
     """
 
     @abstractmethod

@@ -12,8 +12,7 @@ from jaxtyping import Array, PyTree
 from .._custom_types import BoolScalar
 from .._numerics import max_norm, relative
 from .._system import AbstractMechanicalSystem, State
-from ._adjoint import AbstractAdjoint, count, DirectAdjoint
-from ._loop import Loop
+from ._loop import AbstractAdjoint, count, DirectAdjoint, Loop
 from ._progress_meter import NoProgressMeter
 from ._saving import Rows
 from ._stepper import AbstractCarry

@@ -2,7 +2,7 @@
 
 import reprlib
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from typing import Any, cast, NamedTuple
 
 import equinox as eqx
 import jax
@@ -266,15 +266,19 @@ class Saving(eqx.Module):
     if `stride` is 0). These are `num_saved` entries. The run keeps `num_records`
     records of steps, and `log_length` entries of the stepper's log. `num_steps` is used
     only if steps save rows or records.
+
+    The buffers of a part of a run begin with the step `first_step`. Then `num_saved`
+    and `num_records` are the room in the buffers, and all steps keep their records.
     """
 
     fn: Callable[[FloatScalar, State, Args], PyTree[Array]]
-    num_steps: int = eqx.field(static=True)
-    stride: int = eqx.field(static=True)
+    num_steps: int | IntScalar
+    stride: int | IntScalar
     num_saved: int = eqx.field(static=True)
     num_records: int = eqx.field(static=True)
     record_slots: Int[Array, " nodes"] | None
     log_length: int = eqx.field(static=True)
+    first_step: IntScalar | None = None
 
     @classmethod
     def of(
@@ -310,7 +314,7 @@ class Saving(eqx.Module):
         def save():
             return self.saved(t, y, args)
 
-        if self.stride <= 1:
+        if isinstance(self.stride, int) and self.stride <= 1:
             return save() if self.stride else None
         zeros = jax.tree.map(
             lambda x: jnp.zeros(x.shape, x.dtype), jax.eval_shape(save)
@@ -336,7 +340,17 @@ class Saving(eqx.Module):
 
     def _slot(self, k: Int[Array, ""]) -> Int[Array, ""]:
         kept = ((k + 1) % self.stride == 0) & (k < self.num_steps)
-        return jnp.where(kept, (k + 1) // self.stride - 1, self.num_saved)
+        slot = (k + 1) // self.stride - 1
+        if self.first_step is not None:
+            slot = slot - self.first_step // self.stride
+        return jnp.where(kept, slot, self.num_saved)
+
+    def _record_slot(self, k: Int[Array, ""]) -> Int[Array, ""]:
+        if self.record_slots is not None:
+            return self.record_slots[jnp.minimum(k, self.num_steps)]
+        # Without slots, the records are those of a part of a run.
+        slot = k - cast(Array, self.first_step)
+        return jnp.where(k < self.num_steps, slot, self.num_records)
 
     def empty(self, row: Rows) -> Rows:
         """Return buffers of zeros for all rows that are saved, and for one extra row.
@@ -372,11 +386,10 @@ class Saving(eqx.Module):
         k = k if rows.row is None else rows.row
         if rows.log is not None:
             log = put(log, rows.log, rows.log_slot)
-        if self.stride:
+        if rows.saved is not None:
             saved = put(saved, rows.saved, self._slot(k))
-        if self.record_slots is not None:
-            slot = self.record_slots[jnp.minimum(k, self.num_steps)]
-            records = put(records, rows.record, slot)
+        if self.num_records:
+            records = put(records, rows.record, self._record_slot(k))
         return Rows(saved, records, log)
 
     def read(

@@ -1,4 +1,4 @@
-"""The solution of a run, and the errors that it raises."""
+"""The solution of a run, the log of its events, and the errors that it raises."""
 
 from collections.abc import Mapping, Sequence
 from functools import partial
@@ -6,16 +6,41 @@ from typing import Any, NamedTuple
 
 import equinox as eqx
 import numpy as np
-from jaxtyping import Array, Float, PyTree
+from jaxtyping import Array, Float, Int, PyTree
 
 from .._custom_types import FloatScalarLike
-from .._errors import IntegrationError, is_traced, member_name, raise_where
-from .._results import EVENT_OCCURRED, FALLBACK, JUMPS, messages, RESULTS
+from .._errors import IntegrationError, is_traced, member_name, on_host, raise_where
+from .._results import (
+    EVENT_OCCURRED,
+    FALLBACK,
+    JUMPS,
+    messages,
+    result_codes,
+    RESULTS,
+)
 from .._system import State
 from ._checkpoint import Checkpoint
 from ._dataset import to_dataset
-from ._events import EventLog
 from ._interpolation import DenseInterpolation
+
+
+class EventLog(eqx.Module):
+    """The events of a run in order of time: the field `events` of a `Solution`.
+
+    - `num`: the number of events.
+    - `ts`: their times, of shape (e,) for the e events that the run had room for.
+    - `which`: for each of them, the index in the events that `integrate` was given.
+    - `before`, `after`: the states at the events before and after their resets, each a
+        `State` with a leading axis of length e.
+
+    Unused entries are infinite, and -1 in `which`.
+    """
+
+    num: Int[Array, ""]
+    ts: Float[Array, " e"]
+    which: Int[Array, " e"]
+    before: PyTree[Array]
+    after: PyTree[Array]
 
 
 class Solution(eqx.Module):
@@ -194,17 +219,19 @@ def _outcome(sol: Solution) -> _Outcome:
 
 def is_unsolved(sol: Solution) -> bool:
     """Return whether a run without a batch ended because a step was not solved."""
-    unsolved = (
-        RESULTS.nonlinear_divergence,
-        RESULTS.nonlinear_max_iterations,
-        RESULTS.left_chart,
-    )
-    return any(bool(sol.result == result) for result in unsolved)
+    unsolved = "nonlinear_divergence", "nonlinear_max_iterations", "left_chart"
+    return ended_as(sol, *unsolved)
+
+
+def ended_as(sol: Solution, *results: str) -> bool:
+    """Return whether a run without a batch ended with one of the named `RESULTS`."""
+    code = int(sol.result._value)
+    return any(code == result_codes()[name] for name in results)
 
 
 def is_singular_from_the_start(sol: Solution) -> bool:
     """Return whether a run without a batch failed at step 0 by a singular matrix."""
-    singular = bool(sol.result == RESULTS.singular_stage_matrix)
+    singular = ended_as(sol, "singular_stage_matrix")
     return singular and int(sol.stats["failed_step"]) == 0
 
 
@@ -216,7 +243,7 @@ def raise_failures(
     With the step size `dt`, the message suggests another one. It recommends Newton's
     method unless the run has already `used_newton`.
     """
-    outcome = _outcome(sol)
+    outcome = on_host(_outcome(sol))
     bad = outcome.codes != messages().index("")
     if sol.events is not None:
         bad = bad & (outcome.codes != messages().index(EVENT_OCCURRED))

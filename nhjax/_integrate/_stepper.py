@@ -115,6 +115,10 @@ class AbstractStepper(eqx.Module, Generic[C, R]):
         """Return the number of entries for which the log has room, 0 without a log."""
 
     @abstractmethod
+    def num_filled(self, carry: C, i: Int[Array, ""]) -> Int[Array, ""]:
+        """Return the number of output rows that are filled before iteration i."""
+
+    @abstractmethod
     def with_round_off(self, round_off: RoundOff) -> "AbstractStepper[C, R]":
         """Return the same stepper with the measured round-off of the system."""
 
@@ -239,6 +243,11 @@ class PlainStepper(AbstractStepper[PlainCarry, None]):
     def log_length(self) -> int:
         """Return 0: this stepper has no log."""
         return 0
+
+    def num_filled(self, carry: PlainCarry, i: Int[Array, ""]) -> Int[Array, ""]:
+        """Return i: every step fills a row."""
+        del carry
+        return i
 
     def with_round_off(self, round_off: RoundOff) -> "PlainStepper":
         """Return the same stepper with the measured round-off of the system."""

@@ -15,6 +15,7 @@ from ._arguments import (
 )
 from ._checks import (
     check_functions as check_functions,
+    check_multiplier as check_multiplier,
     check_state as check_state,
     dependence_error as dependence_error,
     dependent_names as dependent_names,

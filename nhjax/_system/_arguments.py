@@ -5,7 +5,7 @@ import reprlib
 import warnings
 from collections.abc import Callable
 from types import MethodType
-from typing import Any, TypeAlias
+from typing import Any, cast, TypeAlias
 
 import equinox as eqx
 import jax
@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, PyTree
 
-from .._custom_types import Args, FloatScalar, FloatScalarLike
+from .._custom_types import Args, BoolScalar, FloatScalar, FloatScalarLike
 from .._errors import (
     Check,
     check_choice,
@@ -114,15 +114,11 @@ def real_scalar(name: str, x: FloatScalarLike, dtype: Any) -> FloatScalar:
 
     Other types raise a `DTypeError`. Arrays that are not scalars raise a `ShapeError`.
     """
-    # A concrete number stays concrete inside `jit`.
-    if not is_traced(x):
-        with jax.ensure_compile_time_eval():
-            return _real_scalar(name, x, dtype)
-    return _real_scalar(name, x, dtype)
-
-
-def _real_scalar(name: str, x: FloatScalarLike, dtype: Any) -> FloatScalar:
-    array = jnp.asarray(x) if eqx.is_array_like(x) else None
+    # A concrete number stays concrete inside `jit`, and its conversion on the host
+    # compiles nothing.
+    array: Any = None
+    if eqx.is_array_like(x):
+        array = x if is_traced(x) else np.asarray(x)
     if array is None or not (
         jnp.issubdtype(array.dtype, jnp.floating)
         or jnp.issubdtype(array.dtype, jnp.integer)
@@ -136,17 +132,15 @@ def _real_scalar(name: str, x: FloatScalarLike, dtype: Any) -> FloatScalar:
             f"`{name}` has shape {array.shape}, but a scalar is needed; for several "
             "values use `jax.vmap`."
         )
-    return array.astype(dtype)
+    if is_traced(array):
+        return array.astype(dtype)
+    with jax.ensure_compile_time_eval():
+        return jax.device_put(array.astype(dtype))
 
 
 def finite(name: str, x: Any) -> Check:
     """Create the check that every number in `x` is finite."""
-    leaves = jax.tree.leaves(x)
-    if is_traced(*leaves):
-        return Check(all_finite(x), _not_finite, (name, x))
-    # NumPy gives a concrete answer inside `jit` too.
-    ok = all(bool(np.all(np.isfinite(np.asarray(leaf)))) for leaf in leaves)
-    return Check(ok, _not_finite, (name, x))
+    return Check(all_finite(x), _not_finite, (name, x))
 
 
 def _not_finite(name: str, x: Any) -> NonFiniteError:
@@ -180,10 +174,14 @@ def parameters(args: Args) -> Args:
     return jax.tree_util.tree_map_with_path(leaf, args)
 
 
-def all_finite(tree: Any) -> Array:
+def all_finite(tree: Any) -> BoolScalar:
     """Return whether every number in `tree` is finite."""
-    leaves = [jnp.all(jnp.isfinite(leaf)) for leaf in jax.tree.leaves(tree)]
-    return jnp.all(jnp.stack(leaves))
+    leaves = jax.tree.leaves(tree)
+    if not is_traced(*leaves):
+        # NumPy gives a concrete answer inside `jit` too, and compiles nothing.
+        finite = [np.all(np.isfinite(np.asarray(leaf))) for leaf in leaves]
+        return cast(BoolScalar, np.all(finite))
+    return jnp.all(jnp.stack([jnp.all(jnp.isfinite(leaf)) for leaf in leaves]))
 
 
 def check_signature(

@@ -94,12 +94,11 @@ def check_functions(
             )
 
 
-def check_state(
-    system: AbstractMechanicalSystem, y: State, args: Args, called: str = "y0"
-) -> None:
+def check_state(system: AbstractMechanicalSystem, y: State, called: str = "y0") -> None:
     """Raise unless `y` has the shapes and dtypes of a state of `system`.
 
-    `called` is the name of `y` in messages.
+    `check_multiplier` checks the shape of the multiplier. `called` is the name of `y`
+    in messages.
     """
     parts = {name: getattr(y, name) for name in ("p", "v", "q", "multiplier")}
     for name, x in parts.items():
@@ -137,7 +136,21 @@ def check_state(
                 f"({manifold.dim},). Use `initial_state`."
             )
     require_names(system, f"{called}.q", manifold)
-    t = jnp.zeros((), y.v.dtype)
+    for name, x in parts.items():
+        # For traced parts the integration reports each member that is not finite.
+        if not is_traced(*jax.tree.leaves(x)):
+            require(x, finite(f"{called}.{name}", x))
+
+
+def check_multiplier(
+    system: AbstractMechanicalSystem, y: State, args: Args, called: str = "y0"
+) -> None:
+    """Raise unless `y` has a multiplier for each constraint of `system`.
+
+    This traces the constraints of the user, so that programs do it when they are
+    traced.
+    """
+    t = jax.ShapeDtypeStruct((), y.v.dtype)
     u = system.fibre_coordinate(y)
     expected = eqx.filter_eval_shape(system.constraint, t, y.q, u, args).shape
     if y.multiplier.shape != expected:
@@ -146,10 +159,6 @@ def check_state(
             f"constraints of the system have shape {expected}. Use `initial_state` "
             "with this system."
         )
-    for name, x in parts.items():
-        # For traced parts the integration reports each member that is not finite.
-        if not is_traced(*jax.tree.leaves(x)):
-            require(x, finite(f"{called}.{name}", x))
 
 
 def _names(num_nonholonomic: int, num_holonomic: int) -> list[str]:

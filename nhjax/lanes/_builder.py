@@ -306,6 +306,8 @@ class Builder:
         self.path: list[int] = []
         # The numbers of each loop that are known to change, by the path of the loop.
         self.changing: dict[tuple[int, ...], set[int]] = {}
+        # The constants with which numbers started that loops may have changed since.
+        self.loop_starts: dict[Node, Node] = {}
         self._last_uses: dict[int, tuple[Any, list[list[Any]]]] = {}
 
     def run(

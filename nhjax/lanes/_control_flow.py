@@ -4,7 +4,8 @@ A loop carries arrays as parameters, number by number, or leaves them in place i
 memory. Numbers that start as constants are first assumed to stay constant. The body is
 built. If some of these numbers change, the body is built again without the assumption
 for them. The changing numbers are remembered, so that building an outer loop again does
-not multiply the time with the depth of nesting.
+not multiply the time with the depth of nesting. If a loop continues an earlier one, the
+operation `loop_start` names the constants with which the earlier loop started.
 
 Short scans are unrolled, unless their body contains loops.
 """
@@ -170,6 +171,19 @@ def _expanded(
     return builder.run(program.jaxpr, program.consts, values)
 
 
+def _loop_start(
+    builder: Builder, equation: Any, values: list[ArrayValue]
+) -> list[ArrayValue]:
+    """Remember the constants with which the numbers of a carry started."""
+    del equation
+    carry, firsts = values[: len(values) // 2], values[len(values) // 2 :]
+    for value, first in zip(carry, firsts, strict=True):
+        if not (isinstance(value, InMemory) or isinstance(first, InMemory)):
+            pairs = zip(value.reshape(-1), first.reshape(-1), strict=True)
+            builder.loop_starts.update((x, one) for x, one in pairs if one.is_constant)
+    return carry
+
+
 _CALLS = """
     checkpoint closed_call core_call custom_jvp_call custom_vjp_call
     custom_vjp_call_jaxpr jit cpu_kernel pjit remat remat2
@@ -179,6 +193,7 @@ BRANCHES: dict[str, Operation] = {
     "call_hi_primitive": _expanded,
     "cond": _cond,
     "custom_linear_solve": _linear_solve,
+    "loop_start": _loop_start,
 }
 
 
@@ -478,11 +493,12 @@ class _Attempt:
                 self._take_over(body(arrays))
 
     def _parameters(self, start: int, value: Registers) -> Registers:
-        out = np.empty(value.size, object)
+        out, starts = np.empty(value.size, object), self.builder.loop_starts
         for index, node in enumerate(value.reshape(-1)):
             position = start + index
-            if node.is_constant and position not in self.changing:
-                self.fixed[position] = out[index] = node
+            first = starts[node] if node in starts else node  # noqa: SIM401
+            if first.is_constant and position not in self.changing:
+                self.fixed[position] = out[index] = first
             else:
                 self.varying.append(position)
                 out[index] = self.loop.parameter(node)

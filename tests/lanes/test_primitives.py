@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from jax import lax
 
-from nhjax._compile import _jaxprs
+from nhjax._compile import _jaxprs, started_like
 from nhjax._numerics import small_einsum
 from nhjax.lanes import _program, Unsupported
 from support import lanes_run
@@ -155,6 +155,9 @@ _CASES = {
     "rev": _unary(lambda x: x[::-1]),
     "slice": _unary(lambda x: x[::2]),
     # A sum, an index that stays in both operands, and an empty result.
+    "loop_start": [
+        (lambda x: started_like((x * 0.0, 2.0 * x), (x, x + 1)), [_of("float64")])
+    ],
     "small_product": [
         (partial(small_einsum, "ab,cb->ca"), [Kind("float32", (2, 3))] * 2),
         (partial(small_einsum, "ia,ib->bai"), [Kind(*MATRIX)] * 2),

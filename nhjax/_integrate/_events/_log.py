@@ -1,30 +1,12 @@
-"""The log of the events of a run, and the report that users see."""
+"""The log of the events of a run, from which the report for users is made."""
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int, PyTree
+from jaxtyping import Array, Float, Int
 
 from ..._system import State
-
-
-class EventLog(eqx.Module):
-    """The events of a run in order of time: the field `events` of a `Solution`.
-
-    - `num`: the number of events.
-    - `ts`: their times, of shape (e,) for the e events that the run had room for.
-    - `which`: for each of them, the index in the events that `integrate` was given.
-    - `before`, `after`: the states at the events before and after their resets, each a
-        `State` with a leading axis of length e.
-
-    Unused entries are infinite, and -1 in `which`.
-    """
-
-    num: Int[Array, ""]
-    ts: Float[Array, " e"]
-    which: Int[Array, " e"]
-    before: PyTree[Array]
-    after: PyTree[Array]
+from .._solution import EventLog
 
 
 class LogEntry(eqx.Module):

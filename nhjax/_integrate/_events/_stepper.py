@@ -19,6 +19,7 @@ from ..._results import RESULTS
 from ..._step import first_step_state, ImplicitStep, RoundOff, StepArguments, StepState
 from ..._system import FunctionNoise, State
 from .._checkpoint import Checkpoint
+from .._solution import EventLog
 from .._stepper import (
     AbstractCarry,
     AbstractReverseReplay,
@@ -33,7 +34,7 @@ from .._stepper import (
     updated_statistics,
 )
 from ._event import Conditions, ConditionSigns, Event, EventActions, signs_at
-from ._log import EventLog, LogEntry, reported_log
+from ._log import LogEntry, reported_log
 from ._root import ImplicitTruncatedStep, TruncatedStep
 
 
@@ -184,6 +185,11 @@ class EventStepper(AbstractStepper[EventCarry, ReplayedIteration]):
         If events only end the run, no log is kept on the way: `finish` makes it.
         """
         return 0 if self.actions.only_end else self.actions.max_events
+
+    def num_filled(self, carry: EventCarry, i: Int[Array, ""]) -> Int[Array, ""]:
+        """Return the number of output rows that are filled: the carry knows it."""
+        del i
+        return carry.place.row
 
     def with_round_off(self, round_off: RoundOff) -> "EventStepper":
         """Return the same stepper with the measured round-off of the system."""

@@ -1,0 +1,49 @@
+"""What the compiler may know about the start of a loop that continues another one.
+
+A run is a loop whose carry starts with constants, such as the zeros of a mass matrix.
+Those that no iteration changes are constants of the whole loop, and the compiler leaves
+out operations with them. If the loop is interrupted and goes on from arrays, the
+compiler no longer sees them, and the loop becomes slower and rounds differently.
+"""
+
+from typing import TypeVar
+
+import jax
+import jax.core
+import jax.extend
+from jax.interpreters import batching, mlir
+
+from ._kernel import never_high
+
+
+T = TypeVar("T")
+
+loop_start = jax.extend.core.Primitive("loop_start")
+loop_start.multiple_results = True
+loop_start.is_high = never_high
+
+
+def started_like(first: T, carry: T) -> T:
+    """Return the carry of a loop that started as `first` and is continued.
+
+    Where a number of `first` is a constant of the program, and the loop does not change
+    it, the compiler uses the constant. The same loop must have led from `first` to
+    `carry`.
+    """
+    ours, structure = jax.tree.flatten(carry)
+    out = loop_start.bind(*ours, *jax.tree.leaves(first))
+    return jax.tree.unflatten(structure, out)
+
+
+def _carry(*operands):
+    return list(operands[: len(operands) // 2])
+
+
+def _batched(operands, axes):
+    return _carry(*operands), _carry(*axes)
+
+
+loop_start.def_impl(_carry)
+loop_start.def_abstract_eval(_carry)
+mlir.register_lowering(loop_start, mlir.lower_fun(_carry, multiple_results=True))
+batching.primitive_batchers[loop_start] = _batched

@@ -1,0 +1,246 @@
+"""The loop on the host that drives a plain call of `integrate` in chunks of steps.
+
+Outside of transformations a run is not one compiled program. A program takes a chunk of
+steps: it leads from a carry to a carry, and writes rows to a buffer of fixed size. The
+first step, the number of steps and the stride of the output are arguments of it, so
+that a run of another length or with other output compiles nothing. Between chunks the
+host moves the rows to the output, updates the progress meter, and stops the run after
+Ctrl-C.
+"""
+
+import contextlib
+import math
+import signal
+import threading
+import time
+from collections.abc import Callable, Iterator
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+from jaxtyping import Array, PyTree
+
+from ._checkpoint import MOST_STEPS
+from ._progress_meter import AbstractProgressMeter
+
+
+# The size of the buffers of a chunk, in numbers, and limits of their length in rows.
+_BUFFER_SIZE = 2**17
+_LEAST_ROWS, _MOST_ROWS = 16, 4096
+# The first chunk without rows has this many iterations. Later chunks take about this
+# many seconds, after which a chunk returns to the host.
+_FIRST_ITERATIONS = 256
+_SECONDS = 0.2
+# The number of times of `SaveAt(ts=...)` at which one call computes the output.
+SAMPLES_AT_ONCE = 64
+# A run without output after steps has this stride.
+NO_STRIDE = MOST_STEPS
+
+
+class Span(NamedTuple):
+    """The part of a run that a chunk takes, which its program gets as one array.
+
+    - `start`, `end`: the first iteration, and the one after the last.
+    - `stride`: save the state after every `stride`-th step of the run.
+    - `num_steps`: the number of steps of the run.
+    - `saves_end`: whether to compute the output of the last state, 0 or 1.
+    """
+
+    start: Any
+    end: Any
+    stride: Any
+    num_steps: Any
+    saves_end: Any
+
+
+class Output(NamedTuple):
+    """The output of all chunks of a run, as arrays of NumPy.
+
+    - `last`: the result of the last chunk.
+    - `saved`: the saved rows, along a leading axis, or None.
+    - `records`: the records of all steps, or of the steps that were asked for.
+    - `num_steps`: the number of steps for which there are rows.
+    - `is_interrupted`: whether Ctrl-C ended the run before its last step.
+    """
+
+    last: Any
+    saved: PyTree[np.ndarray] | None
+    records: PyTree[np.ndarray] | None
+    num_steps: int
+    is_interrupted: bool
+
+
+def room_for(rows: PyTree[Any]) -> int:
+    """Return the number of rows of a buffer for rows of these shapes."""
+    numbers = sum(math.prod(x.shape) for x in jax.tree.leaves(rows))
+    room = 2 ** int(math.log2(_BUFFER_SIZE / max(numbers, 1)))
+    return min(max(room, _LEAST_ROWS), _MOST_ROWS)
+
+
+def drive(
+    chunk: Callable[[Any, Any, Array], Any],
+    carry: Any,
+    log: Any,
+    *,
+    num_steps: int,
+    num_iterations: int,
+    stride: int,
+    room: int,
+    saves_end: Callable[[int], bool],
+    recorded: np.ndarray | None,
+    keeps_records: bool,
+    meter: AbstractProgressMeter,
+) -> Output:
+    """Take all steps of a run in chunks, and collect their rows.
+
+    **Arguments:**
+
+    - `chunk`: takes a chunk; a function of the carry, the log and the numbers of a
+        `Span`. Its result has the fields `carry`, `log`, `num_filled`, `saved` and
+        `records`.
+    - `carry`, `log`: those before the first iteration.
+    - `num_steps`, `num_iterations`: the numbers of steps and of iterations.
+    - `stride`, `room`: the stride of the output, and the rows of the buffers.
+    - `saves_end`: whether a run of a number of steps saves its last state.
+    - `recorded`: the sorted indices of the steps whose records are needed; None for
+        all.
+    - `keeps_records`: whether chunks return records of steps.
+    - `meter`: the progress meter.
+    """
+    done, filled, last = 0, 0, None
+    saved, records = [], []
+    schedule = _Schedule(num_steps, num_iterations, meter)
+    with _interruptions() as is_interrupted:
+        while done < num_iterations and not (done and is_interrupted()):
+            most = (filled // stride + room) * stride - filled
+            if keeps_records:
+                most = min(most, room)
+            end = min(done + schedule.length(done, most), num_iterations)
+            at_end = end == num_iterations and saves_end(num_steps)
+            started = time.monotonic()
+            last = chunk(carry, log, _span(done, end, stride, num_steps, at_end))
+            before, filled = filled, int(last.num_filled)
+            schedule.finished(end - done, time.monotonic() - started)
+            carry, log, done = last.carry, last.log, end
+            count = filled // stride - before // stride
+            if last.saved is not None and count:
+                saved.append(_rows(last.saved, slice(count)))
+            if keeps_records:
+                records.append(_rows(last.records, _asked(recorded, before, filled)))
+            schedule.report(done)
+        if done < num_iterations:
+            span = _span(done, done, stride, filled, saves_end(filled))
+            last = chunk(carry, log, span)
+    return Output(
+        last,
+        _joined(saved),
+        _joined(records),
+        num_steps if done == num_iterations else filled,
+        done < num_iterations,
+    )
+
+
+def on_device(tree: PyTree[np.ndarray], like: Any) -> PyTree[Any]:
+    """Return arrays of JAX with these values, on the device of the array `like`."""
+    # In contrast to `jnp.asarray`, this compiles nothing.
+    with jax.default_device(next(iter(like.devices()))):
+        return jax.device_put(tree)
+
+
+def joined(pieces: list[PyTree[Any]]) -> PyTree[np.ndarray]:
+    """Concatenate pieces of the output along their leading axis, on the host."""
+    return _joined([jax.tree.map(np.asarray, piece) for piece in pieces])
+
+
+def padded(x: np.ndarray, length: int) -> np.ndarray:
+    """Return an array that is continued by its last entry up to a length."""
+    return np.concatenate([x, np.broadcast_to(x[-1:], (length - len(x), *x.shape[1:]))])
+
+
+def _span(*numbers: int) -> Array:
+    return jax.device_put(np.array(Span(*numbers), np.int32))
+
+
+def _rows(buffers: PyTree[Any], which: Any) -> PyTree[np.ndarray]:
+    # The rows are copied: a view would keep the whole buffer.
+    return jax.tree.map(lambda x: np.array(np.asarray(x)[which]), buffers)
+
+
+def _asked(recorded: np.ndarray | None, before: int, filled: int) -> Any:
+    """Find the rows of a buffer that have the records of steps that are needed."""
+    if recorded is None:
+        return slice(filled - before)
+    return recorded[(recorded >= before) & (recorded < filled)] - before
+
+
+def _joined(pieces: list[PyTree[np.ndarray]]) -> PyTree[np.ndarray] | None:
+    if len(pieces) < 2:
+        return pieces[0] if pieces else None
+    return jax.tree.map(lambda *leaves: np.concatenate(leaves), *pieces)
+
+
+class _Schedule:
+    """The lengths of the chunks, and the reports to the progress meter.
+
+    An event takes additional iterations. The first `surplus` iterations are therefore
+    not reported: the steps that are reported are certain to be complete.
+    """
+
+    def __init__(
+        self, num_steps: int, num_iterations: int, meter: AbstractProgressMeter
+    ):
+        self._meter, self._num_steps = meter, num_steps
+        self._surplus = num_iterations - num_steps
+        # A meter shows the run in about a hundred parts.
+        self._every = max(1, num_steps // 100)
+        self._next, self._reported = _FIRST_ITERATIONS, 0
+
+    def length(self, done: int, most: int) -> int:
+        """Return the number of iterations of the next chunk, at most `most`."""
+        if self._meter.silent:
+            return min(self._next, most)
+        steps = max(done - self._surplus, 0)
+        if steps == 0:
+            return min(self._surplus + 1 - done, most)
+        return min(self._every - steps % self._every, most)
+
+    def finished(self, length: int, seconds: float) -> None:
+        """Learn from a chunk of this length how long the next ones may be."""
+        factor = _SECONDS / max(seconds, 1e-3 * _SECONDS)
+        self._next = max(1, min(int(length * factor), 8 * self._next))
+
+    def report(self, done: int) -> None:
+        """Report the steps that are complete after `done` iterations."""
+        steps = done - self._surplus
+        is_due = steps == 1 or steps % self._every == 0 or steps == self._num_steps
+        if not self._meter.silent and steps > 0 and is_due:
+            self._meter.update(steps, self._num_steps)
+
+
+@contextlib.contextmanager
+def _interruptions() -> Iterator[Callable[[], bool]]:
+    """Catch Ctrl-C; yield a function that returns whether it was pressed.
+
+    A second one raises `KeyboardInterrupt` as usual. Handlers that others have
+    installed are left alone, as are threads other than the main thread, which have no
+    handlers.
+    """
+    pressed = threading.Event()
+    is_ours = (
+        threading.current_thread() is threading.main_thread()
+        and signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    )
+    if not is_ours:
+        yield pressed.is_set
+        return
+
+    def handle(number: int, frame: Any) -> None:
+        if pressed.is_set():
+            signal.default_int_handler(number, frame)
+        pressed.set()
+
+    signal.signal(signal.SIGINT, handle)
+    try:
+        yield pressed.is_set
+    finally:
+        signal.signal(signal.SIGINT, signal.default_int_handler)

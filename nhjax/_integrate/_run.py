@@ -1,0 +1,627 @@
+"""The compiled programs of a run, and how they are put together to a solution.
+
+Inside transformations, `run` is one program for all steps. Outside of them,
+`run_in_chunks` calls a program that takes a chunk of steps as often as needed, so that
+a run of another length or with other output compiles nothing.
+"""
+
+import reprlib
+from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int, PyTree
+
+from .._compile import (
+    as_cpu_kernel,
+    captured_by,
+    started_like,
+    TraceCache,
+    tracked_jit,
+)
+from .._custom_types import (
+    Args,
+    BoolScalar,
+    FloatScalar,
+    IntScalar,
+)
+from .._errors import naming, on_host
+from .._method import AbstractMethod
+from .._numerics import ClosureConverted
+from .._results import RESULTS
+from .._step import (
+    AbstractStageSolver,
+    RoundOff,
+    StepRecord,
+)
+from .._system import (
+    AbstractMechanicalSystem,
+    check_multiplier,
+    closure_converted,
+    function_noise,
+    FunctionNoise,
+    linearise,
+    State,
+)
+from ._checkpoint import (
+    Checkpoint,
+    start_of,
+)
+from ._chunks import (
+    drive,
+    joined,
+    NO_STRIDE,
+    on_device,
+    Output,
+    padded,
+    room_for,
+    SAMPLES_AT_ONCE,
+    Span,
+)
+from ._conservation import kept_invariants
+from ._events import Event, EventStepper
+from ._interpolation import (
+    DenseInterpolation,
+    interpolate,
+    step_index,
+)
+from ._loop import AbstractAdjoint, advance, Loop
+from ._progress_meter import AbstractProgressMeter, NoProgressMeter
+from ._saving import (
+    record_places,
+    Rows,
+    SaveAt,
+    Saving,
+    stack_saved,
+    static_length,
+)
+from ._solution import (
+    Solution,
+)
+from ._stepper import (
+    AbstractCarry,
+    AbstractStepper,
+    PlainStepper,
+    reported_statistics,
+    RunEnd,
+)
+
+
+class TimeGrid(eqx.Module):
+    """The nodes t_k = t0 + k dt of a run, for k = 0, ..., num_steps."""
+
+    t0: FloatScalar
+    dt: FloatScalar
+    num_steps: Any
+
+
+class RunOptions(eqx.Module):
+    """The user's options that contain functions: output, invariants and events.
+
+    `fn` is that of `SaveAt`, `invariants` the argument of `integrate`, and `events` its
+    argument `event` as a tuple.
+    """
+
+    fn: Callable[[Any, Any, Any], PyTree[Array]]
+    invariants: str | Callable[..., Any] | None
+    events: tuple[Event, ...] | None
+
+
+class SolverOptions(eqx.Module):
+    """The options for how steps are solved, differentiated and reported."""
+
+    stage_solver: AbstractStageSolver
+    adjoint: AbstractAdjoint
+    meter: AbstractProgressMeter
+
+
+@tracked_jit("system", "args", "options", "saveat")
+def run(
+    system: AbstractMechanicalSystem,
+    method: AbstractMethod,
+    y0: State | Checkpoint,
+    grid: TimeGrid,
+    args: Args,
+    options: RunOptions,
+    saveat: SaveAt,
+    solver_options: SolverOptions,
+) -> Solution:
+    """Integrate with arguments that have been checked, and return the solution.
+
+    This is one program, for runs inside transformations.
+    """
+    t0 = grid.t0
+    given = system, method, y0, grid, args, options, solver_options.stage_solver
+    stepper, fn = _stepper(*given)
+    plain = stepper.plain
+    system = plain.system
+    sampled = _sampled_steps(saveat, grid)
+    places = record_places(saveat.dense, sampled, grid.num_steps)
+    saving = Saving.of(saveat, fn, grid.num_steps, places, stepper.log_length)
+    loop = Loop(stepper, saving, solver_options.meter)
+    adjoint = solver_options.adjoint
+    round_off, start, carry, rows = _all_steps(adjoint, loop, y0, saveat.checkpoint)
+    given = (system, y0, t0, grid.dt, args), options.events
+    end = loop.stepper.finish(carry, (rows.saved, rows.record), rows.log, given)
+    ts, ys = _output(saveat, loop, grid, start, end, sampled)
+    interpolation, checkpoint, records = None, None, end.rows[1]
+    if saveat.dense and records is not None:
+        interpolation = _interpolation(plain, grid, records)
+    if saveat.checkpoint:
+        checkpoint = plain.checkpoint(round_off, carry, end.state)
+    return Solution(
+        t0=t0,
+        t1=end.t,
+        ts=ts,
+        ys=ys,
+        stats=reported_statistics(carry.stats, method),
+        result=carry.result,
+        interpolation=interpolation,
+        checkpoint=checkpoint,
+        coordinates=system.coordinates,
+        events=end.log,
+    )
+
+
+def _stepper(
+    system: AbstractMechanicalSystem,
+    method: AbstractMethod,
+    y0: State | Checkpoint,
+    grid: TimeGrid,
+    args: Args,
+    options: RunOptions,
+    stage_solver: AbstractStageSolver,
+) -> tuple[AbstractStepper[Any, Any], ClosureConverted]:
+    """Return the stepper of a run, and the function `fn` of its output."""
+    t0, fn = grid.t0, options.fn
+    state, origin = start_of(y0, t0, grid.dt)
+    called = "y0.state" if isinstance(y0, Checkpoint) else "y0"
+    check_multiplier(system, state, args, called)
+    _check_saved(fn, t0, state, args)
+    # Arrays that the user's functions close over become leaves, for derivatives.
+    system = closure_converted(system, t0, state, args)
+    # The type checker sees the property `plain` as a field.
+    plain = PlainStepper(  # pyright: ignore[reportCallIssue]
+        system=system,
+        method=method,
+        stage_solver=stage_solver,
+        origin=origin,
+        dt=grid.dt,
+        args=args,
+        invariants=kept_invariants(options.invariants, system, t0, state, args),
+        programs=TraceCache(),
+        round_off=None,
+        num_steps=grid.num_steps,
+    )
+    fn = ClosureConverted(fn, t0, state, args)
+    if options.events is None:
+        return plain, fn
+    return EventStepper.of(options.events, plain, state), fn
+
+
+class _Start(NamedTuple):
+    """The start of a run in chunks.
+
+    - `carry`, `log`: those before the first iteration.
+    - `round_off`: the round-off of the functions of the system.
+    - `saved`: the output of the initial state, if it is asked for.
+    - `surplus`: the number of iterations that the run may need beyond its steps.
+    - `room`: the number of rows of the buffers of a chunk.
+    """
+
+    carry: AbstractCarry
+    log: PyTree[Array] | None
+    round_off: RoundOff
+    saved: PyTree[Array]
+    surplus: IntScalar
+    room: int
+
+
+class _Chunk(NamedTuple):
+    """The result of a chunk of steps.
+
+    - `carry`, `log`: those after the chunk.
+    - `num_filled`: the number of rows that the run has filled.
+    - `saved`, `records`: buffers, with the rows of this chunk at their start.
+    - `end`: the end of the run, if this was its last chunk.
+    - `saved_end`: the output of the last state, if it is asked for.
+    - `checkpoint`: the checkpoint after the chunk; None for runs with events.
+    - `system`: the system for the interpolation of records, if there are any.
+    - `stats`: the statistics of the solution.
+    """
+
+    carry: AbstractCarry
+    log: PyTree[Array] | None
+    num_filled: IntScalar
+    saved: PyTree[Array]
+    records: StepRecord | None
+    end: RunEnd[None, Any]
+    saved_end: PyTree[Array]
+    checkpoint: Checkpoint | None
+    system: AbstractMechanicalSystem | None
+    stats: dict[str, Any]
+
+
+@tracked_jit("system", "args", "options")
+def _started(
+    system: AbstractMechanicalSystem,
+    method: AbstractMethod,
+    y0: State | Checkpoint,
+    grid: TimeGrid,
+    args: Args,
+    options: RunOptions,
+    stage_solver: AbstractStageSolver,
+    saves_start: BoolScalar,
+) -> _Start:
+    """Return the start of a run in chunks."""
+    # The start does not depend on the number of steps, apart from events.
+    grid = replace(grid, num_steps=jnp.zeros((), jnp.int32))
+    stepper, fn = _stepper(system, method, y0, grid, args, options, stage_solver)
+    noise = _noise(stepper, y0)
+    round_off, carry = as_cpu_kernel(_start, stepper, y0, noise)
+    saving = _saving_in_chunks(stepper, fn, grid.num_steps, grid.num_steps, 0, 1)
+    loop = Loop(stepper, saving, NoProgressMeter())
+    rows = loop.row_shapes(carry)
+    return _Start(
+        carry,
+        loop.empty_rows(carry).log,
+        round_off,
+        _saved_if(saves_start, loop, grid.t0, carry.step_state.state),
+        jnp.asarray(stepper.num_iterations, jnp.int32),
+        room_for((rows.saved, rows.record)),
+    )
+
+
+@tracked_jit("system", "args", "options")
+def _chunk(
+    system: AbstractMechanicalSystem,
+    method: AbstractMethod,
+    y0: State | Checkpoint,
+    grid: TimeGrid,
+    args: Args,
+    options: RunOptions,
+    stage_solver: AbstractStageSolver,
+    start: tuple[RoundOff, AbstractCarry, PyTree[Array] | None],
+    numbers: Int[Array, " 5"],
+    room: int,
+    keeps_records: bool,
+) -> _Chunk:
+    """Take the iterations of a `Span` of `numbers`, from the carry in `start`."""
+    round_off, carry, log = start
+    span = Span(*numbers)
+    grid = replace(grid, num_steps=span.num_steps)
+    stepper, fn = _stepper(system, method, y0, grid, args, options, stage_solver)
+    stepper = stepper.with_round_off(round_off)
+    num_records = room if keeps_records else 0
+    filled = stepper.num_filled(carry, span.start)
+    saving = _saving_in_chunks(stepper, fn, filled, span.num_steps, num_records, room)
+    saving = replace(saving, stride=span.stride)
+    loop = Loop(stepper, saving, NoProgressMeter())
+
+    def steps(loop: Loop, carry: AbstractCarry, log: Any, start: Any, end: Any):
+        # The matrices are constant where those of the first step are. They are
+        # evaluated here to find out where, and not computed.
+        plain, state = loop.stepper.plain, carry.step_state.state
+        u = plain.system.fibre_coordinate(state)
+        given = plain.system, plain.time(0), state.q, u, plain.args
+        lin = started_like(linearise(*given, may_be_sparse=True), carry.step_state.lin)
+        carry = eqx.tree_at(lambda x: x.step_state.lin, carry, lin)
+        buffers = loop.empty_rows(carry)._replace(log=log)
+        return jax.lax.fori_loop(start, end, partial(advance, loop), (carry, buffers))
+
+    given = loop, carry, log, span.start, span.end
+    carry, rows = as_cpu_kernel(steps, *given)
+    end = stepper.finish(carry, None, rows.log, None)
+    checkpoint = None
+    if options.events is None:
+        checkpoint = stepper.plain.checkpoint(round_off, carry, end.state)
+    return _Chunk(
+        carry=carry,
+        log=rows.log,
+        num_filled=stepper.num_filled(carry, span.end),
+        saved=rows.saved,
+        records=rows.record,
+        end=end,
+        saved_end=_saved_if(span.saves_end != 0, loop, end.t, end.state),
+        checkpoint=checkpoint,
+        system=stepper.plain.system if num_records else None,
+        stats=reported_statistics(carry.stats, method),
+    )
+
+
+def _saving_in_chunks(
+    stepper: AbstractStepper[Any, Any],
+    fn: ClosureConverted,
+    first_step: IntScalar,
+    num_steps: IntScalar,
+    num_records: int,
+    room: int,
+) -> Saving:
+    """Return the data that a chunk saves, with the stride 1."""
+    return Saving(
+        fn=fn,
+        num_steps=num_steps,
+        stride=jnp.ones((), jnp.int32),
+        num_saved=room,
+        num_records=num_records,
+        record_slots=None,
+        log_length=stepper.log_length,
+        first_step=first_step,
+    )
+
+
+def _saved_if(
+    is_asked: BoolScalar, loop: Loop, t: FloatScalar, y: State
+) -> PyTree[Array]:
+    """Compute the output of a state, or zeros if it is not asked for."""
+
+    def save():
+        return loop.saving.saved(t, y, loop.stepper.plain.args)
+
+    shapes = jax.eval_shape(save)
+    blank = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
+    return jax.lax.cond(is_asked, save, lambda: blank)
+
+
+@tracked_jit("system", "args", "options")
+def _samples(
+    system: AbstractMechanicalSystem,
+    method: AbstractMethod,
+    y0: State | Checkpoint,
+    grid: TimeGrid,
+    args: Args,
+    options: RunOptions,
+    stage_solver: AbstractStageSolver,
+    samples: tuple[Float[Array, " k"], Int[Array, " k"], StepRecord],
+) -> PyTree[Array]:
+    """Compute the output at times inside steps, whose indices and records are given."""
+    grid = replace(grid, num_steps=jnp.zeros((), jnp.int32))
+    stepper, fn = _stepper(system, method, y0, grid, args, options, stage_solver)
+    saving = _saving_in_chunks(stepper, fn, grid.num_steps, grid.num_steps, 0, 1)
+    loop = Loop(stepper, saving, NoProgressMeter())
+    return jax.vmap(partial(_sample, loop))(*samples)
+
+
+def run_in_chunks(
+    system: AbstractMechanicalSystem,
+    method: AbstractMethod,
+    y0: State | Checkpoint,
+    grid: TimeGrid,
+    args: Args,
+    options: RunOptions,
+    saveat: SaveAt,
+    solver_options: SolverOptions,
+) -> Solution:
+    """Integrate by chunks of steps, outside of transformations."""
+    num_steps = static_length(grid.num_steps)
+    steps = _sampled_steps(saveat, grid)
+    keeps_records = saveat.dense or steps is not None
+    # The chunks get the number of steps with their spans.
+    whole, grid = grid, replace(grid, num_steps=None)
+    given = system, method, y0, grid, args, options, solver_options.stage_solver
+    captured = captured_by(system, args, options)
+    saves_start = jax.device_put(np.array(saveat.t0))
+    start = _started(*given, saves_start, captured=captured)
+    if not all(isinstance(x.dtype, np.dtype) for x in jax.tree.leaves(start.saved)):
+        # NumPy has no arrays of random keys.
+        return run(system, method, y0, whole, args, options, saveat, solver_options)
+
+    def chunk(carry: AbstractCarry, log: Any, span: Array) -> _Chunk:
+        begun = start.round_off, carry, log
+        given_span = span, start.room, keeps_records
+        return _chunk(*given, begun, *given_span, captured=captured)
+
+    output = drive(
+        chunk,
+        start.carry,
+        start.log,
+        num_steps=num_steps,
+        num_iterations=num_steps + int(start.surplus),
+        stride=saveat.steps or NO_STRIDE,
+        room=start.room,
+        saves_end=saveat.saves_end,
+        recorded=None if saveat.dense or steps is None else np.unique(steps),
+        keeps_records=keeps_records,
+        meter=solver_options.meter,
+    )
+    last: _Chunk = output.last
+    pieces = [_one(on_host(start.saved))] if saveat.t0 else []
+    if output.saved is not None:
+        pieces.append(output.saved)
+    if saveat.ts is not None and steps is not None:
+        pieces += _sampled_in_chunks(given, saveat, np.asarray(steps), output)
+    if saveat.saves_end(output.num_steps):
+        pieces.append(_one(on_host(last.saved_end)))
+    ts, ys = on_device(joined(pieces), last.end.t) if pieces else (None, None)
+    interpolation, result = None, last.carry.result
+    if saveat.dense and last.system is not None:
+        interpolation = DenseInterpolation(
+            system=last.system,
+            method=method,
+            num_steps=output.num_steps,
+            t0=grid.t0,
+            dt=grid.dt,
+            records=on_device(output.records, last.end.t),
+            args=args,
+        )
+    if output.is_interrupted:
+        is_good = result == RESULTS.successful
+        result = RESULTS.where(is_good, RESULTS.interrupted, result)
+    return Solution(
+        t0=grid.t0,
+        t1=last.end.t,
+        ts=ts,
+        ys=ys,
+        stats=last.stats,
+        result=result,
+        interpolation=interpolation,
+        checkpoint=last.checkpoint if saveat.checkpoint else None,
+        coordinates=system.coordinates,
+        events=last.end.log,
+    )
+
+
+def _sampled_in_chunks(
+    given: tuple[Any, ...], saveat: SaveAt, steps: np.ndarray, output: Output
+) -> list[PyTree[np.ndarray]]:
+    """Compute the output at `SaveAt(ts=...)`, a fixed number of times at once.
+
+    `steps` are the indices of the steps in which the times lie.
+    """
+    reached = steps < output.num_steps
+    ts, steps = np.asarray(saveat.ts)[reached], steps[reached]
+    # The records are those of different steps, and all of them for dense output.
+    places = steps if saveat.dense else np.unique(steps, return_inverse=True)[1]
+    records = jax.tree.map(lambda x: x[places], output.records)
+    pieces = []
+    for first in range(0, len(ts), SAMPLES_AT_ONCE):
+        part = slice(first, first + SAMPLES_AT_ONCE)
+        count = len(ts[part])
+        samples = jax.tree.map(
+            lambda x, part=part: jax.device_put(padded(x[part], SAMPLES_AT_ONCE)),
+            (ts, steps, records),
+        )
+        values = _samples(*given, samples)
+        pieces.append(jax.tree.map(lambda x, n=count: np.asarray(x)[:n], values))
+    return pieces
+
+
+def _sampled_steps(saveat: SaveAt, grid: TimeGrid) -> Int[Array, " k"] | None:
+    """Find the steps in which the times of `SaveAt(ts=...)` lie; None without these."""
+    if saveat.ts is None:
+        return None
+    length = static_length(grid.num_steps)
+    return jax.vmap(lambda t: step_index(t, grid.t0, grid.dt, length))(saveat.ts)
+
+
+def _all_steps(
+    adjoint: AbstractAdjoint, loop: Loop, y0: State | Checkpoint, checkpoint: bool
+) -> tuple[RoundOff, State, AbstractCarry, Rows]:
+    """Take all steps.
+
+    Return the measured round-off, the first state, the last carry and the saved rows.
+    """
+
+    def steps(loop: Loop, started: tuple[RoundOff, AbstractCarry] | None, *given: Any):
+        round_off, first = _start(loop.stepper, *given) if started is None else started
+        loop = loop.with_round_off(round_off)
+        run = adjoint.run(loop, loop.moving(first))
+        return round_off, first.step_state.state, *run
+
+    noise = _noise(loop.stepper, y0)
+    if isinstance(y0, State) and not checkpoint:
+        return as_cpu_kernel(steps, loop, None, y0, noise)
+    # A compiler that knows the start of a loop, such as zeros in its matrices, rounds
+    # differently in the loop. The barrier hides the start, so that a resumed run takes
+    # its steps by the same instructions.
+    started = as_cpu_kernel(_start, loop.stepper, y0, noise)
+    given, rest = eqx.partition((loop, started), eqx.is_array)
+    loop, started = eqx.combine(jax.lax.optimization_barrier(given), rest)
+    return as_cpu_kernel(steps, loop, started)
+
+
+def _start(
+    stepper: AbstractStepper[Any, Any],
+    y0: State | Checkpoint,
+    noise: FunctionNoise | None,
+) -> tuple[RoundOff, AbstractCarry]:
+    """Return the round-off of steps and the carry before the first iteration."""
+    first = stepper.init(y0, noise)
+    return stepper.plain.round_off_at(y0, first.step_state, noise), first
+
+
+def _noise(
+    stepper: AbstractStepper[Any, Any], y0: State | Checkpoint
+) -> FunctionNoise | None:
+    """Measure the noise of the functions at a state; a checkpoint does not need it."""
+    if isinstance(y0, Checkpoint):
+        return None
+    # The noise has its own kernel: a loop over steps is compiled to faster code without
+    # another loop before it, and in a batch of runs from one state this kernel is not
+    # batched.
+    plain = stepper.plain
+    u = plain.system.fibre_coordinate(y0)
+    given = plain.system, plain.time(0), y0.q, u, y0.multiplier, plain.args
+    return as_cpu_kernel(function_noise, *given, is_brief=True)
+
+
+def _output(
+    saveat: SaveAt,
+    loop: Loop,
+    grid: TimeGrid,
+    start: State,
+    end: RunEnd[Any, Any],
+    sampled: Int[Array, " k"] | None,
+) -> tuple[PyTree[Array], PyTree[Array]]:
+    """Join the output of the start, the steps and the end: times and values."""
+    saving, args, ts = loop.saving, loop.stepper.plain.args, saveat.ts
+    saved, records = end.rows
+    pieces = []
+    if saveat.t0:
+        pieces.append(_one(saving.saved(grid.t0, start, args)))
+    if saveat.steps:
+        pieces.append(jax.tree.map(lambda x: x[:-1], saved))
+    if ts is not None and sampled is not None and saving.record_slots is not None:
+        row = saving.record_slots[sampled]
+        records = jax.tree.map(lambda x: x[row], records)
+        pieces.append(jax.vmap(partial(_sample, loop))(ts, sampled, records))
+    if saveat.saves_end(grid.num_steps):
+        pieces.append(_one(saving.saved(end.t, end.state, args)))
+    return stack_saved(pieces) if pieces else (None, None)
+
+
+def _interpolation(
+    stepper: PlainStepper, grid: TimeGrid, records: StepRecord
+) -> DenseInterpolation:
+    """Return the dense output, from the records of all steps."""
+    return DenseInterpolation(
+        system=stepper.system,
+        method=stepper.method,
+        num_steps=static_length(grid.num_steps),
+        t0=grid.t0,
+        dt=grid.dt,
+        records=jax.tree.map(lambda x: x[:-1], records),
+        args=stepper.args,
+    )
+
+
+def _one(saved: PyTree[Array]) -> PyTree[Array]:
+    """Return an entry of the output with a time axis of length one."""
+    return jax.tree.map(lambda x: x[None], saved)
+
+
+def _sample(
+    loop: Loop, t: FloatScalar, k: Int[Array, ""], record: StepRecord
+) -> PyTree[Array]:
+    """Compute the output at a time t inside step k."""
+    run = loop.stepper.plain
+    start, h = run.time(k), run.dt
+    theta = (t - start) / h
+    y = interpolate(run.system, run.method, record, start, h, theta, run.args)
+    return loop.saving.saved(t, y, run.args)
+
+
+def _check_saved(
+    fn: Callable[[Any, Any, Any], PyTree[Array]], t: FloatScalar, y: Any, args: Args
+) -> None:
+    """Raise a `TypeError` unless `SaveAt(fn=...)` returns a tree of arrays."""
+    with naming("SaveAt: fn(t, y, args)", fn, args):
+        leaves = jax.tree.leaves(eqx.filter_eval_shape(fn, t, y, args))
+    wrong = [
+        leaf
+        for leaf in leaves
+        if not (isinstance(leaf, jax.ShapeDtypeStruct) or eqx.is_array_like(leaf))
+    ]
+    if leaves and not wrong:
+        return
+    got = "None: is a `return` missing?"
+    if wrong:
+        got = f"{reprlib.repr(wrong[0])} of type {type(wrong[0]).__name__}."
+    raise TypeError(
+        f"SaveAt: `fn(t, y, args)` must return an array, or a tree of arrays, got {got}"
+    )

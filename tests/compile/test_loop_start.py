@@ -1,0 +1,68 @@
+"""A loop that continues another one, and the constants with which that one started."""
+
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from nhjax._compile import as_cpu_kernel, started_like
+from nhjax.lanes import llvm_ir
+
+
+# Two programs agree bit for bit only in kernels as users have them.
+pytestmark = pytest.mark.usefixtures("optimised_kernels")
+
+
+def first_carry(x):
+    """A vector, a matrix with zeros that stay, and a counter that starts as zero."""
+    matrix = jnp.zeros((3, 3)).at[0, 0].set(x[0]).at[1, 2].set(x[1])
+    return x, matrix, jnp.zeros(())
+
+
+def advance(_, carry):
+    x, matrix, count = carry
+    x = x + 0.1 * (matrix @ x) + 0.01 * count
+    changed = jnp.zeros((3, 3)).at[0, 0].set(jnp.sin(x[0])).at[1, 2].set(x[2])
+    return x, changed, count + 1
+
+
+def whole(x, length):
+    return jax.lax.fori_loop(0, length, advance, first_carry(x))
+
+
+def rest(x, carry, length, *, is_told=True):
+    if is_told:
+        carry = started_like(first_carry(x), carry)
+    return jax.lax.fori_loop(0, length, advance, carry)
+
+
+X = jnp.array([0.7, -1.1, 0.4])
+
+
+@pytest.mark.parametrize("engine", ["lanes", "kernels", "xla"])
+def test_loop_in_two_parts_equals_whole_loop(monkeypatch, engine):
+    monkeypatch.setenv("NHJAX_ENGINE", engine)
+    expected = jax.jit(lambda x: as_cpu_kernel(whole, x, 25))(X)
+    carry = jax.jit(lambda x: as_cpu_kernel(whole, x, 12))(X)
+    got = jax.jit(lambda x, carry: as_cpu_kernel(rest, x, carry, 13))(X, carry)
+    assert float(got[2]) == 25
+    compare = partial(np.testing.assert_allclose, rtol=1e-15)
+    if engine == "lanes":
+        compare = np.testing.assert_array_equal
+    jax.tree.map(compare, got, expected)
+
+
+def test_told_loop_is_as_short_as_the_whole_loop():
+    def size(function, *args):
+        program = jax.make_jaxpr(function)(*args)
+        return llvm_ir(program, (False,) * len(program.in_avals), 1).count(" fmul ")
+
+    carry = whole(X, 2)
+    one, told, not_told = (
+        size(lambda x: whole(x, 20), X),
+        size(lambda x, carry: rest(x, carry, 20), X, carry),
+        size(lambda x, carry: rest(x, carry, 20, is_told=False), X, carry),
+    )
+    assert told == one < not_told
