@@ -3,7 +3,8 @@
 Near rest the numbers of a state are small, and the constants inside of the functions of
 a system, a wheel's radius or a weight, leave round-off of their own size. Each system
 starts from its reference with v scaled by 1e-8 to 1, and takes steps of four sizes over
-three decades with both solvers, compiled.
+three decades with both solvers, compiled. All refused steps are judged, and a sample of
+the accepted steps.
 
 A step is judged at the stages that the solver ended with, whether it accepts them or
 not. The stage equations are evaluated there in 50 digits. Newton's correction with
@@ -120,12 +121,10 @@ def equations(method, arguments: StepArguments, x: StageUnknowns) -> Float[Array
 
 
 @eqx.filter_jit
-def inverse_jacobian(method, arguments, x: StageUnknowns) -> Float[Array, "k k"]:
-    """Invert the Jacobian of all stage equations."""
+def jacobian_of_equations(method, arguments, x: StageUnknowns) -> Float[Array, "k k"]:
+    """Differentiate all stage equations."""
     z, unravel = ravel_pytree(x)
-    return jnp.linalg.inv(
-        jax.jacfwd(lambda z: equations(method, arguments, unravel(z)))(z)
-    )
+    return jax.jacfwd(lambda z: equations(method, arguments, unravel(z)))(z)
 
 
 @eqx.filter_jit
@@ -151,7 +150,11 @@ def distance(method, arguments: StepArguments, x: StageUnknowns) -> Distance:
         dynamic,
         x,
     )
-    inverse = np.asarray(inverse_jacobian(method, arguments, x))
+    jacobian = np.asarray(jacobian_of_equations(method, arguments, x))
+    try:
+        inverse = np.linalg.inv(jacobian)
+    except np.linalg.LinAlgError:
+        return Distance(np.inf, 0.0, False)
 
     def size(r):
         dz = jnp.asarray(inverse @ to_float(r))
@@ -159,7 +162,7 @@ def distance(method, arguments: StepArguments, x: StageUnknowns) -> Distance:
 
     eps = float(np.finfo(z.dtype).eps)
     missed = [np.asarray(equations(method, arguments, x)) - exact]
-    rng, jacobian = np.random.default_rng(0), np.linalg.inv(inverse)
+    rng = np.random.default_rng(0)
     for _ in range(4):
         there = z * (1 + eps * rng.integers(-4, 5, z.size))
         # The change of the equations by the move itself is no noise.
@@ -190,7 +193,8 @@ def near_rest(
 ) -> Iterator[dict[str, Any]]:
     """Measure one system with one number of stages, a row for each solver and scale.
 
-    At most so many steps of each kind are judged in 50 digits for a row.
+    All refused steps, and at most so many accepted steps of a row, are judged in 50
+    digits.
     """
     example = make()
     system, y0 = example.system, example.initial_state()
@@ -199,6 +203,10 @@ def near_rest(
         int(getattr(nhjax.RESULTS, name)._value)
         for name in ("nonlinear_max_iterations", "nonlinear_divergence")
     }
+    # The functions and the shapes are those of all steps. Finding them evaluates the
+    # system without compilation, which takes far longer than judging a step.
+    first = first_arguments(system, method, y0, jnp.asarray(SIZES[0]))
+    static = eqx.filter(first, _is_no_array)
     for solver_name, solver in SOLVERS.items():
         for scale in SCALES:
             y = nhjax.initial_state(system, y0.q, scale * y0.v, project=True)
@@ -209,7 +217,6 @@ def near_rest(
             for size in SIZES:
                 h = jnp.asarray(size)
                 tried = steps(system, method, solver, y, h)
-                static = eqx.filter(first_arguments(system, method, y, h), _is_no_array)
                 for k, code in enumerate(np.asarray(tried.code)):
                     if code < 0:
                         continue
@@ -232,10 +239,11 @@ def _is_no_array(x: Any) -> bool:
 
 
 def _judged(method, kept: dict[str, list], most: int) -> dict[str, Any]:
-    """Judge a sample of the steps: all of few, else some that are spread evenly."""
+    """Judge all refused steps, and some accepted ones that are spread evenly."""
     found: dict[str, Any] = {}
     for kind, them in kept.items():
-        places = np.unique(np.linspace(0, len(them) - 1, most).round().astype(int))
+        number = most if kind == "accepted" else len(them)
+        places = np.unique(np.linspace(0, len(them) - 1, number).round().astype(int))
         sample = [them[k] for k in places] if them else []
         ratios = []
         for arguments, x in sample:
@@ -269,15 +277,17 @@ COLUMNS = {
 }
 
 
+def _cell(value: float | int | str | None) -> str:
+    """Write a value of a row, or a dash where no refused step has a distance."""
+    if value is None or value == np.inf:
+        return "-"
+    return number(value) if isinstance(value, float) else str(value)
+
+
 def save(rows: list[dict[str, Any]]) -> None:
     """Print and save the table of all rows."""
     cells = [
-        [row["system"]]
-        + [
-            number(row[key]) if isinstance(row[key], float) else str(row[key])
-            for key in COLUMNS.values()
-        ]
-        for row in rows
+        [row["system"]] + [_cell(row[key]) for key in COLUMNS.values()] for row in rows
     ]
     total = {
         key: sum(row[key] for row in rows)
@@ -307,7 +317,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--systems", nargs="+", help="names of systems")
     parser.add_argument("--stages", type=int, nargs="+", default=[2, 3, 4, 5, 6])
-    parser.add_argument("--judged", type=int, default=1, help="steps of each kind")
+    parser.add_argument("--judged", type=int, default=1, help="accepted steps")
     add_keep(parser)
     options = parser.parse_args()
     jax.config.update("jax_enable_x64", True)

@@ -30,6 +30,8 @@ _GROWTH, _GROWTH_IF_SLOW = 30.0, 2.0
 _HOPELESS = 1e6
 # An upper bound on the magnification of round-off by the problem.
 _LARGEST_NOISE = 1e5
+# After more than this many iterations, an iteration counts as slow.
+_SLOW = 100
 
 
 class UpdateNorms(NamedTuple):
@@ -121,7 +123,9 @@ def iterate(
     section VIII.6). Each time that an increment fails to fall, the level of increments
     that are treated as noise is raised, up to `noise_units` of round-off. By default
     the highest level is the square root of the unit round-off, which suits iterations
-    that converge so fast that only noise can slow them down.
+    that converge so fast that only noise can slow them down. After many iterations all
+    levels fall again, in proportion to the number of iterations, because the error of a
+    slow iteration is much larger than its increment.
     """
     # `jit` makes JAX trace the iteration once, for the shapes and for the loop: that is
     # most of the work of tracing a step.
@@ -171,19 +175,25 @@ def _progress(rules: _Rules, before: _Progress, sizes: UpdateNorms) -> _Progress
     if sizes.noise is not None:
         noise = jnp.minimum(sizes.noise, _LARGEST_NOISE * measure)
         magnified = jnp.maximum(measure, noise)
+    count = before.iterations + 1
+    left = increment
+    if rules.max_iterations > _SLOW:
+        # An iteration that reaches round-off after n iterations contracts by about
+        # eps^(1/n). The error that it leaves is larger than an increment, by a factor
+        # that grows with n.
+        left = increment * jnp.maximum(1, count.astype(increment.dtype) / _SLOW)
     # Only increments that can be noise raise its level: the increments of an iteration
     # that spirals towards the solution rise and fall as well.
-    may_be_noise = increment <= rules.noisiest * magnified
+    may_be_noise = left <= rules.noisiest * magnified
     stalls = may_be_noise & (increment >= before.smallest)
     more = jnp.minimum(rules.growth * before.believed, rules.noisiest)
     believed = jnp.where(stalls, more, before.believed)
-    stagnant = stalls & (increment <= believed * magnified)
+    stagnant = stalls & (left <= believed * magnified)
     # A tolerance is relative to x itself, and does not depend on the round-off of x.
     least = jnp.maximum(rules.least, rules.tolerance_or_eps * sizes.iterate)
     least = jnp.where(has_size, least, rules.tolerance_or_eps * before.first)
     small = increment <= least
     converged = small | stagnant
-    count = before.iterations + 1
     # This is False if the increment is not finite.
     bounded = increment < _HOPELESS * (measure + first)
     exhausted = bounded & ~converged & (count >= rules.max_iterations)

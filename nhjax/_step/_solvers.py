@@ -49,6 +49,8 @@ from ._step import AbstractStageSolver, FrozenNewtonMap
 # If the residual is larger than this, relative to the momenta, the iterate is not a
 # solution.
 _GROSS = 1e-6
+# After this many iterations of simplified Newton, the fallback is faster.
+_MOST_BEFORE_NEWTON = 100
 
 
 def tolerance_array(tolerance: FloatScalarLike) -> FloatScalarLike:
@@ -89,6 +91,7 @@ class SimplifiedNewton(AbstractStageSolver):
     **Arguments:**
 
     - `max_iterations`: the number of iterations after which a step counts as failed.
+        With the fallback, Newton's method takes over after at most 100 iterations.
     - `tolerance`: the size of the increment, relative to the velocities, at which to
         stop. The default, 0, iterates to round-off. Changing the tolerance does not
         recompile.
@@ -113,7 +116,7 @@ class SimplifiedNewton(AbstractStageSolver):
         20
     """
 
-    max_iterations: int = eqx.field(static=True, default=100)
+    max_iterations: int = eqx.field(static=True, default=2000)
     tolerance: FloatScalarLike = eqx.field(converter=tolerance_array, default=0.0)
     fallback: bool | None = eqx.field(static=True, default=None)
     jacobian: JacobianName = eqx.field(static=True, default=None)
@@ -135,7 +138,10 @@ class SimplifiedNewton(AbstractStageSolver):
             x_next, evaluation = simplified_newton_update(stages, factors, x)
             return x_next, update_norms(stages, x, x_next, lin), evaluation
 
-        solved = _iterated(self, iteration, x0, scale, skip)
+        limit = self.max_iterations
+        if self.fallback:
+            limit = min(limit, _MOST_BEFORE_NEWTON)
+        solved = _iterated(self, iteration, x0, scale, skip, limit)
         if not self.fallback:
             return solved
         # If the first iterate is not finite, the functions of the system are not finite
@@ -201,7 +207,7 @@ class Newton(AbstractStageSolver):
         20
     """
 
-    max_iterations: int = eqx.field(static=True, default=30)
+    max_iterations: int = eqx.field(static=True, default=300)
     tolerance: FloatScalarLike = eqx.field(converter=tolerance_array, default=0.0)
 
     def solve(
@@ -243,7 +249,7 @@ class Newton(AbstractStageSolver):
             )
             return x_next, found, evaluation
 
-        solved = _iterated(self, iteration, x0, scale, skip)
+        solved = _iterated(self, iteration, x0, scale, skip, self.max_iterations)
         # Where forces grow without bound, increments are small even far from a
         # solution. Therefore the residual is checked too.
         gross = lin.momentum_inverse.matvec(solved.aux.forces.residual)
@@ -290,13 +296,14 @@ def _iterated(
     x0: StageUnknowns,
     scale: Scale,
     skip: Array,
+    max_iterations: int,
 ) -> Solved[StageUnknowns, Evaluation]:
     """Repeat the `iteration` of a solver until it ends."""
     return iterate(
         iteration,
         x0,
         scale.size,
-        max_iterations=stage_solver.max_iterations,
+        max_iterations=max_iterations,
         tolerance=stage_solver.tolerance,
         round_off=scale.round_off,
         noise_units=NOISE_UNITS,

@@ -7,22 +7,25 @@ import pytest
 from nhjax._numerics import iterate, UpdateNorms
 
 
-def circling(rate, angle, units):
-    """An iteration whose error turns by `angle` as it contracts, seen from aside."""
+def circling(rate, angle, units, max_iterations=200, components=1):
+    """An iteration whose error turns by `angle` as it contracts.
+
+    If only one component is measured, its increments rise and fall.
+    """
     turn = rate * np.array(
         [[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]
     )
 
     def sweep(x):
         after = jnp.asarray(turn) @ x
-        # Only one component is measured, which rises and falls.
-        return after, UpdateNorms(jnp.abs(after[0] - x[0])), None
+        change = jnp.max(jnp.abs(after - x)[:components])
+        return after, UpdateNorms(change), None
 
     return iterate(
         sweep,
         jnp.asarray([1.0, 0.3]),
         jnp.asarray(1.0),
-        max_iterations=200,
+        max_iterations=max_iterations,
         noise_units=units,
     )
 
@@ -34,6 +37,16 @@ def test_iteration_that_spirals_converges(rate, angle):
     assert solved.converged
     # What is left of the error is of the size of what is believed to be noise.
     assert float(jnp.max(jnp.abs(solved.x))) < 100 * np.finfo(float).eps / (1 - rate)
+
+
+@pytest.mark.parametrize("angle", [0.0, 0.3, 0.8, 1.3, 2.0, 2.6])
+@pytest.mark.parametrize("rate", [0.8, 0.9, 0.95, 0.965])
+def test_slow_iteration_that_spirals_leaves_no_more_error_than_noise(rate, angle):
+    solved = circling(rate, angle, 400, max_iterations=1000, components=2)
+    assert solved.converged
+    assert int(solved.num_iterations) > 100
+    # The error is 1 / (1 - rate) times as large as an increment.
+    assert float(jnp.max(jnp.abs(solved.x))) < 400 * np.finfo(float).eps
 
 
 def test_iteration_with_increments_of_noise_ends():
