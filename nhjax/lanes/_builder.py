@@ -480,5 +480,32 @@ class Builder:
         return out.reshape(shape)
 
 
+# The primitives that run an inner program as it is.
+CALLS = frozenset(
+    """
+    checkpoint closed_call core_call custom_jvp_call custom_vjp_call
+    custom_vjp_call_jaxpr jit cpu_kernel pjit remat remat2
+    """.split()  # noqa: SIM905
+)
+# The primitive that has a method of Python which returns its program.
+EXPANDED = "call_hi_primitive"
+_PROGRAM_KEYS = ("jaxpr", "call_jaxpr", "program", "fun_jaxpr")
+
+
+def called_program(equation: Any) -> Any:
+    """Return the inner program of an equation, or `None` if it has none."""
+    params = equation.params
+    return next((params[key] for key in _PROGRAM_KEYS if key in params), None)
+
+
+def sizes_of_scan(params: dict[str, Any]) -> tuple[int, int]:
+    """Return the number of constants of a scan, and the number of carried arrays."""
+    if "num_carry" in params:
+        return params["num_consts"], params["num_carry"]
+    # Since JAX 0.12 a scan has the tree structures of its operands instead.
+    consts, carry, _ = params["ft_in"].unpack()
+    return len(consts), len(carry)
+
+
 def _is_uniform(value: Registers) -> bool:
     return value.size == 1 or (value.size > 0 and not any(value.strides))

@@ -22,6 +22,9 @@ from jax.extend.core import Literal
 from ._builder import (
     ArrayValue,
     Builder,
+    called_program,
+    CALLS,
+    EXPANDED,
     flat_indices,
     hold,
     InMemory,
@@ -29,6 +32,7 @@ from ._builder import (
     Operation,
     Registers,
     release,
+    sizes_of_scan,
 )
 from ._graph import BranchBuilder, dtype_name, LoopBuilder, Node
 
@@ -36,9 +40,7 @@ from ._graph import BranchBuilder, dtype_name, LoopBuilder, Node
 def _call(
     builder: Builder, equation: Any, values: list[ArrayValue]
 ) -> list[ArrayValue]:
-    params = equation.params
-    keys = ("jaxpr", "call_jaxpr", "program", "fun_jaxpr")
-    inner = next(params[key] for key in keys if key in params)
+    inner = called_program(equation)
     jaxpr = getattr(inner, "jaxpr", inner)
     return builder.run(jaxpr, getattr(inner, "consts", ()), values)
 
@@ -184,13 +186,9 @@ def _loop_start(
     return carry
 
 
-_CALLS = """
-    checkpoint closed_call core_call custom_jvp_call custom_vjp_call
-    custom_vjp_call_jaxpr jit cpu_kernel pjit remat remat2
-""".split()  # noqa: SIM905
 BRANCHES: dict[str, Operation] = {
-    **dict.fromkeys(_CALLS, _call),
-    "call_hi_primitive": _expanded,
+    **dict.fromkeys(CALLS, _call),
+    EXPANDED: _expanded,
     "cond": _cond,
     "custom_linear_solve": _linear_solve,
     "loop_start": _loop_start,
@@ -246,7 +244,7 @@ def _scan(
     builder: Builder, equation: Any, values: list[ArrayValue]
 ) -> list[ArrayValue]:
     params, length = equation.params, equation.params["length"]
-    first, count = _sizes(params)
+    first, count = sizes_of_scan(params)
     consts, carry = values[:first], values[first : first + count]
     rows = values[first + count :]
     with builder.held([*consts, *rows]):
@@ -256,15 +254,6 @@ def _scan(
         if is_short:
             return _unrolled(builder, equation, consts, carry, rows)
         return _scanned(builder, equation, consts, carry, rows)
-
-
-def _sizes(params: dict[str, Any]) -> tuple[int, int]:
-    """Return the number of constants of a scan, and the number of carried arrays."""
-    if "num_carry" in params:
-        return params["num_consts"], params["num_carry"]
-    # Since JAX 0.12 a scan has the tree structures of its operands instead.
-    consts, carry, _ = params["ft_in"].unpack()
-    return len(consts), len(carry)
 
 
 def _has_loop(jaxpr: Any, builder: Builder) -> bool:
@@ -595,7 +584,6 @@ def inner_programs(equation: Any) -> Iterator[tuple[Any, int]]:
         for branch in params["branches"]:
             yield branch.jaxpr, 1
     else:
-        for key in ("jaxpr", "call_jaxpr", "program", "fun_jaxpr"):
-            if key in params:
-                yield getattr(params[key], "jaxpr", params[key]), 0
-                return
+        inner = called_program(equation)
+        if inner is not None:
+            yield getattr(inner, "jaxpr", inner), 0

@@ -27,11 +27,13 @@ def _each(
     return builder.map_numbers(aval.shape, dtype, bound, *values)
 
 
-def _plain(op: str) -> Callable[..., Node]:
-    def function(builder: Builder, equation: Any, *numbers: Node) -> Node:
-        return builder.graph.op(op, *numbers)
-
-    return function
+def _each_op(
+    op: str, builder: Builder, equation: Any, values: list[ArrayValue]
+) -> ArrayValue:
+    """Apply an operation of the graph, without a function of the equation between."""
+    aval = equation.outvars[0].aval
+    function = partial(builder.graph.op, op)
+    return builder.map_numbers(aval.shape, dtype_name(aval.dtype), function, *values)
 
 
 def _elementary(name: str) -> Callable[..., Node]:
@@ -181,7 +183,6 @@ _NAMES = {
     },
 }
 _FUNCTIONS: dict[str, Callable[..., Node]] = {
-    **{name: _plain(op) for name, op in _NAMES.items()},
     **{
         name: _elementary(name)
         for name in """
@@ -201,6 +202,7 @@ _FUNCTIONS: dict[str, Callable[..., Node]] = {
     **{f"{op}_to": _in_total_order(op) for op in ("eq", "lt", "le")},
 }
 ELEMENTWISE: dict[str, Operation] = {
+    **{name: partial(_each_op, op) for name, op in _NAMES.items()},
     **{name: partial(_each, function) for name, function in _FUNCTIONS.items()},
     **dict.fromkeys(
         ("copy", "copy_p", "stop_gradient", "optimization_barrier", "pvary"), _same

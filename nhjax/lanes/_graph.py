@@ -10,7 +10,7 @@ node lies in the deepest region of its arguments, so that invariant code is hois
 of loops. It never leaves the side of a branch in which it was created, because that
 side may not be taken.
 
-`simplify` folds constants and removes operations, but never changes a result: rounding,
+`Graph.op` folds constants and removes operations, but never changes a result: rounding,
 infinities, NaN and -0.0 are unchanged. Only a structural zero makes a product zero for
 every value of the other factor.
 
@@ -158,8 +158,12 @@ class Graph:
         """Return the number for the next node."""
         self.count += 1
         if self.count > self.most_nodes:
-            raise Unsupported(f"more than {self.most_nodes} operations on numbers")
+            self.refuse()
         return self.count
+
+    def refuse(self) -> None:
+        """Raise the error for too many nodes."""
+        raise Unsupported(f"more than {self.most_nodes} operations on numbers")
 
     def constant(self, value: Any, dtype: str, is_structural: bool = False) -> Node:
         """Return the node of a constant.
@@ -192,23 +196,31 @@ class Graph:
 
         The node is not hoisted out of the region `within`.
         """
-        key = (op, dtype, attr, *[arg.number for arg in args])
-        floor: Region | None = self.region.floor
+        # This is the inner loop of the compiler: nodes are compared by identity, and
+        # `next_number` and `home` are written out.
+        key = (op, dtype, attr, *args)
+        region = self.region.floor
+        floor: Region | None = region
         while floor is not None:
             node = floor.table.get(key)
             if node is not None:
                 return node
             floor = floor.parent.floor if floor.parent is not None else None
-        home = self.home(args, within)
-        node = Node(op, args, dtype, home, self.next_number(), attr)
-        self.region.floor.table[key] = node
-        return node
-
-    def home(self, args: Iterable[Node], within: Region | None = None) -> Region:
-        """Return the region in which a pure node with these arguments lies."""
-        home = self.region.floor
+        home = region
         if within is not None and within.depth > home.depth:
             home = within
+        for arg in args:
+            if arg.region.depth > home.depth:
+                home = arg.region
+        self.count = number = self.count + 1
+        if number > self.most_nodes:
+            self.refuse()
+        region.table[key] = node = Node(op, args, dtype, home, number, attr)
+        return node
+
+    def home(self, args: Iterable[Node]) -> Region:
+        """Return the region in which a pure node with these arguments lies."""
+        home = self.region.floor
         for arg in args:
             if arg.region.depth > home.depth:
                 home = arg.region
@@ -225,13 +237,21 @@ class Graph:
 
         The result has the dtype of the last argument unless `dtype` is given.
         """
-        simpler = simplify(self, op, args)
-        if simpler is not None:
-            return simpler
-        if op in _COMMUTATIVE and args[0].number > args[1].number:
-            args = (args[1], args[0])
+        first, last = args[0], args[-1]
+        rule = _RULES.get(op)
+        if rule is not None:
+            simpler = rule(self, *args) if op == "select" else rule(self, first, last)
+            if simpler is not None:
+                return simpler
+        if first.op in _KNOWN:
+            simpler = _folded(self, op, args)
+            if simpler is not None:
+                return simpler
+        if op in _COMMUTATIVE and first.number > last.number:
+            args = (last, first)
+            last = first
         if dtype is None:
-            dtype = "bool" if op in COMPARISONS else args[-1].dtype
+            dtype = "bool" if op in COMPARISONS else last.dtype
         return self.pure(op, args, dtype)
 
     def select(self, predicate: Node, yes: Node, no: Node) -> Node:
@@ -355,24 +375,22 @@ _FOLDS: dict[str, Callable[..., Any]] = {
     "is_finite": np.isfinite,
 }
 
-_Rule = Callable[[Graph, Any, Any], Node | None]
+_Rule = Callable[..., Node | None]
 
 
-def simplify(graph: Graph, op: str, args: Sequence[Node]) -> Node | None:
-    """Return a simpler node for an operation, or `None`."""
-    if op == "select":
-        return _select(graph, *args)
-    rule = _RULES.get(op)
-    if rule is not None:
-        first = args[0]
-        simpler = rule(graph, first, args[1] if len(args) > 1 else first)
-        if simpler is not None:
-            return simpler
+# The kinds of nodes whose value is known, and the kinds that the rules below look for
+# in the arguments of arithmetic. Most nodes are of other kinds.
+_KNOWN = frozenset(("const", "zero"))
+_SPECIAL = frozenset((*_KNOWN, "neg"))
+
+
+def _folded(graph: Graph, op: str, args: Sequence[Node]) -> Node | None:
+    """Return the constant that an operation on constants gives, or `None`."""
     fold = _FOLDS.get(op)
     if fold is None:
         return None
     for arg in args:
-        if arg.op != "const" and arg.op != "zero":
+        if arg.op not in _KNOWN:
             return None
     with np.errstate(all="ignore"):
         value = fold(*[arg.attr for arg in args])
@@ -393,6 +411,8 @@ def _is_no_summand(node: Node) -> bool:
 
 
 def _add(graph: Graph, a: Node, b: Node) -> Node | None:
+    if a.op not in _SPECIAL and b.op not in _SPECIAL:
+        return None
     if _is_no_summand(a):
         return b
     if _is_no_summand(b):
@@ -417,6 +437,8 @@ def _sub(graph: Graph, a: Node, b: Node) -> Node | None:
 
 
 def _mul(graph: Graph, a: Node, b: Node) -> Node | None:
+    if a.op not in _SPECIAL and b.op not in _SPECIAL:
+        return None
     for x, y in ((a, b), (b, a)):
         if x.op == "zero" or (_is(x, 0) and not is_float(x.dtype)):
             return x
@@ -544,6 +566,7 @@ _RULES: dict[str, _Rule] = {
     "and": _and,
     "or": _or,
     "not": _not,
+    "select": _select,
     **{op: _compare(op) for op in ("eq", "ne", "lt", "le", "gt", "ge")},
 }
 

@@ -10,6 +10,10 @@ compiled once in a process. XLA keeps names as long as the process runs, and an
 executable may call them at any time. Code is therefore never freed: a program takes 20
 to 150 KB, and `compiled_code` returns the total.
 
+Before the graph is built, the key of the jaxpr is looked up (`_cache`): in this
+process, and then in the cache on disk if JAX's options switch it on. The entry has the
+name and the native code, so that a known program needs neither the graph nor LLVM.
+
 Executables in JAX's persistent cache call programs by these names too. JAX lowers a
 program before it looks for its executable, and lowering registers the name. If an
 executable is loaded in another way, in a process that has not registered the name, XLA
@@ -22,6 +26,7 @@ import hashlib
 import math
 import os
 import threading
+import time
 from typing import Any, NamedTuple
 
 import jax
@@ -36,6 +41,7 @@ from ._builder import (
     MOST_IN_REGISTERS,
     Operation,
 )
+from ._cache import directory, Entry, program_key, read, write
 from ._control_flow import BRANCHES, SCANS
 from ._elementary_functions import definitions
 from ._elementwise import ELEMENTWISE
@@ -52,16 +58,7 @@ def compile_single(program: Any, is_brief: bool = False) -> str:
 
     **Raises:** `Unsupported` if the program cannot be compiled.
     """
-    shared = (False,) * len(program.in_avals)
-    kernel = llvm_ir(program, shared, 1)
-    return register_kernel(
-        kernel,
-        len(program.in_avals),
-        len(program.out_avals),
-        1,
-        is_batched=False,
-        is_brief=is_brief,
-    )
+    return _compile(program, None, 1, is_brief)
 
 
 def compile_batched(
@@ -81,15 +78,38 @@ def compile_batched(
     **Raises:** `Unsupported` if the program cannot be compiled.
     """
     width = host_width("float64" if _is_double(program) else "float32")
-    kernel = llvm_ir(program, is_batched, width)
-    return register_kernel(
-        kernel,
-        len(program.in_avals),
-        len(program.out_avals),
-        width,
-        is_batched=True,
-        is_brief=is_brief,
-    )
+    return _compile(program, is_batched, width, is_brief)
+
+
+def _compile(
+    program: Any, is_batched: tuple[bool, ...] | None, width: int, is_brief: bool
+) -> str:
+    """Return the name of a program, which is found or compiled.
+
+    `is_batched` is `None` for a single run.
+    """
+    quick = is_brief or is_quick()
+    key = program_key(program, is_batched, width, quick)
+    folder = directory()
+    with _lock:
+        if key is not None and key in _names:
+            return _names[key]
+        if key is not None and folder is not None:
+            found = read(folder, key)
+            if found is not None:
+                _register(*found)
+                _names[key] = found.name
+                return found.name
+    start = time.perf_counter()
+    marks = (False,) * len(program.in_avals) if is_batched is None else is_batched
+    kernel = llvm_ir(program, marks, width)
+    sizes = len(program.in_avals), len(program.out_avals), width
+    made = _registered(kernel, *sizes, is_batched is not None, quick)
+    if key is not None:
+        _names[key] = made.name
+        if folder is not None and made.code:
+            write(folder, key, made, time.perf_counter() - start)
+    return made.name
 
 
 def _is_double(program: Any) -> bool:
@@ -196,6 +216,10 @@ def _count_operations(jaxpr: Any) -> int:
 # The size in bytes of the code of each program, by its name.
 _programs: dict[str, int] = {}
 
+# The names of programs by the keys of their jaxprs. Different jaxprs may have the same
+# name.
+_names: dict[str, str] = {}
+
 # The number of threads that are working in kernels, which all programs count together.
 _workers = ctypes.c_int64(0)
 
@@ -255,19 +279,43 @@ def register_kernel(
 
     **Returns:** a name for `jax.ffi.ffi_call` and `jax.ffi.ffi_lowering`.
     """
-    handler = handler_ir(num_operands, num_results, width, is_batched)
     quick = is_brief or is_quick()
+    sizes = num_operands, num_results, width
+    return _registered(kernel_ir, *sizes, is_batched, quick).name
+
+
+def _registered(
+    kernel_ir: str,
+    num_operands: int,
+    num_results: int,
+    width: int,
+    is_batched: bool,
+    quick: bool,
+) -> Entry:
+    """Compile and register a kernel; the result has no code if this has been done."""
+    handler = handler_ir(num_operands, num_results, width, is_batched)
     name = _name(kernel_ir, handler, "quick" if quick else "optimised")
     with _lock:
-        if name not in _programs:
-            code = object_code([kernel_ir, handler], HANDLER, host(), quick)
-            imports = {SHARED_HANDLER: _shared_handler()}
-            address = ctypes.c_void_p(load(code, name, HANDLER, imports))
-            jax.ffi.register_ffi_target(
-                name, jax.ffi.pycapsule(address), platform="cpu", api_version=1
-            )
-            _programs[name] = len(code)
-    return name
+        if name in _programs:
+            return Entry(name, b"")
+        code = object_code([kernel_ir, handler], HANDLER, host(), quick)
+        _register(name, code)
+    return Entry(name, code)
+
+
+def _register(name: str, code: bytes) -> None:
+    """Load the code of a program and register it with XLA, unless this has been done.
+
+    The caller holds the lock.
+    """
+    if name in _programs:
+        return
+    imports = {SHARED_HANDLER: _shared_handler()}
+    address = ctypes.c_void_p(load(code, name, HANDLER, imports))
+    jax.ffi.register_ffi_target(
+        name, jax.ffi.pycapsule(address), platform="cpu", api_version=1
+    )
+    _programs[name] = len(code)
 
 
 @functools.cache

@@ -44,6 +44,58 @@ def cached(directory: str) -> None:
     print("hits:", len(hits))
 
 
+def kept(directory: str, is_enabled: str, feature: str = "") -> None:
+    """Compile a program for members and for a single run, with the cache on disk.
+
+    The machine of the keys has a feature of the processor more than this one, if given.
+    Tell how often LLVM was asked for the code of a program, and the results in
+    hexadecimal.
+    """
+    from nhjax.lanes import _cache, _program
+
+    jax.config.update("jax_compilation_cache_dir", directory)
+    jax.config.update("jax_enable_compilation_cache", is_enabled == "on")
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
+    jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
+    target = _cache.host()
+    _cache.host = lambda: target._replace(features=target.features + feature)
+    exported, compile_it = [], _program.object_code
+
+    def object_code(texts, symbol, *rest, **options):
+        exported.append(symbol)
+        return compile_it(texts, symbol, *rest, **options)
+
+    _program.object_code = object_code
+    table = np.array([0.3, -1.7, 2.9])
+
+    def relaxed(x, a):
+        """Iterate x <- sin(a x + table), until the change is small."""
+
+        def go_on(carry):
+            return (jnp.abs(carry[1]) > 1e-9).any() & (carry[2] < 200)
+
+        def step(carry):
+            after = jnp.sin(a * carry[0] + table)
+            return after, after - carry[0], carry[2] + 1
+
+        carry = x, jnp.ones(3), 0
+        x, _, count = jax.lax.while_loop(go_on, step, carry)
+        return x, count
+
+    x, a = jnp.linspace(-1.0, 1.0, 21).reshape(7, 3), jnp.asarray(0.6)
+    program = jax.make_jaxpr(relaxed)(x[0], a)
+    kinds = jax.ShapeDtypeStruct((3,), x.dtype), jax.ShapeDtypeStruct((), jnp.int64)
+    many = [jax.ShapeDtypeStruct((7, *kind.shape), kind.dtype) for kind in kinds]
+    found = [
+        *jax.ffi.ffi_call(lanes.compile_single(program), kinds)(x[0], a),
+        *jax.ffi.ffi_call(lanes.compile_batched(program, (True, False)), many)(x, a),
+    ]
+    np.testing.assert_allclose(found[0], found[2][0], rtol=1e-14)
+    programs = exported.count(_program.HANDLER)
+    texts = [np.asarray(part).tobytes().hex() for part in found]
+    print("compiled:", programs, "results:", "".join(texts))
+
+
 def saved(path: str) -> None:
     """Save an executable."""
     from jax.experimental import serialize_executable
@@ -166,5 +218,14 @@ def without_llvmlite() -> None:
 
 
 if __name__ == "__main__":
-    commands = (cached, saved, loaded, forked, threads, many_callers, without_llvmlite)
+    commands = (
+        cached,
+        kept,
+        saved,
+        loaded,
+        forked,
+        threads,
+        many_callers,
+        without_llvmlite,
+    )
     {command.__name__: command for command in commands}[sys.argv[1]](*sys.argv[2:])
