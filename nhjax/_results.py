@@ -17,7 +17,9 @@ JUMPS = (
 )
 # Advice only for stage solvers that do not switch to Newton's method themselves.
 FALLBACK = (
-    ", or `stage_solver=nhjax.SimplifiedNewton(fallback=True)`, by which Newton's "
+    ', or `stage_solver=nhjax.SimplifiedNewton(jacobian="full")` where feedback, '
+    "springs or reactions are stiff, or "
+    "`stage_solver=nhjax.SimplifiedNewton(fallback=True)`, by which Newton's "
     "method takes over steps that are not solved"
 )
 EVENT_OCCURRED = "An event ended the run, as requested; this is not a failure."

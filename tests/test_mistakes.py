@@ -843,9 +843,9 @@ METHODS = [
     ),
     row(
         "misspelled the terms of a Jacobian",
-        lambda: NHJAX.SimplifiedNewton(jacobian="full"),
+        lambda: NHJAX.SimplifiedNewton(jacobian="exact"),
         ValueError,
-        "jacobian must be one of 'leading', 'first_order', got 'full'",
+        "jacobian must be one of 'leading', 'first_order', 'full', got 'exact'",
     ),
     row(
         "asked for one checkpoint",

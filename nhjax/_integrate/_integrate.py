@@ -86,8 +86,10 @@ _TOO_LARGE = (
 _TAKEN_OVER = (
     "`SimplifiedNewton` did not solve step {} of this run, which is therefore repeated "
     "with Newton's method for such steps. This compiles a second program. To compile "
-    "only one, pass `stage_solver=nhjax.SimplifiedNewton(fallback=True)` or "
-    "`nhjax.Newton()`, or take a smaller `dt`."
+    'only one, pass `stage_solver=nhjax.SimplifiedNewton(jacobian="full")`, which '
+    "includes stiffness and damping and is much faster than Newton's method, "
+    "`nhjax.SimplifiedNewton(fallback=True)` or `nhjax.Newton()`, or take a smaller "
+    "`dt`."
 )
 _INTERRUPTED = (
     "The run was interrupted after {} of {} steps, and the solution ends there. Its "

@@ -1,6 +1,12 @@
 """The numerical building blocks without mechanics: products, norms, iterations."""
 
-from ._contraction import inverse as inverse, small_einsum as small_einsum
+from ._contraction import (
+    inverse as inverse,
+    inverse_by_blocks as inverse_by_blocks,
+    inverses as inverses,
+    mapped as mapped,
+    small_einsum as small_einsum,
+)
 from ._floating_point import (
     largest_column as largest_column,
     max_norm as max_norm,

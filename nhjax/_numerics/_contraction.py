@@ -15,7 +15,7 @@ from typing import Any
 import jax
 import jax.extend
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, PyTree
 
 from .._compile import LARGEST_REDUCTION, LONGEST_SUM, small_product
 
@@ -133,6 +133,78 @@ def _eliminated(matrix: Float[Array, "m m"]) -> Float[Array, "m m"]:
     table, order = jax.lax.fori_loop(0, len(rows), eliminate, (matrix, rows))
     places = (order[:, None] == rows[None]).astype(matrix.dtype)
     return small_einsum("ij,jk->ik", table, places)
+
+
+def mapped(
+    function: Callable[[Array], PyTree[Array]], rows: Float[Array, "k *n"]
+) -> PyTree[Array]:
+    """Apply a function to each row, in a loop that is never written out.
+
+    Unlike `jax.lax.map` it has no derivative in reverse mode.
+    """
+    shapes = jax.eval_shape(function, rows[0])
+    empty = jax.tree.map(
+        lambda one: jnp.zeros((rows.shape[0], *one.shape), one.dtype), shapes
+    )
+
+    def put_row(k, found):
+        row = function(_taken(rows, k))
+        return jax.tree.map(lambda all_rows, x: _put(all_rows, x, k), found, row)
+
+    return _repeated(rows.shape[0], put_row, empty)
+
+
+def inverses(matrices: Float[Array, "k n n"]) -> Float[Array, "k n n"]:
+    """Invert some small matrices, one after the other."""
+    return mapped(inverse, matrices)
+
+
+def inverse_by_blocks(matrix: Float[Array, "s n s n"]) -> Float[Array, "s n s n"]:
+    """Invert a matrix of s x s blocks by Gauss-Jordan elimination of blocks.
+
+    Rows are exchanged only within a block. This is stable if the diagonal blocks
+    dominate, or if the matrix is close to a Kronecker product with a matrix that is
+    stable in the same sense. The elimination is a loop over blocks, so that the
+    program is short and the matrix may be larger than for `inverse`.
+    """
+    s = matrix.shape[0]
+
+    def eliminate(k, table):
+        row = _taken(table, k)
+        is_k = (jnp.arange(s, dtype=k.dtype) == k)[None, :, None]
+        pivot = inverse(jax.lax.dynamic_index_in_dim(row, k, 1, keepdims=False))
+        scaled = small_einsum("ab,bjc->ajc", pivot, row)
+        scaled = jnp.where(is_k, pivot[:, None, :], scaled)
+
+        def reduce_row(i, table):
+            row = _taken(table, i)
+            factor = jax.lax.dynamic_index_in_dim(row, k, 1, keepdims=False)
+            reduced = small_einsum("ab,bjc->ajc", factor, scaled)
+            reduced = jnp.where(is_k, 0, row) - reduced
+            return _put(table, jnp.where(i == k, scaled, reduced), i)
+
+        return _repeated(s, reduce_row, table)
+
+    return _repeated(s, eliminate, matrix)
+
+
+def _repeated(count: int, body: Callable[[Array, Any], Any], carry: Any) -> Any:
+    # Unlike a `fori_loop` this has no derivative in reverse mode, and our compiler
+    # never writes it out.
+    def step(given):
+        k, carry = given
+        return k + 1, body(k, carry)
+
+    start = jnp.zeros((), jnp.int32), carry
+    return jax.lax.while_loop(lambda given: given[0] < count, step, start)[1]
+
+
+def _taken(x: Array, k: Array) -> Array:
+    return jax.lax.dynamic_index_in_dim(x, k, keepdims=False)
+
+
+def _put(x: Array, row: Array, k: Array) -> Array:
+    return jax.lax.dynamic_update_index_in_dim(x, row, k, 0)
 
 
 def with_small_products(program: Any) -> Callable[..., list[Any]]:

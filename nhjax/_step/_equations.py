@@ -307,6 +307,39 @@ def stage_forces(stages: StageEquations, x: StageUnknowns) -> StageForces:
     return StageForces(transported, multiplier, residual, momentum)
 
 
+def momenta_of_forces(
+    stages: StageEquations, x: StageUnknowns, forces: Float[Array, "s n c"]
+) -> tuple[Float[Array, "s n c"], Float[Array, "r n c"]]:
+    """Compute the momenta of stages and nodes from forces at the stages, for h = 1.
+
+    The chart transports forces from stage to stage, which adds a term of order h.
+    """
+    a_hat, b = stages.coefficients("a_hat"), stages.coefficients("b")
+    if stages.manifold.is_flat:
+        return (
+            small_einsum("ij,jnc->inc", a_hat, forces),
+            small_einsum("ij,jnc->inc", stages.node_weights, forces),
+        )
+    chart, y = stage_coordinates(stages, x)
+    nodes = node_coordinates(stages, x)[1]
+
+    def one(force):
+        zero = jnp.zeros_like(force)
+        _, chart_force = chart.to_chart(y, zero, zero, force)
+        carried = chart.to_origin(y, force)
+        sums = (
+            small_einsum("ij,jn->in", b[None], part)[0]
+            for part in (carried, chart_force)
+        )
+        base = chart.base_momentum(zero[0], *sums)
+        on_nodes = chart.from_origin(
+            nodes, small_einsum("ij,jn->in", stages.node_weights, carried)
+        )
+        return base[None] + small_einsum("ij,jn->in", a_hat, chart_force), on_nodes
+
+    return jax.vmap(one, in_axes=2, out_axes=2)(forces)
+
+
 def node_residual(
     stages: StageEquations, x: StageUnknowns, force: Float[Array, "s n"]
 ) -> Float[Array, "r n"]:

@@ -17,16 +17,12 @@ from jaxtyping import Array, Float
 from .._custom_types import FloatScalar
 from .._numerics import full_jacobian, jacobian_sparsity, small_einsum
 from .._system import Linearisation, total_force
-from ._equations import (
-    node_coordinates,
-    stage_coordinates,
-    StageEquations,
-    StageUnknowns,
-)
+from ._equations import StageEquations, StageUnknowns
 
 
-# The part of the Jacobian that simplified Newton inverts; None selects the faster one.
-JacobianName: TypeAlias = Literal["leading", "first_order"] | None
+# The part of the Jacobian that simplified Newton inverts; None selects the faster one
+# of the first two.
+JacobianName: TypeAlias = Literal["leading", "first_order", "full"] | None
 
 # The terms are worthwhile if the saved iterations cost more time than the terms: up to
 # this many stages, coordinates, and entries of the responses of stages to multipliers,
@@ -59,12 +55,12 @@ def uses_first_order_terms(
     is_small &= s * n * (s - 1) * m <= _MOST_RESPONSES
     if not is_available or not is_small or stages.num_holonomic > 0:
         return False
-    if not _forces_have_slopes(stages):
+    if not forces_have_slopes(stages):
         return False
     return not stages.manifold.is_flat or _has_terms(stages)
 
 
-def _forces_have_slopes(stages: StageEquations) -> bool:
+def forces_have_slopes(stages: StageEquations) -> bool:
     """Return whether forces have forward-mode derivatives in the velocities.
 
     Callbacks and functions with a custom rule for reverse mode only do not have them.
@@ -228,31 +224,6 @@ def first_order_terms(
 def _size(matrix: Float[Array, "n n"]) -> FloatScalar:
     """Measure a matrix independently of the units of the coordinates."""
     return jnp.sqrt(jnp.sum(jnp.abs(matrix * matrix.T)))
-
-
-def momenta_of_forces(
-    stages: StageEquations, x: StageUnknowns, forces: Float[Array, "s n c"]
-) -> tuple[Float[Array, "s n c"], Float[Array, "r n c"]]:
-    """Compute the momenta of stages and nodes from forces at the stages, for h = 1.
-
-    The chart transports forces from stage to stage, which adds a term of order h.
-    """
-    a_hat, b = stages.coefficients("a_hat"), stages.coefficients("b")
-    if stages.manifold.is_flat:
-        return _weighted(a_hat, forces), _weighted(stages.node_weights, forces)
-    chart, y = stage_coordinates(stages, x)
-    nodes = node_coordinates(stages, x)[1]
-
-    def one(force):
-        zero = jnp.zeros_like(force)
-        _, chart_force = chart.to_chart(y, zero, zero, force)
-        carried = chart.to_origin(y, force)
-        sums = (_weighted(b[None], part)[0] for part in (carried, chart_force))
-        base = chart.base_momentum(zero[0], *sums)
-        on_nodes = chart.from_origin(nodes, _weighted(stages.node_weights, carried))
-        return base[None] + _weighted(a_hat, chart_force), on_nodes
-
-    return jax.vmap(one, in_axes=2, out_axes=2)(forces)
 
 
 class _BodySlopes(NamedTuple):

@@ -27,6 +27,7 @@ from .._numerics import (
     DiagonalMatrix,
     inverse,
     InverseMatrix,
+    mapped,
     max_norm,
     ReactionMatrix,
     small_einsum,
@@ -43,6 +44,7 @@ from ._equations import (
     invariant_correction,
     invariant_errors,
     is_in_chart,
+    momenta_of_forces,
     node_residual,
     sparse_constraint_jacobian,
     stage_forces,
@@ -53,9 +55,19 @@ from ._equations import (
 from ._first_order import (
     first_order_terms,
     FirstOrderTerms,
+    forces_have_slopes,
     JacobianName,
-    momenta_of_forces,
     uses_first_order_terms,
+)
+from ._full_jacobian import (
+    ConstraintSlopes,
+    end_slopes,
+    inverse_of_schur,
+    linearised_step,
+    LinearisedStep,
+    reactions_at_end,
+    reactions_at_stages,
+    StageResponses,
 )
 from ._invariants import InvariantCorrection
 
@@ -79,6 +91,9 @@ def simplified_newton_update(
         # reactions on this change is not negligible.
         error = invariant_errors(stages, x_next)
         x_next = factors.correct_impulses(stages, x_next, error)
+    if factors.full is not None:
+        x_next = factors.full.correct_multipliers(stages, x_next)
+        return x_next, Evaluation(forces, r_nodes, jnp.asarray(False))
     if stages.constrained:
         kinematic, holonomic = constraint_values(stages, x_next)
         x_next = factors.correct_multipliers(stages, x_next, kinematic, holonomic)
@@ -99,6 +114,78 @@ class MultiplierResponses(NamedTuple):
 
     velocity: Float[Array, "s n c"]
     node_fibre_coordinate: Float[Array, "r n c"]
+
+
+class FullFactors(eqx.Module):
+    """The factors of the Jacobian of all stage equations.
+
+    The unknowns of the multipliers are h δy of the closure, h δΛ of the holonomic
+    constraints and, with the symmetric closure, h δλ_c at the end of the step. The last
+    change includes the change of the closure that keeps the nodes to leading order.
+    """
+
+    step: LinearisedStep
+    responses: StageResponses | None
+    schur_inverse: Float[Array, "c c"]
+    end: Linearisation
+    end_slopes: tuple[tuple[Array, Array], ...] | None  # by ξ and u
+
+    def correct_stages(
+        self, stages: StageEquations, x: StageUnknowns, residual: Float[Array, "s n"]
+    ) -> StageUnknowns:
+        """Solve the linearised equations of the stages with constant multipliers."""
+        velocity, momentum = self.step.of_stages(stages, residual)
+        moved = replace(x, velocity=x.velocity - velocity)
+        if not stages.hamiltonian:
+            return moved
+        moved = replace(moved, momentum=x.momentum - momentum)
+        return replace(moved, velocity=stage_velocities(stages, moved))
+
+    def correct_multipliers(
+        self, stages: StageEquations, x: StageUnknowns
+    ) -> StageUnknowns:
+        """Change the multipliers so that the linearised constraints hold.
+
+        With the symmetric closure, this includes the equations of motion at the end.
+        """
+        if self.responses is None:
+            return x
+        residuals = [value.reshape(-1) for value in constraint_values(stages, x)]
+        m = stages.num_nonholonomic
+        acceleration, multiplier = x.end_acceleration, x.end_multiplier
+        first = m * (self.end_slopes is not None)
+        if self.end_slopes is not None:
+            on_momentum, hidden = end_residual(stages, x)
+            da, dlam = self.end.solve(-on_momentum, -hidden)
+            acceleration, multiplier = acceleration + da, multiplier + dlam
+            residuals = [-stages.h * dlam[:m], *residuals]
+        change = -small_einsum(
+            "kc,c->k", self.schur_inverse, jnp.concatenate(residuals)
+        )
+        last = first + x.closure.size
+        h_dy = change[first:last].reshape(x.closure.shape)
+        h_dholonomic = change[last:].reshape(x.holonomic.shape)
+        velocity, momentum, at_nodes = (
+            small_einsum("inc,c->in", response, change) for response in self.responses
+        )
+        dy = h_dy / stages.h
+        if self.end_slopes is not None:
+            dlam_c = change[:m] / stages.h
+            dy = dy + jnp.outer(stages.closure_weights("response"), dlam_c)
+            b = stages.coefficients("b")
+            xi = stages.h * small_einsum("s,sn->n", b, velocity)
+            da, dlam_end = _end_change(self.end, self.end_slopes, xi, at_nodes[-1])
+            acceleration, multiplier = acceleration + da, multiplier + dlam_end
+        return replace(
+            x,
+            velocity=x.velocity + velocity,
+            momentum=x.momentum + momentum,
+            node_fibre_coordinate=x.node_fibre_coordinate + at_nodes,
+            closure=x.closure + dy,
+            holonomic=x.holonomic + h_dholonomic / stages.h,
+            end_acceleration=acceleration,
+            end_multiplier=multiplier,
+        )
 
 
 class StageJacobianFactors(eqx.Module):
@@ -129,11 +216,14 @@ class StageJacobianFactors(eqx.Module):
     impulses: InvariantCorrection | None = None
     first_order: FirstOrderTerms | None = None
     responses: MultiplierResponses | None = None
+    full: FullFactors | None = None
 
     def correct_stages(
         self, stages: StageEquations, x: StageUnknowns, residual: Float[Array, "s n"]
     ) -> StageUnknowns:
         """Compute u - N⁻¹ r_u for the stages, and their velocities."""
+        if self.full is not None:
+            return self.full.correct_stages(stages, x, residual)
         change = self.momentum_inverse.matvec(residual)
         if self.first_order is not None:
             change = self.first_order.of_stages(stages, change)
@@ -154,6 +244,9 @@ class StageJacobianFactors(eqx.Module):
         The residual was evaluated at positions that include the `change` of the stage
         velocities, but with forces that do not include it.
         """
+        if self.full is not None:
+            du = self.full.step.of_nodes(stages, residual, change)
+            return replace(x, node_fibre_coordinate=x.node_fibre_coordinate + du)
         du = -self.momentum_inverse.matvec(residual)
         if self.first_order is not None:
             du = self.first_order.of_nodes(du)
@@ -289,6 +382,8 @@ def factorise_stage_jacobian(
 def _factors_without_impulses(
     stages: StageEquations, x: StageUnknowns, lin: Linearisation, jacobian: JacobianName
 ) -> StageJacobianFactors:
+    if jacobian == "full":
+        return _full_factors(stages, x, lin)
     terms = None
     if uses_first_order_terms(stages, lin, jacobian):
         terms = first_order_terms(stages, x, lin)
@@ -445,6 +540,106 @@ def _first_order_factors(
         end=_with_mass_at_end(lin, terms, jacobian[-1]),
         first_order=terms,
         responses=MultiplierResponses(velocity, at_nodes),
+    )
+
+
+def _full_factors(
+    stages: StageEquations, x: StageUnknowns, lin: Linearisation
+) -> StageJacobianFactors:
+    """Compute the factors of the Jacobian of all equations at the stages x."""
+    if not forces_have_slopes(stages):
+        raise ValueError(
+            '`SimplifiedNewton(jacobian="full")` needs derivatives of forces in forward'
+            " mode, which callbacks and functions with a rule for reverse mode only do "
+            'not have; use "leading" or None.'
+        )
+    step = linearised_step(stages, x)
+    s, n, dtype = stages.method.stages, stages.p.shape[0], stages.p.dtype
+    h, m, redundancy = stages.h, stages.num_nonholonomic, stages.redundancy
+    reaction = DenseMatrix(jnp.zeros((s, n, 0), dtype))
+    none = DenseMatrix(jnp.zeros((0, 0), dtype))
+    given = lin.momentum_inverse, reaction, reaction, none, lin
+    if not stages.constrained:
+        full = FullFactors(step, None, none.entries, lin, None)
+        return StageJacobianFactors(*given, full=full)
+    slopes = ConstraintSlopes.at(stages, x)
+    covectors = reactions_at_stages(stages, x)
+    pushes = _reactions(stages, covectors)
+    end, end_by = lin, None
+    if stages.end_multiplier_is_unknown:
+        end = _end_of_full(stages, x, lin, step, slopes.jacobian[-1])
+        end_by = end_slopes(stages, x)
+        weights = small_einsum(
+            "sr,r->s", stages.closure_weights("E"), stages.closure_weights("response")
+        ) + stages.closure_weights("end")
+        of_end = weights[:, None, None] * jnp.swapaxes(covectors[:, :m], 1, 2)
+        pushes = jnp.concatenate([of_end, pushes], axis=2)
+
+    def column(push):
+        response = step.response(stages, x, push)
+        at_nodes = response.node_fibre_coordinate
+        change = slopes.along(stages, response.velocity, at_nodes)
+        if end_by is None:
+            return response, change
+        b = stages.coefficients("b")
+        xi = h * small_einsum("s,sn->n", b, response.velocity)
+        _, dlam = _end_change(end, end_by, xi, at_nodes[-1])
+        return response, jnp.concatenate([-h * dlam[:m], change])
+
+    # This is a loop over the multipliers, so that the program stays short.
+    forces = jnp.moveaxis(pushes, 2, 0)
+    found, columns = mapped(column, forces)
+    responses = jax.tree.map(lambda z: jnp.moveaxis(z, 0, -1), found)
+    schur, num_end = columns.T, m * (end_by is not None)
+    if redundancy is not None:
+        rest = redundancy.schur_rest(s, m)
+        schur = schur + jnp.pad(rest, ((num_end, 0), (num_end, 0)))
+    if end_by is not None:
+        free = schur.shape[0] - m
+        schur = schur + jnp.pad(jnp.eye(m, dtype=dtype), ((0, free), (0, free)))
+    schur_inverse = inverse_of_schur(stages, schur, num_end + x.closure.size)
+    full = FullFactors(step, responses, schur_inverse, end, end_by)
+    return StageJacobianFactors(*given, full=full)
+
+
+def _end_change(
+    end: Linearisation,
+    end_slopes: tuple[tuple[Array, Array], ...],
+    xi: Float[Array, " n"],
+    u: Float[Array, " n"],
+) -> tuple[Float[Array, " n"], Float[Array, " l"]]:
+    """Compute how acceleration and λ_c at the end change with ξ and u."""
+    by_moves = (
+        small_einsum("kn,n->k", by_xi, xi) + small_einsum("kn,n->k", by_u, u)
+        for by_xi, by_u in zip(*end_slopes, strict=True)
+    )
+    return end.solve(*(-part for part in by_moves))
+
+
+def _end_of_full(
+    stages: StageEquations,
+    x: StageUnknowns,
+    lin: Linearisation,
+    step: LinearisedStep,
+    jacobian: Float[Array, "l n"],
+) -> Linearisation:
+    """Return a linearisation with the matrices at the end of the step."""
+    at_end = reactions_at_end(stages, x)
+    reaction = small_einsum("kn,ln->kl", step.node_inverse[-1], at_end)
+    rows, rest, redundancy = jacobian, 0.0, stages.redundancy
+    if redundancy is not None:
+        rows = small_einsum("ab,bn->an", redundancy.projector, jacobian)
+        rest = redundancy.rest
+    inverse_mass = lin.fibre_hessian_inverse
+    if not stages.hamiltonian:
+        inverse_mass = DenseMatrix(step.node_inverse[-1])
+    delassus = small_einsum("kn,nl->kl", rows, reaction) + rest
+    return replace(
+        lin,
+        fibre_hessian_inverse=inverse_mass,
+        jacobian=DenseMatrix(rows),
+        reaction=DenseMatrix(reaction),
+        delassus_inverse=DenseMatrix(inverse(delassus)),
     )
 
 

@@ -79,6 +79,12 @@ class SimplifiedNewton(AbstractStageSolver):
     positions, and of forces with respect to velocities, at the start of the step. With
     these terms the factor is always O(h²).
 
+    Both omit the stiffness: the derivatives of forces, inertia and reactions with
+    respect to positions. On machines with feedback control, stiff springs or light
+    steered parts this makes the iteration slow or divergent. The full Jacobian has all
+    derivatives, at the starting values of the step. It is computed and inverted once a
+    step, which costs as much as 3 to 15 iterations.
+
     If this iteration does not converge, Newton's method with the exact Jacobian may
     still converge. With the fallback, Newton's method takes over in such a step, and
     `Solution.stats["num_newton_steps"]` counts these steps. A program that contains
@@ -98,12 +104,15 @@ class SimplifiedNewton(AbstractStageSolver):
     - `fallback`: whether `nhjax.Newton()` takes over a step that is not solved: True,
         False, or None, the default, which means only in plain calls. Derivatives of a
         run with the fallback use the exact Jacobian, as with `nhjax.Newton()`.
-    - `jacobian`: `"leading"`; or `"first_order"`, which includes the terms of order h;
-        or None, the default, which includes them if they reduce the run time. They do
-        so with s <= 5 stages, n <= 6 coordinates and m constraints with s (s - 1) n m
-        <= 100, all nonholonomic. The terms are not available for Hamiltonian systems,
-        redundant constraints, and so many constraints that they are stored as sparse
-        matrices.
+    - `jacobian`: the part of the Jacobian that is used.
+        - `"leading"`, or `"first_order"`, which includes the terms of order h.
+        - `"full"`, the full Jacobian, for machines whose steps need many iterations or
+            are not solved.
+        - None, the default: the terms of order h are included if they reduce the run
+            time. They do so with s <= 5 stages, n <= 6 coordinates and m constraints
+            with s (s - 1) n m <= 100, all nonholonomic. The terms are not available for
+            Hamiltonian systems, redundant constraints, and so many constraints that
+            they are stored as sparse matrices.
 
     !!! example
 
@@ -123,7 +132,7 @@ class SimplifiedNewton(AbstractStageSolver):
 
     def __check_init__(self):
         if self.jacobian is not None:
-            check_choice("jacobian", self.jacobian, ("leading", "first_order"))
+            check_choice("jacobian", self.jacobian, ("leading", "first_order", "full"))
         if self.fallback is not None:
             check_flag("fallback", self.fallback)
 
