@@ -47,7 +47,15 @@ def cases() -> list[tuple[str, Any, nhjax.State, int, str]]:
         ("heavy top on SE(3)", top.system, top.initial_state(), 3, kind)
         for kind in KINDS
     ]
-    return [*found, *(("bicycle", riding.system, upright, 3, kind) for kind in KINDS)]
+    found += [("bicycle", riding.system, upright, 3, kind) for kind in KINDS]
+    return [
+        *found,
+        *(
+            ("bicycle", riding.system, upright, s, kind)
+            for s in (4, 6, 8)
+            for kind in ("run", "gradient")
+        ),
+    ]
 
 
 def program(system: Any, stages: int, kind: str) -> Callable[[Any, Any], Any]:

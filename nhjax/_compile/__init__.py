@@ -1,6 +1,6 @@
 """Compilation of whole programs by three engines, with derivatives and `vmap`."""
 
-from ._batched_call import batched_call as batched_call
+from ._batched_call import batched_call as batched_call, vmapped as vmapped
 from ._jaxprs import (
     CALLING as CALLING,
     cse_dce as cse_dce,

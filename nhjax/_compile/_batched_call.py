@@ -6,7 +6,9 @@ that is not possible, they run one after the other in kernels. On other devices,
 neither is possible, JAX batches the program.
 """
 
+from collections.abc import Callable
 from functools import partial
+from typing import Any, TypeVar
 
 import jax
 import jax.core
@@ -16,6 +18,7 @@ from jax.interpreters import ad, batching, mlir
 
 from ..lanes import compile_batched, Unsupported
 from ._garbage_collection import rare_collections
+from ._jaxprs import BATCHED_CALL, cse_dce, num_results
 from ._kernel import (
     kernel,
     kernel_jvp,
@@ -23,19 +26,71 @@ from ._kernel import (
     merge_lists,
     never_high,
     partition_list,
+    split_by_operands,
 )
 from ._lowering import (
+    as_parts_of_a_program,
     is_exported,
+    is_part_of_a_program,
     is_within_kernel,
     reason_against_kernel,
     reason_against_lanes,
     record_engine,
+    require_not_chosen,
 )
 
 
-batched_call = jax.extend.core.Primitive("batched_call")
+T = TypeVar("T")
+
+batched_call = jax.extend.core.Primitive(BATCHED_CALL)
 batched_call.multiple_results = True
 batched_call.is_high = never_high
+
+# Functions that compute fewer numbers for all rows together are written out for each
+# row, because a loop would save little time of the compiler.
+SHORTEST_IN_LOOP = 2000
+
+
+def vmapped(function: Callable[..., T], *rows: Any, out_axis: int = 0) -> T:
+    """Compute `jax.vmap(function)(*rows)`, with a long function as one operation.
+
+    Within a program that nhjax's own compiler compiles, the operation is a loop over
+    the rows. Then the time of compilation does not grow with the number of rows. What
+    does not depend on the rows is computed before, once.
+
+    **Arguments:**
+
+    - `function`: a function of trees of arrays, with arrays as results.
+    - `rows`: trees of arrays that have the same first axis.
+    - `out_axis`: the axis of the results that lists the rows.
+    """
+    leaves, treedef = jax.tree.flatten(rows)
+    structure = None
+
+    def flat(*leaves):
+        nonlocal structure
+        out = function(*jax.tree.unflatten(treedef, leaves))
+        leaves, structure = jax.tree.flatten(out)
+        return leaves
+
+    # With `jax.disable_jit`, the user wants to step through single operations.
+    if jax.config.jax_disable_jit:  # pyright: ignore[reportAttributeAccessIssue]
+        return jax.vmap(function, out_axes=out_axis)(*rows)
+    row = [jax.ShapeDtypeStruct(x.shape[1:], x.dtype) for x in leaves]
+    program = cse_dce(jax.make_jaxpr(flat)(*row))
+    if program.effects:
+        return jax.vmap(function, out_axes=out_axis)(*rows)
+    shared, program = split_by_operands(program)
+    number = leaves[0].shape[0]
+    if number == 1 or number * num_results(program.jaxpr) < SHORTEST_IN_LOOP:
+        in_axes = [*[None] * len(shared), *[0] * len(leaves)]
+        run = jax.extend.core.jaxpr_as_fun(program)
+        out = jax.vmap(run, in_axes, out_axis)(*shared, *leaves)
+        return jax.tree.unflatten(structure, out)
+    marks = (False,) * len(shared) + (True,) * len(leaves)
+    given = {"program": program, "is_batched": marks, "is_brief": False}
+    out = batched_call.bind(*shared, *leaves, **given)
+    return jax.tree.unflatten(structure, [jnp.moveaxis(x, 0, out_axis) for x in out])
 
 
 @batched_call.def_impl
@@ -192,6 +247,8 @@ def _mapped(*operands, program, is_batched, is_brief):
 def _lowered(ctx, *operands, program, is_batched, is_brief):
     members = _members(ctx.avals_in, is_batched)
     given = {"program": program, "is_batched": is_batched, "is_brief": is_brief}
+    if is_part_of_a_program():
+        return _by_xla(ctx, *operands, **given)
     if is_exported(ctx):
         record_engine("xla", "the program is exported", members)
         return _by_xla(ctx, *operands, **given)
@@ -205,6 +262,10 @@ def _lowered(ctx, *operands, program, is_batched, is_brief):
             record_engine("lanes", "the first choice", members)
             return jax.ffi.ffi_lowering(name)(ctx, *operands)
     against = reason_against_kernel(program)
+    if not is_within_kernel():
+        require_not_chosen("lanes", reason)
+        if against is not None:
+            require_not_chosen("kernels", against)
     if against is not None or is_within_kernel():
         record_engine("xla", against or reason, members)
         lower = _by_xla
@@ -214,6 +275,6 @@ def _lowered(ctx, *operands, program, is_batched, is_brief):
     return lower(ctx, *operands, **given)
 
 
-_by_xla = mlir.lower_fun(_vmapped, multiple_results=True)
+_by_xla = as_parts_of_a_program(mlir.lower_fun(_vmapped, multiple_results=True))
 mlir.register_lowering(batched_call, _by_xla, cacheable=False)
 mlir.register_lowering(batched_call, _lowered, platform="cpu", cacheable=False)

@@ -54,7 +54,17 @@ SMALL_PRODUCT = "small_product"
 CALLING = """
     checkpoint closed_call custom_jvp_call custom_vjp_call jit remat2
 """.split()  # noqa: SIM905
-_CONTAINING = [*CALLING, "cond", "custom_linear_solve", "cpu_kernel", "scan", "while"]
+# nhjax's own operation, which computes a program for each row of its operands.
+BATCHED_CALL = "batched_call"
+_CONTAINING = [
+    *CALLING,
+    BATCHED_CALL,
+    "cond",
+    "custom_linear_solve",
+    "cpu_kernel",
+    "scan",
+    "while",
+]
 # Numbers of elements. XLA leaves larger reductions to a library, and shares work on
 # larger arrays among threads, which a kernel cannot start.
 LARGEST_REDUCTION = 1024
@@ -122,6 +132,15 @@ def _sizes_of_product(product: Any) -> Iterator[int]:
         yield size * terms
 
 
+def num_results(program: Any) -> int:
+    """Count the numbers that the operations of a jaxpr compute, each loop once."""
+    count = 0
+    for equation in program.eqns:
+        inner = [num_results(part) for part in _programs(equation.params)]
+        count += sum(inner) if inner else sum(map(_size, equation.outvars))
+    return count
+
+
 # Only these operations are removed when repeated. They have no state (random numbers
 # have one), and no parameters that a user chooses.
 _REPEATABLE = frozenset(
@@ -131,6 +150,7 @@ _REPEATABLE = frozenset(
 # programs. The inner programs of other operations are not simplified, because the rules
 # of these operations rely on them.
 _INNER = {
+    BATCHED_CALL: ("program",),
     "checkpoint": ("jaxpr",),
     "cond": ("branches",),
     "custom_jvp_call": ("call_jaxpr",),

@@ -222,6 +222,39 @@ def _fixed_part(program) -> tuple[list[Any], list[bool]]:
     return fixed, list(map(varies, program.jaxpr.outvars))
 
 
+def split_by_operands(program) -> tuple[list[Any], Any]:
+    """Compute what depends on no operand, and return a program for the rest.
+
+    Returns the values that the rest uses, and the rest. These values are its first
+    operands.
+    """
+    jaxpr = program.jaxpr
+    varying, fixed, others = set(jaxpr.invars), [], []
+    for equation in jaxpr.eqns:
+        if varying.isdisjoint(_variables(equation.invars)):
+            fixed.append(equation)
+        else:
+            varying.update(equation.outvars)
+            others.append(equation)
+    used = [v for equation in others for v in _variables(equation.invars)]
+    used += _variables(jaxpr.outvars)
+    names = list(dict.fromkeys(v for v in used if v not in varying))
+    values = jax.extend.core.jaxpr_as_fun(
+        _part(program, invars=[], eqns=fixed, outvars=names)
+    )()
+    rest = jaxpr.replace(
+        constvars=[],
+        invars=[*names, *jaxpr.invars],
+        eqns=others,
+        debug_info=jaxpr.debug_info.with_unknown_names(),
+    )
+    return values, jax.extend.core.ClosedJaxpr(rest, [])
+
+
+def _variables(operands: Iterable[Any]) -> list[Any]:
+    return [v for v in operands if not isinstance(v, jax.extend.core.Literal)]
+
+
 def _part(program, **fields: list[Any]):
     """Return a program with a part of the operations, operands or results replaced."""
     jaxpr = program.jaxpr

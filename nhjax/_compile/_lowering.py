@@ -14,7 +14,7 @@ mark, as on other devices, the results are the same.
 import os
 from collections.abc import Callable
 from contextvars import ContextVar
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import jax
 import jax.extend
@@ -27,6 +27,8 @@ from ._garbage_collection import rare_collections
 from ._jaxprs import fits_one_kernel, LARGEST_REDUCTION, rms_array_size
 from ._kernel import kernel, merge_lists, partition_list
 
+
+T = TypeVar("T")
 
 # The engines, in the order in which they are tried.
 ENGINES = ("lanes", "kernels", "xla")
@@ -47,15 +49,25 @@ class EngineUse(NamedTuple):
     members: int | None
 
 
-def chosen_engine() -> str:
-    """Read `NHJAX_ENGINE` from the environment: the first engine to be tried."""
-    chosen = os.environ.get("NHJAX_ENGINE", ENGINES[0])
-    if chosen not in ENGINES:
+def chosen_engine() -> str | None:
+    """Read `NHJAX_ENGINE` from the environment: the engine of all programs, if set."""
+    chosen = os.environ.get("NHJAX_ENGINE")
+    if chosen is not None and chosen not in ENGINES:
         raise ValueError(
             f"The environment variable NHJAX_ENGINE is {chosen!r}, which is none of "
             f"{', '.join(map(repr, ENGINES))}: set it to one of these, or unset it."
         )
     return chosen
+
+
+def require_not_chosen(engine: str, reason: str) -> None:
+    """Raise if the user has chosen an engine that cannot compile a program."""
+    if chosen_engine() == engine:
+        raise RuntimeError(
+            f"The environment variable NHJAX_ENGINE is {engine!r}, but this engine "
+            f"cannot compile a program: {reason}. Unset the variable, so that another "
+            "engine compiles this program."
+        )
 
 
 # A list while `engines` lowers programs, otherwise `None`.
@@ -74,9 +86,9 @@ def engines(function: Callable[..., Any], *args: Any) -> tuple[EngineUse, ...]:
 
     The function is compiled, but not run. On the CPU, nhjax compiles an ensemble (a run
     under `jax.vmap`) itself if possible, and vectorises over its members (SIMD). The
-    environment variable `NHJAX_ENGINE` selects the first engine that is tried: `lanes`
-    (the default), `kernels` or `xla`. Programs that were compiled before keep their
-    engine until `jax.clear_caches()`.
+    environment variable `NHJAX_ENGINE` chooses the engine of all programs: `lanes`,
+    `kernels` or `xla`. If the engine cannot compile one of them, an error says why.
+    Programs that were compiled before keep their engine until `jax.clear_caches()`.
 
     **Arguments:**
 
@@ -112,6 +124,29 @@ def is_within_kernel() -> bool:
     return _within.get()
 
 
+# Whether a program is being lowered by XLA. What it does for each row of an array is
+# then a part of it.
+_is_part = ContextVar("is_part", default=False)
+
+
+def is_part_of_a_program() -> bool:
+    """Return whether a part of a program is being lowered by XLA."""
+    return _is_part.get()
+
+
+def as_parts_of_a_program(lower: Callable[..., T]) -> Callable[..., T]:
+    """Return a function that lowers a program, and all its operations with it."""
+
+    def lower_all(*args: Any, **params: Any) -> T:
+        token = _is_part.set(True)
+        try:
+            return lower(*args, **params)
+        finally:
+            _is_part.reset(token)
+
+    return lower_all
+
+
 def is_exported(ctx: Any) -> bool:
     """Return whether a program is lowered to be run by other processes."""
     return bool(ctx.module_context.lowering_parameters.for_export)
@@ -119,7 +154,7 @@ def is_exported(ctx: Any) -> bool:
 
 def reason_against_lanes() -> str | None:
     """Return why nhjax's own compiler is not tried, or `None` if it is."""
-    if chosen_engine() != "lanes":
+    if chosen_engine() not in ("lanes", None):
         return "chosen"
     if is_within_kernel():
         return "it is a part of a kernel"
@@ -144,7 +179,7 @@ def reason_against_kernel(program: Any) -> str | None:
 # Measurements on the gallery's systems with 2 to 8 stages, and on larger systems, show
 # that nhjax's own compiler is faster below this root mean square of array sizes, and
 # that XLA is faster above it.
-_SMALL_ARRAYS = 40
+_SMALL_ARRAYS = 110
 
 
 @rare_collections()
@@ -156,7 +191,8 @@ def _lowered(ctx, *operands, program, is_brief):
     if is_within_kernel():
         return _by_xla(ctx, *operands, program=program, is_brief=is_brief)
     reason = reason_against_lanes()
-    if reason is None and rms_array_size(program.jaxpr) > _SMALL_ARRAYS:
+    large = rms_array_size(program.jaxpr) > _SMALL_ARRAYS
+    if reason is None and large and chosen_engine() is None:
         reason = "its arrays are so large that XLA uses vectors for them"
     if reason is None:
         try:
@@ -166,8 +202,10 @@ def _lowered(ctx, *operands, program, is_brief):
         else:
             record_engine("lanes", "the first choice", None)
             return jax.ffi.ffi_lowering(name)(ctx, *operands)
+    require_not_chosen("lanes", reason)
     against = reason_against_kernel(program)
     if against is not None:
+        require_not_chosen("kernels", against)
         record_engine("xla", against, None)
         return _by_xla(ctx, *operands, program=program, is_brief=is_brief)
     record_engine("kernels", reason, None)
@@ -192,7 +230,8 @@ def _as_one_kernel(ctx, *operands, program):
 
     token = _within.set(True)
     try:
-        results = mlir.lower_fun(call, multiple_results=True)(ctx, *operands)
+        lower = as_parts_of_a_program(mlir.lower_fun(call, multiple_results=True))
+        results = lower(ctx, *operands)
     finally:
         _within.reset(token)
     attributes = {"xla_cpu_small_call": "true", "inlineable": "false"}
@@ -223,6 +262,6 @@ def _plain(*operands, program, is_brief):
     return jax.extend.core.jaxpr_as_fun(program)(*operands)
 
 
-_by_xla = mlir.lower_fun(_plain, multiple_results=True)
+_by_xla = as_parts_of_a_program(mlir.lower_fun(_plain, multiple_results=True))
 mlir.register_lowering(kernel, _by_xla, cacheable=False)
 mlir.register_lowering(kernel, _lowered, platform="cpu", cacheable=False)

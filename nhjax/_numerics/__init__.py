@@ -47,6 +47,7 @@ from ._operators import (
     DiagonalMatrix as DiagonalMatrix,
     full_jacobian as full_jacobian,
     InverseMatrix as InverseMatrix,
+    jacobian_by_rows as jacobian_by_rows,
     JacobianMatrix as JacobianMatrix,
     ReactionMatrix as ReactionMatrix,
     sparse_jacobian as sparse_jacobian,

@@ -10,6 +10,7 @@ kernel with the operations around them, and a batch of them runs one by one.
 import math
 import string
 from collections.abc import Callable
+from functools import reduce
 from typing import Any
 
 import jax
@@ -20,12 +21,11 @@ from jaxtyping import Array, Float, PyTree
 from .._compile import LARGEST_REDUCTION, LONGEST_SUM, small_product
 
 
-# Matrices with more rows are inverted by a library: a kernel must not sum more numbers
-# than the entries of a matrix of this size.
-LARGEST = math.isqrt(LARGEST_REDUCTION)
-# A library computes larger products, and sums longer than `LONGEST_SUM`, too, so that
-# the program stays short. From about 10⁵ terms on the library was faster (measured).
+# A library computes larger products, and sums longer than `LONGEST_SUM`, so that the
+# program stays short. From about 10⁵ terms on the library was faster (measured).
 LARGEST_PRODUCT = 2**15
+# Matrices with more rows are inverted by a library.
+LARGEST = 50
 
 
 def small_einsum(subscripts: str, a: Array, b: Array) -> Array:
@@ -117,7 +117,7 @@ def _eliminated(matrix: Float[Array, "m m"]) -> Float[Array, "m m"]:
         # Rows are selected by masks: an index that differs between the members of a
         # batch would need gather and scatter operations.
         is_k, is_pivot = rows == k, rows == best
-        pivot_row = jnp.sum(jnp.where(is_pivot[:, None], table, 0), axis=0)
+        pivot_row = _sum_of_rows(jnp.where(is_pivot[:, None], table, 0))
         pivot = at(pivot_row, k)
         scaled = jnp.where(is_k, 1 / pivot, pivot_row / pivot)
         # Exchange the rows k and `best`.
@@ -132,7 +132,20 @@ def _eliminated(matrix: Float[Array, "m m"]) -> Float[Array, "m m"]:
 
     table, order = jax.lax.fori_loop(0, len(rows), eliminate, (matrix, rows))
     places = (order[:, None] == rows[None]).astype(matrix.dtype)
-    return small_einsum("ij,jk->ik", table, places)
+    if matrix.size * len(rows) <= LARGEST_PRODUCT:
+        return small_einsum("ij,jk->ik", table, places)
+
+    def put_column(k, out):
+        return out + at(table.T, k)[:, None] * at(places, k)[None]
+
+    return jax.lax.fori_loop(0, len(rows), put_column, jnp.zeros_like(matrix))
+
+
+def _sum_of_rows(rows: Float[Array, "k n"]) -> Float[Array, " n"]:
+    # A kernel must not sum more numbers than `LARGEST_REDUCTION` at once.
+    most = max(LARGEST_REDUCTION // rows.shape[1], 1)
+    parts = [rows[k : k + most] for k in range(0, rows.shape[0], most)]
+    return reduce(jnp.add, [jnp.sum(part, axis=0) for part in parts])
 
 
 def mapped(

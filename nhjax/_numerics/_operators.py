@@ -25,6 +25,7 @@ import numpy as np
 import scipy
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
+from .._compile import vmapped
 from .._custom_types import BoolScalar, FloatScalar
 from ._contraction import inverse, small_einsum
 from ._floating_point import max_norm
@@ -440,7 +441,17 @@ def full_jacobian(
     def push(du):
         return jax.jvp(function, (u,), (du,))[1]
 
-    return jax.vmap(push, out_axes=-1)(_unit_vectors(u))
+    return vmapped(push, _unit_vectors(u), out_axis=-1)
+
+
+def jacobian_by_rows(
+    function: Callable[[Array], Float[Array, " m"]], u: Float[Array, " n"]
+) -> Float[Array, "m n"]:
+    """Compute the Jacobian of a function by reverse differentiation."""
+    values, pull = jax.vjp(function, u)
+    return vmapped(
+        lambda row: pull(row)[0], jnp.eye(values.shape[0], dtype=values.dtype)
+    )
 
 
 def _unit_vectors(u: Float[Array, " n"]) -> Float[Array, "n n"]:

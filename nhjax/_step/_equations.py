@@ -12,10 +12,12 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, PyTree
 
+from .._compile import vmapped
 from .._custom_types import Args, BoolScalar, FloatScalar
 from .._manifold import AbstractLieGroup, unframed
 from .._method import AbstractMethod
 from .._numerics import (
+    jacobian_by_rows,
     max_norm,
     nonzero_or_one,
     small_einsum,
@@ -275,8 +277,11 @@ class StageEquations(eqx.Module):
 def stage_velocities(stages: StageEquations, x: StageUnknowns) -> Float[Array, "s n"]:
     """Compute the chart velocities dτ_y⁻¹ D2H(Q^i, P^i) of a Hamiltonian system."""
     chart, y = stage_coordinates(stages, x)
-    v = jax.vmap(lambda t, q, u: stages.system.velocity(t, q, u, stages.args))(
-        stages.stage_times, stage_positions(stages, chart, y), x.momentum
+    v = vmapped(
+        lambda t, q, u: stages.system.velocity(t, q, u, stages.args),
+        stages.stage_times,
+        stage_positions(stages, chart, y),
+        x.momentum,
     )
     return chart.chart_velocities(y, v)
 
@@ -288,12 +293,16 @@ def stage_forces(stages: StageEquations, x: StageUnknowns) -> StageForces:
     chart, y = stage_coordinates(stages, x)
     q = stage_positions(stages, chart, y)
     u = x.momentum if stages.hamiltonian else chart.body_velocities(y, x.velocity)
-    force, momentum = jax.vmap(
+    force, momentum = vmapped(
         lambda t, q, u, lam: (
             total_force(stages.system, t, q, u, lam, stages.args),
             stages.system.momentum(t, q, u, stages.args),
-        )
-    )(stages.stage_times, q, u, multiplier)
+        ),
+        stages.stage_times,
+        q,
+        u,
+        multiplier,
+    )
     momentum, chart_force = chart.to_chart(y, x.velocity, momentum, force)
     transported = chart.to_origin(y, force)
     base = chart.base_momentum(
@@ -349,8 +358,11 @@ def node_residual(
     impulse is subtracted too.
     """
     chart, y = node_coordinates(stages, x)
-    momentum = jax.vmap(lambda t, q, u: stages.system.momentum(t, q, u, stages.args))(
-        stages.node_times, chart.positions(y), x.node_fibre_coordinate
+    momentum = vmapped(
+        lambda t, q, u: stages.system.momentum(t, q, u, stages.args),
+        stages.node_times,
+        chart.positions(y),
+        x.node_fibre_coordinate,
     )
     start = chart.momentum_at_origin(_start_momentum(stages, x))
     gained = stages.h * small_einsum("ij,jn->in", stages.node_weights, force)
@@ -373,9 +385,12 @@ def constraint_values(stages: StageEquations, x: StageUnknowns) -> tuple[Array, 
 def node_constraint(stages: StageEquations, x: StageUnknowns) -> Float[Array, "r m"]:
     """Compute the nonholonomic constraints Φ(q^i, u^i) at the nodes."""
     chart, y = node_coordinates(stages, x)
-    values = jax.vmap(
-        lambda t, q, u: stages.system.kinematic_constraint(t, q, u, stages.args)
-    )(stages.node_times, chart.positions(y), x.node_fibre_coordinate)
+    values = vmapped(
+        lambda t, q, u: stages.system.kinematic_constraint(t, q, u, stages.args),
+        stages.node_times,
+        chart.positions(y),
+        x.node_fibre_coordinate,
+    )
     if stages.redundancy is None:
         return values
     return stages.redundancy.reduced(values, stages.h * x.closure, 0)
@@ -390,9 +405,11 @@ def holonomic_constraint(
     """
     chart, y = stage_coordinates(stages, x)
     nodes = chart.positions(y[1:])
-    on_positions = jax.vmap(
-        lambda t, q: stages.system.position_constraint(t, q, stages.args)
-    )(stages.stage_times[1:], nodes)
+    on_positions = vmapped(
+        lambda t, q: stages.system.position_constraint(t, q, stages.args),
+        stages.stage_times[1:],
+        nodes,
+    )
     end = jax.tree.map(lambda leaf: leaf[-1], nodes)
     rate = stages.system.holonomic_rate(
         stages.t + stages.h, end, x.node_fibre_coordinate[-1], stages.args
@@ -435,7 +452,9 @@ def constraint_jacobian(
     stages: StageEquations, x: StageUnknowns
 ) -> Float[Array, "r l n"]:
     """Compute B = ∂Φ/∂u at the nodes i >= 2, where Φ are all velocity constraints."""
-    return _at_nodes(stages, x, jax.jacrev)
+    return _at_nodes(
+        stages, x, lambda constraint: lambda u: jacobian_by_rows(constraint, u)
+    )
 
 
 def sparse_constraint_jacobian(
@@ -459,11 +478,14 @@ def _at_nodes(
         u = jnp.broadcast_to(u, (stages.method.stages - 1, u.shape[1]))
     chart, y = stage_coordinates(stages, x)
     nodes = chart.positions(y[1:])
-    return jax.vmap(
+    return vmapped(
         lambda t, q, u: differentiated(
             lambda u: stages.system.constraint(t, q, u, stages.args)
-        )(u)
-    )(times, nodes, u)
+        )(u),
+        times,
+        nodes,
+        u,
+    )
 
 
 def start_impulse(stages: StageEquations, x: StageUnknowns) -> Float[Array, " n"]:

@@ -19,6 +19,7 @@ from .._numerics import (
     DenseMatrix,
     DiagonalMatrix,
     InverseMatrix,
+    jacobian_by_rows,
     jacobian_sparsity,
     JacobianMatrix,
     least_norm_inverse,
@@ -242,7 +243,9 @@ def constraint_matrices(
     if may_be_sparse and num_constraints >= _FEWEST_SPARSE and metric.is_diagonal:
         pattern = _constraint_pattern(system, t, q, u, args)
     if pattern is None:
-        slopes = DenseMatrix(jax.jacrev(system.constraint, argnums=2)(t, q, u, args))
+        slopes = DenseMatrix(
+            jacobian_by_rows(lambda u: system.constraint(t, q, u, args), u)
+        )
     else:
         slopes = sparse_jacobian(lambda u: system.constraint(t, q, u, args), u, pattern)
     reaction = slopes.weighted_transpose(fibre_hessian_inverse)

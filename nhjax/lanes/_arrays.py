@@ -7,7 +7,7 @@ operation becomes loads and stores.
 """
 
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -568,19 +568,12 @@ def _reduce(builder: Builder, equation: Any, values: list[ArrayValue]) -> ArrayV
     shape, rows = _rows(x, [int(axis) for axis in equation.params["axes"]])
     out = np.empty(len(rows), object)
     for index, row in enumerate(rows):
-        out[index] = _folded(builder, op, row)
+        out[index] = builder.graph.folded(op, row)
         if out[index] is None:
             out[index] = builder.graph.constant(
                 np.array(empty(dtype)).astype(dtype), dtype
             )
     return out.reshape(shape)
-
-
-def _folded(builder: Builder, op: str, numbers: Iterable[Node]) -> Node | None:
-    total = None
-    for number in numbers:
-        total = number if total is None else builder.graph.op(op, total, number)
-    return total
 
 
 def _arg(
@@ -622,70 +615,6 @@ def _cumulative(op: str, builder: Builder, equation: Any, values: list) -> Array
     return np.moveaxis(out, 0, axis)
 
 
-def _dot_general(
-    builder: Builder, equation: Any, values: list[ArrayValue]
-) -> ArrayValue:
-    (left, right), (left_batch, right_batch) = equation.params["dimension_numbers"]
-    graph, aval = builder.graph, equation.outvars[0].aval
-    dtype = dtype_name(aval.dtype)
-    a, b = map(builder.memory.registers, values)
-    summed = math.prod(a.shape[axis] for axis in left)
-    if math.prod(aval.shape) * max(summed, 1) > 16 * MOST_ONE_BY_ONE:
-        raise Unsupported("a large product of matrices")
-    a = _arranged(a, left_batch, left)
-    b = _arranged(b, right_batch, right)
-    out = np.empty((a.shape[0], a.shape[1], b.shape[1]), object)
-    times, plus = ("and", "or") if dtype == "bool" else ("mul", "add")
-    for batch, i, j in np.ndindex(out.shape):
-        products = [
-            graph.op(times, graph.convert(x, dtype), graph.convert(y, dtype))
-            for x, y in zip(a[batch, i], b[batch, j], strict=True)
-        ]
-        out[batch, i, j] = _folded(builder, plus, products) or graph.zero(dtype)
-    return out.reshape(aval.shape)
-
-
-def _arranged(x: np.ndarray, batch: Sequence[int], summed: Sequence[int]) -> np.ndarray:
-    """Transpose and reshape an operand to (batch, free, summed)."""
-    free = [axis for axis in range(x.ndim) if axis not in (*batch, *summed)]
-    sizes = [
-        math.prod(x.shape[axis] for axis in axes) for axes in (batch, free, summed)
-    ]
-    return x.transpose([*batch, *free, *summed]).reshape(sizes)
-
-
-def _small_product(
-    builder: Builder, equation: Any, values: list[ArrayValue]
-) -> ArrayValue:
-    first, second, result = (equation.params[k] for k in ("first", "second", "result"))
-    graph, aval = builder.graph, equation.outvars[0].aval
-    a, b = map(builder.memory.registers, values)
-    lengths = {
-        **dict(zip(first, a.shape, strict=True)),
-        **dict(zip(second, b.shape, strict=True)),
-    }
-    order = [*result, *(index for index in first if index not in result)]
-    shape = [lengths[index] for index in order]
-
-    def rows(x: np.ndarray, indices: str) -> np.ndarray:
-        """Return the numbers of an operand as rows, one row for each sum."""
-        x = x.transpose([indices.index(index) for index in order if index in indices])
-        x = x.reshape([lengths[index] if index in indices else 1 for index in order])
-        terms = math.prod(shape[len(result) :])
-        return np.broadcast_to(x, shape).reshape(aval.size, terms)
-
-    products = [
-        [graph.op("mul", x, y) for x, y in zip(*pair, strict=True)]
-        for pair in zip(rows(a, first), rows(b, second), strict=True)
-    ]
-    out = np.empty(aval.size, object)
-    for index, row in enumerate(products):
-        out[index] = _folded(builder, "add", row)
-        if out[index] is None:
-            out[index] = graph.zero(dtype_name(aval.dtype))
-    return out.reshape(aval.shape)
-
-
 REDUCTIONS: dict[str, Operation] = {
     **dict.fromkeys(_REDUCTIONS, _reduce),
     "argmax": partial(_arg, "gt"),
@@ -694,6 +623,4 @@ REDUCTIONS: dict[str, Operation] = {
     "cumprod": partial(_cumulative, "mul"),
     "cummax": partial(_cumulative, "max"),
     "cummin": partial(_cumulative, "min"),
-    "dot_general": _dot_general,
-    "small_product": _small_product,
 }

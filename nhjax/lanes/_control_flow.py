@@ -1,4 +1,4 @@
-"""Loops, branches and calls of a jaxpr: `while`, `scan`, `cond` and inner programs.
+"""Loops, branches, calls and products of a jaxpr: `while`, `cond`, `dot_general`, ….
 
 A loop carries arrays as parameters, number by number, or leaves them in place in
 memory. Numbers that start as constants are first assumed to stay constant. The body is
@@ -7,13 +7,15 @@ for them. The changing numbers are remembered, so that building an outer loop ag
 not multiply the time with the depth of nesting. If a loop continues an earlier one, the
 operation `loop_start` names the constants with which the earlier loop started.
 
-Short scans are unrolled, unless their body contains loops.
+Short scans are unrolled, unless their body contains loops. Products of arrays are
+written out number by number, or in a loop over the first index if they are long.
 """
 
 import math
+import string
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
-from typing import Any
+from typing import Any, TypeAlias
 
 import jax
 import numpy as np
@@ -29,12 +31,30 @@ from ._builder import (
     hold,
     InMemory,
     MOST_IN_REGISTERS,
+    MOST_ONE_BY_ONE,
     Operation,
     Registers,
     release,
     sizes_of_scan,
 )
-from ._graph import BranchBuilder, dtype_name, LoopBuilder, Node
+from ._graph import (
+    BranchBuilder,
+    dtype_name,
+    is_float,
+    LoopBuilder,
+    Node,
+    Unsupported,
+)
+
+
+# The indices of the first operand, of the second, and of the result, as for an einsum.
+_Indices: TypeAlias = tuple[str, str, str]
+
+# Longer sums of products of two arrays are computed in a loop, which takes less time to
+# compile, and for products of this length runs as fast.
+_LONGEST_PRODUCT = 1000
+# Larger products are left to a library.
+_LARGEST_PRODUCT = 2**16
 
 
 def _call(
@@ -264,7 +284,7 @@ def _has_loop(jaxpr: Any, builder: Builder) -> bool:
     """
     for equation in jaxpr.eqns:
         name = equation.primitive.name
-        if name == "while":
+        if name in ("while", "batched_call"):
             return True
         if name == "scan" and equation.params["length"] > builder.unroll:
             return True
@@ -343,14 +363,68 @@ def _stacked(builder: Builder, aval: Any, values: list[ArrayValue]) -> ArrayValu
 def _scanned(
     builder: Builder, equation: Any, consts: list, carry: list, rows: list
 ) -> list[ArrayValue]:
-    params, graph, memory = equation.params, builder.graph, builder.memory
-    body, length, count = params["jaxpr"], params["length"], len(carry)
+    params, count = equation.params, len(carry)
+    body, length = params["jaxpr"], params["length"]
     stored = {index - len(consts) for index in updated_inputs(body.jaxpr)}
     of_carry = [
         value.size > 0 and (value.size > MOST_IN_REGISTERS or index in stored)
         for index, value in enumerate(carry)
     ]
+
+    def iteration(
+        carry: list[ArrayValue], row: list[ArrayValue]
+    ) -> tuple[list[ArrayValue], list[ArrayValue]]:
+        outs = builder.run(body.jaxpr, body.consts, [*consts, *carry, *row])
+        return outs[:count], outs[count:]
+
     avals = [variable.aval for variable in equation.outvars[count:]]
+    order = length, params["reverse"]
+    return _over_rows(builder, iteration, carry, of_carry, rows, avals, order)
+
+
+def _each_row(
+    builder: Builder, equation: Any, values: list[ArrayValue]
+) -> list[ArrayValue]:
+    """Compute a program for each row of some operands, in a loop."""
+    params = equation.params
+    program, is_row = params["program"], params["is_batched"]
+    rows, shared = _split(is_row, values)
+
+    def iteration(
+        carry: list[ArrayValue], row: list[ArrayValue]
+    ) -> tuple[list[ArrayValue], list[ArrayValue]]:
+        del carry
+        operands = _merged(is_row, row, shared)
+        return [], builder.run(program.jaxpr, program.consts, operands)
+
+    avals = [variable.aval for variable in equation.outvars]
+    order = rows[0].shape[0], False
+    with builder.held([*shared, *rows]):
+        return _over_rows(builder, iteration, [], [], rows, avals, order)
+
+
+_Iteration = Callable[
+    [list[ArrayValue], list[ArrayValue]], tuple[list[ArrayValue], list[ArrayValue]]
+]
+
+
+def _over_rows(
+    builder: Builder,
+    iteration: _Iteration,
+    carry: list[ArrayValue],
+    of_carry: list[bool],
+    rows: list[ArrayValue],
+    avals: list[Any],
+    order: tuple[int, bool],
+) -> list[ArrayValue]:
+    """Create a loop over rows, which carries some arrays and stacks other results.
+
+    `of_carry` says which of the carried arrays are in memory, and `avals` are the types
+    of the stacked results. `order` is the number of rows, and whether the loop begins
+    with the last row.
+    """
+    graph, memory, count = builder.graph, builder.memory, len(carry)
+    length, reverse = order
     saved: list[ArrayValue] = []
     for aval in avals:
         size = math.prod(aval.shape)
@@ -366,26 +440,170 @@ def _scanned(
     def step(values: list[ArrayValue]) -> list[ArrayValue]:
         k = builder.index(values[0])
         place = k
-        if params["reverse"]:
+        if reverse:
             place = graph.op("sub", builder.integer(length - 1), k)
         row = [_row(builder, value, place) for value in rows]
-        args = [*consts, *values[1 : 1 + count], *row]
-        outs = builder.run(body.jaxpr, body.consts, args)
+        carry, out = iteration(values[1 : 1 + count], row)
         after = values[1 + count :]
-        with builder.held(outs):
-            for target, value in zip(after, outs[count:], strict=True):
+        with builder.held([*carry, *out]):
+            for target, value in zip(after, out, strict=True):
                 if isinstance(target, InMemory):
                     shift = graph.op("mul", place, builder.integer(value.size))
                     memory.write(target.buffer, flat_indices(value.shape), value, shift)
         counter = builder.full((), graph.op("add", k, builder.integer(1)))
-        return [counter, *outs[:count], *after]
+        return [counter, *carry, *after]
 
     counter = builder.full((), builder.integer(0))
     flags = [False, *of_carry, *[isinstance(value, InMemory) for value in saved]]
     return loop(builder, [counter, *carry, *saved], flags, predicate, step)[1:]
 
 
-SCANS: dict[str, Operation] = {"while": _while, "scan": _scan}
+def _small_product(
+    builder: Builder, equation: Any, values: list[ArrayValue]
+) -> ArrayValue:
+    first, second, result = (equation.params[k] for k in ("first", "second", "result"))
+    aval = equation.outvars[0].aval
+    return _product(builder, values, (first, second, result), aval)
+
+
+def _dot_general(
+    builder: Builder, equation: Any, values: list[ArrayValue]
+) -> ArrayValue:
+    aval = equation.outvars[0].aval
+    (left, right), (left_batch, right_batch) = equation.params["dimension_numbers"]
+    if not is_float(dtype_name(aval.dtype)) or len({x.dtype for x in values}) > 1:
+        return _of_any_type(builder, equation, values)
+    letters = iter(string.ascii_letters)
+    first, second = ([next(letters) for _ in value.shape] for value in values)
+    for i, j in zip((*left_batch, *left), (*right_batch, *right), strict=True):
+        second[j] = first[i]
+    free = [first[i] for i in range(len(first)) if i not in (*left_batch, *left)]
+    free += [second[j] for j in range(len(second)) if j not in (*right_batch, *right)]
+    result = [*(first[i] for i in left_batch), *free]
+    indices = "".join(first), "".join(second), "".join(result)
+    return _product(builder, values, indices, aval)
+
+
+def _product(
+    builder: Builder, values: list[ArrayValue], indices: _Indices, aval: Any
+) -> ArrayValue:
+    """Compute a sum of products; if it is long, in a loop over the first index."""
+    first, second, result = indices
+    dtype = dtype_name(aval.dtype)
+    lengths = {
+        index: length
+        for names, value in zip((first, second), values, strict=True)
+        for index, length in zip(names, value.shape, strict=True)
+    }
+    size = math.prod(lengths.values())
+    if size <= _LONGEST_PRODUCT or aval.shape[:1] in ((), (1,)):
+        a, b = map(builder.memory.registers, values)
+        return _written_out(builder, a, b, indices, dtype)
+    if size > _LARGEST_PRODUCT:
+        raise Unsupported("a large product of matrices")
+    index = result[0]
+    is_row = [index in first, index in second]
+
+    def iteration(
+        carry: list[ArrayValue], row: list[ArrayValue]
+    ) -> tuple[list[ArrayValue], list[ArrayValue]]:
+        del carry
+        a, b = map(builder.memory.registers, _merged(is_row, row, shared))
+        left, right, kept = (names.replace(index, "") for names in indices)
+        return [], [_written_out(builder, a, b, (left, right, kept), dtype)]
+
+    values = [
+        _with_axis_first(builder, value, names.index(index)) if mark else value
+        for mark, value, names in zip(is_row, values, (first, second), strict=True)
+    ]
+    rows, shared = _split(is_row, values)
+    with builder.held(values):
+        order = aval.shape[0], False
+        return _over_rows(builder, iteration, [], [], rows, [aval], order)[0]
+
+
+def _with_axis_first(builder: Builder, value: ArrayValue, axis: int) -> ArrayValue:
+    if axis == 0:
+        return value
+    return np.moveaxis(builder.memory.registers(value), axis, 0)
+
+
+def _of_any_type(
+    builder: Builder, equation: Any, values: list[ArrayValue]
+) -> ArrayValue:
+    """Compute a product of matrices of numbers or booleans, with conversions."""
+    (left, right), (left_batch, right_batch) = equation.params["dimension_numbers"]
+    graph, aval = builder.graph, equation.outvars[0].aval
+    dtype = dtype_name(aval.dtype)
+    a, b = map(builder.memory.registers, values)
+    summed = math.prod(a.shape[axis] for axis in left)
+    if math.prod(aval.shape) * max(summed, 1) > 16 * MOST_ONE_BY_ONE:
+        raise Unsupported("a large product of matrices")
+    a = _arranged(a, left_batch, left)
+    b = _arranged(b, right_batch, right)
+    out = np.empty((a.shape[0], a.shape[1], b.shape[1]), object)
+    times, plus = ("and", "or") if dtype == "bool" else ("mul", "add")
+    for batch, i, j in np.ndindex(out.shape):
+        products = [
+            graph.op(times, graph.convert(x, dtype), graph.convert(y, dtype))
+            for x, y in zip(a[batch, i], b[batch, j], strict=True)
+        ]
+        out[batch, i, j] = graph.folded(plus, products) or graph.zero(dtype)
+    return out.reshape(aval.shape)
+
+
+def _arranged(x: np.ndarray, batch: Sequence[int], summed: Sequence[int]) -> np.ndarray:
+    """Transpose and reshape an operand to (batch, free, summed)."""
+    free = [axis for axis in range(x.ndim) if axis not in (*batch, *summed)]
+    sizes = [
+        math.prod(x.shape[axis] for axis in axes) for axes in (batch, free, summed)
+    ]
+    return x.transpose([*batch, *free, *summed]).reshape(sizes)
+
+
+def _written_out(
+    builder: Builder, a: Registers, b: Registers, indices: _Indices, dtype: str
+) -> Registers:
+    """Compute the sum of products of two arrays, as `jax.numpy.einsum` does.
+
+    `indices` are those of the operands and of the result.
+    """
+    first, second, result = indices
+    graph = builder.graph
+    lengths = {
+        **dict(zip(first, a.shape, strict=True)),
+        **dict(zip(second, b.shape, strict=True)),
+    }
+    order = [*result, *(index for index in first if index not in result)]
+    shape = [lengths[index] for index in order]
+    size = math.prod(shape[: len(result)])
+
+    def rows(x: np.ndarray, indices: str) -> np.ndarray:
+        """Return the numbers of an operand as rows, one row for each sum."""
+        x = x.transpose([indices.index(index) for index in order if index in indices])
+        x = x.reshape([lengths[index] if index in indices else 1 for index in order])
+        terms = math.prod(shape[len(result) :])
+        return np.broadcast_to(x, shape).reshape(size, terms)
+
+    products = [
+        [graph.op("mul", x, y) for x, y in zip(*pair, strict=True)]
+        for pair in zip(rows(a, first), rows(b, second), strict=True)
+    ]
+    out = np.empty(size, object)
+    for index, row in enumerate(products):
+        out[index] = graph.folded("add", row)
+        if out[index] is None:
+            out[index] = graph.zero(dtype)
+    return out.reshape(shape[: len(result)])
+
+
+SCANS: dict[str, Operation] = {
+    "while": _while,
+    "scan": _scan,
+    "batched_call": _each_row,
+    "dot_general": _dot_general,
+    "small_product": _small_product,
+}
 
 
 _Predicate = Callable[[list[ArrayValue]], Node]

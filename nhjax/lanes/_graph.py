@@ -184,6 +184,13 @@ class Graph:
         """Return the node of a structural zero."""
         return self.constant(0, dtype, is_structural=True)
 
+    def folded(self, op: str, nodes: Iterable[Node]) -> Node | None:
+        """Combine nodes one after the other; return `None` if there are none."""
+        total = None
+        for node in nodes:
+            total = node if total is None else self.op(op, total, node)
+        return total
+
     def pure(
         self,
         op: str,

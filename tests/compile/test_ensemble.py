@@ -127,8 +127,9 @@ def test_ensemble_call_of_unsupported_function_is_batched_by_jax(monkeypatch):
     assert use == nhjax.EngineUse("xla", "chosen", 4)
 
 
-@pytest.mark.usefixtures("engine")
-def test_ensemble_call_with_operations_that_jax_expands_equals_jax():
+@pytest.mark.parametrize("engine", ["lanes", "xla"])
+def test_ensemble_call_with_operations_that_jax_expands_equals_jax(monkeypatch, engine):
+    monkeypatch.setenv("NHJAX_ENGINE", engine)
     # Since JAX 0.12 a search in a table is such an operation.
     table = jnp.linspace(0.0, 1.0, 9)
 

@@ -77,6 +77,36 @@ def test_unknown_engine_raises_with_known_ones(monkeypatch):
         nhjax.engines(in_kernel, *OPERANDS)
 
 
+@pytest.mark.parametrize("engine", ["lanes", "kernels"])
+@pytest.mark.parametrize("members", [None, 4])
+def test_engine_chosen_for_a_library_call_raises_with_reason(
+    monkeypatch, engine, members
+):
+    def factorised(x):
+        return as_cpu_kernel(jnp.linalg.cholesky, jnp.eye(2) * x)
+
+    run, x = factorised, jnp.ones(())
+    if members is not None:
+        run, x = jax.vmap(run), jnp.ones(members)
+    assert nhjax.engines(run, x)[0].engine == "xla"
+    monkeypatch.setenv("NHJAX_ENGINE", engine)
+    with pytest.raises(RuntimeError, match=f"NHJAX_ENGINE is '{engine}', but .*: .*"):
+        jax.jit(run)(x)
+
+
+def test_engine_chosen_for_large_arrays_is_used(monkeypatch):
+    def run(x):
+        return as_cpu_kernel(lambda x: x * x + x, x)
+
+    x = jnp.ones(200)
+    (use,) = nhjax.engines(run, x)
+    assert use.engine == "kernels"
+    assert "so large" in use.reason
+    monkeypatch.setenv("NHJAX_ENGINE", "lanes")
+    (use,) = nhjax.engines(run, x)
+    assert use.engine == "lanes"
+
+
 @pytest.mark.usefixtures("engine")
 @pytest.mark.parametrize(
     "transform",
@@ -234,23 +264,28 @@ def test_run_without_factorisation_is_one_kernel():
 
 
 @pytest.mark.parametrize(
-    ("example", "stages"),
+    ("example", "stages", "engine"),
     [
-        (systems.TurntableBall(), 8),
-        (systems.HeavyTopSE3(), 8),
-        (systems.ChaoticSystem(50), 3),
-        (systems.ChaoticSystem(20), 8),
+        (systems.TurntableBall(), 8, "lanes"),
+        (systems.HeavyTopSE3(), 8, "lanes"),
+        (systems.ChaoticSystem(50), 3, "kernels"),
+        (systems.ChaoticSystem(20), 8, "kernels"),
     ],
     ids=["ball", "top", "101 coordinates", "41 coordinates"],
 )
-def test_run_of_high_order_is_one_kernel(example, stages):
+def test_run_with_large_arrays_is_one_program_of_an_engine(example, stages, engine):
     def run(y0):
         method = LobattoIIIAB(stages)
         return nhjax.integrate(
             example.system, method, y0, dt=0.05, num_steps=3, throw=False
         ).ys
 
-    assert MARK in jax.jit(run).lower(example.initial_state()).as_text()
+    y0 = example.initial_state()
+    use = nhjax.engines(run, y0)[-1]
+    assert use.engine == engine
+    if engine == "kernels":
+        assert "arrays are so large" in use.reason
+        assert MARK in jax.jit(run).lower(y0).as_text()
 
 
 def test_trace_cache_traces_once_for_each_kind_of_arguments():

@@ -206,6 +206,9 @@ _CASES = {
     ],
     "custom_linear_solve": _unary(_solved),
     "cpu_kernel": _unary(_kernel),
+    "batched_call": _unary(
+        lambda x: jax.vmap(_kernel)(jnp.outer(x, jnp.arange(1.0, 4.0, dtype=x.dtype)))
+    ),
     "scan": [
         (
             lambda x: lax.scan(lambda c, y: (c + y, c * y), x, jnp.outer(x, x)),
