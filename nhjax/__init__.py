@@ -4,6 +4,7 @@ from importlib import import_module
 from types import ModuleType
 from typing import TYPE_CHECKING
 
+from . import lanes as lanes
 from ._analysis import (
     check_system as check_system,
     linear_stability as linear_stability,
@@ -13,7 +14,6 @@ from ._analysis import (
     steady_motion as steady_motion,
     SystemReport as SystemReport,
 )
-from ._compile import engines as engines, EngineUse as EngineUse
 from ._ensemble import (
     AbstractReduction as AbstractReduction,
     ensemble as ensemble,
@@ -92,6 +92,7 @@ from .diagnostics import (
     energy_error as energy_error,
     momentum_map as momentum_map,
 )
+from .lanes import engines as engines, EngineUse as EngineUse
 
 
 if TYPE_CHECKING:

@@ -62,6 +62,17 @@ def test_floor_times_quoted_agree_with_the_result():
     assert_agree(quoted(text, sentence), [both, ours / both])
 
 
+def test_programs_of_others_quoted_agree_with_the_result():
+    rows = {row["program"]: row for row in results("lanes_for_others")["rows"]}
+    table = rows_of(page("engines"), "program", "members")
+    assert [name for name, *_ in table] == list(rows)
+    for name, members, engine, *printed in table:
+        row = rows[name]
+        assert (members, engine) == (str(row["members"] or 1), row["engine"])
+        by_jax, by_nhjax = row["seconds"]
+        assert_agree(printed, [1e3 * by_jax, 1e3 * by_nhjax, row["ratio"]])
+
+
 def test_engine_ratios_quoted_agree_with_the_result():
     rows = results("engines")["rows"]
     ratios = {row["system"]: row["ratio"] for row in rows}

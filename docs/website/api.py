@@ -16,8 +16,8 @@ GROUPS = tomllib.loads(Path(__file__).with_name("api.toml").read_text(encoding="
 OVERVIEW = """# API
 
 Every public name has a page, which is made from its docstring. `import nhjax` gives all
-names except those in its modules `nhjax.systems` and `nhjax.plot`. Equations use the
-notation of the paper, as [the theory](../theory.md) explains it.
+names except those in its modules `nhjax.systems`, `nhjax.plot` and `nhjax.lanes`.
+Equations use the notation of the paper, as [the theory](../theory.md) explains it.
 """
 
 

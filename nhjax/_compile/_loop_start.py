@@ -13,7 +13,7 @@ import jax.core
 import jax.extend
 from jax.interpreters import batching, mlir
 
-from ._kernel import never_high
+from ..lanes import never_high
 
 
 T = TypeVar("T")

@@ -17,8 +17,7 @@ import jax.numpy as jnp
 from jax.interpreters import ad, batching, mlir
 from jaxtyping import Array
 
-from ._jaxprs import SMALL_PRODUCT
-from ._kernel import never_high
+from ..lanes import never_high, SMALL_PRODUCT
 
 
 # Longer sums are not written out term by term.

@@ -27,7 +27,7 @@ import jax
 import jax.core
 import numpy as np
 
-from ._garbage_collection import rare_collections
+from ..lanes import rare_collections
 
 
 # The place of a value: the identity of its owner, and a name or index.

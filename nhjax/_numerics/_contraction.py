@@ -18,7 +18,8 @@ import jax.extend
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PyTree
 
-from .._compile import LARGEST_REDUCTION, LONGEST_SUM, small_product
+from .._compile import LONGEST_SUM, small_product
+from ..lanes import LARGEST_REDUCTION
 
 
 # A library computes larger products, and sums longer than `LONGEST_SUM`, so that the

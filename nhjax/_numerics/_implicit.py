@@ -18,8 +18,9 @@ import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, PyTree
 
-from .._compile import as_cpu_kernel, cse_dce, TraceCache
+from .._compile import as_cpu_kernel, TraceCache
 from .._custom_types import BoolScalar, FloatScalar
+from ..lanes import cse_dce
 from ._contraction import with_small_products
 from ._floating_point import max_norm, nonzero_or_one
 from ._iteration import dense_increment, iterate, Solved, UpdateNorms

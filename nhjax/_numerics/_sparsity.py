@@ -15,7 +15,7 @@ import jax.extend
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from .._compile import CALLING, ELEMENTWISE, SMALL_PRODUCT
+from ..lanes import CALLING, ELEMENTWISE, SMALL_PRODUCT
 
 
 # These operations rearrange the elements of their operands. NumPy rearranges the sets

@@ -1,6 +1,24 @@
 """A compiler of small JAX programs that run for many members, by SIMD and threads."""
 
+from ._batched_call import batched_call as batched_call
+from ._engines import engines as engines, EngineUse as EngineUse
+from ._garbage_collection import rare_collections as rare_collections
 from ._graph import Unsupported as Unsupported
+from ._jaxprs import (
+    CALLING as CALLING,
+    cse_dce as cse_dce,
+    ELEMENTWISE as ELEMENTWISE,
+    LARGEST_REDUCTION as LARGEST_REDUCTION,
+    num_results as num_results,
+    SMALL_PRODUCT as SMALL_PRODUCT,
+)
+from ._kernel import (
+    captures_tracers as captures_tracers,
+    CompileOptions as CompileOptions,
+    never_high as never_high,
+    run_program as run_program,
+    split_by_operands as split_by_operands,
+)
 from ._native import host_width as host_width, is_available as is_available
 from ._program import (
     compile_batched as compile_batched,
@@ -10,3 +28,4 @@ from ._program import (
     llvm_ir as llvm_ir,
     register_kernel as register_kernel,
 )
+from ._transforms import jit as jit, vmap as vmap

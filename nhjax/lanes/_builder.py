@@ -480,11 +480,12 @@ class Builder:
         return out.reshape(shape)
 
 
-# The primitives that run an inner program as it is.
+# The primitives that run an inner program as it is. `eval_jaxpr` is the name of
+# `closed_call` since JAX 0.12.
 CALLS = frozenset(
     """
     checkpoint closed_call core_call custom_jvp_call custom_vjp_call
-    custom_vjp_call_jaxpr jit cpu_kernel pjit remat remat2
+    custom_vjp_call_jaxpr eval_jaxpr jit cpu_kernel pjit remat remat2
     """.split()  # noqa: SIM905
 )
 # The primitive that has a method of Python which returns its program.

@@ -220,6 +220,8 @@ def _while(
 ) -> list[ArrayValue]:
     params = equation.params
     test, body = params["cond_jaxpr"], params["body_jaxpr"]
+    if test.out_avals[0].shape:
+        raise Unsupported("a loop with a condition for each of several members")
     first, second = params["cond_nconsts"], params["body_nconsts"]
     of_test, of_body = values[:first], values[first : first + second]
     inits = values[first + second :]

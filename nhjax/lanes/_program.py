@@ -1,4 +1,4 @@
-"""Compilation of a program, from a jaxpr to a name that XLA can call.
+"""Compilation of a program, from a jaxpr to a name that XLA can call, and to the call.
 
 `compile_batched` and `compile_single` build the graph of a program (`build_graph`),
 write its kernel (`llvm_ir`), compile it together with a handler, and register the
@@ -13,6 +13,9 @@ to 150 KB, and `compiled_code` returns the total.
 Before the graph is built, the key of the jaxpr is looked up (`_cache`): in this
 process, and then in the cache on disk if JAX's options switch it on. The entry has the
 name and the native code, so that a known program needs neither the graph nor LLVM.
+
+The rules at the end of the file lower the operations that stand for a program
+(`_kernel`, `_batched_call`) to such calls, or leave the program to another engine.
 
 Executables in JAX's persistent cache call programs by these names too. JAX lowers a
 program before it looks for its executable, and lowering registers the name. If an
@@ -30,9 +33,12 @@ import time
 from typing import Any, NamedTuple
 
 import jax
+import jax.extend
 import jax.ffi
+from jax.interpreters import mlir
 
 from ._arrays import GATHERS, INDEXING, REDUCTIONS, SHAPING
+from ._batched_call import batched_call, num_members, vmapped
 from ._builder import (
     ArrayValue,
     Builder,
@@ -46,8 +52,24 @@ from ._control_flow import BRANCHES, SCANS
 from ._elementary_functions import definitions
 from ._elementwise import ELEMENTWISE
 from ._emission import emit
-from ._graph import Buffer, dtype_name, Region
+from ._engines import (
+    as_parts_of_a_program,
+    by_one_kernel,
+    chosen_engine,
+    is_exported,
+    is_part_of_a_program,
+    is_within_kernel,
+    reason_against_kernel,
+    reason_against_lanes,
+    record_engine,
+    require_not_chosen,
+)
+from ._expansion import expanded
+from ._garbage_collection import rare_collections
+from ._graph import Buffer, dtype_name, Region, Unsupported
 from ._handler import HANDLER, handler_ir, SHARED_HANDLER, shared_handler_ir, WORKERS
+from ._jaxprs import rms_array_size
+from ._kernel import CompileOptions, kernel, merge_lists, partition_list
 from ._native import host, host_width, load, object_code, version
 
 
@@ -89,6 +111,7 @@ def _compile(
     `is_batched` is `None` for a single run.
     """
     quick = is_brief or is_quick()
+    program = expanded(program, OPERATIONS)
     key = program_key(program, is_batched, width, quick)
     folder = directory()
     with _lock:
@@ -140,7 +163,7 @@ def llvm_ir(
 
     **Raises:** `Unsupported` if the program cannot be compiled.
     """
-    traced = build_graph(program)
+    traced = build_graph(expanded(program, OPERATIONS))
     kernel, wanted = emit(traced.root, traced.results, is_batched, width, contract)
     return f"{kernel}{definitions(wanted)}\n"
 
@@ -341,3 +364,124 @@ def _name(*texts: str) -> str:
         digest.update(part.encode())
         digest.update(b"\0")
     return f"nhjax_lanes_{digest.hexdigest()[:32]}"
+
+
+# The lowering of the operations that stand for programs
+
+
+# Measurements on the gallery's systems with 2 to 8 stages, and on larger systems, show
+# that this compiler, which turns all arrays into scalars, is faster below this root
+# mean square of array sizes. Above it XLA is faster, since it uses vectors for loops
+# over larger arrays also in a single run.
+_SMALL_ARRAYS = 110
+
+
+@rare_collections()
+def _lower_single(ctx: Any, *operands: Any, program: Any, options: CompileOptions):
+    if is_exported(ctx):
+        # Another process cannot call machine code of this process.
+        record_engine("xla", "the program is exported", None)
+        return _single_by_xla(ctx, *operands, program=program, options=options)
+    if is_within_kernel():
+        return _single_by_xla(ctx, *operands, program=program, options=options)
+    reason = reason_against_lanes()
+    large = rms_array_size(program.jaxpr) > _SMALL_ARRAYS
+    if reason is None and large and chosen_engine() is None:
+        reason = "its arrays are so large that XLA uses vectors for them"
+    if reason is None:
+        try:
+            name = compile_single(program, options.is_brief)
+        except Unsupported as error:
+            reason = str(error)
+        else:
+            record_engine("lanes", f"the first choice{options.note}", None)
+            return jax.ffi.ffi_lowering(name)(ctx, *operands)
+    against = _reason_against_kernel(program, options, reason)
+    if against is not None:
+        record_engine("xla", f"{against}{options.note}", None)
+        return _single_by_xla(ctx, *operands, program=program, options=options)
+    record_engine("kernels", reason, None)
+    return by_one_kernel(ctx, *operands, program=program)
+
+
+@rare_collections()
+def _lower_batched(
+    ctx: Any,
+    *operands: Any,
+    program: Any,
+    is_batched: tuple[bool, ...],
+    options: CompileOptions,
+):
+    members = num_members(ctx.avals_in, is_batched)
+    given = {"program": program, "is_batched": is_batched, "options": options}
+    if is_part_of_a_program():
+        return _batched_by_xla(ctx, *operands, **given)
+    if is_exported(ctx):
+        record_engine("xla", "the program is exported", members)
+        return _batched_by_xla(ctx, *operands, **given)
+    reason = reason_against_lanes()
+    if reason is None:
+        try:
+            name = compile_batched(program, is_batched, options.is_brief)
+        except Unsupported as error:
+            reason = str(error)
+        else:
+            record_engine("lanes", f"the first choice{options.note}", members)
+            return jax.ffi.ffi_lowering(name)(ctx, *operands)
+    against = _reason_against_kernel(program, options, reason)
+    if against is not None:
+        record_engine("xla", f"{against}{options.note}", members)
+        return _batched_by_xla(ctx, *operands, **given)
+    record_engine("kernels", reason, members)
+    return _one_by_one(ctx, *operands, **given)
+
+
+def _reason_against_kernel(
+    program: Any, options: CompileOptions, reason: str
+) -> str | None:
+    """Return why XLA does not compile a single kernel, or `None` if it does.
+
+    `reason` is the reason against `lanes`, which comes first.
+    """
+    is_free = not is_within_kernel()
+    if is_free:
+        require_not_chosen("lanes", reason)
+    if "kernels" not in options.engines:
+        return reason
+    against = reason_against_kernel(program)
+    if is_free and against is not None:
+        require_not_chosen("kernels", against)
+    if against is None or reason == against:
+        return against
+    return f"{reason}; no kernel: {against}"
+
+
+def _run_single(*operands: Any, program: Any, options: CompileOptions) -> list[Any]:
+    del options
+    return jax.extend.core.jaxpr_as_fun(program)(*operands)
+
+
+def _run_one_by_one(
+    *operands: Any,
+    program: Any,
+    is_batched: tuple[bool, ...],
+    options: CompileOptions,
+) -> list[Any]:
+    batched, shared = partition_list(is_batched, operands)
+
+    def member(batched: list[Any]) -> list[Any]:
+        given = {"program": program, "options": options}
+        return kernel.bind(*merge_lists(is_batched, batched, shared), **given)
+
+    return jax.lax.map(member, batched)
+
+
+_single_by_xla = as_parts_of_a_program(
+    mlir.lower_fun(_run_single, multiple_results=True)
+)
+_batched_by_xla = as_parts_of_a_program(mlir.lower_fun(vmapped, multiple_results=True))
+_one_by_one = mlir.lower_fun(_run_one_by_one, multiple_results=True)
+mlir.register_lowering(kernel, _single_by_xla, cacheable=False)
+mlir.register_lowering(kernel, _lower_single, platform="cpu", cacheable=False)
+mlir.register_lowering(batched_call, _batched_by_xla, cacheable=False)
+mlir.register_lowering(batched_call, _lower_batched, platform="cpu", cacheable=False)

@@ -5,7 +5,7 @@ import threading
 
 import pytest
 
-from nhjax._compile._garbage_collection import rare_collections
+from nhjax.lanes import rare_collections
 
 
 @pytest.fixture(autouse=True)

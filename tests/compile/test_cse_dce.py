@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from jax import lax
 
-from nhjax._compile import cse_dce
+from nhjax.lanes import cse_dce
 
 
 X = np.linspace(-1.0, 2.0, 5)

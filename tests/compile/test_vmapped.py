@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from nhjax._compile import _batched_call, as_cpu_kernel, vmapped
+from nhjax._compile import _rows, as_cpu_kernel, vmapped
 from nhjax._numerics import (
     full_jacobian,
     inverse,
@@ -25,7 +25,7 @@ P = jnp.array([0.7, -0.3, 1.9])
 @pytest.fixture(params=["loop", "written out"])
 def form(request, monkeypatch):
     shortest = 0 if request.param == "loop" else 10**9
-    monkeypatch.setattr(_batched_call, "SHORTEST_IN_LOOP", shortest)
+    monkeypatch.setattr(_rows, "SHORTEST_IN_LOOP", shortest)
     return request.param
 
 

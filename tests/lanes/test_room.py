@@ -5,6 +5,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 import nhjax.lanes
 from docs import rooms
 
@@ -31,6 +33,8 @@ name = compiler.compile_batched(program, (True,))
 x = jax.numpy.arange(5.0)
 call = jax.ffi.ffi_call(name, jax.ShapeDtypeStruct(x.shape, x.dtype))
 assert abs(call(x) - jax.numpy.sin(x) * x).max() < 1e-6
+assert abs(compiler.vmap(jax.numpy.sin)(x) - jax.numpy.sin(x)).max() < 1e-6
+assert compiler.engines(compiler.vmap(jax.numpy.sin), x)[0].engine == "lanes"
 print("works alone")
 """
 
@@ -68,8 +72,11 @@ def test_lanes_readme_names_functions_that_exist():
         assert re.search(pattern, SOURCES[f"lanes.{file}"], re.MULTILINE), name
 
 
-def test_lanes_readme_example_runs(capsys):
-    (example,) = re.findall(r"```python\n(.*?)```", README, re.DOTALL)
+EXAMPLES = re.findall(r"```python\n(.*?)```", README, re.DOTALL)
+
+
+@pytest.mark.parametrize("example", EXAMPLES, ids=["functions", "compiler"])
+def test_lanes_readme_example_runs(example, capsys):
     expected = re.search(r"# (\[.*\])", example)
     exec(example, {})
     assert expected is not None
@@ -77,9 +84,8 @@ def test_lanes_readme_example_runs(capsys):
 
 
 def test_lanes_readme_quotes_the_ir_of_its_example():
-    (example,) = re.findall(r"```python\n(.*?)```", README, re.DOTALL)
     space = {}
-    exec(example, space)
+    exec(EXAMPLES[1], space)
     text = nhjax.lanes.llvm_ir(space["program"], (True, False), 4)
     quoted = "".join(re.findall(r"```llvm\n(.*?)```", README, re.DOTALL)).splitlines()
     lines = [line for line in quoted if line.strip() != "..."]

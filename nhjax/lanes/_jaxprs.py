@@ -16,7 +16,6 @@ from typing import Any
 import jax
 import jax.extend
 import numpy as np
-from jaxtyping import PyTree
 
 
 # The lists below contain, by JAX's names, the operations that XLA can put into one
@@ -100,7 +99,7 @@ def _size(variable: Any) -> int:
     return math.prod(variable.aval.shape)
 
 
-def _programs(params: PyTree[Any]) -> Iterator[Any]:
+def _programs(params: Any) -> Iterator[Any]:
     for leaf in jax.tree.leaves(params):
         leaf = getattr(leaf, "jaxpr", leaf)
         if hasattr(leaf, "eqns"):

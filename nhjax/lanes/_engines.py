@@ -1,7 +1,4 @@
-"""Which engine compiles a single run on the CPU, and why.
-
-nhjax's own compiler turns all arrays into scalars, which is fastest while arrays are
-small. For loops over larger arrays XLA uses vectors, also in a single run.
+"""The engines that can compile a program on the CPU, and the reasons against them.
 
 XLA runs a program on the CPU as a sequence of kernels. Starting a kernel takes about 50
 ns, as long as the arithmetic of tens of numbers, and one iteration of a stage solver is
@@ -22,16 +19,12 @@ import jax.numpy as jnp
 from jax.interpreters import mlir
 from jaxlib.mlir import ir
 
-from ..lanes import compile_single, is_available, Unsupported
-from ._garbage_collection import rare_collections
-from ._jaxprs import fits_one_kernel, LARGEST_REDUCTION, rms_array_size
-from ._kernel import kernel, merge_lists, partition_list
+from ._jaxprs import fits_one_kernel, LARGEST_REDUCTION
+from ._kernel import ENGINES, merge_lists, partition_list
+from ._native import is_available
 
 
 T = TypeVar("T")
-
-# The engines, in the order in which they are tried.
-ENGINES = ("lanes", "kernels", "xla")
 
 
 class EngineUse(NamedTuple):
@@ -41,7 +34,8 @@ class EngineUse(NamedTuple):
         an ensemble (SIMD); `"kernels"` is XLA with one kernel for each member; `"xla"`
         is XLA without such kernels.
     - `reason`: why this engine was used, and why earlier engines were not used.
-    - `members`: the number of members of an ensemble; `None` for a single run.
+    - `members`: the number of members of an ensemble; `None` for a single run, and for
+        a part of a program that is not compiled as a whole.
     """
 
     engine: str
@@ -84,11 +78,13 @@ def record_engine(engine: str, reason: str, members: int | None) -> None:
 def engines(function: Callable[..., Any], *args: Any) -> tuple[EngineUse, ...]:
     """Return which engines compile the programs of `function(*args)` on a CPU, and why.
 
-    The function is compiled, but not run. On the CPU, nhjax compiles an ensemble (a run
-    under `jax.vmap`) itself if possible, and vectorises over its members (SIMD). The
-    environment variable `NHJAX_ENGINE` chooses the engine of all programs: `lanes`,
-    `kernels` or `xla`. If the engine cannot compile one of them, an error says why.
-    Programs that were compiled before keep their engine until `jax.clear_caches()`.
+    The programs are the runs of nhjax in the function, and the functions given to
+    `nhjax.lanes.vmap` and `nhjax.lanes.jit`. The function is compiled, but not run. On
+    the CPU, nhjax compiles an ensemble (a run under `jax.vmap`) itself if possible, and
+    vectorises over its members (SIMD). The environment variable `NHJAX_ENGINE` chooses
+    the engine of all programs: `lanes`, `kernels` or `xla`. If the engine cannot
+    compile one of them, an error says why. Programs that were compiled before keep
+    their engine until `jax.clear_caches()`.
 
     **Arguments:**
 
@@ -167,6 +163,8 @@ def reason_against_kernel(program: Any) -> str | None:
     """Return why XLA does not compile a single kernel, or `None` if it does."""
     if chosen_engine() == "xla":
         return "chosen"
+    if is_within_kernel():
+        return "it is a part of a kernel"
     # The dtype of random keys has no attribute `kind`, so its kind is None here.
     kinds = {getattr(aval.dtype, "kind", None) for aval in program.in_avals}
     if not kinds <= set("fiub"):
@@ -176,43 +174,8 @@ def reason_against_kernel(program: Any) -> str | None:
     return None
 
 
-# Measurements on the gallery's systems with 2 to 8 stages, and on larger systems, show
-# that nhjax's own compiler is faster below this root mean square of array sizes, and
-# that XLA is faster above it.
-_SMALL_ARRAYS = 110
-
-
-@rare_collections()
-def _lowered(ctx, *operands, program, is_brief):
-    if is_exported(ctx):
-        # Another process cannot call machine code of this process.
-        record_engine("xla", "the program is exported", None)
-        return _by_xla(ctx, *operands, program=program, is_brief=is_brief)
-    if is_within_kernel():
-        return _by_xla(ctx, *operands, program=program, is_brief=is_brief)
-    reason = reason_against_lanes()
-    large = rms_array_size(program.jaxpr) > _SMALL_ARRAYS
-    if reason is None and large and chosen_engine() is None:
-        reason = "its arrays are so large that XLA uses vectors for them"
-    if reason is None:
-        try:
-            name = compile_single(program, is_brief)
-        except Unsupported as error:
-            reason = str(error)
-        else:
-            record_engine("lanes", "the first choice", None)
-            return jax.ffi.ffi_lowering(name)(ctx, *operands)
-    require_not_chosen("lanes", reason)
-    against = reason_against_kernel(program)
-    if against is not None:
-        require_not_chosen("kernels", against)
-        record_engine("xla", against, None)
-        return _by_xla(ctx, *operands, program=program, is_brief=is_brief)
-    record_engine("kernels", reason, None)
-    return _as_one_kernel(ctx, *operands, program=program)
-
-
-def _as_one_kernel(ctx, *operands, program):
+def by_one_kernel(ctx, *operands, program):
+    """Lower a program to one kernel of XLA."""
     run = jax.extend.core.jaxpr_as_fun(program)
 
     def call(*operands):
@@ -255,13 +218,3 @@ def _tied(operands: tuple[Any, ...]) -> list[Any]:
         jnp.where(never, jnp.zeros_like(x), x) if x.size <= LARGEST_REDUCTION else x
         for x in operands
     ]
-
-
-def _plain(*operands, program, is_brief):
-    del is_brief
-    return jax.extend.core.jaxpr_as_fun(program)(*operands)
-
-
-_by_xla = as_parts_of_a_program(mlir.lower_fun(_plain, multiple_results=True))
-mlir.register_lowering(kernel, _by_xla, cacheable=False)
-mlir.register_lowering(kernel, _lowered, platform="cpu", cacheable=False)

@@ -1,0 +1,293 @@
+"""Operations that are replaced by programs of simpler operations before compilation.
+
+Factorisations of small matrices are written out, since XLA calls a library for them.
+Loops whose iterations end member by member, as under `vmap`, get one condition.
+The operations of other libraries, such as those that equinox defines for its loops, are
+replaced by the program of their implementation: what they compute outside of `vmap`.
+"""
+
+from collections.abc import Callable, Container
+from functools import partial
+from typing import Any
+
+import jax
+import jax.extend
+import jax.numpy as jnp
+import numpy as np
+from jax.extend.core.primitives import closed_call_p
+
+
+# Larger matrices are left to XLA, which calls LAPACK.
+MOST_ROWS = 32
+
+
+def register_expansion(primitive: Any, function: Callable[..., Any]) -> None:
+    """Replace a primitive by the program of a function with the same arguments."""
+    _EXPANSIONS[primitive.name] = (lambda equation: True), function
+
+
+def expanded(program: Any, known: Container[str]) -> Any:
+    """Replace operations of a closed jaxpr, and of its inner programs, where possible.
+
+    The program is returned unchanged if it has no such operation.
+
+    **Arguments:**
+
+    - `program`: the closed jaxpr.
+    - `known`: the names of the operations that the compiler knows.
+    """
+    return _Expander(known).program(program)
+
+
+class _Expander:
+    """Replaces operations; a program that occurs several times is expanded once.
+
+    `stays` are the names of operations that are not replaced by their implementations.
+    """
+
+    def __init__(self, stays: Container[str]):
+        self._stays = stays
+        # The original program is kept too, so that its identity is not reused.
+        self._known: dict[int, tuple[Any, Any]] = {}
+
+    def program(self, program: Any) -> Any:
+        """Expand an open or closed jaxpr."""
+        if id(program) not in self._known:
+            whole = self._expanded(program)
+            self._known[id(program)] = program, whole
+        return self._known[id(program)][1]
+
+    def _expanded(self, program: Any) -> Any:
+        jaxpr = getattr(program, "jaxpr", program)
+        equations = list(map(self._equation, jaxpr.eqns))
+        if all(a is b for a, b in zip(equations, jaxpr.eqns, strict=True)):
+            return program
+        jaxpr = jaxpr.replace(eqns=equations)
+        return program.replace(jaxpr=jaxpr) if hasattr(program, "jaxpr") else jaxpr
+
+    def _equation(self, equation: Any) -> Any:
+        inner = self._program_of(equation)
+        if inner is not None:
+            params = {"call_jaxpr": self.program(inner)}
+            return equation.replace(primitive=closed_call_p, params=params)
+        params = {
+            name: jax.tree.map(self._value, value) if _holds_programs(value) else value
+            for name, value in equation.params.items()
+        }
+        if all(params[name] is equation.params[name] for name in params):
+            return equation
+        return equation.replace(params=params)
+
+    def _program_of(self, equation: Any) -> Any:
+        """Return a program that computes an operation by simpler ones, or `None`."""
+        primitive, params = equation.primitive, equation.params
+        if primitive.name in _EXPANSIONS:
+            applies, function = _EXPANSIONS[primitive.name]
+            if applies(equation):
+                return _traced(partial(function, **params), equation)
+        if primitive.name in self._stays or not is_foreign(primitive):
+            return None
+        program = _traced(partial(primitive.impl, **params), equation)
+        if program is None or _contains(program.jaxpr, primitive):
+            return None
+        return program
+
+    def _value(self, value: Any) -> Any:
+        return self.program(value) if _is_program(value) else value
+
+
+def _is_program(value: Any) -> bool:
+    return hasattr(getattr(value, "jaxpr", value), "eqns")
+
+
+def _holds_programs(value: Any) -> bool:
+    return _is_program(value) or (
+        isinstance(value, tuple) and any(map(_is_program, value))
+    )
+
+
+def is_foreign(primitive: Any) -> bool:
+    """Return whether another library than JAX has defined an operation.
+
+    JAX implements its own operations by compiling and running them.
+    """
+    implementation = primitive.impl
+    while isinstance(implementation, partial):
+        implementation = implementation.func
+    module = getattr(implementation, "__module__", None) or "jax"
+    return module.partition(".")[0] != "jax"
+
+
+def _traced(function: Callable[..., Any], equation: Any) -> Any:
+    """Return the program of an operation, or `None` if it cannot be traced."""
+    avals = [variable.aval for variable in equation.invars]
+    args = [
+        jax.ShapeDtypeStruct(a.shape, a.dtype, weak_type=a.weak_type) for a in avals
+    ]
+    try:
+        program = jax.make_jaxpr(function)(*args)
+    except Exception:
+        # The code of another library may need numbers, or call other code.
+        return None
+    found = [(x.shape, x.dtype) for x in program.out_avals]
+    wanted = [(x.aval.shape, x.aval.dtype) for x in equation.outvars]
+    return program if found == wanted else None
+
+
+def _contains(jaxpr: Any, primitive: Any) -> bool:
+    """Return whether a jaxpr or one of its inner programs has an operation."""
+    for equation in jaxpr.eqns:
+        if equation.primitive is primitive:
+            return True
+        for value in jax.tree.leaves(list(equation.params.values())):
+            inner = getattr(value, "jaxpr", value)
+            if hasattr(inner, "eqns") and _contains(inner, primitive):
+                return True
+    return False
+
+
+def _is_small_matrix(equation: Any) -> bool:
+    """Return whether the first operand is a single matrix with few rows and columns."""
+    shape = equation.invars[0].aval.shape
+    is_real = jnp.issubdtype(equation.invars[0].aval.dtype, jnp.floating)
+    return is_real and len(shape) == 2 and max(shape) <= MOST_ROWS
+
+
+def _lu(a: Any, **_: Any) -> tuple[Any, Any, Any]:
+    """Factorise with row exchanges, like LAPACK's `getrf`.
+
+    The results are both factors in one matrix, the exchanges and the permutation.
+    """
+    rows = list(a)
+    order = [jnp.int32(k) for k in range(len(rows))]
+    pivots = []
+    for k in range(min(a.shape)):
+        place, largest = jnp.int32(k), jnp.abs(rows[k][k])
+        for i in range(k + 1, len(rows)):
+            is_larger = jnp.abs(rows[i][k]) > largest
+            place = jnp.where(is_larger, jnp.int32(i), place)
+            largest = jnp.where(is_larger, jnp.abs(rows[i][k]), largest)
+        first, first_order = rows[k], order[k]
+        for i in range(k + 1, len(rows)):
+            is_pivot = place == i
+            rows[k] = jnp.where(is_pivot, rows[i], rows[k])
+            order[k] = jnp.where(is_pivot, order[i], order[k])
+            rows[i] = jnp.where(is_pivot, first, rows[i])
+            order[i] = jnp.where(is_pivot, first_order, order[i])
+        pivots.append(place)
+        pivot = rows[k][k]
+        divisor = jnp.where(pivot == 0, jnp.ones_like(pivot), pivot)
+        for i in range(k + 1, len(rows)):
+            factor = rows[i][k] / divisor
+            rest = rows[i][k + 1 :] - factor * rows[k][k + 1 :]
+            rows[i] = jnp.concatenate([rows[i][:k], factor[None], rest])
+    return jnp.stack(rows), jnp.stack(pivots), jnp.stack(order)
+
+
+def _permutation(pivots: Any, *, permutation_size: int, **_: Any) -> Any:
+    """Return the order of rows after a sequence of exchanges."""
+    order = [jnp.int32(k) for k in range(permutation_size)]
+    for k in range(len(pivots)):
+        first = order[k]
+        for i in range(k + 1, permutation_size):
+            is_pivot = pivots[k] == i
+            order[k] = jnp.where(is_pivot, order[i], order[k])
+            order[i] = jnp.where(is_pivot, first, order[i])
+    return jnp.stack(order)
+
+
+def _triangular_solve(
+    a: Any,
+    b: Any,
+    *,
+    left_side: bool,
+    lower: bool,
+    transpose_a: bool,
+    unit_diagonal: bool,
+    **_: Any,
+) -> Any:
+    """Solve `a x = b`, or `x a = b`, by substitution."""
+    if not left_side:
+        a, b, lower = a.T, b.T, not lower
+    if transpose_a:
+        a, lower = a.T, not lower
+    solved: dict[int, Any] = {}
+    for i in range(len(a)) if lower else reversed(range(len(a))):
+        rest = b[i]
+        for j, x in solved.items():
+            rest = rest - a[i, j] * x
+        solved[i] = rest if unit_diagonal else rest / a[i, i]
+    x = jnp.stack([solved[i] for i in range(len(a))])
+    return x if left_side else x.T
+
+
+def _nextafter(x: Any, y: Any, **_: Any) -> Any:
+    """Return the number next to `x` in the direction of `y`."""
+    bits = jnp.dtype(f"int{8 * x.dtype.itemsize}")
+    number = jax.lax.bitcast_convert_type(x, bits)
+    one = jnp.ones_like(number)
+    # Away from zero the bits, read as an integer, grow.
+    grows = (y > x) == (x > 0)
+    next_bits = jnp.where(grows, number + one, number - one)
+    after = jax.lax.bitcast_convert_type(next_bits, x.dtype)
+    least = jax.lax.bitcast_convert_type(one, x.dtype)
+    after = jnp.where(x == 0, jnp.where(y > 0, least, -least), after)
+    after = jnp.where(x == y, y, after)
+    return jnp.where((x != x) | (y != y), x + y, after)
+
+
+def _is_short(equation: Any) -> bool:
+    shape = equation.outvars[0].aval.shape
+    return len(shape) == 1 and shape[0] <= MOST_ROWS
+
+
+def _has_members(equation: Any) -> bool:
+    """Return whether a `while` loop has a condition for each of several members."""
+    return equation.params["cond_jaxpr"].out_avals[0].shape != ()
+
+
+def _while_any(
+    *operands: Any,
+    cond_jaxpr: Any,
+    body_jaxpr: Any,
+    cond_nconsts: int,
+    body_nconsts: int,
+) -> list[Any]:
+    """Iterate while any member goes on; the others keep their values."""
+    test, body = map(jax.extend.core.jaxpr_as_fun, (cond_jaxpr, body_jaxpr))
+    of_test, of_body = operands[:cond_nconsts], operands[cond_nconsts:][:body_nconsts]
+
+    def step(carry: list[Any]) -> list[Any]:
+        (goes_on,) = test(*of_test, *carry)
+        return [
+            jnp.where(
+                goes_on.reshape(goes_on.shape + (1,) * (x.ndim - goes_on.ndim)), x, y
+            )
+            for x, y in zip(body(*of_body, *carry), carry, strict=True)
+        ]
+
+    start = list(operands[cond_nconsts + body_nconsts :])
+    return jax.lax.while_loop(
+        lambda carry: jnp.any(test(*of_test, *carry)[0]), step, start
+    )
+
+
+def _platform_index(*, platforms: Any) -> Any:
+    """Return the number of the branch for the CPU, or of the default branch."""
+    return jnp.int32(
+        next(k for k, names in enumerate(platforms) if names is None or "cpu" in names)
+    )
+
+
+def _is_real(equation: Any) -> bool:
+    return equation.invars[0].aval.dtype in (np.float32, np.float64)
+
+
+_EXPANSIONS: dict[str, tuple[Callable[[Any], bool], Callable[..., Any]]] = {
+    "lu": (_is_small_matrix, _lu),
+    "lu_pivots_to_permutation": (_is_short, _permutation),
+    "nextafter": (_is_real, _nextafter),
+    "platform_index": (lambda equation: True, _platform_index),
+    "triangular_solve": (_is_small_matrix, _triangular_solve),
+    "while": (_has_members, _while_any),
+}

@@ -1,0 +1,258 @@
+"""The operation that stands for a program compiled as a whole, and its derivatives.
+
+`run_program` binds a program as one operation, `cpu_kernel`. Its forward derivative is
+a pair of such operations, one for the values and one that is linear in the tangents;
+reverse mode transposes the second. `_program` decides how a program is compiled: this
+depends on the device and on the operations of the program.
+"""
+
+from collections.abc import Iterable
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.core
+import jax.extend
+import jax.numpy as jnp
+from jax.interpreters import ad
+
+from ._garbage_collection import rare_collections
+from ._jaxprs import cse_dce
+
+
+# The engines, in the order in which they are tried.
+ENGINES = ("lanes", "kernels", "xla")
+
+
+class CompileOptions(NamedTuple):
+    """How a program is compiled.
+
+    - `is_brief`: whether it runs once and for a short time. Then it is compiled in less
+        time, to slower code.
+    - `engines`: the engines that may compile it, and its derivatives, in the order in
+        which they are tried.
+    - `note`: what `engines` adds to the reason.
+    """
+
+    is_brief: bool = False
+    engines: tuple[str, ...] = ENGINES
+    note: str = ""
+
+
+def run_program(program: Any, leaves: list[Any], options: CompileOptions) -> list[Any]:
+    """Compute a program as one operation, or operation by operation if it has effects.
+
+    **Arguments:**
+
+    - `program`: a closed jaxpr.
+    - `leaves`: its operands.
+    - `options`: how it is compiled.
+    """
+    program = cse_dce(program)
+    # All traced values must be operands of a primitive, and it must have no effects,
+    # such as printing.
+    if program.effects or captures_tracers(program):
+        return jax.extend.core.jaxpr_as_fun(program)(*leaves)
+    return kernel.bind(*leaves, program=program, options=options)
+
+
+def captures_tracers(program: Any) -> bool:
+    """Return whether a closed jaxpr has constants that another trace computes."""
+    return any(isinstance(const, jax.core.Tracer) for const in program.consts)
+
+
+def never_high(*_: Any, **__: Any) -> bool:
+    """Tell JAX not to expand operations inside a program before it is lowered.
+
+    Since JAX 0.12 a primitive whose program contains such operations would need a rule
+    to expand them (`to_lojax`). Here they are expanded when a program is lowered.
+    """
+    return False
+
+
+kernel = jax.extend.core.Primitive("cpu_kernel")
+kernel.multiple_results = True
+kernel.is_high = never_high
+
+
+@kernel.def_impl
+def _run(*operands, program, options):
+    if jax.config.jax_disable_jit:  # pyright: ignore[reportAttributeAccessIssue]
+        # A kernel that was traced before. `jax.jit` would call this same rule again.
+        return jax.extend.core.jaxpr_as_fun(program)(*operands)
+    run = partial(kernel.bind, program=program, options=options)
+    return jax.jit(run)(*operands)
+
+
+@kernel.def_abstract_eval
+def _shapes(*operands, program, options):
+    del operands, options
+    return program.out_avals
+
+
+@rare_collections()
+def kernel_jvp(operands, tangents, *, program, options):
+    """Compute values and tangents in two kernels, the second linear in the tangents.
+
+    There are two kernels so that reverse mode can store the results of the first and
+    transpose the second.
+    """
+    options = options._replace(is_brief=False)
+    run = jax.extend.core.jaxpr_as_fun(program)
+    is_moving = [not isinstance(tangent, ad.Zero) for tangent in tangents]
+    rates, _ = partition_list(is_moving, tangents)
+    is_smooth = [jnp.issubdtype(x.dtype, jnp.inexact) for x in program.out_avals]
+    treedef = None
+
+    def linearised(*operands):
+        nonlocal treedef
+        moving, fixed = partition_list(is_moving, operands)
+
+        def values(*moving):
+            return partition_list(
+                is_smooth, run(*merge_lists(is_moving, moving, fixed))
+            )
+
+        smooth, push, rest = jax.linearize(values, *moving, has_aux=True)
+        residuals, treedef = jax.tree.flatten(push)
+        return [*merge_lists(is_smooth, smooth, rest), *residuals]
+
+    try:
+        whole = jax.make_jaxpr(linearised)(*operands)
+    except ValueError:
+        # JAX cannot linearise a while loop, for instance. Such programs have forward
+        # mode only.
+        all_rates = [ad.instantiate_zeros(tangent) for tangent in tangents]
+        return jax.jvp(run, operands, all_rates)
+    size = len(program.out_avals)
+    # Residuals that depend on no operand are recomputed and not stored: in a loop they
+    # would be stored in each iteration.
+    fixed, is_varying = _fixed_part(whole)
+    is_kept = [True] * size + is_varying[size:]
+    kept, fixed_results = partition_list(is_kept, whole.jaxpr.outvars)
+    results = run_program(part_of(whole, outvars=kept), list(operands), options)
+    out, residuals = results[:size], results[size:]
+
+    def push(*given):
+        residuals, rates = given[: -sum(is_moving)], given[-sum(is_moving) :]
+        constants = jax.extend.core.jaxpr_as_fun(
+            part_of(whole, invars=[], eqns=fixed, outvars=fixed_results)
+        )()
+        everything = merge_lists(is_kept[size:], residuals, constants)
+        return list(jax.tree.unflatten(treedef, everything)(*rates))
+
+    given = [*residuals, *rates]
+    changes = run_program(jax.make_jaxpr(push)(*given), given, options)
+    zeros = [ad.Zero(aval.to_tangent_aval()) for aval in program.out_avals]
+    return out, merge_lists(is_smooth, changes, partition_list(is_smooth, zeros)[1])
+
+
+def _fixed_part(program) -> tuple[list[Any], list[bool]]:
+    """Find the operations that depend on no operand, and mark such results."""
+    traced = [isinstance(const, jax.core.Tracer) for const in program.consts]
+    varying = {
+        *program.jaxpr.invars,
+        *partition_list(traced, program.jaxpr.constvars)[0],
+    }
+
+    def varies(x) -> bool:
+        return not isinstance(x, jax.extend.core.Literal) and x in varying
+
+    fixed = []
+    for equation in program.eqns:
+        if equation.effects or any(map(varies, equation.invars)):
+            varying.update(equation.outvars)
+        else:
+            fixed.append(equation)
+    return fixed, list(map(varies, program.jaxpr.outvars))
+
+
+def split_by_operands(program) -> tuple[list[Any], Any]:
+    """Compute what depends on no operand, and return a program for the rest.
+
+    Returns the values that the rest uses, and the rest. These values are its first
+    operands.
+    """
+    jaxpr = program.jaxpr
+    varying, fixed, others = set(jaxpr.invars), [], []
+    for equation in jaxpr.eqns:
+        if varying.isdisjoint(_variables(equation.invars)):
+            fixed.append(equation)
+        else:
+            varying.update(equation.outvars)
+            others.append(equation)
+    used = [v for equation in others for v in _variables(equation.invars)]
+    used += _variables(jaxpr.outvars)
+    names = list(dict.fromkeys(v for v in used if v not in varying))
+    values = jax.extend.core.jaxpr_as_fun(
+        part_of(program, invars=[], eqns=fixed, outvars=names)
+    )()
+    rest = jaxpr.replace(
+        constvars=[],
+        invars=[*names, *jaxpr.invars],
+        eqns=others,
+        debug_info=jaxpr.debug_info.with_unknown_names(),
+    )
+    return values, jax.extend.core.ClosedJaxpr(rest, [])
+
+
+def _variables(operands: Iterable[Any]) -> list[Any]:
+    return [v for v in operands if not isinstance(v, jax.extend.core.Literal)]
+
+
+def part_of(program, consts: list[Any] | None = None, **fields: Any):
+    """Return a program with some of its fields replaced.
+
+    `fields` are the operations, operands, constants or results of its jaxpr.
+    """
+    names = program.jaxpr.debug_info.with_unknown_names()
+    jaxpr = program.jaxpr.replace(debug_info=names, **fields)
+    return program.replace(
+        jaxpr=jaxpr, consts=program.consts if consts is None else consts
+    )
+
+
+ad.primitive_jvps[kernel] = kernel_jvp
+
+
+@rare_collections()
+def kernel_transpose(cotangents, *operands, program, options):
+    run = jax.extend.core.jaxpr_as_fun(program)
+    is_linear = [ad.is_undefined_primal(x) for x in operands]
+    linear, known = partition_list(is_linear, operands)
+    is_asked = [not isinstance(cotangent, ad.Zero) for cotangent in cotangents]
+    asked, _ = partition_list(is_asked, cotangents)
+
+    def pull(*given):
+        known, asked = given[: -sum(is_asked)], given[-sum(is_asked) :]
+
+        def push(*rates):
+            return partition_list(is_asked, run(*merge_lists(is_linear, rates, known)))[
+                0
+            ]
+
+        transpose = jax.linear_transpose(push, *(x.aval for x in linear))
+        return list(transpose(list(asked)))
+
+    given = [*known, *asked]
+    pulled = run_program(jax.make_jaxpr(pull)(*given), given, options)
+    return merge_lists(is_linear, pulled, [None] * len(known))
+
+
+ad.primitive_transposes[kernel] = kernel_transpose
+
+
+def partition_list(
+    marks: Iterable[bool], xs: Iterable[Any]
+) -> tuple[list[Any], list[Any]]:
+    """Split a list into the entries whose mark is true, and the other entries."""
+    pairs = list(zip(marks, xs, strict=True))
+    return [x for mark, x in pairs if mark], [x for mark, x in pairs if not mark]
+
+
+def merge_lists(
+    marks: Iterable[bool], marked: Iterable[Any], others: Iterable[Any]
+) -> list[Any]:
+    """Merge the two lists that `partition_list` returns, in the original order."""
+    marked, others = iter(marked), iter(others)
+    return [next(marked) if mark else next(others) for mark in marks]
