@@ -117,20 +117,11 @@ def program(
 
 
 def compiled(engine: str, function: Callable[..., Any], *args: Any):
-    """The compiled function, seconds of the processor, and the engine that it took.
-
-    XLA takes what the engine cannot compile.
-    """
+    """The compiled function, seconds of the processor, and the engine that it took."""
     os.environ["NHJAX_ENGINE"] = engine
     jax.clear_caches()
     start = time.process_time()
-    try:
-        lowered = jax.jit(jax.vmap(function)).lower(*args)
-    except RuntimeError:
-        os.environ["NHJAX_ENGINE"] = "xla"
-        start = time.process_time()
-        lowered = jax.jit(jax.vmap(function)).lower(*args)
-    ready = lowered.compile()
+    ready = jax.jit(jax.vmap(function)).lower(*args).compile()
     seconds = time.process_time() - start
     uses = nhjax.engines(jax.vmap(function), *args)
     took = {use.engine for use in uses if use.members is not None}

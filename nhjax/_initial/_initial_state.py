@@ -168,7 +168,7 @@ def _solve(system, t, q, v, p, args, project: bool, keep: tuple[Kept, Kept]) -> 
     starts, fixed_q, fixed_u = [], None, None
     if project:
         normal = manifold.normalise(q)
-        possible = all_finite(normal)
+        possible = jnp.asarray(all_finite(normal))
         q = tree_where(possible, normal, q)
         off_group = jnp.where(possible, 0, off_group)
         if system.holonomic is not None:

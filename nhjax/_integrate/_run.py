@@ -590,7 +590,7 @@ def _interpolation(
     )
 
 
-def _one(saved: PyTree[Array]) -> PyTree[Array]:
+def _one(saved: PyTree[Any]) -> PyTree[Any]:
     """Return an entry of the output with a time axis of length one."""
     return jax.tree.map(lambda x: x[None], saved)
 

@@ -5,7 +5,7 @@ import reprlib
 import warnings
 from collections.abc import Callable
 from types import MethodType
-from typing import Any, cast, TypeAlias
+from typing import Any, TypeAlias
 
 import equinox as eqx
 import jax
@@ -174,13 +174,13 @@ def parameters(args: Args) -> Args:
     return jax.tree_util.tree_map_with_path(leaf, args)
 
 
-def all_finite(tree: Any) -> BoolScalar:
+def all_finite(tree: Any) -> BoolScalar | np.bool_:
     """Return whether every number in `tree` is finite."""
     leaves = jax.tree.leaves(tree)
     if not is_traced(*leaves):
         # NumPy gives a concrete answer inside `jit` too, and compiles nothing.
         finite = [np.all(np.isfinite(np.asarray(leaf))) for leaf in leaves]
-        return cast(BoolScalar, np.all(finite))
+        return np.all(finite)
     return jnp.all(jnp.stack([jnp.all(jnp.isfinite(leaf)) for leaf in leaves]))
 
 

@@ -44,7 +44,7 @@ class EngineUse(NamedTuple):
 
 
 def chosen_engine() -> str | None:
-    """Read `NHJAX_ENGINE` from the environment: the engine of all programs, if set."""
+    """Read `NHJAX_ENGINE` from the environment: the engine to be tried first."""
     chosen = os.environ.get("NHJAX_ENGINE")
     if chosen is not None and chosen not in ENGINES:
         raise ValueError(
@@ -52,16 +52,6 @@ def chosen_engine() -> str | None:
             f"{', '.join(map(repr, ENGINES))}: set it to one of these, or unset it."
         )
     return chosen
-
-
-def require_not_chosen(engine: str, reason: str) -> None:
-    """Raise if the user has chosen an engine that cannot compile a program."""
-    if chosen_engine() == engine:
-        raise RuntimeError(
-            f"The environment variable NHJAX_ENGINE is {engine!r}, but this engine "
-            f"cannot compile a program: {reason}. Unset the variable, so that another "
-            "engine compiles this program."
-        )
 
 
 # A list while `engines` lowers programs, otherwise `None`.
@@ -82,9 +72,9 @@ def engines(function: Callable[..., Any], *args: Any) -> tuple[EngineUse, ...]:
     `nhjax.lanes.vmap` and `nhjax.lanes.jit`. The function is compiled, but not run. On
     the CPU, nhjax compiles an ensemble (a run under `jax.vmap`) itself if possible, and
     vectorises over its members (SIMD). The environment variable `NHJAX_ENGINE` chooses
-    the engine of all programs: `lanes`, `kernels` or `xla`. If the engine cannot
-    compile one of them, an error says why. Programs that were compiled before keep
-    their engine until `jax.clear_caches()`.
+    the engine: `lanes`, `kernels` or `xla`. The next one compiles what it cannot
+    compile. Programs that were compiled before keep their engine until
+    `jax.clear_caches()`.
 
     **Arguments:**
 

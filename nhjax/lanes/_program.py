@@ -62,7 +62,6 @@ from ._engines import (
     reason_against_kernel,
     reason_against_lanes,
     record_engine,
-    require_not_chosen,
 )
 from ._expansion import expanded
 from ._garbage_collection import rare_collections
@@ -443,14 +442,9 @@ def _reason_against_kernel(
 
     `reason` is the reason against `lanes`, which comes first.
     """
-    is_free = not is_within_kernel()
-    if is_free:
-        require_not_chosen("lanes", reason)
     if "kernels" not in options.engines:
         return reason
     against = reason_against_kernel(program)
-    if is_free and against is not None:
-        require_not_chosen("kernels", against)
     if against is None or reason == against:
         return against
     return f"{reason}; no kernel: {against}"

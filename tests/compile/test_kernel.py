@@ -77,23 +77,6 @@ def test_unknown_engine_raises_with_known_ones(monkeypatch):
         nhjax.engines(in_kernel, *OPERANDS)
 
 
-@pytest.mark.parametrize("engine", ["lanes", "kernels"])
-@pytest.mark.parametrize("members", [None, 4])
-def test_engine_chosen_for_a_library_call_raises_with_reason(
-    monkeypatch, engine, members
-):
-    def factorised(x):
-        return as_cpu_kernel(jnp.linalg.cholesky, jnp.eye(2) * x)
-
-    run, x = factorised, jnp.ones(())
-    if members is not None:
-        run, x = jax.vmap(run), jnp.ones(members)
-    assert nhjax.engines(run, x)[0].engine == "xla"
-    monkeypatch.setenv("NHJAX_ENGINE", engine)
-    with pytest.raises(RuntimeError, match=f"NHJAX_ENGINE is '{engine}', but .*: .*"):
-        jax.jit(run)(x)
-
-
 def test_engine_chosen_for_large_arrays_is_used(monkeypatch):
     def run(x):
         return as_cpu_kernel(lambda x: x * x + x, x)
