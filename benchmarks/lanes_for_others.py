@@ -7,10 +7,10 @@
     JAX, and the gradient of a scan that carries many scalars, as in issue 40150. They
     are written after the descriptions there.
 
-Each program is compiled by JAX and by nhjax, and both are run in turn. Times are wall
-times with all cores, the fastest of the runs; compile times are those of the first
-call, from the trace on. The difference is the largest of any number that comes out,
-relative to the largest of its array.
+Each program is compiled by JAX and by nhjax, and both are run in turn. The table has
+the wall time of the fastest run, with all cores. The compile time is the time of the
+first call, including the trace. The difference is the largest of any number that comes
+out, relative to the largest of its array.
 
     python -m benchmarks.lanes_for_others
 """

@@ -203,8 +203,8 @@ def near_rest(
         int(getattr(nhjax.RESULTS, name)._value)
         for name in ("nonlinear_max_iterations", "nonlinear_divergence")
     }
-    # The functions and the shapes are those of all steps. Finding them evaluates the
-    # system without compilation, which takes far longer than judging a step.
+    # All steps have these functions and shapes. To find them the system is evaluated
+    # without compilation, which takes far longer than to judge a step.
     first = first_arguments(system, method, y0, jnp.asarray(SIZES[0]))
     static = eqx.filter(first, _is_no_array)
     for solver_name, solver in SOLVERS.items():

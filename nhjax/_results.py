@@ -141,8 +141,8 @@ class RESULTS(eqx.Enumeration, metaclass=_Named):
         "motion away from the next event."
     )
     interrupted = (
-        "The run was interrupted from the keyboard. Its output, statistics and final "
-        "state are those of the steps before."
+        "The run was interrupted from the keyboard. The solution ends with the last "
+        "step before the interruption."
     )
 
 

@@ -1,4 +1,4 @@
-"""What the compiler may know about the start of a loop that continues another one.
+"""An operation that tells the compiler how a loop started that is now continued.
 
 A run is a loop whose carry starts with constants, such as the zeros of a mass matrix.
 Those that no iteration changes are constants of the whole loop, and the compiler leaves

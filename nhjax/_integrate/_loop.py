@@ -187,7 +187,7 @@ class RecursiveCheckpointAdjoint(AbstractAdjoint):
     The steps are divided into `checkpoints` blocks, and each block again, until a block
     has at most `checkpoints` steps. The reverse pass works in one block of each
     level at a time. It stores the states at the starts of the smaller blocks inside,
-    and the stages of the current block of the last level. By default there are two
+    and the stages of the current block in the last level. The default is two
     levels. Each level beyond the first costs another forward run. With L levels and
     num_steps = checkpoints^L the memory is O(L checkpoints).
 

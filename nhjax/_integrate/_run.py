@@ -304,8 +304,8 @@ def _chunk(
     loop = Loop(stepper, saving, NoProgressMeter())
 
     def steps(loop: Loop, carry: AbstractCarry, log: Any, start: Any, end: Any):
-        # The matrices are constant where those of the first step are. They are
-        # evaluated here to find out where, and not computed.
+        # The entries that are constant in the first step are constant in all steps.
+        # The matrices are evaluated only to find these entries, and are not computed.
         plain, state = loop.stepper.plain, carry.step_state.state
         u = plain.system.fibre_coordinate(state)
         given = plain.system, plain.time(0), state.q, u, plain.args

@@ -348,7 +348,7 @@ class Saving(eqx.Module):
     def _record_slot(self, k: Int[Array, ""]) -> Int[Array, ""]:
         if self.record_slots is not None:
             return self.record_slots[jnp.minimum(k, self.num_steps)]
-        # Without slots, the records are those of a part of a run.
+        # A part of a run has no slots: it records each of its steps.
         slot = k - cast(Array, self.first_step)
         return jnp.where(k < self.num_steps, slot, self.num_records)
 

@@ -463,7 +463,7 @@ class ConstraintSlopes(eqx.Module):
     ) -> Float[Array, " e"]:
         """Compute the changes of `constraint_values` with those of stages and nodes.
 
-        Of redundant constraints, only the independent combinations are formed.
+        If constraints are redundant, these are the independent combinations of them.
         """
         h, m, k = stages.h, stages.num_nonholonomic, stages.num_holonomic
         increments = h * _weighted(stages.coefficients("a")[1:], velocity)

@@ -33,7 +33,7 @@ batched_call.is_high = never_high
 @batched_call.def_impl
 def _run(*operands, program, is_batched, options):
     if jax.config.jax_disable_jit:  # pyright: ignore[reportAttributeAccessIssue]
-        return vmapped(
+        return by_vmap(
             *operands, program=program, is_batched=is_batched, options=options
         )
     given = {"program": program, "is_batched": is_batched, "options": options}
@@ -164,7 +164,7 @@ def _transpose_of_batched_call(cotangents, *operands, program, is_batched, optio
 ad.primitive_transposes[batched_call] = _transpose_of_batched_call
 
 
-def vmapped(*operands, program, is_batched, options):
+def by_vmap(*operands, program, is_batched, options):
     """Compute the operation by JAX's own `vmap`."""
     del options
     run = jax.extend.core.jaxpr_as_fun(program)

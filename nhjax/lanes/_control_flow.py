@@ -31,7 +31,6 @@ from ._builder import (
     hold,
     InMemory,
     MOST_IN_REGISTERS,
-    MOST_ONE_BY_ONE,
     Operation,
     Registers,
     release,
@@ -40,14 +39,14 @@ from ._builder import (
 from ._graph import (
     BranchBuilder,
     dtype_name,
-    is_float,
     LoopBuilder,
     Node,
     Unsupported,
 )
 
 
-# The indices of the first operand, of the second, and of the result, as for an einsum.
+# The indices of both factors and of the result of a sum of products, as for
+# `jax.numpy.einsum`.
 _Indices: TypeAlias = tuple[str, str, str]
 
 # Longer sums of products of two arrays are computed in a loop, which takes less time to
@@ -473,8 +472,6 @@ def _dot_general(
 ) -> ArrayValue:
     aval = equation.outvars[0].aval
     (left, right), (left_batch, right_batch) = equation.params["dimension_numbers"]
-    if not is_float(dtype_name(aval.dtype)) or len({x.dtype for x in values}) > 1:
-        return _of_any_type(builder, equation, values)
     letters = iter(string.ascii_letters)
     first, second = ([next(letters) for _ in value.shape] for value in values)
     for i, j in zip((*left_batch, *left), (*right_batch, *right), strict=True):
@@ -498,11 +495,11 @@ def _product(
         for index, length in zip(names, value.shape, strict=True)
     }
     size = math.prod(lengths.values())
+    if size > _LARGEST_PRODUCT:
+        raise Unsupported("a large product of matrices")
     if size <= _LONGEST_PRODUCT or aval.shape[:1] in ((), (1,)):
         a, b = map(builder.memory.registers, values)
         return _written_out(builder, a, b, indices, dtype)
-    if size > _LARGEST_PRODUCT:
-        raise Unsupported("a large product of matrices")
     index = result[0]
     is_row = [index in first, index in second]
 
@@ -530,47 +527,12 @@ def _with_axis_first(builder: Builder, value: ArrayValue, axis: int) -> ArrayVal
     return np.moveaxis(builder.memory.registers(value), axis, 0)
 
 
-def _of_any_type(
-    builder: Builder, equation: Any, values: list[ArrayValue]
-) -> ArrayValue:
-    """Compute a product of matrices of numbers or booleans, with conversions."""
-    (left, right), (left_batch, right_batch) = equation.params["dimension_numbers"]
-    graph, aval = builder.graph, equation.outvars[0].aval
-    dtype = dtype_name(aval.dtype)
-    a, b = map(builder.memory.registers, values)
-    summed = math.prod(a.shape[axis] for axis in left)
-    if math.prod(aval.shape) * max(summed, 1) > 16 * MOST_ONE_BY_ONE:
-        raise Unsupported("a large product of matrices")
-    a = _arranged(a, left_batch, left)
-    b = _arranged(b, right_batch, right)
-    out = np.empty((a.shape[0], a.shape[1], b.shape[1]), object)
-    times, plus = ("and", "or") if dtype == "bool" else ("mul", "add")
-    for batch, i, j in np.ndindex(out.shape):
-        products = [
-            graph.op(times, graph.convert(x, dtype), graph.convert(y, dtype))
-            for x, y in zip(a[batch, i], b[batch, j], strict=True)
-        ]
-        out[batch, i, j] = graph.folded(plus, products) or graph.zero(dtype)
-    return out.reshape(aval.shape)
-
-
-def _arranged(x: np.ndarray, batch: Sequence[int], summed: Sequence[int]) -> np.ndarray:
-    """Transpose and reshape an operand to (batch, free, summed)."""
-    free = [axis for axis in range(x.ndim) if axis not in (*batch, *summed)]
-    sizes = [
-        math.prod(x.shape[axis] for axis in axes) for axes in (batch, free, summed)
-    ]
-    return x.transpose([*batch, *free, *summed]).reshape(sizes)
-
-
 def _written_out(
     builder: Builder, a: Registers, b: Registers, indices: _Indices, dtype: str
 ) -> Registers:
-    """Compute the sum of products of two arrays, as `jax.numpy.einsum` does.
-
-    `indices` are those of the operands and of the result.
-    """
+    """Compute a sum of products number by number, in the dtype of the result."""
     first, second, result = indices
+    times, plus = ("and", "or") if dtype == "bool" else ("mul", "add")
     graph = builder.graph
     lengths = {
         **dict(zip(first, a.shape, strict=True)),
@@ -588,12 +550,15 @@ def _written_out(
         return np.broadcast_to(x, shape).reshape(size, terms)
 
     products = [
-        [graph.op("mul", x, y) for x, y in zip(*pair, strict=True)]
+        [
+            graph.op(times, graph.convert(x, dtype), graph.convert(y, dtype))
+            for x, y in zip(*pair, strict=True)
+        ]
         for pair in zip(rows(a, first), rows(b, second), strict=True)
     ]
     out = np.empty(size, object)
     for index, row in enumerate(products):
-        out[index] = graph.folded("add", row)
+        out[index] = graph.folded(plus, row)
         if out[index] is None:
             out[index] = graph.zero(dtype)
     return out.reshape(shape[: len(result)])

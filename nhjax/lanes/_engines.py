@@ -110,8 +110,8 @@ def is_within_kernel() -> bool:
     return _within.get()
 
 
-# Whether a program is being lowered by XLA. What it does for each row of an array is
-# then a part of it.
+# Whether XLA lowers the surrounding program. Then it also lowers the functions of rows
+# in this program.
 _is_part = ContextVar("is_part", default=False)
 
 
@@ -142,8 +142,6 @@ def reason_against_lanes() -> str | None:
     """Return why nhjax's own compiler is not tried, or `None` if it is."""
     if chosen_engine() not in ("lanes", None):
         return "chosen"
-    if is_within_kernel():
-        return "it is a part of a kernel"
     if not is_available():
         return "llvmlite is not installed, or does not work here"
     return None
@@ -153,8 +151,6 @@ def reason_against_kernel(program: Any) -> str | None:
     """Return why XLA does not compile a single kernel, or `None` if it does."""
     if chosen_engine() == "xla":
         return "chosen"
-    if is_within_kernel():
-        return "it is a part of a kernel"
     # The dtype of random keys has no attribute `kind`, so its kind is None here.
     kinds = {getattr(aval.dtype, "kind", None) for aval in program.in_avals}
     if not kinds <= set("fiub"):
@@ -164,8 +160,9 @@ def reason_against_kernel(program: Any) -> str | None:
     return None
 
 
-def by_one_kernel(ctx, *operands, program):
+def by_one_kernel(ctx, *operands, program, options):
     """Lower a program to one kernel of XLA."""
+    del options
     run = jax.extend.core.jaxpr_as_fun(program)
 
     def call(*operands):

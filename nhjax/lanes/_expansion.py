@@ -21,11 +21,6 @@ from jax.extend.core.primitives import closed_call_p
 MOST_ROWS = 32
 
 
-def register_expansion(primitive: Any, function: Callable[..., Any]) -> None:
-    """Replace a primitive by the program of a function with the same arguments."""
-    _EXPANSIONS[primitive.name] = (lambda equation: True), function
-
-
 def expanded(program: Any, known: Container[str]) -> Any:
     """Replace operations of a closed jaxpr, and of its inner programs, where possible.
 

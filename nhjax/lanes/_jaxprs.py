@@ -221,15 +221,16 @@ class _Simplifier:
 
 def _used(jaxpr: Any) -> list[Any]:
     """List the operations whose results are used, or that have effects."""
-    used, found = set(_variables(jaxpr.outvars)), []
+    used, found = set(variables(jaxpr.outvars)), []
     for equation in reversed(jaxpr.eqns):
         if equation.effects or not used.isdisjoint(equation.outvars):
-            used.update(_variables(equation.invars))
+            used.update(variables(equation.invars))
             found.append(equation)
     return found[::-1]
 
 
-def _variables(operands: Any) -> list[Any]:
+def variables(operands: Any) -> list[Any]:
+    """Return the operands that are not numbers."""
     return [v for v in operands if not isinstance(v, jax.extend.core.Literal)]
 
 

@@ -17,7 +17,7 @@ import jax.numpy as jnp
 from jax.interpreters import ad
 
 from ._garbage_collection import rare_collections
-from ._jaxprs import cse_dce
+from ._jaxprs import cse_dce, variables
 
 
 # The engines, in the order in which they are tried.
@@ -148,23 +148,12 @@ def kernel_jvp(operands, tangents, *, program, options):
 
 
 def _fixed_part(program) -> tuple[list[Any], list[bool]]:
-    """Find the operations that depend on no operand, and mark such results."""
+    """Find the operations that depend on no operand, and mark the other results."""
     traced = [isinstance(const, jax.core.Tracer) for const in program.consts]
-    varying = {
-        *program.jaxpr.invars,
-        *partition_list(traced, program.jaxpr.constvars)[0],
-    }
-
-    def varies(x) -> bool:
-        return not isinstance(x, jax.extend.core.Literal) and x in varying
-
-    fixed = []
-    for equation in program.eqns:
-        if equation.effects or any(map(varies, equation.invars)):
-            varying.update(equation.outvars)
-        else:
-            fixed.append(equation)
-    return fixed, list(map(varies, program.jaxpr.outvars))
+    constants = partition_list(traced, program.jaxpr.constvars)[0]
+    fixed, _, varying = _split([*program.jaxpr.invars, *constants], program.eqns)
+    results = program.jaxpr.outvars
+    return fixed, [not varying.isdisjoint(variables([x])) for x in results]
 
 
 def split_by_operands(program) -> tuple[list[Any], Any]:
@@ -174,30 +163,33 @@ def split_by_operands(program) -> tuple[list[Any], Any]:
     operands.
     """
     jaxpr = program.jaxpr
-    varying, fixed, others = set(jaxpr.invars), [], []
-    for equation in jaxpr.eqns:
-        if varying.isdisjoint(_variables(equation.invars)):
-            fixed.append(equation)
-        else:
-            varying.update(equation.outvars)
-            others.append(equation)
-    used = [v for equation in others for v in _variables(equation.invars)]
-    used += _variables(jaxpr.outvars)
+    fixed, others, varying = _split(jaxpr.invars, jaxpr.eqns)
+    used = [v for equation in others for v in variables(equation.invars)]
+    used += variables(jaxpr.outvars)
     names = list(dict.fromkeys(v for v in used if v not in varying))
     values = jax.extend.core.jaxpr_as_fun(
         part_of(program, invars=[], eqns=fixed, outvars=names)
     )()
-    rest = jaxpr.replace(
-        constvars=[],
-        invars=[*names, *jaxpr.invars],
-        eqns=others,
-        debug_info=jaxpr.debug_info.with_unknown_names(),
-    )
-    return values, jax.extend.core.ClosedJaxpr(rest, [])
+    invars = [*names, *jaxpr.invars]
+    return values, part_of(program, [], constvars=[], invars=invars, eqns=others)
 
 
-def _variables(operands: Iterable[Any]) -> list[Any]:
-    return [v for v in operands if not isinstance(v, jax.extend.core.Literal)]
+def _split(
+    operands: list[Any], equations: list[Any]
+) -> tuple[list[Any], list[Any], set[Any]]:
+    """Split operations into those that depend on no operand, and the others.
+
+    Operations with effects count as dependent. The last result are the operands and
+    all variables that depend on them.
+    """
+    varying, fixed, others = set(operands), [], []
+    for equation in equations:
+        if equation.effects or not varying.isdisjoint(variables(equation.invars)):
+            varying.update(equation.outvars)
+            others.append(equation)
+        else:
+            fixed.append(equation)
+    return fixed, others, varying
 
 
 def part_of(program, consts: list[Any] | None = None, **fields: Any):
@@ -207,8 +199,8 @@ def part_of(program, consts: list[Any] | None = None, **fields: Any):
     """
     names = program.jaxpr.debug_info.with_unknown_names()
     jaxpr = program.jaxpr.replace(debug_info=names, **fields)
-    return program.replace(
-        jaxpr=jaxpr, consts=program.consts if consts is None else consts
+    return jax.extend.core.ClosedJaxpr(
+        jaxpr, program.consts if consts is None else consts
     )
 
 

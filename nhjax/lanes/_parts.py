@@ -12,6 +12,7 @@ import jax
 import jax.extend
 
 from ._expansion import is_foreign
+from ._jaxprs import variables
 from ._kernel import partition_list
 
 
@@ -78,9 +79,9 @@ def _needed(index: int, equations: list[Any], maker: dict[Any, int]) -> set[int]
 def _across_members(equations: list[Any], is_late: list[bool]) -> list[bool]:
     """Mark operations that must be repeated after the compiled part.
 
-    Operations of other libraries may combine members under `jax.vmap`. Error checks do
-    so to decide whether any member has failed. What they pass to late operations is
-    computed again by JAX, except in loops.
+    Operations of other libraries may combine members under `jax.vmap`: an error check
+    finds out whether any member has failed. If late operations use their results, JAX
+    computes them again, except in loops.
     """
     wanted: set[Any] = set()
     serves = []
@@ -134,11 +135,6 @@ def evaluate(equations: list[Any], values: dict[Any, Any]) -> None:
 def read(x: Any, values: dict[Any, Any]) -> Any:
     """Return the value of an operand."""
     return x.val if isinstance(x, jax.extend.core.Literal) else values[x]
-
-
-def variables(operands: list[Any]) -> list[Any]:
-    """Return the operands that are not numbers."""
-    return [x for x in operands if not isinstance(x, jax.extend.core.Literal)]
 
 
 def _count(equation: Any) -> int:

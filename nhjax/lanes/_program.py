@@ -30,6 +30,8 @@ import math
 import os
 import threading
 import time
+from collections.abc import Callable
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -38,7 +40,7 @@ import jax.ffi
 from jax.interpreters import mlir
 
 from ._arrays import GATHERS, INDEXING, REDUCTIONS, SHAPING
-from ._batched_call import batched_call, num_members, vmapped
+from ._batched_call import batched_call, by_vmap, num_members
 from ._builder import (
     ArrayValue,
     Builder,
@@ -375,32 +377,26 @@ def _name(*texts: str) -> str:
 _SMALL_ARRAYS = 110
 
 
+class _Ways(NamedTuple):
+    """How an operation is lowered: to native code of a name, by XLA, or to kernels."""
+
+    compiled: Callable[[], str]
+    by_xla: Callable[..., Any]
+    by_kernels: Callable[..., Any]
+
+
 @rare_collections()
 def _lower_single(ctx: Any, *operands: Any, program: Any, options: CompileOptions):
-    if is_exported(ctx):
-        # Another process cannot call machine code of this process.
-        record_engine("xla", "the program is exported", None)
-        return _single_by_xla(ctx, *operands, program=program, options=options)
+    params = {"program": program, "options": options}
     if is_within_kernel():
-        return _single_by_xla(ctx, *operands, program=program, options=options)
+        return _single_by_xla(ctx, *operands, **params)
     reason = reason_against_lanes()
     large = rms_array_size(program.jaxpr) > _SMALL_ARRAYS
     if reason is None and large and chosen_engine() is None:
         reason = "its arrays are so large that XLA uses vectors for them"
-    if reason is None:
-        try:
-            name = compile_single(program, options.is_brief)
-        except Unsupported as error:
-            reason = str(error)
-        else:
-            record_engine("lanes", f"the first choice{options.note}", None)
-            return jax.ffi.ffi_lowering(name)(ctx, *operands)
-    against = _reason_against_kernel(program, options, reason)
-    if against is not None:
-        record_engine("xla", f"{against}{options.note}", None)
-        return _single_by_xla(ctx, *operands, program=program, options=options)
-    record_engine("kernels", reason, None)
-    return by_one_kernel(ctx, *operands, program=program)
+    compiled = partial(compile_single, program, options.is_brief)
+    ways = _Ways(compiled, _single_by_xla, by_one_kernel)
+    return _by_first_engine(ctx, operands, params, None, reason, ways)
 
 
 @rare_collections()
@@ -411,28 +407,47 @@ def _lower_batched(
     is_batched: tuple[bool, ...],
     options: CompileOptions,
 ):
-    members = num_members(ctx.avals_in, is_batched)
-    given = {"program": program, "is_batched": is_batched, "options": options}
+    params = {"program": program, "is_batched": is_batched, "options": options}
     if is_part_of_a_program():
-        return _batched_by_xla(ctx, *operands, **given)
-    if is_exported(ctx):
-        record_engine("xla", "the program is exported", members)
-        return _batched_by_xla(ctx, *operands, **given)
+        return _batched_by_xla(ctx, *operands, **params)
+    members = num_members(ctx.avals_in, is_batched)
+    compiled = partial(compile_batched, program, is_batched, options.is_brief)
+    ways = _Ways(compiled, _batched_by_xla, _one_by_one)
     reason = reason_against_lanes()
+    return _by_first_engine(ctx, operands, params, members, reason, ways)
+
+
+def _by_first_engine(
+    ctx: Any,
+    operands: tuple[Any, ...],
+    params: dict[str, Any],
+    members: int | None,
+    reason: str | None,
+    ways: _Ways,
+):
+    """Lower a program by the first engine that can compile it, and record the engine.
+
+    `reason` says why native code is not tried, if it is not.
+    """
+    options = params["options"]
+    if is_exported(ctx):
+        # Another process cannot call machine code of this process.
+        record_engine("xla", "the program is exported", members)
+        return ways.by_xla(ctx, *operands, **params)
     if reason is None:
         try:
-            name = compile_batched(program, is_batched, options.is_brief)
+            name = ways.compiled()
         except Unsupported as error:
             reason = str(error)
         else:
             record_engine("lanes", f"the first choice{options.note}", members)
             return jax.ffi.ffi_lowering(name)(ctx, *operands)
-    against = _reason_against_kernel(program, options, reason)
+    against = _reason_against_kernel(params["program"], options, reason)
     if against is not None:
         record_engine("xla", f"{against}{options.note}", members)
-        return _batched_by_xla(ctx, *operands, **given)
+        return ways.by_xla(ctx, *operands, **params)
     record_engine("kernels", reason, members)
-    return _one_by_one(ctx, *operands, **given)
+    return ways.by_kernels(ctx, *operands, **params)
 
 
 def _reason_against_kernel(
@@ -473,7 +488,7 @@ def _run_one_by_one(
 _single_by_xla = as_parts_of_a_program(
     mlir.lower_fun(_run_single, multiple_results=True)
 )
-_batched_by_xla = as_parts_of_a_program(mlir.lower_fun(vmapped, multiple_results=True))
+_batched_by_xla = as_parts_of_a_program(mlir.lower_fun(by_vmap, multiple_results=True))
 _one_by_one = mlir.lower_fun(_run_one_by_one, multiple_results=True)
 mlir.register_lowering(kernel, _single_by_xla, cacheable=False)
 mlir.register_lowering(kernel, _lower_single, platform="cpu", cacheable=False)

@@ -20,6 +20,7 @@ import jax.extend
 import numpy as np
 
 from ._engines import record_engine
+from ._jaxprs import variables
 from ._kernel import (
     CompileOptions,
     merge_lists,
@@ -27,7 +28,7 @@ from ._kernel import (
     partition_list,
     run_program,
 )
-from ._parts import evaluate, inlined, parts, python_calls, read, start, variables
+from ._parts import evaluate, inlined, parts, python_calls, read, start
 
 
 # Kernels compute one member after the other, which for large arrays takes longer than

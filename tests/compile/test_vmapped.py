@@ -14,7 +14,7 @@ from nhjax._numerics import (
     jacobian_by_rows,
     small_einsum,
 )
-from nhjax.lanes import compile_single, llvm_ir
+from nhjax.lanes import compile_single, llvm_ir, Unsupported
 
 
 X = jnp.linspace(-1.0, 2.0, 12).reshape(4, 3)
@@ -191,3 +191,19 @@ def test_jacobian_in_a_loop_equals_jacfwd(form, jacobian):
 
     got = jax.jit(lambda u: as_cpu_kernel(jacobian, function, u))(X[2])
     np.testing.assert_allclose(got, jax.jacfwd(function)(X[2]), rtol=1e-14)
+
+
+@pytest.mark.parametrize("shape", [(), (1,)])
+def test_product_with_too_many_terms_is_refused_by_the_compiler(shape):
+    left, right = jnp.ones((*shape, 70_000)), jnp.ones(70_000)
+    with pytest.raises(Unsupported, match="a large product of matrices"):
+        compile_single(jax.make_jaxpr(jnp.dot)(left, right))
+
+
+@pytest.mark.parametrize("dtype", [bool, jnp.int32])
+def test_long_products_of_other_types_in_native_code_equal_numpy(dtype):
+    a = (jnp.arange(11 * 12).reshape(11, 12) % 7 > 3).astype(dtype)
+    b = (jnp.arange(12 * 13).reshape(12, 13) % 5 > 3).astype(dtype)
+    compile_single(jax.make_jaxpr(jnp.matmul)(a, b))
+    got = jax.jit(lambda *x: as_cpu_kernel(jnp.matmul, *x))(a, b)
+    np.testing.assert_array_equal(got, np.asarray(a) @ np.asarray(b))
