@@ -6,12 +6,17 @@ iterations and the time of a step, the time of the processor of the first call, 
 largest step at which the run is solved, up to a factor 1.2. `benchmarks.machines` has
 another quantity, the first calls of all machines with default options.
 
+A second table compares a step by `Newton` with a step with the full Jacobian, on some
+of the machines.
+
     python -m benchmarks.iterations
+    python -m benchmarks.iterations --only newton
 """
 
 import argparse
+import json
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple
 
 import jax
@@ -21,11 +26,18 @@ import numpy as np
 import nhjax
 from nhjax import systems
 
-from ._report import markdown_table, write
+from ._report import markdown_table, RESULTS, write
 
 
 NUM_STEPS = 20
 REPEATS = 20
+# The rows of the table with Newton's method: names and numbers of stages.
+BY_NEWTON = (
+    ("NonholonomicParticle", 3),
+    ("FourBar", 3),
+    ("RollingTorus", 3),
+    ("bicycle, 4.6 m/s", 4),
+)
 # Steps are searched up to this factor of the given one.
 LARGEST_FACTOR = 32
 STEP_RATIO = 1.2
@@ -104,9 +116,8 @@ def cases() -> Iterator[Case]:
             yield Case(name, example.system, example.initial_state(), None, stages, dt)
 
 
-def measured(case: Case, jacobian: Any) -> dict[str, Any]:
-    """Run a case with a choice of the Jacobian."""
-    solver = nhjax.SimplifiedNewton(jacobian=jacobian, fallback=False)
+def timed(case: Case, solver: Any) -> tuple[Callable[..., Any], dict[str, Any]]:
+    """Run a case with a solver; return the program, and what it took."""
 
     @jax.jit
     def run(y0, dt):
@@ -129,51 +140,79 @@ def measured(case: Case, jacobian: Any) -> dict[str, Any]:
         begin = time.perf_counter()
         jax.block_until_ready(run(case.y0, jnp.asarray(case.dt)))
         best = min(best, time.perf_counter() - begin)
+    steps = int(sol.stats["num_steps"])
+    return run, {
+        "solved": bool(sol.result == nhjax.RESULTS.successful),
+        "iterations": float(sol.stats["num_iterations"]) / max(steps, 1),
+        "us": best / NUM_STEPS * 1e6,
+        "first_call": first_call,
+    }
+
+
+def measured(case: Case, jacobian: Any) -> dict[str, Any]:
+    """Run a case with a choice of the Jacobian, and search the largest step."""
+    solver = nhjax.SimplifiedNewton(jacobian=jacobian, fallback=False)
+    run, found = timed(case, solver)
 
     def is_solved(dt):
         return run(case.y0, jnp.asarray(dt)).result == nhjax.RESULTS.successful
 
-    solved = bool(is_solved(case.dt))
-    steps = int(sol.stats["num_steps"])
     # The search goes up from a step that is solved, to the first that is not.
     largest, most = case.dt, LARGEST_FACTOR * case.dt
     while not is_solved(largest) and largest > case.dt / LARGEST_FACTOR:
         largest /= STEP_RATIO
     while largest * STEP_RATIO <= most and is_solved(largest * STEP_RATIO):
         largest *= STEP_RATIO
-    return {
-        "solved": solved,
-        "iterations": float(sol.stats["num_iterations"]) / max(steps, 1),
-        "us": best / NUM_STEPS * 1e6,
-        "first_call": first_call,
-        "largest": largest,
-    }
+    return found | {"largest": largest}
 
 
-def main() -> None:
-    """Print and save the table."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--systems", nargs="+", help="a part of the names")
-    names = parser.parse_args().systems
-    jax.config.update("jax_enable_x64", True)
-    rows, data = [], []
+def machines_table(names: list[str] | None) -> list[dict[str, Any]]:
+    """Measure the default and the full Jacobian on all machines."""
+    data = []
     for case in cases():
         if names and not any(name in case.name for name in names):
             continue
         found = [measured(case, jacobian) for jacobian in (None, "full")]
-        cells = [
-            " / ".join(one[key] if one["solved"] else "fails" for one in text)
-            for key in ("iterations", "us")
-            for text in [[{"solved": x["solved"], key: f"{x[key]:.1f}"} for x in found]]
-        ]
-        cells.append(" / ".join(f"{one['first_call']:.1f}" for one in found))
-        cells.append(" / ".join(f"{one['largest']:.2g}" for one in found))
-        row = [case.name, str(case.stages), f"{case.dt:g}", *cells]
-        print(*row, sep="\t", flush=True)
-        rows.append(row)
         about = {"name": case.name, "stages": case.stages, "dt": case.dt}
         data.append(about | dict(zip(("default", "full"), found, strict=True)))
+        print(data[-1], flush=True)
         jax.clear_caches()
+    return data
+
+
+def newton_table(names: list[str] | None) -> list[dict[str, Any]]:
+    """Measure Newton's method and the full Jacobian on some machines."""
+    data = []
+    full = nhjax.SimplifiedNewton(jacobian="full", fallback=False)
+    for case in cases():
+        if (case.name, case.stages) not in BY_NEWTON:
+            continue
+        if names and not any(name in case.name for name in names):
+            continue
+        about = {"name": case.name, "stages": case.stages, "dt": case.dt}
+        about |= {
+            "newton": timed(case, nhjax.Newton())[1],
+            "full": timed(case, full)[1],
+        }
+        data.append(about)
+        print(about, flush=True)
+        jax.clear_caches()
+    return data
+
+
+def pair(row: dict[str, Any], names: tuple[str, str], key: str, digits: str) -> str:
+    """Format a quantity of two solvers; a run that is not solved fails."""
+    shown = [
+        format(row[name][key], digits)
+        if row[name]["solved"] or key in ("first_call", "largest")
+        else "fails"
+        for name in names
+    ]
+    return " / ".join(shown)
+
+
+def report(data: dict[str, list[dict[str, Any]]]) -> str:
+    """Write both tables."""
     header = [
         "machine",
         "s",
@@ -181,15 +220,49 @@ def main() -> None:
         "iterations a step",
         "time of a step, µs",
         "first call, s",
-        "largest step",
+    ]
+    columns = (("iterations", ".1f"), ("us", ".1f"), ("first_call", ".1f"))
+
+    def cells(row, names):
+        found = [row["name"], str(row["stages"]), f"{row['dt']:g}"]
+        return found + [pair(row, names, *column) for column in columns]
+
+    of_machines, by_newton = ("default", "full"), ("newton", "full")
+    rows = [
+        [*cells(row, of_machines), pair(row, of_machines, "largest", ".2g")]
+        for row in data["rows"]
     ]
     text = (
         f"Default / full Jacobian, {NUM_STEPS} steps. Times of a step are the least of "
         f"{REPEATS} runs; first calls are times of the processor. Largest steps are "
         f"searched up to {LARGEST_FACTOR} h.\n\n"
     )
-    text += markdown_table(header, rows)
-    write("iterations", "Iterations of machines", text, {"rows": data})
+    text += markdown_table([*header, "largest step"], rows)
+    rows = [
+        [*cells(row, by_newton), f"{row['newton']['us'] / row['full']['us']:.1f}"]
+        for row in data["newton"]
+    ]
+    text += "\n\n## Newton's method\n\n`Newton()` / full Jacobian, measured alike.\n\n"
+    return text + markdown_table([*header, "ratio of the times"], rows)
+
+
+def main() -> None:
+    """Print and save the tables."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--systems", nargs="+", help="a part of the names")
+    tables = {"rows": machines_table, "newton": newton_table}
+    parser.add_argument(
+        "--only", choices=tables, help="measure one table, and keep the other as saved"
+    )
+    given = parser.parse_args()
+    jax.config.update("jax_enable_x64", True)
+    data = {}
+    for name, table in tables.items():
+        if given.only in (None, name):
+            data[name] = table(given.systems)
+        else:
+            data[name] = json.loads((RESULTS / "iterations.json").read_text())[name]
+    write("iterations", "Iterations of machines", report(data), data)
 
 
 if __name__ == "__main__":

@@ -5,7 +5,9 @@ from ._contraction import (
     inverse_by_blocks as inverse_by_blocks,
     inverses as inverses,
     mapped as mapped,
+    repeated as repeated,
     small_einsum as small_einsum,
+    solve_by_rows as solve_by_rows,
 )
 from ._floating_point import (
     largest_column as largest_column,

@@ -306,7 +306,7 @@ def stage_forces(stages: StageEquations, x: StageUnknowns) -> StageForces:
     momentum, chart_force = chart.to_chart(y, x.velocity, momentum, force)
     transported = chart.to_origin(y, force)
     base = chart.base_momentum(
-        chart.momentum_at_origin(_start_momentum(stages, x)),
+        chart.momentum_at_origin(start_momentum(stages, x)),
         h * small_einsum("s,sn->n", b, transported),
         h * small_einsum("s,sn->n", b, chart_force),
     )
@@ -364,7 +364,7 @@ def node_residual(
         chart.positions(y),
         x.node_fibre_coordinate,
     )
-    start = chart.momentum_at_origin(_start_momentum(stages, x))
+    start = chart.momentum_at_origin(start_momentum(stages, x))
     gained = stages.h * small_einsum("ij,jn->in", stages.node_weights, force)
     residual = momentum - chart.from_origin(y, start[None] + gained)
     if stages.invariants is None:
@@ -494,7 +494,7 @@ def start_impulse(stages: StageEquations, x: StageUnknowns) -> Float[Array, " n"
     return small_einsum("k,kn->n", x.impulse, stages.invariants.covectors)
 
 
-def _start_momentum(stages: StageEquations, x: StageUnknowns) -> Float[Array, " n"]:
+def start_momentum(stages: StageEquations, x: StageUnknowns) -> Float[Array, " n"]:
     """Compute the momentum after the impulse at the start of the step."""
     return (
         stages.p if stages.invariants is None else stages.p + start_impulse(stages, x)
@@ -623,6 +623,48 @@ class Evaluation(NamedTuple):
     newton: BoolScalar
 
 
+class StageResiduals(NamedTuple):
+    """The residuals of all equations of a step; None where there is no equation.
+
+    - `momentum`, `node`: of the momentum equations at the stages and nodes.
+    - `velocity`: of the stage velocities, for Hamiltonian systems.
+    - `kinematic`, `holonomic`: the values of the constraints.
+    - `end`: of the equations of motion at the end, for the symmetric closure.
+    - `impulse`: of the equations for the impulses that keep invariants.
+    """
+
+    momentum: Float[Array, "s n"]
+    node: Float[Array, "r n"]
+    velocity: Float[Array, "s n"] | None
+    kinematic: Float[Array, "r m"] | Float[Array, "0"]
+    holonomic: Float[Array, "s k"] | Float[Array, "0"]
+    end: tuple[Float[Array, " n"], Float[Array, " l"]] | None
+    impulse: Float[Array, " i"] | None
+
+
+def stage_residuals(
+    stages: StageEquations, x: StageUnknowns
+) -> tuple[StageResiduals, Evaluation]:
+    """Evaluate all equations of a step at the unknowns x."""
+    forces = stage_forces(stages, x)
+    r_nodes = node_residual(stages, x, forces.force)
+    velocity = end = impulse = None
+    if stages.hamiltonian:
+        velocity = x.velocity - stage_velocities(stages, x)
+    kinematic, holonomic = constraint_values(stages, x)
+    if stages.end_multiplier_is_unknown:
+        end = end_residual(stages, x)
+    if stages.invariants is not None:
+        # This is the equation that simplified Newton solves.
+        weights = stop_gradient(invariant_correction(stages, x))
+        impulse = -weights.change(x.impulse, invariant_errors(stages, x))
+    given = forces.residual, r_nodes, velocity, kinematic, holonomic, end, impulse
+    return (
+        StageResiduals(*given),
+        Evaluation(forces, r_nodes, jnp.asarray(False)),
+    )
+
+
 def stage_residual(
     stages: StageEquations, x: StageUnknowns
 ) -> tuple[Float[Array, " k"], Evaluation]:
@@ -661,22 +703,8 @@ def stage_residual(
         >>> int(sol.stats["num_steps"])
         1
     """
-    forces = stage_forces(stages, x)
-    r_nodes = node_residual(stages, x, forces.force)
-    parts = [forces.residual, r_nodes]
-    if stages.hamiltonian:
-        parts.append(x.velocity - stage_velocities(stages, x))
-    parts += constraint_values(stages, x)
-    if stages.end_multiplier_is_unknown:
-        parts += end_residual(stages, x)
-    if stages.invariants is not None:
-        # This is the equation that simplified Newton solves.
-        weights = stop_gradient(invariant_correction(stages, x))
-        parts.append(-weights.change(x.impulse, invariant_errors(stages, x)))
-    return (
-        ravel_pytree(parts)[0],
-        Evaluation(forces, r_nodes, jnp.asarray(False)),
-    )
+    residuals, evaluation = stage_residuals(stages, x)
+    return ravel_pytree(residuals)[0], evaluation
 
 
 def unknown_units(stages: StageEquations, lin: Linearisation) -> list[FloatScalar]:

@@ -6,6 +6,7 @@ constraints, at the starting values of the step, and solves the linear system ex
 """
 
 from collections.abc import Callable
+from dataclasses import replace
 from functools import reduce
 from itertools import pairwise
 from typing import NamedTuple
@@ -20,12 +21,14 @@ from .._numerics import inverse_by_blocks, inverses, mapped, small_einsum
 from .._system import motion_residual, total_force
 from ._chart import AbstractChart
 from ._equations import (
+    end_impulse,
     end_position,
     momenta_of_forces,
     stage_coordinates,
     stage_positions,
     StageEquations,
     StageUnknowns,
+    start_momentum,
 )
 
 
@@ -96,7 +99,8 @@ class LinearisedStep(eqx.Module):
     stages: Float[Array, "s n s n"]  # the inverse of ∂r_i/∂H_j
     transported: Slopes  # of n_i
     conjugate: Slopes | None  # of μ_i, for a Hamiltonian system
-    node_inverse: Float[Array, "r n n"]  # (∂p_i/∂u_i)⁻¹
+    node_inverse: Float[Array, "r n n"]  # of the nodes' residuals by u_i
+    end_inverse: Float[Array, "n n"]  # (∂p/∂u)⁻¹ at the end
     node_gain: Float[Array, "r n n"] | None  # the identity on a vector space
     node_position: Float[Array, "r n n"]  # by Ξ_i of the nodes
     node_xi: Float[Array, "r n n"] | None
@@ -253,13 +257,19 @@ def _path(stages: StageEquations, x: StageUnknowns) -> _Path:
     return _Path(moved, xi, at_stages, at_nodes)
 
 
-def linearised_step(stages: StageEquations, x: StageUnknowns) -> LinearisedStep:
-    """Linearise the equations of stages and nodes at the stages x."""
+def linearised_step(
+    stages: StageEquations, x: StageUnknowns, *, has_impulse_slopes: bool = False
+) -> LinearisedStep:
+    """Linearise the equations of stages and nodes at the stages x.
+
+    With `has_impulse_slopes` this includes the change of the direction of the impulse
+    at the end, which is small, since it is proportional to the impulse.
+    """
     h, path, flat = stages.h, _path(stages, x), stages.manifold.is_flat
     a_hat, b = stages.coefficients("a_hat"), stages.coefficients("b")[None]
     s, n = x.velocity.shape
     (w, f), momentum, force, transported, conjugate = _stage_slopes(stages, x, path)
-    base = None if flat else _base_slopes(stages, path, w, f)
+    base = None if flat else _base_slopes(stages, x, path, w, f)
 
     def residual(velocity):
         moves = _moves(stages, velocity)
@@ -273,11 +283,21 @@ def linearised_step(stages: StageEquations, x: StageUnknowns) -> LinearisedStep:
     units = jnp.eye(s * n, dtype=stages.p.dtype).reshape(s * n, s, n)
     matrix = jnp.moveaxis(mapped(residual, units), 0, -1).reshape(s, n, s, n)
     inertia, gain, by_position, by_xi = _node_slopes(stages, x, path, w)
+    mass_inverse = inverses(inertia)
+    node_inverse, end_inverse = mass_inverse, mass_inverse[-1]
+    if has_impulse_slopes and stages.invariants is not None:
+        of_xi, of_u = _end_impulse_slopes(stages, x)
+        node_inverse = inverses(inertia.at[-1].add(-of_u))
+        if by_xi is None:
+            by_position = by_position.at[-1].add(-of_xi)
+        else:
+            by_xi = by_xi.at[-1].add(-of_xi)
     return LinearisedStep(
         stages=inverse_by_blocks(matrix),
         transported=transported,
         conjugate=conjugate,
-        node_inverse=inverses(inertia),
+        node_inverse=node_inverse,
+        end_inverse=end_inverse,
         node_gain=gain,
         node_position=by_position,
         node_xi=by_xi,
@@ -353,6 +373,7 @@ def _stage_slopes(
 
 def _base_slopes(
     stages: StageEquations,
+    x: StageUnknowns,
     path: _Path,
     transported: Float[Array, "s n"],
     force: Float[Array, "s n"],
@@ -361,7 +382,7 @@ def _base_slopes(
 
     def base(xi, transported, force):
         chart = path.chart(xi)
-        momentum = chart.momentum_at_origin(stages.p)
+        momentum = chart.momentum_at_origin(start_momentum(stages, x))
         return chart.base_momentum(momentum, transported, force)
 
     sums = [
@@ -396,7 +417,7 @@ def _node_slopes(
     def residual(increments, u, gained, xi):
         chart = path.chart(xi)
         y = chart.coordinates(increments)
-        start = chart.momentum_at_origin(stages.p)
+        start = chart.momentum_at_origin(start_momentum(stages, x))
         return momenta(increments, u, xi) - chart.from_origin(y, start[None] + gained)
 
     gained = stages.h * _weighted(stages.node_weights, transported)
@@ -404,6 +425,20 @@ def _node_slopes(
         residual, path.node_increments, u, gained, path.xi
     )
     return inertia, -by_gain, by_position, by_xi
+
+
+def _end_impulse_slopes(stages: StageEquations, x: StageUnknowns) -> tuple[Array, ...]:
+    """Differentiate the impulse at the end of the step by ξ and by u at the end."""
+
+    def impulse(xi, u):
+        # The weights b_j have the sum 1, so that this changes the increment by xi.
+        moved = x.velocity + xi[None] / stages.h
+        nodes = jnp.concatenate([x.node_fibre_coordinate[:-1], u[None]])
+        at = replace(x, velocity=moved, node_fibre_coordinate=nodes)
+        return end_impulse(stages, at)
+
+    u = x.node_fibre_coordinate[-1]
+    return slopes(impulse, jnp.zeros_like(u), u)[1]
 
 
 class ConstraintSlopes(eqx.Module):
@@ -593,4 +628,11 @@ def end_slopes(
             stages.args,
         )
 
-    return slopes(residual, given.xi, x.node_fibre_coordinate[-1])[1]
+    found = slopes(residual, given.xi, x.node_fibre_coordinate[-1])[1]
+    redundancy = stages.redundancy
+    if redundancy is None:
+        return found
+    return tuple(
+        (on_momentum, small_einsum("ab,bn->an", redundancy.projector, hidden))
+        for on_momentum, hidden in found
+    )

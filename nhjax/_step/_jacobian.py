@@ -11,6 +11,7 @@ more than a product.
 The end of the file has the norms by which iterations measure their updates.
 """
 
+from collections.abc import Callable
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -50,6 +51,7 @@ from ._equations import (
     stage_forces,
     stage_velocities,
     StageEquations,
+    StageResiduals,
     StageUnknowns,
 )
 from ._first_order import (
@@ -116,6 +118,9 @@ class MultiplierResponses(NamedTuple):
     node_fibre_coordinate: Float[Array, "r n c"]
 
 
+Linearised = Callable[[StageUnknowns], StageResiduals]
+
+
 class FullFactors(eqx.Module):
     """The factors of the Jacobian of all stage equations.
 
@@ -129,6 +134,8 @@ class FullFactors(eqx.Module):
     schur_inverse: Float[Array, "c c"]
     end: Linearisation
     end_slopes: tuple[tuple[Array, Array], ...] | None  # by ξ and u
+    slopes: ConstraintSlopes | None
+    unknowns: StageUnknowns
 
     def correct_stages(
         self, stages: StageEquations, x: StageUnknowns, residual: Float[Array, "s n"]
@@ -172,9 +179,7 @@ class FullFactors(eqx.Module):
         if self.end_slopes is not None:
             dlam_c = change[:m] / stages.h
             dy = dy + jnp.outer(stages.closure_weights("response"), dlam_c)
-            b = stages.coefficients("b")
-            xi = stages.h * small_einsum("s,sn->n", b, velocity)
-            da, dlam_end = _end_change(self.end, self.end_slopes, xi, at_nodes[-1])
+            da, dlam_end = self.end_change(stages, velocity, at_nodes[-1])
             acceleration, multiplier = acceleration + da, multiplier + dlam_end
         return replace(
             x,
@@ -186,6 +191,142 @@ class FullFactors(eqx.Module):
             end_acceleration=acceleration,
             end_multiplier=multiplier,
         )
+
+    def solve(
+        self, stages: StageEquations, push: Linearised, r: StageResiduals
+    ) -> StageUnknowns:
+        """Solve the linearised equations J dx = r with constant impulses.
+
+        `push` is the product with J at the stages of these factors.
+        """
+        h, m = stages.h, stages.num_nonholonomic
+        momentum = jnp.zeros_like(r.momentum)[:, :0]
+        if r.velocity is not None:
+            # The momenta take up the residuals of the velocities, by (∂v/∂μ)⁻¹.
+            assert self.step.conjugate is not None
+            matrices = self.step.conjugate.by_velocity
+            momentum = -small_einsum("ikn,in->ik", matrices, r.velocity)
+            zero = jax.tree.map(jnp.zeros_like, self.unknowns)
+            changed = push(replace(zero, momentum=momentum))
+            r = jax.tree.map(jnp.subtract, r, changed)
+        velocity, conjugate = self.step.of_stages(stages, r.momentum)
+        momentum = momentum + conjugate
+        at_nodes = self.step.by_position(stages, velocity) - r.node
+        at_nodes = self.step.of_nodes(stages, at_nodes, velocity)
+        dx = replace(
+            jax.tree.map(jnp.zeros_like, self.unknowns),
+            velocity=velocity,
+            momentum=momentum,
+            node_fibre_coordinate=at_nodes,
+        )
+        if self.responses is None:
+            return dx
+        assert self.slopes is not None
+        wanted = jnp.concatenate([r.kinematic.reshape(-1), r.holonomic.reshape(-1)])
+        wanted = wanted - self.slopes.along(stages, velocity, at_nodes)
+        first, of_end = 0, None
+        if r.end is not None:
+            first = m
+            of_end = self.end_change(stages, velocity, at_nodes[-1], r.end)
+            wanted = jnp.concatenate([h * of_end[1][:m], wanted])
+        change = small_einsum("kc,c->k", self.schur_inverse, wanted)
+        last = first + dx.closure.size
+        moved = [small_einsum("inc,c->in", z, change) for z in self.responses]
+        dy = change[first:last].reshape(dx.closure.shape) / h
+        dx = replace(
+            dx,
+            velocity=velocity + moved[0],
+            momentum=momentum + moved[1],
+            node_fibre_coordinate=at_nodes + moved[2],
+            closure=dy,
+            holonomic=change[last:].reshape(dx.holonomic.shape) / h,
+        )
+        if of_end is None:
+            return dx
+        by_moves = self.end_change(stages, moved[0], moved[2][-1])
+        return replace(
+            dx,
+            closure=dy + jnp.outer(stages.closure_weights("response"), change[:m] / h),
+            end_acceleration=of_end[0] + by_moves[0],
+            end_multiplier=of_end[1] + by_moves[1],
+        )
+
+    def end_change(
+        self,
+        stages: StageEquations,
+        velocity: Float[Array, "s n"],
+        u: Float[Array, " n"],
+        residual: tuple[Float[Array, " n"], Float[Array, " l"]] | None = None,
+    ) -> tuple[Float[Array, " n"], Float[Array, " l"]]:
+        """Compute the changes of acceleration and λ_c at the end of the step.
+
+        The stages and the end change by given velocities and u, and the equations of
+        motion at the end change by the `residual`, or keep their values.
+        """
+        assert self.end_slopes is not None
+        b = stages.coefficients("b")
+        xi = stages.h * small_einsum("s,sn->n", b, velocity)
+        found = _end_change(self.end, self.end_slopes, xi, u)
+        if residual is None:
+            return found
+        of_residual = self.end.solve(*residual)
+        return found[0] + of_residual[0], found[1] + of_residual[1]
+
+
+class NewtonFactors(eqx.Module):
+    """The factors of the Jacobian of all equations of a step at given unknowns.
+
+    Of the invariants, `impulses` are the changes of all unknowns with unit impulses at
+    which the other equations hold, one impulse on each row, and `schur_inverse` is the
+    inverse of the derivative of the equations of the impulses along them.
+    """
+
+    full: FullFactors
+    impulses: StageUnknowns | None
+    schur_inverse: Float[Array, "k k"] | None
+
+    @classmethod
+    def at(
+        cls,
+        stages: StageEquations,
+        x: StageUnknowns,
+        lin: Linearisation,
+        push: Linearised,
+    ) -> "NewtonFactors":
+        """Factorise the Jacobian J at the unknowns x; `push` is the product with J."""
+        full = full_factors(stages, x, lin, has_impulse_slopes=True)
+        if stages.invariants is None:
+            return cls(full, None, None)
+
+        def along(unit):
+            dx = replace(jax.tree.map(jnp.zeros_like, x), impulse=unit)
+            others = full.solve(stages, push, push(dx))
+            dx = replace(jax.tree.map(jnp.negative, others), impulse=unit)
+            return dx, push(dx).impulse
+
+        units = jnp.eye(x.impulse.shape[0], dtype=stages.p.dtype)
+        impulses, rows = mapped(along, units)
+        return cls(full, impulses, inverse(rows.T))
+
+    def solve(
+        self, stages: StageEquations, push: Linearised, r: StageResiduals
+    ) -> StageUnknowns:
+        """Solve the linearised equations J dx = r."""
+        dx = self.full.solve(stages, push, r)
+        if self.impulses is None:
+            return dx
+        assert self.schur_inverse is not None
+        changed = push(dx).impulse
+        assert r.impulse is not None
+        assert changed is not None
+        left = r.impulse - changed
+        impulse = small_einsum("kl,l->k", self.schur_inverse, left)
+
+        def with_impulses(z, columns):
+            weights = impulse.reshape(-1, *[1] * z.ndim)
+            return z + jnp.sum(weights * columns, axis=0)
+
+        return jax.tree.map(with_impulses, dx, self.impulses)
 
 
 class StageJacobianFactors(eqx.Module):
@@ -383,7 +524,7 @@ def _factors_without_impulses(
     stages: StageEquations, x: StageUnknowns, lin: Linearisation, jacobian: JacobianName
 ) -> StageJacobianFactors:
     if jacobian == "full":
-        return _full_factors(stages, x, lin)
+        return _with_full_factors(stages, x, lin)
     terms = None
     if uses_first_order_terms(stages, lin, jacobian):
         terms = first_order_terms(stages, x, lin)
@@ -543,25 +684,38 @@ def _first_order_factors(
     )
 
 
-def _full_factors(
+def _with_full_factors(
     stages: StageEquations, x: StageUnknowns, lin: Linearisation
 ) -> StageJacobianFactors:
-    """Compute the factors of the Jacobian of all equations at the stages x."""
     if not forces_have_slopes(stages):
         raise ValueError(
             '`SimplifiedNewton(jacobian="full")` needs derivatives of forces in forward'
             " mode, which callbacks and functions with a rule for reverse mode only do "
             'not have; use "leading" or None.'
         )
-    step = linearised_step(stages, x)
     s, n, dtype = stages.method.stages, stages.p.shape[0], stages.p.dtype
-    h, m, redundancy = stages.h, stages.num_nonholonomic, stages.redundancy
     reaction = DenseMatrix(jnp.zeros((s, n, 0), dtype))
     none = DenseMatrix(jnp.zeros((0, 0), dtype))
     given = lin.momentum_inverse, reaction, reaction, none, lin
+    return StageJacobianFactors(*given, full=full_factors(stages, x, lin))
+
+
+def full_factors(
+    stages: StageEquations,
+    x: StageUnknowns,
+    lin: Linearisation,
+    *,
+    has_impulse_slopes: bool = False,
+) -> FullFactors:
+    """Compute the factors of the Jacobian of all equations at the stages x.
+
+    `has_impulse_slopes` is passed on to `linearised_step`.
+    """
+    step = linearised_step(stages, x, has_impulse_slopes=has_impulse_slopes)
+    s, dtype = stages.method.stages, stages.p.dtype
+    h, m, redundancy = stages.h, stages.num_nonholonomic, stages.redundancy
     if not stages.constrained:
-        full = FullFactors(step, None, none.entries, lin, None)
-        return StageJacobianFactors(*given, full=full)
+        return FullFactors(step, None, jnp.zeros((0, 0), dtype), lin, None, None, x)
     slopes = ConstraintSlopes.at(stages, x)
     covectors = reactions_at_stages(stages, x)
     pushes = _reactions(stages, covectors)
@@ -598,8 +752,7 @@ def _full_factors(
         free = schur.shape[0] - m
         schur = schur + jnp.pad(jnp.eye(m, dtype=dtype), ((0, free), (0, free)))
     schur_inverse = inverse_of_schur(stages, schur, num_end + x.closure.size)
-    full = FullFactors(step, responses, schur_inverse, end, end_by)
-    return StageJacobianFactors(*given, full=full)
+    return FullFactors(step, responses, schur_inverse, end, end_by, slopes, x)
 
 
 def _end_change(
@@ -625,14 +778,14 @@ def _end_of_full(
 ) -> Linearisation:
     """Return a linearisation with the matrices at the end of the step."""
     at_end = reactions_at_end(stages, x)
-    reaction = small_einsum("kn,ln->kl", step.node_inverse[-1], at_end)
+    reaction = small_einsum("kn,ln->kl", step.end_inverse, at_end)
     rows, rest, redundancy = jacobian, 0.0, stages.redundancy
     if redundancy is not None:
         rows = small_einsum("ab,bn->an", redundancy.projector, jacobian)
         rest = redundancy.rest
     inverse_mass = lin.fibre_hessian_inverse
     if not stages.hamiltonian:
-        inverse_mass = DenseMatrix(step.node_inverse[-1])
+        inverse_mass = DenseMatrix(step.end_inverse)
     delassus = small_einsum("kn,nl->kl", rows, reaction) + rest
     return replace(
         lin,

@@ -18,9 +18,10 @@ from .._errors import check_choice
 from .._manifold import unframed
 from .._numerics import (
     iterate,
-    jacobian_and_value,
     max_norm,
     NOISE_UNITS,
+    repeated,
+    solve_by_rows,
     Solved,
     uneven_perturbations,
     UpdateNorms,
@@ -30,15 +31,20 @@ from ._equations import (
     Evaluation,
     invariant_correction,
     stage_residual,
+    stage_residuals,
     StageEquations,
+    StageResiduals,
     StageUnknowns,
+    unknown_units,
     with_moved_positions,
 )
-from ._first_order import JacobianName
+from ._first_order import forces_have_slopes, JacobianName
 from ._jacobian import (
     factorise_stage_jacobian,
     fibre_coordinate_size,
     increment_size,
+    Linearised,
+    NewtonFactors,
     simplified_newton_update,
     update_norms,
 )
@@ -49,6 +55,8 @@ from ._step import AbstractStageSolver, FrozenNewtonMap
 # If the residual is larger than this, relative to the momenta, the iterate is not a
 # solution.
 _GROSS = 1e-6
+# Newton's method solves larger systems by a library.
+_MOST_COORDINATES, _MOST_UNKNOWNS = 32, 256
 # After this many iterations of simplified Newton, the fallback is faster.
 _MOST_BEFORE_NEWTON = 100
 
@@ -195,13 +203,13 @@ def leaves_steps_to_newton(stage_solver: AbstractStageSolver) -> bool:
 
 
 class Newton(AbstractStageSolver):
-    """Newton's method on the stage equations, with their exact dense Jacobian.
+    """Newton's method on the stage equations, with their exact Jacobian.
 
-    An iteration costs more than an iteration of `SimplifiedNewton`, but the method
-    converges for larger steps and for stiff forces. Stiff forces magnify round-off in
-    the increments. This solver distinguishes such increments from the increments of an
-    iteration that has not converged. Both solvers give the same trajectory to
-    round-off.
+    The Jacobian is computed at each iterate and eliminated by blocks. An iteration
+    costs more than an iteration of `SimplifiedNewton`, but the method converges for
+    larger steps and for stiff forces. Stiff forces magnify round-off in the increments.
+    This solver distinguishes such increments from the increments of an iteration that
+    has not converged. Both solvers give the same trajectory to round-off.
 
     **Arguments:** `max_iterations` and `tolerance`, as for `SimplifiedNewton`.
 
@@ -223,32 +231,30 @@ class Newton(AbstractStageSolver):
         self, stages: StageEquations, x0: StageUnknowns, lin: Linearisation, skip: Array
     ) -> Solved[StageUnknowns, Evaluation]:
         """Solve the stage equations from `x0`; do nothing where `skip` is true."""
-        _, unravel = ravel_pytree(x0)
         scale = fibre_coordinate_scale(stages, x0, lin)
-
         eps = float(jnp.finfo(stages.p.dtype).eps)
         nudge = eps**0.5
         moved = with_moved_positions(stages, jnp.asarray(nudge, stages.p.dtype))
 
-        def residual(z):
-            return stage_residual(stages, unravel(z))
-
         def iteration(x: StageUnknowns):
-            z, _ = ravel_pytree(x)
-            jacobian, r, evaluation = jacobian_and_value(residual, z)
-            change = stage_residual(moved, x)[0] - r
+            z, unravel = ravel_pytree(x)
+            r, push, evaluation = jax.linearize(
+                lambda x: stage_residuals(stages, x), x, has_aux=True
+            )
             # After a change of x by a few units in the last place, the equations differ
             # from the prediction of the Jacobian by their round-off.
-            near = z + 8 * eps * uneven_perturbations(z)
-            missed = residual(near)[0] - r - jacobian @ (near - z)
-            rights = jnp.stack([r, change, missed], axis=1)
-            dz, *noises = jnp.linalg.solve(jacobian, -rights).T
-            x_next = unravel(z + dz)
+            near_z = z + 8 * eps * uneven_perturbations(z)
+            near = stage_residuals(stages, unravel(near_z))[0]
+            change = stage_residuals(moved, x)[0]
+            rights = [_minus(side, r) for side in (change, near)]
+            dz, by_moving, by_steps = _solved(stages, x, lin, push, [r, *rights])
+            x_next = unravel(z - dz)
             # Two kinds of round-off move the stages: the round-off of the positions,
             # which stiff forces magnify, and the round-off of the equations, which is
             # magnified if the equations are nearly dependent.
             by_positions, by_equations = (
-                increment_size(stages, x, unravel(z + noise), lin) for noise in noises
+                increment_size(stages, x, unravel(z + noise), lin)
+                for noise in (-by_moving, (near_z - z) - by_steps)
             )
             noise = jnp.maximum(by_positions / nudge, PART * by_equations / eps)
             found = UpdateNorms(
@@ -286,6 +292,80 @@ class Newton(AbstractStageSolver):
             return unravel(ravel_pytree(x)[0] - jacobian_inverse @ residual)
 
         return update
+
+
+def _solved(
+    stages: StageEquations,
+    x: StageUnknowns,
+    lin: Linearisation,
+    push: Linearised,
+    rights: list[StageResiduals],
+) -> Float[Array, "r k"]:
+    """Solve the linearised equations J dx = r of a step for some residuals r.
+
+    `push` is the product with J. The equations are eliminated by blocks, with one round
+    of refinement for the first r. Blocks are inverted without exchanges of rows between
+    blocks, which can lose digits although J is regular. The refinement shows this, and
+    the equations are then solved by elimination with partial pivoting of all rows.
+    Larger systems are solved by a library.
+    """
+    flat = jnp.stack([ravel_pytree(r)[0] for r in rights])
+    _, residuals = ravel_pytree(rights[0])
+    z, unravel = ravel_pytree(x)
+    size, dtype = len(z), z.dtype
+
+    def pushed(z):
+        return ravel_pytree(push(unravel(z)))[0]
+
+    if not _eliminates_blocks(stages, size):
+        jacobian = jax.vmap(pushed, out_axes=1)(jnp.eye(size, dtype=dtype))
+        return jnp.linalg.solve(jacobian, flat.T).T
+    factors = NewtonFactors.at(stages, x, lin, push)
+    units = unknown_units(stages, lin)
+
+    def measured(z):
+        leaves = jax.tree.leaves(unravel(z))
+        pairs = zip(leaves, units, strict=True)
+        return max_norm(*(leaf / unit for leaf, unit in pairs if leaf.size))
+
+    eps = float(jnp.finfo(dtype).eps)
+
+    def by_blocks(k, carry):
+        sides, found = carry
+        dx = ravel_pytree(factors.solve(stages, push, residuals(sides[k])))[0]
+
+        def with_rest():
+            return sides.at[1].set(sides[0] - pushed(dx))
+
+        # The second side is the residual that the first solution leaves.
+        sides = jax.lax.cond(k == 0, with_rest, lambda: sides)
+        return sides, found.at[k].set(dx)
+
+    sides = jnp.concatenate([flat[:1], jnp.zeros_like(flat[:1]), flat[1:]])
+    _, found = repeated(len(sides), by_blocks, (sides, jnp.zeros_like(sides)))
+    is_solved = measured(found[1]) <= eps**0.5 * measured(found[0])
+    found = jnp.concatenate([found[:1] + found[1:2], found[2:]])
+
+    def by_rows():
+        def put_column(k, table):
+            unit = (jnp.arange(size, dtype=k.dtype) == k).astype(dtype)
+            column = pushed(unit)[:, None]
+            return jax.lax.dynamic_update_slice_in_dim(table, column, k, axis=1)
+
+        table = jnp.zeros((size, size), dtype)
+        return solve_by_rows(repeated(size, put_column, table), flat.T).T
+
+    return jax.lax.cond(is_solved, lambda: found, by_rows)
+
+
+def _eliminates_blocks(stages: StageEquations, size: int) -> bool:
+    """Return whether Newton's method solves its equations without a library."""
+    is_small = stages.p.shape[0] <= _MOST_COORDINATES and size <= _MOST_UNKNOWNS
+    return is_small and forces_have_slopes(stages)
+
+
+def _minus(tree: StageResiduals, other: StageResiduals) -> StageResiduals:
+    return jax.tree.map(jnp.subtract, tree, other)
 
 
 class Scale(NamedTuple):
