@@ -96,11 +96,11 @@ class SimplifiedNewton(AbstractStageSolver):
     If this iteration does not converge, Newton's method with the exact Jacobian may
     still converge. With the fallback, Newton's method takes over in such a step, and
     `Solution.stats["num_newton_steps"]` counts these steps. A program that contains
-    both methods takes longer to compile, and runs slower even if the fallback is never
-    used. For this reason a plain call of `integrate` first runs without the fallback,
-    and repeats the run with it if a step was not solved. In your own transformed
-    program (`jax.jit`, `jax.vmap`, `jax.grad`), a step that is not solved ends the run,
-    unless you ask for the fallback.
+    both methods takes about three times as long to compile. For this reason a plain
+    call of `integrate` first runs without the fallback, and repeats the run with it if
+    a step was not solved. In your own transformed program (`jax.jit`, `jax.vmap`,
+    `jax.grad`), a step that is not solved ends the run, unless you ask for the
+    fallback.
 
     **Arguments:**
 
