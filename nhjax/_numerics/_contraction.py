@@ -16,7 +16,7 @@ from typing import Any
 import jax
 import jax.extend
 import jax.numpy as jnp
-from jaxtyping import Array, Float, PyTree
+from jaxtyping import Array, Float, PyTree, Shaped
 
 from .._compile import LONGEST_SUM, small_product
 from ..lanes import LARGEST_REDUCTION
@@ -150,7 +150,7 @@ def _sum_of_rows(rows: Float[Array, "k n"]) -> Float[Array, " n"]:
 
 
 def mapped(
-    function: Callable[[Array], PyTree[Array]], rows: Float[Array, "k *n"]
+    function: Callable[[Array], PyTree[Array]], rows: Shaped[Array, "k *n"]
 ) -> PyTree[Array]:
     """Apply a function to each row, in a loop that is never written out.
 
