@@ -276,9 +276,11 @@ class FullFactors(eqx.Module):
 class NewtonFactors(eqx.Module):
     """The factors of the Jacobian of all equations of a step at given unknowns.
 
-    Of the invariants, `impulses` are the changes of all unknowns with unit impulses at
-    which the other equations hold, one impulse on each row, and `schur_inverse` is the
-    inverse of the derivative of the equations of the impulses along them.
+    If the run keeps invariants, the impulses are eliminated last. Row k of `impulses`
+    is the change of all unknowns with a unit impulse for invariant k, such that the
+    equations other than those of the impulses still hold. `schur_inverse` inverts the
+    derivative of the equations of the impulses along these rows. Without invariants
+    both are None.
     """
 
     full: FullFactors

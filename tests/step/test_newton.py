@@ -18,6 +18,7 @@ from nhjax._step._jacobian import NewtonFactors
 from nhjax._step._solvers import _solved
 from nhjax._step._step import equations_of_step, starting_values, StepArguments
 from support.forms import in_rotation, in_space
+from support.helpers import twice_constrained_pendulum
 from support.long import long_but
 
 
@@ -53,19 +54,6 @@ def dense_and_by_blocks(system, y0, method, h, invariants=None):
 
     jacobian, r, found = map(np.asarray, both(jnp.asarray(h)))
     return np.linalg.solve(jacobian, r), found, np.linalg.cond(jacobian)
-
-
-def twice_constrained_pendulum():
-    """A pendulum whose rod is written twice, and its start."""
-    pendulum = systems.SphericalPendulum()
-
-    def twice(t, q, args):
-        return jnp.stack([pendulum.holonomic(t, q, args), q @ q - 1.0])
-
-    system = nhjax.LagrangianSystem(
-        pendulum.lagrangian, holonomic=twice, constraints="redundant"
-    )
-    return system, nhjax.initial_state(system, pendulum.q0, pendulum.v0)
 
 
 def energy_at_start(system, y0):

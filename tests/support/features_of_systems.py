@@ -10,6 +10,7 @@ from sympy.physics.mechanics import dynamicsymbols
 
 import nhjax
 from nhjax import LobattoIIIAB, systems
+from support.helpers import twice_constrained_pendulum
 from support.user_features import assert_exact, close, feature, PARTICLE, run, TWO
 
 
@@ -60,14 +61,7 @@ def both_kinds_of_constraints():
 @feature
 def redundant_constraints():
     pendulum = systems.SphericalPendulum()
-
-    def twice(t, q, args):
-        return jnp.stack([pendulum.holonomic(t, q, args), q @ q - 1.0])
-
-    system = nhjax.LagrangianSystem(
-        pendulum.lagrangian, holonomic=twice, constraints="redundant"
-    )
-    y0 = nhjax.initial_state(system, pendulum.q0, pendulum.v0)
+    system, y0 = twice_constrained_pendulum()
     sol = run(pendulum, system=system, y0=y0)
     assert_exact(pendulum, sol)
     assert int(sol.stats["num_redundant"]) == 1

@@ -236,3 +236,16 @@ def scalar(tree, seed=1):
         jnp.sum(jnp.asarray(rng.uniform(0.5, 1.5, x.shape), x.dtype) * jnp.sin(x))
         for x in jax.tree.leaves(tree)
     )
+
+
+def twice_constrained_pendulum():
+    """A pendulum whose rod is written twice, and its start."""
+    pendulum = systems.SphericalPendulum()
+
+    def twice(t, q, args):
+        return jnp.stack([pendulum.holonomic(t, q, args), q @ q - 1.0])
+
+    system = nhjax.LagrangianSystem(
+        pendulum.lagrangian, holonomic=twice, constraints="redundant"
+    )
+    return system, nhjax.initial_state(system, pendulum.q0, pendulum.v0)
