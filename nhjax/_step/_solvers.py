@@ -346,16 +346,23 @@ def _solved(
     is_solved = measured(found[1]) <= eps**0.5 * measured(found[0])
     found = jnp.concatenate([found[:1] + found[1:2], found[2:]])
 
-    def by_rows():
+    def by_rows(carry):
+        is_solved, _ = carry
+
         def put_column(k, table):
-            unit = (jnp.arange(size, dtype=k.dtype) == k).astype(dtype)
-            column = pushed(unit)[:, None]
+            # XLA would move columns that do not depend on the carry out of the loop.
+            unit = (jnp.arange(size, dtype=k.dtype) == k) & ~is_solved
+            column = pushed(unit.astype(dtype))[:, None]
             return jax.lax.dynamic_update_slice_in_dim(table, column, k, axis=1)
 
         table = jnp.zeros((size, size), dtype)
-        return solve_by_rows(repeated(size, put_column, table), flat.T).T
+        found = solve_by_rows(repeated(size, put_column, table), flat.T).T
+        return jnp.asarray(True), found
 
-    return jax.lax.cond(is_solved, lambda: found, by_rows)
+    # Under `jax.vmap`, a `cond` always computes both branches. This loop computes
+    # nothing if the equations of all members are solved.
+    _, found = jax.lax.while_loop(lambda carry: ~carry[0], by_rows, (is_solved, found))
+    return found
 
 
 def _eliminates_blocks(stages: StageEquations, size: int) -> bool:

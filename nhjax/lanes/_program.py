@@ -371,10 +371,21 @@ def _name(*texts: str) -> str:
 
 
 # Measurements on the gallery's systems with 2 to 8 stages, and on larger systems, show
-# that this compiler, which turns all arrays into scalars, is faster below this root
-# mean square of array sizes. Above it XLA is faster, since it uses vectors for loops
-# over larger arrays also in a single run.
-_SMALL_ARRAYS = 110
+# that this compiler, which turns all arrays into scalars, runs faster below the first
+# root mean square of array sizes. Above it XLA is often faster, since it uses vectors
+# for loops over larger arrays also in a single run. But XLA takes more than 1 ms to
+# compile an operation. Therefore only short programs are left to it between the two
+# sizes, and all programs above the second one.
+_SMALL_ARRAYS, _LARGE_ARRAYS = 40, 110
+_SHORT_PROGRAM = 2800
+
+
+def _suits_vectors(program: Any) -> bool:
+    """Return whether XLA should compile a single run, with vectors for its arrays."""
+    size = rms_array_size(program)
+    if _SMALL_ARRAYS < size <= _LARGE_ARRAYS:
+        return _count_operations(program) < _SHORT_PROGRAM
+    return size > _LARGE_ARRAYS
 
 
 class _Ways(NamedTuple):
@@ -391,8 +402,8 @@ def _lower_single(ctx: Any, *operands: Any, program: Any, options: CompileOption
     if is_within_kernel():
         return _single_by_xla(ctx, *operands, **params)
     reason = reason_against_lanes()
-    large = rms_array_size(program.jaxpr) > _SMALL_ARRAYS
-    if reason is None and large and chosen_engine() is None:
+    suits_vectors = _suits_vectors(program.jaxpr)
+    if reason is None and suits_vectors and chosen_engine() is None:
         reason = "its arrays are so large that XLA uses vectors for them"
     compiled = partial(compile_single, program, options.is_brief)
     ways = _Ways(compiled, _single_by_xla, by_one_kernel)

@@ -168,12 +168,21 @@ def test_newton_step_with_singular_diagonal_block_is_solved():
     np.testing.assert_allclose(sol.ys.v[-1], growth * np.asarray(y0.v), rtol=1e-14)
 
 
-def test_newton_equations_with_singular_diagonal_block_are_solved_by_rows():
-    h, method = jnp.asarray(0.1), LOBATTO(3)
+def test_newton_equations_of_ensemble_are_solved_by_rows_only_if_a_block_is_singular(
+    monkeypatch,
+):
+    # With the first step size a diagonal block of the first member is singular.
+    method, counted = LOBATTO(3), []
     system, y0 = amplified(1 / (0.1 * method.a_hat[0, 0]))
 
-    @jax.jit
-    def both(h):
+    def by_rows(matrix, rights):
+        jax.debug.callback(lambda: counted.append(1))
+        return solve_by_rows(matrix, rights)
+
+    monkeypatch.setattr("nhjax._step._solvers.solve_by_rows", by_rows)
+
+    @jax.vmap
+    def solved(h):
         stages, x, lin = equations_near_start(system, y0, method, h)
         r, push = jax.linearize(lambda x: stage_residuals(stages, x)[0], x)
         z, unravel = ravel_pytree(x)
@@ -181,8 +190,13 @@ def test_newton_equations_with_singular_diagonal_block_are_solved_by_rows():
         jacobian = rows(jnp.eye(len(z))).T
         return _solved(stages, x, lin, push, [r, r])[0], jacobian, ravel_pytree(r)[0]
 
-    found, jacobian, r = map(np.asarray, both(h))
-    np.testing.assert_allclose(found, np.linalg.solve(jacobian, r), rtol=1e-13)
+    for sizes, is_singular in (([0.1, 0.07], True), ([0.08, 0.07], False)):
+        counted.clear()
+        found, jacobian, r = map(np.asarray, jax.jit(solved)(jnp.asarray(sizes)))
+        jax.effects_barrier()
+        expected = np.linalg.solve(jacobian, r[..., None])[..., 0]
+        np.testing.assert_allclose(found, expected, rtol=1e-13)
+        assert bool(counted) == is_singular
 
 
 @pytest.mark.parametrize("size", [1, 2, 7, 40])
