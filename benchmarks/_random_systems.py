@@ -98,9 +98,16 @@ def random_system(
 
 
 def coordinates(q: PyTree[Array]) -> Array:
-    """All numbers of a configuration in one vector."""
-    parts = q if isinstance(q, tuple) else (q,)
-    return jnp.concatenate([part.reshape(-1) for part in parts])
+    """All numbers of a configuration in one vector, with functions of the angle of a
+    pose.
+
+    A function on SE(2) has the period 2π in the angle, which nhjax may shift by turns.
+    """
+    if not isinstance(q, tuple):
+        return q.reshape(-1)
+    (x, y, angle), point = q
+    pose = jnp.stack([x, y, jnp.cos(angle), jnp.sin(angle)])
+    return jnp.concatenate([pose, point])
 
 
 def random_systems(

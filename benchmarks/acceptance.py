@@ -144,8 +144,13 @@ def residual_and_correction(
     r = equations(z, stages)
     jacobian = jax.jacfwd(equations)(z, stages)
     moved = equations(z, with_moved_positions(stages, jnp.asarray(NUDGE)))
-    terms = jnp.abs(jacobian) @ block_sizes(stages, x) + jnp.abs(moved - r) / NUDGE
-    change = unravel(jnp.linalg.solve(jacobian, -r))
+    sizes = block_sizes(stages, x)
+    terms = jnp.abs(jacobian) @ sizes + jnp.abs(moved - r) / NUDGE
+    # In units of its terms and unknowns, the system neither over- nor underflows.
+    rows = jnp.where(terms > 0, terms, 1)
+    columns = jnp.where(sizes > 0, sizes, 1)
+    scaled = jacobian * columns / rows[:, None]
+    change = unravel(columns * jnp.linalg.solve(scaled, -r / rows))
     correction = max_norm(change.velocity, change.node_fibre_coordinate) / (
         1 + max_norm(x.velocity, x.node_fibre_coordinate)
     )
