@@ -98,10 +98,11 @@ def random_system(
 
 
 def coordinates(q: PyTree[Array]) -> Array:
-    """All numbers of a configuration in one vector, with functions of the angle of a
-    pose.
+    """Return the numbers of a configuration as a vector, with the cosine and the sine
+    of the angle of a pose.
 
-    A function on SE(2) has the period 2π in the angle, which nhjax may shift by turns.
+    Functions on SE(2) must have the period 2π in the angle, from which nhjax may
+    subtract turns.
     """
     if not isinstance(q, tuple):
         return q.reshape(-1)

@@ -45,7 +45,7 @@ from jaxtyping import Array, Float
 import nhjax
 from nhjax import systems
 from nhjax._method import AbstractMethod
-from nhjax._numerics import max_norm
+from nhjax._numerics import max_norm, nonzero_or_one
 from nhjax._step import step, StepOutcome, StepState
 from nhjax._step._equations import (
     stage_residual,
@@ -147,9 +147,8 @@ def residual_and_correction(
     sizes = block_sizes(stages, x)
     terms = jnp.abs(jacobian) @ sizes + jnp.abs(moved - r) / NUDGE
     # In units of its terms and unknowns, the system neither over- nor underflows.
-    rows = jnp.where(terms > 0, terms, 1)
-    columns = jnp.where(sizes > 0, sizes, 1)
-    scaled = jacobian * columns / rows[:, None]
+    rows, columns = nonzero_or_one(terms), nonzero_or_one(sizes)
+    scaled = jacobian * columns[None] / rows[:, None]
     change = unravel(columns * jnp.linalg.solve(scaled, -r / rows))
     correction = max_norm(change.velocity, change.node_fibre_coordinate) / (
         1 + max_norm(x.velocity, x.node_fibre_coordinate)

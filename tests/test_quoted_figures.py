@@ -238,12 +238,12 @@ def test_accepted_step_errors_quoted_agree_with_the_result():
     text = page("solvers")
     assert_agree(quoted(text, "or a violation above {} of its scale"), largest[:1])
     newton = [max(row[k] or 0.0 for row in ordinary for k in kinds[2:])]
-    assert_agree(quoted(text, "`Newton` stays below {}."), newton)
+    assert_agree(quoted(text, "With `Newton` the largest is {}."), newton)
     ends, apart = quoted(text, "Of about {} computed ends of steps, {} differ from")
     assert int(apart) == sum(row["apart"] for row in ordinary)
     accepted = sum(row["simplified accepted"] for row in ordinary)
     assert accepted == pytest.approx(int(ends.replace(" ", "")), rel=0.05)
-    residual, apart = quoted(text, "residuals reach {}. {} of these steps are apart")
+    residual, apart = quoted(text, "residuals reach {}. Of these steps, {} end")
     assert_agree([residual], largest[1:])
     assert int(apart) == sum(row["apart"] for row in steep)
 

@@ -277,10 +277,9 @@ class NewtonFactors(eqx.Module):
     """The factors of the Jacobian of all equations of a step at given unknowns.
 
     If the run keeps invariants, the impulses are eliminated last. Row k of `impulses`
-    is the change of all unknowns with a unit impulse for invariant k, such that the
-    equations other than those of the impulses still hold. `schur_inverse` inverts the
-    derivative of the equations of the impulses along these rows. Without invariants
-    both are None.
+    is a change of all unknowns with a unit impulse for invariant k. It does not change
+    the residuals, except those of the equations of the impulses. `schur_inverse` is the
+    inverse of the matrix of their changes. Without invariants both are None.
     """
 
     full: FullFactors

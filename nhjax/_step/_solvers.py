@@ -350,7 +350,8 @@ def _solved(
         is_solved, _ = carry
 
         def put_column(k, table):
-            # XLA would move columns that do not depend on the carry out of the loop.
+            # `is_solved` is false here. XLA would move a column that does not depend on
+            # the carry out of the loop, and compute it in any case.
             unit = (jnp.arange(size, dtype=k.dtype) == k) & ~is_solved
             column = pushed(unit.astype(dtype))[:, None]
             return jax.lax.dynamic_update_slice_in_dim(table, column, k, axis=1)

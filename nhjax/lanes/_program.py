@@ -402,8 +402,8 @@ def _lower_single(ctx: Any, *operands: Any, program: Any, options: CompileOption
     if is_within_kernel():
         return _single_by_xla(ctx, *operands, **params)
     reason = reason_against_lanes()
-    suits_vectors = _suits_vectors(program.jaxpr)
-    if reason is None and suits_vectors and chosen_engine() is None:
+    is_free = reason is None and chosen_engine() is None
+    if is_free and _suits_vectors(program.jaxpr):
         reason = "its arrays are so large that XLA uses vectors for them"
     compiled = partial(compile_single, program, options.is_brief)
     ways = _Ways(compiled, _single_by_xla, by_one_kernel)
