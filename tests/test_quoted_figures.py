@@ -47,6 +47,17 @@ def test_contest_ratios_quoted_agree_with_the_result():
                 assert_agree([cell], [best[library]["ratio_seconds"]])
 
 
+def test_times_on_accelerator_quoted_agree_with_the_result():
+    measured = {
+        (row["name"], row["members"]): (row["accelerator"], row["cpu"])
+        for row in results("accelerators")["rows"]
+    }
+    rows = rows_of(page("performance"), "ensemble", "members")
+    assert len(rows) == 5
+    for name, members, *times in rows:
+        assert_agree(times, measured[name, int(members)])
+
+
 def test_floor_times_quoted_agree_with_the_result():
     one, many = results("floor")["rows"]
     text = page("performance")

@@ -6,6 +6,7 @@ The operations of other libraries, such as those that equinox defines for its lo
 replaced by the program of their implementation: what they compute outside of `vmap`.
 """
 
+import math
 from collections.abc import Callable, Container
 from functools import partial
 from typing import Any
@@ -231,6 +232,24 @@ def _nextafter(x: Any, y: Any, **_: Any) -> Any:
     return jnp.where((x != x) | (y != y), x + y, after)
 
 
+def _log2(x: Any, **_: Any) -> Any:
+    return jnp.log(x) * jnp.asarray(1 / math.log(2), x.dtype)
+
+
+def _one_minus_square(x: Any) -> Any:
+    """Compute 1 - x² by factors, accurate where x is close to one."""
+    one = jnp.ones_like(x)
+    return (one + x) * (one - x)
+
+
+def _polynomial(x: Any, *coefficients: Any, **_: Any) -> Any:
+    """Compute the polynomial whose coefficients are given from the constant term on."""
+    *others, value = coefficients
+    for coefficient in reversed(others):
+        value = value * x + coefficient
+    return value
+
+
 def _is_short(equation: Any) -> bool:
     shape = equation.outvars[0].aval.shape
     return len(shape) == 1 and shape[0] <= MOST_ROWS
@@ -279,6 +298,10 @@ def _is_real(equation: Any) -> bool:
 
 
 _EXPANSIONS: dict[str, tuple[Callable[[Any], bool], Callable[..., Any]]] = {
+    # Operations of JAX from 0.12 on, which earlier releases wrote as arithmetic.
+    "log2": (_is_real, _log2),
+    "one_minus_square": (_is_real, _one_minus_square),
+    "polynomial": (_is_real, _polynomial),
     "lu": (_is_small_matrix, _lu),
     "lu_pivots_to_permutation": (_is_short, _permutation),
     "nextafter": (_is_real, _nextafter),

@@ -27,9 +27,9 @@ import numpy as np
 ELEMENTWISE = """
     abs acos acosh add add_any and asin asinh atan atan2 atanh
     bitcast_convert_type cbrt ceil clamp convert_element_type cos cosh div eq erf
-    exp exp2 expm1 floor ge gt integer_pow is_finite le log log1p logistic lt max
-    min mul ne neg not or pow rem round rsqrt select_n sign sin sinh sqrt square
-    stop_gradient sub tan tanh xor zeros_like
+    exp exp2 expm1 floor ge gt integer_pow is_finite le log log1p log2 logistic lt max
+    min mul ne neg not one_minus_square or polynomial pow rem round rsqrt select_n sign
+    sin sinh sqrt square stop_gradient sub tan tanh xor zeros_like
 """.split()  # noqa: SIM905
 _REDUCING = """
     argmax argmin reduce_and reduce_max reduce_min reduce_or reduce_prod

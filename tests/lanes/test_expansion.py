@@ -74,6 +74,27 @@ def test_solved_equations_in_lanes_equal_jax():
     _assert_same(jnp.linalg.solve, _matrices(4, 4) + 3 * np.eye(4), _matrices(4))
 
 
+@pytest.mark.parametrize(
+    "function",
+    [
+        jnp.log2,
+        jax.grad(lambda x: jnp.sum(jnp.tanh(x) + jnp.arctanh(x))),
+        jax.grad(lambda x: jnp.sum(jnp.arcsin(x) * jnp.log2(x))),
+        lambda x: jnp.polyval(x, x),
+        jax.grad(lambda x: jnp.sum(jnp.polyval(x[:3], x))),
+        *(
+            [jax.grad(lambda x: jnp.sum(lax.polynomial(x, [1.0, *x, *x, *x])))]
+            if hasattr(lax, "polynomial")
+            else []
+        ),
+    ],
+)
+@pytest.mark.parametrize("dtype", ["float64", "float32"])
+def test_functions_with_operations_of_jax_0_12_in_lanes_equal_jax(function, dtype):
+    x = RNG.uniform(0.1, 0.9, size=(5, 4)).astype(dtype)
+    _assert_same(function, x)
+
+
 def test_loop_with_a_condition_for_each_element_in_lanes_equals_jax():
     def halvings(x):
         def body(carry):

@@ -1,0 +1,170 @@
+"""Ensembles on an accelerator beside the processor of the same machine.
+
+Each ensemble is one compiled `jax.vmap(integrate)`. The table has the time of a step
+and member on both devices, and how far apart the final positions are, relative to the
+largest: the chaotic system multiplies differences of round-off. Times are the least of
+three calls; compile time is separate.
+
+    python -m benchmarks.accelerators
+"""
+
+import argparse
+import time
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import nhjax
+from nhjax import systems
+
+from ._report import markdown_table, number, write
+
+
+NUM_STEPS, ROUNDS = 50, 3
+EXPLAINED = f"""\
+Time of a step and member, {NUM_STEPS} steps a call; in pairs: the accelerator's, the
+processor's. `apart`: the largest difference between the final positions of both."""
+
+
+class Ensemble(NamedTuple):
+    """A system, a method with its step, and the start of each member."""
+
+    name: str
+    system: nhjax.LagrangianSystem
+    method: nhjax.LobattoIIIAB
+    h: float
+    start: Callable[[int], nhjax.State]
+    stage_solver: nhjax.AbstractStageSolver
+
+
+def ensembles(dtype: Any) -> list[Ensemble]:
+    """The ensembles that are measured."""
+    chaotic, bicycle = (
+        systems.ChaoticSystem(),
+        systems.WhippleBicycle.running(lean_rate=0.5),
+    )
+    default = nhjax.SimplifiedNewton()
+
+    def from_circle(members):
+        q, v = chaotic.ensemble(max(members - 1, 1), dtype)
+        start = jax.vmap(lambda q, v: nhjax.initial_state(chaotic.system, q, v))(q, v)
+        return jax.tree.map(lambda x: x[:members], start)
+
+    def running(members):
+        y0 = jax.tree.map(lambda x: jnp.asarray(x, dtype), bicycle.initial_state())
+        # Speeds of 95 to 105 percent, at which the constraints still hold.
+        scales = jnp.linspace(0.95, 1.05, members, dtype=dtype)
+        return jax.vmap(
+            lambda scale: nhjax.initial_state(bicycle.system, y0.q, scale * y0.v)
+        )(scales)
+
+    def lobatto(s):
+        return nhjax.LobattoIIIAB(s)
+
+    small = chaotic.system, lobatto(2), 0.1, from_circle
+    return [
+        Ensemble("chaotic system, s = 2", *small, default),
+        Ensemble("the same by `Newton()`", *small, nhjax.Newton()),
+        Ensemble(
+            "chaotic, s = 4", chaotic.system, lobatto(4), 0.1, from_circle, default
+        ),
+        Ensemble("bicycle, s = 3", bicycle.system, lobatto(3), 0.02, running, default),
+    ]
+
+
+def program(ensemble: Ensemble) -> Callable[[nhjax.State], Any]:
+    """The compiled ensemble: final positions, and whether each member succeeded."""
+
+    def run(y0):
+        sol = nhjax.integrate(
+            ensemble.system,
+            ensemble.method,
+            y0,
+            dt=ensemble.h,
+            num_steps=NUM_STEPS,
+            saveat=nhjax.SaveAt(t1=True),
+            stage_solver=ensemble.stage_solver,
+            throw=False,
+        )
+        good = sol.result == nhjax.RESULTS.successful
+        return sol.ys.q[-1], good, sol.stats["num_iterations"]
+
+    return jax.jit(jax.vmap(run))
+
+
+def measure(ensemble: Ensemble, members: int) -> dict[str, Any]:
+    """Times of an ensemble on the default device and on the processor."""
+    devices = {"accelerator": jax.devices()[0], "cpu": jax.devices("cpu")[0]}
+    found: dict[str, Any] = {"name": ensemble.name, "members": members}
+    positions = {}
+    for name, device in devices.items():
+        with jax.default_device(device):
+            start = jax.device_put(ensemble.start(members), device)
+            before = time.perf_counter()
+            compiled = program(ensemble).lower(start).compile()
+            found[f"{name}, compile"] = time.perf_counter() - before
+            times = []
+            for _ in range(ROUNDS):
+                before = time.perf_counter()
+                q, good, iterations = jax.block_until_ready(compiled(start))
+                times.append(time.perf_counter() - before)
+        found[name] = 1e6 * min(times) / (members * NUM_STEPS)
+        found[f"{name}, failed"] = int(members - np.sum(good))
+        found[f"{name}, iterations"] = float(np.mean(iterations) / NUM_STEPS)
+        positions[name] = np.asarray(q)
+    apart = np.abs(positions["accelerator"] - positions["cpu"]).max()
+    found["apart"] = float(apart / np.abs(positions["cpu"]).max())
+    return found
+
+
+def table(rows: list[dict[str, Any]]) -> str:
+    """The figures of all ensembles."""
+    lines = [
+        [
+            row["name"],
+            row["dtype"],
+            str(row["members"]),
+            f"{row['accelerator']:.4f}",
+            f"{row['cpu']:.4f}",
+            f"{row['cpu'] / row['accelerator']:.2f}",
+            f"{row['accelerator, iterations']:.1f}, {row['cpu, iterations']:.1f}",
+            f"{row['accelerator, failed']}, {row['cpu, failed']}",
+            number(row["apart"]),
+            f"{row['accelerator, compile']:.1f}, {row['cpu, compile']:.1f}",
+        ]
+        for row in rows
+    ]
+    header = ["ensemble", "dtype", "members", "accelerator [µs]", "processor [µs]"]
+    header += ["processor / accelerator", "iterations a step", "failed", "apart"]
+    return markdown_table([*header, "compile [s]"], lines)
+
+
+def main() -> None:
+    """Measure, and write the table after each row."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--members", type=int, nargs="+", default=[1, 1000, 100_000])
+    parser.add_argument("--smoke", action="store_true", help="little, and not saved")
+    options = parser.parse_args()
+    jax.config.update("jax_enable_x64", True)
+    rows = []
+    for dtype in ("float64", "float32"):
+        for ensemble in ensembles(dtype):
+            for members in [3] if options.smoke else options.members:
+                rows.append({"dtype": dtype, **measure(ensemble, members)})
+                text = f"{EXPLAINED}\n\n{table(rows)}"
+                if options.smoke:
+                    print(text, flush=True)
+                else:
+                    write(
+                        "accelerators",
+                        "Ensembles on an accelerator",
+                        text,
+                        {"rows": rows},
+                    )
+
+
+if __name__ == "__main__":
+    main()
