@@ -9,7 +9,7 @@ from support.pages import blocks, DOCS, page, run_page
 
 
 PAGES = (
-    *("index", "start", "constraints", "lie_groups", "theory", "gallery"),
+    *("index", "start", "constraints", "forces", "lie_groups", "theory", "gallery"),
     *("systems", "events", "derivatives", "engines", "performance", "machines"),
 )
 

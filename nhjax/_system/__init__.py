@@ -48,5 +48,6 @@ from ._systems import (
     HamiltonianSystem as HamiltonianSystem,
     LagrangianSystem as LagrangianSystem,
     State as State,
+    static_function as static_function,
     with_frames as with_frames,
 )

@@ -1,0 +1,477 @@
+"""Forces and torques on points and bodies, as generalised forces of a system.
+
+A force f that acts on a point x(t, q) does the work f · ẋ. Its generalised force is
+F = (∂x/∂q)ᵀ f, on a group F = L_g^* (∂x/∂g)ᵀ f, so that F · v = f · ẋ for points that
+do not depend on time by themselves.
+"""
+
+import abc
+import reprlib
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, ArrayLike, Float, PyTree
+
+from ._custom_types import Args, FloatScalarLike, PhaseFunction, PositionFunction
+from ._errors import naming, ShapeError
+from ._manifold import AbstractLieGroup, Euclidean
+from ._system import static_function
+
+
+def _number(value: Any) -> Array:
+    """Convert a parameter; numbers become weakly typed, to suit every precision."""
+    if isinstance(value, int | float | np.number):
+        return jnp.asarray(float(value))
+    if isinstance(value, str) or callable(value):
+        raise TypeError(
+            f"A parameter of a force must be a number or an array, got "
+            f"{reprlib.repr(value)} of type {type(value).__name__}."
+        )
+    return jnp.asarray(value)
+
+
+def _function_or_numbers(value: Any) -> Any:
+    return static_function(value) if callable(value) else _number(value)
+
+
+def _position(value: Any) -> Any:
+    if not callable(value):
+        raise TypeError(
+            f"A point of a force must be a function of (t, q, args), got "
+            f"{reprlib.repr(value)} of type {type(value).__name__}."
+        )
+    return static_function(value)
+
+
+def _of_phase(name: str, value: Any, like: Array, *arguments: Any) -> Array:
+    """Evaluate a number, an array or a function of (t, q, v, args), shaped `like`."""
+    if callable(value):
+        function = getattr(value, "function", value)
+        with naming(f"{name}(t, q, v, args)", function, arguments[-1]):
+            value = value(*arguments)
+    value = jnp.asarray(value)
+    if value.shape != like.shape:
+        raise ShapeError(
+            f"`{name}` must have the shape of what it acts on, {like.shape}, got "
+            f"shape {value.shape}."
+        )
+    return value.astype(like.dtype)
+
+
+class AbstractForce(eqx.Module):
+    """A generalised force F(t, q, v, args), the `force` of a `LagrangianSystem`.
+
+    Forces are added by `+`, also to functions of (t, q, v, args). Their numbers are
+    leaves: if they change, nothing is compiled again, and derivatives with respect to
+    them are available.
+
+    To define a force, write a subclass with this method:
+
+    - `__call__(t, q, v, args)`: the generalised force, of shape (n,); on a group in
+        left-trivialised components.
+    """
+
+    @abc.abstractmethod
+    def __call__(
+        self,
+        t: FloatScalarLike,
+        q: PyTree[Array],
+        v: Float[Array, " n"],
+        args: Args = None,
+    ) -> Float[Array, " n"]:
+        """Compute the generalised force."""
+
+    def __add__(self, other: Any) -> "Sum":
+        """Add another force, or a function F(t, q, v, args)."""
+        return Sum(self, other)
+
+    def __radd__(self, other: Any) -> "AbstractForce":
+        """Add to a function F(t, q, v, args); `sum` starts with the number 0."""
+        return Sum(other, self) if callable(other) or other != 0 else self
+
+
+class Sum(AbstractForce):
+    """The sum of forces and of functions F(t, q, v, args).
+
+    !!! example
+
+        >>> import jax.numpy as jnp
+        >>> from nhjax import forces
+        >>> tip = lambda t, q, args: q[:2]
+        >>> pull = forces.PointForce(tip, jnp.array([1.0, 0.0]))
+        >>> (pull + forces.Drag(tip, linear=0.5))(0.0, jnp.zeros(3), jnp.ones(3))
+        Array([ 0.5, -0.5,  0. ], dtype=float64)
+    """
+
+    terms: tuple[Callable[..., Any], ...]
+
+    def __init__(self, *terms: PhaseFunction):
+        for term in terms:
+            if not callable(term):
+                raise TypeError(
+                    f"A force must be a function of (t, q, v, args), got "
+                    f"{reprlib.repr(term)} of type {type(term).__name__}."
+                )
+        self.terms = tuple(map(static_function, terms))
+
+    def __call__(
+        self,
+        t: FloatScalarLike,
+        q: PyTree[Array],
+        v: Float[Array, " n"],
+        args: Args = None,
+    ) -> Float[Array, " n"]:
+        """Compute the sum."""
+        total = jnp.zeros_like(v)
+        for term in self.terms:
+            total = total + _of_phase("force", term, v, t, q, v, args)
+        return total
+
+
+class PointForce(AbstractForce):
+    """A force on a point, or a torque on an angle.
+
+    F = (∂x/∂q)ᵀ f, with the point x(t, q, args) and the force f(t, q, v, args).
+
+    If x is an angle [rad], f is the torque [N m] about its axis. A torque between two
+    bodies acts on the angle between them, such as `q[3] - q[2]`.
+
+    **Arguments:**
+
+    - `point`: x, called as `point(t, q, args)`: coordinates [m] of shape (d,), or an
+        angle of shape ().
+    - `vector`: f [N], an array of the shape of x, or a function of (t, q, v, args) that
+        returns one.
+    - `manifold`: the manifold of the system, if it has one.
+
+    **Raises:** when called, `ShapeError` if the shapes of x and f differ.
+
+    !!! example
+
+        >>> import jax.numpy as jnp
+        >>> from nhjax import forces
+        >>> tip = lambda t, q, args: 2.0 * jnp.array([jnp.cos(q[0]), jnp.sin(q[0])])
+        >>> forces.PointForce(tip, [0.0, 3.0])(0.0, jnp.zeros(1), jnp.zeros(1))
+        Array([6.], dtype=float64)
+    """
+
+    point: PositionFunction = eqx.field(converter=_position)
+    vector: ArrayLike | PhaseFunction = eqx.field(converter=_function_or_numbers)
+    manifold: AbstractLieGroup | None = eqx.field(default=None, kw_only=True)
+
+    def __call__(
+        self,
+        t: FloatScalarLike,
+        q: PyTree[Array],
+        v: Float[Array, " n"],
+        args: Args = None,
+    ) -> Float[Array, " n"]:
+        """Compute the generalised force."""
+        x = _at("point", self.point, t, q, args)
+        vector = _of_phase("vector", self.vector, x, t, q, v, args)
+        return _pulled_back(self.point, vector, self.manifold, t, q, args)
+
+
+class Torque(AbstractForce):
+    """A torque on a body in space, given by its rotation.
+
+    F · v = τ · ω with the angular velocity ω of the body, hat(ω) = Ṙ Rᵀ.
+
+    **Arguments:**
+
+    - `rotation`: R, called as `rotation(t, q, args)`, of shape (3, 3): from the frame
+        of the body to the frame of space.
+    - `vector`: τ [N m] in the frame of space, of shape (3,), or a function of
+        (t, q, v, args) that returns one.
+    - `manifold`: the manifold of the system, if it has one.
+
+    **Raises:** when called, `ShapeError` if R or τ has another shape.
+
+    !!! example
+
+        >>> import jax.numpy as jnp, nhjax
+        >>> group = nhjax.SO3()
+        >>> torque = nhjax.forces.Torque(
+        ...     lambda t, q, args: group.matrix(q), [0.0, 0.0, 2.0], manifold=group)
+        >>> torque(0.0, group.identity(), jnp.zeros(3))
+        Array([0., 0., 2.], dtype=float64)
+    """
+
+    rotation: PositionFunction = eqx.field(converter=_position)
+    vector: ArrayLike | PhaseFunction = eqx.field(converter=_function_or_numbers)
+    manifold: AbstractLieGroup | None = eqx.field(default=None, kw_only=True)
+
+    def __call__(
+        self,
+        t: FloatScalarLike,
+        q: PyTree[Array],
+        v: Float[Array, " n"],
+        args: Args = None,
+    ) -> Float[Array, " n"]:
+        """Compute the generalised force."""
+        rotation = _at("rotation", self.rotation, t, q, args)
+        if rotation.shape != (3, 3):
+            raise ShapeError(
+                f"`rotation` must have shape (3, 3), got {rotation.shape}. For an "
+                f"angle use `PointForce`."
+            )
+        torque = _of_phase("vector", self.vector, rotation[0], t, q, v, args)
+        # With Ṙ = hat(ω) R the product of the matrices ½ hat(τ) R and Ṙ is τ · ω.
+        covector = 0.5 * jnp.cross(torque[:, None], rotation, axis=0)
+        return _pulled_back(self.rotation, covector, self.manifold, t, q, args)
+
+
+class Spring(AbstractForce):
+    """A spring with a damper between two points.
+
+    The force on the first point is -(k (|d| - l) + c d/dt |d|) d / |d| with
+    d = x₁ - x₂, and the second point feels the opposite force. Where the points
+    coincide, only the part -k d of it is left, which is zero there.
+
+    The energy of a system does not contain that of its forces. If there is no damper
+    and the energy matters, add -½ k (|d| - l)² to the Lagrangian instead: the steps
+    are the same.
+
+    **Arguments:**
+
+    - `first`: x₁, called as `first(t, q, args)`, coordinates [m] of shape (d,).
+    - `second`: x₂, such a function, or the coordinates of a point that is fixed.
+    - `stiffness`: k [N/m].
+    - `rest_length`: l [m].
+    - `damping`: c [N s/m].
+    - `manifold`: the manifold of the system, if it has one.
+
+    **Raises:** when called, `ShapeError` if the shapes of the points differ, or are not
+    of the form (d,).
+
+    !!! example
+
+        >>> import jax.numpy as jnp
+        >>> from nhjax import forces
+        >>> mass = lambda t, q, args: q
+        >>> spring = forces.Spring(mass, [0.0, 0.0], 10.0, rest_length=1.0)
+        >>> spring(0.0, jnp.array([1.5, 2.0]), jnp.zeros(2))
+        Array([ -9., -12.], dtype=float64)
+    """
+
+    first: PositionFunction = eqx.field(converter=_position)
+    second: ArrayLike | PositionFunction = eqx.field(converter=_function_or_numbers)
+    stiffness: ArrayLike = eqx.field(converter=_number)
+    rest_length: ArrayLike = eqx.field(default=0.0, converter=_number, kw_only=True)
+    damping: ArrayLike = eqx.field(default=0.0, converter=_number, kw_only=True)
+    manifold: AbstractLieGroup | None = eqx.field(default=None, kw_only=True)
+
+    def __call__(
+        self,
+        t: FloatScalarLike,
+        q: PyTree[Array],
+        v: Float[Array, " n"],
+        args: Args = None,
+    ) -> Float[Array, " n"]:
+        """Compute the generalised force."""
+        d, rate = _with_rate(self._difference, self.manifold, t, q, v, args)
+        length = _length(d)
+        apart = length > 0
+        direction = jnp.where(apart, d / jnp.where(apart, length, 1), 0)
+        k, rest, damping = (
+            jnp.asarray(x, d.dtype)
+            for x in (self.stiffness, self.rest_length, self.damping)
+        )
+        pull = (k * rest - damping * jnp.sum(direction * rate)) * direction - k * d
+        return _pulled_back(self._difference, pull, self.manifold, t, q, args)
+
+    def _difference(self, t: Any, q: Any, args: Any) -> Array:
+        first = _at("first", self.first, t, q, args)
+        second = self.second
+        if callable(second):
+            second = _at("second", second, t, q, args)
+        second = jnp.asarray(second, first.dtype)
+        if second.shape != first.shape or first.ndim != 1:
+            raise ShapeError(
+                f"The points of a spring must both have a shape (d,), got `first` of "
+                f"shape {first.shape} and `second` of shape {second.shape}. Between "
+                f"angles use `PointForce`."
+            )
+        return first - second
+
+
+class Drag(AbstractForce):
+    """A force on a point against its velocity u relative to a medium.
+
+    f = -(c₁ + c₂ |u|) u. The drag of a body of area A in a medium of density ρ has
+    c₂ = ½ ρ C A with the drag coefficient C. If the point is an angle, f is a torque,
+    for instance of a bearing.
+
+    **Arguments:**
+
+    - `point`: x, called as `point(t, q, args)`: coordinates [m] of shape (d,), or an
+        angle [rad] of shape ().
+    - `linear`: c₁ [N s/m].
+    - `quadratic`: c₂ [N s²/m²].
+    - `medium`: the velocity of the medium [m/s], a number, an array of the shape of x,
+        or a function of (t, q, v, args) that returns one; zero by default.
+    - `manifold`: the manifold of the system, if it has one.
+
+    **Raises:** when called, `ShapeError` if the medium has another shape than x.
+
+    !!! example
+
+        >>> import jax.numpy as jnp
+        >>> from nhjax import forces
+        >>> drag = forces.Drag(lambda t, q, args: q, linear=1.0, quadratic=2.0)
+        >>> drag(0.0, jnp.zeros(2), jnp.array([3.0, 4.0]))
+        Array([-33., -44.], dtype=float64)
+    """
+
+    point: PositionFunction = eqx.field(converter=_position)
+    linear: ArrayLike = eqx.field(default=0.0, converter=_number, kw_only=True)
+    quadratic: ArrayLike = eqx.field(default=0.0, converter=_number, kw_only=True)
+    medium: ArrayLike | PhaseFunction | None = eqx.field(
+        default=None,
+        converter=lambda x: None if x is None else _function_or_numbers(x),
+        kw_only=True,
+    )
+    manifold: AbstractLieGroup | None = eqx.field(default=None, kw_only=True)
+
+    def __call__(
+        self,
+        t: FloatScalarLike,
+        q: PyTree[Array],
+        v: Float[Array, " n"],
+        args: Args = None,
+    ) -> Float[Array, " n"]:
+        """Compute the generalised force."""
+        _, u = _with_rate(self.point, self.manifold, t, q, v, args)
+        if self.medium is not None:
+            u = u - _of_phase("medium", self.medium, u, t, q, v, args)
+        linear, quadratic = (
+            jnp.asarray(x, u.dtype) for x in (self.linear, self.quadratic)
+        )
+        drag = -(linear + quadratic * _length(u)) * u
+        return _pulled_back(self.point, drag, self.manifold, t, q, args)
+
+
+class Motor(AbstractForce):
+    """A motor with a gear and a straight line of torque against speed.
+
+    It turns the angle φ with the torque i τ₀ (c - i φ̇ / ω₀): a DC motor whose voltage
+    is the fraction c of its full voltage, behind a gear of ratio i.
+
+    **Arguments:**
+
+    - `angle`: φ, called as `angle(t, q, args)` [rad], of shape (): the rotation of what
+        the motor drives relative to what carries it.
+    - `command`: c, a number or a function of (t, q, v, args). Values beyond -1 and 1
+        are not limited: see `saturated`.
+    - `stall_torque`: τ₀ [N m], the torque of the motor at rest with c = 1.
+    - `no_load_speed`: ω₀ [rad/s], the speed of the motor without torque with c = 1.
+    - `gear`: i, turns of the motor for each turn of the angle.
+    - `manifold`: the manifold of the system, if it has one.
+
+    **Raises:** when called, `ShapeError` if φ or c is no scalar.
+
+    !!! example
+
+        >>> import jax.numpy as jnp
+        >>> from nhjax import forces
+        >>> wheel = lambda t, q, args: q[1]
+        >>> motor = forces.Motor(wheel, 1.0, stall_torque=2.0, no_load_speed=10.0)
+        >>> motor(0.0, jnp.zeros(2), jnp.array([0.0, 5.0]))
+        Array([0., 1.], dtype=float64)
+    """
+
+    angle: PositionFunction = eqx.field(converter=_position)
+    command: ArrayLike | PhaseFunction = eqx.field(converter=_function_or_numbers)
+    stall_torque: ArrayLike = eqx.field(converter=_number, kw_only=True)
+    no_load_speed: ArrayLike = eqx.field(converter=_number, kw_only=True)
+    gear: ArrayLike = eqx.field(default=1.0, converter=_number, kw_only=True)
+    manifold: AbstractLieGroup | None = eqx.field(default=None, kw_only=True)
+
+    def __call__(
+        self,
+        t: FloatScalarLike,
+        q: PyTree[Array],
+        v: Float[Array, " n"],
+        args: Args = None,
+    ) -> Float[Array, " n"]:
+        """Compute the generalised force."""
+        phi, rate = _with_rate(self.angle, self.manifold, t, q, v, args)
+        if phi.shape != ():
+            raise ShapeError(f"`angle` must have shape (), got {phi.shape}.")
+        command = _of_phase("command", self.command, phi, t, q, v, args)
+        stall, free, gear = (
+            jnp.asarray(x, phi.dtype)
+            for x in (self.stall_torque, self.no_load_speed, self.gear)
+        )
+        torque = gear * stall * (command - gear * rate / free)
+        return _pulled_back(self.angle, torque, self.manifold, t, q, args)
+
+
+def saturated(x: ArrayLike, limit: ArrayLike) -> Array:
+    """Limit a signal smoothly: limit · tanh(x / limit).
+
+    A step solves equations with derivatives, so that `jnp.clip` would cost iterations
+    and the order of the method where the signal passes the limit.
+
+    **Arguments:**
+
+    - `x`: the signal, of any shape.
+    - `limit`: the positive value that the result stays below, in the units of `x`.
+
+    **Returns:** an array of the shape of `x`.
+
+    !!! example
+
+        >>> from nhjax import forces
+        >>> float(forces.saturated(0.0, 2.0)), float(forces.saturated(50.0, 2.0))
+        (0.0, 2.0)
+    """
+    limit = jnp.asarray(limit)
+    return limit * jnp.tanh(jnp.asarray(x) / limit)
+
+
+def _at(name: str, function: Any, t: Any, q: Any, args: Any) -> Array:
+    """Evaluate a function of (t, q, args) of the user."""
+    with naming(f"{name}(t, q, args)", getattr(function, "function", function), args):
+        return jnp.asarray(function(t, q, args))
+
+
+def _with_rate(
+    function: PositionFunction,
+    manifold: AbstractLieGroup | None,
+    t: Any,
+    q: Any,
+    v: Array,
+    args: Any,
+) -> tuple[Array, Array]:
+    """Evaluate x(t, q) and ẋ = ∂x/∂t + ∂x/∂q · q̇."""
+    t = jnp.asarray(t, v.dtype)
+    tangent = v if manifold is None else manifold.tangent(q, v)
+    return jax.jvp(
+        lambda t, q: _at("point", function, t, q, args),
+        (t, q),
+        (jnp.ones_like(t), tangent),
+    )
+
+
+def _pulled_back(
+    function: PositionFunction,
+    covector: Array,
+    manifold: AbstractLieGroup | None,
+    t: Any,
+    q: Any,
+    args: Any,
+) -> Float[Array, " n"]:
+    """Compute (∂x/∂q)ᵀ f, the generalised force of a covector on x(t, q)."""
+    manifold = Euclidean(q.shape[0]) if manifold is None else manifold
+    return manifold.left_gradient(lambda q: jnp.sum(covector * function(t, q, args)), q)
+
+
+def _length(x: Array) -> Array:
+    """Compute |x|, with the derivative zero at x = 0."""
+    square = jnp.sum(x * x)
+    return jnp.where(square > 0, jnp.sqrt(jnp.where(square > 0, square, 1)), 0)
