@@ -48,7 +48,7 @@ FLOORS = (
     ("_integrate",),
     ("_io",),
     ("_ensemble",),
-    ("forces", "systems", "diagnostics", "plot", "studies", "__main__"),
+    ("forces", "rolling", "systems", "diagnostics", "plot", "studies", "__main__"),
 )
 ROOMS = tuple(room for floor in FLOORS for room in floor)
 
@@ -456,7 +456,8 @@ _COLUMNS = {
     "_integrate": 3.0,
     "_io": 4.1,
     "_ensemble": 3.5,
-    "forces": 0.9,
+    "forces": 0.7,
+    "rolling": 1.2,
     "systems": 0.0,
     "diagnostics": 1.8,
     "plot": 2.5,

@@ -4,7 +4,7 @@ from importlib import import_module
 from types import ModuleType
 from typing import TYPE_CHECKING
 
-from . import forces as forces, lanes as lanes
+from . import forces as forces, lanes as lanes, rolling as rolling
 from ._analysis import (
     check_system as check_system,
     linear_stability as linear_stability,

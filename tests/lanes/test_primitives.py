@@ -101,6 +101,19 @@ _CASES = {
     "not": _unary(lax.bitwise_not, BITS),
     "nextafter": _binary(lax.nextafter, FLOATS),
     "square": _unary(lax.square, NUMBERS),
+    # Operations of JAX from 0.12 on; before, these functions consist of others.
+    "log2": _unary(jnp.log2, FLOATS),
+    "one_minus_square": _unary(
+        getattr(lax, "one_minus_square", lambda x: (1 + x) * (1 - x)), FLOATS
+    ),
+    "polynomial": _unary(
+        lambda x: (
+            lax.polynomial(x, [-1.0, 0.5, 2.0])
+            if hasattr(lax, "polynomial")
+            else (x * 2 + 0.5) * x - 1
+        ),
+        FLOATS,
+    ),
     "integer_pow": [
         *_unary(lambda x: lax.integer_pow(x, 5), NUMBERS),
         *_unary(lambda x: lax.integer_pow(x, -3)),
@@ -236,8 +249,8 @@ _CASES = {
 # Those that are not rounded correctly, by XLA least of all.
 _INEXACT = """
     acos acosh asin asinh atan atan2 atanh cbrt cos cosh erf exp exp2 expm1 log log1p
-    logistic pow rsqrt sin sinh tan tanh reduce_sum reduce_prod add_any scan
-    stop_gradient small_product
+    log2 logistic one_minus_square polynomial pow rsqrt sin sinh tan tanh reduce_sum
+    reduce_prod add_any scan stop_gradient small_product
 """.split()  # noqa: SIM905
 
 

@@ -1,0 +1,479 @@
+"""Rolling contacts as parts: wheels, balls and blades on a plane, from their poses.
+
+A contact is given by the pose of a body: its position x(t, q) in space and its rotation
+R(t, q). The point c of the body that touches the plane follows from its shape. Its
+height n · c - h is the holonomic constraint, and the components of its velocity
+
+    u = ẋ + Ṙ Rᵀ (c - x) - w
+
+along the plane are the nonholonomic ones, with the velocity w of the ground. Each
+multiplier is the force in newtons in its direction.
+"""
+
+import abc
+import math
+import reprlib
+from collections.abc import Callable
+from typing import Any, Literal
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, ArrayLike, Float, PyTree
+
+from ._custom_types import Args, FloatScalarLike, PositionFunction
+from ._errors import naming, ShapeError
+from ._manifold import AbstractLieGroup
+from ._system import check_type, State, static_function
+
+
+def _vector(value: Any) -> Array:
+    vector = jnp.asarray(value, float)
+    if vector.shape != (3,):
+        raise ShapeError(
+            f"A vector in space must have shape (3,), got {reprlib.repr(value)}."
+        )
+    return vector
+
+
+def _pose(value: Any) -> Any:
+    if not callable(value):
+        raise TypeError(
+            "`pose` must be a function of (t, q, args) that returns a position and a "
+            f"rotation, got {reprlib.repr(value)} of type {type(value).__name__}."
+        )
+    return static_function(value)
+
+
+def _unit(vector: Array) -> Array:
+    return vector / jnp.sqrt(vector @ vector)
+
+
+class Plane(eqx.Module):
+    """A plane that bodies roll on: all points x with n · x = h.
+
+    **Arguments:**
+
+    - `normal`: n, which points away from the ground; its length does not matter.
+    - `height`: h [m], the distance of the plane from the origin along n.
+    - `velocity`: w [m/s], the velocity of the ground in space, called as
+        `velocity(t, x, args)` at a point x, for a turntable or a belt; by default it
+        rests.
+
+    !!! example
+
+        >>> from nhjax import rolling
+        >>> rolling.Plane(normal=(0.0, 3.0, 4.0)).unit_normal("float64")
+        Array([0. , 0.6, 0.8], dtype=float64)
+    """
+
+    normal: Float[ArrayLike, "3"] = eqx.field(
+        default=(0.0, 0.0, 1.0), converter=_vector
+    )
+    height: ArrayLike = eqx.field(default=0.0, kw_only=True)
+    velocity: Callable[[Any, Any, Any], Any] | None = eqx.field(
+        default=None,
+        converter=lambda f: None if f is None else static_function(f),
+        kw_only=True,
+    )
+
+    def unit_normal(self, dtype: Any) -> Float[Array, "3"]:
+        """Return n / |n| in a precision."""
+        return _unit(jnp.asarray(self.normal).astype(dtype))
+
+
+class AbstractContact(eqx.Module):
+    """A body that touches a plane in one point.
+
+    To define a shape, write a subclass with the fields below and two methods:
+
+    - `offset(rotation, normal)`: c - x, the vector from the origin of the body to the
+        point that touches, in space.
+    - `directions(rotation, normal)`: the directions along the plane in which the body
+        does not slip, the rows of a matrix of shape (k, 3).
+    """
+
+    pose: eqx.AbstractVar[PositionFunction]
+    ground: eqx.AbstractVar[Plane]
+    touches: eqx.AbstractVar[bool]
+    manifold: eqx.AbstractVar[AbstractLieGroup | None]
+
+    @abc.abstractmethod
+    def offset(
+        self, rotation: Float[Array, "3 3"], normal: Float[Array, "3"]
+    ) -> Float[Array, "3"]:
+        """Compute c - x, from the origin of the body to the contact, in space."""
+
+    @abc.abstractmethod
+    def directions(
+        self, rotation: Float[Array, "3 3"], normal: Float[Array, "3"]
+    ) -> Float[Array, "k 3"]:
+        """Compute the directions in which the body does not slip."""
+
+    def place(
+        self, t: FloatScalarLike, q: PyTree[Array], args: Args
+    ) -> tuple[Float[Array, "3"], Float[Array, "3 3"]]:
+        """Evaluate the pose, and check its shapes."""
+        function = getattr(self.pose, "function", self.pose)
+        with naming("pose(t, q, args)", function, args):
+            position, rotation = self.pose(t, q, args)
+        if jnp.shape(position) != (3,) or jnp.shape(rotation) != (3, 3):
+            raise ShapeError(
+                "`pose` must return a position of shape (3,) and a rotation of shape "
+                f"(3, 3), got {jnp.shape(position)} and {jnp.shape(rotation)}."
+            )
+        return position, rotation
+
+    def point(
+        self, t: FloatScalarLike, q: PyTree[Array], args: Args = None
+    ) -> Float[Array, "3"]:
+        """Compute the point c of the body that touches the plane."""
+        position, rotation = self.place(t, q, args)
+        return position + self.offset(rotation, self.ground.unit_normal(position.dtype))
+
+    def height(
+        self, t: FloatScalarLike, q: PyTree[Array], args: Args = None
+    ) -> Float[Array, ""]:
+        """Compute n · c - h, the height of that point above the plane."""
+        point = self.point(t, q, args)
+        height = jnp.asarray(self.ground.height).astype(point.dtype)
+        return self.ground.unit_normal(point.dtype) @ point - height
+
+    def slip(
+        self,
+        t: FloatScalarLike,
+        q: PyTree[Array],
+        v: Float[Array, " n"],
+        args: Args = None,
+    ) -> Float[Array, " k"]:
+        """Compute the velocity at the contact in the directions without slip."""
+        t = jnp.asarray(t, v.dtype)
+        tangent = v if self.manifold is None else self.manifold.tangent(q, v)
+        (position, rotation), (velocity, turning) = jax.jvp(
+            lambda t, q: self.place(t, q, args), (t, q), (jnp.ones_like(t), tangent)
+        )
+        normal = self.ground.unit_normal(position.dtype)
+        offset = self.offset(rotation, normal)
+        velocity = velocity + turning @ (rotation.T @ offset)
+        if self.ground.velocity is not None:
+            velocity = velocity - self.ground.velocity(t, position + offset, args)
+        return self.directions(rotation, normal) @ velocity
+
+
+class Wheel(AbstractContact):
+    """A wheel, a disc with a thin rim or a tyre that is a torus.
+
+    The rolling direction is `along` = axle x n, normalised, and `across` = n x `along`.
+
+    The axle must not be perpendicular to the plane: there is no lowest point then.
+
+    **Arguments:**
+
+    - `pose`: called as `pose(t, q, args)`; returns the position of the hub [m], of
+        shape (3,), and the rotation from the frame of the wheel to space, of shape
+        (3, 3). The turn of the wheel about its axle is a part of the rotation.
+    - `radius`: from the axle to the thin rim, or to the middle of the tube [m].
+    - `tube_radius`: the radius of the tube of a torus [m].
+    - `axle`: the direction of the axle in the frame of the wheel.
+    - `no_slip`: the directions in which the wheel does not slip: `"along"`, `"across"`,
+        or an angle [rad] from `along` towards `across`. An omni wheel has
+        `("along",)`, a mecanum wheel the angle of the axle of its rollers, π/4 or -π/4.
+        Of two wheels on one axle only one needs `"across"`.
+    - `touches`: whether the height of the contact is a constraint. Say False if the
+        coordinates allow no other height, as those of a robot on a plane do.
+    - `ground`: the plane.
+    - `manifold`: the manifold of the system, if it has one.
+
+    **Raises:** `ValueError` if `no_slip` has another name; when called, `ShapeError` if
+    the pose has other shapes.
+
+    !!! example
+
+        >>> import jax.numpy as jnp
+        >>> from nhjax import rolling
+        >>> def pose(t, q, args):  # upright, q = (x, turn)
+        ...     (x, a), zero = q, 0.0 * q[0]
+        ...     turn = [[jnp.cos(a), zero, jnp.sin(a)], [zero, zero + 1, zero],
+        ...             [-jnp.sin(a), zero, jnp.cos(a)]]
+        ...     return jnp.stack([x, zero, zero + 0.5]), jnp.asarray(turn)
+        >>> wheel = rolling.Wheel(pose, 0.5, no_slip=("along",), touches=False)
+        >>> wheel.slip(0.0, jnp.array([0.0, 0.3]), jnp.array([1.0, 3.0]))
+        Array([-0.5], dtype=float64)
+    """
+
+    pose: PositionFunction = eqx.field(converter=_pose)
+    radius: ArrayLike
+    tube_radius: ArrayLike = eqx.field(default=0.0, kw_only=True)
+    axle: Float[ArrayLike, "3"] = eqx.field(
+        default=(0.0, 1.0, 0.0), converter=_vector, kw_only=True
+    )
+    no_slip: tuple[Literal["along", "across"] | float, ...] = eqx.field(
+        default=("along", "across"), static=True, kw_only=True
+    )
+    touches: bool = eqx.field(default=True, static=True, kw_only=True)
+    ground: Plane = eqx.field(default_factory=Plane, kw_only=True)
+    manifold: AbstractLieGroup | None = eqx.field(default=None, kw_only=True)
+
+    def __check_init__(self) -> None:
+        check_type("ground", self.ground, Plane)
+        names = ("along", "across")
+        if isinstance(self.no_slip, str) or any(
+            x not in names if isinstance(x, str) else not isinstance(x, int | float)
+            for x in self.no_slip
+        ):
+            raise ValueError(
+                '`no_slip` must be a tuple of "along", "across" and angles in radians, '
+                f"got {self.no_slip!r}."
+            )
+
+    def offset(
+        self, rotation: Float[Array, "3 3"], normal: Float[Array, "3"]
+    ) -> Float[Array, "3"]:
+        """Compute the vector from the hub to the lowest point."""
+        axle = self._axle(rotation)
+        radius, tube = (
+            jnp.asarray(x).astype(axle.dtype) for x in (self.radius, self.tube_radius)
+        )
+        down = _unit((normal @ axle) * axle - normal)
+        return radius * down - tube * normal
+
+    def directions(
+        self, rotation: Float[Array, "3 3"], normal: Float[Array, "3"]
+    ) -> Float[Array, "k 3"]:
+        """Compute the directions of `no_slip`."""
+        along = _unit(jnp.cross(self._axle(rotation), normal))
+        across = jnp.cross(normal, along)
+        angles = {"along": 0.0, "across": 0.5 * math.pi}
+        rows = []
+        for name in self.no_slip:
+            if isinstance(name, str):
+                rows.append(along if angles[name] == 0 else across)
+            else:
+                rows.append(math.cos(name) * along + math.sin(name) * across)
+        return jnp.stack(rows) if rows else jnp.zeros((0, 3), along.dtype)
+
+    def _axle(self, rotation: Array) -> Array:
+        return rotation @ _unit(jnp.asarray(self.axle).astype(rotation.dtype))
+
+
+class Ellipsoid(AbstractContact):
+    """An ellipsoid or a ball that rolls, and may spin about the normal.
+
+    The two directions without slip are fixed axes of the plane; for a horizontal plane
+    with the normal (0, 0, 1) they are x and y.
+
+    **Arguments:**
+
+    - `pose`: called as `pose(t, q, args)`; returns the position of the centre of the
+        ellipsoid [m], of shape (3,), and the rotation to space, of shape (3, 3).
+    - `semi_axes`: three lengths [m] along the axes of the body, or the radius of a
+        ball.
+    - `touches`: whether the height of the contact is a constraint.
+    - `ground`: the plane.
+    - `manifold`: the manifold of the system, if it has one.
+
+    **Raises:** when called, `ShapeError` if the pose has other shapes.
+
+    !!! example
+
+        >>> import jax.numpy as jnp
+        >>> from nhjax import rolling
+        >>> egg = rolling.Ellipsoid(lambda t, q, args: (q, jnp.eye(3)), [1.0, 2.0, 3.0])
+        >>> egg.point(0.0, jnp.array([0.0, 0.0, 3.0]))
+        Array([0., 0., 0.], dtype=float64)
+    """
+
+    pose: PositionFunction = eqx.field(converter=_pose)
+    semi_axes: ArrayLike = eqx.field(converter=jnp.asarray)
+    touches: bool = eqx.field(default=True, static=True, kw_only=True)
+    ground: Plane = eqx.field(default_factory=Plane, kw_only=True)
+    manifold: AbstractLieGroup | None = eqx.field(default=None, kw_only=True)
+
+    def __check_init__(self) -> None:
+        check_type("ground", self.ground, Plane)
+        if jnp.shape(self.semi_axes) not in ((), (3,)):
+            raise ShapeError(
+                "`semi_axes` must be three lengths or one radius, got shape "
+                f"{jnp.shape(self.semi_axes)}."
+            )
+
+    def offset(
+        self, rotation: Float[Array, "3 3"], normal: Float[Array, "3"]
+    ) -> Float[Array, "3"]:
+        """Compute the vector from the centre to the lowest point."""
+        axes = jnp.asarray(self.semi_axes).astype(rotation.dtype)
+        if axes.shape == ():
+            return -axes * normal
+        # The support function of the ellipsoid in the direction -n.
+        scaled = axes * (rotation.T @ normal)
+        return -rotation @ (axes * _unit(scaled))
+
+    def directions(
+        self, rotation: Float[Array, "3 3"], normal: Float[Array, "3"]
+    ) -> Float[Array, "2 3"]:
+        """Return two fixed axes of the plane."""
+        x, y, _ = jnp.eye(3, dtype=normal.dtype)
+        first = _unit(jnp.cross(jnp.where(jnp.abs(normal[1]) < 0.9, y, x), normal))
+        return jnp.stack([first, jnp.cross(normal, first)])
+
+
+class Blade(AbstractContact):
+    """A blade, a skate or a keel that does not move sideways.
+
+    **Arguments:**
+
+    - `pose`: called as `pose(t, q, args)`; returns the position of the point that
+        touches [m], of shape (3,), and the rotation of the blade, of shape (3, 3).
+    - `lateral`: the direction in the frame of the blade in which it does not move.
+    - `touches`: whether the height of the point is a constraint.
+    - `ground`: the plane.
+    - `manifold`: the manifold of the system, if it has one.
+
+    **Raises:** when called, `ShapeError` if the pose has other shapes.
+
+    !!! example
+
+        >>> import jax.numpy as jnp
+        >>> from nhjax import rolling
+        >>> blade = rolling.Blade(lambda t, q, args: (q, jnp.eye(3)), touches=False)
+        >>> blade.slip(0.0, jnp.zeros(3), jnp.array([1.0, 2.0, 0.0]))
+        Array([2.], dtype=float64)
+    """
+
+    pose: PositionFunction = eqx.field(converter=_pose)
+    lateral: Float[ArrayLike, "3"] = eqx.field(
+        default=(0.0, 1.0, 0.0), converter=_vector, kw_only=True
+    )
+    touches: bool = eqx.field(default=True, static=True, kw_only=True)
+    ground: Plane = eqx.field(default_factory=Plane, kw_only=True)
+    manifold: AbstractLieGroup | None = eqx.field(default=None, kw_only=True)
+
+    def __check_init__(self) -> None:
+        check_type("ground", self.ground, Plane)
+
+    def offset(
+        self, rotation: Float[Array, "3 3"], normal: Float[Array, "3"]
+    ) -> Float[Array, "3"]:
+        """Return zero: the position of the pose is the point that touches."""
+        return jnp.zeros_like(normal)
+
+    def directions(
+        self, rotation: Float[Array, "3 3"], normal: Float[Array, "3"]
+    ) -> Float[Array, "1 3"]:
+        """Compute the lateral direction, along the plane."""
+        lateral = rotation @ jnp.asarray(self.lateral).astype(rotation.dtype)
+        return _unit(lateral - (lateral @ normal) * normal)[None]
+
+
+class Contacts(eqx.Module):
+    """The contacts of a machine, as the constraints of a system.
+
+    Pass its `nonholonomic` and its `holonomic` to `LagrangianSystem`. The multipliers
+    are in the order of the contacts: first all that prevent slip, then all heights.
+
+    **Arguments:**
+
+    - keywords: contacts by their names.
+
+    !!! example
+
+        >>> import jax.numpy as jnp, nhjax
+        >>> from nhjax import rolling
+        >>> group = nhjax.SE3()
+        >>> pose = lambda t, q, args: (q[4:], nhjax.SO3().matrix(q[:4]))
+        >>> ball = rolling.Ellipsoid(pose, 0.5, manifold=group)
+        >>> contacts = rolling.Contacts(ball=ball)
+        >>> system = nhjax.LagrangianSystem(
+        ...     lambda t, q, v, args: 0.5 * v[:3] @ v[:3] + 0.05 * v[3:] @ v[3:]
+        ...     - 9.81 * q[6], nonholonomic=contacts.nonholonomic,
+        ...     holonomic=contacts.holonomic, manifold=group)
+        >>> y = nhjax.initial_state(
+        ...     system, group.identity().at[6].set(0.5), jnp.zeros(6))
+        >>> contacts.forces(0.0, y)["ball"].round(6)
+        Array([0.  , 0.  , 9.81], dtype=float64)
+    """
+
+    # JAX sorts the keys of a dictionary, so that the order would not be kept.
+    names: tuple[str, ...] = eqx.field(static=True)
+    contacts: tuple[AbstractContact, ...]
+
+    def __init__(self, **contacts: AbstractContact):
+        for name, contact in contacts.items():
+            check_type(name, contact, AbstractContact)
+        self.names = tuple(contacts)
+        self.contacts = tuple(contacts.values())
+
+    def nonholonomic(
+        self,
+        t: FloatScalarLike,
+        q: PyTree[Array],
+        v: Float[Array, " n"],
+        args: Args = None,
+    ) -> Float[Array, " m"]:
+        """Compute the velocities at all contacts in the directions without slip."""
+        return jnp.concatenate([x.slip(t, q, v, args) for x in self.contacts])
+
+    @property
+    def holonomic(self) -> PositionFunction | None:
+        """The heights of the contacts that touch, or None if there are none."""
+        return self._heights if self._touching() else None
+
+    def points(
+        self, t: FloatScalarLike, q: PyTree[Array], args: Args = None
+    ) -> dict[str, Float[Array, "3"]]:
+        """Compute the point of each contact in space [m]."""
+        points = [x.point(t, q, args) for x in self.contacts]
+        return dict(zip(self.names, points, strict=True))
+
+    def forces(
+        self, t: FloatScalarLike, y: State, args: Args = None
+    ) -> dict[str, Float[Array, "3"]]:
+        """Compute the force of the ground on each body at its contact [N].
+
+        The force is a vector in space, from the multipliers of the state. A contact
+        with `touches=False` lacks the part along the normal, which the coordinates
+        hide, and every contact lacks the parts in directions that are not constrained.
+
+        **Arguments:**
+
+        - `t`, `y`, `args`: the time, the state and the arguments of the system, whose
+            constraints are those of the contacts.
+
+        **Returns:** vectors of shape (3,), by the names of the contacts.
+
+        **Raises:** `ShapeError` if the state has another number of multipliers.
+        """
+        check_type("y", y, State)
+        rows, normals = [], []
+        for contact in self.contacts:
+            position, rotation = contact.place(t, y.q, args)
+            normal = contact.ground.unit_normal(position.dtype)
+            rows.append(contact.directions(rotation, normal))
+            if contact.touches:
+                normals.append(normal)
+        counts = [len(x) for x in rows]
+        m, k = sum(counts), len(normals)
+        if y.multiplier.shape != (m + k,):
+            raise ShapeError(
+                f"The contacts have {m + k} multipliers, and those of `y` have shape "
+                f"{y.multiplier.shape}: pass one state of a system whose constraints "
+                f"are those of the contacts alone."
+            )
+        parts = jnp.split(y.multiplier[:m], np.cumsum(counts)[:-1])
+        along_normals = iter(y.multiplier[m:, None] * jnp.stack(normals) if k else ())
+        forces = [
+            part @ directions + (next(along_normals) if contact.touches else 0)
+            for contact, part, directions in zip(
+                self.contacts, parts, rows, strict=True
+            )
+        ]
+        return dict(zip(self.names, forces, strict=True))
+
+    def _touching(self) -> list[AbstractContact]:
+        return [x for x in self.contacts if x.touches]
+
+    def _heights(
+        self, t: FloatScalarLike, q: PyTree[Array], args: Args = None
+    ) -> Float[Array, " k"]:
+        return jnp.stack([x.height(t, q, args) for x in self._touching()])

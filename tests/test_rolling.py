@@ -1,0 +1,355 @@
+"""Rolling contacts from parts, against constraints that are written by hand."""
+
+from typing import Any, cast
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import nhjax
+from nhjax import rolling
+from nhjax.systems import _whipple_bicycle as bicycle_parts
+from nhjax.systems._frames import about_y
+
+
+RNG = np.random.default_rng(3)
+SE3, SO3 = nhjax.SE3(), nhjax.SO3()
+
+
+def _free_body(t, q, args):
+    """The pose of a body on SE(3), whose element is a quaternion and a position."""
+    return q[4:], SO3.matrix(q[:4])
+
+
+def _assert_same_motion(hand_written, from_parts, q, v):
+    """Both systems accept a state and give it the same acceleration."""
+    found = []
+    for system in (hand_written, from_parts):
+        y = nhjax.initial_state(system, q, v)
+        found.append(nhjax.motion(system, 0.0, y).acceleration)
+    scale = np.abs(found[0]).max()
+    np.testing.assert_allclose(found[1], found[0], atol=1e-12 * max(scale, 1.0))
+
+
+def _replaced(system, contacts, **others):
+    return nhjax.LagrangianSystem(
+        system.lagrangian,
+        nonholonomic=contacts.nonholonomic,
+        holonomic=contacts.holonomic,
+        force=system.force,
+        manifold=system.manifold,
+        **others,
+    )
+
+
+# --- The gallery from parts ----------------------------------------------------------
+
+
+@pytest.mark.parametrize("tube_radius", [0.0, 0.1])
+def test_torus_from_parts_moves_like_that_of_the_gallery(tube_radius):
+    torus = nhjax.systems.RollingTorus.circling(
+        tilt=1.1, radius_of_path=0.4, radius=0.3, tube_radius=tube_radius
+    )
+    wheel = rolling.Wheel(
+        _free_body, 0.3, tube_radius=tube_radius, axle=(0, 0, 1), manifold=SE3
+    )
+    contacts = rolling.Contacts(torus=wheel)
+    system = _replaced(torus.system, contacts)
+    _assert_same_motion(torus.system, system, torus.q0, torus.v0)
+    y, by_hand = nhjax.initial_state(system, torus.q0, torus.v0), torus.initial_state()
+    np.testing.assert_allclose(
+        contacts.forces(0.0, y)["torus"], by_hand.multiplier, atol=1e-11
+    )
+    np.testing.assert_allclose(
+        contacts.points(0.0, torus.q0)["torus"],
+        torus.points(0.0, torus.q0)["contact"],
+        atol=1e-15,
+    )
+
+
+def test_rattleback_from_parts_moves_like_that_of_the_gallery():
+    stone = nhjax.systems.Rattleback.spinning(5.0, (0.3, -0.2))
+
+    def pose(t, q, args):
+        rotation = SO3.matrix(q[:4])
+        return q[4:] + stone.depth * rotation[:, 2], rotation
+
+    contacts = rolling.Contacts(
+        stone=rolling.Ellipsoid(pose, stone.semiaxes, manifold=SE3)
+    )
+    system = _replaced(stone.system, contacts)
+    _assert_same_motion(stone.system, system, stone.q0, stone.v0)
+    y = nhjax.initial_state(system, stone.q0, stone.v0)
+    # The axes x and y of the plane are the directions, so that the multipliers agree.
+    expected = stone.initial_state().multiplier
+    np.testing.assert_allclose(y.multiplier, expected, atol=1e-11)
+    np.testing.assert_allclose(contacts.forces(0.0, y)["stone"], expected, atol=1e-11)
+
+
+def test_ball_on_turntable_from_parts_moves_like_that_of_the_gallery():
+    ball = nhjax.systems.TurntableBall(moments=(0.3, 0.4, 0.5))
+
+    def pose(t, q, args):
+        return jnp.append(q[1], ball.radius), SO3.matrix(q[0])
+
+    table = rolling.Plane(
+        velocity=lambda t, x, args: ball.rate * jnp.stack([-x[1], x[0], 0.0 * x[2]])
+    )
+    contact = rolling.Ellipsoid(
+        pose, ball.radius, touches=False, ground=table, manifold=ball.manifold
+    )
+    contacts = rolling.Contacts(ball=contact)
+    assert contacts.holonomic is None
+    y0 = ball.initial_state()
+    _assert_same_motion(ball.system, _replaced(ball.system, contacts), y0.q, y0.v)
+
+
+def test_robot_from_parts_moves_like_that_of_the_gallery():
+    robot = nhjax.systems.TwoWheeledRobot.rolling(speed=1.0, turn_rate=0.7)
+
+    def wheel(number, side, no_slip):
+        def pose(t, q, args):
+            x, y, heading = q[:3]
+            cos, sin, zero = jnp.cos(heading), jnp.sin(heading), jnp.zeros_like(x)
+            left = robot.half_track * side * jnp.stack([-sin, cos, zero])
+            turned = jnp.stack(
+                [
+                    jnp.stack([cos, -sin, zero]),
+                    jnp.stack([sin, cos, zero]),
+                    jnp.stack([zero, zero, zero + 1]),
+                ]
+            )
+            hub = jnp.stack([x, y, zero + robot.radius]) + left
+            return hub, turned @ about_y(q[number])
+
+        return rolling.Wheel(pose, robot.radius, no_slip=no_slip, touches=False)
+
+    contacts = rolling.Contacts(
+        right=wheel(3, -1.0, ("across", "along")), left=wheel(4, 1.0, ("along",))
+    )
+    system = _replaced(robot.system, contacts)
+    _assert_same_motion(robot.system, system, robot.q0, robot.v0)
+    y = nhjax.initial_state(system, robot.q0, robot.v0)
+    expected = robot.initial_state().multiplier
+    np.testing.assert_allclose(y.multiplier, expected, atol=1e-12)
+
+
+def test_bicycle_from_parts_moves_like_that_of_the_gallery():
+    bicycle = nhjax.systems.WhippleBicycle.running(5.0, 0.4, 0.2, lean=0.1, steer=0.05)
+
+    def wheel(number, touches):
+        def pose(t, q, args):
+            frame = bicycle_parts._frames(bicycle, q)[number]
+            hub = bicycle_parts._wheels(bicycle, q)[number].hub
+            return frame.move(hub), frame.rotation @ about_y(q[6 + number])
+
+        radius = (bicycle.rear_radius, bicycle.front_radius)[number]
+        ground = rolling.Plane((0.0, 0.0, -1.0))  # The third axis points down.
+        return rolling.Wheel(pose, radius, ground=ground, touches=touches)
+
+    # The coordinates put the rear wheel on the ground.
+    contacts = rolling.Contacts(rear=wheel(0, False), front=wheel(1, True))
+    system = _replaced(bicycle.system, contacts)
+    _assert_same_motion(bicycle.system, system, bicycle.q0, bicycle.v0)
+
+
+def test_sleigh_with_a_blade_keeps_the_closed_form():
+    def pose(t, q, args):
+        cos, sin = jnp.cos(q[2]), jnp.sin(q[2])
+        zero = jnp.zeros_like(cos)
+        rows = [[cos, -sin, zero], [sin, cos, zero], [zero, zero, zero + 1]]
+        return jnp.append(q[:2], zero), jnp.asarray(rows)
+
+    contacts = rolling.Contacts(blade=rolling.Blade(pose, touches=False))
+    system = nhjax.LagrangianSystem(
+        lambda t, q, v, args: 0.5 * v @ v, nonholonomic=contacts.nonholonomic
+    )
+    y0 = nhjax.initial_state(system, jnp.zeros(3), jnp.array([2.0, 0.0, 1.5]))
+    sol = nhjax.integrate(system, nhjax.LobattoIIIAB(4), y0, dt=0.02, num_steps=50)
+    # The blade goes round a circle at constant rates; λ = m u w.
+    exact = np.array([2 * np.sin(1.5) / 1.5, 2 * (1 - np.cos(1.5)) / 1.5, 1.5])
+    np.testing.assert_allclose(sol.ys.q[-1], exact, atol=1e-11)
+    np.testing.assert_allclose(sol.ys.multiplier[-1], [3.0], atol=1e-9)
+
+
+# --- New machines ------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("s", [2, 3])
+def test_ball_on_an_incline_rolls_as_in_the_closed_form(s):
+    slope, r, g = 0.3, 0.2, 9.81
+    normal = np.array([np.sin(slope), 0.0, np.cos(slope)])
+    downhill = np.array([np.cos(slope), 0.0, -np.sin(slope)])
+    ball = rolling.Ellipsoid(
+        _free_body, r, ground=rolling.Plane(normal, height=0.7), manifold=SE3
+    )
+    contacts = rolling.Contacts(ball=ball)
+
+    def lagrangian(t, q, v, args):
+        return 0.5 * v[:3] @ v[:3] + 0.2 * r**2 * v[3:] @ v[3:] - g * q[6]
+
+    system = nhjax.LagrangianSystem(
+        lagrangian,
+        nonholonomic=contacts.nonholonomic,
+        holonomic=contacts.holonomic,
+        manifold=SE3,
+    )
+    # It starts with a spin about the normal, which it keeps.
+    start = jnp.concatenate([SO3.identity(), (0.7 + r) * normal])
+    v0 = jnp.concatenate([jnp.zeros(3), 2.0 * normal])
+    y0 = nhjax.initial_state(system, start, v0)
+    sol = nhjax.integrate(system, nhjax.LobattoIIIAB(s), y0, dt=0.01, num_steps=50)
+    y = jax.tree.map(lambda x: x[-1], sol.ys)
+    acceleration = 5 / 7 * g * np.sin(slope)
+    moved = 0.5 * acceleration * 0.5**2 * downhill
+    np.testing.assert_allclose(
+        y.q[4:] - start[4:], moved, atol=1e-4 if s == 2 else 1e-7
+    )
+    assert sol.stats["max_constraint_violation"] < 1e-14
+    force = contacts.forces(0.5, y)["ball"]
+    expected = g * np.cos(slope) * normal - 2 / 7 * g * np.sin(slope) * downhill
+    np.testing.assert_allclose(force, expected, atol=1e-3 if s == 2 else 1e-6)
+
+
+def _mecanum(radius=0.05, length=0.2, width=0.15):
+    """Four mecanum wheels on a platform, q = (x, y, heading, four turns)."""
+
+    def wheel(number, ahead, left, angle):
+        def pose(t, q, args):
+            cos, sin = jnp.cos(q[2]), jnp.sin(q[2])
+            zero = jnp.zeros_like(cos)
+            rows = [[cos, -sin, zero], [sin, cos, zero], [zero, zero, zero + 1]]
+            turned = jnp.asarray(rows)
+            place = jnp.asarray([ahead, left, radius], q.dtype)
+            return jnp.append(q[:2], zero) + turned @ place, turned @ about_y(q[number])
+
+        return rolling.Wheel(pose, radius, no_slip=(angle,), touches=False)
+
+    corners = [(1, 1, -1), (1, -1, 1), (-1, 1, 1), (-1, -1, -1)]
+    contacts = rolling.Contacts(
+        **{
+            f"wheel_{k}": wheel(3 + k, a * length, b * width, c * np.pi / 4)
+            for k, (a, b, c) in enumerate(corners)
+        }
+    )
+    masses = jnp.array([10.0, 10.0, 0.4, 0.01, 0.01, 0.01, 0.01])
+
+    def torque(t, q, v, args):
+        # Each wheel is driven towards the rate that it has in a sideways motion.
+        rates = args * jnp.array([-1.0, 1.0, 1.0, -1.0])
+        return jnp.concatenate([jnp.zeros(3, v.dtype), 2.0 * (rates - v[3:])])
+
+    system = nhjax.LagrangianSystem(
+        lambda t, q, v, args: 0.5 * masses @ v**2,
+        nonholonomic=contacts.nonholonomic,
+        force=torque,
+    )
+    return system, contacts
+
+
+def test_mecanum_robot_commanded_sideways_does_not_turn():
+    system, contacts = _mecanum()
+    q0 = jnp.array([0.0, 0.0, 0.3, 0.0, 0.0, 0.0, 0.0])
+    y0 = nhjax.initial_state(system, q0, jnp.zeros(7), args=8.0)
+    sol = nhjax.integrate(
+        system, nhjax.LobattoIIIAB(3), y0, dt=0.01, num_steps=300, args=8.0
+    )
+    y = jax.tree.map(lambda x: x[-1], sol.ys)
+    assert sol.stats["max_constraint_violation"] < 1e-14
+    assert abs(y.q[2] - 0.3) < 1e-13
+    # Wheels of 5 cm at 8 rad/s move the robot at 0.4 m/s, to its left.
+    speed = 0.4 * np.array([-np.sin(0.3), np.cos(0.3)])
+    np.testing.assert_allclose(y.v[:2], speed, rtol=1e-6)
+    forces = contacts.forces(3.0, y)
+    assert max(np.abs(force).max() for force in forces.values()) < 1e-4
+
+
+def test_omni_wheel_is_free_across_its_rolling_direction():
+    def pose(t, q, args):
+        return q, jnp.eye(3)
+
+    wheel = rolling.Wheel(pose, 0.1, no_slip=("along",), touches=False)
+    assert wheel.slip(0.0, jnp.zeros(3), jnp.array([0.0, 5.0, 0.0])) == 0.0
+    assert wheel.slip(0.0, jnp.zeros(3), jnp.array([3.0, 5.0, 0.0])) == 3.0
+
+
+def test_radius_of_a_wheel_is_differentiated_through_a_run():
+    torus = nhjax.systems.RollingTorus.circling(tilt=1.1, radius_of_path=0.4)
+
+    @jax.jit
+    def end(radius):
+        wheel = rolling.Wheel(_free_body, radius, axle=(0, 0, 1), manifold=SE3)
+        system = _replaced(torus.system, rolling.Contacts(wheel=wheel))
+        y0 = nhjax.initial_state(system, torus.q0, torus.v0, project=True)
+        sol = nhjax.integrate(system, nhjax.LobattoIIIAB(2), y0, dt=0.02, num_steps=10)
+        return sol.ys.q[-1, 4]
+
+    difference = (end(0.5 + 1e-5) - end(0.5 - 1e-5)) / 2e-5
+    np.testing.assert_allclose(jax.grad(end)(0.5), difference, rtol=1e-6)
+
+
+@pytest.mark.parametrize("dtype", ["float32", "float64"])
+def test_contacts_keep_the_precision_of_the_state(dtype):
+    torus = nhjax.systems.RollingTorus()
+    wheel = rolling.Wheel(
+        _free_body, np.float64(0.5), axle=np.array([0.0, 0.0, 1.0]), manifold=SE3
+    )
+    contacts = rolling.Contacts(wheel=wheel)
+    q, v = torus.q0.astype(dtype), torus.v0.astype(dtype)
+    assert contacts.nonholonomic(0.0, q, v).dtype == dtype
+    assert contacts.holonomic is not None
+    assert contacts.holonomic(0.0, q, None).dtype == dtype
+
+
+# --- Mistakes ----------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("make", "error", "message"),
+    [
+        (lambda: rolling.Wheel(cast(Any, 1.0), 0.3), TypeError, "`pose` must be a"),
+        (
+            lambda: rolling.Wheel(_free_body, 0.3, no_slip=cast(Any, "along")),
+            ValueError,
+            "`no_slip` must be a tuple",
+        ),
+        (
+            lambda: rolling.Wheel(_free_body, 0.3, no_slip=cast(Any, ("sideways",))),
+            ValueError,
+            "`no_slip` must be a tuple",
+        ),
+        (lambda: rolling.Plane((0.0, 1.0)), nhjax.ShapeError, r"shape \(3,\)"),
+        (
+            lambda: rolling.Ellipsoid(_free_body, [1.0, 2.0]),
+            nhjax.ShapeError,
+            "three lengths or one radius",
+        ),
+        (
+            lambda: rolling.Blade(_free_body, ground=cast(Any, (0, 0, 1))),
+            TypeError,
+            "`ground` must be an nhjax.Plane",
+        ),
+        (
+            lambda: rolling.Contacts(wheel=cast(Any, _free_body)),
+            TypeError,
+            "`wheel` must be an nhjax.AbstractContact",
+        ),
+    ],
+)
+def test_contact_with_wrong_argument_is_refused_by_name(make, error, message):
+    with pytest.raises(error, match=message):
+        make()
+
+
+def test_pose_of_wrong_shape_is_refused_by_name():
+    wheel = rolling.Wheel(lambda t, q, args: (q[:2], jnp.eye(3)), 0.3)
+    with pytest.raises(nhjax.ShapeError, match="`pose` must return a position"):
+        wheel.point(0.0, jnp.zeros(3))
+
+
+def test_forces_of_another_number_of_multipliers_are_refused():
+    torus = nhjax.systems.RollingTorus()
+    blade = rolling.Blade(_free_body, manifold=SE3)
+    with pytest.raises(nhjax.ShapeError, match="have 2 multipliers"):
+        rolling.Contacts(blade=blade).forces(0.0, torus.initial_state())
