@@ -1,14 +1,14 @@
 """Forces and torques on points and bodies, as generalised forces of a system.
 
-A force f that acts on a point x(t, q) does the work f · ẋ. Its generalised force is
-F = (∂x/∂q)ᵀ f, on a group F = L_g^* (∂x/∂g)ᵀ f, so that F · v = f · ẋ for points that
-do not depend on time by themselves.
+A force f that acts on a point x(t, q) has the power f · ẋ. Its generalised force is
+F = (∂x/∂q)ᵀ f, on a group F = L_g^* (∂x/∂g)ᵀ f, so that F · v = f · ẋ if the point does
+not depend explicitly on time.
 """
 
 import abc
 import reprlib
 from collections.abc import Callable
-from typing import Any
+from typing import Any, cast
 
 import equinox as eqx
 import jax
@@ -19,31 +19,50 @@ from jaxtyping import Array, ArrayLike, Float, PyTree
 from ._custom_types import Args, FloatScalarLike, PhaseFunction, PositionFunction
 from ._errors import naming, ShapeError
 from ._manifold import AbstractLieGroup, Euclidean
-from ._system import static_function
+from ._system import check_signature, static_function
 
 
 def _number(value: Any) -> Array:
-    """Convert a parameter; numbers become weakly typed, to suit every precision."""
+    """Convert a parameter to floating point.
+
+    Numbers become weakly typed, so that they keep the precision of the state.
+    """
     if isinstance(value, int | float | np.number):
         return jnp.asarray(float(value))
-    if isinstance(value, str) or callable(value):
+    if value is None or isinstance(value, str) or callable(value):
         raise TypeError(
             f"A parameter of a force must be a number or an array, got "
-            f"{reprlib.repr(value)} of type {type(value).__name__}."
+            f"{reprlib.repr(value)} of type {type(value).__name__}. To change it along "
+            f"the motion, write a function of (t, q, v, args)."
         )
-    return jnp.asarray(value)
+    array = jnp.asarray(value)
+    if jnp.iscomplexobj(array):
+        raise TypeError(f"A parameter of a force must be real, got {array.dtype}.")
+    if not jnp.issubdtype(array.dtype, jnp.floating):
+        array = array.astype(float)
+    return array
+
+
+def _scalar(value: Any) -> Array:
+    """Convert a parameter that is one number."""
+    number = _number(value)
+    if number.shape != ():
+        raise ShapeError(
+            f"A parameter of a force must be one number, got shape {number.shape}. For "
+            f"several values use `jax.vmap`."
+        )
+    return number
 
 
 def _function_or_numbers(value: Any) -> Any:
-    return static_function(value) if callable(value) else _number(value)
+    if not callable(value):
+        return _number(value)
+    check_signature("A force", "its function", value, ("t", "q", "v", "args"))
+    return static_function(value)
 
 
 def _position(value: Any) -> Any:
-    if not callable(value):
-        raise TypeError(
-            f"A point of a force must be a function of (t, q, args), got "
-            f"{reprlib.repr(value)} of type {type(value).__name__}."
-        )
+    check_signature("A force", "its point", value, ("t", "q", "args"))
     return static_function(value)
 
 
@@ -54,6 +73,8 @@ def _of_phase(name: str, value: Any, like: Array, *arguments: Any) -> Array:
         with naming(f"{name}(t, q, v, args)", function, arguments[-1]):
             value = value(*arguments)
     value = jnp.asarray(value)
+    if jnp.iscomplexobj(value):
+        raise TypeError(f"`{name}` must be real, got {value.dtype}.")
     if value.shape != like.shape:
         raise ShapeError(
             f"`{name}` must have the shape of what it acts on, {like.shape}, got "
@@ -65,9 +86,12 @@ def _of_phase(name: str, value: Any, like: Array, *arguments: Any) -> Array:
 class AbstractForce(eqx.Module):
     """A generalised force F(t, q, v, args), the `force` of a `LagrangianSystem`.
 
-    Forces are added by `+`, also to functions of (t, q, v, args). Their numbers are
-    leaves: if they change, nothing is compiled again, and derivatives with respect to
-    them are available.
+    Add forces, and functions of (t, q, v, args), with `+`. Their parameters are leaves:
+    with the same functions, changing them does not recompile, and derivatives with
+    respect to them are available.
+
+    A `HamiltonianSystem` passes momenta in place of velocities: use `Drag`, `Motor` and
+    a `Spring` with a damper in a `LagrangianSystem`.
 
     To define a force, write a subclass with this method:
 
@@ -90,8 +114,12 @@ class AbstractForce(eqx.Module):
         return Sum(self, other)
 
     def __radd__(self, other: Any) -> "AbstractForce":
-        """Add to a function F(t, q, v, args); `sum` starts with the number 0."""
-        return Sum(other, self) if callable(other) or other != 0 else self
+        """Add to a function F(t, q, v, args), or to the 0 with which `sum` starts."""
+        is_start = isinstance(other, int) and other is not False and other == 0
+        return self if is_start else Sum(cast(Any, other), self)
+
+    # NumPy would add the elements of its arrays one by one.
+    __array_ufunc__ = None
 
 
 class Sum(AbstractForce):
@@ -110,12 +138,8 @@ class Sum(AbstractForce):
     terms: tuple[Callable[..., Any], ...]
 
     def __init__(self, *terms: PhaseFunction):
-        for term in terms:
-            if not callable(term):
-                raise TypeError(
-                    f"A force must be a function of (t, q, v, args), got "
-                    f"{reprlib.repr(term)} of type {type(term).__name__}."
-                )
+        for number, term in enumerate(terms):
+            check_signature("Sum", f"term {number}", term, ("t", "q", "v", "args"))
         self.terms = tuple(map(static_function, terms))
 
     def __call__(
@@ -146,7 +170,7 @@ class PointForce(AbstractForce):
         angle of shape ().
     - `vector`: f [N], an array of the shape of x, or a function of (t, q, v, args) that
         returns one.
-    - `manifold`: the manifold of the system, if it has one.
+    - `manifold`: the `manifold` of the system, required if it has one.
 
     **Raises:** when called, `ShapeError` if the shapes of x and f differ.
 
@@ -187,7 +211,7 @@ class Torque(AbstractForce):
         of the body to the frame of space.
     - `vector`: τ [N m] in the frame of space, of shape (3,), or a function of
         (t, q, v, args) that returns one.
-    - `manifold`: the manifold of the system, if it has one.
+    - `manifold`: the `manifold` of the system, required if it has one.
 
     **Raises:** when called, `ShapeError` if R or τ has another shape.
 
@@ -230,11 +254,10 @@ class Spring(AbstractForce):
 
     The force on the first point is -(k (|d| - l) + c d/dt |d|) d / |d| with
     d = x₁ - x₂, and the second point feels the opposite force. Where the points
-    coincide, only the part -k d of it is left, which is zero there.
+    coincide, the force is zero. With l > 0 it jumps there, so keep the points apart.
 
-    The energy of a system does not contain that of its forces. If there is no damper
-    and the energy matters, add -½ k (|d| - l)² to the Lagrangian instead: the steps
-    are the same.
+    `system.energy` does not include the energy of a spring. To include it, use no
+    damper and add -½ k (|d| - l)² to the Lagrangian instead. The steps are the same.
 
     **Arguments:**
 
@@ -243,7 +266,7 @@ class Spring(AbstractForce):
     - `stiffness`: k [N/m].
     - `rest_length`: l [m].
     - `damping`: c [N s/m].
-    - `manifold`: the manifold of the system, if it has one.
+    - `manifold`: the `manifold` of the system, required if it has one.
 
     **Raises:** when called, `ShapeError` if the shapes of the points differ, or are not
     of the form (d,).
@@ -259,10 +282,12 @@ class Spring(AbstractForce):
     """
 
     first: PositionFunction = eqx.field(converter=_position)
-    second: ArrayLike | PositionFunction = eqx.field(converter=_function_or_numbers)
-    stiffness: ArrayLike = eqx.field(converter=_number)
-    rest_length: ArrayLike = eqx.field(default=0.0, converter=_number, kw_only=True)
-    damping: ArrayLike = eqx.field(default=0.0, converter=_number, kw_only=True)
+    second: ArrayLike | PositionFunction = eqx.field(
+        converter=lambda x: _position(x) if callable(x) else _number(x)
+    )
+    stiffness: ArrayLike = eqx.field(converter=_scalar)
+    rest_length: ArrayLike = eqx.field(default=0.0, converter=_scalar, kw_only=True)
+    damping: ArrayLike = eqx.field(default=0.0, converter=_scalar, kw_only=True)
     manifold: AbstractLieGroup | None = eqx.field(default=None, kw_only=True)
 
     def __call__(
@@ -300,11 +325,14 @@ class Spring(AbstractForce):
 
 
 class Drag(AbstractForce):
-    """A force on a point against its velocity u relative to a medium.
+    """A drag force on a point, opposite to its velocity u relative to a medium.
 
     f = -(c₁ + c₂ |u|) u. The drag of a body of area A in a medium of density ρ has
     c₂ = ½ ρ C A with the drag coefficient C. If the point is an angle, f is a torque,
-    for instance of a bearing.
+    such as the viscous friction of a bearing.
+
+    The quadratic part has a kink where a motion along a line turns back; methods have
+    order 2 there.
 
     **Arguments:**
 
@@ -312,9 +340,9 @@ class Drag(AbstractForce):
         angle [rad] of shape ().
     - `linear`: c₁ [N s/m].
     - `quadratic`: c₂ [N s²/m²].
-    - `medium`: the velocity of the medium [m/s], a number, an array of the shape of x,
-        or a function of (t, q, v, args) that returns one; zero by default.
-    - `manifold`: the manifold of the system, if it has one.
+    - `medium`: the velocity of the medium [m/s], an array of the shape of x, or a
+        function of (t, q, v, args) that returns one; zero by default.
+    - `manifold`: the `manifold` of the system, required if it has one.
 
     **Raises:** when called, `ShapeError` if the medium has another shape than x.
 
@@ -328,8 +356,8 @@ class Drag(AbstractForce):
     """
 
     point: PositionFunction = eqx.field(converter=_position)
-    linear: ArrayLike = eqx.field(default=0.0, converter=_number, kw_only=True)
-    quadratic: ArrayLike = eqx.field(default=0.0, converter=_number, kw_only=True)
+    linear: ArrayLike = eqx.field(default=0.0, converter=_scalar, kw_only=True)
+    quadratic: ArrayLike = eqx.field(default=0.0, converter=_scalar, kw_only=True)
     medium: ArrayLike | PhaseFunction | None = eqx.field(
         default=None,
         converter=lambda x: None if x is None else _function_or_numbers(x),
@@ -356,23 +384,24 @@ class Drag(AbstractForce):
 
 
 class Motor(AbstractForce):
-    """A motor with a gear and a straight line of torque against speed.
+    """A geared motor whose torque falls linearly with its speed.
 
     It turns the angle φ with the torque i τ₀ (c - i φ̇ / ω₀): a DC motor whose voltage
-    is the fraction c of its full voltage, behind a gear of ratio i.
+    is the fraction c of its full voltage, behind a gear of ratio i. The inertia J of
+    its rotor is a part of the Lagrangian, as ½ J (i φ̇)².
 
     **Arguments:**
 
     - `angle`: φ, called as `angle(t, q, args)` [rad], of shape (): the rotation of what
         the motor drives relative to what carries it.
-    - `command`: c, a number or a function of (t, q, v, args). Values beyond -1 and 1
-        are not limited: see `saturated`.
+    - `command`: c, a number or a function of (t, q, v, args). Values outside
+        [-1, 1] are not limited: see `saturated`.
     - `stall_torque`: τ₀ [N m], the torque of the motor at rest with c = 1.
-    - `no_load_speed`: ω₀ [rad/s], the speed of the motor without torque with c = 1.
+    - `no_load_speed`: ω₀ [rad/s], the speed at which the torque vanishes, c = 1.
     - `gear`: i, turns of the motor for each turn of the angle.
-    - `manifold`: the manifold of the system, if it has one.
+    - `manifold`: the `manifold` of the system, required if it has one.
 
-    **Raises:** when called, `ShapeError` if φ or c is no scalar.
+    **Raises:** when called, `ShapeError` if φ or c is not a scalar.
 
     !!! example
 
@@ -386,9 +415,9 @@ class Motor(AbstractForce):
 
     angle: PositionFunction = eqx.field(converter=_position)
     command: ArrayLike | PhaseFunction = eqx.field(converter=_function_or_numbers)
-    stall_torque: ArrayLike = eqx.field(converter=_number, kw_only=True)
-    no_load_speed: ArrayLike = eqx.field(converter=_number, kw_only=True)
-    gear: ArrayLike = eqx.field(default=1.0, converter=_number, kw_only=True)
+    stall_torque: ArrayLike = eqx.field(converter=_scalar, kw_only=True)
+    no_load_speed: ArrayLike = eqx.field(converter=_scalar, kw_only=True)
+    gear: ArrayLike = eqx.field(default=1.0, converter=_scalar, kw_only=True)
     manifold: AbstractLieGroup | None = eqx.field(default=None, kw_only=True)
 
     def __call__(
@@ -414,13 +443,13 @@ class Motor(AbstractForce):
 def saturated(x: ArrayLike, limit: ArrayLike) -> Array:
     """Limit a signal smoothly: limit · tanh(x / limit).
 
-    A step solves equations with derivatives, so that `jnp.clip` would cost iterations
-    and the order of the method where the signal passes the limit.
+    Each step uses derivatives of the force. `jnp.clip` has a kink at the limit, which
+    costs iterations and lowers the order of the method there.
 
     **Arguments:**
 
     - `x`: the signal, of any shape.
-    - `limit`: the positive value that the result stays below, in the units of `x`.
+    - `limit`: the positive bound of |result|, in the units of `x`.
 
     **Returns:** an array of the shape of `x`.
 
@@ -430,7 +459,7 @@ def saturated(x: ArrayLike, limit: ArrayLike) -> Array:
         >>> float(forces.saturated(0.0, 2.0)), float(forces.saturated(50.0, 2.0))
         (0.0, 2.0)
     """
-    limit = jnp.asarray(limit)
+    limit = _number(limit)
     return limit * jnp.tanh(jnp.asarray(x) / limit)
 
 

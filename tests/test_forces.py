@@ -294,15 +294,49 @@ def test_gradient_by_numbers_of_forces_equals_differences():
 
 
 def test_other_numbers_of_a_force_are_used_and_compile_nothing(caplog):
+    def point(t, q, args):
+        return q
+
     def run(k):
-        spring = forces.Spring(lambda t, q, args: q, [0.0], k)
+        spring = forces.Spring(point, [0.0], k)
         system = nhjax.LagrangianSystem(_kinetic, force=spring)
         return _integrate(system, [1.0], [0.0], s=4, h=0.1, num_steps=10).ys.q[-1, 0]
 
-    np.testing.assert_allclose(run(1.0), np.cos(1.0), atol=1e-9)
     with jax.log_compiles():
+        np.testing.assert_allclose(run(1.0), np.cos(1.0), atol=1e-9)
+        assert [x for x in caplog.messages if "jit(compiled)" in x]
+        caplog.clear()
         np.testing.assert_allclose(run(4.0), np.cos(2.0), atol=1e-5)
-    assert not [x for x in caplog.messages if "integrate" in x or "chunk" in x]
+        assert not [x for x in caplog.messages if "jit(compiled)" in x]
+
+
+@pytest.mark.parametrize(
+    ("on_force", "on_system"), [(None, nhjax.SE2()), (nhjax.SE2(), None)]
+)
+def test_force_with_another_manifold_than_its_system_is_refused(on_force, on_system):
+    force = forces.PointForce(lambda t, q, args: q[:2], [1.0, 0.0], manifold=on_force)
+    for total in (force, force + force):
+        with pytest.raises(ValueError, match="pass the same `manifold=` to the force"):
+            nhjax.LagrangianSystem(_kinetic, force=total, manifold=on_system)
+
+
+def test_run_with_force_on_a_group_equals_run_in_coordinates():
+    def stern(t, q, args):
+        return q[:2] - jnp.stack([jnp.cos(q[2]), jnp.sin(q[2])])
+
+    def thrust(t, q, v, args):
+        return 3.0 * jnp.stack([jnp.cos(q[2] + 0.1), jnp.sin(q[2] + 0.1)])
+
+    found = []
+    for manifold in (None, nhjax.SE2()):
+        boat = nhjax.LagrangianSystem(
+            lambda t, q, v, args: 0.5 * jnp.array([10.0, 10.0, 4.0]) @ v**2,
+            force=forces.PointForce(stern, thrust, manifold=manifold),
+            manifold=manifold,
+        )
+        run = _integrate(boat, [0.0, 0.0, 0.5], [0.0, 0.0, 0.0], s=4)
+        found.append(run.ys.q[-1])
+    np.testing.assert_allclose(*found, atol=1e-10)
 
 
 def test_forces_under_vmap_equal_single_runs():
@@ -343,7 +377,14 @@ def test_saturated_signal_follows_small_values_and_keeps_below_the_limit():
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda: forces.PointForce([1.0, 2.0], [0.0, 1.0]), "must be a function of"),
+        (
+            lambda: forces.PointForce(cast(Any, [1.0, 2.0]), [0.0, 1.0]),
+            "must be a function of",
+        ),
+        (lambda: forces.PointForce(_point, cast(Any, None)), "must be a number"),
+        (lambda: forces.PointForce(_point, [1j, 0.0]), "must be real"),
+        (lambda: forces.Drag(lambda q, t, args: q), "has another order"),
+        (lambda: np.zeros(3) + forces.Drag(_point), "must be a function of"),
         (lambda: forces.Spring(_point, _other, "stiff"), "must be a number"),
         (lambda: forces.Spring(_point, _other, lambda args: 1.0), "must be a number"),
         (lambda: forces.Sum(cast(Any, 3.0)), "must be a function of"),
@@ -386,3 +427,13 @@ def test_error_in_point_of_a_force_names_the_function():
         force(0.0, jnp.zeros(3), jnp.zeros(3))
     assert "`point(t, q, args)`" in caught.value.__notes__[0]
     assert "has `args=...` been left out" in caught.value.__notes__[0]
+
+
+def test_several_numbers_for_one_parameter_are_refused():
+    with pytest.raises(nhjax.ShapeError, match="must be one number"):
+        forces.Spring(_point, _other, jnp.array([1.0, 2.0]))
+
+
+def test_whole_numbers_of_a_force_are_differentiable():
+    force = forces.PointForce(_point, np.array([0, 1]))
+    assert jnp.issubdtype(cast(Any, force.vector).dtype, jnp.floating)

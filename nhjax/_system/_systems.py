@@ -130,6 +130,24 @@ class AbstractMechanicalSystem(eqx.Module):
         check_constraints(self)
         check_manifold(self)
         check_coordinates(self)
+        self._check_manifold_of_force()
+
+    def _check_manifold_of_force(self) -> None:
+        """Refuse a force of `nhjax.forces` whose manifold is not that of the system."""
+        forces: tuple[Any, ...] = getattr(self.force, "terms", (self.force,))
+        for force in forces:
+            if not hasattr(force, "manifold") or callable(force.manifold):
+                continue
+            own, its = (
+                None if x is None or x.is_flat else type(x)
+                for x in (self.manifold, force.manifold)
+            )
+            if own is not its:
+                raise ValueError(
+                    f"`force` has the manifold {force.manifold}, and the system has "
+                    f"{self.manifold}: pass the same `manifold=` to the force, "
+                    f"{type(force).__name__}(..., manifold=...)."
+                )
 
     @abstractmethod
     def momentum(
