@@ -10,6 +10,7 @@ steps has a process of its own. `temp` is what the compiled program allocates,
 """
 
 import argparse
+import functools
 import gc
 import json
 import os
@@ -45,7 +46,8 @@ EXAMPLES = {
     "sleigh": of_the_gallery(systems.ChaplyginSleigh),
     "CVT": of_the_gallery(systems.ContinuouslyVariableTransmission),
     "Suslov": of_the_gallery(systems.Suslov),
-    "Suslov in a potential": suslov_in_a_potential,
+    # Once, since functions that are created again make another system.
+    "Suslov in a potential": functools.cache(suslov_in_a_potential),
     "heavy top": of_the_gallery(systems.HeavyTop),
 }
 ADJOINTS = {
