@@ -42,11 +42,9 @@ class Ensemble(NamedTuple):
 
 def ensembles(dtype: Any) -> list[Ensemble]:
     """The ensembles that are measured."""
-    chaotic, bicycle = (
-        systems.ChaoticSystem(),
-        systems.WhippleBicycle.running(lean_rate=0.5),
-    )
-    default = nhjax.SimplifiedNewton()
+    chaotic = systems.ChaoticSystem()
+    bicycle = systems.WhippleBicycle.running(lean_rate=0.5)
+    default, lobatto = nhjax.SimplifiedNewton(), nhjax.LobattoIIIAB
 
     def from_circle(members):
         q, v = chaotic.ensemble(max(members - 1, 1), dtype)
@@ -60,9 +58,6 @@ def ensembles(dtype: Any) -> list[Ensemble]:
         return jax.vmap(
             lambda scale: nhjax.initial_state(bicycle.system, y0.q, scale * y0.v)
         )(scales)
-
-    def lobatto(s):
-        return nhjax.LobattoIIIAB(s)
 
     small = chaotic.system, lobatto(2), 0.1, from_circle
     return [

@@ -4,7 +4,7 @@ from importlib import import_module
 from types import ModuleType
 from typing import TYPE_CHECKING
 
-from . import forces as forces, lanes as lanes, rolling as rolling
+from . import lanes as lanes
 from ._analysis import (
     check_system as check_system,
     linear_stability as linear_stability,
@@ -96,14 +96,19 @@ from .lanes import engines as engines, EngineUse as EngineUse
 
 
 if TYPE_CHECKING:
-    from . import plot as plot, systems as systems
+    from . import (
+        forces as forces,
+        plot as plot,
+        rolling as rolling,
+        systems as systems,
+    )
 
 __version__ = "0.1.0"
 
 
 def __getattr__(name: str) -> ModuleType:
     # The gallery and the plots take a quarter of the time of `import nhjax`.
-    if name in ("plot", "systems"):
+    if name in ("forces", "plot", "rolling", "systems"):
         return import_module(f".{name}", __name__)
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
 

@@ -11,31 +11,31 @@ from collections.abc import Callable
 from typing import Any, cast
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, ArrayLike, Float, PyTree
 
 from ._custom_types import Args, FloatScalarLike, PhaseFunction, PositionFunction
 from ._errors import naming, ShapeError
 from ._manifold import AbstractLieGroup, Euclidean
-from ._system import check_signature, static_function
+from ._system import (
+    AbstractOnManifold,
+    as_given,
+    check_signature,
+    parameter,
+    static_function,
+    value_and_rate,
+)
 
 
 def _number(value: Any) -> Array:
-    """Convert a parameter to floating point.
-
-    Numbers become weakly typed, so that they keep the precision of the state.
-    """
-    if isinstance(value, int | float | np.number):
-        return jnp.asarray(float(value))
-    if value is None or isinstance(value, str) or callable(value):
+    """Convert a parameter to floating point."""
+    if value is None or callable(value):
         raise TypeError(
             f"A parameter of a force must be a number or an array, got "
             f"{reprlib.repr(value)} of type {type(value).__name__}. To change it along "
             f"the motion, write a function of (t, q, v, args)."
         )
-    array = jnp.asarray(value)
+    array = parameter(value)
     if jnp.iscomplexobj(array):
         raise TypeError(f"A parameter of a force must be real, got {array.dtype}.")
     if not jnp.issubdtype(array.dtype, jnp.floating):
@@ -69,8 +69,7 @@ def _position(value: Any) -> Any:
 def _of_phase(name: str, value: Any, like: Array, *arguments: Any) -> Array:
     """Evaluate a number, an array or a function of (t, q, v, args), shaped `like`."""
     if callable(value):
-        function = getattr(value, "function", value)
-        with naming(f"{name}(t, q, v, args)", function, arguments[-1]):
+        with naming(f"{name}(t, q, v, args)", as_given(value), arguments[-1]):
             value = value(*arguments)
     value = jnp.asarray(value)
     if jnp.iscomplexobj(value):
@@ -83,7 +82,7 @@ def _of_phase(name: str, value: Any, like: Array, *arguments: Any) -> Array:
     return value.astype(like.dtype)
 
 
-class AbstractForce(eqx.Module):
+class AbstractForce(AbstractOnManifold):
     """A generalised force F(t, q, v, args), the `force` of a `LagrangianSystem`.
 
     Add forces, and functions of (t, q, v, args), with `+`. Their parameters are leaves:
@@ -109,14 +108,18 @@ class AbstractForce(eqx.Module):
     ) -> Float[Array, " n"]:
         """Compute the generalised force."""
 
+    def check_manifold(self, manifold: AbstractLieGroup | None) -> None:
+        """Accept every manifold, as functions of the user do."""
+
     def __add__(self, other: Any) -> "Sum":
         """Add another force, or a function F(t, q, v, args)."""
         return Sum(self, other)
 
     def __radd__(self, other: Any) -> "AbstractForce":
         """Add to a function F(t, q, v, args), or to the 0 with which `sum` starts."""
-        is_start = isinstance(other, int) and other is not False and other == 0
-        return self if is_start else Sum(cast(Any, other), self)
+        if type(other) is int and other == 0:
+            return self
+        return Sum(cast(Any, other), self)
 
     # NumPy would add the elements of its arrays one by one.
     __array_ufunc__ = None
@@ -142,6 +145,12 @@ class Sum(AbstractForce):
             check_signature("Sum", f"term {number}", term, ("t", "q", "v", "args"))
         self.terms = tuple(map(static_function, terms))
 
+    def check_manifold(self, manifold: AbstractLieGroup | None) -> None:
+        """Check the manifold of each term."""
+        for term in self.terms:
+            if isinstance(term, AbstractOnManifold):
+                term.check_manifold(manifold)
+
     def __call__(
         self,
         t: FloatScalarLike,
@@ -156,7 +165,54 @@ class Sum(AbstractForce):
         return total
 
 
-class PointForce(AbstractForce):
+class _AbstractPulledBack(AbstractForce):
+    """A force that acts on x(t, q): a point, an angle or a rotation."""
+
+    manifold: eqx.AbstractVar[AbstractLieGroup | None]
+
+    @abc.abstractmethod
+    def _place(self, t: Any, q: Any, args: Any) -> Array:
+        """Compute x(t, q)."""
+
+    @abc.abstractmethod
+    def _covector(self, t: Any, q: Any, v: Array, args: Any) -> Array:
+        """Compute the covector on x, whose product with ẋ is the power of the force."""
+
+    def __call__(
+        self,
+        t: FloatScalarLike,
+        q: PyTree[Array],
+        v: Float[Array, " n"],
+        args: Args = None,
+    ) -> Float[Array, " n"]:
+        """Compute the generalised force (∂x/∂q)ᵀ f of the covector f."""
+        covector = self._covector(t, q, v, args)
+        manifold = Euclidean(q.shape[0]) if self.manifold is None else self.manifold
+        return manifold.left_gradient(
+            lambda q: jnp.sum(covector * self._place(t, q, args)), q
+        )
+
+    def check_manifold(self, manifold: AbstractLieGroup | None) -> None:
+        """Raise a `ValueError` unless the system has the manifold of this force."""
+        of_system, own = (
+            None if x is None or x.is_flat else type(x)
+            for x in (manifold, self.manifold)
+        )
+        if of_system is not own:
+            raise ValueError(
+                f"`force` has the manifold {self.manifold}, and the system has "
+                f"{manifold}: pass the same `manifold=` to the force, "
+                f"{type(self).__name__}(..., manifold=...)."
+            )
+
+    def _with_rate(self, t: Any, q: Any, v: Array, args: Any) -> tuple[Array, Array]:
+        """Evaluate x(t, q) and ẋ = ∂x/∂t + ∂x/∂q · q̇."""
+        return value_and_rate(
+            lambda t, q: self._place(t, q, args), self.manifold, t, q, v
+        )
+
+
+class PointForce(_AbstractPulledBack):
     """A force on a point, or a torque on an angle.
 
     F = (∂x/∂q)ᵀ f, with the point x(t, q, args) and the force f(t, q, v, args).
@@ -187,20 +243,15 @@ class PointForce(AbstractForce):
     vector: ArrayLike | PhaseFunction = eqx.field(converter=_function_or_numbers)
     manifold: AbstractLieGroup | None = eqx.field(default=None, kw_only=True)
 
-    def __call__(
-        self,
-        t: FloatScalarLike,
-        q: PyTree[Array],
-        v: Float[Array, " n"],
-        args: Args = None,
-    ) -> Float[Array, " n"]:
-        """Compute the generalised force."""
-        x = _at("point", self.point, t, q, args)
-        vector = _of_phase("vector", self.vector, x, t, q, v, args)
-        return _pulled_back(self.point, vector, self.manifold, t, q, args)
+    def _place(self, t: Any, q: Any, args: Any) -> Array:
+        return _at("point", self.point, t, q, args)
+
+    def _covector(self, t: Any, q: Any, v: Array, args: Any) -> Array:
+        x = self._place(t, q, args)
+        return _of_phase("vector", self.vector, x, t, q, v, args)
 
 
-class Torque(AbstractForce):
+class Torque(_AbstractPulledBack):
     """A torque on a body in space, given by its rotation.
 
     F · v = τ · ω with the angular velocity ω of the body, hat(ω) = Ṙ Rᵀ.
@@ -229,27 +280,23 @@ class Torque(AbstractForce):
     vector: ArrayLike | PhaseFunction = eqx.field(converter=_function_or_numbers)
     manifold: AbstractLieGroup | None = eqx.field(default=None, kw_only=True)
 
-    def __call__(
-        self,
-        t: FloatScalarLike,
-        q: PyTree[Array],
-        v: Float[Array, " n"],
-        args: Args = None,
-    ) -> Float[Array, " n"]:
-        """Compute the generalised force."""
+    def _place(self, t: Any, q: Any, args: Any) -> Array:
         rotation = _at("rotation", self.rotation, t, q, args)
         if rotation.shape != (3, 3):
             raise ShapeError(
                 f"`rotation` must have shape (3, 3), got {rotation.shape}. For an "
                 f"angle use `PointForce`."
             )
+        return rotation
+
+    def _covector(self, t: Any, q: Any, v: Array, args: Any) -> Array:
+        rotation = self._place(t, q, args)
         torque = _of_phase("vector", self.vector, rotation[0], t, q, v, args)
         # With Ṙ = hat(ω) R the product of the matrices ½ hat(τ) R and Ṙ is τ · ω.
-        covector = 0.5 * jnp.cross(torque[:, None], rotation, axis=0)
-        return _pulled_back(self.rotation, covector, self.manifold, t, q, args)
+        return 0.5 * jnp.cross(torque[:, None], rotation, axis=0)
 
 
-class Spring(AbstractForce):
+class Spring(_AbstractPulledBack):
     """A spring with a damper between two points.
 
     The force on the first point is -(k (|d| - l) + c d/dt |d|) d / |d| with
@@ -290,26 +337,7 @@ class Spring(AbstractForce):
     damping: ArrayLike = eqx.field(default=0.0, converter=_scalar, kw_only=True)
     manifold: AbstractLieGroup | None = eqx.field(default=None, kw_only=True)
 
-    def __call__(
-        self,
-        t: FloatScalarLike,
-        q: PyTree[Array],
-        v: Float[Array, " n"],
-        args: Args = None,
-    ) -> Float[Array, " n"]:
-        """Compute the generalised force."""
-        d, rate = _with_rate(self._difference, self.manifold, t, q, v, args)
-        length = _length(d)
-        apart = length > 0
-        direction = jnp.where(apart, d / jnp.where(apart, length, 1), 0)
-        k, rest, damping = (
-            jnp.asarray(x, d.dtype)
-            for x in (self.stiffness, self.rest_length, self.damping)
-        )
-        pull = (k * rest - damping * jnp.sum(direction * rate)) * direction - k * d
-        return _pulled_back(self._difference, pull, self.manifold, t, q, args)
-
-    def _difference(self, t: Any, q: Any, args: Any) -> Array:
+    def _place(self, t: Any, q: Any, args: Any) -> Array:
         first = _at("first", self.first, t, q, args)
         second = self.second
         if callable(second):
@@ -323,8 +351,16 @@ class Spring(AbstractForce):
             )
         return first - second
 
+    def _covector(self, t: Any, q: Any, v: Array, args: Any) -> Array:
+        d, rate = self._with_rate(t, q, v, args)
+        length = _length(d)
+        apart = length > 0
+        direction = jnp.where(apart, d / jnp.where(apart, length, 1), 0)
+        k, rest, damping = _like(d, self.stiffness, self.rest_length, self.damping)
+        return (k * rest - damping * jnp.sum(direction * rate)) * direction - k * d
 
-class Drag(AbstractForce):
+
+class Drag(_AbstractPulledBack):
     """A drag force on a point, opposite to its velocity u relative to a medium.
 
     f = -(c₁ + c₂ |u|) u. The drag of a body of area A in a medium of density ρ has
@@ -365,25 +401,18 @@ class Drag(AbstractForce):
     )
     manifold: AbstractLieGroup | None = eqx.field(default=None, kw_only=True)
 
-    def __call__(
-        self,
-        t: FloatScalarLike,
-        q: PyTree[Array],
-        v: Float[Array, " n"],
-        args: Args = None,
-    ) -> Float[Array, " n"]:
-        """Compute the generalised force."""
-        _, u = _with_rate(self.point, self.manifold, t, q, v, args)
+    def _place(self, t: Any, q: Any, args: Any) -> Array:
+        return _at("point", self.point, t, q, args)
+
+    def _covector(self, t: Any, q: Any, v: Array, args: Any) -> Array:
+        _, u = self._with_rate(t, q, v, args)
         if self.medium is not None:
             u = u - _of_phase("medium", self.medium, u, t, q, v, args)
-        linear, quadratic = (
-            jnp.asarray(x, u.dtype) for x in (self.linear, self.quadratic)
-        )
-        drag = -(linear + quadratic * _length(u)) * u
-        return _pulled_back(self.point, drag, self.manifold, t, q, args)
+        linear, quadratic = _like(u, self.linear, self.quadratic)
+        return -(linear + quadratic * _length(u)) * u
 
 
-class Motor(AbstractForce):
+class Motor(_AbstractPulledBack):
     """A geared motor whose torque falls linearly with its speed.
 
     It turns the angle φ with the torque i τ₀ (c - i φ̇ / ω₀): a DC motor whose voltage
@@ -420,24 +449,17 @@ class Motor(AbstractForce):
     gear: ArrayLike = eqx.field(default=1.0, converter=_scalar, kw_only=True)
     manifold: AbstractLieGroup | None = eqx.field(default=None, kw_only=True)
 
-    def __call__(
-        self,
-        t: FloatScalarLike,
-        q: PyTree[Array],
-        v: Float[Array, " n"],
-        args: Args = None,
-    ) -> Float[Array, " n"]:
-        """Compute the generalised force."""
-        phi, rate = _with_rate(self.angle, self.manifold, t, q, v, args)
-        if phi.shape != ():
-            raise ShapeError(f"`angle` must have shape (), got {phi.shape}.")
+    def _place(self, t: Any, q: Any, args: Any) -> Array:
+        angle = _at("angle", self.angle, t, q, args)
+        if angle.shape != ():
+            raise ShapeError(f"`angle` must have shape (), got {angle.shape}.")
+        return angle
+
+    def _covector(self, t: Any, q: Any, v: Array, args: Any) -> Array:
+        phi, rate = self._with_rate(t, q, v, args)
         command = _of_phase("command", self.command, phi, t, q, v, args)
-        stall, free, gear = (
-            jnp.asarray(x, phi.dtype)
-            for x in (self.stall_torque, self.no_load_speed, self.gear)
-        )
-        torque = gear * stall * (command - gear * rate / free)
-        return _pulled_back(self.angle, torque, self.manifold, t, q, args)
+        stall, free, gear = _like(phi, self.stall_torque, self.no_load_speed, self.gear)
+        return gear * stall * (command - gear * rate / free)
 
 
 def saturated(x: ArrayLike, limit: ArrayLike) -> Array:
@@ -465,39 +487,13 @@ def saturated(x: ArrayLike, limit: ArrayLike) -> Array:
 
 def _at(name: str, function: Any, t: Any, q: Any, args: Any) -> Array:
     """Evaluate a function of (t, q, args) of the user."""
-    with naming(f"{name}(t, q, args)", getattr(function, "function", function), args):
+    with naming(f"{name}(t, q, args)", as_given(function), args):
         return jnp.asarray(function(t, q, args))
 
 
-def _with_rate(
-    function: PositionFunction,
-    manifold: AbstractLieGroup | None,
-    t: Any,
-    q: Any,
-    v: Array,
-    args: Any,
-) -> tuple[Array, Array]:
-    """Evaluate x(t, q) and ẋ = ∂x/∂t + ∂x/∂q · q̇."""
-    t = jnp.asarray(t, v.dtype)
-    tangent = v if manifold is None else manifold.tangent(q, v)
-    return jax.jvp(
-        lambda t, q: _at("point", function, t, q, args),
-        (t, q),
-        (jnp.ones_like(t), tangent),
-    )
-
-
-def _pulled_back(
-    function: PositionFunction,
-    covector: Array,
-    manifold: AbstractLieGroup | None,
-    t: Any,
-    q: Any,
-    args: Any,
-) -> Float[Array, " n"]:
-    """Compute (∂x/∂q)ᵀ f, the generalised force of a covector on x(t, q)."""
-    manifold = Euclidean(q.shape[0]) if manifold is None else manifold
-    return manifold.left_gradient(lambda q: jnp.sum(covector * function(t, q, args)), q)
+def _like(x: Array, *numbers: ArrayLike) -> list[Array]:
+    """Convert numbers to the precision of x."""
+    return [jnp.asarray(number, x.dtype) for number in numbers]
 
 
 def _length(x: Array) -> Array:

@@ -17,7 +17,6 @@ from collections.abc import Callable
 from typing import Any, Literal
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float, PyTree
@@ -25,7 +24,15 @@ from jaxtyping import Array, ArrayLike, Float, PyTree
 from ._custom_types import Args, FloatScalarLike, PositionFunction
 from ._errors import naming, ShapeError
 from ._manifold import AbstractLieGroup
-from ._system import check_type, State, static_function
+from ._system import (
+    as_given,
+    check_signature,
+    check_type,
+    parameter,
+    State,
+    static_function,
+    value_and_rate,
+)
 
 
 def _vector(value: Any) -> Array:
@@ -38,11 +45,7 @@ def _vector(value: Any) -> Array:
 
 
 def _pose(value: Any) -> Any:
-    if not callable(value):
-        raise TypeError(
-            "`pose` must be a function of (t, q, args) that returns a position and a "
-            f"rotation, got {reprlib.repr(value)} of type {type(value).__name__}."
-        )
+    check_signature("A contact", "pose", value, ("t", "q", "args"))
     return static_function(value)
 
 
@@ -71,7 +74,7 @@ class Plane(eqx.Module):
     normal: Float[ArrayLike, "3"] = eqx.field(
         default=(0.0, 0.0, 1.0), converter=_vector
     )
-    height: ArrayLike = eqx.field(default=0.0, kw_only=True)
+    height: ArrayLike = eqx.field(default=0.0, converter=parameter, kw_only=True)
     velocity: Callable[[Any, Any, Any], Any] | None = eqx.field(
         default=None,
         converter=lambda f: None if f is None else static_function(f),
@@ -99,6 +102,9 @@ class AbstractContact(eqx.Module):
     touches: eqx.AbstractVar[bool]
     manifold: eqx.AbstractVar[AbstractLieGroup | None]
 
+    def __check_init__(self) -> None:
+        check_type("ground", self.ground, Plane)
+
     @abc.abstractmethod
     def offset(
         self, rotation: Float[Array, "3 3"], normal: Float[Array, "3"]
@@ -115,8 +121,7 @@ class AbstractContact(eqx.Module):
         self, t: FloatScalarLike, q: PyTree[Array], args: Args
     ) -> tuple[Float[Array, "3"], Float[Array, "3 3"]]:
         """Evaluate the pose, and check its shapes."""
-        function = getattr(self.pose, "function", self.pose)
-        with naming("pose(t, q, args)", function, args):
+        with naming("pose(t, q, args)", as_given(self.pose), args):
             position, rotation = self.pose(t, q, args)
         if jnp.shape(position) != (3,) or jnp.shape(rotation) != (3, 3):
             raise ShapeError(
@@ -148,10 +153,8 @@ class AbstractContact(eqx.Module):
         args: Args = None,
     ) -> Float[Array, " k"]:
         """Compute the velocity at the contact in the directions without slip."""
-        t = jnp.asarray(t, v.dtype)
-        tangent = v if self.manifold is None else self.manifold.tangent(q, v)
-        (position, rotation), (velocity, turning) = jax.jvp(
-            lambda t, q: self.place(t, q, args), (t, q), (jnp.ones_like(t), tangent)
+        (position, rotation), (velocity, turning) = value_and_rate(
+            lambda t, q: self.place(t, q, args), self.manifold, t, q, v
         )
         normal = self.ground.unit_normal(position.dtype)
         offset = self.offset(rotation, normal)
@@ -179,9 +182,9 @@ class Wheel(AbstractContact):
     - `no_slip`: the directions in which the wheel does not slip: `"along"`, `"across"`,
         or an angle [rad] from `along` towards `across`. An omni wheel has
         `("along",)`, a mecanum wheel the angle of the axle of its rollers, π/4 or -π/4.
-        Of two wheels on one axle only one needs `"across"`.
-    - `touches`: whether the height of the contact is a constraint. Say False if the
-        coordinates allow no other height, as those of a robot on a plane do.
+        If two wheels share an axle, only one of them needs `"across"`.
+    - `touches`: whether the height of the contact is a constraint. Pass False if the
+        coordinates fix the height, as the coordinates (x, y, heading) of a robot do.
     - `ground`: the plane.
     - `manifold`: the manifold of the system, if it has one.
 
@@ -203,8 +206,8 @@ class Wheel(AbstractContact):
     """
 
     pose: PositionFunction = eqx.field(converter=_pose)
-    radius: ArrayLike
-    tube_radius: ArrayLike = eqx.field(default=0.0, kw_only=True)
+    radius: ArrayLike = eqx.field(converter=parameter)
+    tube_radius: ArrayLike = eqx.field(default=0.0, converter=parameter, kw_only=True)
     axle: Float[ArrayLike, "3"] = eqx.field(
         default=(0.0, 1.0, 0.0), converter=_vector, kw_only=True
     )
@@ -216,7 +219,6 @@ class Wheel(AbstractContact):
     manifold: AbstractLieGroup | None = eqx.field(default=None, kw_only=True)
 
     def __check_init__(self) -> None:
-        check_type("ground", self.ground, Plane)
         names = ("along", "across")
         if isinstance(self.no_slip, str) or any(
             x not in names if isinstance(x, str) else not isinstance(x, int | float)
@@ -244,13 +246,13 @@ class Wheel(AbstractContact):
         """Compute the directions of `no_slip`."""
         along = _unit(jnp.cross(self._axle(rotation), normal))
         across = jnp.cross(normal, along)
-        angles = {"along": 0.0, "across": 0.5 * math.pi}
-        rows = []
-        for name in self.no_slip:
-            if isinstance(name, str):
-                rows.append(along if angles[name] == 0 else across)
-            else:
-                rows.append(math.cos(name) * along + math.sin(name) * across)
+        named = {"along": along, "across": across}
+        rows = [
+            named[x]
+            if isinstance(x, str)
+            else math.cos(x) * along + math.sin(x) * across
+            for x in self.no_slip
+        ]
         return jnp.stack(rows) if rows else jnp.zeros((0, 3), along.dtype)
 
     def _axle(self, rotation: Array) -> Array:
@@ -291,7 +293,6 @@ class Ellipsoid(AbstractContact):
     manifold: AbstractLieGroup | None = eqx.field(default=None, kw_only=True)
 
     def __check_init__(self) -> None:
-        check_type("ground", self.ground, Plane)
         if jnp.shape(self.semi_axes) not in ((), (3,)):
             raise ShapeError(
                 "`semi_axes` must be three lengths or one radius, got shape "
@@ -348,9 +349,6 @@ class Blade(AbstractContact):
     touches: bool = eqx.field(default=True, static=True, kw_only=True)
     ground: Plane = eqx.field(default_factory=Plane, kw_only=True)
     manifold: AbstractLieGroup | None = eqx.field(default=None, kw_only=True)
-
-    def __check_init__(self) -> None:
-        check_type("ground", self.ground, Plane)
 
     def offset(
         self, rotation: Float[Array, "3 3"], normal: Float[Array, "3"]
@@ -437,8 +435,8 @@ class Contacts(eqx.Module):
 
         **Arguments:**
 
-        - `t`, `y`, `args`: the time, the state and the arguments of the system, whose
-            constraints are those of the contacts.
+        - `t`, `y`, `args`: the time, the state and the arguments of the system. The
+            system must have the constraints of these contacts and no others.
 
         **Returns:** vectors of shape (3,), by the names of the contacts.
 
@@ -446,28 +444,24 @@ class Contacts(eqx.Module):
         """
         check_type("y", y, State)
         rows, normals = [], []
-        for contact in self.contacts:
+        for number, contact in enumerate(self.contacts):
             position, rotation = contact.place(t, y.q, args)
             normal = contact.ground.unit_normal(position.dtype)
             rows.append(contact.directions(rotation, normal))
             if contact.touches:
-                normals.append(normal)
+                normals.append((number, normal))
         counts = [len(x) for x in rows]
         m, k = sum(counts), len(normals)
         if y.multiplier.shape != (m + k,):
             raise ShapeError(
-                f"The contacts have {m + k} multipliers, and those of `y` have shape "
-                f"{y.multiplier.shape}: pass one state of a system whose constraints "
-                f"are those of the contacts alone."
+                f"The contacts have {m + k} multipliers, and `y.multiplier` has shape "
+                f"{y.multiplier.shape}: pass one state of a system that has the "
+                f"constraints of these contacts and no others."
             )
         parts = jnp.split(y.multiplier[:m], np.cumsum(counts)[:-1])
-        along_normals = iter(y.multiplier[m:, None] * jnp.stack(normals) if k else ())
-        forces = [
-            part @ directions + (next(along_normals) if contact.touches else 0)
-            for contact, part, directions in zip(
-                self.contacts, parts, rows, strict=True
-            )
-        ]
+        forces = [part @ x for part, x in zip(parts, rows, strict=True)]
+        for multiplier, (number, normal) in zip(y.multiplier[m:], normals, strict=True):
+            forces[number] = forces[number] + multiplier * normal
         return dict(zip(self.names, forces, strict=True))
 
     def _touching(self) -> list[AbstractContact]:

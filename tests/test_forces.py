@@ -195,10 +195,10 @@ def test_run_with_spring_equals_run_with_its_energy_in_the_lagrangian():
 
 @pytest.mark.parametrize("s", [2, 3])
 def test_sleigh_with_quadratic_drag_at_its_blade_has_the_order_of_the_method(s):
-    """The sleigh runs straight on: u' = -c u² and the blade's reaction is zero.
+    """The drag acts at the centre of mass: the sleigh turns at a constant rate w.
 
-    With a turn at rate w and the drag in the middle, the speed is the same, the
-    reaction is λ = u w, and the path is the integral of u (cos wt, sin wt).
+    The speed obeys u' = -c u², the reaction of the blade is λ = u w, and the path is
+    the integral of u (cos wt, sin wt).
     """
     c, w, t1 = 0.8, 1.3, 2.0
 

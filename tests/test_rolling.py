@@ -10,7 +10,7 @@ import pytest
 import nhjax
 from nhjax import rolling
 from nhjax.systems import _whipple_bicycle as bicycle_parts
-from nhjax.systems._frames import about_y
+from nhjax.systems._frames import about_y, about_z
 
 
 RNG = np.random.default_rng(3)
@@ -110,17 +110,9 @@ def test_robot_from_parts_moves_like_that_of_the_gallery():
 
     def wheel(number, side, no_slip):
         def pose(t, q, args):
-            x, y, heading = q[:3]
-            cos, sin, zero = jnp.cos(heading), jnp.sin(heading), jnp.zeros_like(x)
-            left = robot.half_track * side * jnp.stack([-sin, cos, zero])
-            turned = jnp.stack(
-                [
-                    jnp.stack([cos, -sin, zero]),
-                    jnp.stack([sin, cos, zero]),
-                    jnp.stack([zero, zero, zero + 1]),
-                ]
-            )
-            hub = jnp.stack([x, y, zero + robot.radius]) + left
+            turned = about_z(q[2])
+            hub = jnp.append(q[:2], robot.radius)
+            hub = hub + robot.half_track * side * turned[:, 1]
             return hub, turned @ about_y(q[number])
 
         return rolling.Wheel(pose, robot.radius, no_slip=no_slip, touches=False)
@@ -156,10 +148,7 @@ def test_bicycle_from_parts_moves_like_that_of_the_gallery():
 
 def test_sleigh_with_a_blade_keeps_the_closed_form():
     def pose(t, q, args):
-        cos, sin = jnp.cos(q[2]), jnp.sin(q[2])
-        zero = jnp.zeros_like(cos)
-        rows = [[cos, -sin, zero], [sin, cos, zero], [zero, zero, zero + 1]]
-        return jnp.append(q[:2], zero), jnp.asarray(rows)
+        return jnp.append(q[:2], 0.0), about_z(q[2])
 
     contacts = rolling.Contacts(blade=rolling.Blade(pose, touches=False))
     system = nhjax.LagrangianSystem(
@@ -217,12 +206,9 @@ def _mecanum(radius=0.05, length=0.2, width=0.15):
 
     def wheel(number, ahead, left, angle):
         def pose(t, q, args):
-            cos, sin = jnp.cos(q[2]), jnp.sin(q[2])
-            zero = jnp.zeros_like(cos)
-            rows = [[cos, -sin, zero], [sin, cos, zero], [zero, zero, zero + 1]]
-            turned = jnp.asarray(rows)
+            turned = about_z(q[2])
             place = jnp.asarray([ahead, left, radius], q.dtype)
-            return jnp.append(q[:2], zero) + turned @ place, turned @ about_y(q[number])
+            return jnp.append(q[:2], 0.0) + turned @ place, turned @ about_y(q[number])
 
         return rolling.Wheel(pose, radius, no_slip=(angle,), touches=False)
 

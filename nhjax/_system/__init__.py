@@ -10,6 +10,7 @@ from ._arguments import (
     finite as finite,
     floating as floating,
     no_array as no_array,
+    parameter as parameter,
     parameters as parameters,
     real_scalar as real_scalar,
 )
@@ -43,11 +44,14 @@ from ._scales import (
 )
 from ._systems import (
     AbstractMechanicalSystem as AbstractMechanicalSystem,
+    AbstractOnManifold as AbstractOnManifold,
+    as_given as as_given,
     check_time_and_state as check_time_and_state,
     closure_converted as closure_converted,
     HamiltonianSystem as HamiltonianSystem,
     LagrangianSystem as LagrangianSystem,
     State as State,
     static_function as static_function,
+    value_and_rate as value_and_rate,
     with_frames as with_frames,
 )

@@ -11,7 +11,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, PyTree
+from jaxtyping import Array, ArrayLike, PyTree
 
 from .._custom_types import Args, BoolScalar, FloatScalar, FloatScalarLike
 from .._errors import (
@@ -147,6 +147,19 @@ def _not_finite(name: str, x: Any) -> NonFiniteError:
     return NonFiniteError(f"`{name}` is not finite: {x}.")
 
 
+def parameter(value: ArrayLike) -> Array:
+    """Convert a parameter to an array, so that changing it does not recompile.
+
+    A Python or NumPy scalar becomes a weakly-typed float, so that it takes part in
+    float32 and float64 arithmetic, also with strict dtype promotion.
+    """
+    if isinstance(value, (int, float, np.number)):
+        return jnp.asarray(float(value))
+    if isinstance(value, str):
+        raise TypeError(f"A parameter must be a number, got {value!r} of type str.")
+    return jnp.asarray(value)
+
+
 def parameters(args: Args) -> Args:
     """Convert the floats in `args` to arrays, so that changing them does not recompile.
 
@@ -156,10 +169,8 @@ def parameters(args: Args) -> Args:
     def leaf(path, x):
         if eqx.is_array(x):
             return x
-        # An array made from a Python float is weakly typed, so that it keeps the
-        # precision of float32 and of float64 arithmetic.
         if isinstance(x, float):
-            return jnp.asarray(float(x))
+            return parameter(x)
         try:
             hash(x)
         except TypeError:

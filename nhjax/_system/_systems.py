@@ -96,8 +96,33 @@ def static_function(function: Any) -> Any:
     return StaticFunction(function) if is_plain else function
 
 
-def _as_given(function: Any) -> Any:
+def as_given(function: Any) -> Any:
+    """Return the function that the user gave to `static_function`."""
     return function.function if isinstance(function, StaticFunction) else function
+
+
+def value_and_rate(
+    function: Callable[[Any, Any], Any],
+    manifold: AbstractLieGroup | None,
+    t: FloatScalarLike,
+    q: PyTree[Array],
+    v: Float[Array, " n"],
+) -> tuple[Any, Any]:
+    """Evaluate x(t, q) and its rate dx/dt along the velocity v.
+
+    Without a manifold, q is an element of R^n.
+    """
+    t = jnp.asarray(t, v.dtype)
+    tangent = v if manifold is None else manifold.tangent(q, v)
+    return jax.jvp(function, (t, q), (jnp.ones_like(t), tangent))
+
+
+class AbstractOnManifold(eqx.Module):
+    """A function of a system that needs the manifold of the system."""
+
+    @abstractmethod
+    def check_manifold(self, manifold: AbstractLieGroup | None) -> None:
+        """Raise a `ValueError` if `manifold`, of the system, is another one."""
 
 
 class AbstractMechanicalSystem(eqx.Module):
@@ -123,31 +148,15 @@ class AbstractMechanicalSystem(eqx.Module):
     def __check_init__(self):
         owner, letter = type(self).__name__, self.fibre_coordinate_name
         for name, arguments in self.signatures().items():
-            function = _as_given(getattr(self, name))
+            function = as_given(getattr(self, name))
             if function is not None or name == self.generator:
                 check_signature(owner, name, function, arguments)
                 check_third_argument(owner, name, function, arguments, letter)
         check_constraints(self)
         check_manifold(self)
         check_coordinates(self)
-        self._check_manifold_of_force()
-
-    def _check_manifold_of_force(self) -> None:
-        """Refuse a force of `nhjax.forces` whose manifold is not that of the system."""
-        forces: tuple[Any, ...] = getattr(self.force, "terms", (self.force,))
-        for force in forces:
-            if not hasattr(force, "manifold") or callable(force.manifold):
-                continue
-            own, its = (
-                None if x is None or x.is_flat else type(x)
-                for x in (self.manifold, force.manifold)
-            )
-            if own is not its:
-                raise ValueError(
-                    f"`force` has the manifold {force.manifold}, and the system has "
-                    f"{self.manifold}: pass the same `manifold=` to the force, "
-                    f"{type(force).__name__}(..., manifold=...)."
-                )
+        if isinstance(self.force, AbstractOnManifold):
+            self.force.check_manifold(self.manifold)
 
     @abstractmethod
     def momentum(
@@ -215,7 +224,7 @@ class AbstractMechanicalSystem(eqx.Module):
 
         The note says which function of the system raised the error.
         """
-        function = _as_given(getattr(self, name))
+        function = as_given(getattr(self, name))
         called = f"{name}({', '.join(self.signatures()[name])})"
         with naming(called, function, arguments[-1]):
             return function(*arguments)

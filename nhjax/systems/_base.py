@@ -15,25 +15,12 @@ from .._custom_types import Args, FloatScalarLike
 from .._errors import is_traced, ShapeError
 from .._initial import initial_state
 from .._manifold import AbstractLieGroup
-from .._system import LagrangianSystem, State
+from .._system import LagrangianSystem, parameter as parameter, State
 
 
 # Gauss-Legendre rule of one panel: exact to round-off on panels whose length is
 # below the distance of the integrand's nearest complex singularity.
 NODES, WEIGHTS = np.polynomial.legendre.leggauss(20)
-
-
-def parameter(value: ArrayLike) -> Array:
-    """Convert a parameter of an example to an array, which is a leaf.
-
-    A Python or NumPy scalar becomes a weakly-typed float, so that it takes part in
-    float32 and float64 arithmetic, also with strict dtype promotion.
-    """
-    if isinstance(value, (int, float, np.number)):
-        return jnp.asarray(float(value))
-    if isinstance(value, str):
-        raise TypeError(f"A parameter must be a number, got {value!r} of type str.")
-    return jnp.asarray(value)
 
 
 def coordinates(
