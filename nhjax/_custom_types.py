@@ -13,8 +13,10 @@ IntScalar: TypeAlias = Int[Array, ""]
 BoolScalar: TypeAlias = Bool[Array, ""]
 Args: TypeAlias = Any
 
-# The functions L(t, q, v, args) of shape (), Φ(t, q, v, args) of shape () or (m,) and
-# F(t, q, v, args) of shape (n,); for Hamiltonian systems they take (t, q, p, args).
+# The functions L(t, q, v, args) of shape () and Φ(t, q, v, args) of shape () or (m,);
+# for Hamiltonian systems they take (t, q, p, args).
 PhaseFunction: TypeAlias = Callable[[Any, Any, Any, Any], Any]
+# The force F(t, q, v, args) or F(t, q, v, multipliers, args), of shape (n,).
+ForceFunction: TypeAlias = Callable[..., Any]
 # The holonomic constraints Γ(t, q, args), of shape () or (k,).
 PositionFunction: TypeAlias = Callable[[Any, Any, Any], Any]

@@ -21,7 +21,13 @@ from .._numerics import (
     reciprocal_condition,
     reciprocal_condition_of_range,
 )
-from .._system import AbstractMechanicalSystem, check_functions, finite, parameters
+from .._system import (
+    AbstractMechanicalSystem,
+    check_functions,
+    finite,
+    linearise,
+    parameters,
+)
 from ._motion import convert_to_velocities
 
 
@@ -182,7 +188,7 @@ def check_system(
         dependent=tuple(letters[i] for i in rows),
         depends_on_time=tuple(
             name
-            for name in system.functions(t, q, u, args)
+            for name in system.functions(t, q, u, None, args)
             if np.any(_changes(found["by_time"][name]))
         ),
         ignorable=tuple(int(i) for i in np.flatnonzero(~moving)),
@@ -209,7 +215,7 @@ def _condition(reciprocal: np.ndarray) -> float:
 
 @tracked_jit("system", "args")
 def _measurements(system, t, q, u, args) -> dict[str, Any]:
-    manifold, coordinate = system.manifold_of(q), system.fibre_coordinate_name
+    manifold = system.manifold_of(q)
 
     def hessian(t, xi, u):
         return system.metric(t, manifold.act(q, xi), u, args)
@@ -219,15 +225,18 @@ def _measurements(system, t, q, u, args) -> dict[str, Any]:
         return jax.jacfwd(system.kinematic_constraint, argnums=2)(t, g, u, args)
 
     def on_chart(name):
-        arguments = system.signatures()[name]
-
         def value(t, xi, u):
-            given = {"t": t, "q": manifold.act(q, xi), coordinate: u, "args": args}
-            return jnp.atleast_1d(system.call(name, *(given[x] for x in arguments)))
+            g = manifold.act(q, xi)
+            function, given = system.functions(t, g, u, multiplier, args)[name]
+            return jnp.atleast_1d(function(*given))
 
         return value
 
-    functions = {name: on_chart(name) for name in system.functions(t, q, u, args)}
+    multiplier = None
+    if system.force_takes_multipliers:
+        multiplier = linearise(system, t, q, u, args).multiplier
+    names = system.functions(t, q, u, multiplier, args)
+    functions = {name: on_chart(name) for name in names}
 
     def sample(xi, w):
         point = (t, xi, u + w)

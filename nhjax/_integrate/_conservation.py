@@ -131,7 +131,7 @@ def _require_conserved_energy(
     if system.force is not None:
         reason = "has a `force`, which may do work"
     for name in (system.generator, "holonomic"):
-        function, given = system.functions(t, q, u, args).get(name, (None, ()))
+        function, given = system.functions(t, q, u, None, args).get(name, (None, ()))
         if function is not None and _depends_on_time(function, *given):
             reason = f"has a `{name}` that depends on time"
     if reason is not None:

@@ -29,6 +29,7 @@ from .._numerics import (
 )
 from .._system import (
     AbstractMechanicalSystem,
+    force_by_multiplier,
     Linearisation,
     motion_residual,
     State,
@@ -314,6 +315,28 @@ def stage_forces(stages: StageEquations, x: StageUnknowns) -> StageForces:
         base[None] + h * small_einsum("ij,jn->in", a_hat, chart_force)
     )
     return StageForces(transported, multiplier, residual, momentum)
+
+
+def forces_by_multiplier(
+    stages: StageEquations, x: StageUnknowns
+) -> Float[Array, "s l n"] | None:
+    """Compute ∂F/∂Λ at the stages, a row for each multiplier.
+
+    The result is None if the forces do not depend on the multipliers.
+    """
+    if not stages.system.force_takes_multipliers or not stages.constrained:
+        return None
+    chart, y = stage_coordinates(stages, x)
+    u = x.momentum if stages.hamiltonian else chart.body_velocities(y, x.velocity)
+    return vmapped(
+        lambda t, q, u, lam: (
+            force_by_multiplier(stages.system, t, q, u, lam, stages.args).T
+        ),
+        stages.stage_times,
+        stage_positions(stages, chart, y),
+        u,
+        stages.multipliers(x),
+    )
 
 
 def momenta_of_forces(

@@ -18,11 +18,12 @@ import numpy as np
 from jaxtyping import Array, Float, PyTree
 
 from .._numerics import inverse_by_blocks, inverses, mapped, small_einsum
-from .._system import motion_residual, total_force
+from .._system import force_by_multiplier, motion_residual, total_force
 from ._chart import AbstractChart
 from ._equations import (
     end_impulse,
     end_position,
+    forces_by_multiplier,
     momenta_of_forces,
     stage_coordinates,
     stage_positions,
@@ -589,14 +590,20 @@ def reactions_at_stages(
     if not stages.hamiltonian:
         u = chart.body_velocities(y, x.velocity)
     given = stages.stage_times, stage_positions(stages, chart, y), u
-    return jnp.moveaxis(_reactions(stages, *given), 0, 1)
+    covectors = jnp.moveaxis(_reactions(stages, *given), 0, 1)
+    of_force = forces_by_multiplier(stages, x)
+    return covectors if of_force is None else covectors + of_force
 
 
 def reactions_at_end(stages: StageEquations, x: StageUnknowns) -> Float[Array, "l n"]:
     """Compute the reactions at the end of the step, a row for each unit multiplier."""
     time, u = stages.node_times[-1:], x.node_fibre_coordinate[-1:]
     q = jax.tree.map(lambda leaf: leaf[None], end_position(stages, x))
-    return _reactions(stages, time, q, u)[:, 0]
+    covectors = _reactions(stages, time, q, u)[:, 0]
+    if not stages.system.force_takes_multipliers:
+        return covectors
+    at_end = time[0], end_position(stages, x), u[0], x.end_multiplier
+    return covectors + force_by_multiplier(stages.system, *at_end, stages.args).T
 
 
 def _reactions(

@@ -42,6 +42,7 @@ from ._equations import (
     constraint_values,
     end_residual,
     Evaluation,
+    forces_by_multiplier,
     invariant_correction,
     invariant_errors,
     is_in_chart,
@@ -541,16 +542,23 @@ def _factors_without_impulses(
     rows = jnp.concatenate([lin.jacobian.as_matrix()[None], at_nodes])
     if terms is not None:
         return _first_order_factors(stages, x, lin, rows, terms)
-    return _dense_factors(stages, lin, rows)
+    return _dense_factors(stages, x, lin, rows)
 
 
 def _dense_factors(
-    stages: StageEquations, lin: Linearisation, jacobian: Float[Array, "s l n"]
+    stages: StageEquations,
+    x: StageUnknowns,
+    lin: Linearisation,
+    jacobian: Float[Array, "s l n"],
 ) -> StageJacobianFactors:
     """Compute the factors with the Jacobians B of the constraints at all stages."""
     reaction = (
         DenseMatrix(jacobian).weighted_transpose(lin.fibre_hessian_inverse).entries
     )
+    of_force = forces_by_multiplier(stages, x)
+    if of_force is not None:
+        pushed = lin.momentum_inverse.matvec(of_force)
+        reaction = reaction + jnp.swapaxes(pushed, 1, 2)
     rows, redundancy = jacobian[1:], stages.redundancy
     if redundancy is not None:
         rows = small_einsum("ab,ibn->ian", redundancy.projector, rows)
@@ -564,6 +572,10 @@ def _dense_factors(
     velocity_reaction = reaction
     if stages.hamiltonian:
         velocity_reaction = jnp.swapaxes(jacobian, 1, 2)
+        if of_force is not None:
+            hessian = inverse(lin.fibre_hessian_inverse.as_matrix())
+            by_force = small_einsum("kn,iln->ikl", hessian, of_force)
+            velocity_reaction = velocity_reaction + by_force
     return StageJacobianFactors(
         momentum_inverse=lin.momentum_inverse,
         reaction=DenseMatrix(reaction),
@@ -656,8 +668,11 @@ def _first_order_factors(
     terms: FirstOrderTerms,
 ) -> StageJacobianFactors:
     """Compute the factors with the terms of order h."""
-    reaction = DenseMatrix(jacobian).weighted_transpose(lin.fibre_hessian_inverse)
-    momenta = momenta_of_forces(stages, x, _reactions(stages, jacobian))
+    of_force, covectors = forces_by_multiplier(stages, x), jacobian
+    if of_force is not None:
+        covectors = jacobian + of_force
+    reaction = DenseMatrix(covectors).weighted_transpose(lin.fibre_hessian_inverse)
+    momenta = momenta_of_forces(stages, x, _reactions(stages, covectors))
     on_stages, on_nodes = (
         jnp.swapaxes(lin.momentum_inverse.matvec(jnp.swapaxes(p, 1, 2)), 1, 2)
         for p in momenta
@@ -679,7 +694,7 @@ def _first_order_factors(
         reaction=reaction,
         velocity_reaction=reaction,
         schur_inverse=DenseMatrix(inverse(schur)),
-        end=_with_mass_at_end(lin, terms, jacobian[-1]),
+        end=_with_mass_at_end(lin, terms, jacobian[-1], covectors[-1]),
         first_order=terms,
         responses=MultiplierResponses(velocity, at_nodes),
     )
@@ -815,7 +830,10 @@ def _reactions(
 
 
 def _with_mass_at_end(
-    lin: Linearisation, terms: FirstOrderTerms, jacobian: Float[Array, "l n"]
+    lin: Linearisation,
+    terms: FirstOrderTerms,
+    jacobian: Float[Array, "l n"],
+    covectors: Float[Array, "l n"],
 ) -> Linearisation:
     """Return a linearisation with mass matrix and constraints at the end of the step.
 
@@ -825,7 +843,7 @@ def _with_mass_at_end(
     at_start = lin.momentum_inverse.as_matrix()
     change = small_einsum("kl,ln->kn", terms.node_inertia[-1], at_start)
     at_end = at_start - change
-    reaction = small_einsum("kn,ln->kl", at_end, jacobian)
+    reaction = small_einsum("kn,ln->kl", at_end, covectors)
     delassus = small_einsum("kn,nl->kl", jacobian, reaction)
     return replace(
         lin,

@@ -28,6 +28,7 @@ from ._checks import (
 from ._linearisation import (
     constraint_matrices as constraint_matrices,
     continuous_multiplier as continuous_multiplier,
+    force_by_multiplier as force_by_multiplier,
     Linearisation as Linearisation,
     linearise as linearise,
     motion_residual as motion_residual,

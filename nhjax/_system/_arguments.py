@@ -272,10 +272,32 @@ def check_third_argument(
         raise TypeError(message)
 
 
+def takes_multipliers(force: Any) -> bool:
+    """Return whether a force is a function of (t, q, v, multipliers, args).
+
+    A class of forces can say it by an attribute `takes_multipliers`. Otherwise a force
+    that can be called with four arguments does not take multipliers.
+    """
+    stated = getattr(force, "takes_multipliers", None)
+    if stated is not None:
+        return bool(stated)
+    signature = _signature(force) if callable(force) else None
+    if signature is None:
+        return False
+    arguments = ("t", "q", "v", "multipliers", "args")
+    return _takes(signature, arguments) and not _takes(signature, arguments[1:])
+
+
 def check_constraints(owner: Any) -> None:
-    """Raise a `ValueError` unless the option `constraints` of `owner` is known."""
+    """Raise a `ValueError` unless the option `constraints` of `owner` is possible."""
     name = f"{type(owner).__name__}: `constraints`"
     check_choice(name, owner.constraints, ("independent", "redundant"))
+    if owner.constraints == "redundant" and owner.force_takes_multipliers:
+        raise ValueError(
+            f'{name} cannot be "redundant" with a `force` that takes the multipliers: '
+            "the multipliers of redundant constraints are not unique. Remove the "
+            "constraints that follow from others."
+        )
 
 
 def check_manifold(owner: Any) -> None:

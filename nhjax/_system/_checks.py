@@ -74,7 +74,14 @@ def check_functions(
         ),
         "force": (f"shape ({n},)", lambda shape: shape == (n,), each),
     }
-    for name, (function, arguments) in system.functions(t, q, u, args).items():
+    # The number of multipliers is known once the constraints have been checked.
+    multiplier = None
+    functions = system.functions(t, q, u, multiplier, args)
+    for name in functions:
+        if name == "force" and system.force_takes_multipliers:
+            multiplier = eqx.filter_eval_shape(system.constraint, t, q, u, args)
+            functions = system.functions(t, q, u, multiplier, args)
+        function, arguments = functions[name]
         wanted, fits, advice = expected[name]
         called = f"`{name}({', '.join(system.signatures()[name])})`"
         out = eqx.filter_eval_shape(function, *arguments)

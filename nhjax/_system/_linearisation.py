@@ -6,6 +6,7 @@ without the solution, and `motion_residual` evaluates the equations themselves.
 """
 
 from collections.abc import Callable
+from dataclasses import replace
 from functools import reduce
 from typing import Literal, NamedTuple
 
@@ -18,6 +19,8 @@ from .._custom_types import Args, FloatScalar, FloatScalarLike
 from .._numerics import (
     DenseMatrix,
     DiagonalMatrix,
+    full_jacobian,
+    inverse,
     InverseMatrix,
     jacobian_by_rows,
     jacobian_sparsity,
@@ -25,7 +28,9 @@ from .._numerics import (
     least_norm_inverse,
     least_norm_inverse_by_blocks,
     max_norm,
+    nan_unless,
     ReactionMatrix,
+    root,
     small_einsum,
     sparse_jacobian,
     SparsityPattern,
@@ -55,7 +60,8 @@ class Linearisation(eqx.Module):
     the Delassus matrix, which the paper calls the compatibility matrix C^{ab} (section
     3). For a Lagrangian system N is the mass matrix M = D2D2L, R = Bᵀ, and u̇ is the
     acceleration. For a Hamiltonian system N = 1 and R = (D2D2H)⁻¹ Bᵀ. In both cases N⁻¹
-    R = K⁻¹ Bᵀ with the fibre Hessian K = D2D2L or D2D2H.
+    R = K⁻¹ Bᵀ with the fibre Hessian K = D2D2L or D2D2H. If the force depends on the
+    multipliers, R includes ∂F/∂λ.
 
     The Jacobian of the stage equations has the same matrices. Inverses are computed
     once, and later computations multiply by them: the matrices are tiny, and a
@@ -172,7 +178,7 @@ def total_force(
     args: Args,
 ) -> Float[Array, " n"]:
     """Compute the total force W: the free force plus the reaction of constraints."""
-    free = system.free_force(t, q, u, args)
+    free = system.free_force(t, q, u, multiplier, args)
     return free + system.reaction(t, q, u, multiplier, args)
 
 
@@ -290,10 +296,73 @@ def linearise(
         fibre_coordinate_name=system.fibre_coordinate_name,
         is_redundant=system.constraints == "redundant",
     )
-    known = system.free_force(t, q, u, args) + _inertial_force(system, q, p, v)
+    inertial = _inertial_force(system, q, p, v)
+    if system.force_takes_multipliers and violation.shape[0] > 0:
+        known = system.conservative_force(t, q, u, args) + inertial - p_dot
+        return _with_force_of_multipliers(system, t, q, u, args, lin, known, -phi_dot)
+    known = system.free_force(t, q, u, lin.multiplier, args) + inertial
     acceleration, multiplier = lin.solve(known - p_dot, -phi_dot)
     return eqx.tree_at(
         lambda x: (x.acceleration, x.multiplier), lin, (acceleration, multiplier)
+    )
+
+
+def force_by_multiplier(
+    system: AbstractMechanicalSystem,
+    t: FloatScalar,
+    q: PyTree[Array],
+    u: Float[Array, " n"],
+    multiplier: Float[Array, " l"],
+    args: Args,
+) -> Float[Array, "n l"]:
+    """Compute ∂F/∂λ of a force F(t, q, v, multipliers, args)."""
+    return full_jacobian(
+        lambda multiplier: system.external_force(t, q, u, multiplier, args), multiplier
+    )
+
+
+def _with_force_of_multipliers(
+    system: AbstractMechanicalSystem,
+    t: FloatScalar,
+    q: PyTree[Array],
+    u: Float[Array, " n"],
+    args: Args,
+    lin: Linearisation,
+    known: Float[Array, " n"],
+    hidden: Float[Array, " l"],
+) -> Linearisation:
+    """Solve N u̇ - R λ - F(λ) = known and B u̇ = hidden, and linearise F there.
+
+    The multiplier is NaN if Newton's method does not find one. The matrices N⁻¹ R and C
+    of the result include ∂F/∂λ.
+    """
+
+    def free(multiplier):
+        force = known + system.external_force(t, q, u, multiplier, args)
+        return lin.momentum_inverse.matvec(force)
+
+    def residual(multiplier):
+        acceleration = free(multiplier) + lin.reaction.matvec(multiplier)
+        return lin.jacobian.matvec(acceleration) - hidden
+
+    def solve(jacobian, b):
+        return small_einsum("kl,l->k", inverse(jacobian), b)
+
+    # Friction vanishes with the reaction, so that this is the multiplier without it.
+    start = lin.delassus_inverse.matvec(
+        hidden - lin.jacobian.matvec(free(jnp.zeros_like(hidden)))
+    )
+    found = root(residual, start, max_norm(start), solve=solve)
+    multiplier = nan_unless(found.converged, found.x)
+    slopes = force_by_multiplier(system, t, q, u, multiplier, args)
+    reaction = lin.reaction.as_matrix() + lin.momentum_inverse.matvec(slopes.T).T
+    delassus = small_einsum("kn,nl->kl", lin.jacobian.as_matrix(), reaction)
+    return replace(
+        lin,
+        reaction=DenseMatrix(reaction),
+        delassus_inverse=DenseMatrix(inverse(delassus)),
+        acceleration=free(multiplier) + lin.reaction.matvec(multiplier),
+        multiplier=multiplier,
     )
 
 
@@ -345,6 +414,8 @@ def _constraint_pattern(
     """
     kinds = [system.nonholonomic, system.holonomic]
     if system.constraints == "redundant" or None not in kinds:
+        return None
+    if system.force_takes_multipliers:
         return None
     entries = jacobian_sparsity(lambda u: system.constraint(t, q, u, args), u)
     pattern = SparsityPattern(entries)

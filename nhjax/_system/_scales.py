@@ -146,7 +146,7 @@ def function_noise(
 ) -> FunctionNoise:
     """Measure the round-off of the functions of a system at (t, q, u).
 
-    Only the shape of the multiplier is used.
+    The force is measured with a constant multiplier.
     """
     # This is a closure, because `args` may contain objects that are not arrays.
     positions = jax.eval_shape(lambda: system.position_constraint(t, q, args))
@@ -155,7 +155,7 @@ def function_noise(
     def values(t, q, u):
         return FunctionNoise(
             system.momentum(t, q, u, args),
-            system.free_force(t, q, u, args),
+            system.free_force(t, q, u, multiplier, args),
             system.constraint(t, q, u, args),
             system.position_constraint(t, q, args),
         )

@@ -20,6 +20,7 @@ from .._custom_types import (
     Args,
     FloatScalar,
     FloatScalarLike,
+    ForceFunction,
     PhaseFunction,
     PositionFunction,
 )
@@ -33,6 +34,7 @@ from ._arguments import (
     check_signature,
     check_third_argument,
     check_type,
+    takes_multipliers,
 )
 
 
@@ -130,13 +132,15 @@ class AbstractMechanicalSystem(eqx.Module):
 
     The two kinds differ in the fibre coordinate u, which is the velocity of a
     Lagrangian and the momentum of a Hamiltonian system. Both kinds provide the
-    functions `velocity`, `momentum`, `free_force`, `constraint` and `metric` of
-    (t, q, u). The equations of a step use only these functions.
+    functions `velocity`, `momentum`, `conservative_force`, `constraint` and `metric` of
+    (t, q, u). The equations of a step use only these functions, and `free_force`, which
+    may depend on the multipliers too.
     """
 
     nonholonomic: eqx.AbstractVar[PhaseFunction | None]
     holonomic: eqx.AbstractVar[PositionFunction | None]
-    force: eqx.AbstractVar[PhaseFunction | None]
+    force: eqx.AbstractVar[ForceFunction | None]
+    force_takes_multipliers: eqx.AbstractVar[bool]
     manifold: eqx.AbstractVar[AbstractLieGroup | None]
     constraints: eqx.AbstractVar[Literal["independent", "redundant"]]
     coordinates: eqx.AbstractVar[tuple[str, ...] | None]
@@ -144,6 +148,10 @@ class AbstractMechanicalSystem(eqx.Module):
     # The name of the function L or H, and the letter of the fibre coordinate.
     generator: eqx.AbstractClassVar[Literal["lagrangian", "hamiltonian"]]
     fibre_coordinate_name: eqx.AbstractClassVar[Literal["v", "p"]]
+
+    def __post_init__(self):
+        # Programs replace the functions by traced ones without these signatures.
+        self.force_takes_multipliers = takes_multipliers(as_given(self.force))
 
     def __check_init__(self):
         owner, letter = type(self).__name__, self.fibre_coordinate_name
@@ -177,10 +185,10 @@ class AbstractMechanicalSystem(eqx.Module):
         """Compute the metric K on the fibre: the Hessian D2D2L or D2D2H."""
 
     @abstractmethod
-    def free_force(
+    def conservative_force(
         self, t: FloatScalarLike, q: PyTree[Array], u: Float[Array, " n"], args: Args
     ) -> Float[Array, " n"]:
-        """Compute the force on the system without the constraint reactions."""
+        """Compute the force that comes from L or H, L_q^* D1L or -L_q^* D1H."""
 
     @abstractmethod
     def flat(
@@ -197,22 +205,23 @@ class AbstractMechanicalSystem(eqx.Module):
     def energy(self, t: FloatScalarLike, y: State, args: Args = None) -> FloatScalar:
         """Compute the energy of the system in the state `y` at time `t`."""
 
-    @classmethod
-    def signatures(cls) -> dict[str, tuple[str, ...]]:
+    def signatures(self) -> dict[str, tuple[str, ...]]:
         """Map the name of each function of the system to the names of its arguments."""
-        of_phase = ("t", "q", cls.fibre_coordinate_name, "args")
+        before = ("t", "q", self.fibre_coordinate_name)
+        multipliers = ("multipliers",) if self.force_takes_multipliers else ()
         return {
-            cls.generator: of_phase,
-            "nonholonomic": of_phase,
+            self.generator: (*before, "args"),
+            "nonholonomic": (*before, "args"),
             "holonomic": ("t", "q", "args"),
-            "force": of_phase,
+            "force": (*before, *multipliers, "args"),
         }
 
     def functions(
-        self, t: Any, q: PyTree[Any], u: Any, args: Args
+        self, t: Any, q: PyTree[Any], u: Any, multiplier: Any, args: Args
     ) -> dict[str, tuple[Callable[..., Any], tuple[Any, ...]]]:
         """Map the name of each function to a callable and its arguments."""
-        values = {"t": t, "q": q, self.fibre_coordinate_name: u, "args": args}
+        letter = self.fibre_coordinate_name
+        values = {"t": t, "q": q, letter: u, "multipliers": multiplier, "args": args}
         return {
             name: (partial(self.call, name), tuple(values[x] for x in arguments))
             for name, arguments in self.signatures().items()
@@ -228,6 +237,32 @@ class AbstractMechanicalSystem(eqx.Module):
         called = f"{name}({', '.join(self.signatures()[name])})"
         with naming(called, function, arguments[-1]):
             return function(*arguments)
+
+    def external_force(
+        self,
+        t: FloatScalarLike,
+        q: PyTree[Array],
+        u: Float[Array, " n"],
+        multiplier: Float[Array, " l"],
+        args: Args,
+    ) -> Float[Array, " n"]:
+        """Compute the user's force F. There must be one."""
+        given = (multiplier,) if self.force_takes_multipliers else ()
+        return self.call("force", t, q, u, *given, args)
+
+    def free_force(
+        self,
+        t: FloatScalarLike,
+        q: PyTree[Array],
+        u: Float[Array, " n"],
+        multiplier: Float[Array, " l"],
+        args: Args,
+    ) -> Float[Array, " n"]:
+        """Compute the force without the constraint reactions, L_q^* D1L + F."""
+        conservative = self.conservative_force(t, q, u, args)
+        if self.force is None:
+            return conservative
+        return conservative + self.external_force(t, q, u, multiplier, args)
 
     def fibre_coordinate(self, y: State) -> Float[Array, " n"]:
         """Return the fibre coordinate u of a state, which is its v or its p."""
@@ -378,7 +413,11 @@ class LagrangianSystem(AbstractMechanicalSystem):
         linear, affine or nonlinear in v, and it may depend on time.
     - `holonomic`: Γ, called as `holonomic(t, q, args)`, of shape () or (k,).
     - `force`: an external covector F, called as `force(t, q, v, args)`, of shape (n,);
-        on a group in left-trivialised components.
+        on a group in left-trivialised components. A force that depends on the reactions
+        of the constraints, such as friction, is called as
+        `force(t, q, v, multipliers, args)`, with the λ and ν of all constraints in the
+        order of `State.multiplier`. Its derivative by the multipliers must exist in
+        forward mode, and the constraints must be independent.
     - `manifold`: the configuration manifold; by default R^n with the n of the state.
     - `constraints`: `"independent"` refuses dependent constraints. `"redundant"` allows
         constraints that follow from others, also nonholonomic constraints that follow
@@ -407,7 +446,7 @@ class LagrangianSystem(AbstractMechanicalSystem):
     holonomic: PositionFunction | None = eqx.field(
         default=None, kw_only=True, converter=static_function
     )
-    force: PhaseFunction | None = eqx.field(
+    force: ForceFunction | None = eqx.field(
         default=None, kw_only=True, converter=static_function
     )
     manifold: AbstractLieGroup | None = eqx.field(default=None, kw_only=True)
@@ -417,6 +456,7 @@ class LagrangianSystem(AbstractMechanicalSystem):
     coordinates: tuple[str, ...] | None = eqx.field(
         default=None, kw_only=True, static=True
     )
+    force_takes_multipliers: bool = eqx.field(init=False, static=True)
 
     generator: ClassVar[Literal["lagrangian", "hamiltonian"]] = "lagrangian"
     fibre_coordinate_name: ClassVar[Literal["v", "p"]] = "v"
@@ -451,19 +491,17 @@ class LagrangianSystem(AbstractMechanicalSystem):
         """Compute the mass matrix M = D2D2L, the metric on velocities."""
         return jax.jacfwd(self.momentum, argnums=2)(t, q, u, args)
 
-    def free_force(
+    def conservative_force(
         self,
         t: FloatScalarLike,
         q: PyTree[Array],
         u: Float[Array, " n"],
         args: Args = None,
     ) -> Float[Array, " n"]:
-        """Compute the force without the reaction of the constraints, L_q^* D1L + F."""
-        manifold = self.manifold_of(q)
-        d1l = manifold.left_gradient(
+        """Compute L_q^* D1L, the derivative of the Lagrangian by the position."""
+        return self.manifold_of(q).left_gradient(
             lambda g: self.call("lagrangian", t, g, u, args), q
         )
-        return d1l if self.force is None else d1l + self.call("force", t, q, u, args)
 
     def flat(
         self,
@@ -522,7 +560,9 @@ class HamiltonianSystem(AbstractMechanicalSystem):
         algebra.
     - `nonholonomic`: Ψ, called as `nonholonomic(t, q, p, args)`, of shape () or (m,).
     - `holonomic`: Γ, called as `holonomic(t, q, args)`, of shape () or (k,).
-    - `force`: an external covector F, called as `force(t, q, p, args)`, of shape (n,).
+    - `force`: an external covector F, called as `force(t, q, p, args)`, or as
+        `force(t, q, p, multipliers, args)` if it depends on the reactions, of shape
+        (n,).
     - `manifold`: the configuration manifold; by default R^n with the n of the state.
     - `constraints`: `"independent"` refuses dependent constraints. `"redundant"` allows
         constraints that follow from others, also nonholonomic constraints that follow
@@ -553,7 +593,7 @@ class HamiltonianSystem(AbstractMechanicalSystem):
     holonomic: PositionFunction | None = eqx.field(
         default=None, kw_only=True, converter=static_function
     )
-    force: PhaseFunction | None = eqx.field(
+    force: ForceFunction | None = eqx.field(
         default=None, kw_only=True, converter=static_function
     )
     manifold: AbstractLieGroup | None = eqx.field(default=None, kw_only=True)
@@ -563,6 +603,7 @@ class HamiltonianSystem(AbstractMechanicalSystem):
     coordinates: tuple[str, ...] | None = eqx.field(
         default=None, kw_only=True, static=True
     )
+    force_takes_multipliers: bool = eqx.field(init=False, static=True)
 
     generator: ClassVar[Literal["lagrangian", "hamiltonian"]] = "hamiltonian"
     fibre_coordinate_name: ClassVar[Literal["v", "p"]] = "p"
@@ -597,19 +638,17 @@ class HamiltonianSystem(AbstractMechanicalSystem):
         """Compute the metric D2D2H on momenta, the inverse of the mass matrix."""
         return jax.jacfwd(self.velocity, argnums=2)(t, q, u, args)
 
-    def free_force(
+    def conservative_force(
         self,
         t: FloatScalarLike,
         q: PyTree[Array],
         u: Float[Array, " n"],
         args: Args = None,
     ) -> Float[Array, " n"]:
-        """Compute the force without the reaction of the constraints, -L_q^* D1H + F."""
-        manifold = self.manifold_of(q)
-        d1h = manifold.left_gradient(
+        """Compute -L_q^* D1H from the derivative of H by the position."""
+        return -self.manifold_of(q).left_gradient(
             lambda g: self.call("hamiltonian", t, g, u, args), q
         )
-        return -d1h if self.force is None else self.call("force", t, q, u, args) - d1h
 
     def flat(
         self,
@@ -640,7 +679,8 @@ def closure_converted(system: S, t: FloatScalar, y: State, args: Args) -> S:
 
     The derivative rules of a step reach only the leaves of its arguments.
     """
-    functions = system.functions(t, y.q, system.fibre_coordinate(y), args)
+    u = system.fibre_coordinate(y)
+    functions = system.functions(t, y.q, u, y.multiplier, args)
     return eqx.tree_at(
         lambda system: [getattr(system, name) for name in functions],
         system,
@@ -673,9 +713,9 @@ def with_frames(system: S, q: PyTree[Array]) -> tuple[S, PyTree[Array]]:
 
 
 class _OfPosition(eqx.Module):
-    """A function of (t, q, args) or (t, q, u, args) that accepts q with frames."""
+    """A function of (t, q, ...) that accepts q with frames."""
 
-    function: PhaseFunction | PositionFunction
+    function: PhaseFunction | PositionFunction | ForceFunction
 
     def __call__(self, t, q, *rest):
         return self.function(t, unframed(q), *rest)

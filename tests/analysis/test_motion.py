@@ -54,7 +54,7 @@ def test_motion_momentum_rate_is_the_sum_of_forces_and_reactions(start):
     system, y = start.forms["lagrangian"], start.y0
     motion = nhjax.motion(system, 0.0, y)
     t = jnp.asarray(0.0)
-    force = system.free_force(t, y.q, y.v, None)
+    force = system.free_force(t, y.q, y.v, y.multiplier, None)
     if not system.manifold_of(y.q).is_flat:
         force = force + jnp.cross(y.p, y.v)
     expected = force + motion.reaction
