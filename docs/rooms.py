@@ -48,7 +48,8 @@ FLOORS = (
     ("_integrate",),
     ("_io",),
     ("_ensemble",),
-    ("forces", "rolling", "systems", "diagnostics", "plot", "studies", "__main__"),
+    ("forces", "rolling"),
+    ("friction", "systems", "diagnostics", "plot", "studies", "__main__"),
 )
 ROOMS = tuple(room for floor in FLOORS for room in floor)
 
@@ -458,6 +459,7 @@ _COLUMNS = {
     "_ensemble": 3.5,
     "forces": 0.7,
     "rolling": 1.2,
+    "friction": 0.8,
     "systems": 0.0,
     "diagnostics": 1.8,
     "plot": 2.5,

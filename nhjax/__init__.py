@@ -98,6 +98,7 @@ from .lanes import engines as engines, EngineUse as EngineUse
 if TYPE_CHECKING:
     from . import (
         forces as forces,
+        friction as friction,
         plot as plot,
         rolling as rolling,
         systems as systems,
@@ -105,13 +106,15 @@ if TYPE_CHECKING:
 
 __version__ = "0.1.0"
 
+_LOADED_LATER = ("forces", "friction", "plot", "rolling", "systems")
+
 
 def __getattr__(name: str) -> ModuleType:
     # The gallery and the plots take a quarter of the time of `import nhjax`.
-    if name in ("forces", "plot", "rolling", "systems"):
+    if name in _LOADED_LATER:
         return import_module(f".{name}", __name__)
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
 
 
 def __dir__() -> list[str]:
-    return sorted({*globals(), "plot", "systems"})
+    return sorted({*globals(), *_LOADED_LATER})

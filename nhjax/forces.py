@@ -14,7 +14,13 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float, PyTree
 
-from ._custom_types import Args, FloatScalarLike, PhaseFunction, PositionFunction
+from ._custom_types import (
+    Args,
+    FloatScalarLike,
+    ForceFunction,
+    PhaseFunction,
+    PositionFunction,
+)
 from ._errors import naming, ShapeError
 from ._manifold import AbstractLieGroup, Euclidean
 from ._system import (
@@ -23,6 +29,7 @@ from ._system import (
     check_signature,
     parameter,
     static_function,
+    takes_multipliers,
     value_and_rate,
 )
 
@@ -43,7 +50,7 @@ def _number(value: Any) -> Array:
     return array
 
 
-def _scalar(value: Any) -> Array:
+def scalar(value: Any) -> Array:
     """Convert a parameter that is one number."""
     number = _number(value)
     if number.shape != ():
@@ -54,22 +61,28 @@ def _scalar(value: Any) -> Array:
     return number
 
 
-def _function_or_numbers(value: Any) -> Any:
+def function_or_numbers(value: Any) -> Any:
     if not callable(value):
         return _number(value)
     check_signature("A force", "its function", value, ("t", "q", "v", "args"))
     return static_function(value)
 
 
-def _position(value: Any) -> Any:
+def position_function(value: Any) -> Any:
     check_signature("A force", "its point", value, ("t", "q", "args"))
     return static_function(value)
 
 
-def _of_phase(name: str, value: Any, like: Array, *arguments: Any) -> Array:
-    """Evaluate a number, an array or a function of (t, q, v, args), shaped `like`."""
+def of_phase(name: str, value: Any, like: Array, *arguments: Any) -> Array:
+    """Evaluate a number, an array or a function of the user, shaped `like`.
+
+    The function takes (t, q, v, args) or (t, q, v, multipliers, args).
+    """
     if callable(value):
-        with naming(f"{name}(t, q, v, args)", as_given(value), arguments[-1]):
+        names = ["t", "q", "v", "args"]
+        if len(arguments) > len(names):
+            names.insert(3, "multipliers")
+        with naming(f"{name}({', '.join(names)})", as_given(value), arguments[-1]):
             value = value(*arguments)
     value = jnp.asarray(value)
     if jnp.iscomplexobj(value):
@@ -82,7 +95,27 @@ def _of_phase(name: str, value: Any, like: Array, *arguments: Any) -> Array:
     return value.astype(like.dtype)
 
 
-class AbstractForce(AbstractOnManifold):
+class AbstractSummable(AbstractOnManifold):
+    """A generalised force that can be added to others and to functions of the user."""
+
+    def check_manifold(self, manifold: AbstractLieGroup | None) -> None:
+        """Accept every manifold, as functions of the user do."""
+
+    def __add__(self, other: Any) -> "Sum":
+        """Add another force, or a function F(t, q, v, args)."""
+        return Sum(cast(Any, self), other)
+
+    def __radd__(self, other: Any) -> "AbstractSummable":
+        """Add to a function F(t, q, v, args), or to the 0 with which `sum` starts."""
+        if type(other) is int and other == 0:
+            return self
+        return Sum(cast(Any, other), cast(Any, self))
+
+    # NumPy would add the elements of its arrays one by one.
+    __array_ufunc__ = None
+
+
+class AbstractForce(AbstractSummable):
     """A generalised force F(t, q, v, args), the `force` of a `LagrangianSystem`.
 
     Add forces, and functions of (t, q, v, args), with `+`. Their parameters are leaves:
@@ -108,25 +141,35 @@ class AbstractForce(AbstractOnManifold):
     ) -> Float[Array, " n"]:
         """Compute the generalised force."""
 
-    def check_manifold(self, manifold: AbstractLieGroup | None) -> None:
-        """Accept every manifold, as functions of the user do."""
 
-    def __add__(self, other: Any) -> "Sum":
-        """Add another force, or a function F(t, q, v, args)."""
-        return Sum(self, other)
+class AbstractForceOfReactions(AbstractSummable):
+    """A force F(t, q, v, multipliers, args) that depends on the reactions.
 
-    def __radd__(self, other: Any) -> "AbstractForce":
-        """Add to a function F(t, q, v, args), or to the 0 with which `sum` starts."""
-        if type(other) is int and other == 0:
-            return self
-        return Sum(cast(Any, other), self)
+    The forces of `nhjax.friction` are of this kind. Add them like other forces. To
+    define one, write a subclass with this method:
 
-    # NumPy would add the elements of its arrays one by one.
-    __array_ufunc__ = None
+    - `__call__(t, q, v, multipliers, args)`: the generalised force, of shape (n,), with
+        the multipliers of all constraints of the system in the order of
+        `State.multiplier`.
+    """
+
+    @abc.abstractmethod
+    def __call__(
+        self,
+        t: FloatScalarLike,
+        q: PyTree[Array],
+        v: Float[Array, " n"],
+        multipliers: Float[Array, " l"],
+        args: Args,
+    ) -> Float[Array, " n"]:
+        """Compute the generalised force."""
 
 
-class Sum(AbstractForce):
+class Sum(AbstractSummable):
     """The sum of forces and of functions F(t, q, v, args).
+
+    If a term depends on the multipliers, the sum is a force F(t, q, v, multipliers,
+    args).
 
     !!! example
 
@@ -140,10 +183,17 @@ class Sum(AbstractForce):
 
     terms: tuple[Callable[..., Any], ...]
 
-    def __init__(self, *terms: PhaseFunction):
+    def __init__(self, *terms: ForceFunction):
         for number, term in enumerate(terms):
-            check_signature("Sum", f"term {number}", term, ("t", "q", "v", "args"))
+            multipliers = ("multipliers",) if takes_multipliers(term) else ()
+            arguments = ("t", "q", "v", *multipliers, "args")
+            check_signature("Sum", f"term {number}", term, arguments)
         self.terms = tuple(map(static_function, terms))
+
+    @property
+    def takes_multipliers(self) -> bool:
+        """Whether the sum is called with the multipliers."""
+        return any(takes_multipliers(as_given(term)) for term in self.terms)
 
     def check_manifold(self, manifold: AbstractLieGroup | None) -> None:
         """Check the manifold of each term."""
@@ -156,13 +206,34 @@ class Sum(AbstractForce):
         t: FloatScalarLike,
         q: PyTree[Array],
         v: Float[Array, " n"],
-        args: Args = None,
+        *rest: Any,
     ) -> Float[Array, " n"]:
-        """Compute the sum."""
+        """Compute the sum.
+
+        The rest of the arguments are the multipliers, if a term takes them, and `args`,
+        by default None.
+        """
+        rest = rest or (None,)
         total = jnp.zeros_like(v)
         for term in self.terms:
-            total = total + _of_phase("force", term, v, t, q, v, args)
+            given = rest if takes_multipliers(as_given(term)) else rest[-1:]
+            total = total + of_phase("force", term, v, t, q, v, *given)
         return total
+
+
+def check_same_manifold(
+    name: str, own: AbstractLieGroup | None, of_system: AbstractLieGroup | None
+) -> None:
+    """Raise a `ValueError` unless a part of a force has the manifold of the system.
+
+    `name` is the class of the part.
+    """
+    kinds = (None if x is None or x.is_flat else type(x) for x in (own, of_system))
+    if len(set(kinds)) > 1:
+        raise ValueError(
+            f"`force` has the manifold {own}, and the system has {of_system}: pass the "
+            f"same `manifold=` to the force, {name}(..., manifold=...)."
+        )
 
 
 class _AbstractPulledBack(AbstractForce):
@@ -194,16 +265,7 @@ class _AbstractPulledBack(AbstractForce):
 
     def check_manifold(self, manifold: AbstractLieGroup | None) -> None:
         """Raise a `ValueError` unless the system has the manifold of this force."""
-        of_system, own = (
-            None if x is None or x.is_flat else type(x)
-            for x in (manifold, self.manifold)
-        )
-        if of_system is not own:
-            raise ValueError(
-                f"`force` has the manifold {self.manifold}, and the system has "
-                f"{manifold}: pass the same `manifold=` to the force, "
-                f"{type(self).__name__}(..., manifold=...)."
-            )
+        check_same_manifold(type(self).__name__, self.manifold, manifold)
 
     def _with_rate(self, t: Any, q: Any, v: Array, args: Any) -> tuple[Array, Array]:
         """Evaluate x(t, q) and ẋ = ∂x/∂t + ∂x/∂q · q̇."""
@@ -239,16 +301,16 @@ class PointForce(_AbstractPulledBack):
         Array([6.], dtype=float64)
     """
 
-    point: PositionFunction = eqx.field(converter=_position)
-    vector: ArrayLike | PhaseFunction = eqx.field(converter=_function_or_numbers)
+    point: PositionFunction = eqx.field(converter=position_function)
+    vector: ArrayLike | PhaseFunction = eqx.field(converter=function_or_numbers)
     manifold: AbstractLieGroup | None = eqx.field(default=None, kw_only=True)
 
     def _place(self, t: Any, q: Any, args: Any) -> Array:
-        return _at("point", self.point, t, q, args)
+        return value_at("point", self.point, t, q, args)
 
     def _covector(self, t: Any, q: Any, v: Array, args: Any) -> Array:
         x = self._place(t, q, args)
-        return _of_phase("vector", self.vector, x, t, q, v, args)
+        return of_phase("vector", self.vector, x, t, q, v, args)
 
 
 class Torque(_AbstractPulledBack):
@@ -276,12 +338,12 @@ class Torque(_AbstractPulledBack):
         Array([0., 0., 2.], dtype=float64)
     """
 
-    rotation: PositionFunction = eqx.field(converter=_position)
-    vector: ArrayLike | PhaseFunction = eqx.field(converter=_function_or_numbers)
+    rotation: PositionFunction = eqx.field(converter=position_function)
+    vector: ArrayLike | PhaseFunction = eqx.field(converter=function_or_numbers)
     manifold: AbstractLieGroup | None = eqx.field(default=None, kw_only=True)
 
     def _place(self, t: Any, q: Any, args: Any) -> Array:
-        rotation = _at("rotation", self.rotation, t, q, args)
+        rotation = value_at("rotation", self.rotation, t, q, args)
         if rotation.shape != (3, 3):
             raise ShapeError(
                 f"`rotation` must have shape (3, 3), got {rotation.shape}. For an "
@@ -291,7 +353,7 @@ class Torque(_AbstractPulledBack):
 
     def _covector(self, t: Any, q: Any, v: Array, args: Any) -> Array:
         rotation = self._place(t, q, args)
-        torque = _of_phase("vector", self.vector, rotation[0], t, q, v, args)
+        torque = of_phase("vector", self.vector, rotation[0], t, q, v, args)
         # With Ṙ = hat(ω) R the product of the matrices ½ hat(τ) R and Ṙ is τ · ω.
         return 0.5 * jnp.cross(torque[:, None], rotation, axis=0)
 
@@ -328,20 +390,20 @@ class Spring(_AbstractPulledBack):
         Array([ -9., -12.], dtype=float64)
     """
 
-    first: PositionFunction = eqx.field(converter=_position)
+    first: PositionFunction = eqx.field(converter=position_function)
     second: ArrayLike | PositionFunction = eqx.field(
-        converter=lambda x: _position(x) if callable(x) else _number(x)
+        converter=lambda x: position_function(x) if callable(x) else _number(x)
     )
-    stiffness: ArrayLike = eqx.field(converter=_scalar)
-    rest_length: ArrayLike = eqx.field(default=0.0, converter=_scalar, kw_only=True)
-    damping: ArrayLike = eqx.field(default=0.0, converter=_scalar, kw_only=True)
+    stiffness: ArrayLike = eqx.field(converter=scalar)
+    rest_length: ArrayLike = eqx.field(default=0.0, converter=scalar, kw_only=True)
+    damping: ArrayLike = eqx.field(default=0.0, converter=scalar, kw_only=True)
     manifold: AbstractLieGroup | None = eqx.field(default=None, kw_only=True)
 
     def _place(self, t: Any, q: Any, args: Any) -> Array:
-        first = _at("first", self.first, t, q, args)
+        first = value_at("first", self.first, t, q, args)
         second = self.second
         if callable(second):
-            second = _at("second", second, t, q, args)
+            second = value_at("second", second, t, q, args)
         second = jnp.asarray(second, first.dtype)
         if second.shape != first.shape or first.ndim != 1:
             raise ShapeError(
@@ -356,7 +418,9 @@ class Spring(_AbstractPulledBack):
         length = _length(d)
         apart = length > 0
         direction = jnp.where(apart, d / jnp.where(apart, length, 1), 0)
-        k, rest, damping = _like(d, self.stiffness, self.rest_length, self.damping)
+        k, rest, damping = in_precision_of(
+            d, self.stiffness, self.rest_length, self.damping
+        )
         return (k * rest - damping * jnp.sum(direction * rate)) * direction - k * d
 
 
@@ -391,24 +455,24 @@ class Drag(_AbstractPulledBack):
         Array([-33., -44.], dtype=float64)
     """
 
-    point: PositionFunction = eqx.field(converter=_position)
-    linear: ArrayLike = eqx.field(default=0.0, converter=_scalar, kw_only=True)
-    quadratic: ArrayLike = eqx.field(default=0.0, converter=_scalar, kw_only=True)
+    point: PositionFunction = eqx.field(converter=position_function)
+    linear: ArrayLike = eqx.field(default=0.0, converter=scalar, kw_only=True)
+    quadratic: ArrayLike = eqx.field(default=0.0, converter=scalar, kw_only=True)
     medium: ArrayLike | PhaseFunction | None = eqx.field(
         default=None,
-        converter=lambda x: None if x is None else _function_or_numbers(x),
+        converter=lambda x: None if x is None else function_or_numbers(x),
         kw_only=True,
     )
     manifold: AbstractLieGroup | None = eqx.field(default=None, kw_only=True)
 
     def _place(self, t: Any, q: Any, args: Any) -> Array:
-        return _at("point", self.point, t, q, args)
+        return value_at("point", self.point, t, q, args)
 
     def _covector(self, t: Any, q: Any, v: Array, args: Any) -> Array:
         _, u = self._with_rate(t, q, v, args)
         if self.medium is not None:
-            u = u - _of_phase("medium", self.medium, u, t, q, v, args)
-        linear, quadratic = _like(u, self.linear, self.quadratic)
+            u = u - of_phase("medium", self.medium, u, t, q, v, args)
+        linear, quadratic = in_precision_of(u, self.linear, self.quadratic)
         return -(linear + quadratic * _length(u)) * u
 
 
@@ -442,24 +506,70 @@ class Motor(_AbstractPulledBack):
         Array([0., 1.], dtype=float64)
     """
 
-    angle: PositionFunction = eqx.field(converter=_position)
-    command: ArrayLike | PhaseFunction = eqx.field(converter=_function_or_numbers)
-    stall_torque: ArrayLike = eqx.field(converter=_scalar, kw_only=True)
-    no_load_speed: ArrayLike = eqx.field(converter=_scalar, kw_only=True)
-    gear: ArrayLike = eqx.field(default=1.0, converter=_scalar, kw_only=True)
+    angle: PositionFunction = eqx.field(converter=position_function)
+    command: ArrayLike | PhaseFunction = eqx.field(converter=function_or_numbers)
+    stall_torque: ArrayLike = eqx.field(converter=scalar, kw_only=True)
+    no_load_speed: ArrayLike = eqx.field(converter=scalar, kw_only=True)
+    gear: ArrayLike = eqx.field(default=1.0, converter=scalar, kw_only=True)
     manifold: AbstractLieGroup | None = eqx.field(default=None, kw_only=True)
 
     def _place(self, t: Any, q: Any, args: Any) -> Array:
-        angle = _at("angle", self.angle, t, q, args)
-        if angle.shape != ():
-            raise ShapeError(f"`angle` must have shape (), got {angle.shape}.")
-        return angle
+        return _angle(self.angle, t, q, args)
 
     def _covector(self, t: Any, q: Any, v: Array, args: Any) -> Array:
         phi, rate = self._with_rate(t, q, v, args)
-        command = _of_phase("command", self.command, phi, t, q, v, args)
-        stall, free, gear = _like(phi, self.stall_torque, self.no_load_speed, self.gear)
+        command = of_phase("command", self.command, phi, t, q, v, args)
+        stall, free, gear = in_precision_of(
+            phi, self.stall_torque, self.no_load_speed, self.gear
+        )
         return gear * stall * (command - gear * rate / free)
+
+
+class Brake(_AbstractPulledBack):
+    """A brake on an angle, with the torque -τ tanh(φ̇ / ω₀).
+
+    **Arguments:**
+
+    - `angle`: φ, called as `angle(t, q, args)` [rad], of shape (): the rotation of the
+        wheel relative to what carries the brake.
+    - `torque`: τ >= 0 [N m], a number or a function of (t, q, v, args). For a friction
+        that depends on reactions use `nhjax.friction.JointFriction`.
+    - `smoothing`: ω₀ [rad/s]. Below it the brake acts like a damper, so that a wheel
+        which is held still turns slowly.
+    - `manifold`: the `manifold` of the system, required if it has one.
+
+    **Raises:** when called, `ShapeError` if φ or τ is not a scalar.
+
+    !!! example
+
+        >>> import jax.numpy as jnp
+        >>> from nhjax import forces
+        >>> brake = forces.Brake(lambda t, q, args: q[1], 3.0, smoothing=0.1)
+        >>> brake(0.0, jnp.zeros(2), jnp.array([0.0, -8.0]))
+        Array([0., 3.], dtype=float64)
+    """
+
+    angle: PositionFunction = eqx.field(converter=position_function)
+    torque: ArrayLike | PhaseFunction = eqx.field(converter=function_or_numbers)
+    smoothing: ArrayLike = eqx.field(converter=scalar, kw_only=True)
+    manifold: AbstractLieGroup | None = eqx.field(default=None, kw_only=True)
+
+    def _place(self, t: Any, q: Any, args: Any) -> Array:
+        return _angle(self.angle, t, q, args)
+
+    def _covector(self, t: Any, q: Any, v: Array, args: Any) -> Array:
+        phi, rate = self._with_rate(t, q, v, args)
+        torque = of_phase("torque", self.torque, phi, t, q, v, args)
+        (smoothing,) = in_precision_of(phi, self.smoothing)
+        return -torque * jnp.tanh(rate / smoothing)
+
+
+def _angle(angle: Any, t: Any, q: Any, args: Any) -> Array:
+    """Evaluate the angle of a motor or a brake."""
+    phi = value_at("angle", angle, t, q, args)
+    if phi.shape != ():
+        raise ShapeError(f"`angle` must have shape (), got {phi.shape}.")
+    return phi
 
 
 def saturated(x: ArrayLike, limit: ArrayLike) -> Array:
@@ -485,13 +595,13 @@ def saturated(x: ArrayLike, limit: ArrayLike) -> Array:
     return limit * jnp.tanh(jnp.asarray(x) / limit)
 
 
-def _at(name: str, function: Any, t: Any, q: Any, args: Any) -> Array:
+def value_at(name: str, function: Any, t: Any, q: Any, args: Any) -> Array:
     """Evaluate a function of (t, q, args) of the user."""
     with naming(f"{name}(t, q, args)", as_given(function), args):
         return jnp.asarray(function(t, q, args))
 
 
-def _like(x: Array, *numbers: ArrayLike) -> list[Array]:
+def in_precision_of(x: Array, *numbers: ArrayLike) -> list[Array]:
     """Convert numbers to the precision of x."""
     return [jnp.asarray(number, x.dtype) for number in numbers]
 

@@ -14,15 +14,23 @@ import abc
 import math
 import reprlib
 from collections.abc import Callable
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float, PyTree
 
-from ._custom_types import Args, FloatScalarLike, PositionFunction
+from ._custom_types import (
+    Args,
+    FloatScalar,
+    FloatScalarLike,
+    ForceFunction,
+    PositionFunction,
+)
 from ._errors import naming, ShapeError
+from ._integrate import Event
 from ._manifold import AbstractLieGroup
 from ._system import (
     as_given,
@@ -84,6 +92,25 @@ class Plane(eqx.Module):
     def unit_normal(self, dtype: Any) -> Float[Array, "3"]:
         """Return n / |n| in a precision."""
         return _unit(jnp.asarray(self.normal).astype(dtype))
+
+
+class ContactState(NamedTuple):
+    """The place of a contact and its velocities, as vectors in space.
+
+    - `position`, `rotation`: the pose of the body.
+    - `normal`: the unit normal of the ground.
+    - `travel`: the velocity of the origin of the body [m/s], relative to the ground.
+    - `velocity`: the velocity u of the point of the body that touches [m/s], relative
+        to the ground.
+    - `angular_velocity`: the angular velocity of the body [rad/s].
+    """
+
+    position: Float[Array, "3"]
+    rotation: Float[Array, "3 3"]
+    normal: Float[Array, "3"]
+    travel: Float[Array, "3"]
+    velocity: Float[Array, "3"]
+    angular_velocity: Float[Array, "3"]
 
 
 class AbstractContact(eqx.Module):
@@ -153,15 +180,37 @@ class AbstractContact(eqx.Module):
         args: Args = None,
     ) -> Float[Array, " k"]:
         """Compute the velocity at the contact in the directions without slip."""
+        at = self.state(t, q, v, args)
+        return self.directions(at.rotation, at.normal) @ at.velocity
+
+    def state(
+        self,
+        t: FloatScalarLike,
+        q: PyTree[Array],
+        v: Float[Array, " n"],
+        args: Args = None,
+    ) -> "ContactState":
+        """Compute the place and the velocities of the contact."""
         (position, rotation), (velocity, turning) = value_and_rate(
             lambda t, q: self.place(t, q, args), self.manifold, t, q, v
         )
         normal = self.ground.unit_normal(position.dtype)
         offset = self.offset(rotation, normal)
-        velocity = velocity + turning @ (rotation.T @ offset)
+        turned = turning @ (rotation.T @ offset)
+        travel, velocity = velocity, velocity + turned
         if self.ground.velocity is not None:
-            velocity = velocity - self.ground.velocity(t, position + offset, args)
-        return self.directions(rotation, normal) @ velocity
+            ground = self.ground.velocity(t, position + offset, args)
+            travel, velocity = travel - ground, velocity - ground
+        spin = turning @ rotation.T
+        angular = jnp.stack([spin[2, 1], spin[0, 2], spin[1, 0]])
+        return ContactState(position, rotation, normal, travel, velocity, angular)
+
+    @property
+    def num_directions(self) -> int:
+        """Return the number of directions without slip."""
+        unit = jax.ShapeDtypeStruct((3, 3), float)
+        normal = jax.ShapeDtypeStruct((3,), float)
+        return jax.eval_shape(self.directions, unit, normal).shape[0]
 
 
 class Wheel(AbstractContact):
@@ -443,26 +492,68 @@ class Contacts(eqx.Module):
         **Raises:** `ShapeError` if the state has another number of multipliers.
         """
         check_type("y", y, State)
-        rows, normals = [], []
-        for number, contact in enumerate(self.contacts):
-            position, rotation = contact.place(t, y.q, args)
+        return self.reactions(t, y.q, y.multiplier, args)
+
+    def reactions(
+        self,
+        t: FloatScalarLike,
+        q: PyTree[Array],
+        multipliers: Float[Array, " l"],
+        args: Args = None,
+    ) -> dict[str, Float[Array, "3"]]:
+        """Compute the same forces from multipliers, for a force of your own."""
+        self._check_multipliers(multipliers)
+        counts = [x.num_directions for x in self.contacts]
+        parts = jnp.split(multipliers[: sum(counts)], np.cumsum(counts)[:-1])
+        forces = {}
+        for name, contact, part in zip(self.names, self.contacts, parts, strict=True):
+            position, rotation = contact.place(t, q, args)
             normal = contact.ground.unit_normal(position.dtype)
-            rows.append(contact.directions(rotation, normal))
+            force = part @ contact.directions(rotation, normal)
             if contact.touches:
-                normals.append((number, normal))
-        counts = [len(x) for x in rows]
-        m, k = sum(counts), len(normals)
-        if y.multiplier.shape != (m + k,):
-            raise ShapeError(
-                f"The contacts have {m + k} multipliers, and `y.multiplier` has shape "
-                f"{y.multiplier.shape}: pass one state of a system that has the "
-                f"constraints of these contacts and no others."
+                force = force + self.load(name, multipliers) * normal
+            forces[name] = force
+        return forces
+
+    def load(self, name: str, multipliers: Float[Array, " l"]) -> Float[Array, ""]:
+        """Return the normal force on a contact that touches [N].
+
+        **Arguments:**
+
+        - `name`: the name of the contact.
+        - `multipliers`: the multipliers of the system.
+
+        **Raises:** `ValueError` if the contact has `touches=False`, so that its normal
+        force is not a multiplier; `ShapeError` for another number of multipliers.
+        """
+        contact = self[name]
+        if not contact.touches:
+            raise ValueError(
+                f"The normal force on {name!r} is not a multiplier, since its height "
+                "is not a constraint: pass the load [N] as `load=`."
             )
-        parts = jnp.split(y.multiplier[:m], np.cumsum(counts)[:-1])
-        forces = [part @ x for part, x in zip(parts, rows, strict=True)]
-        for multiplier, (number, normal) in zip(y.multiplier[m:], normals, strict=True):
-            forces[number] = forces[number] + multiplier * normal
-        return dict(zip(self.names, forces, strict=True))
+        self._check_multipliers(multipliers)
+        before = [x.touches for x in self.contacts[: self.names.index(name)]]
+        count = sum(x.num_directions for x in self.contacts)
+        return multipliers[count + sum(before)]
+
+    def __getitem__(self, name: str) -> AbstractContact:
+        """Return the contact of a name."""
+        if name not in self.names:
+            raise ValueError(
+                f"`contact` must be one of {', '.join(map(repr, self.names))}, got "
+                f"{name!r}."
+            )
+        return self.contacts[self.names.index(name)]
+
+    def _check_multipliers(self, multipliers: Array) -> None:
+        count = sum(x.num_directions + x.touches for x in self.contacts)
+        if multipliers.shape != (count,):
+            raise ShapeError(
+                f"The contacts have {count} multipliers, got multipliers of shape "
+                f"{multipliers.shape}: pass those of one state of a system that has "
+                f"the constraints of these contacts and no others."
+            )
 
     def _touching(self) -> list[AbstractContact]:
         return [x for x in self.contacts if x.touches]
@@ -471,3 +562,137 @@ class Contacts(eqx.Module):
         self, t: FloatScalarLike, q: PyTree[Array], args: Args = None
     ) -> Float[Array, " k"]:
         return jnp.stack([x.height(t, q, args) for x in self._touching()])
+
+
+def slips(
+    contacts: Contacts,
+    contact: str,
+    friction: ArrayLike,
+    *,
+    load: ArrayLike | ForceFunction | None = None,
+    **options: Any,
+) -> Event:
+    """Return the event that a contact needs more friction than there is.
+
+    Its function is the margin μ |N| - |F_t| [N] of the friction coefficient μ, the
+    normal force N and the force F_t of the constraints along the plane. The contact
+    rolls as long as the margin is positive.
+
+    **Arguments:**
+
+    - `contacts`, `contact`: the contacts of the system, and the name of one of them.
+    - `friction`: μ.
+    - `load`: N if the height of the contact is not a constraint: a number [N], or a
+        function of (t, q, v, multipliers, args).
+    - `options`: passed on to `nhjax.Event`; by default the event ends the run.
+
+    **Raises:** `ValueError` if there is no contact of this name, or no load.
+
+    !!! example
+
+        >>> import jax.numpy as jnp
+        >>> from nhjax import rolling
+        >>> blade = rolling.Blade(lambda t, q, args: (q, jnp.eye(3)), touches=False)
+        >>> contacts = rolling.Contacts(blade=blade)
+        >>> rolling.slips(contacts, "blade", 0.5, load=20.0).direction
+        False
+    """
+    margin = _Margin(contacts, contact, parameter(friction), checked_load(load))
+    if load is None and not contacts[contact].touches:
+        raise ValueError(
+            f"The height of {contact!r} is not a constraint: pass its load [N] as "
+            "`load=`."
+        )
+    return Event(margin, **{"direction": False, **options})
+
+
+def lifts_off(contacts: Contacts, contact: str, **options: Any) -> Event:
+    """Return the event that the normal force N [N] of a contact falls to zero.
+
+    A ground that does not hold the contact down loses it there.
+
+    **Arguments:**
+
+    - `contacts`, `contact`: the contacts of the system, and the name of one of them.
+    - `options`: passed on to `nhjax.Event`; by default the event ends the run.
+
+    **Raises:** `ValueError` if there is no contact of this name, or its height is not a
+    constraint.
+
+    !!! example
+
+        >>> import jax.numpy as jnp
+        >>> from nhjax import rolling
+        >>> blade = rolling.Blade(lambda t, q, args: (q, jnp.eye(3)))
+        >>> rolling.lifts_off(rolling.Contacts(blade=blade), "blade").terminate
+        True
+    """
+    return Event(_NormalForce(contacts, contact), **{"direction": False, **options})
+
+
+def checked_load(load: Any) -> Any:
+    """Convert the load of a contact: a number, a function or None."""
+    if callable(load):
+        arguments = ("t", "q", "v", "multipliers", "args")
+        check_signature("A contact", "load", load, arguments)
+        return static_function(load)
+    return None if load is None else parameter(load)
+
+
+def load_on(
+    contacts: Contacts,
+    contact: str,
+    load: Any,
+    t: Any,
+    q: Any,
+    v: Array,
+    multipliers: Array,
+    args: Any,
+) -> FloatScalar:
+    """Compute the load |N| on a contact [N]."""
+    if load is None:
+        return jnp.abs(contacts.load(contact, multipliers))
+    return absolute_load(load, t, q, v, multipliers, args)
+
+
+def absolute_load(
+    load: Any, t: Any, q: Any, v: Array, multipliers: Array, args: Any
+) -> FloatScalar:
+    """Compute |N| of a load that is a number or a function of the user [N]."""
+    if callable(load):
+        with naming("load(t, q, v, multipliers, args)", as_given(load), args):
+            load = load(t, q, v, multipliers, args)
+    load = jnp.asarray(load)
+    if load.shape != ():
+        raise ShapeError(f"`load` must be one number, got shape {load.shape}.")
+    return jnp.abs(load.astype(v.dtype))
+
+
+class _Margin(eqx.Module):
+    contacts: Contacts
+    contact: str = eqx.field(static=True)
+    friction: Array
+    load: Any
+
+    def __call__(self, t: Any, y: State, args: Any) -> FloatScalar:
+        given = t, y.q, y.v, y.multiplier, args
+        load = load_on(self.contacts, self.contact, self.load, *given)
+        force = self.contacts.forces(t, y, args)[self.contact]
+        normal = self.contacts[self.contact].ground.unit_normal(force.dtype)
+        along = force - (force @ normal) * normal
+        square = along @ along
+        size = jnp.sqrt(jnp.where(square > 0, square, 1))
+        friction = self.friction.astype(force.dtype)
+        return friction * load - jnp.where(square > 0, size, 0)
+
+
+class _NormalForce(eqx.Module):
+    contacts: Contacts
+    contact: str = eqx.field(static=True)
+
+    def __check_init__(self) -> None:
+        zeros = sum(x.num_directions + x.touches for x in self.contacts.contacts)
+        self.contacts.load(self.contact, jnp.zeros(zeros))
+
+    def __call__(self, t: Any, y: State, args: Any) -> FloatScalar:
+        return self.contacts.load(self.contact, y.multiplier)

@@ -13,6 +13,7 @@ from ._arguments import (
     parameter as parameter,
     parameters as parameters,
     real_scalar as real_scalar,
+    takes_multipliers as takes_multipliers,
 )
 from ._checks import (
     check_functions as check_functions,

@@ -150,7 +150,7 @@ def function_noise(
     """
     # This is a closure, because `args` may contain objects that are not arrays.
     positions = jax.eval_shape(lambda: system.position_constraint(t, q, args))
-    system, args = stop_gradient((system, args))
+    system, args, multiplier = stop_gradient((system, args, multiplier))
 
     def values(t, q, u):
         return FunctionNoise(

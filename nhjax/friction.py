@@ -1,0 +1,543 @@
+"""Friction in contacts, joints and tyres, proportional to the load that they carry.
+
+The load of a contact is a reaction, so that these forces depend on the multipliers. All
+laws are smooth: near rest the friction is proportional to the velocity, with a slope
+that a velocity u₀ sets. A contact that should rest on a slope therefore creeps. With
+u₀ = 1e-3 m/s it creeps slower than a millimetre each second. Steps of size h need
+h · (friction / mass) / u₀ of about one or less to converge fast.
+"""
+
+import abc
+import math
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, ArrayLike, Float, PyTree
+
+from ._custom_types import (
+    Args,
+    FloatScalar,
+    FloatScalarLike,
+    ForceFunction,
+    PositionFunction,
+)
+from ._errors import ShapeError
+from ._manifold import AbstractLieGroup, Euclidean
+from ._system import check_type, value_and_rate
+from .forces import (
+    AbstractForceOfReactions,
+    check_same_manifold,
+    in_precision_of,
+    position_function,
+    scalar,
+    value_at,
+)
+from .rolling import (
+    absolute_load,
+    AbstractContact,
+    checked_load,
+    Contacts,
+    ContactState,
+    load_on,
+)
+
+
+# --- Laws -----------------------------------------------------------------------------
+
+
+class AbstractFrictionLaw(eqx.Module):
+    """A friction coefficient μ(u) that depends on the sliding speed u.
+
+    To define a law, write a subclass with this method:
+
+    - `slope(square)`: μ(u) / u, as a smooth function of u² >= 0.
+    """
+
+    @abc.abstractmethod
+    def slope(self, square: FloatScalar) -> FloatScalar:
+        """Compute μ(u) / u from u²."""
+
+    def coefficient(self, speed: ArrayLike) -> Array:
+        """Compute μ(u), with the sign of u."""
+        speed = jnp.asarray(speed)
+        return speed * self.slope(speed * speed)
+
+
+class Coulomb(AbstractFrictionLaw):
+    """Coulomb's law, made smooth: μ(u) = μ tanh(u / u₀).
+
+    **Arguments:**
+
+    - `friction`: μ, the coefficient of friction.
+    - `smoothing`: u₀ [m/s]. At 3 u₀ the friction is 99.5 percent of μ; at 20 u₀ it is μ
+        to round-off.
+
+    !!! example
+
+        >>> from nhjax import friction
+        >>> float(friction.Coulomb(0.5, smoothing=0.01).coefficient(1.0))
+        0.5
+    """
+
+    friction: ArrayLike = eqx.field(converter=scalar)
+    smoothing: ArrayLike = eqx.field(converter=scalar, kw_only=True)
+
+    def slope(self, square: FloatScalar) -> FloatScalar:
+        """Compute μ(u) / u from u²."""
+        friction, smoothing = in_precision_of(square, self.friction, self.smoothing)
+        return friction / smoothing * _tanh_slope(square / smoothing**2)
+
+
+class Stribeck(AbstractFrictionLaw):
+    """Stribeck's law: static friction that falls to kinetic friction.
+
+    μ(u) = (μ_k + (μ_s - μ_k) exp(-(u / u_s)²)) tanh(u / u₀) + c u.
+
+    **Arguments:**
+
+    - `static`, `kinetic`: μ_s and μ_k.
+    - `stribeck_speed`: u_s [m/s].
+    - `smoothing`: u₀ [m/s], smaller than u_s.
+    - `viscous`: c [s/m].
+
+    !!! example
+
+        >>> from nhjax import friction
+        >>> law = friction.Stribeck(0.6, 0.4, stribeck_speed=0.1, smoothing=0.001)
+        >>> [round(float(law.coefficient(u)), 3) for u in (0.02, 1.0)]
+        [0.592, 0.4]
+    """
+
+    static: ArrayLike = eqx.field(converter=scalar)
+    kinetic: ArrayLike = eqx.field(converter=scalar)
+    stribeck_speed: ArrayLike = eqx.field(converter=scalar, kw_only=True)
+    smoothing: ArrayLike = eqx.field(converter=scalar, kw_only=True)
+    viscous: ArrayLike = eqx.field(default=0.0, converter=scalar, kw_only=True)
+
+    def slope(self, square: FloatScalar) -> FloatScalar:
+        """Compute μ(u) / u from u²."""
+        static, kinetic, stribeck, smoothing, viscous = in_precision_of(
+            square,
+            self.static,
+            self.kinetic,
+            self.stribeck_speed,
+            self.smoothing,
+            self.viscous,
+        )
+        friction = kinetic + (static - kinetic) * jnp.exp(-square / stribeck**2)
+        return friction / smoothing * _tanh_slope(square / smoothing**2) + viscous
+
+
+class LinearSlip(AbstractFrictionLaw):
+    """The law of a tyre that slips a little: μ(σ) = C σ, of the slip σ without unit.
+
+    **Arguments:**
+
+    - `stiffness`: C, the tyre's slip stiffness divided by its load; about 10 to 20 for
+        a car.
+
+    !!! example
+
+        >>> from nhjax import friction
+        >>> float(friction.LinearSlip(10.0).coefficient(0.05))
+        0.5
+    """
+
+    stiffness: ArrayLike = eqx.field(converter=scalar)
+
+    def slope(self, square: FloatScalar) -> FloatScalar:
+        """Compute C, the slope of the law."""
+        return in_precision_of(square, self.stiffness)[0]
+
+
+class MagicFormula(AbstractFrictionLaw):
+    """Pacejka's formula: μ(σ) = D sin(C atan(B σ - E (B σ - atan B σ))).
+
+    **Arguments:**
+
+    - `stiffness`, `shape`, `peak`, `curvature`: B, C, D and E, numbers without unit. D
+        is the largest friction coefficient, and B C D the slope at σ = 0.
+
+    !!! example
+
+        >>> from nhjax import friction
+        >>> tyre = friction.MagicFormula(10.0, 1.9, 1.0, 0.97)
+        >>> [round(float(tyre.coefficient(x)), 3) for x in (0.01, 0.15, 1.0)]
+        [0.188, 0.997, 0.915]
+    """
+
+    stiffness: ArrayLike = eqx.field(converter=scalar)
+    shape: ArrayLike = eqx.field(converter=scalar)
+    peak: ArrayLike = eqx.field(converter=scalar)
+    curvature: ArrayLike = eqx.field(converter=scalar)
+
+    def slope(self, square: FloatScalar) -> FloatScalar:
+        """Compute μ(σ) / σ from σ²."""
+        b, c, d, e = in_precision_of(
+            square, self.stiffness, self.shape, self.peak, self.curvature
+        )
+        # Each function is odd, and is evaluated as x f(x²).
+        first = b * (1 - e * (1 - _atan_slope(b * b * square)))
+        second = c * first * _atan_slope(first * first * square)
+        return d * second * _sin_slope(second * second * square)
+
+
+# --- Forces on contacts ---------------------------------------------------------------
+
+
+def _checked_contacts(contacts: Any) -> Contacts:
+    check_type("contacts", contacts, Contacts)
+    return contacts
+
+
+class _AbstractOnContact(AbstractForceOfReactions):
+    """A force -|N| f(r) r at a contact with the normal force N.
+
+    r is a velocity of the contact that depends on v linearly, and f > 0. The
+    generalised force is (∂r/∂v)ᵀ applied to it, so that the power is -|N| f(r) r².
+    """
+
+    contacts: eqx.AbstractVar[Contacts]
+    contact: eqx.AbstractVar[str]
+    load: eqx.AbstractVar[ArrayLike | ForceFunction | None]
+
+    def __check_init__(self) -> None:
+        if self.load is None and not self.contacts[self.contact].touches:
+            raise ValueError(
+                f"The height of {self.contact!r} is not a constraint: pass its load "
+                "[N] as `load=`."
+            )
+
+    @abc.abstractmethod
+    def _rate(self, contact: AbstractContact, at: ContactState) -> Array:
+        """Return the velocity r."""
+
+    @abc.abstractmethod
+    def _slope(self, at: ContactState, rate: Array) -> Array:
+        """Return f(r), the force for unit load divided by r."""
+
+    def check_manifold(self, manifold: AbstractLieGroup | None) -> None:
+        """Raise a `ValueError` unless the contact has the manifold of the system."""
+        contact = self.contacts[self.contact]
+        check_same_manifold(type(contact).__name__, contact.manifold, manifold)
+
+    def __call__(
+        self,
+        t: FloatScalarLike,
+        q: PyTree[Array],
+        v: Float[Array, " n"],
+        multipliers: Float[Array, " l"],
+        args: Args,
+    ) -> Float[Array, " n"]:
+        """Compute the generalised force."""
+        contact = self.contacts[self.contact]
+
+        def rate(v):
+            at = contact.state(t, q, v, args)
+            return self._rate(contact, at), at
+
+        r, pull_back, at = jax.vjp(rate, v, has_aux=True)
+        given = self.contacts, self.contact, self.load, t, q, v, multipliers, args
+        return pull_back(-load_on(*given) * self._slope(at, r) * r)[0]
+
+
+class Sliding(_AbstractOnContact):
+    """Friction of a contact that slides, in the directions that slip.
+
+    The force on the body is -|N| μ(u) in the direction of the velocity u at which the
+    contact slides. Only the part of u is used that the constraints of the contact leave
+    free: all of it if `no_slip=()`, and the part along a blade.
+
+    **Arguments:**
+
+    - `contacts`, `contact`: the contacts of the system, and the name of one of them.
+    - `law`: μ(u), such as `Coulomb(0.5, smoothing=0.001)`.
+    - `load`: N if the height of the contact is not a constraint: a number [N], or a
+        function of (t, q, v, multipliers, args). By default the multiplier of the
+        height.
+
+    **Raises:** `ValueError` if there is no contact of this name, no load, or no
+    direction in which the contact slips.
+
+    !!! example
+
+        >>> import jax.numpy as jnp
+        >>> from nhjax import friction, rolling
+        >>> contacts = rolling.Contacts(skate=rolling.Blade(
+        ...     lambda t, q, args: (q, jnp.eye(3)), touches=False))
+        >>> law = friction.Coulomb(0.25, smoothing=0.01)
+        >>> force = friction.Sliding(contacts, "skate", law, load=8.0)
+        >>> v = jnp.array([3.0, 0.0, 0.0])
+        >>> force(0.0, jnp.zeros(3), v, jnp.zeros(1), None)
+        Array([-2.,  0.,  0.], dtype=float64)
+    """
+
+    contacts: Contacts = eqx.field(converter=_checked_contacts)
+    contact: str = eqx.field(static=True)
+    law: AbstractFrictionLaw
+    load: ArrayLike | ForceFunction | None = eqx.field(
+        default=None, converter=checked_load, kw_only=True
+    )
+
+    def __check_init__(self) -> None:
+        check_type("law", self.law, AbstractFrictionLaw)
+        if self.contacts[self.contact].num_directions > 1:
+            raise ValueError(
+                f"The contact {self.contact!r} does not slip in any direction: give "
+                "it fewer directions `no_slip`."
+            )
+
+    def _rate(self, contact: AbstractContact, at: ContactState) -> Array:
+        return _sliding(contact, at)
+
+    def _slope(self, at: ContactState, rate: Array) -> Array:
+        return self.law.slope(rate @ rate)
+
+
+class Tyre(_AbstractOnContact):
+    """A tyre that slips a little: its force depends on the slip σ.
+
+    σ = u / (V² + V₀²)^½ with the velocity u at which the contact slides and the speed V
+    of the hub. The force on the wheel is -|N| μ(|σ|) σ / |σ|. Slip along and across the
+    wheel are treated alike, so that their forces share the friction.
+
+    **Arguments:**
+
+    - `contacts`, `contact`: the contacts of the system, and the name of one of them.
+    - `law`: μ(σ), a `LinearSlip` or a `MagicFormula`.
+    - `slowest`: V₀ [m/s]. Slip is not defined at rest: below V₀ the tyre is a damper.
+    - `load`: as for `Sliding`.
+
+    **Raises:** as `Sliding`.
+
+    !!! example
+
+        >>> import jax.numpy as jnp
+        >>> from nhjax import friction, rolling
+        >>> ball = rolling.Wheel(lambda t, q, args: (q, jnp.eye(3)), 0.3,
+        ...     no_slip=(), touches=False)
+        >>> tyre = friction.Tyre(rolling.Contacts(wheel=ball), "wheel",
+        ...     friction.LinearSlip(2.0), slowest=1e-3, load=10.0)
+        >>> v = jnp.array([0.0, 4.0, 0.0])
+        >>> tyre(0.0, jnp.zeros(3), v, jnp.zeros(0), None).round(4)
+        Array([  0., -20.,   0.], dtype=float64)
+    """
+
+    contacts: Contacts = eqx.field(converter=_checked_contacts)
+    contact: str = eqx.field(static=True)
+    law: AbstractFrictionLaw
+    slowest: ArrayLike = eqx.field(converter=scalar, kw_only=True)
+    load: ArrayLike | ForceFunction | None = eqx.field(
+        default=None, converter=checked_load, kw_only=True
+    )
+
+    def __check_init__(self) -> None:
+        Sliding(self.contacts, self.contact, self.law, load=0.0)
+
+    def _rate(self, contact: AbstractContact, at: ContactState) -> Array:
+        return _sliding(contact, at)
+
+    def _slope(self, at: ContactState, rate: Array) -> Array:
+        (slowest,) = in_precision_of(rate, self.slowest)
+        travel = _along_plane(at.travel, at)
+        square = travel @ travel + slowest * slowest
+        return self.law.slope(rate @ rate / square) / jnp.sqrt(square)
+
+
+class RollingResistance(_AbstractOnContact):
+    """Rolling resistance: a torque against the rolling of a wheel or a ball.
+
+    The torque is -|N| e tanh(|ω| / ω₀) in the direction of ω, the angular velocity
+    along the plane.
+
+    **Arguments:**
+
+    - `contacts`, `contact`: the contacts of the system, and the name of one of them.
+    - `arm`: e [m], by which the normal force is ahead of the contact: the coefficient
+        of rolling resistance times the radius.
+    - `smoothing`: ω₀ [rad/s].
+    - `load`: as for `Sliding`.
+
+    **Raises:** `ValueError` if there is no contact of this name, or no load.
+
+    !!! example
+
+        >>> import jax.numpy as jnp, nhjax
+        >>> from nhjax import friction, rolling
+        >>> group = nhjax.SO3()
+        >>> contacts = rolling.Contacts(ball=rolling.Ellipsoid(
+        ...     lambda t, q, args: (jnp.array([0.0, 0.0, 0.5]), group.matrix(q)), 0.5,
+        ...     touches=False, manifold=group))
+        >>> force = friction.RollingResistance(
+        ...     contacts, "ball", 0.01, smoothing=0.1, load=50.0)
+        >>> force(0.0, group.identity(), jnp.array([9.0, 0.0, 0.0]), jnp.zeros(2), None)
+        Array([-0.5,  0. ,  0. ], dtype=float64)
+    """
+
+    contacts: Contacts = eqx.field(converter=_checked_contacts)
+    contact: str = eqx.field(static=True)
+    arm: ArrayLike = eqx.field(converter=scalar)
+    smoothing: ArrayLike = eqx.field(converter=scalar, kw_only=True)
+    load: ArrayLike | ForceFunction | None = eqx.field(
+        default=None, converter=checked_load, kw_only=True
+    )
+
+    def _rate(self, contact: AbstractContact, at: ContactState) -> Array:
+        return _along_plane(at.angular_velocity, at)
+
+    def _slope(self, at: ContactState, rate: Array) -> Array:
+        return Coulomb(self.arm, smoothing=self.smoothing).slope(rate @ rate)
+
+
+class PivotingFriction(_AbstractOnContact):
+    """Friction against spinning about the normal of the plane.
+
+    The torque about the normal n is -|N| e tanh(ω · n / ω₀). A contact area of radius a
+    with an even pressure has e = 2/3 μ a.
+
+    **Arguments:** as for `RollingResistance`, with the angular velocity about the
+    normal in place of that along the plane.
+
+    **Raises:** as `RollingResistance`.
+
+    !!! example
+
+        >>> import jax.numpy as jnp, nhjax
+        >>> from nhjax import friction, rolling
+        >>> group = nhjax.SO3()
+        >>> contacts = rolling.Contacts(top=rolling.Ellipsoid(
+        ...     lambda t, q, args: (jnp.array([0.0, 0.0, 0.5]), group.matrix(q)), 0.5,
+        ...     touches=False, manifold=group))
+        >>> force = friction.PivotingFriction(
+        ...     contacts, "top", 0.01, smoothing=0.1, load=50.0)
+        >>> force(0.0, group.identity(), jnp.array([9.0, 0.0, 7.0]), jnp.zeros(2), None)
+        Array([ 0. ,  0. , -0.5], dtype=float64)
+    """
+
+    contacts: Contacts = eqx.field(converter=_checked_contacts)
+    contact: str = eqx.field(static=True)
+    arm: ArrayLike = eqx.field(converter=scalar)
+    smoothing: ArrayLike = eqx.field(converter=scalar, kw_only=True)
+    load: ArrayLike | ForceFunction | None = eqx.field(
+        default=None, converter=checked_load, kw_only=True
+    )
+
+    def _rate(self, contact: AbstractContact, at: ContactState) -> Array:
+        return (at.angular_velocity @ at.normal)[None]
+
+    def _slope(self, at: ContactState, rate: Array) -> Array:
+        return Coulomb(self.arm, smoothing=self.smoothing).slope(rate @ rate)
+
+
+class JointFriction(AbstractForceOfReactions):
+    """Friction in a joint, from the force that the joint carries.
+
+    A joint that slides along x has the force -|N| μ(ẋ). A bearing of radius r has the
+    torque -r |N| μ(r φ̇) on its angle φ.
+
+    **Arguments:**
+
+    - `coordinate`: x [m] or φ [rad], called as `coordinate(t, q, args)`, of shape ().
+    - `law`: μ(u), such as `Coulomb(0.1, smoothing=0.001)`.
+    - `load`: N [N], a number or a function of (t, q, v, multipliers, args).
+    - `radius`: r [m]; 1 for a joint that slides.
+    - `manifold`: the `manifold` of the system, required if it has one.
+
+    **Raises:** `TypeError` if an argument has a wrong type; when called, `ShapeError`
+    if the coordinate is not a scalar.
+
+    !!! example
+
+        >>> import jax.numpy as jnp
+        >>> from nhjax import friction
+        >>> law = friction.Coulomb(0.2, smoothing=0.01)
+        >>> slider = friction.JointFriction(lambda t, q, args: q[0], law,
+        ...     lambda t, q, v, multipliers, args: multipliers[0])
+        >>> slider(0.0, jnp.zeros(2), jnp.ones(2), jnp.array([-5.0]), None)
+        Array([-1.,  0.], dtype=float64)
+    """
+
+    coordinate: PositionFunction = eqx.field(converter=position_function)
+    law: AbstractFrictionLaw
+    load: ArrayLike | ForceFunction = eqx.field(converter=checked_load)
+    radius: ArrayLike = eqx.field(default=1.0, converter=scalar, kw_only=True)
+    manifold: AbstractLieGroup | None = eqx.field(default=None, kw_only=True)
+
+    def __check_init__(self) -> None:
+        check_type("law", self.law, AbstractFrictionLaw)
+
+    def check_manifold(self, manifold: AbstractLieGroup | None) -> None:
+        """Raise a `ValueError` unless the system has the manifold of this force."""
+        check_same_manifold(type(self).__name__, self.manifold, manifold)
+
+    def __call__(
+        self,
+        t: FloatScalarLike,
+        q: PyTree[Array],
+        v: Float[Array, " n"],
+        multipliers: Float[Array, " l"],
+        args: Args,
+    ) -> Float[Array, " n"]:
+        """Compute the generalised force."""
+
+        def coordinate(t, q):
+            return value_at("coordinate", self.coordinate, t, q, args)
+
+        x, rate = value_and_rate(coordinate, self.manifold, t, q, v)
+        if x.shape != ():
+            raise ShapeError(f"`coordinate` must have shape (), got {x.shape}.")
+        load = absolute_load(self.load, t, q, v, multipliers, args)
+        (radius,) = in_precision_of(x, self.radius)
+        force = -radius * load * self.law.coefficient(radius * rate)
+        manifold = Euclidean(q.shape[0]) if self.manifold is None else self.manifold
+        return manifold.left_gradient(lambda q: force * coordinate(t, q), q)
+
+
+def _along_plane(vector: Array, at: ContactState) -> Array:
+    return vector - (vector @ at.normal) * at.normal
+
+
+def _sliding(contact: AbstractContact, at: ContactState) -> Array:
+    """Return the part of the velocity along the plane that is not constrained."""
+    velocity = _along_plane(at.velocity, at)
+    for direction in contact.directions(at.rotation, at.normal):
+        velocity = velocity - (velocity @ direction) * direction
+    return velocity
+
+
+# --- f(x) / x as a function of x², for odd functions f --------------------------------
+
+# The series of these functions are used for x² below this number. With as many terms as
+# below, the error is smaller than the unit round-off.
+_SMALL = 0.01
+_SIN = [(-1) ** k / math.factorial(2 * k + 1) for k in range(5)]
+_ATAN = [(-1) ** k / (2 * k + 1) for k in range(9)]
+_TANH = [1, -1 / 3, 2 / 15, -17 / 315, 62 / 2835, -1382 / 155925, 21844 / 6081075]
+
+
+def _slope_of(
+    function: Callable[[Array], Array], coefficients: list[float], square: Array
+) -> Array:
+    """Compute f(x) / x from x², with accurate derivatives at x = 0 too."""
+    is_small = square < _SMALL
+    near = jnp.where(is_small, square, 0)
+    series = jnp.zeros_like(square)
+    for coefficient in reversed(coefficients):
+        series = coefficient + near * series
+    x = jnp.sqrt(jnp.where(is_small, 1, square))
+    return jnp.where(is_small, series, function(x) / x)
+
+
+def _tanh_slope(square: Array) -> Array:
+    return _slope_of(jnp.tanh, _TANH, square)
+
+
+def _atan_slope(square: Array) -> Array:
+    return _slope_of(jnp.arctan, _ATAN, square)
+
+
+def _sin_slope(square: Array) -> Array:
+    return _slope_of(jnp.sin, _SIN, square)
