@@ -9,8 +9,9 @@ from support.pages import blocks, DOCS, page, run_page
 
 
 PAGES = (
-    *("index", "start", "constraints", "forces", "lie_groups", "theory", "gallery"),
+    *("index", "start", "constraints", "forces", "friction", "lie_groups", "theory"),
     *("systems", "events", "derivatives", "engines", "performance", "machines"),
+    "gallery",
 )
 
 
