@@ -26,6 +26,7 @@ from ._manifold import AbstractLieGroup, Euclidean
 from ._system import (
     AbstractOnManifold,
     as_given,
+    check_same_manifold,
     check_signature,
     parameter,
     static_function,
@@ -105,7 +106,7 @@ class AbstractSummable(AbstractOnManifold):
         """Add another force, or a function F(t, q, v, args)."""
         return Sum(cast(Any, self), other)
 
-    def __radd__(self, other: Any) -> "AbstractSummable":
+    def __radd__(self, other: Any) -> Any:
         """Add to a function F(t, q, v, args), or to the 0 with which `sum` starts."""
         if type(other) is int and other == 0:
             return self
@@ -221,21 +222,6 @@ class Sum(AbstractSummable):
         return total
 
 
-def check_same_manifold(
-    name: str, own: AbstractLieGroup | None, of_system: AbstractLieGroup | None
-) -> None:
-    """Raise a `ValueError` unless a part of a force has the manifold of the system.
-
-    `name` is the class of the part.
-    """
-    kinds = (None if x is None or x.is_flat else type(x) for x in (own, of_system))
-    if len(set(kinds)) > 1:
-        raise ValueError(
-            f"`force` has the manifold {own}, and the system has {of_system}: pass the "
-            f"same `manifold=` to the force, {name}(..., manifold=...)."
-        )
-
-
 class _AbstractPulledBack(AbstractForce):
     """A force that acts on x(t, q): a point, an angle or a rotation."""
 
@@ -265,7 +251,7 @@ class _AbstractPulledBack(AbstractForce):
 
     def check_manifold(self, manifold: AbstractLieGroup | None) -> None:
         """Raise a `ValueError` unless the system has the manifold of this force."""
-        check_same_manifold(type(self).__name__, self.manifold, manifold)
+        check_same_manifold("force", self, self.manifold, manifold)
 
     def _with_rate(self, t: Any, q: Any, v: Array, args: Any) -> tuple[Array, Array]:
         """Evaluate x(t, q) and ẋ = ∂x/∂t + ∂x/∂q · q̇."""

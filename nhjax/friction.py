@@ -26,10 +26,9 @@ from ._custom_types import (
 )
 from ._errors import ShapeError
 from ._manifold import AbstractLieGroup, Euclidean
-from ._system import check_type, value_and_rate
+from ._system import check_same_manifold, check_type, value_and_rate
 from .forces import (
     AbstractForceOfReactions,
-    check_same_manifold,
     in_precision_of,
     position_function,
     scalar,
@@ -222,7 +221,7 @@ class _AbstractOnContact(AbstractForceOfReactions):
     def check_manifold(self, manifold: AbstractLieGroup | None) -> None:
         """Raise a `ValueError` unless the contact has the manifold of the system."""
         contact = self.contacts[self.contact]
-        check_same_manifold(type(contact).__name__, contact.manifold, manifold)
+        check_same_manifold("force", contact, contact.manifold, manifold)
 
     def __call__(
         self,
@@ -284,7 +283,7 @@ class Sliding(_AbstractOnContact):
 
     def __check_init__(self) -> None:
         check_type("law", self.law, AbstractFrictionLaw)
-        if self.contacts[self.contact].num_directions > 1:
+        if len(self.contacts[self.contact].no_slip) > 1:
             raise ValueError(
                 f"The contact {self.contact!r} does not slip in any direction: give "
                 "it fewer directions `no_slip`."
@@ -471,7 +470,7 @@ class JointFriction(AbstractForceOfReactions):
 
     def check_manifold(self, manifold: AbstractLieGroup | None) -> None:
         """Raise a `ValueError` unless the system has the manifold of this force."""
-        check_same_manifold(type(self).__name__, self.manifold, manifold)
+        check_same_manifold("force", self, self.manifold, manifold)
 
     def __call__(
         self,

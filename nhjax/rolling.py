@@ -1,12 +1,12 @@
-"""Rolling contacts as parts: wheels, balls and blades on a plane, from their poses.
+"""Rolling contacts as parts: wheels, balls and blades on the ground, from their poses.
 
 A contact is given by the pose of a body: its position x(t, q) in space and its rotation
-R(t, q). The point c of the body that touches the plane follows from its shape. Its
-height n · c - h is the holonomic constraint, and the components of its velocity
+R(t, q). The point c of the body that touches the ground follows from its shape. Its
+height above the ground is the holonomic constraint, and the components of its velocity
 
     u = ẋ + Ṙ Rᵀ (c - x) - w
 
-along the plane are the nonholonomic ones, with the velocity w of the ground. Each
+along the ground are the nonholonomic ones, with the velocity w of the ground. Each
 multiplier is the force in newtons in its direction.
 """
 
@@ -14,7 +14,7 @@ import abc
 import math
 import reprlib
 from collections.abc import Callable
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple, TypeAlias
 
 import equinox as eqx
 import jax
@@ -29,11 +29,14 @@ from ._custom_types import (
     ForceFunction,
     PositionFunction,
 )
-from ._errors import naming, ShapeError
+from ._errors import check_choice, naming, ShapeError
 from ._integrate import Event
 from ._manifold import AbstractLieGroup
+from ._numerics import inverse, max_norm, nan_unless, root
 from ._system import (
+    AbstractOnManifold,
     as_given,
+    check_same_manifold,
     check_signature,
     check_type,
     parameter,
@@ -61,7 +64,50 @@ def _unit(vector: Array) -> Array:
     return vector / jnp.sqrt(vector @ vector)
 
 
-class Plane(eqx.Module):
+class Touch(NamedTuple):
+    """Where a body is nearest to the ground.
+
+    - `point`: the point c of the body.
+    - `normal`: the unit normal of the ground there, which points away from it.
+    - `height`: the distance from the ground to the point, negative below the ground.
+    """
+
+    point: Float[Array, "3"]
+    normal: Float[Array, "3"]
+    height: FloatScalar
+
+
+class AbstractGround(eqx.Module):
+    """A ground that bodies roll on.
+
+    To define one, write a subclass with a field `velocity`, as `Plane` has it, and this
+    method:
+
+    - `touch(support, position, args)`: find where a convex body is nearest.
+        `support(normal)` is its point that is farthest in the direction -normal, and
+        `position` the origin of the body.
+    """
+
+    velocity: eqx.AbstractVar[Callable[[Any, Any, Any], Any] | None]
+
+    @abc.abstractmethod
+    def touch(
+        self,
+        support: Callable[[Float[Array, "3"]], Float[Array, "3"]],
+        position: Float[Array, "3"],
+        args: Args,
+    ) -> Touch:
+        """Find the point of a convex body that is nearest to the ground."""
+
+
+def _velocity(function: Any) -> Any:
+    if function is None:
+        return None
+    check_signature("A ground", "velocity", function, ("t", "x", "args"))
+    return static_function(function)
+
+
+class Plane(AbstractGround):
     """A plane that bodies roll on: all points x with n · x = h.
 
     **Arguments:**
@@ -84,20 +130,166 @@ class Plane(eqx.Module):
     )
     height: ArrayLike = eqx.field(default=0.0, converter=parameter, kw_only=True)
     velocity: Callable[[Any, Any, Any], Any] | None = eqx.field(
-        default=None,
-        converter=lambda f: None if f is None else static_function(f),
-        kw_only=True,
+        default=None, converter=_velocity, kw_only=True
     )
 
     def unit_normal(self, dtype: Any) -> Float[Array, "3"]:
         """Return n / |n| in a precision."""
         return _unit(jnp.asarray(self.normal).astype(dtype))
 
+    def touch(
+        self,
+        support: Callable[[Float[Array, "3"]], Float[Array, "3"]],
+        position: Float[Array, "3"],
+        args: Args,
+    ) -> Touch:
+        """Find the lowest point of a body."""
+        normal = self.unit_normal(position.dtype)
+        point = support(normal)
+        height = jnp.asarray(self.height).astype(point.dtype)
+        return Touch(point, normal, normal @ point - height)
+
+
+class Surface(AbstractGround):
+    """A curved ground, z = f(x, y).
+
+    The body touches where its surface and the ground have opposite normals. This point
+    is found by Newton's method in each evaluation, and differentiated by the implicit
+    function theorem. There must be only one such point near the body: in a hollow, the
+    body must be more curved than the ground.
+
+    **Arguments:**
+
+    - `elevation`: f, called as `elevation(x, args)` with x of shape (2,) [m]; returns a
+        scalar [m]. It must be smooth. `Heightfield` makes one from numbers on a grid.
+    - `velocity`: as for `Plane`.
+
+    !!! example
+
+        >>> import jax.numpy as jnp
+        >>> from nhjax import rolling
+        >>> bowl = rolling.Surface(lambda x, args: 0.5 * x @ x)
+        >>> ball = rolling.Ellipsoid(lambda t, q, args: (q, jnp.eye(3)), 0.25,
+        ...     ground=bowl)
+        >>> float(ball.height(0.0, jnp.array([0.0, 0.0, 0.5])))
+        0.25
+    """
+
+    elevation: Callable[[Any, Any], Any] = eqx.field(
+        converter=lambda f: static_function(f)
+    )
+    velocity: Callable[[Any, Any, Any], Any] | None = eqx.field(
+        default=None, converter=_velocity, kw_only=True
+    )
+
+    def __check_init__(self) -> None:
+        function = as_given(self.elevation)
+        check_signature("Surface", "elevation", function, ("x", "args"))
+
+    def touch(
+        self,
+        support: Callable[[Float[Array, "3"]], Float[Array, "3"]],
+        position: Float[Array, "3"],
+        args: Args,
+    ) -> Touch:
+        """Find the point where the normals of body and ground are opposite."""
+
+        def ground(x):
+            with naming("elevation(x, args)", as_given(self.elevation), args):
+                z, slope = jax.value_and_grad(lambda x: self.elevation(x, args))(x)
+            return jnp.append(x, z), slope, _unit(jnp.append(-slope, jnp.ones_like(z)))
+
+        def between(x):
+            below, slope, normal = ground(x)
+            apart = support(normal) - below
+            # The vectors (1, 0, ∂f/∂x) and (0, 1, ∂f/∂y) are tangent to the ground.
+            return apart[:2] + slope * apart[2]
+
+        def solve(jacobian, b):
+            return inverse(jacobian) @ b
+
+        lowest = support(jnp.eye(3, dtype=position.dtype)[2])
+        found = root(between, lowest[:2], max_norm(lowest), solve=solve)
+        below, _, normal = ground(nan_unless(found.converged, found.x))
+        point = support(normal)
+        return Touch(point, normal, normal @ (point - below))
+
+
+class Heightfield(eqx.Module):
+    """The elevation of a `Surface` through given heights on a rectangular grid.
+
+    The surface is a cubic spline, which has continuous curvature. Outside of the grid
+    the polynomials at its border continue. Orders of methods above 3 are not reached
+    where a contact crosses a line of the grid.
+
+    **Arguments:**
+
+    - `heights`: z [m], of shape (k, l) with k, l >= 4: the entry (i, j) is the height
+        at x = x₀ + i d, y = y₀ + j d.
+    - `spacing`: d [m].
+    - `origin`: (x₀, y₀) [m].
+
+    **Raises:** `ShapeError` if the heights do not have such a shape.
+
+    !!! example
+
+        >>> import numpy as np, jax.numpy as jnp
+        >>> from nhjax import rolling
+        >>> x = 0.5 * np.arange(8.0)
+        >>> hill = rolling.Heightfield(np.sin(x)[:, None] + 0 * x, 0.5)
+        >>> round(float(hill(jnp.array([1.5, 0.7]))), 6)
+        0.997495
+    """
+
+    coefficients: Float[np.ndarray, "k l"]
+    spacing: float = eqx.field(static=True)
+    origin: tuple[float, float] = eqx.field(static=True)
+
+    def __init__(
+        self,
+        heights: Any,
+        spacing: float,
+        origin: tuple[float, float] = (0.0, 0.0),
+    ):
+        given = np.asarray(heights, float)
+        if given.ndim != 2 or min(given.shape) < 4:
+            raise ShapeError(
+                "`heights` must have the shape (k, l) with k, l >= 4, got "
+                f"{given.shape}."
+            )
+        import scipy.ndimage
+
+        # Two more rows on each side are enough for a point at the border.
+        padded = np.pad(given, 8, mode="reflect", reflect_type="odd")
+        spline = scipy.ndimage.spline_filter(padded, order=3, mode="mirror")
+        self.coefficients = spline[6:-6, 6:-6]
+        self.spacing = float(spacing)
+        self.origin = (float(origin[0]), float(origin[1]))
+
+    def __call__(self, x: Float[Array, "2"], args: Args = None) -> FloatScalar:
+        """Compute the height at x."""
+        place = (x - jnp.asarray(self.origin, x.dtype)) / self.spacing
+        last = jnp.asarray(np.asarray(self.coefficients.shape) - 6, x.dtype)
+        cell = jnp.clip(jnp.floor(jax.lax.stop_gradient(place)), 0 * last, last)
+        weights = jax.vmap(_spline_weights)(place - cell)
+        # The coefficient of the first row of the grid has the index 2.
+        first = cell.astype(jnp.int32) + 1
+        coefficients = jnp.asarray(self.coefficients, x.dtype)
+        near = jax.lax.dynamic_slice(coefficients, first, (4, 4))
+        return weights[0] @ near @ weights[1]
+
+
+def _spline_weights(x: FloatScalar) -> Float[Array, "4"]:
+    """Return the cubic B-splines at -1, 0, 1, 2, evaluated at x in [0, 1]."""
+    y = 1 - x
+    return jnp.stack([y**3, 4 - 6 * x**2 + 3 * x**3, 4 - 6 * y**2 + 3 * y**3, x**3]) / 6
+
 
 class ContactState(NamedTuple):
     """The place of a contact and its velocities, as vectors in space.
 
-    - `position`, `rotation`: the pose of the body.
+    - `rotation`: the rotation of the body.
+    - `point`: the point of the body that touches.
     - `normal`: the unit normal of the ground.
     - `travel`: the velocity of the origin of the body [m/s], relative to the ground.
     - `velocity`: the velocity u of the point of the body that touches [m/s], relative
@@ -105,44 +297,57 @@ class ContactState(NamedTuple):
     - `angular_velocity`: the angular velocity of the body [rad/s].
     """
 
-    position: Float[Array, "3"]
     rotation: Float[Array, "3 3"]
+    point: Float[Array, "3"]
     normal: Float[Array, "3"]
     travel: Float[Array, "3"]
     velocity: Float[Array, "3"]
     angular_velocity: Float[Array, "3"]
 
 
+NoSlip: TypeAlias = tuple[Literal["along", "across"] | float, ...]
+
+
 class AbstractContact(eqx.Module):
-    """A body that touches a plane in one point.
+    """A convex body that touches the ground in one point.
 
     To define a shape, write a subclass with the fields below and two methods:
 
-    - `offset(rotation, normal)`: c - x, the vector from the origin of the body to the
-        point that touches, in space.
-    - `directions(rotation, normal)`: the directions along the plane in which the body
-        does not slip, the rows of a matrix of shape (k, 3).
+    - `offset(rotation, normal)`: the vector from the origin of the body to its point
+        that is farthest in the direction -normal, in space.
+    - `axes(rotation, normal)`: two directions along the ground that are perpendicular
+        to each other, `along` and `across`, of shape (2, 3).
     """
 
     pose: eqx.AbstractVar[PositionFunction]
-    ground: eqx.AbstractVar[Plane]
+    no_slip: eqx.AbstractVar[NoSlip]
     touches: eqx.AbstractVar[bool]
+    ground: eqx.AbstractVar[AbstractGround]
     manifold: eqx.AbstractVar[AbstractLieGroup | None]
 
     def __check_init__(self) -> None:
-        check_type("ground", self.ground, Plane)
+        check_type("ground", self.ground, AbstractGround)
+        names = ("along", "across")
+        if isinstance(self.no_slip, str) or any(
+            x not in names if isinstance(x, str) else not isinstance(x, int | float)
+            for x in self.no_slip
+        ):
+            raise ValueError(
+                '`no_slip` must be a tuple of "along", "across" and angles in radians, '
+                f"got {self.no_slip!r}."
+            )
 
     @abc.abstractmethod
     def offset(
         self, rotation: Float[Array, "3 3"], normal: Float[Array, "3"]
     ) -> Float[Array, "3"]:
-        """Compute c - x, from the origin of the body to the contact, in space."""
+        """Compute the vector from the origin of the body to the contact, in space."""
 
     @abc.abstractmethod
-    def directions(
+    def axes(
         self, rotation: Float[Array, "3 3"], normal: Float[Array, "3"]
-    ) -> Float[Array, "k 3"]:
-        """Compute the directions in which the body does not slip."""
+    ) -> Float[Array, "2 3"]:
+        """Compute the directions `along` and `across`."""
 
     def place(
         self, t: FloatScalarLike, q: PyTree[Array], args: Args
@@ -157,20 +362,57 @@ class AbstractContact(eqx.Module):
             )
         return position, rotation
 
+    def touch(self, t: FloatScalarLike, q: PyTree[Array], args: Args = None) -> Touch:
+        """Compute where the body is nearest to the ground."""
+        position, rotation = self.place(t, q, args)
+        return self._touch(position, rotation, args)
+
+    def _touch(self, position: Array, rotation: Array, args: Args) -> Touch:
+        def support(normal):
+            return position + self.offset(rotation, normal)
+
+        return self.ground.touch(support, position, args)
+
     def point(
         self, t: FloatScalarLike, q: PyTree[Array], args: Args = None
     ) -> Float[Array, "3"]:
-        """Compute the point c of the body that touches the plane."""
-        position, rotation = self.place(t, q, args)
-        return position + self.offset(rotation, self.ground.unit_normal(position.dtype))
+        """Compute the point c of the body that touches the ground."""
+        return self.touch(t, q, args).point
 
     def height(
         self, t: FloatScalarLike, q: PyTree[Array], args: Args = None
     ) -> Float[Array, ""]:
-        """Compute n · c - h, the height of that point above the plane."""
-        point = self.point(t, q, args)
-        height = jnp.asarray(self.ground.height).astype(point.dtype)
-        return self.ground.unit_normal(point.dtype) @ point - height
+        """Compute the height of that point above the ground."""
+        return self.touch(t, q, args).height
+
+    def frame(
+        self, t: FloatScalarLike, q: PyTree[Array], args: Args = None
+    ) -> Float[Array, "3 3"]:
+        """Compute the frame of the contact: the rows are along, across and normal."""
+        position, rotation = self.place(t, q, args)
+        normal = self._touch(position, rotation, args).normal
+        return jnp.concatenate([self.axes(rotation, normal), normal[None]])
+
+    def state(
+        self,
+        t: FloatScalarLike,
+        q: PyTree[Array],
+        v: Float[Array, " n"],
+        args: Args = None,
+    ) -> ContactState:
+        """Compute the place and the velocities of the contact."""
+        (position, rotation), (velocity, turning) = value_and_rate(
+            lambda t, q: self.place(t, q, args), self.manifold, t, q, v
+        )
+        point, normal, _ = self._touch(position, rotation, args)
+        travel = velocity
+        velocity = velocity + turning @ (rotation.T @ (point - position))
+        if self.ground.velocity is not None:
+            ground = self.ground.velocity(t, point, args)
+            travel, velocity = travel - ground, velocity - ground
+        spin = turning @ rotation.T
+        angular = jnp.stack([spin[2, 1], spin[0, 2], spin[1, 0]])
+        return ContactState(rotation, point, normal, travel, velocity, angular)
 
     def slip(
         self,
@@ -183,42 +425,28 @@ class AbstractContact(eqx.Module):
         at = self.state(t, q, v, args)
         return self.directions(at.rotation, at.normal) @ at.velocity
 
-    def state(
-        self,
-        t: FloatScalarLike,
-        q: PyTree[Array],
-        v: Float[Array, " n"],
-        args: Args = None,
-    ) -> "ContactState":
-        """Compute the place and the velocities of the contact."""
-        (position, rotation), (velocity, turning) = value_and_rate(
-            lambda t, q: self.place(t, q, args), self.manifold, t, q, v
-        )
-        normal = self.ground.unit_normal(position.dtype)
-        offset = self.offset(rotation, normal)
-        turned = turning @ (rotation.T @ offset)
-        travel, velocity = velocity, velocity + turned
-        if self.ground.velocity is not None:
-            ground = self.ground.velocity(t, position + offset, args)
-            travel, velocity = travel - ground, velocity - ground
-        spin = turning @ rotation.T
-        angular = jnp.stack([spin[2, 1], spin[0, 2], spin[1, 0]])
-        return ContactState(position, rotation, normal, travel, velocity, angular)
-
-    @property
-    def num_directions(self) -> int:
-        """Return the number of directions without slip."""
-        unit = jax.ShapeDtypeStruct((3, 3), float)
-        normal = jax.ShapeDtypeStruct((3,), float)
-        return jax.eval_shape(self.directions, unit, normal).shape[0]
+    def directions(
+        self, rotation: Float[Array, "3 3"], normal: Float[Array, "3"]
+    ) -> Float[Array, "k 3"]:
+        """Compute the directions in which the body does not slip."""
+        axes = self.axes(rotation, normal)
+        unit = {"along": (1.0, 0.0), "across": (0.0, 1.0)}
+        weights = [
+            unit[x] if isinstance(x, str) else (math.cos(x), math.sin(x))
+            for x in self.no_slip
+        ]
+        return jnp.asarray(weights, axes.dtype).reshape(-1, 2) @ axes
 
 
 class Wheel(AbstractContact):
     """A wheel, a disc with a thin rim or a tyre that is a torus.
 
-    The rolling direction is `along` = axle x n, normalised, and `across` = n x `along`.
+    The direction `along` = axle x n, normalised, is the rolling direction, and `across`
+    = n x `along`.
 
-    The axle must not be perpendicular to the plane: there is no lowest point then.
+    The axle must not be perpendicular to the ground: there is no lowest point then. A
+    track that runs over a sprocket is a wheel too, with the radius of the sprocket,
+    under the middle of the track.
 
     **Arguments:**
 
@@ -230,11 +458,12 @@ class Wheel(AbstractContact):
     - `axle`: the direction of the axle in the frame of the wheel.
     - `no_slip`: the directions in which the wheel does not slip: `"along"`, `"across"`,
         or an angle [rad] from `along` towards `across`. An omni wheel has
-        `("along",)`, a mecanum wheel the angle of the axle of its rollers, π/4 or -π/4.
-        If two wheels share an axle, only one of them needs `"across"`.
+        `("along",)`, a mecanum wheel the angle of the axle of its rollers, π/4 or -π/4,
+        and a wheel that slides `()`. If two wheels share an axle, only one of them
+        needs `"across"`.
     - `touches`: whether the height of the contact is a constraint. Pass False if the
         coordinates fix the height, as the coordinates (x, y, heading) of a robot do.
-    - `ground`: the plane.
+    - `ground`: a `Plane` or a `Surface`; by default the plane z = 0.
     - `manifold`: the manifold of the system, if it has one.
 
     **Raises:** `ValueError` if `no_slip` has another name; when called, `ShapeError` if
@@ -260,23 +489,10 @@ class Wheel(AbstractContact):
     axle: Float[ArrayLike, "3"] = eqx.field(
         default=(0.0, 1.0, 0.0), converter=_vector, kw_only=True
     )
-    no_slip: tuple[Literal["along", "across"] | float, ...] = eqx.field(
-        default=("along", "across"), static=True, kw_only=True
-    )
+    no_slip: NoSlip = eqx.field(default=("along", "across"), static=True, kw_only=True)
     touches: bool = eqx.field(default=True, static=True, kw_only=True)
-    ground: Plane = eqx.field(default_factory=Plane, kw_only=True)
+    ground: AbstractGround = eqx.field(default_factory=Plane, kw_only=True)
     manifold: AbstractLieGroup | None = eqx.field(default=None, kw_only=True)
-
-    def __check_init__(self) -> None:
-        names = ("along", "across")
-        if isinstance(self.no_slip, str) or any(
-            x not in names if isinstance(x, str) else not isinstance(x, int | float)
-            for x in self.no_slip
-        ):
-            raise ValueError(
-                '`no_slip` must be a tuple of "along", "across" and angles in radians, '
-                f"got {self.no_slip!r}."
-            )
 
     def offset(
         self, rotation: Float[Array, "3 3"], normal: Float[Array, "3"]
@@ -289,20 +505,12 @@ class Wheel(AbstractContact):
         down = _unit((normal @ axle) * axle - normal)
         return radius * down - tube * normal
 
-    def directions(
+    def axes(
         self, rotation: Float[Array, "3 3"], normal: Float[Array, "3"]
-    ) -> Float[Array, "k 3"]:
-        """Compute the directions of `no_slip`."""
+    ) -> Float[Array, "2 3"]:
+        """Compute the rolling direction, and the direction across it."""
         along = _unit(jnp.cross(self._axle(rotation), normal))
-        across = jnp.cross(normal, along)
-        named = {"along": along, "across": across}
-        rows = [
-            named[x]
-            if isinstance(x, str)
-            else math.cos(x) * along + math.sin(x) * across
-            for x in self.no_slip
-        ]
-        return jnp.stack(rows) if rows else jnp.zeros((0, 3), along.dtype)
+        return jnp.stack([along, jnp.cross(normal, along)])
 
     def _axle(self, rotation: Array) -> Array:
         return rotation @ _unit(jnp.asarray(self.axle).astype(rotation.dtype))
@@ -311,8 +519,8 @@ class Wheel(AbstractContact):
 class Ellipsoid(AbstractContact):
     """An ellipsoid or a ball that rolls, and may spin about the normal.
 
-    The two directions without slip are fixed axes of the plane; for a horizontal plane
-    with the normal (0, 0, 1) they are x and y.
+    The directions `along` and `across` do not turn with the body; for a horizontal
+    plane with the normal (0, 0, 1) they are x and y.
 
     **Arguments:**
 
@@ -320,9 +528,8 @@ class Ellipsoid(AbstractContact):
         ellipsoid [m], of shape (3,), and the rotation to space, of shape (3, 3).
     - `semi_axes`: three lengths [m] along the axes of the body, or the radius of a
         ball.
-    - `touches`: whether the height of the contact is a constraint.
-    - `ground`: the plane.
-    - `manifold`: the manifold of the system, if it has one.
+    - `no_slip`: the directions in which the body does not slip; `()` if it slides.
+    - `touches`, `ground`, `manifold`: as for `Wheel`.
 
     **Raises:** when called, `ShapeError` if the pose has other shapes.
 
@@ -337,8 +544,9 @@ class Ellipsoid(AbstractContact):
 
     pose: PositionFunction = eqx.field(converter=_pose)
     semi_axes: ArrayLike = eqx.field(converter=jnp.asarray)
+    no_slip: NoSlip = eqx.field(default=("along", "across"), static=True, kw_only=True)
     touches: bool = eqx.field(default=True, static=True, kw_only=True)
-    ground: Plane = eqx.field(default_factory=Plane, kw_only=True)
+    ground: AbstractGround = eqx.field(default_factory=Plane, kw_only=True)
     manifold: AbstractLieGroup | None = eqx.field(default=None, kw_only=True)
 
     def __check_init__(self) -> None:
@@ -359,10 +567,10 @@ class Ellipsoid(AbstractContact):
         scaled = axes * (rotation.T @ normal)
         return -rotation @ (axes * _unit(scaled))
 
-    def directions(
+    def axes(
         self, rotation: Float[Array, "3 3"], normal: Float[Array, "3"]
     ) -> Float[Array, "2 3"]:
-        """Return two fixed axes of the plane."""
+        """Return two directions that do not depend on the body."""
         x, y, _ = jnp.eye(3, dtype=normal.dtype)
         first = _unit(jnp.cross(jnp.where(jnp.abs(normal[1]) < 0.9, y, x), normal))
         return jnp.stack([first, jnp.cross(normal, first)])
@@ -371,14 +579,15 @@ class Ellipsoid(AbstractContact):
 class Blade(AbstractContact):
     """A blade, a skate or a keel that does not move sideways.
 
+    The direction `across` is its lateral direction, along the ground, and `along` =
+    `across` x n.
+
     **Arguments:**
 
     - `pose`: called as `pose(t, q, args)`; returns the position of the point that
         touches [m], of shape (3,), and the rotation of the blade, of shape (3, 3).
     - `lateral`: the direction in the frame of the blade in which it does not move.
-    - `touches`: whether the height of the point is a constraint.
-    - `ground`: the plane.
-    - `manifold`: the manifold of the system, if it has one.
+    - `no_slip`, `touches`, `ground`, `manifold`: as for `Wheel`.
 
     **Raises:** when called, `ShapeError` if the pose has other shapes.
 
@@ -395,8 +604,9 @@ class Blade(AbstractContact):
     lateral: Float[ArrayLike, "3"] = eqx.field(
         default=(0.0, 1.0, 0.0), converter=_vector, kw_only=True
     )
+    no_slip: NoSlip = eqx.field(default=("across",), static=True, kw_only=True)
     touches: bool = eqx.field(default=True, static=True, kw_only=True)
-    ground: Plane = eqx.field(default_factory=Plane, kw_only=True)
+    ground: AbstractGround = eqx.field(default_factory=Plane, kw_only=True)
     manifold: AbstractLieGroup | None = eqx.field(default=None, kw_only=True)
 
     def offset(
@@ -405,12 +615,13 @@ class Blade(AbstractContact):
         """Return zero: the position of the pose is the point that touches."""
         return jnp.zeros_like(normal)
 
-    def directions(
+    def axes(
         self, rotation: Float[Array, "3 3"], normal: Float[Array, "3"]
-    ) -> Float[Array, "1 3"]:
-        """Compute the lateral direction, along the plane."""
+    ) -> Float[Array, "2 3"]:
+        """Compute the direction of the blade and the lateral direction."""
         lateral = rotation @ jnp.asarray(self.lateral).astype(rotation.dtype)
-        return _unit(lateral - (lateral @ normal) * normal)[None]
+        across = _unit(lateral - (lateral @ normal) * normal)
+        return jnp.stack([jnp.cross(across, normal), across])
 
 
 class Contacts(eqx.Module):
@@ -418,6 +629,7 @@ class Contacts(eqx.Module):
 
     Pass its `nonholonomic` and its `holonomic` to `LagrangianSystem`. The multipliers
     are in the order of the contacts: first all that prevent slip, then all heights.
+    Each is None if there are no such constraints. `multiplier_names` lists them.
 
     **Arguments:**
 
@@ -451,20 +663,17 @@ class Contacts(eqx.Module):
         self.names = tuple(contacts)
         self.contacts = tuple(contacts.values())
 
-    def nonholonomic(
-        self,
-        t: FloatScalarLike,
-        q: PyTree[Array],
-        v: Float[Array, " n"],
-        args: Args = None,
-    ) -> Float[Array, " m"]:
-        """Compute the velocities at all contacts in the directions without slip."""
-        return jnp.concatenate([x.slip(t, q, v, args) for x in self.contacts])
+    @property
+    def nonholonomic(self) -> "Slips | None":
+        """The velocities at the contacts that do not slip, or None if all slide."""
+        rolling = tuple(x for x in self.contacts if x.no_slip)
+        return Slips(rolling) if rolling else None
 
     @property
-    def holonomic(self) -> PositionFunction | None:
+    def holonomic(self) -> "Heights | None":
         """The heights of the contacts that touch, or None if there are none."""
-        return self._heights if self._touching() else None
+        touching = tuple(x for x in self.contacts if x.touches)
+        return Heights(touching) if touching else None
 
     def points(
         self, t: FloatScalarLike, q: PyTree[Array], args: Args = None
@@ -474,25 +683,44 @@ class Contacts(eqx.Module):
         return dict(zip(self.names, points, strict=True))
 
     def forces(
-        self, t: FloatScalarLike, y: State, args: Args = None
+        self,
+        t: FloatScalarLike,
+        y: State,
+        args: Args = None,
+        *,
+        frame: Literal["space", "contact"] = "space",
     ) -> dict[str, Float[Array, "3"]]:
         """Compute the force of the ground on each body at its contact [N].
 
-        The force is a vector in space, from the multipliers of the state. A contact
-        with `touches=False` lacks the part along the normal, which the coordinates
-        hide, and every contact lacks the parts in directions that are not constrained.
+        It follows from the multipliers of the state. A contact with `touches=False`
+        lacks the part along the normal, which the coordinates hide, and every contact
+        lacks the parts in directions that are not constrained.
 
         **Arguments:**
 
         - `t`, `y`, `args`: the time, the state and the arguments of the system. The
             system must have the constraints of these contacts and no others.
+        - `frame`: whether the force is a vector in space, or has the components along,
+            across and normal of the frame of the contact.
 
         **Returns:** vectors of shape (3,), by the names of the contacts.
 
         **Raises:** `ShapeError` if the state has another number of multipliers.
         """
         check_type("y", y, State)
-        return self.reactions(t, y.q, y.multiplier, args)
+        check_choice("`frame`", frame, ("space", "contact"))
+        forces = self.reactions(t, y.q, y.multiplier, args)
+        if frame == "space":
+            return forces
+        pairs = zip(self.names, self.contacts, strict=True)
+        return {name: x.frame(t, y.q, args) @ forces[name] for name, x in pairs}
+
+    @property
+    def multiplier_names(self) -> tuple[str, ...]:
+        """The name of each multiplier, such as "wheel along" and "wheel normal"."""
+        pairs = list(zip(self.names, self.contacts, strict=True))
+        slips = [f"{name} {x}" for name, contact in pairs for x in contact.no_slip]
+        return (*slips, *(f"{name} normal" for name, x in pairs if x.touches))
 
     def reactions(
         self,
@@ -503,12 +731,12 @@ class Contacts(eqx.Module):
     ) -> dict[str, Float[Array, "3"]]:
         """Compute the same forces from multipliers, for a force of your own."""
         self._check_multipliers(multipliers)
-        counts = [x.num_directions for x in self.contacts]
+        counts = [len(x.no_slip) for x in self.contacts]
         parts = jnp.split(multipliers[: sum(counts)], np.cumsum(counts)[:-1])
         forces = {}
         for name, contact, part in zip(self.names, self.contacts, parts, strict=True):
-            position, rotation = contact.place(t, q, args)
-            normal = contact.ground.unit_normal(position.dtype)
+            _, rotation = contact.place(t, q, args)
+            normal = contact.touch(t, q, args).normal
             force = part @ contact.directions(rotation, normal)
             if contact.touches:
                 force = force + self.load(name, multipliers) * normal
@@ -534,7 +762,7 @@ class Contacts(eqx.Module):
             )
         self._check_multipliers(multipliers)
         before = [x.touches for x in self.contacts[: self.names.index(name)]]
-        count = sum(x.num_directions for x in self.contacts)
+        count = sum(len(x.no_slip) for x in self.contacts)
         return multipliers[count + sum(before)]
 
     def __getitem__(self, name: str) -> AbstractContact:
@@ -547,7 +775,7 @@ class Contacts(eqx.Module):
         return self.contacts[self.names.index(name)]
 
     def _check_multipliers(self, multipliers: Array) -> None:
-        count = sum(x.num_directions + x.touches for x in self.contacts)
+        count = sum(len(x.no_slip) + x.touches for x in self.contacts)
         if multipliers.shape != (count,):
             raise ShapeError(
                 f"The contacts have {count} multipliers, got multipliers of shape "
@@ -555,13 +783,43 @@ class Contacts(eqx.Module):
                 f"the constraints of these contacts and no others."
             )
 
-    def _touching(self) -> list[AbstractContact]:
-        return [x for x in self.contacts if x.touches]
 
-    def _heights(
+class Slips(AbstractOnManifold):
+    """The nonholonomic constraints of contacts: their velocities without slip."""
+
+    contacts: tuple[AbstractContact, ...]
+
+    def check_manifold(self, manifold: AbstractLieGroup | None) -> None:
+        """Raise a `ValueError` unless all contacts have the manifold of the system."""
+        for contact in self.contacts:
+            check_same_manifold("nonholonomic", contact, contact.manifold, manifold)
+
+    def __call__(
+        self,
+        t: FloatScalarLike,
+        q: PyTree[Array],
+        v: Float[Array, " n"],
+        args: Args = None,
+    ) -> Float[Array, " m"]:
+        """Compute the velocities of all contacts in the directions without slip."""
+        return jnp.concatenate([x.slip(t, q, v, args) for x in self.contacts])
+
+
+class Heights(AbstractOnManifold):
+    """The holonomic constraints of contacts: their heights above the ground."""
+
+    contacts: tuple[AbstractContact, ...]
+
+    def check_manifold(self, manifold: AbstractLieGroup | None) -> None:
+        """Raise a `ValueError` unless all contacts have the manifold of the system."""
+        for contact in self.contacts:
+            check_same_manifold("holonomic", contact, contact.manifold, manifold)
+
+    def __call__(
         self, t: FloatScalarLike, q: PyTree[Array], args: Args = None
     ) -> Float[Array, " k"]:
-        return jnp.stack([x.height(t, q, args) for x in self._touching()])
+        """Compute the heights of all contacts."""
+        return jnp.stack([x.height(t, q, args) for x in self.contacts])
 
 
 def slips(
@@ -677,10 +935,8 @@ class _Margin(eqx.Module):
     def __call__(self, t: Any, y: State, args: Any) -> FloatScalar:
         given = t, y.q, y.v, y.multiplier, args
         load = load_on(self.contacts, self.contact, self.load, *given)
-        force = self.contacts.forces(t, y, args)[self.contact]
-        normal = self.contacts[self.contact].ground.unit_normal(force.dtype)
-        along = force - (force @ normal) * normal
-        square = along @ along
+        force = self.contacts.forces(t, y, args, frame="contact")[self.contact]
+        square = force[:2] @ force[:2]
         size = jnp.sqrt(jnp.where(square > 0, square, 1))
         friction = self.friction.astype(force.dtype)
         return friction * load - jnp.where(square > 0, size, 0)
@@ -691,7 +947,7 @@ class _NormalForce(eqx.Module):
     contact: str = eqx.field(static=True)
 
     def __check_init__(self) -> None:
-        zeros = sum(x.num_directions + x.touches for x in self.contacts.contacts)
+        zeros = sum(len(x.no_slip) + x.touches for x in self.contacts.contacts)
         self.contacts.load(self.contact, jnp.zeros(zeros))
 
     def __call__(self, t: Any, y: State, args: Any) -> FloatScalar:

@@ -316,7 +316,7 @@ def test_other_numbers_of_a_force_are_used_and_compile_nothing(caplog):
 def test_force_with_another_manifold_than_its_system_is_refused(on_force, on_system):
     force = forces.PointForce(lambda t, q, args: q[:2], [1.0, 0.0], manifold=on_force)
     for total in (force, force + force):
-        with pytest.raises(ValueError, match="pass the same `manifold=` to the force"):
+        with pytest.raises(ValueError, match="pass the same `manifold=` to the part"):
             nhjax.LagrangianSystem(_kinetic, force=total, manifold=on_system)
 
 

@@ -572,7 +572,7 @@ def _free_pose(t, q, args):
     return q[4:], SO3.matrix(q[:4])
 
 
-def _ball(no_slip, *forces_on, **options):
+def _ball(no_slip, *forces_on):
     """A ball of 1 kg and radius 0.1 m on a plane, on SE(3)."""
     if no_slip:
         ball = rolling.Ellipsoid(_free_pose, 0.1, manifold=SE3)
@@ -586,7 +586,7 @@ def _ball(no_slip, *forces_on, **options):
         lambda t, q, v, args: (
             0.5 * v[:3] @ v[:3] + 0.5 * inertia * v[3:] @ v[3:] - G * q[6]
         ),
-        nonholonomic=contacts.nonholonomic if no_slip else None,
+        nonholonomic=contacts.nonholonomic,
         holonomic=contacts.holonomic,
         force=made,
         manifold=SE3,
@@ -602,7 +602,7 @@ def test_ball_that_slides_and_spins_keeps_the_closed_form():
     """A ball with back spin slows down by μ g, and gains the spin 5/2 μ g t / r."""
     mu = 0.2
     law = friction.Coulomb(mu, smoothing=1e-3)
-    contacts, system = _ball(False, lambda c: friction.Sliding(c, "ball", law))
+    contacts, system = _ball((), lambda c: friction.Sliding(c, "ball", law))
     y0 = _ball_start(system, [3.0, 0.0, 0.0, 0.0, -8.0, 3.0])
     sol = nhjax.integrate(system, nhjax.LobattoIIIAB(5), y0, dt=0.01, num_steps=20)
     y, t = _last(sol), 0.2
@@ -618,7 +618,7 @@ def test_ball_that_slides_and_spins_keeps_the_closed_form():
 def test_ball_with_rolling_and_pivoting_friction_keeps_the_closed_form():
     arm = 2e-3
     _, system = _ball(
-        True,
+        ("along", "across"),
         lambda c: friction.RollingResistance(c, "ball", arm, smoothing=0.05),
         lambda c: friction.PivotingFriction(c, "ball", 0.5 * arm, smoothing=0.05),
     )
@@ -680,7 +680,7 @@ def _driven_wheel(no_slip, *terms):
         lambda t, q, v, args: (
             0.5 * v @ (jnp.array([MASS, MASS, INERTIA]) * v) - MASS * G * q[1]
         ),
-        nonholonomic=contacts.nonholonomic if no_slip else None,
+        nonholonomic=contacts.nonholonomic,
         holonomic=contacts.holonomic,
         force=made,
     )
@@ -787,9 +787,7 @@ def test_friction_with_wrong_argument_is_refused_by_name(make, message):
 
 def test_friction_of_a_contact_with_another_manifold_is_refused():
     law = friction.Coulomb(0.2, smoothing=1e-3)
-    contacts = rolling.Contacts(
-        ball=rolling.Wheel(_free_pose, 0.0, tube_radius=0.1, no_slip=())
-    )
+    contacts = rolling.Contacts(ball=rolling.Ellipsoid(_free_pose, 0.1, no_slip=()))
     with pytest.raises(ValueError, match="manifold"):
         nhjax.LagrangianSystem(
             lambda t, q, v, args: 0.5 * v @ v,

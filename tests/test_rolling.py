@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import scipy.optimize
 
 import nhjax
 from nhjax import rolling
@@ -162,6 +163,131 @@ def test_sleigh_with_a_blade_keeps_the_closed_form():
     np.testing.assert_allclose(sol.ys.multiplier[-1], [3.0], atol=1e-9)
 
 
+# --- Curved ground -----------------------------------------------------------------
+
+
+def _gallery_bowl():
+    ball = nhjax.systems.BallInBowl.rolling((0.5, 0.1), (0.2, 1.2), 2.0, shape="sphere")
+    centre = 1 / float(ball.curvature)
+    radius = centre + float(ball.radius)
+
+    def elevation(x, args):
+        return centre - jnp.sqrt(radius**2 - x @ x)
+
+    def turning(t, x, args):
+        return ball.rate * jnp.stack([-x[1], x[0], 0.0 * x[2]])
+
+    return ball, elevation, turning
+
+
+def _ball_on(ball, ground):
+    def pose(t, q, args):
+        return q[1], SO3.matrix(q[0])
+
+    contact = rolling.Ellipsoid(
+        pose, ball.radius, ground=ground, manifold=ball.manifold
+    )
+    return rolling.Contacts(ball=contact)
+
+
+def test_ball_in_a_bowl_from_parts_moves_like_that_of_the_gallery():
+    ball, elevation, turning = _gallery_bowl()
+    contacts = _ball_on(ball, rolling.Surface(elevation, velocity=turning))
+    system = _replaced(ball.system, contacts)
+    _assert_same_motion(ball.system, system, ball.q0, ball.v0)
+    y, by_hand = nhjax.initial_state(system, ball.q0, ball.v0), ball.initial_state()
+    slope = ball.bowl.slope(ball.q0[1])
+    multipliers = by_hand.multiplier
+    force = jnp.append(multipliers[:2], 0.0) + multipliers[2] * slope
+    np.testing.assert_allclose(contacts.forces(0.0, y)["ball"], force, atol=1e-11)
+
+
+@pytest.mark.parametrize("s", [2, 3])
+def test_run_on_a_curved_ground_has_the_order_of_the_method(s):
+    ball, elevation, turning = _gallery_bowl()
+    ground = rolling.Surface(elevation, velocity=turning)
+    system = _replaced(ball.system, _ball_on(ball, ground))
+    exact = nhjax.integrate(
+        ball.system,
+        nhjax.LobattoIIIAB(5),
+        ball.initial_state(),
+        dt=0.0125,
+        num_steps=32,
+    )
+    errors = []
+    for num_steps in (16, 32):
+        y0 = nhjax.initial_state(system, ball.q0, ball.v0)
+        method = nhjax.LobattoIIIAB(s)
+        dt = 0.4 / num_steps
+        sol = nhjax.integrate(system, method, y0, dt=dt, num_steps=num_steps)
+        assert sol.stats["max_constraint_violation"] < 1e-13
+        moved = sol.ys.q[1][-1] - exact.ys.q[1][-1]
+        errors.append(np.abs(moved).max())
+    np.testing.assert_allclose(np.log2(errors[0] / errors[1]), method.order, atol=0.3)
+
+
+def test_height_of_an_ellipsoid_over_a_hill_equals_the_smallest_distance():
+    semi_axes = np.array([0.3, 0.2, 0.1])
+
+    def elevation(x, args):
+        return args * jnp.sin(1.5 * x[0]) * jnp.cos(x[1])
+
+    egg = rolling.Ellipsoid(
+        _free_body, semi_axes, ground=rolling.Surface(elevation), manifold=SE3
+    )
+    for _ in range(3):
+        q = jnp.concatenate([SO3.identity(), jnp.asarray(RNG.uniform(-1, 1, 3))])
+        q = SE3.act(q, jnp.asarray(RNG.normal(size=6)))
+        q = q.at[6].set(1.2)
+
+        @jax.jit
+        @jax.value_and_grad
+        def distance(z, q=q):
+            a, b = z[:2]
+            direction = [jnp.cos(a) * jnp.cos(b), jnp.sin(a) * jnp.cos(b), jnp.sin(b)]
+            place = q[4:] + SO3.matrix(q[:4]) @ (semi_axes * jnp.stack(direction))
+            return jnp.sum((place - jnp.append(z[2:], elevation(z[2:], 0.3))) ** 2)
+
+        found = min(
+            scipy.optimize.minimize(
+                distance, [a, -0.5, q[4], q[5]], jac=True, tol=1e-12
+            ).fun
+            for a in (0.0, 2.0, 4.0)
+        )
+        height = float(egg.height(0.0, q, 0.3))
+        np.testing.assert_allclose(height, np.sqrt(found), rtol=1e-7)
+
+
+def test_heightfield_passes_through_its_heights_with_continuous_curvature():
+    heights = RNG.normal(size=(7, 5))
+    ground = rolling.Heightfield(heights, 0.5, (-1.0, 2.0))
+    for i in range(7):
+        for j in range(5):
+            x = jnp.array([-1.0 + 0.5 * i, 2.0 + 0.5 * j])
+            np.testing.assert_allclose(ground(x), heights[i, j], atol=1e-12)
+    curvature = jax.hessian(ground)
+    for point in ([0.0, 2.7], [-0.2, 3.0]):
+        x, e = jnp.array(point), 1e-9
+        np.testing.assert_allclose(curvature(x - e), curvature(x + e), atol=1e-5)
+
+
+def test_ball_on_a_heightfield_moves_like_on_the_surface_that_it_samples():
+    ball, elevation, _ = _gallery_bowl()
+    x = np.linspace(-0.64, 0.64, 129)
+    places = jnp.asarray(np.stack(np.meshgrid(x, x, indexing="ij"), axis=-1))
+    heights = jax.vmap(jax.vmap(lambda x: elevation(0.8 * x, None)))(places)
+    sampled = rolling.Heightfield(heights, x[1] - x[0], (x[0], x[0]))
+    found = []
+    for function in (sampled, lambda x, args: elevation(0.8 * x, None)):
+        contacts = _ball_on(ball, rolling.Surface(function))
+        system = _replaced(ball.system, contacts)
+        q = (ball.q0[0], jnp.array([0.3, 0.1, 0.3]))
+        y = nhjax.initial_state(system, q, ball.v0, project=True)
+        found.append(nhjax.motion(system, 0.0, y).acceleration)
+    np.testing.assert_allclose(found[0], found[1], atol=1e-4)
+    assert np.abs(found[1]).max() > 1
+
+
 # --- New machines ------------------------------------------------------------------
 
 
@@ -283,6 +409,7 @@ def test_contacts_keep_the_precision_of_the_state(dtype):
     )
     contacts = rolling.Contacts(wheel=wheel)
     q, v = torus.q0.astype(dtype), torus.v0.astype(dtype)
+    assert contacts.nonholonomic is not None
     assert contacts.nonholonomic(0.0, q, v).dtype == dtype
     assert contacts.holonomic is not None
     assert contacts.holonomic(0.0, q, None).dtype == dtype
@@ -314,7 +441,7 @@ def test_contacts_keep_the_precision_of_the_state(dtype):
         (
             lambda: rolling.Blade(_free_body, ground=cast(Any, (0, 0, 1))),
             TypeError,
-            "`ground` must be an nhjax.Plane",
+            "`ground` must be an nhjax.AbstractGround",
         ),
         (
             lambda: rolling.Contacts(wheel=cast(Any, _free_body)),
@@ -326,6 +453,37 @@ def test_contacts_keep_the_precision_of_the_state(dtype):
 def test_contact_with_wrong_argument_is_refused_by_name(make, error, message):
     with pytest.raises(error, match=message):
         make()
+
+
+def test_contact_without_the_manifold_of_its_system_is_refused():
+    wheel = rolling.Wheel(_free_body, 0.3)
+    with pytest.raises(ValueError, match=r"Wheel\(\.\.\., manifold="):
+        nhjax.LagrangianSystem(
+            lambda t, q, v, args: 0.5 * v @ v,
+            nonholonomic=rolling.Contacts(wheel=wheel).nonholonomic,
+            manifold=SE3,
+        )
+
+
+def test_heights_of_wrong_shape_are_refused_by_name():
+    with pytest.raises(nhjax.ShapeError, match="`heights` must have the shape"):
+        rolling.Heightfield(np.zeros((3, 8)), 0.1)
+
+
+def test_forces_in_the_frame_of_the_contact_are_those_in_space_turned():
+    torus = nhjax.systems.RollingTorus.circling(tilt=1.1, radius_of_path=0.4)
+    wheel = rolling.Wheel(_free_body, 0.5, axle=(0, 0, 1), manifold=SE3)
+    contacts = rolling.Contacts(wheel=wheel)
+    assert contacts.multiplier_names == ("wheel along", "wheel across", "wheel normal")
+    system = _replaced(torus.system, contacts)
+    y = nhjax.initial_state(system, torus.q0, torus.v0, project=True)
+    in_frame = contacts.forces(0.0, y, frame="contact")["wheel"]
+    np.testing.assert_allclose(in_frame, y.multiplier, atol=1e-12)
+    frame = wheel.frame(0.0, torus.q0)
+    np.testing.assert_allclose(frame @ frame.T, np.eye(3), atol=1e-15)
+    np.testing.assert_allclose(
+        frame.T @ in_frame, contacts.forces(0.0, y)["wheel"], atol=1e-12
+    )
 
 
 def test_pose_of_wrong_shape_is_refused_by_name():

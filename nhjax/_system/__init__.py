@@ -3,6 +3,7 @@
 from ._arguments import (
     all_finite as all_finite,
     check_flag as check_flag,
+    check_same_manifold as check_same_manifold,
     check_signature as check_signature,
     check_type as check_type,
     configuration as configuration,

@@ -312,6 +312,30 @@ def check_manifold(owner: Any) -> None:
         )
 
 
+def check_same_manifold(
+    name: str,
+    part: object,
+    own: AbstractLieGroup | None,
+    of_system: AbstractLieGroup | None,
+) -> None:
+    """Raise a `ValueError` unless a part has the manifold of its system.
+
+    **Arguments:**
+
+    - `name`: the name of the argument of the system that has the part.
+    - `part`: the part, such as a force or a contact.
+    - `own`, `of_system`: the manifold of the part and of the system.
+    """
+    kinds = (None if x is None or x.is_flat else type(x) for x in (own, of_system))
+    if len(set(kinds)) > 1:
+        kind = type(part).__name__
+        raise ValueError(
+            f"`{name}` has a {kind} with the manifold {own}, and the system has "
+            f"{of_system}: pass the same `manifold=` to the part, "
+            f"{kind}(..., manifold=...)."
+        )
+
+
 def check_coordinates(owner: Any) -> None:
     """Raise unless the `coordinates` of `owner` are a tuple of names, or None."""
     names = owner.coordinates

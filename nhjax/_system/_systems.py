@@ -163,8 +163,10 @@ class AbstractMechanicalSystem(eqx.Module):
         check_constraints(self)
         check_manifold(self)
         check_coordinates(self)
-        if isinstance(self.force, AbstractOnManifold):
-            self.force.check_manifold(self.manifold)
+        for name in self.signatures():
+            function = getattr(self, name)
+            if isinstance(function, AbstractOnManifold):
+                function.check_manifold(self.manifold)
 
     @abstractmethod
     def momentum(
