@@ -174,6 +174,13 @@ SYSTEMS = [
         "returns `jnp.hstack([f(t, q, v, args), g(t, q, v, args)])`",
     ),
     row(
+        "gave a list of forces",
+        lambda: system_with(force=[lambda t, q, v, args: v, lambda t, q, v, args: q]),
+        TypeError,
+        "`force` must be one function of (t, q, v, args), got a list of 2",
+        "Add forces f and g: `nhjax.forces.Sum(f, g)`.",
+    ),
+    row(
         "took the time last in the Lagrangian",
         lambda: system_with(lagrangian=lambda q, v, t, args: 0.5 * v @ v),
         TypeError,

@@ -212,10 +212,13 @@ def check_signature(
     """
     expected = f"({', '.join(arguments)})"
     if isinstance(function, tuple | list) and all(map(callable, function)):
+        advice = f"Join functions f and g by one that returns `jnp.hstack([f{expected}, "
+        advice += f"g{expected}])`."
+        if name == "force":
+            advice = "Add forces f and g: `nhjax.forces.Sum(f, g)`."
         raise TypeError(
             f"{owner}: `{name}` must be one function of {expected}, got a "
-            f"{type(function).__name__} of {len(function)}. Join functions f and g by "
-            f"one that returns `jnp.hstack([f{expected}, g{expected}])`."
+            f"{type(function).__name__} of {len(function)}. {advice}"
         )
     if not callable(function):
         raise TypeError(
@@ -259,6 +262,8 @@ def check_third_argument(
     else:
         refused, passed = {"v"}, "the momentum p"
         remedy = "Write the function in terms of p, and name the argument p."
+        if name == "force":
+            remedy += " Forces of nhjax that use velocities need a LagrangianSystem."
     if refused.isdisjoint(given):
         return
     message = (
