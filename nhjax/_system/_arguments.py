@@ -212,8 +212,8 @@ def check_signature(
     """
     expected = f"({', '.join(arguments)})"
     if isinstance(function, tuple | list) and all(map(callable, function)):
-        advice = f"Join functions f and g by one that returns `jnp.hstack([f{expected}, "
-        advice += f"g{expected}])`."
+        joined = f"`jnp.hstack([f{expected}, g{expected}])`"
+        advice = f"Join functions f and g by one that returns {joined}."
         if name == "force":
             advice = "Add forces f and g: `nhjax.forces.Sum(f, g)`."
         raise TypeError(
