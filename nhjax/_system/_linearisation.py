@@ -348,10 +348,14 @@ def _with_force_of_multipliers(
     def solve(jacobian, b):
         return small_einsum("kl,l->k", inverse(jacobian), b)
 
-    # Friction vanishes with the reaction, so that this is the multiplier without it.
-    start = lin.delassus_inverse.matvec(
-        hidden - lin.jacobian.matvec(free(jnp.zeros_like(hidden)))
-    )
+    def without(free):
+        return lin.delassus_inverse.matvec(hidden - lin.jacobian.matvec(free))
+
+    # Friction vanishes with the reaction, so that this is the multiplier without it. A
+    # force that divides by the reaction is left out.
+    start = without(free(jnp.zeros_like(hidden)))
+    rest = without(lin.momentum_inverse.matvec(known))
+    start = jnp.where(jnp.all(jnp.isfinite(start)), start, rest)
     found = root(residual, start, max_norm(start), solve=solve)
     multiplier = nan_unless(found.converged, found.x)
     slopes = force_by_multiplier(system, t, q, u, multiplier, args)

@@ -20,6 +20,8 @@ from jax.extend.core.primitives import closed_call_p
 
 # Larger matrices are left to XLA, which calls LAPACK.
 MOST_ROWS = 32
+# More matrices at once would make the written-out program long.
+_MOST_MEMBERS = 16
 
 
 def expanded(program: Any, known: Container[str]) -> Any:
@@ -142,11 +144,27 @@ def _contains(jaxpr: Any, primitive: Any) -> bool:
     return False
 
 
+def _for_each(function: Callable[..., Any], rank: int) -> Callable[..., Any]:
+    """Return a function that treats the first axes of its operands as members.
+
+    `rank` is the number of axes of the first operand for one member.
+    """
+
+    def run(*operands: Any, **params: Any) -> Any:
+        one = partial(function, **params)
+        for _ in range(operands[0].ndim - rank):
+            one = jax.vmap(one)
+        return one(*operands)
+
+    return run
+
+
 def _is_small_matrix(equation: Any) -> bool:
-    """Return whether the first operand is a single matrix with few rows and columns."""
+    """Return whether the first operand is a few matrices with few rows and columns."""
     shape = equation.invars[0].aval.shape
     is_real = jnp.issubdtype(equation.invars[0].aval.dtype, jnp.floating)
-    return is_real and len(shape) == 2 and max(shape) <= MOST_ROWS
+    is_small = len(shape) >= 2 and max(shape[-2:]) <= MOST_ROWS
+    return is_real and is_small and math.prod(shape[:-2]) <= _MOST_MEMBERS
 
 
 def _lu(a: Any, **_: Any) -> tuple[Any, Any, Any]:
@@ -190,6 +208,41 @@ def _permutation(pivots: Any, *, permutation_size: int, **_: Any) -> Any:
             order[k] = jnp.where(is_pivot, order[i], order[k])
             order[i] = jnp.where(is_pivot, first, order[i])
     return jnp.stack(order)
+
+
+def _sort(*operands: Any, dimension: int, is_stable: bool, num_keys: int) -> list[Any]:
+    """Sort integers, and other operands in the same order.
+
+    Each number is moved to its rank, the number of those that come before it.
+    """
+    del dimension, is_stable, num_keys
+    keys = operands[0]
+    place, before = jnp.arange(len(keys)), keys[:, None] > keys[None]
+    is_tie = keys[:, None] == keys[None]
+    before = before | (is_tie & (place[:, None] > place[None]))
+    ranks = jnp.sum(before, axis=1, dtype=jnp.int32)
+    found = []
+    for operand in operands:
+        rows = []
+        for k in range(len(keys)):
+            value = operand[0]
+            for i in range(1, len(keys)):
+                value = jnp.where(ranks[i] == k, operand[i], value)
+            rows.append(value)
+        found.append(jnp.stack(rows))
+    return found
+
+
+def _is_sort_of_integers(equation: Any) -> bool:
+    """Return whether an operation sorts few integers along their last axis."""
+    keys, params = equation.invars[0].aval, equation.params
+    return (
+        jnp.issubdtype(keys.dtype, jnp.integer)
+        and params["num_keys"] == 1
+        and params["dimension"] == keys.ndim - 1
+        and keys.shape[-1] <= MOST_ROWS
+        and math.prod(keys.shape[:-1]) <= _MOST_MEMBERS
+    )
 
 
 def _triangular_solve(
@@ -252,7 +305,7 @@ def _polynomial(x: Any, *coefficients: Any, **_: Any) -> Any:
 
 def _is_short(equation: Any) -> bool:
     shape = equation.outvars[0].aval.shape
-    return len(shape) == 1 and shape[0] <= MOST_ROWS
+    return shape[-1] <= MOST_ROWS and math.prod(shape[:-1]) <= _MOST_MEMBERS
 
 
 def _has_members(equation: Any) -> bool:
@@ -302,10 +355,12 @@ _EXPANSIONS: dict[str, tuple[Callable[[Any], bool], Callable[..., Any]]] = {
     "log2": (_is_real, _log2),
     "one_minus_square": (_is_real, _one_minus_square),
     "polynomial": (_is_real, _polynomial),
-    "lu": (_is_small_matrix, _lu),
-    "lu_pivots_to_permutation": (_is_short, _permutation),
+    "lu": (_is_small_matrix, _for_each(_lu, 2)),
+    "lu_pivots_to_permutation": (_is_short, _for_each(_permutation, 1)),
     "nextafter": (_is_real, _nextafter),
     "platform_index": (lambda equation: True, _platform_index),
-    "triangular_solve": (_is_small_matrix, _triangular_solve),
+    # The inverse of a permutation is an order of integers.
+    "sort": (_is_sort_of_integers, _for_each(_sort, 1)),
+    "triangular_solve": (_is_small_matrix, _for_each(_triangular_solve, 2)),
     "while": (_has_members, _while_any),
 }

@@ -75,6 +75,35 @@ def test_solved_equations_in_lanes_equal_jax():
 
 
 @pytest.mark.parametrize(
+    "function", [jnp.linalg.solve, jax.vmap(lax.linalg.lu), jax.vmap(jnp.linalg.inv)]
+)
+def test_several_matrices_at_once_in_lanes_equal_jax(function):
+    a = _matrices(3, 4, 4) + 3 * np.eye(4)
+    given = (a, _matrices(3, 4, 2)) if function is jnp.linalg.solve else (a,)
+    _assert_same(function, *given)
+
+
+def test_transposed_solve_in_lanes_equals_jax():
+    """The transpose of a solve sorts the permutation of the rows."""
+
+    def pulled(a, b):
+        return jax.vjp(lambda b: jnp.linalg.solve(a, b), b)[1](b)[0]
+
+    _assert_same(pulled, _matrices(4, 4) + 3 * np.eye(4), _matrices(4))
+    a, b = _matrices(3, 4, 4) + 3 * np.eye(4), _matrices(3, 4)
+    _assert_same(jax.vmap(pulled), a, b)
+
+
+@pytest.mark.parametrize("shape", [(1,), (7,), (3, 5)])
+@pytest.mark.parametrize("num_operands", [1, 2])
+def test_sorted_integers_in_lanes_equal_jax(shape, num_operands):
+    keys = RNG.integers(-3, 3, size=(5, *shape)).astype("int32")
+    values = RNG.normal(size=(5, *shape))
+    given = (keys, values)[:num_operands]
+    _assert_same(lambda *x: lax.sort(x, num_keys=1), *given)
+
+
+@pytest.mark.parametrize(
     "function",
     [
         jnp.log2,
