@@ -2,6 +2,7 @@
 import gc
 import importlib.metadata
 import os
+import shutil
 from pathlib import Path
 
 
@@ -23,6 +24,13 @@ if tuple(map(int, importlib.metadata.version("jaxlib").split(".")[:3])) < (0, 11
     QUICK_FLAGS = f"--xla_cpu_use_fusion_emitters=false {QUICK_FLAGS}"
 os.environ["XLA_FLAGS"] = f"{QUICK_FLAGS} {os.environ.get('XLA_FLAGS', '')}".strip()
 
+# Programs are compiled once for all processes and runs of the tests: a third of the
+# time of a run whose programs are known. What the environment says comes first.
+CACHE = Path(__file__).parent.parent / ".pytest_cache" / "compiled"
+os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(CACHE))
+os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
+os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES", "-1")
+
 # Python's collector looks for cycles each time that 700 objects have been made, which
 # takes a third of the time of a long trace; what is traced here stays in caches anyway.
 # The libraries below are loaded in less time, too.
@@ -37,6 +45,14 @@ from nhjax.lanes import _program
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_numpy_dtype_promotion", "strict")
 jax.config.update("jax_numpy_rank_promotion", "raise")
+
+
+def pytest_sessionstart(session):
+    """Start with an empty cache if it has grown beyond a gigabyte."""
+    is_worker = hasattr(session.config, "workerinput")
+    size = sum(path.stat().st_size for path in CACHE.rglob("*") if path.is_file())
+    if not is_worker and size > 1e9:
+        shutil.rmtree(CACHE)
 
 
 # A file stays in one process: of two, those that take longest come first, lest one
