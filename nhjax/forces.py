@@ -12,6 +12,7 @@ from typing import Any, cast
 
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, ArrayLike, Float, PyTree
 
 from ._custom_types import (
@@ -21,10 +22,10 @@ from ._custom_types import (
     PhaseFunction,
     PositionFunction,
 )
-from ._errors import naming, ShapeError
+from ._errors import is_traced, naming, ShapeError
 from ._manifold import AbstractLieGroup, Euclidean
 from ._system import (
-    AbstractOnManifold,
+    AbstractOfSystem,
     as_given,
     check_same_manifold,
     check_signature,
@@ -33,6 +34,23 @@ from ._system import (
     takes_multipliers,
     value_and_rate,
 )
+
+
+def positive(value: Any) -> Array:
+    """Convert a parameter that is one positive number."""
+    return _checked_sign(value, "positive", lambda x: x > 0)
+
+
+def not_negative(value: Any) -> Array:
+    """Convert a parameter that is one number, positive or zero."""
+    return _checked_sign(value, "positive or zero", lambda x: x >= 0)
+
+
+def _checked_sign(value: Any, sign: str, is_right: Callable[[Any], Any]) -> Array:
+    number = scalar(value)
+    if not is_traced(number) and not is_right(np.asarray(number)):
+        raise ValueError(f"This parameter of a force must be {sign}, got {number}.")
+    return number
 
 
 def _number(value: Any) -> Array:
@@ -70,7 +88,8 @@ def function_or_numbers(value: Any) -> Any:
 
 
 def position_function(value: Any) -> Any:
-    check_signature("A force", "its point", value, ("t", "q", "args"))
+    """Check a function of (t, q, args) of a force: a point, an angle, a rotation."""
+    check_signature("A force", "its point or angle", value, ("t", "q", "args"))
     return static_function(value)
 
 
@@ -96,11 +115,11 @@ def of_phase(name: str, value: Any, like: Array, *arguments: Any) -> Array:
     return value.astype(like.dtype)
 
 
-class AbstractSummable(AbstractOnManifold):
+class AbstractSummable(AbstractOfSystem):
     """A generalised force that can be added to others and to functions of the user."""
 
-    def check_manifold(self, manifold: AbstractLieGroup | None) -> None:
-        """Accept every manifold, as functions of the user do."""
+    def check_system(self, system: Any) -> None:
+        """Accept every system, as functions of the user do."""
 
     def __add__(self, other: Any) -> "Sum":
         """Add another force, or a function F(t, q, v, args)."""
@@ -185,6 +204,11 @@ class Sum(AbstractSummable):
     terms: tuple[Callable[..., Any], ...]
 
     def __init__(self, *terms: ForceFunction):
+        if len(terms) == 1 and isinstance(terms[0], tuple | list):
+            raise TypeError(
+                "Sum takes forces as arguments: write `Sum(*forces)` instead of "
+                "`Sum(forces)`."
+            )
         for number, term in enumerate(terms):
             multipliers = ("multipliers",) if takes_multipliers(term) else ()
             arguments = ("t", "q", "v", *multipliers, "args")
@@ -196,11 +220,11 @@ class Sum(AbstractSummable):
         """Whether the sum is called with the multipliers."""
         return any(takes_multipliers(as_given(term)) for term in self.terms)
 
-    def check_manifold(self, manifold: AbstractLieGroup | None) -> None:
-        """Check the manifold of each term."""
+    def check_system(self, system: Any) -> None:
+        """Check each term."""
         for term in self.terms:
-            if isinstance(term, AbstractOnManifold):
-                term.check_manifold(manifold)
+            if isinstance(term, AbstractOfSystem):
+                term.check_system(system)
 
     def __call__(
         self,
@@ -249,9 +273,9 @@ class _AbstractPulledBack(AbstractForce):
             lambda q: jnp.sum(covector * self._place(t, q, args)), q
         )
 
-    def check_manifold(self, manifold: AbstractLieGroup | None) -> None:
+    def check_system(self, system: Any) -> None:
         """Raise a `ValueError` unless the system has the manifold of this force."""
-        check_same_manifold("force", self, self.manifold, manifold)
+        check_same_manifold("force", self, self.manifold, system.manifold)
 
     def _with_rate(self, t: Any, q: Any, v: Array, args: Any) -> tuple[Array, Array]:
         """Evaluate x(t, q) and ẋ = ∂x/∂t + ∂x/∂q · q̇."""
@@ -537,7 +561,7 @@ class Brake(_AbstractPulledBack):
 
     angle: PositionFunction = eqx.field(converter=position_function)
     torque: ArrayLike | PhaseFunction = eqx.field(converter=function_or_numbers)
-    smoothing: ArrayLike = eqx.field(converter=scalar, kw_only=True)
+    smoothing: ArrayLike = eqx.field(converter=positive, kw_only=True)
     manifold: AbstractLieGroup | None = eqx.field(default=None, kw_only=True)
 
     def _place(self, t: Any, q: Any, args: Any) -> Array:

@@ -3,8 +3,8 @@
 The load of a contact is a reaction, so that these forces depend on the multipliers. All
 laws are smooth: near rest the friction is proportional to the velocity, with a slope
 that a velocity u₀ sets. A contact that should rest on a slope therefore creeps. With
-u₀ = 1e-3 m/s it creeps slower than a millimetre each second. Steps of size h need
-h · (friction / mass) / u₀ of about one or less to converge fast.
+u₀ = 1e-3 m/s it creeps slower than a millimetre each second. Near rest, steps of the
+size u₀ · mass / friction converge fast.
 """
 
 import abc
@@ -30,13 +30,16 @@ from ._system import check_same_manifold, check_type, value_and_rate
 from .forces import (
     AbstractForceOfReactions,
     in_precision_of,
+    not_negative,
     position_function,
+    positive,
     scalar,
     value_at,
 )
 from .rolling import (
     absolute_load,
     AbstractContact,
+    checked_contacts,
     checked_load,
     Contacts,
     ContactState,
@@ -65,6 +68,11 @@ class AbstractFrictionLaw(eqx.Module):
         return speed * self.slope(speed * speed)
 
 
+def _check_law(law: Any) -> None:
+    advice = "For example, pass nhjax.friction.Coulomb(0.5, smoothing=0.001)."
+    check_type("law", law, AbstractFrictionLaw, advice)
+
+
 class Coulomb(AbstractFrictionLaw):
     """Coulomb's law, made smooth: μ(u) = μ tanh(u / u₀).
 
@@ -81,8 +89,8 @@ class Coulomb(AbstractFrictionLaw):
         0.5
     """
 
-    friction: ArrayLike = eqx.field(converter=scalar)
-    smoothing: ArrayLike = eqx.field(converter=scalar, kw_only=True)
+    friction: ArrayLike = eqx.field(converter=not_negative)
+    smoothing: ArrayLike = eqx.field(converter=positive, kw_only=True)
 
     def slope(self, square: FloatScalar) -> FloatScalar:
         """Compute μ(u) / u from u²."""
@@ -110,10 +118,10 @@ class Stribeck(AbstractFrictionLaw):
         [0.592, 0.4]
     """
 
-    static: ArrayLike = eqx.field(converter=scalar)
-    kinetic: ArrayLike = eqx.field(converter=scalar)
-    stribeck_speed: ArrayLike = eqx.field(converter=scalar, kw_only=True)
-    smoothing: ArrayLike = eqx.field(converter=scalar, kw_only=True)
+    static: ArrayLike = eqx.field(converter=not_negative)
+    kinetic: ArrayLike = eqx.field(converter=not_negative)
+    stribeck_speed: ArrayLike = eqx.field(converter=positive, kw_only=True)
+    smoothing: ArrayLike = eqx.field(converter=positive, kw_only=True)
     viscous: ArrayLike = eqx.field(default=0.0, converter=scalar, kw_only=True)
 
     def slope(self, square: FloatScalar) -> FloatScalar:
@@ -187,9 +195,13 @@ class MagicFormula(AbstractFrictionLaw):
 # --- Forces on contacts ---------------------------------------------------------------
 
 
-def _checked_contacts(contacts: Any) -> Contacts:
-    check_type("contacts", contacts, Contacts)
-    return contacts
+def _require_velocities(force: Any, system: Any) -> None:
+    """Raise a `ValueError` for a Hamiltonian system, whose forces receive momenta."""
+    if system.fibre_coordinate_name == "p":
+        raise ValueError(
+            f"`force` has a {type(force).__name__}, which depends on velocities, but a "
+            "HamiltonianSystem passes momenta: use a LagrangianSystem."
+        )
 
 
 class _AbstractOnContact(AbstractForceOfReactions):
@@ -218,10 +230,13 @@ class _AbstractOnContact(AbstractForceOfReactions):
     def _slope(self, at: ContactState, rate: Array) -> Array:
         """Return f(r), the force for unit load divided by r."""
 
-    def check_manifold(self, manifold: AbstractLieGroup | None) -> None:
-        """Raise a `ValueError` unless the contact has the manifold of the system."""
+    def check_system(self, system: Any) -> None:
+        """Raise a `ValueError` unless the contact and its load fit the system."""
+        _require_velocities(self, system)
         contact = self.contacts[self.contact]
-        check_same_manifold("force", contact, contact.manifold, manifold)
+        check_same_manifold("force", contact, contact.manifold, system.manifold)
+        if self.load is None:
+            self.contacts.check_constraints_of(system)
 
     def __call__(
         self,
@@ -274,7 +289,7 @@ class Sliding(_AbstractOnContact):
         Array([-2.,  0.,  0.], dtype=float64)
     """
 
-    contacts: Contacts = eqx.field(converter=_checked_contacts)
+    contacts: Contacts = eqx.field(converter=checked_contacts)
     contact: str = eqx.field(static=True)
     law: AbstractFrictionLaw
     load: ArrayLike | ForceFunction | None = eqx.field(
@@ -282,7 +297,7 @@ class Sliding(_AbstractOnContact):
     )
 
     def __check_init__(self) -> None:
-        check_type("law", self.law, AbstractFrictionLaw)
+        _check_law(self.law)
         if len(self.contacts[self.contact].no_slip) > 1:
             raise ValueError(
                 f"The contact {self.contact!r} does not slip in any direction: give "
@@ -325,10 +340,10 @@ class Tyre(_AbstractOnContact):
         Array([  0., -20.,   0.], dtype=float64)
     """
 
-    contacts: Contacts = eqx.field(converter=_checked_contacts)
+    contacts: Contacts = eqx.field(converter=checked_contacts)
     contact: str = eqx.field(static=True)
     law: AbstractFrictionLaw
-    slowest: ArrayLike = eqx.field(converter=scalar, kw_only=True)
+    slowest: ArrayLike = eqx.field(converter=positive, kw_only=True)
     load: ArrayLike | ForceFunction | None = eqx.field(
         default=None, converter=checked_load, kw_only=True
     )
@@ -376,10 +391,10 @@ class RollingResistance(_AbstractOnContact):
         Array([-0.5,  0. ,  0. ], dtype=float64)
     """
 
-    contacts: Contacts = eqx.field(converter=_checked_contacts)
+    contacts: Contacts = eqx.field(converter=checked_contacts)
     contact: str = eqx.field(static=True)
-    arm: ArrayLike = eqx.field(converter=scalar)
-    smoothing: ArrayLike = eqx.field(converter=scalar, kw_only=True)
+    arm: ArrayLike = eqx.field(converter=not_negative)
+    smoothing: ArrayLike = eqx.field(converter=positive, kw_only=True)
     load: ArrayLike | ForceFunction | None = eqx.field(
         default=None, converter=checked_load, kw_only=True
     )
@@ -416,10 +431,10 @@ class PivotingFriction(_AbstractOnContact):
         Array([ 0. ,  0. , -0.5], dtype=float64)
     """
 
-    contacts: Contacts = eqx.field(converter=_checked_contacts)
+    contacts: Contacts = eqx.field(converter=checked_contacts)
     contact: str = eqx.field(static=True)
-    arm: ArrayLike = eqx.field(converter=scalar)
-    smoothing: ArrayLike = eqx.field(converter=scalar, kw_only=True)
+    arm: ArrayLike = eqx.field(converter=not_negative)
+    smoothing: ArrayLike = eqx.field(converter=positive, kw_only=True)
     load: ArrayLike | ForceFunction | None = eqx.field(
         default=None, converter=checked_load, kw_only=True
     )
@@ -466,11 +481,12 @@ class JointFriction(AbstractForceOfReactions):
     manifold: AbstractLieGroup | None = eqx.field(default=None, kw_only=True)
 
     def __check_init__(self) -> None:
-        check_type("law", self.law, AbstractFrictionLaw)
+        _check_law(self.law)
 
-    def check_manifold(self, manifold: AbstractLieGroup | None) -> None:
+    def check_system(self, system: Any) -> None:
         """Raise a `ValueError` unless the system has the manifold of this force."""
-        check_same_manifold("force", self, self.manifold, manifold)
+        _require_velocities(self, system)
+        check_same_manifold("force", self, self.manifold, system.manifold)
 
     def __call__(
         self,

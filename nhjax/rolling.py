@@ -12,6 +12,7 @@ multiplier is the force in newtons in its direction.
 
 import abc
 import math
+import operator
 import reprlib
 from collections.abc import Callable
 from typing import Any, Literal, NamedTuple, TypeAlias
@@ -34,7 +35,7 @@ from ._integrate import Event
 from ._manifold import AbstractLieGroup
 from ._numerics import inverse, max_norm, nan_unless, root
 from ._system import (
-    AbstractOnManifold,
+    AbstractOfSystem,
     as_given,
     check_same_manifold,
     check_signature,
@@ -328,7 +329,7 @@ class AbstractContact(eqx.Module):
     def __check_init__(self) -> None:
         check_type("ground", self.ground, AbstractGround)
         names = ("along", "across")
-        if isinstance(self.no_slip, str) or any(
+        if not isinstance(self.no_slip, tuple) or any(
             x not in names if isinstance(x, str) else not isinstance(x, int | float)
             for x in self.no_slip
         ):
@@ -354,7 +355,13 @@ class AbstractContact(eqx.Module):
     ) -> tuple[Float[Array, "3"], Float[Array, "3 3"]]:
         """Evaluate the pose, and check its shapes."""
         with naming("pose(t, q, args)", as_given(self.pose), args):
-            position, rotation = self.pose(t, q, args)
+            found = self.pose(t, q, args)
+        if not isinstance(found, tuple) or len(found) != 2:
+            raise ShapeError(
+                "`pose` must return a position and a rotation, got "
+                f"{type(found).__name__}."
+            )
+        position, rotation = map(jnp.asarray, found)
         if jnp.shape(position) != (3,) or jnp.shape(rotation) != (3, 3):
             raise ShapeError(
                 "`pose` must return a position of shape (3,) and a rotation of shape "
@@ -765,6 +772,25 @@ class Contacts(eqx.Module):
         count = sum(len(x.no_slip) for x in self.contacts)
         return multipliers[count + sum(before)]
 
+    def check_constraints_of(self, system: Any) -> None:
+        """Raise a `ValueError` unless a system has these constraints and no others.
+
+        The multipliers are then in the order of the contacts.
+        """
+        for name in ("nonholonomic", "holonomic"):
+            own, given = getattr(self, name), getattr(system, name)
+            is_same = own is given is None or (
+                type(own) is type(given)
+                and len(own.contacts) == len(given.contacts)
+                and all(map(operator.is_, own.contacts, given.contacts))
+            )
+            if not is_same:
+                raise ValueError(
+                    f"`force` needs the normal force of one of its contacts, but the "
+                    f"system has other constraints: pass `{name}=contacts.{name}` to "
+                    "the system, or the load [N] of the contact as `load=`."
+                )
+
     def __getitem__(self, name: str) -> AbstractContact:
         """Return the contact of a name."""
         if name not in self.names:
@@ -779,20 +805,21 @@ class Contacts(eqx.Module):
         if multipliers.shape != (count,):
             raise ShapeError(
                 f"The contacts have {count} multipliers, got multipliers of shape "
-                f"{multipliers.shape}: pass those of one state of a system that has "
-                f"the constraints of these contacts and no others."
+                f"{multipliers.shape}. The system must have the constraints of these "
+                f"contacts and no others; pass one of its states."
             )
 
 
-class Slips(AbstractOnManifold):
+class Slips(AbstractOfSystem):
     """The nonholonomic constraints of contacts: their velocities without slip."""
 
     contacts: tuple[AbstractContact, ...]
 
-    def check_manifold(self, manifold: AbstractLieGroup | None) -> None:
+    def check_system(self, system: Any) -> None:
         """Raise a `ValueError` unless all contacts have the manifold of the system."""
         for contact in self.contacts:
-            check_same_manifold("nonholonomic", contact, contact.manifold, manifold)
+            given = contact, contact.manifold, system.manifold
+            check_same_manifold("nonholonomic", *given)
 
     def __call__(
         self,
@@ -805,21 +832,80 @@ class Slips(AbstractOnManifold):
         return jnp.concatenate([x.slip(t, q, v, args) for x in self.contacts])
 
 
-class Heights(AbstractOnManifold):
+class Heights(AbstractOfSystem):
     """The holonomic constraints of contacts: their heights above the ground."""
 
     contacts: tuple[AbstractContact, ...]
 
-    def check_manifold(self, manifold: AbstractLieGroup | None) -> None:
+    def check_system(self, system: Any) -> None:
         """Raise a `ValueError` unless all contacts have the manifold of the system."""
         for contact in self.contacts:
-            check_same_manifold("holonomic", contact, contact.manifold, manifold)
+            given = contact, contact.manifold, system.manifold
+            check_same_manifold("holonomic", *given)
 
     def __call__(
         self, t: FloatScalarLike, q: PyTree[Array], args: Args = None
     ) -> Float[Array, " k"]:
         """Compute the heights of all contacts."""
         return jnp.stack([x.height(t, q, args) for x in self.contacts])
+
+
+def checked_contacts(contacts: Any) -> Contacts:
+    """Return the contacts, or raise a `TypeError` if they are anything else."""
+    check_type("contacts", contacts, Contacts, "Make them with rolling.Contacts(...).")
+    return contacts
+
+
+def margin(
+    contacts: Contacts,
+    contact: str,
+    friction: ArrayLike,
+    *,
+    load: ArrayLike | ForceFunction | None = None,
+) -> Callable[[Any, State, Any], FloatScalar]:
+    """Return a function that says how much more friction a contact could bear.
+
+    It is the function (t, y, args) -> μ |N| - |F_t| [N] of the friction coefficient μ,
+    the normal force N and the force F_t of the constraints along the ground. The
+    contact rolls where it is positive. Pass it to `SaveAt(fn=)`, or see `slips`.
+
+    **Arguments:** those of `slips`.
+
+    **Raises:** as `slips`.
+
+    !!! example
+
+        >>> import jax.numpy as jnp, nhjax
+        >>> from nhjax import rolling
+        >>> blade = rolling.Blade(lambda t, q, args: (q, jnp.eye(3)), touches=False)
+        >>> contacts = rolling.Contacts(blade=blade)
+        >>> system = nhjax.LagrangianSystem(
+        ...     lambda t, q, v, args: 0.5 * v @ v + 4.0 * q[1],
+        ...     nonholonomic=contacts.nonholonomic)
+        >>> y = nhjax.initial_state(system, jnp.zeros(3), jnp.zeros(3))
+        >>> float(rolling.margin(contacts, "blade", 0.5, load=20.0)(0.0, y, None))
+        6.0
+    """
+    touched = checked_contacts(contacts)[contact]
+    if not touched.no_slip:
+        raise ValueError(
+            f"The contact {contact!r} has no directions `no_slip`, so that it slips."
+        )
+    if load is None and not touched.touches:
+        raise ValueError(
+            f"The height of {contact!r} is not a constraint: pass its load [N] as "
+            "`load=`."
+        )
+    return _Margin(contacts, contact, _friction(friction), checked_load(load))
+
+
+def _friction(value: Any) -> Array:
+    if eqx.is_array_like(value) and jnp.shape(value) == ():
+        return parameter(value)
+    raise TypeError(
+        f"`friction` must be a number, the friction coefficient, got "
+        f"{reprlib.repr(value)}."
+    )
 
 
 def slips(
@@ -830,11 +916,11 @@ def slips(
     load: ArrayLike | ForceFunction | None = None,
     **options: Any,
 ) -> Event:
-    """Return the event that a contact needs more friction than there is.
+    """Return the event that a contact starts to slip.
 
-    Its function is the margin μ |N| - |F_t| [N] of the friction coefficient μ, the
-    normal force N and the force F_t of the constraints along the plane. The contact
-    rolls as long as the margin is positive.
+    This is where the `margin` falls to zero. As every event, it is a change of sign: a
+    contact that needs too much friction from the start on does not trigger it.
+    Therefore look at the `margin` of the first state.
 
     **Arguments:**
 
@@ -844,7 +930,8 @@ def slips(
         function of (t, q, v, multipliers, args).
     - `options`: passed on to `nhjax.Event`; by default the event ends the run.
 
-    **Raises:** `ValueError` if there is no contact of this name, or no load.
+    **Raises:** `TypeError` if `friction` is not a number; `ValueError` if there is no
+    contact of this name, no load, or no direction without slip.
 
     !!! example
 
@@ -855,13 +942,8 @@ def slips(
         >>> rolling.slips(contacts, "blade", 0.5, load=20.0).direction
         False
     """
-    margin = _Margin(contacts, contact, parameter(friction), checked_load(load))
-    if load is None and not contacts[contact].touches:
-        raise ValueError(
-            f"The height of {contact!r} is not a constraint: pass its load [N] as "
-            "`load=`."
-        )
-    return Event(margin, **{"direction": False, **options})
+    function = margin(contacts, contact, friction, load=load)
+    return Event(function, **{"direction": False, **options})
 
 
 def lifts_off(contacts: Contacts, contact: str, **options: Any) -> Event:
@@ -885,7 +967,8 @@ def lifts_off(contacts: Contacts, contact: str, **options: Any) -> Event:
         >>> rolling.lifts_off(rolling.Contacts(blade=blade), "blade").terminate
         True
     """
-    return Event(_NormalForce(contacts, contact), **{"direction": False, **options})
+    function = _NormalForce(checked_contacts(contacts), contact)
+    return Event(function, **{"direction": False, **options})
 
 
 def checked_load(load: Any) -> Any:

@@ -776,6 +776,15 @@ COULOMB = friction.Coulomb(0.3, smoothing=0.01)
             "multipliers",
         ),
         (lambda: rolling.slips(_skate(touches=False), "skate", 0.3), "pass its load"),
+        (lambda: rolling.slips(_skate(no_slip=()), "skate", 0.3), "so that it slips"),
+        (
+            lambda: rolling.slips(_skate(), "skate", cast(Any, COULOMB)),
+            "`friction` must be a number",
+        ),
+        (lambda: rolling.slips(cast(Any, "skate"), "skate", 0.3), "Contacts"),
+        (lambda: friction.Coulomb(-0.3, smoothing=0.01), "positive or zero"),
+        (lambda: friction.Coulomb(0.3, smoothing=0.0), "must be positive"),
+        (lambda: forces.Sum(cast(Any, [lambda t, q, v, args: v])), r"Sum\(\*forces\)"),
         (lambda: rolling.lifts_off(_skate(touches=False), "skate"), "not a multiplier"),
         (lambda: rolling.lifts_off(_skate(), "wheel"), "one of 'skate'"),
     ],
@@ -797,12 +806,75 @@ def test_friction_of_a_contact_with_another_manifold_is_refused():
         )
 
 
-def test_friction_in_a_system_with_other_constraints_is_refused_by_number():
+@pytest.mark.parametrize("holonomic", [None, lambda t, q, args: q[2], "other"])
+def test_friction_in_a_system_with_other_constraints_is_refused(holonomic):
     contacts = _skate()
+    if holonomic == "other":
+        holonomic = _skate().holonomic
+    with pytest.raises(ValueError, match=r"holonomic=contacts\.holonomic"):
+        nhjax.LagrangianSystem(
+            lambda t, q, v, args: 0.5 * v @ v,
+            nonholonomic=contacts.nonholonomic,
+            holonomic=holonomic,
+            force=friction.Sliding(contacts, "skate", COULOMB),
+        )
+
+
+@pytest.mark.filterwarnings("ignore:HamiltonianSystem")
+def test_friction_in_a_hamiltonian_system_is_refused():
+    contacts = _skate()
+    with pytest.raises(ValueError, match="use a LagrangianSystem"):
+        nhjax.HamiltonianSystem(
+            lambda t, q, p, args: 0.5 * p @ p,
+            force=friction.Sliding(contacts, "skate", COULOMB),
+        )
+
+
+def test_contacts_with_another_number_of_multipliers_are_refused():
+    with pytest.raises(nhjax.ShapeError, match="have 2 multipliers"):
+        _skate().reactions(0.0, jnp.zeros(3), jnp.zeros(3))
+
+
+@pytest.mark.parametrize("args", [{}, {"args": None}])
+def test_force_with_multipliers_and_default_args_receives_multipliers(args):
+    """Its fourth argument is called `multipliers`, also if there is a default."""
+
+    def force(t, q, v, multipliers, args=None):
+        return -0.3 * jnp.abs(multipliers[0]) * jnp.tanh(v / 1e-3)
+
+    system = nhjax.LagrangianSystem(
+        lambda t, q, v, args: 0.5 * v @ v - G * q[1],
+        holonomic=lambda t, q, args: q[1],
+        force=force,
+    )
+    y0 = nhjax.initial_state(system, jnp.zeros(2), jnp.array([1.0, 0.0]))
+    found = nhjax.motion(system, 0.0, y0).acceleration
+    np.testing.assert_allclose(found, [-0.3 * G, 0.0], atol=1e-13)
+
+
+def test_force_without_args_after_multipliers_is_refused():
+    with pytest.raises(TypeError, match=r"must take \(t, q, v, multipliers, args\)"):
+        nhjax.LagrangianSystem(
+            _lagrangian, nonholonomic=_blade, force=lambda t, q, v, multipliers: v
+        )
+
+
+def test_multipliers_of_a_block_in_a_slot_are_found_where_newton_cycles():
+    """Friction at two guides turns the block, so that |λ| changes its branch."""
+    mu, a, b = 0.7, 0.1, 0.15
+
+    def force(t, q, v, multipliers, args):
+        push = -mu * jnp.abs(multipliers) * jnp.tanh(v[0] / 1e-3)
+        moment = 0.1 - b * (push[0] - push[1])
+        return jnp.stack([push[0] + push[1], jnp.asarray(-10.0), moment])
+
     system = nhjax.LagrangianSystem(
         lambda t, q, v, args: 0.5 * v @ v,
-        nonholonomic=contacts.nonholonomic,
-        force=friction.Sliding(contacts, "skate", COULOMB),
+        holonomic=lambda t, q, args: jnp.stack([q[1] + a * q[2], q[1] - a * q[2]]),
+        force=force,
     )
-    with pytest.raises(ValueError, match="2 multipliers"):
-        nhjax.initial_state(system, jnp.zeros(3), jnp.zeros(3))
+    y0 = nhjax.initial_state(system, jnp.zeros(3), jnp.array([-1.0, 0.0, 0.0]))
+    one, two = y0.multiplier
+    np.testing.assert_allclose(one + two, 10.0, rtol=1e-12)
+    turning = 0.1 - b * mu * (abs(one) - abs(two)) + a * (one - two)
+    np.testing.assert_allclose(turning, 0.0, atol=1e-12)

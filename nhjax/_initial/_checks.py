@@ -254,8 +254,9 @@ def _force_error(case: _Case) -> NonFiniteError:
     return NonFiniteError(
         f"The forces {words.force}, or the derivatives of {words.constraint}, are not "
         f"finite at {case.where}: d{words.coordinate}/dt = {lin.acceleration} and "
-        f"multiplier = {lin.multiplier}. Check the functions of "
-        "the system at this state."
+        f"multiplier = {lin.multiplier}. Check the functions of the system at this "
+        "state. With a force that depends on the multipliers, such as strong friction, "
+        "there may be no reaction that solves the equations."
     )
 
 

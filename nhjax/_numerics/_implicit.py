@@ -28,6 +28,8 @@ from ._iteration import dense_increment, iterate, Solved, UpdateNorms
 
 # Terms of the Neumann series below this many units of round-off are left out.
 _UNITS_LEFT = 256
+# The path to a root is divided into this many parts, with so many iterations in each.
+_PARTS_OF_PATH, _ITERATIONS_OF_PART = 32, 3
 # If the terms of the series stop falling above this many units of round-off, the series
 # does not converge. The derivative is then NaN rather than a wrong number.
 _NOISIEST = 1e4
@@ -213,6 +215,7 @@ def root(
     *,
     judged: Callable[[X], PyTree[Array]] = lambda x: x,
     solve: Callable[[Array, Array], Array] = jnp.linalg.solve,
+    path: Callable[[FloatScalar, X], PyTree[Array]] | None = None,
     max_iterations: int = 30,
 ) -> Solved[X, None]:
     """Find a root of `residual` near `x0`, to round-off, by Newton's method.
@@ -228,6 +231,9 @@ def root(
         left out.
     - `solve`: called as `solve(jacobian, b)` for the increments and for the derivative
         of the root; a dense solve by default.
+    - `path`: a function (θ, x) of residuals that is followed from θ = 0, where `x0` is
+        a root, to θ = 1, where it equals `residual`, if Newton's method does not find
+        a root. It may cycle where the residual has kinks.
     - `max_iterations`: the largest number of iterations.
     """
     flat, unravel = ravel_pytree(x0)
@@ -243,8 +249,36 @@ def root(
         size = rest + max_norm(*jax.tree.leaves(judged(unravel(dx))))
         return x + dx, UpdateNorms(size), None
 
+    def followed(x, is_needed):
+        assert path is not None
+        count = _PARTS_OF_PATH * _ITERATIONS_OF_PART
+
+        def advance(k, x):
+            part = (k // _ITERATIONS_OF_PART + 1).astype(x.dtype) / _PARTS_OF_PATH
+
+            def residual(z):
+                return ravel_pytree(path(part, unravel(z)))[0], None
+
+            # Shorter increments cross a kink where whole ones would cycle.
+            dx, _ = dense_increment(residual, x, solve)
+            shorter = x[None] + jnp.outer(0.5 ** jnp.arange(5, dtype=x.dtype), dx)
+            sizes = jax.vmap(lambda z: max_norm(residual(z)[0]))(shorter)
+            return shorter[jnp.nanargmin(sizes)]
+
+        return jax.lax.fori_loop(0, jnp.where(is_needed, count, 0), advance, x)
+
     def newton(_, x):
         solved = iterate(iteration, x, scale, max_iterations=max_iterations)
+        if path is not None:
+            start = followed(x, ~solved.converged)
+            again = iterate(
+                iteration,
+                start,
+                scale,
+                max_iterations=max_iterations,
+                skip=solved.converged,
+            )
+            solved = tree_where(solved.converged, solved, again)
         # `custom_root` needs floats in `aux`, because it makes tangents of their dtype.
         outcome = (solved.converged, solved.exhausted, solved.num_iterations)
         return solved.x, jax.tree.map(lambda z: z.astype(x.dtype), outcome)

@@ -47,7 +47,7 @@ from ._scales import (
 )
 from ._systems import (
     AbstractMechanicalSystem as AbstractMechanicalSystem,
-    AbstractOnManifold as AbstractOnManifold,
+    AbstractOfSystem as AbstractOfSystem,
     as_given as as_given,
     check_time_and_state as check_time_and_state,
     closure_converted as closure_converted,

@@ -280,8 +280,8 @@ def check_third_argument(
 def takes_multipliers(force: Any) -> bool:
     """Return whether a force is a function of (t, q, v, multipliers, args).
 
-    A class of forces can say it by an attribute `takes_multipliers`. Otherwise a force
-    that can be called with four arguments does not take multipliers.
+    A class of forces can say it by an attribute `takes_multipliers`. Otherwise the
+    fourth argument is called `multipliers`, or a fifth one is required.
     """
     stated = getattr(force, "takes_multipliers", None)
     if stated is not None:
@@ -289,6 +289,8 @@ def takes_multipliers(force: Any) -> bool:
     signature = _signature(force) if callable(force) else None
     if signature is None:
         return False
+    if "multipliers" in _positional_names(signature)[3:4]:
+        return True
     arguments = ("t", "q", "v", "multipliers", "args")
     return _takes(signature, arguments) and not _takes(signature, arguments[1:])
 

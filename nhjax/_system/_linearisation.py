@@ -7,7 +7,7 @@ without the solution, and `motion_residual` evaluates the equations themselves.
 
 from collections.abc import Callable
 from dataclasses import replace
-from functools import reduce
+from functools import partial, reduce
 from typing import Literal, NamedTuple
 
 import equinox as eqx
@@ -337,26 +337,27 @@ def _with_force_of_multipliers(
     of the result include ∂F/∂λ.
     """
 
-    def free(multiplier):
-        force = known + system.external_force(t, q, u, multiplier, args)
+    def free(multiplier, part=1.0):
+        force = system.external_force(t, q, u, multiplier, args)
+        force = known + jnp.asarray(part, force.dtype) * force
         return lin.momentum_inverse.matvec(force)
 
-    def residual(multiplier):
-        acceleration = free(multiplier) + lin.reaction.matvec(multiplier)
-        return lin.jacobian.matvec(acceleration) - hidden
+    def along_path(part, multiplier):
+        # The product with C⁻¹ gives all rows the units of their multipliers.
+        acceleration = free(multiplier, part) + lin.reaction.matvec(multiplier)
+        rate = lin.jacobian.matvec(acceleration) - hidden
+        return lin.delassus_inverse.matvec(rate)
 
     def solve(jacobian, b):
         return small_einsum("kl,l->k", inverse(jacobian), b)
 
-    def without(free):
-        return lin.delassus_inverse.matvec(hidden - lin.jacobian.matvec(free))
-
-    # Friction vanishes with the reaction, so that this is the multiplier without it. A
-    # force that divides by the reaction is left out.
-    start = without(free(jnp.zeros_like(hidden)))
-    rest = without(lin.momentum_inverse.matvec(known))
-    start = jnp.where(jnp.all(jnp.isfinite(start)), start, rest)
-    found = root(residual, start, max_norm(start), solve=solve)
+    # Newton's method may cycle if friction depends on |λ|. The multiplier is then
+    # followed while the friction grows from zero.
+    without = lin.momentum_inverse.matvec(known)
+    start = lin.delassus_inverse.matvec(hidden - lin.jacobian.matvec(without))
+    residual = partial(along_path, 1.0)
+    scale = max_norm(start) + max_norm(residual(start))
+    found = root(residual, start, scale, solve=solve, path=along_path)
     multiplier = nan_unless(found.converged, found.x)
     slopes = force_by_multiplier(system, t, q, u, multiplier, args)
     reaction = lin.reaction.as_matrix() + lin.momentum_inverse.matvec(slopes.T).T

@@ -119,12 +119,12 @@ def value_and_rate(
     return jax.jvp(function, (t, q), (jnp.ones_like(t), tangent))
 
 
-class AbstractOnManifold(eqx.Module):
-    """A function of a system that needs the manifold of the system."""
+class AbstractOfSystem(eqx.Module):
+    """A function of a system that must fit the other parts of the system."""
 
     @abstractmethod
-    def check_manifold(self, manifold: AbstractLieGroup | None) -> None:
-        """Raise a `ValueError` if `manifold`, of the system, is another one."""
+    def check_system(self, system: Any) -> None:
+        """Raise a `ValueError` if the system has another manifold, or other parts."""
 
 
 class AbstractMechanicalSystem(eqx.Module):
@@ -165,8 +165,8 @@ class AbstractMechanicalSystem(eqx.Module):
         check_coordinates(self)
         for name in self.signatures():
             function = getattr(self, name)
-            if isinstance(function, AbstractOnManifold):
-                function.check_manifold(self.manifold)
+            if isinstance(function, AbstractOfSystem):
+                function.check_system(self)
 
     @abstractmethod
     def momentum(
