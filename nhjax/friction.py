@@ -364,8 +364,9 @@ class Tyre(_AbstractOnContact):
 class RollingResistance(_AbstractOnContact):
     """Rolling resistance: a torque against the rolling of a wheel or a ball.
 
-    The torque is -|N| e tanh(|ω| / ω₀) in the direction of ω, the angular velocity
-    along the plane.
+    The torque is -|N| e tanh(|ω| / ω₀) in the direction of ω, the angular velocity of
+    the body along the plane. It is not the friction of a contact that runs along the
+    rim of a spinning coin: write that as a force of your own.
 
     **Arguments:**
 

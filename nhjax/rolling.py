@@ -509,7 +509,8 @@ class Wheel(AbstractContact):
         radius, tube = (
             jnp.asarray(x).astype(axle.dtype) for x in (self.radius, self.tube_radius)
         )
-        down = _unit((normal @ axle) * axle - normal)
+        # In this form a disc that lies nearly flat loses no digits.
+        down = jnp.cross(axle, self.axes(rotation, normal)[0])
         return radius * down - tube * normal
 
     def axes(

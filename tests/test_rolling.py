@@ -401,6 +401,18 @@ def test_radius_of_a_wheel_is_differentiated_through_a_run():
     np.testing.assert_allclose(jax.grad(end)(0.5), difference, rtol=1e-6)
 
 
+@pytest.mark.parametrize("tilt", [1e-2, 1e-4, 1e-6])
+def test_height_of_a_disc_that_lies_flat_keeps_all_digits(tilt):
+    def pose(t, q, args):
+        return jnp.zeros(3), about_y(q[0])
+
+    wheel = rolling.Wheel(pose, 0.5, axle=(0, 0, 1))
+    q = jnp.array([tilt])
+    height, slope = jax.value_and_grad(lambda q: wheel.height(0.0, q))(q)
+    np.testing.assert_allclose(height, -0.5 * np.sin(tilt), rtol=1e-15)
+    np.testing.assert_allclose(slope[0], -0.5 * np.cos(tilt), rtol=1e-14)
+
+
 @pytest.mark.parametrize("dtype", ["float32", "float64"])
 def test_contacts_keep_the_precision_of_the_state(dtype):
     torus = nhjax.systems.RollingTorus()

@@ -249,8 +249,7 @@ def root(
         size = rest + max_norm(*jax.tree.leaves(judged(unravel(dx))))
         return x + dx, UpdateNorms(size), None
 
-    def followed(x, is_needed):
-        assert path is not None
+    def followed(path, x, is_needed):
         count = _PARTS_OF_PATH * _ITERATIONS_OF_PART
 
         def advance(k, x):
@@ -270,7 +269,7 @@ def root(
     def newton(_, x):
         solved = iterate(iteration, x, scale, max_iterations=max_iterations)
         if path is not None:
-            start = followed(x, ~solved.converged)
+            start = followed(path, x, ~solved.converged)
             again = iterate(
                 iteration,
                 start,
