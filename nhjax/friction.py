@@ -94,8 +94,7 @@ class Coulomb(AbstractFrictionLaw):
 
     def slope(self, square: FloatScalar) -> FloatScalar:
         """Compute μ(u) / u from u²."""
-        friction, smoothing = in_precision_of(square, self.friction, self.smoothing)
-        return friction / smoothing * _tanh_slope(square / smoothing**2)
+        return _coulomb_slope(self.friction, self.smoothing, square)
 
 
 class Stribeck(AbstractFrictionLaw):
@@ -126,16 +125,11 @@ class Stribeck(AbstractFrictionLaw):
 
     def slope(self, square: FloatScalar) -> FloatScalar:
         """Compute μ(u) / u from u²."""
-        static, kinetic, stribeck, smoothing, viscous = in_precision_of(
-            square,
-            self.static,
-            self.kinetic,
-            self.stribeck_speed,
-            self.smoothing,
-            self.viscous,
+        static, kinetic, stribeck, viscous = in_precision_of(
+            square, self.static, self.kinetic, self.stribeck_speed, self.viscous
         )
         friction = kinetic + (static - kinetic) * jnp.exp(-square / stribeck**2)
-        return friction / smoothing * _tanh_slope(square / smoothing**2) + viscous
+        return _coulomb_slope(friction, self.smoothing, square) + viscous
 
 
 class LinearSlip(AbstractFrictionLaw):
@@ -216,11 +210,7 @@ class _AbstractOnContact(AbstractForceOfReactions):
     load: eqx.AbstractVar[ArrayLike | ForceFunction | None]
 
     def __check_init__(self) -> None:
-        if self.load is None and not self.contacts[self.contact].touches:
-            raise ValueError(
-                f"The height of {self.contact!r} is not a constraint: pass its load "
-                "[N] as `load=`."
-            )
+        self.contacts.check_load(self.contact, self.load)
 
     @abc.abstractmethod
     def _rate(self, contact: AbstractContact, at: ContactState) -> Array:
@@ -270,8 +260,8 @@ class Sliding(_AbstractOnContact):
     - `contacts`, `contact`: the contacts of the system, and the name of one of them.
     - `law`: μ(u), such as `Coulomb(0.5, smoothing=0.001)`.
     - `load`: N if the height of the contact is not a constraint: a number [N], or a
-        function of (t, q, v, multipliers, args). By default the multiplier of the
-        height.
+        function of (t, q, v, multipliers, args). By default N is the multiplier of
+        the height.
 
     **Raises:** `ValueError` if there is no contact of this name, no load, or no
     direction in which the contact slips.
@@ -404,7 +394,7 @@ class RollingResistance(_AbstractOnContact):
         return _along_plane(at.angular_velocity, at)
 
     def _slope(self, at: ContactState, rate: Array) -> Array:
-        return Coulomb(self.arm, smoothing=self.smoothing).slope(rate @ rate)
+        return _coulomb_slope(self.arm, self.smoothing, rate @ rate)
 
 
 class PivotingFriction(_AbstractOnContact):
@@ -444,7 +434,7 @@ class PivotingFriction(_AbstractOnContact):
         return (at.angular_velocity @ at.normal)[None]
 
     def _slope(self, at: ContactState, rate: Array) -> Array:
-        return Coulomb(self.arm, smoothing=self.smoothing).slope(rate @ rate)
+        return _coulomb_slope(self.arm, self.smoothing, rate @ rate)
 
 
 class JointFriction(AbstractForceOfReactions):
@@ -545,6 +535,12 @@ def _slope_of(
         series = coefficient + near * series
     x = jnp.sqrt(jnp.where(is_small, 1, square))
     return jnp.where(is_small, series, function(x) / x)
+
+
+def _coulomb_slope(friction: ArrayLike, smoothing: ArrayLike, square: Array) -> Array:
+    """Compute μ tanh(u / u₀) / u from u²."""
+    friction, smoothing = in_precision_of(square, friction, smoothing)
+    return friction / smoothing * _tanh_slope(square / smoothing**2)
 
 
 def _tanh_slope(square: Array) -> Array:

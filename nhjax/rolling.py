@@ -437,12 +437,16 @@ class AbstractContact(eqx.Module):
     ) -> Float[Array, "k 3"]:
         """Compute the directions in which the body does not slip."""
         axes = self.axes(rotation, normal)
+        return self.weights(axes.dtype) @ axes
+
+    def weights(self, dtype: Any) -> Float[Array, "k 2"]:
+        """Return the parts along and across of the directions without slip."""
         unit = {"along": (1.0, 0.0), "across": (0.0, 1.0)}
         weights = [
             unit[x] if isinstance(x, str) else (math.cos(x), math.sin(x))
             for x in self.no_slip
         ]
-        return jnp.asarray(weights, axes.dtype).reshape(-1, 2) @ axes
+        return jnp.asarray(weights, dtype).reshape(-1, 2)
 
 
 class Wheel(AbstractContact):
@@ -717,11 +721,9 @@ class Contacts(eqx.Module):
         """
         check_type("y", y, State)
         check_choice("`frame`", frame, ("space", "contact"))
-        forces = self.reactions(t, y.q, y.multiplier, args)
         if frame == "space":
-            return forces
-        pairs = zip(self.names, self.contacts, strict=True)
-        return {name: x.frame(t, y.q, args) @ forces[name] for name, x in pairs}
+            return self.reactions(t, y.q, y.multiplier, args)
+        return self._in_frames(y.multiplier)
 
     @property
     def multiplier_names(self) -> tuple[str, ...]:
@@ -738,17 +740,23 @@ class Contacts(eqx.Module):
         args: Args = None,
     ) -> dict[str, Float[Array, "3"]]:
         """Compute the same forces from multipliers, for a force of your own."""
+        parts = self._in_frames(multipliers)
+        return {
+            name: parts[name] @ contact.frame(t, q, args)
+            for name, contact in zip(self.names, self.contacts, strict=True)
+        }
+
+    def _in_frames(self, multipliers: Array) -> dict[str, Array]:
+        """Compute the forces along, across and normal to the ground."""
         self._check_multipliers(multipliers)
         counts = [len(x.no_slip) for x in self.contacts]
         parts = jnp.split(multipliers[: sum(counts)], np.cumsum(counts)[:-1])
         forces = {}
         for name, contact, part in zip(self.names, self.contacts, parts, strict=True):
-            _, rotation = contact.place(t, q, args)
-            normal = contact.touch(t, q, args).normal
-            force = part @ contact.directions(rotation, normal)
+            normal = jnp.zeros((), multipliers.dtype)
             if contact.touches:
-                force = force + self.load(name, multipliers) * normal
-            forces[name] = force
+                normal = self.load(name, multipliers)
+            forces[name] = jnp.append(part @ contact.weights(part.dtype), normal)
         return forces
 
     def load(self, name: str, multipliers: Float[Array, " l"]) -> Float[Array, ""]:
@@ -762,16 +770,19 @@ class Contacts(eqx.Module):
         **Raises:** `ValueError` if the contact has `touches=False`, so that its normal
         force is not a multiplier; `ShapeError` for another number of multipliers.
         """
-        contact = self[name]
-        if not contact.touches:
-            raise ValueError(
-                f"The normal force on {name!r} is not a multiplier, since its height "
-                "is not a constraint: pass the load [N] as `load=`."
-            )
+        self.check_load(name, None)
         self._check_multipliers(multipliers)
         before = [x.touches for x in self.contacts[: self.names.index(name)]]
         count = sum(len(x.no_slip) for x in self.contacts)
         return multipliers[count + sum(before)]
+
+    def check_load(self, name: str, load: Any) -> None:
+        """Raise a `ValueError` unless there is a load, or a multiplier for it."""
+        if not self[name].touches and load is None:
+            raise ValueError(
+                f"The normal force on {name!r} is not a multiplier, since its height "
+                "is not a constraint: pass its load [N] as `load=`."
+            )
 
     def check_constraints_of(self, system: Any) -> None:
         """Raise a `ValueError` unless a system has these constraints and no others.
@@ -811,6 +822,13 @@ class Contacts(eqx.Module):
             )
 
 
+def _check_manifolds(
+    name: str, contacts: tuple[AbstractContact, ...], system: Any
+) -> None:
+    for contact in contacts:
+        check_same_manifold(name, contact, contact.manifold, system.manifold)
+
+
 class Slips(AbstractOfSystem):
     """The nonholonomic constraints of contacts: their velocities without slip."""
 
@@ -818,9 +836,7 @@ class Slips(AbstractOfSystem):
 
     def check_system(self, system: Any) -> None:
         """Raise a `ValueError` unless all contacts have the manifold of the system."""
-        for contact in self.contacts:
-            given = contact, contact.manifold, system.manifold
-            check_same_manifold("nonholonomic", *given)
+        _check_manifolds("nonholonomic", self.contacts, system)
 
     def __call__(
         self,
@@ -840,9 +856,7 @@ class Heights(AbstractOfSystem):
 
     def check_system(self, system: Any) -> None:
         """Raise a `ValueError` unless all contacts have the manifold of the system."""
-        for contact in self.contacts:
-            given = contact, contact.manifold, system.manifold
-            check_same_manifold("holonomic", *given)
+        _check_manifolds("holonomic", self.contacts, system)
 
     def __call__(
         self, t: FloatScalarLike, q: PyTree[Array], args: Args = None
@@ -892,11 +906,7 @@ def margin(
         raise ValueError(
             f"The contact {contact!r} has no directions `no_slip`, so that it slips."
         )
-    if load is None and not touched.touches:
-        raise ValueError(
-            f"The height of {contact!r} is not a constraint: pass its load [N] as "
-            "`load=`."
-        )
+    contacts.check_load(contact, load)
     return _Margin(contacts, contact, _friction(friction), checked_load(load))
 
 
@@ -1031,8 +1041,7 @@ class _NormalForce(eqx.Module):
     contact: str = eqx.field(static=True)
 
     def __check_init__(self) -> None:
-        zeros = sum(len(x.no_slip) + x.touches for x in self.contacts.contacts)
-        self.contacts.load(self.contact, jnp.zeros(zeros))
+        self.contacts.check_load(self.contact, None)
 
     def __call__(self, t: Any, y: State, args: Any) -> FloatScalar:
         return self.contacts.load(self.contact, y.multiplier)

@@ -24,8 +24,9 @@ if tuple(map(int, importlib.metadata.version("jaxlib").split(".")[:3])) < (0, 11
     QUICK_FLAGS = f"--xla_cpu_use_fusion_emitters=false {QUICK_FLAGS}"
 os.environ["XLA_FLAGS"] = f"{QUICK_FLAGS} {os.environ.get('XLA_FLAGS', '')}".strip()
 
-# Programs are compiled once for all processes and runs of the tests: a third of the
-# time of a run whose programs are known. What the environment says comes first.
+# Programs are compiled once for all processes and runs of the tests. A run whose
+# programs are all in the cache takes a third less time. Variables that are set already
+# are kept.
 CACHE = Path(__file__).parent.parent / ".pytest_cache" / "compiled"
 os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(CACHE))
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")

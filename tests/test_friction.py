@@ -713,7 +713,7 @@ def test_run_goes_on_with_friction_after_the_slip_event_as_in_the_closed_form():
     dt, num_steps = 2e-4, 3000
     sol = nhjax.integrate(sliding, method, y1, t0=t, dt=dt, num_steps=num_steps)
     end, duration = float(t) + dt * num_steps, dt * num_steps
-    # The friction changes the speed as that of the law with a jump, up to u₀.
+    # Up to u₀, the speed is that of Coulomb's law without smoothing.
     speed = float(at.v[0]) + 0.5 * G * duration
     np.testing.assert_allclose(_last(sol).v[0], speed, atol=2e-3)
     drive = 2.0 * (end**2 - float(t) ** 2) - 0.5 * MASS * G * RADIUS * duration

@@ -598,11 +598,12 @@ def reactions_at_stages(
 def reactions_at_end(stages: StageEquations, x: StageUnknowns) -> Float[Array, "l n"]:
     """Compute the reactions at the end of the step, a row for each unit multiplier."""
     time, u = stages.node_times[-1:], x.node_fibre_coordinate[-1:]
-    q = jax.tree.map(lambda leaf: leaf[None], end_position(stages, x))
+    end = end_position(stages, x)
+    q = jax.tree.map(lambda leaf: leaf[None], end)
     covectors = _reactions(stages, time, q, u)[:, 0]
     if not stages.system.force_takes_multipliers:
         return covectors
-    at_end = time[0], end_position(stages, x), u[0], x.end_multiplier
+    at_end = time[0], end, u[0], x.end_multiplier
     return covectors + force_by_multiplier(stages.system, *at_end, stages.args).T
 
 

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import nhjax
+from benchmarks.rolling import published_eigenvalues
 from nhjax.systems import WhippleBicycle
 from support import bicycle as oracle
 from support.library_motion import motion_at
@@ -17,21 +18,6 @@ MATRICES = (
     [[0.0, 33.86641391492494], [-0.85035641456978, 1.68540397397560]],
     [[-80.95, -2.59951685249872], [-2.59951685249872, -0.80329488458618]],
     [[0.0, 76.59734589573222], [0.0, 2.65431523794604]],
-)
-# Table 2: the two real eigenvalues and the pair, which is real in the first row. In 50
-# digits, the linear equations have these to 1e-13 but for 18.15788466125202 at 7 m/s.
-EIGENVALUES = (
-    (-5.53094371765393, -3.13164324790656, (3.13164324790656, 5.53094371765393)),
-    (-7.11008014637442, -3.13423125066578, 3.52696170990070 + 0.8077402751993j),
-    (-8.67387984831735, -3.07158645641514, 2.68234517512745 + 1.68066296590675j),
-    (-10.35101467245920, -2.63366137253667, 1.70675605663975 + 2.31582447384325j),
-    (-12.15861426576447, -1.42944427361326, 0.41325331521125 + 3.07910818603206j),
-    (-14.07838969279822, -0.32286642900409, -0.77534188219585 + 4.46486771378823j),
-    (-16.0853712309803, -0.00406690076970, -1.52644486584142 + 5.87673060598709j),
-    (-18.15788466125262, 0.10268170574766, -2.13875644258362 + 7.19525913329805j),
-    (-20.27940894394569, 0.14327879765713, -2.69348683581097 + 8.46037971396931j),
-    (-22.43788559040858, 0.15790184030917, -3.21675402252485 + 9.69377351531791j),
-    (-24.62459635017404, 0.16105338653172, -3.72016840437287 + 10.90681139476287j),
 )
 WEAVE, CAPSIZE = 4.29238253634111, 6.02426201538837
 
@@ -87,18 +73,10 @@ def multipliers():
     return eigenvalues
 
 
-def printed_eigenvalues():
-    rows = []
-    for *real, pair in EIGENVALUES:
-        both = pair if isinstance(pair, tuple) else (pair, np.conj(pair))
-        rows.append(np.sort_complex(np.array([*real, *both])))
-    return np.array(rows)
-
-
 @pytest.mark.long
 def test_eigenvalues_of_the_bicycle_equal_published_ones(multipliers):
     found = multipliers(np.arange(11.0), 0.015)
-    np.testing.assert_allclose(found, printed_eigenvalues(), rtol=0, atol=2e-12)
+    np.testing.assert_allclose(found, published_eigenvalues(), rtol=0, atol=2e-12)
 
 
 @pytest.mark.long
@@ -106,7 +84,7 @@ def test_eigenvalues_of_small_steps_equal_published_ones(multipliers):
     # At rest the derivatives of multipliers are smaller than their round-off, which
     # grows like 1 / h.
     found = multipliers(np.arange(11.0), 0.004)
-    np.testing.assert_allclose(found, printed_eigenvalues(), rtol=0, atol=1e-9)
+    np.testing.assert_allclose(found, published_eigenvalues(), rtol=0, atol=1e-9)
 
 
 @pytest.mark.long
