@@ -140,6 +140,23 @@ class RESULTS(eqx.Enumeration, metaclass=_Named):
         "ball that comes to rest: then end the run, or let the reset keep the "
         "motion away from the next event."
     )
+    max_steps_reached = (
+        "The run took `max_steps` attempts at a step before it reached its end. Pass a "
+        "larger `max_steps`, or allow larger errors; `SaveAt(checkpoint=True)` with "
+        "`throw=False` returns a checkpoint from which the run goes on."
+    )
+    dt_min_reached = (
+        "The error of a step is larger than the tolerance of the "
+        "`stepsize_controller` even at its `dtmin`, or, without one, at the smallest "
+        "step by which time advances. Lower `dtmin` or allow larger errors. Forces "
+        + JUMPS
+    )
+    density_not_positive = (
+        "The step density of the `stepsize_controller` is zero, negative or not a "
+        "number, or follows its `density` so badly that the next step would have no "
+        "size. Check that `density` is positive along the trajectory, and try a "
+        "smaller `eps`."
+    )
     interrupted = (
         "The run was interrupted from the keyboard. The solution ends with the last "
         "step before the interruption."
@@ -164,6 +181,9 @@ def result_codes() -> dict[str, int]:
         "nonfinite_event",
         "inconsistent_reset",
         "too_many_events",
+        "max_steps_reached",
+        "dt_min_reached",
+        "density_not_positive",
         "interrupted",
     )
     # The items are arrays of JAX, while their codes are needed as Python's integers.

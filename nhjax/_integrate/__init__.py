@@ -32,3 +32,9 @@ from ._solution import (
     raise_failures as raise_failures,
     Solution as Solution,
 )
+from ._step_sizes import (
+    AbstractStepSizeController as AbstractStepSizeController,
+    ConstantStepSize as ConstantStepSize,
+    PIDController as PIDController,
+    ReversibleController as ReversibleController,
+)

@@ -41,6 +41,8 @@ class Checkpoint(eqx.Module):
     - `t0`: the time from which steps are counted, the start of the first run.
     - `dt`: the step size.
     - `num_steps`: the number of steps taken since `t0`.
+    - `clock`: the data of the `stepsize_controller`; empty after a run with constant
+        steps. A run with different steps has its end as `t0`, and zero `num_steps`.
 
     Under `vmap` every array has the batch as its leading axis. Derivatives pass through
     `state`, `t0` and `dt`.
@@ -73,6 +75,7 @@ class Checkpoint(eqx.Module):
     t0: Float[Array, "*b"]
     dt: Float[Array, "*b"]
     num_steps: Int[Array, "*b"]
+    clock: tuple[Array, ...] = ()
 
     @property
     def t(self) -> Float[Array, "*b"]:

@@ -90,6 +90,7 @@ def drive(
     recorded: np.ndarray | None,
     keeps_records: bool,
     meter: AbstractProgressMeter,
+    may_end_early: bool = False,
 ) -> Output:
     """Take all steps of a run in chunks, and collect their rows.
 
@@ -106,17 +107,21 @@ def drive(
         all.
     - `keeps_records`: whether chunks return records of steps.
     - `meter`: the progress meter.
+    - `may_end_early`: whether a chunk says by its fields `is_over` and `progress`
+        whether the run has ended, and which part of it is done.
     """
     done, filled, last = 0, 0, None
     saved, records = [], []
-    schedule = _Schedule(num_steps, num_iterations, meter)
+    schedule = _Schedule(num_steps, num_iterations, meter, may_end_early)
     with _interruptions() as is_interrupted:
-        while done < num_iterations and not (done and is_interrupted()):
+        is_over = False
+        while not is_over and done < num_iterations and not (done and is_interrupted()):
             most = (filled // stride + room) * stride - filled
             if keeps_records:
                 most = min(most, room)
             end = min(done + schedule.length(done, most), num_iterations)
             at_end = end == num_iterations and saves_end(num_steps)
+            at_end = at_end or may_end_early
             started = time.monotonic()
             last = chunk(carry, log, _span(done, end, stride, num_steps, at_end))
             before, filled = filled, int(last.num_filled)
@@ -127,16 +132,21 @@ def drive(
                 saved.append(_rows(last.saved, slice(count)))
             if keeps_records:
                 records.append(_rows(last.records, _asked(recorded, before, filled)))
-            schedule.report(done)
-        if done < num_iterations:
+            if may_end_early:
+                is_over = bool(last.is_over)
+                schedule.report_part(1.0 if is_over else float(last.progress))
+            else:
+                is_over = done == num_iterations
+                schedule.report(done)
+        if not (is_over or may_end_early):
             span = _span(done, done, stride, filled, saves_end(filled))
             last = chunk(carry, log, span)
     return Output(
         last,
         _joined(saved),
         _joined(records),
-        num_steps if done == num_iterations else filled,
-        done < num_iterations,
+        filled if may_end_early or not is_over else num_steps,
+        not is_over,
     )
 
 
@@ -187,17 +197,22 @@ class _Schedule:
     """
 
     def __init__(
-        self, num_steps: int, num_iterations: int, meter: AbstractProgressMeter
+        self,
+        num_steps: int,
+        num_iterations: int,
+        meter: AbstractProgressMeter,
+        may_end_early: bool,
     ):
         self._meter, self._num_steps = meter, num_steps
+        self._may_end_early = may_end_early
         self._surplus = num_iterations - num_steps
         # A meter shows the run in about a hundred parts.
         self._every = max(1, num_steps // 100)
-        self._next, self._reported = _FIRST_ITERATIONS, 0
+        self._next, self._percent = _FIRST_ITERATIONS, 0
 
     def length(self, done: int, most: int) -> int:
         """Return the number of iterations of the next chunk, at most `most`."""
-        if self._meter.silent:
+        if self._meter.silent or self._may_end_early:
             return min(self._next, most)
         steps = max(done - self._surplus, 0)
         if steps == 0:
@@ -208,6 +223,13 @@ class _Schedule:
         """Learn from a chunk of this length how long the next ones may be."""
         factor = _SECONDS / max(seconds, 1e-3 * _SECONDS)
         self._next = max(1, min(int(length * factor), 8 * self._next))
+
+    def report_part(self, part: float) -> None:
+        """Report the part of a run that is done, from 0 to 1, as percents."""
+        percent = int(100 * part)
+        if not self._meter.silent and percent > self._percent:
+            self._meter.update_part(percent)
+        self._percent = max(percent, self._percent)
 
     def report(self, done: int) -> None:
         """Report the steps that are complete after `done` iterations."""

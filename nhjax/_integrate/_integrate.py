@@ -12,7 +12,7 @@ import jax
 import jax.extend
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array
+from jaxtyping import Array, Float
 
 from .._custom_types import (
     Args,
@@ -52,12 +52,14 @@ from ._checkpoint import (
     time_of,
 )
 from ._events import checked_events, Event
+from ._grid import checks_of_output, TimeGrid, variable_grid
 from ._interpolation import (
     require_collocation,
 )
 from ._loop import AbstractAdjoint, DirectAdjoint
 from ._progress_meter import AbstractProgressMeter, NoProgressMeter
-from ._run import run, run_in_chunks, RunOptions, SolverOptions, TimeGrid
+from ._reversible import ReversibleAdjoint
+from ._run import run, run_in_chunks, RunOptions, SolverOptions
 from ._saving import (
     SaveAt,
 )
@@ -68,6 +70,7 @@ from ._solution import (
     raise_failures,
     Solution,
 )
+from ._step_sizes import AbstractStepSizeController, ConstantStepSize
 
 
 METHODS = LobattoIIIAB, Gauss, PartitionedRungeKutta
@@ -102,19 +105,22 @@ def integrate(
     method: AbstractMethod,
     y0: State | Checkpoint,
     *,
-    dt: FloatScalarLike,
-    num_steps: int | IntScalar,
+    dt: FloatScalarLike | Float[Array, " num_steps"] | None = None,
+    num_steps: int | IntScalar | None = None,
     t0: FloatScalarLike | None = None,
+    t1: FloatScalarLike | None = None,
     args: Args = None,
     saveat: SaveAt = SaveAt(t1=True),
     stage_solver: AbstractStageSolver = SimplifiedNewton(),
+    stepsize_controller: AbstractStepSizeController = ConstantStepSize(),
+    max_steps: int | None = None,
     adjoint: AbstractAdjoint = DirectAdjoint(),
     throw: bool = True,
     progress_meter: AbstractProgressMeter = NoProgressMeter(),
     invariants: Literal["energy"] | PhaseFunction | None = None,
     event: Event | Sequence[Event] | None = None,
 ) -> Solution:
-    """Integrate a mechanical system over `num_steps` steps of size `dt`.
+    """Integrate a mechanical system over `num_steps` steps, or to the time `t1`.
 
     Each step solves the discrete equations of the paper (its four summaries) to
     round-off. So the constraints on velocities and positions hold at every node to
@@ -136,8 +142,11 @@ def integrate(
         Only the propagated closure uses its multiplier. It may also be the `Checkpoint`
         of an earlier run, which then continues bit for bit.
     - `dt`: the step size, a scalar, in units of time; negative to integrate backwards.
+        An array of shape (num_steps,) gives the size of each step. With a controller
+        that chooses the sizes, it is the first size, and may be left out.
     - `num_steps`: the number of steps, an int >= 1; see below for arrays.
     - `t0`: the time of `y0`, 0 by default. A checkpoint has its own time.
+    - `t1`: the end of the run, in place of `num_steps`. The last step ends there.
     - `args`: passed on to the functions of the system. Arrays and floats in it are
         traced, so that other values do not recompile. All other values are static.
 
@@ -146,6 +155,14 @@ def integrate(
     - `saveat`: the output to save, the final state by default; see `nhjax.SaveAt`.
     - `stage_solver`: how the equations of a step are solved,
         `nhjax.SimplifiedNewton()` by default, or `nhjax.Newton()`.
+    - `stepsize_controller`: how the sizes of the steps are chosen: all equal to `dt` by
+        default, or `nhjax.PIDController(rtol, atol)`, which keeps an estimated error
+        below a tolerance, or `nhjax.ReversibleController(eps, density)`. Derivatives
+        count the sizes that a controller chose as given.
+    - `max_steps`: the largest number of attempts at a step in a run to `t1`, an int,
+        4096 by default, and with constant steps as many as are needed. Under `jit`,
+        `SaveAt(steps=..., ts=..., dense=...)` and reverse mode need memory for this
+        number of steps.
     - `adjoint`: which data reverse mode stores: `nhjax.DirectAdjoint()` by default,
         `nhjax.RecursiveCheckpointAdjoint()`, or `nhjax.ReversibleAdjoint()`.
     - `throw`: raise an error if a step cannot be solved. Otherwise the trajectory stays
@@ -211,26 +228,48 @@ def integrate(
         "adjoint", adjoint, AbstractAdjoint, "For example, pass nhjax.DirectAdjoint()."
     )
     check_type("progress_meter", progress_meter, AbstractProgressMeter)
+    check_type(
+        "stepsize_controller",
+        stepsize_controller,
+        AbstractStepSizeController,
+        "For example, pass nhjax.PIDController(rtol=1e-6, atol=1e-6).",
+    )
     throw = check_flag("throw", throw)
-    needed_by = _what_needs_the_length(saveat, progress_meter)
-    num_steps = _check_num_steps(num_steps, needed_by)
     args = parameters(args)
     state = check_start(system, y0, args)
-    t0, dt, checks = _times(y0, state, t0, dt, num_steps)
     events = checked_events(event, saveat, invariants)
     _check_method(method, state, saveat)
-    checks += saveat.checks(t0, dt, num_steps)
-    saveat, valid = saveat.within(dt), None
+    controller, size = None, None
+    if _has_constant_steps(stepsize_controller, dt, t1):
+        needed_by = _what_needs_the_length(saveat, progress_meter)
+        _refuse_max_steps(max_steps)
+        num_steps = _check_num_steps(num_steps, needed_by)
+        t0, size, checks = _times(y0, state, t0, dt, num_steps)
+        checks += saveat.checks(t0, size, num_steps)
+        if not isinstance(num_steps, int):
+            num_steps = num_steps.astype(jnp.int32)
+        grid = TimeGrid(t0, size, num_steps)
+    else:
+        t0 = real_scalar("t0", time_of(y0, t0), state.p.dtype)
+        controller, grid, checks = variable_grid(
+            stepsize_controller, t0, dt, t1, num_steps, max_steps
+        )
+        num_steps = grid.most_steps
+        controller.check(system, method, t0, state, args)
+        checks += checks_of_output(saveat, grid, controller)
+        if events is not None and isinstance(adjoint, ReversibleAdjoint):
+            raise ValueError(
+                "ReversibleAdjoint cannot retrace runs with both events and steps that "
+                "differ. Use `nhjax.RecursiveCheckpointAdjoint()`."
+            )
+    saveat, valid = saveat.within(t0), None
     if throw:
-        # All checks go through dt, which is always used: jit drops checks of unused
+        # All checks go through times that are always used: jit drops checks of unused
         # values.
-        dt = require(dt, *checks)
+        grid = require(grid, *checks)
     else:
         valid = hold(*checks)
-    if not isinstance(num_steps, int):
-        num_steps = num_steps.astype(jnp.int32)
-    grid = TimeGrid(t0, dt, num_steps)
-    options = RunOptions(saveat.fn, invariants, events)
+    options = RunOptions(saveat.fn, invariants, events, controller)
     solver_options = SolverOptions(stage_solver, adjoint, progress_meter)
     whole_run = _program_of_run(num_steps)
     sol = whole_run(system, method, y0, grid, args, options, saveat, solver_options)
@@ -249,9 +288,26 @@ def integrate(
         warnings.warn(_INTERRUPTED.format(done, num_steps), stacklevel=2)
     elif throw:
         _require_constraints(sol, system, t0, state, args)
-        sol = raise_failures(sol, dt, used_newton)
-    _warn_of_errors(sol, dt)
+        sol = raise_failures(sol, size, used_newton)
+    if size is not None:
+        _warn_of_errors(sol, size)
     return sol
+
+
+def _has_constant_steps(
+    controller: AbstractStepSizeController, dt: Any, t1: FloatScalarLike | None
+) -> bool:
+    """Return whether all steps have the same size, and their number is given."""
+    is_constant = isinstance(controller, ConstantStepSize)
+    return is_constant and t1 is None and np.ndim(dt) == 0
+
+
+def _refuse_max_steps(max_steps: int | None) -> None:
+    if max_steps is not None:
+        raise ValueError(
+            "`max_steps` is given together with `num_steps`. It limits runs to `t1`, "
+            "whose number of steps is not known."
+        )
 
 
 def step(
@@ -364,10 +420,15 @@ def _times(
     y0: State | Checkpoint,
     state: State,
     t0: FloatScalarLike | None,
-    dt: FloatScalarLike,
+    dt: Any,
     num_steps: int | IntScalar,
 ) -> tuple[FloatScalar, FloatScalar, list[Check]]:
     """Return the time of `y0` and the step size as arrays, and the checks of both."""
+    if dt is None:
+        raise TypeError(
+            "`dt` is missing: give the size of the steps, or a `stepsize_controller` "
+            "that chooses it, such as nhjax.PIDController(rtol=1e-6, atol=1e-6)."
+        )
     dt = real_scalar("dt", dt, state.p.dtype)
     t0 = real_scalar("t0", time_of(y0, t0), state.p.dtype)
     known = dt if is_traced(dt) else np.asarray(dt)
@@ -416,6 +477,11 @@ def _check_num_steps(num_steps: Any, needed_by: str | None) -> int | IntScalar:
     """
     if isinstance(num_steps, jax.Array | np.ndarray):
         return _traced_count(num_steps, needed_by)
+    if num_steps is None:
+        raise TypeError(
+            "`num_steps` is missing: give the number of steps, or `t1`, the end of the "
+            "run."
+        )
     if isinstance(num_steps, bool) or not isinstance(num_steps, int | np.integer):
         raise TypeError(
             "`num_steps` must be an int, or an integer array of shape (), got "

@@ -56,8 +56,9 @@ def interpolate(
 class DenseInterpolation(eqx.Module):
     """The collocation polynomials of a whole trajectory, one for each of its steps.
 
-    They are defined on [t0, t0 + num_steps dt]. `integrate` returns an instance with
-    `SaveAt(dense=True)`; users evaluate it through `Solution.evaluate`.
+    They are defined on [t0, t0 + num_steps dt], and in a run whose steps differ up to
+    its end. `integrate` returns an instance with `SaveAt(dense=True)`; users evaluate
+    it through `Solution.evaluate`.
     """
 
     method: AbstractMethod = eqx.field(static=True)
@@ -65,6 +66,8 @@ class DenseInterpolation(eqx.Module):
     t0: FloatScalar
     dt: FloatScalar
     records: StepRecord
+    # The number of steps whose records are valid, in a run whose steps differ.
+    count: Int[Array, ""] | None
     # The system and args are stored as a list of their arrays, a tuple of their other
     # leaves and the structure of the tree, because `jax.jit` and `jax.vmap` cannot
     # return functions.
@@ -81,8 +84,9 @@ class DenseInterpolation(eqx.Module):
         dt: FloatScalar,
         records: StepRecord,
         args: Args,
+        count: Int[Array, ""] | None = None,
     ):
-        self.method, self.num_steps = method, num_steps
+        self.method, self.num_steps, self.count = method, num_steps, count
         self.t0, self.dt, self.records = t0, dt, records
         leaves, self._treedef = jax.tree.flatten((system, args))
         self._arrays = [leaf for leaf in leaves if eqx.is_array(leaf)]
@@ -103,6 +107,13 @@ class DenseInterpolation(eqx.Module):
                 "`jax.vmap(lambda sol: sol.evaluate(t))(sol)`."
             )
         t = real_scalar("t", t, self.t0.dtype)
+        if self.records.interval is not None and self.count is not None:
+            starts, sizes = self.records.interval
+            last = self.count - 1
+            end = starts[last] + sizes[last]
+            inside = is_within(t, self.t0, end)
+            t = require(t, Check(inside, _outside_of_steps, (t, self.t0, end)))
+            return _evaluate(self, t)
         _, inside = step_position(t, self.t0, self.dt, self.num_steps)
         run = (t, self.t0, self.dt, self.num_steps)
         t = require(t, Check(inside, _outside, run))
@@ -116,6 +127,39 @@ def _outside(
         f"Solution.evaluate: `t` = {float(t)} lies outside the run, from {float(t0)} "
         f"to {float(t0 + num_steps * dt)}."
     )
+
+
+def _outside_of_steps(t: np.ndarray, t0: np.ndarray, t1: np.ndarray) -> ValueError:
+    return ValueError(
+        f"Solution.evaluate: `t` = {float(t)} lies outside the run, from {float(t0)} "
+        f"to {float(t1)}."
+    )
+
+
+def is_within(
+    t: Float[Array, "*k"], t0: FloatScalar, t1: FloatScalar
+) -> Bool[Array, "*k"]:
+    """Return which times lie between t0 and t1, or outside by round-off."""
+    slack = 8 * float(jnp.finfo(t.dtype).eps) * jnp.maximum(jnp.abs(t0), jnp.abs(t1))
+    least, most = jnp.minimum(t0, t1) - slack, jnp.maximum(t0, t1) + slack
+    return (t >= least) & (t <= most)
+
+
+def step_among(
+    t: FloatScalar,
+    interval: tuple[Float[Array, " k"], Float[Array, " k"]],
+    count: Int[Array, ""] | int,
+) -> Int[Array, ""]:
+    """Find the index of the step that contains the time t, among steps that differ.
+
+    `interval` has the starts and the sizes of the steps, of which `count` are valid.
+    """
+    starts, sizes = interval
+    forward = jnp.sign(sizes[0])
+    is_before = forward * starts <= forward * t
+    is_valid = jnp.arange(starts.shape[0], dtype=jnp.int32) < count
+    number = jnp.sum(is_before & is_valid, dtype=jnp.int32)
+    return jnp.maximum(number - 1, 0)
 
 
 def step_position(
@@ -142,12 +186,15 @@ def step_index(
 
 @eqx.filter_jit
 def _evaluate(self: DenseInterpolation, t: FloatScalar) -> State:
-    k = step_index(t, self.t0, self.dt, self.num_steps)
+    intervals = self.records.interval
+    if intervals is not None and self.count is not None:
+        k = step_among(t, intervals, self.count)
+    else:
+        k = step_index(t, self.t0, self.dt, self.num_steps)
     record = jax.tree.map(lambda x: x[k], self.records)
-    start = self.t0 + k.astype(t.dtype) * self.dt
-    theta = (t - start) / self.dt
+    start, h = record.interval or (self.t0 + k.astype(t.dtype) * self.dt, self.dt)
     system, args = self._system_and_args
-    return interpolate(system, self.method, record, start, self.dt, theta, args)
+    return interpolate(system, self.method, record, start, h, (t - start) / h, args)
 
 
 def require_collocation(method: AbstractMethod) -> None:

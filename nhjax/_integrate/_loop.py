@@ -49,9 +49,14 @@ class Loop(eqx.Module):
         self, carry: AbstractCarry, k: Int[Array, ""], replay: Any = None
     ) -> tuple[AbstractCarry, Rows]:
         """Perform iteration k; return the carry after it and the rows that it saves."""
+        before = carry
         carry, result = self.stepper.advance(carry, k, replay)
         if not self.meter.silent:
-            self._report(k)
+            if self.stepper.may_end_early:
+                parts = (self.stepper.progress(x) for x in (before, carry))
+                self.meter.report_part(*parts)
+            else:
+                self._report(k)
         return carry, self._rows(carry, result, k)
 
     def _report(self, k: Int[Array, ""]) -> None:
@@ -144,6 +149,25 @@ def advance(loop: Loop, k: Int[Array, ""], state: _Run) -> _Run:
     return carry, loop.write(buffers, rows, k)
 
 
+def iterate_steps(loop: Loop, start: Any, end: Any, state: _Run) -> _Run:
+    """Perform the iterations from `start` to before `end`, unless the run ends first.
+
+    This loop cannot be differentiated in reverse mode if the run may end early.
+    """
+    if not loop.stepper.may_end_early:
+        return jax.lax.fori_loop(start, end, partial(advance, loop), state)
+
+    def goes_on(counted):
+        k, (carry, _) = counted
+        return (k < end) & ~loop.stepper.is_over(carry)
+
+    def body(counted):
+        k, state = counted
+        return k + np.int32(1), advance(loop, k, state)
+
+    return jax.lax.while_loop(goes_on, body, (start, state))[1]
+
+
 def count(num_steps: int | Int[Array, ""]) -> Any:
     """Convert a number of steps to int32 for a loop. A Python int stays static."""
     return np.int32(num_steps) if isinstance(num_steps, int) else num_steps
@@ -177,8 +201,9 @@ class DirectAdjoint(AbstractAdjoint):
     def run(self, loop: Loop, carry: AbstractCarry) -> _Run:
         """Run all steps of the loop from `carry`; return its end and all saved rows."""
         state = (carry, loop.empty_rows(carry))
-        end = count(loop.num_iterations)
-        return jax.lax.fori_loop(np.int32(0), end, partial(advance, loop), state)
+        if loop.stepper.may_end_early:
+            return _run_until_over((loop, state))
+        return iterate_steps(loop, np.int32(0), count(loop.num_iterations), state)
 
 
 class RecursiveCheckpointAdjoint(AbstractAdjoint):
@@ -235,14 +260,20 @@ class RecursiveCheckpointAdjoint(AbstractAdjoint):
         if not isinstance(loop.num_iterations, int):
             # Blocks are useful in reverse mode only, which needs a static length.
             return DirectAdjoint().run(loop, carry)
+        if loop.stepper.may_end_early:
+            return _run_until_over((loop, (carry, loop.empty_rows(carry))), self)
+        return self.run_blocks(loop, (carry, loop.empty_rows(carry)))
+
+    def run_blocks(self, loop: Loop, state: _Run) -> _Run:
+        """Run a known number of iterations in blocks."""
+        assert isinstance(loop.num_iterations, int)
         lengths = self._block_lengths(loop.num_iterations)
         steps: _Advance = partial(advance, loop)
-        if math.prod(lengths) > loop.num_iterations:
+        if loop.stepper.may_end_early or math.prod(lengths) > loop.num_iterations:
             steps = _idle_after_the_end(loop)
         for level, length in enumerate(reversed(lengths)):
             stride = math.prod(lengths[len(lengths) - level :])
             steps = _block(steps, length, stride, keep_all=level == 0)
-        state = (carry, loop.empty_rows(carry))
         return steps(jnp.zeros((), jnp.int32), state)
 
     def _block_lengths(self, num_steps: int) -> list[int]:
@@ -286,8 +317,11 @@ def _idle_after_the_end(loop: Loop) -> _Advance:
         # them.
         carry, buffers = state
         no_rows = loop.no_rows(carry)
+        is_within = k < loop.num_iterations
+        if loop.stepper.may_end_early:
+            is_within = is_within & ~loop.stepper.is_over(carry)
         carry, rows = jax.lax.cond(
-            k < loop.num_iterations,
+            is_within,
             lambda carry: loop.step(carry, k),
             lambda carry: (carry, no_rows),
             carry,
@@ -295,3 +329,30 @@ def _idle_after_the_end(loop: Loop) -> _Advance:
         return carry, loop.write(buffers, rows, k)
 
     return advance_or_idle
+
+
+@eqx.filter_custom_jvp
+def _run_until_over(
+    arguments: tuple[Loop, _Run], adjoint: AbstractAdjoint | None = None
+) -> _Run:
+    """Iterate until the run is over, within its largest number of iterations."""
+    del adjoint
+    loop, state = arguments
+    start = jnp.zeros((), jnp.int32)
+    return iterate_steps(loop, start, count(loop.num_iterations), state)
+
+
+@_run_until_over.def_jvp
+def _run_until_over_jvp(primals, tangents):
+    # Reverse mode needs a loop of known length, whose last iterations are idle.
+    arguments, adjoint = primals
+    rates, _ = tangents
+
+    def run(arguments):
+        loop, state = arguments
+        if isinstance(adjoint, RecursiveCheckpointAdjoint):
+            return adjoint.run_blocks(loop, state)
+        end, steps = count(loop.num_iterations), _idle_after_the_end(loop)
+        return jax.lax.fori_loop(np.int32(0), end, steps, state)
+
+    return eqx.filter_jvp(run, (arguments,), (rates,))

@@ -6,8 +6,11 @@ from typing import Any
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 import tqdm
 from jaxtyping import Array, Int
+
+from .._custom_types import FloatScalar
 
 
 class AbstractProgressMeter(eqx.Module):
@@ -25,6 +28,13 @@ class AbstractProgressMeter(eqx.Module):
         The loop calls it on the host about a hundred times a run, and with
         done = total at the end.
         """
+
+    def update_part(self, percent: int) -> None:
+        """Show that a part of the run is done, where the number of steps is not known.
+
+        The loop calls it when the percentage of the run's time has increased.
+        """
+        self.update(percent, 100)
 
     def close(self) -> None:
         """Close open resources, such as the bar of a run that was interrupted."""
@@ -52,6 +62,20 @@ class AbstractProgressMeter(eqx.Module):
             lambda: jax.debug.callback(callback, done),
             lambda: None,
         )
+
+    def report_part(self, before: FloatScalar, after: FloatScalar) -> None:
+        """Report from inside a traced loop that a part of the run is done.
+
+        The parts before and after a step are numbers from 0 to 1.
+        """
+        if self.silent:
+            return
+        old, new = ((100 * x).astype(jnp.int32) for x in (before, after))
+
+        def callback(percent):
+            self.update_part(int(percent))
+
+        jax.lax.cond(new > old, lambda: jax.debug.callback(callback, new), lambda: None)
 
 
 class NoProgressMeter(AbstractProgressMeter):
@@ -82,12 +106,23 @@ class TextProgressMeter(AbstractProgressMeter):
         50 of 100 steps
     """
 
+    _printed: "_Printed" = eqx.field(static=True, init=False, repr=False)
+
+    def __init__(self):
+        self._printed = _Printed()
+
     def update(self, done: int, total: int) -> None:
         """Print the number of complete steps, after each tenth of the run."""
         # Reports come after each hundredth of the run, not after each step.
         tenth, apart = max(1, total // 10), max(1, total // 100)
         if done == total or (done >= tenth and done % tenth < apart):
             print(f"{done} of {total} steps", flush=True)
+
+    def update_part(self, percent: int) -> None:
+        """Print the percentage of the run that is done, about every tenth."""
+        if percent // 10 > self._printed.tenth or percent < 10 * self._printed.tenth:
+            print(f"{percent} % of the run", flush=True)
+        self._printed.tenth = percent // 10
 
 
 class TqdmProgressMeter(AbstractProgressMeter):
@@ -139,6 +174,19 @@ class TqdmProgressMeter(AbstractProgressMeter):
         for bar in self._open.bars.values():
             bar.close()
         self._open.bars.clear()
+
+
+class _Printed:
+    """The tenth of a run that was printed last; all instances are equal."""
+
+    def __init__(self):
+        self.tenth = 0
+
+    def __hash__(self) -> int:
+        return 0
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, _Printed)
 
 
 class _Open:

@@ -96,10 +96,11 @@ def _run_bwd(residuals, cotangents, perturbed, arguments):
         change, cotangent = pullback((cotangent, rows))
         return replay, step_state, cotangent, jax.tree.map(jnp.add, total, change)
 
-    last = count(loop.num_iterations) - np.int32(1)
+    number = count(reverse.num_iterations)
+    last = number - np.int32(1)
     _, first, cotangents, total = jax.lax.fori_loop(
         np.int32(0),
-        count(loop.num_iterations),
+        number,
         lambda i, state: back(state, last - i),
         (reverse.after_end, end.step_state, cotangent, zeros),
     )

@@ -15,7 +15,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int, PyTree
+from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from .._compile import (
     as_cpu_kernel,
@@ -50,6 +50,7 @@ from .._system import (
 )
 from ._checkpoint import (
     Checkpoint,
+    Origin,
     start_of,
 )
 from ._chunks import (
@@ -65,12 +66,15 @@ from ._chunks import (
 )
 from ._conservation import kept_invariants
 from ._events import Event, EventStepper
+from ._grid import Grid, VariableGrid
 from ._interpolation import (
     DenseInterpolation,
     interpolate,
+    is_within,
+    step_among,
     step_index,
 )
-from ._loop import AbstractAdjoint, advance, Loop
+from ._loop import AbstractAdjoint, iterate_steps, Loop
 from ._progress_meter import AbstractProgressMeter, NoProgressMeter
 from ._saving import (
     record_places,
@@ -83,6 +87,7 @@ from ._saving import (
 from ._solution import (
     Solution,
 )
+from ._step_sizes import AbstractStepSizeController
 from ._stepper import (
     AbstractCarry,
     AbstractStepper,
@@ -90,26 +95,21 @@ from ._stepper import (
     reported_statistics,
     RunEnd,
 )
-
-
-class TimeGrid(eqx.Module):
-    """The nodes t_k = t0 + k dt of a run, for k = 0, ..., num_steps."""
-
-    t0: FloatScalar
-    dt: FloatScalar
-    num_steps: Any
+from ._variable import StepSizes, VariableStepper
 
 
 class RunOptions(eqx.Module):
-    """The user's options that contain functions: output, invariants and events.
+    """The user's options that contain functions.
 
-    `fn` is that of `SaveAt`, `invariants` the argument of `integrate`, and `events` its
-    argument `event` as a tuple.
+    `fn` is that of `SaveAt`, `invariants` and `controller` are arguments of
+    `integrate`, and `events` is its argument `event` as a tuple. The `controller` is
+    None for a run with constant steps.
     """
 
     fn: Callable[[Any, Any, Any], PyTree[Array]]
     invariants: str | Callable[..., Any] | None
     events: tuple[Event, ...] | None
+    controller: AbstractStepSizeController | None = None
 
 
 class SolverOptions(eqx.Module):
@@ -125,7 +125,7 @@ def run(
     system: AbstractMechanicalSystem,
     method: AbstractMethod,
     y0: State | Checkpoint,
-    grid: TimeGrid,
+    grid: Grid,
     args: Args,
     options: RunOptions,
     saveat: SaveAt,
@@ -135,25 +135,33 @@ def run(
 
     This is one program, for runs inside transformations.
     """
-    t0 = grid.t0
+    t0, is_variable = grid.t0, isinstance(grid, VariableGrid)
     given = system, method, y0, grid, args, options, solver_options.stage_solver
     stepper, fn = _stepper(*given)
     plain = stepper.plain
-    system = plain.system
-    sampled = _sampled_steps(saveat, grid)
-    places = record_places(saveat.dense, sampled, grid.num_steps)
-    saving = Saving.of(saveat, fn, grid.num_steps, places, stepper.log_length)
+    system, most = plain.system, plain.num_steps
+    sampled = None if is_variable else _sampled_steps(saveat, grid)
+    # The steps in which times lie are not known before they are taken.
+    keeps_all = saveat.dense or (is_variable and saveat.ts is not None)
+    places = record_places(keeps_all, sampled, most)
+    saving = Saving.of(saveat, fn, most, places, stepper.log_length)
     loop = Loop(stepper, saving, solver_options.meter)
     adjoint = solver_options.adjoint
     round_off, start, carry, rows = _all_steps(adjoint, loop, y0, saveat.checkpoint)
-    given = (system, y0, t0, grid.dt, args), options.events
+    given = (system, y0, t0, grid, args), options.events, options.controller
     end = loop.stepper.finish(carry, (rows.saved, rows.record), rows.log, given)
-    ts, ys = _output(saveat, loop, grid, start, end, sampled)
+    # With events, the event that ends the run has a row of its own.
+    zero = jnp.zeros((), jnp.int32)
+    number = stepper.num_filled(carry, zero) if is_variable else None
+    if number is None:
+        ts, ys = _output(saveat, loop, t0, start, end, sampled)
+    else:
+        ts, ys = _padded_output(saveat, loop, t0, start, end, number)
     interpolation, checkpoint, records = None, None, end.rows[1]
     if saveat.dense and records is not None:
-        interpolation = _interpolation(plain, grid, records)
+        interpolation = _interpolation(plain, grid, records, number)
     if saveat.checkpoint:
-        checkpoint = plain.checkpoint(round_off, carry, end.state)
+        checkpoint = _checkpoint(stepper, round_off, carry, end.state)
     return Solution(
         t0=t0,
         t1=end.t,
@@ -172,14 +180,21 @@ def _stepper(
     system: AbstractMechanicalSystem,
     method: AbstractMethod,
     y0: State | Checkpoint,
-    grid: TimeGrid,
+    grid: Grid,
     args: Args,
     options: RunOptions,
     stage_solver: AbstractStageSolver,
 ) -> tuple[AbstractStepper[Any, Any], ClosureConverted]:
     """Return the stepper of a run, and the function `fn` of its output."""
     t0, fn = grid.t0, options.fn
-    state, origin = start_of(y0, t0, grid.dt)
+    dt, num_steps = grid.dt, grid.num_steps
+    if isinstance(grid, VariableGrid):
+        # Its steps have no common size, and are not counted from an origin.
+        dt, num_steps = grid.typical_size, grid.most_steps
+        origin = Origin(t0, jnp.zeros((), jnp.int32), jnp.zeros_like(t0))
+        state = y0.state if isinstance(y0, Checkpoint) else y0
+    else:
+        state, origin = start_of(y0, t0, grid.dt)
     called = "y0.state" if isinstance(y0, Checkpoint) else "y0"
     check_multiplier(system, state, args, called)
     _check_saved(fn, t0, state, args)
@@ -191,17 +206,32 @@ def _stepper(
         method=method,
         stage_solver=stage_solver,
         origin=origin,
-        dt=grid.dt,
+        dt=dt,
         args=args,
         invariants=kept_invariants(options.invariants, system, t0, state, args),
         programs=TraceCache(),
         round_off=None,
-        num_steps=grid.num_steps,
+        num_steps=num_steps,
     )
-    fn = ClosureConverted(fn, t0, state, args)
-    if options.events is None:
-        return plain, fn
-    return EventStepper.of(options.events, plain, state), fn
+    fn, sizes = ClosureConverted(fn, t0, state, args), None
+    if isinstance(grid, VariableGrid):
+        sizes = _sizes(options.controller, grid, plain, state)
+    if options.events is not None:
+        return EventStepper.of(options.events, plain, state, sizes), fn
+    return (plain if sizes is None else VariableStepper(plain, sizes)), fn
+
+
+def _sizes(
+    controller: AbstractStepSizeController | None,
+    grid: VariableGrid,
+    plain: PlainStepper,
+    y: State,
+) -> StepSizes:
+    """Return the sizes of the steps of a run."""
+    assert controller is not None
+    controller = controller.closure_converted(plain.system, grid.t0, y, plain.args)
+    given = grid.dt, grid.t1, grid.direction, grid.num_steps, grid.max_steps
+    return StepSizes(controller, *given)
 
 
 class _Start(NamedTuple):
@@ -210,7 +240,8 @@ class _Start(NamedTuple):
     - `carry`, `log`: those before the first iteration.
     - `round_off`: the round-off of the functions of the system.
     - `saved`: the output of the initial state, if it is asked for.
-    - `surplus`: the number of iterations that the run may need beyond its steps.
+    - `surplus`: the number of iterations that the run may need beyond its steps; all
+        of them in a run whose steps differ.
     - `room`: the number of rows of the buffers of a chunk.
     """
 
@@ -233,6 +264,8 @@ class _Chunk(NamedTuple):
     - `checkpoint`: the checkpoint after the chunk; None for runs with events.
     - `system`: the system for the interpolation of records, if there are any.
     - `stats`: the statistics of the solution.
+    - `is_over`, `progress`: whether the run has ended, and the part of it that is done,
+        if its steps differ.
     """
 
     carry: AbstractCarry
@@ -245,6 +278,8 @@ class _Chunk(NamedTuple):
     checkpoint: Checkpoint | None
     system: AbstractMechanicalSystem | None
     stats: dict[str, Any]
+    is_over: BoolScalar | None
+    progress: FloatScalar | None
 
 
 @tracked_jit("system", "args", "options")
@@ -252,7 +287,7 @@ def _started(
     system: AbstractMechanicalSystem,
     method: AbstractMethod,
     y0: State | Checkpoint,
-    grid: TimeGrid,
+    grid: Grid,
     args: Args,
     options: RunOptions,
     stage_solver: AbstractStageSolver,
@@ -260,11 +295,12 @@ def _started(
 ) -> _Start:
     """Return the start of a run in chunks."""
     # The start does not depend on the number of steps, apart from events.
-    grid = replace(grid, num_steps=jnp.zeros((), jnp.int32))
+    none = jnp.zeros((), jnp.int32)
+    grid = grid.of_length(none)
     stepper, fn = _stepper(system, method, y0, grid, args, options, stage_solver)
     noise = _noise(stepper, y0)
     round_off, carry = as_cpu_kernel(_start, stepper, y0, noise)
-    saving = _saving_in_chunks(stepper, fn, grid.num_steps, grid.num_steps, 0, 1)
+    saving = _saving_in_chunks(stepper, fn, none, none, 0, 1)
     loop = Loop(stepper, saving, NoProgressMeter())
     rows = loop.row_shapes(carry)
     return _Start(
@@ -282,7 +318,7 @@ def _chunk(
     system: AbstractMechanicalSystem,
     method: AbstractMethod,
     y0: State | Checkpoint,
-    grid: TimeGrid,
+    grid: Grid,
     args: Args,
     options: RunOptions,
     stage_solver: AbstractStageSolver,
@@ -294,7 +330,7 @@ def _chunk(
     """Take the iterations of a `Span` of `numbers`, from the carry in `start`."""
     round_off, carry, log = start
     span = Span(*numbers)
-    grid = replace(grid, num_steps=span.num_steps)
+    grid = grid.of_length(span.num_steps)
     stepper, fn = _stepper(system, method, y0, grid, args, options, stage_solver)
     stepper = stepper.with_round_off(round_off)
     num_records = room if keeps_records else 0
@@ -312,14 +348,14 @@ def _chunk(
         lin = started_like(linearise(*given, may_be_sparse=True), carry.step_state.lin)
         carry = eqx.tree_at(lambda x: x.step_state.lin, carry, lin)
         buffers = loop.empty_rows(carry)._replace(log=log)
-        return jax.lax.fori_loop(start, end, partial(advance, loop), (carry, buffers))
+        return iterate_steps(loop, start, end, (carry, buffers))
 
     given = loop, carry, log, span.start, span.end
     carry, rows = as_cpu_kernel(steps, *given)
     end = stepper.finish(carry, None, rows.log, None)
     checkpoint = None
     if options.events is None:
-        checkpoint = stepper.plain.checkpoint(round_off, carry, end.state)
+        checkpoint = _checkpoint(stepper, round_off, carry, end.state)
     return _Chunk(
         carry=carry,
         log=rows.log,
@@ -331,7 +367,20 @@ def _chunk(
         checkpoint=checkpoint,
         system=stepper.plain.system if num_records else None,
         stats=reported_statistics(carry.stats, method),
+        is_over=stepper.is_over(carry) if stepper.may_end_early else None,
+        progress=stepper.progress(carry),
     )
+
+
+def _checkpoint(
+    stepper: AbstractStepper[Any, Any],
+    round_off: RoundOff,
+    carry: Any,
+    end: State,
+) -> Checkpoint:
+    """Return the checkpoint after the last step of a run without events."""
+    owner = stepper if isinstance(stepper, VariableStepper) else stepper.plain
+    return owner.checkpoint(round_off, carry, end)
 
 
 def _saving_in_chunks(
@@ -373,16 +422,17 @@ def _samples(
     system: AbstractMechanicalSystem,
     method: AbstractMethod,
     y0: State | Checkpoint,
-    grid: TimeGrid,
+    grid: Grid,
     args: Args,
     options: RunOptions,
     stage_solver: AbstractStageSolver,
     samples: tuple[Float[Array, " k"], Int[Array, " k"], StepRecord],
 ) -> PyTree[Array]:
     """Compute the output at times inside steps, whose indices and records are given."""
-    grid = replace(grid, num_steps=jnp.zeros((), jnp.int32))
+    none = jnp.zeros((), jnp.int32)
+    grid = grid.of_length(none)
     stepper, fn = _stepper(system, method, y0, grid, args, options, stage_solver)
-    saving = _saving_in_chunks(stepper, fn, grid.num_steps, grid.num_steps, 0, 1)
+    saving = _saving_in_chunks(stepper, fn, none, none, 0, 1)
     loop = Loop(stepper, saving, NoProgressMeter())
     return jax.vmap(partial(_sample, loop))(*samples)
 
@@ -391,18 +441,19 @@ def run_in_chunks(
     system: AbstractMechanicalSystem,
     method: AbstractMethod,
     y0: State | Checkpoint,
-    grid: TimeGrid,
+    grid: Grid,
     args: Args,
     options: RunOptions,
     saveat: SaveAt,
     solver_options: SolverOptions,
 ) -> Solution:
     """Integrate by chunks of steps, outside of transformations."""
-    num_steps = static_length(grid.num_steps)
-    steps = _sampled_steps(saveat, grid)
-    keeps_records = saveat.dense or steps is not None
+    is_variable = isinstance(grid, VariableGrid)
+    num_steps = static_length(grid.most_steps)
+    steps = None if is_variable else _sampled_steps(saveat, grid)
+    keeps_records = saveat.dense or saveat.ts is not None
     # The chunks get the number of steps with their spans.
-    whole, grid = grid, replace(grid, num_steps=None)
+    whole, grid = grid, grid.of_length(None)
     given = system, method, y0, grid, args, options, solver_options.stage_solver
     captured = captured_by(system, args, options)
     saves_start = jax.device_put(np.array(saveat.t0))
@@ -421,19 +472,22 @@ def run_in_chunks(
         start.carry,
         start.log,
         num_steps=num_steps,
-        num_iterations=num_steps + int(start.surplus),
+        num_iterations=int(start.surplus) + (0 if is_variable else num_steps),
         stride=saveat.steps or NO_STRIDE,
         room=start.room,
         saves_end=saveat.saves_end,
         recorded=None if saveat.dense or steps is None else np.unique(steps),
         keeps_records=keeps_records,
         meter=solver_options.meter,
+        may_end_early=is_variable,
     )
     last: _Chunk = output.last
     pieces = [_one(on_host(start.saved))] if saveat.t0 else []
     if output.saved is not None:
         pieces.append(output.saved)
-    if saveat.ts is not None and steps is not None:
+    if saveat.ts is not None:
+        if steps is None:
+            saveat, steps = _steps_taken(saveat, grid.t0, last.end.t, output.records)
         pieces += _sampled_in_chunks(given, saveat, np.asarray(steps), output)
     if saveat.saves_end(output.num_steps):
         pieces.append(_one(on_host(last.saved_end)))
@@ -445,9 +499,10 @@ def run_in_chunks(
             method=method,
             num_steps=output.num_steps,
             t0=grid.t0,
-            dt=grid.dt,
+            dt=grid.typical_size,
             records=on_device(output.records, last.end.t),
             args=args,
+            count=jnp.asarray(output.num_steps, jnp.int32) if is_variable else None,
         )
     if output.is_interrupted:
         is_good = result == RESULTS.successful
@@ -466,6 +521,24 @@ def run_in_chunks(
     )
 
 
+def _steps_taken(
+    saveat: SaveAt, t0: FloatScalar, t1: FloatScalar, records: StepRecord | None
+) -> tuple[SaveAt, np.ndarray]:
+    """Find the steps in which the times of `SaveAt(ts=...)` lie, after they were taken.
+
+    Return them with options that contain only the times that were reached.
+    """
+    ts = np.asarray(saveat.ts)
+    if records is None or records.interval is None or not len(records.force):
+        return eqx.tree_at(lambda x: x.ts, saveat, ts[:0]), np.zeros((0,), np.int32)
+    reached = ts[np.asarray(is_within(ts, t0, t1))]
+    starts, sizes = (np.asarray(x) for x in records.interval)
+    forward = np.sign(sizes[0])
+    number = np.searchsorted(forward * starts, forward * reached, side="right")
+    steps = np.maximum(number - 1, 0)
+    return eqx.tree_at(lambda x: x.ts, saveat, reached), steps
+
+
 def _sampled_in_chunks(
     given: tuple[Any, ...], saveat: SaveAt, steps: np.ndarray, output: Output
 ) -> list[PyTree[np.ndarray]]:
@@ -476,7 +549,8 @@ def _sampled_in_chunks(
     reached = steps < output.num_steps
     ts, steps = np.asarray(saveat.ts)[reached], steps[reached]
     # The records are those of different steps, and all of them for dense output.
-    places = steps if saveat.dense else np.unique(steps, return_inverse=True)[1]
+    keeps_all = saveat.dense or len(output.records.force) == output.num_steps
+    places = steps if keeps_all else np.unique(steps, return_inverse=True)[1]
     records = jax.tree.map(lambda x: x[places], output.records)
     pieces = []
     for first in range(0, len(ts), SAMPLES_AT_ONCE):
@@ -491,7 +565,7 @@ def _sampled_in_chunks(
     return pieces
 
 
-def _sampled_steps(saveat: SaveAt, grid: TimeGrid) -> Int[Array, " k"] | None:
+def _sampled_steps(saveat: SaveAt, grid: Grid) -> Int[Array, " k"] | None:
     """Find the steps in which the times of `SaveAt(ts=...)` lie; None without these."""
     if saveat.ts is None:
         return None
@@ -553,7 +627,7 @@ def _noise(
 def _output(
     saveat: SaveAt,
     loop: Loop,
-    grid: TimeGrid,
+    t0: FloatScalar,
     start: State,
     end: RunEnd[Any, Any],
     sampled: Int[Array, " k"] | None,
@@ -563,30 +637,94 @@ def _output(
     saved, records = end.rows
     pieces = []
     if saveat.t0:
-        pieces.append(_one(saving.saved(grid.t0, start, args)))
+        pieces.append(_one(saving.saved(t0, start, args)))
     if saveat.steps:
         pieces.append(jax.tree.map(lambda x: x[:-1], saved))
     if ts is not None and sampled is not None and saving.record_slots is not None:
         row = saving.record_slots[sampled]
         records = jax.tree.map(lambda x: x[row], records)
         pieces.append(jax.vmap(partial(_sample, loop))(ts, sampled, records))
-    if saveat.saves_end(grid.num_steps):
+    if saveat.saves_end(loop.stepper.plain.num_steps):
         pieces.append(_one(saving.saved(end.t, end.state, args)))
     return stack_saved(pieces) if pieces else (None, None)
 
 
+def _padded_output(
+    saveat: SaveAt,
+    loop: Loop,
+    t0: FloatScalar,
+    start: State,
+    end: RunEnd[Any, Any],
+    number: Int[Array, ""],
+) -> tuple[PyTree[Array], PyTree[Array]]:
+    """Join the output of a run whose number of steps is not known when tracing.
+
+    Entries after the last one, and those at times that were not reached, are infinite.
+    """
+    saving, args, ts = loop.saving, loop.stepper.plain.args, saveat.ts
+    saved, records = end.rows
+    pieces = []
+    if saveat.t0:
+        pieces.append(_one(saving.saved(t0, start, args)))
+    last = _one(saving.saved(end.t, end.state, args)) if saveat.t1 else None
+    if saveat.steps:
+        # The extra row of the buffers is there for the end of the run.
+        rows = jnp.arange(saving.num_saved + 1, dtype=jnp.int32)
+        count = number // saveat.steps
+        padded_rows = _infinite_unless(rows < count, saved)
+        if last is not None and saveat.steps > 1:
+            is_end = (rows == count) & (number % saveat.steps != 0)
+            padded_rows = jax.tree.map(
+                lambda x, y: jnp.where(_along(is_end, x), y, x), padded_rows, last
+            )
+        else:
+            padded_rows = jax.tree.map(lambda x: x[:-1], padded_rows)
+        pieces.append(padded_rows)
+    if ts is not None:
+        step = jax.vmap(lambda t: step_among(t, records.interval, number))(ts)
+        chosen = jax.tree.map(lambda x: x[step], records)
+        values = jax.vmap(partial(_sample, loop))(ts, step, chosen)
+        pieces.append(_infinite_unless(is_within(ts, t0, end.t), values))
+    if last is not None and not saveat.steps:
+        pieces.append(last)
+    return stack_saved(pieces) if pieces else (None, None)
+
+
+def _infinite_unless(valid: Bool[Array, " k"], saved: PyTree[Array]) -> PyTree[Array]:
+    """Return the entries that are valid, and infinite numbers for the others."""
+
+    def fill(x: Array) -> Array:
+        if not jnp.issubdtype(x.dtype, jnp.inexact):
+            return x
+        return jnp.where(_along(valid, x), x, jnp.inf)
+
+    return jax.tree.map(fill, saved)
+
+
+def _along(condition: Bool[Array, " k"], x: Array) -> Array:
+    """Return a condition on the entries of an array with axes for those of x."""
+    return condition.reshape(condition.shape + (1,) * (x.ndim - 1))
+
+
 def _interpolation(
-    stepper: PlainStepper, grid: TimeGrid, records: StepRecord
+    stepper: PlainStepper,
+    grid: Grid,
+    records: StepRecord,
+    number: Int[Array, ""] | None,
 ) -> DenseInterpolation:
-    """Return the dense output, from the records of all steps."""
+    """Return the dense output, from the records of all steps.
+
+    `number` is the number of steps of a run whose steps differ.
+    """
     return DenseInterpolation(
         system=stepper.system,
         method=stepper.method,
-        num_steps=static_length(grid.num_steps),
+        num_steps=static_length(stepper.num_steps),
         t0=grid.t0,
-        dt=grid.dt,
+        dt=stepper.dt,
         records=jax.tree.map(lambda x: x[:-1], records),
         args=stepper.args,
+        count=number,
     )
 
 
@@ -600,7 +738,7 @@ def _sample(
 ) -> PyTree[Array]:
     """Compute the output at a time t inside step k."""
     run = loop.stepper.plain
-    start, h = run.time(k), run.dt
+    start, h = record.interval or (run.time(k), run.dt)
     theta = (t - start) / h
     y = interpolate(run.system, run.method, record, start, h, theta, run.args)
     return loop.saving.saved(t, y, run.args)

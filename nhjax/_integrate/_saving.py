@@ -336,6 +336,7 @@ class Saving(eqx.Module):
             jnp.where(is_good, record.velocity, 0),
             jnp.where(is_good, record.force, 0),
             jnp.where(is_good, record.multiplier, record.start.multiplier),
+            record.interval,
         )
 
     def _slot(self, k: Int[Array, ""]) -> Int[Array, ""]:

@@ -110,6 +110,20 @@ class AbstractStepper(eqx.Module, Generic[C, R]):
         """Return the number of iterations within which the run is certain to end."""
 
     @property
+    def may_end_early(self) -> bool:
+        """Return whether the loop stops where `is_over` is true for the carry."""
+        return False
+
+    def is_over(self, carry: C) -> BoolScalar:
+        """Return whether all further iterations would leave the carry unchanged."""
+        return carry.result != RESULTS.successful
+
+    def progress(self, carry: C) -> FloatScalar | None:
+        """Compute the part of the run that is done, from 0 to 1, if it may end early."""
+        del carry
+        return None
+
+    @property
     @abstractmethod
     def log_length(self) -> int:
         """Return the number of entries for which the log has room, 0 without a log."""
@@ -173,6 +187,11 @@ class AbstractStepper(eqx.Module, Generic[C, R]):
 
 class AbstractReverseReplay(eqx.Module, Generic[C, R]):
     """The replay of a run from its end, which finds where each iteration started."""
+
+    @property
+    @abstractmethod
+    def num_iterations(self) -> int | IntScalar:
+        """Return the number of iterations that are undone."""
 
     @property
     @abstractmethod
@@ -408,6 +427,11 @@ class PlainReverseReplay(AbstractReverseReplay[PlainCarry, None]):
 
     stepper: PlainStepper
     start: PlainCarry
+
+    @property
+    def num_iterations(self) -> int | IntScalar:
+        """Return the number of steps."""
+        return self.stepper.num_steps
 
     @property
     def after_end(self) -> None:

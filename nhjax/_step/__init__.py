@@ -8,6 +8,7 @@ from ._invariants import (
     Invariants as Invariants,
     LEAST_PART as LEAST_PART,
 )
+from ._local_error import local_error as local_error
 from ._round_off import (
     round_off_of_steps as round_off_of_steps,
     RoundOff as RoundOff,

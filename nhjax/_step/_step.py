@@ -113,12 +113,14 @@ class StepRecord(eqx.Module):
 
     - `start`: the state at the start of the step.
     - `velocity`, `force`, `multiplier`: the values at the s stages.
+    - `interval`: the start and the size of the step, in a run whose steps differ.
     """
 
     start: State
     velocity: Float[Array, "s n"]
     force: Float[Array, "s n"]
     multiplier: Float[Array, "s m"]
+    interval: tuple[FloatScalar, FloatScalar] | None = None
 
 
 class StepOutcome(NamedTuple):

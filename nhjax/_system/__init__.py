@@ -14,6 +14,7 @@ from ._arguments import (
     parameter as parameter,
     parameters as parameters,
     real_scalar as real_scalar,
+    real_vector as real_vector,
     takes_multipliers as takes_multipliers,
 )
 from ._checks import (

@@ -11,7 +11,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, PyTree
+from jaxtyping import Array, Float, ArrayLike, PyTree
 
 from .._custom_types import Args, BoolScalar, FloatScalar, FloatScalarLike
 from .._errors import (
@@ -132,6 +132,28 @@ def real_scalar(name: str, x: FloatScalarLike, dtype: Any) -> FloatScalar:
             f"`{name}` has shape {array.shape}, but a scalar is needed; for several "
             "values use `jax.vmap`."
         )
+    if is_traced(array):
+        return array.astype(dtype)
+    with jax.ensure_compile_time_eval():
+        return jax.device_put(array.astype(dtype))
+
+
+def real_vector(name: str, x: Any, dtype: Any) -> Float[Array, " k"]:
+    """Convert an array of real numbers of shape (k,), k >= 1, to an array of `dtype`.
+
+    Other types raise a `DTypeError`. Arrays of other shapes raise a `ShapeError`.
+    """
+    array: Any = x if is_traced(x) else np.asarray(x)
+    if not (
+        jnp.issubdtype(array.dtype, jnp.floating)
+        or jnp.issubdtype(array.dtype, jnp.integer)
+    ):
+        raise DTypeError(
+            f"`{name}` must have real numbers, got {reprlib.repr(x)} of dtype "
+            f"{array.dtype}."
+        )
+    if array.ndim != 1 or array.shape[0] == 0:
+        raise ShapeError(f"`{name}` must have shape (k,), k >= 1, got {array.shape}.")
     if is_traced(array):
         return array.astype(dtype)
     with jax.ensure_compile_time_eval():

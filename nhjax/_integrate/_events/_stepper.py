@@ -6,7 +6,7 @@ event may take two additional iterations, and an event that ends the run takes o
 """
 
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import Any, cast, NamedTuple
 
 import equinox as eqx
 import jax
@@ -14,12 +14,13 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from ..._custom_types import BoolScalar, FloatScalar, IntScalar
-from ..._numerics import nan_gradient_unless, tree_where
+from ..._numerics import nan_gradient_unless, tree_where, two_sum
 from ..._results import RESULTS
 from ..._step import first_step_state, ImplicitStep, RoundOff, StepArguments, StepState
 from ..._system import FunctionNoise, State
 from .._checkpoint import Checkpoint
 from .._solution import EventLog
+from .._step_sizes import Attempt, Decision
 from .._stepper import (
     AbstractCarry,
     AbstractReverseReplay,
@@ -33,6 +34,7 @@ from .._stepper import (
     StepResult,
     updated_statistics,
 )
+from .._variable import Clock, NextStep, started, StepSizes
 from ._event import Conditions, ConditionSigns, Event, EventActions, signs_at
 from ._log import LogEntry, reported_log
 from ._root import ImplicitTruncatedStep, TruncatedStep
@@ -52,6 +54,8 @@ class EventLoopState(eqx.Module):
     - `values_at_end`: in that case the conditions at the end of the whole step.
     - `signs`: the signs of the conditions.
     - `pending`: the conditions that the last reset has carried across zero.
+    - `clock`: the time of the last node and the size of the step, in a run whose steps
+      differ.
     """
 
     node: Int[Array, ""]
@@ -64,6 +68,7 @@ class EventLoopState(eqx.Module):
     values_at_end: Float[Array, " e"]
     signs: ConditionSigns
     pending: Bool[Array, " e"]
+    clock: Clock | None = None
 
 
 class EventCarry(AbstractCarry):
@@ -118,6 +123,9 @@ class AttemptedStep(NamedTuple):
     - `values_at_end`: if the step is truncated, the conditions at the end of the whole
         step.
     - `meets`, `fires`: whether there is an event, and whether there is room for it.
+    - `whole`: the size of the whole step from the last node.
+    - `decision`, `next_step`: in a run whose steps differ, what the controller decides
+        on the step, and the step as it would end without events.
     """
 
     is_alive: BoolScalar
@@ -132,6 +140,9 @@ class AttemptedStep(NamedTuple):
     fires: BoolScalar
     size: FloatScalar
     reached: StepState
+    whole: FloatScalar
+    decision: Decision | None
+    next_step: NextStep | None
 
     @property
     def reaches_node(self) -> BoolScalar:
@@ -150,16 +161,21 @@ class AttemptedStep(NamedTuple):
 class EventStepper(AbstractStepper[EventCarry, ReplayedIteration]):
     """Steps from node to node that are truncated at events.
 
-    `plain` takes the single steps.
+    `plain` takes the single steps, and `sizes` has their sizes if they differ.
     """
 
     plain: PlainStepper
     conditions: Conditions
     actions: EventActions
+    sizes: StepSizes | None
 
     @classmethod
     def of(
-        cls, events: tuple[Event, ...], plain: PlainStepper, y: State
+        cls,
+        events: tuple[Event, ...],
+        plain: PlainStepper,
+        y: State,
+        sizes: StepSizes | None = None,
     ) -> "EventStepper":
         """Return the stepper for the user's events in a run that starts at y.
 
@@ -168,7 +184,8 @@ class EventStepper(AbstractStepper[EventCarry, ReplayedIteration]):
         """
         given = plain.time(0), y, plain.args
         conditions = Conditions.of(events, *given)
-        return cls(plain, conditions, EventActions.of(events, plain.system, *given))
+        actions = EventActions.of(events, plain.system, *given)
+        return cls(plain, conditions, actions, sizes)
 
     @property
     def num_iterations(self) -> int | IntScalar:
@@ -176,7 +193,20 @@ class EventStepper(AbstractStepper[EventCarry, ReplayedIteration]):
         actions = self.actions
         goes_on = not all(actions.terminates)
         extra = 2 * actions.max_events if goes_on else 0
-        return self.plain.num_steps + extra + 1
+        steps = self.plain.num_steps if self.sizes is None else self.sizes.max_steps
+        return steps + extra + 1
+
+    @property
+    def may_end_early(self) -> bool:
+        """Return whether the number of attempts at steps is not known."""
+        return self.sizes is not None
+
+    def is_over(self, carry: EventCarry) -> BoolScalar:
+        """Return whether the run has ended."""
+        over = carry.result != RESULTS.successful
+        if carry.place.clock is None:
+            return over | (carry.place.node >= self.plain.num_steps)
+        return over | carry.place.clock.is_done
 
     @property
     def log_length(self) -> int:
@@ -195,8 +225,16 @@ class EventStepper(AbstractStepper[EventCarry, ReplayedIteration]):
         """Return the same stepper with the measured round-off of the system."""
         return replace(self, plain=self.plain.with_round_off(round_off))
 
+    def progress(self, carry: EventCarry) -> FloatScalar | None:
+        """Compute the part of the run that is done, from 0 to 1, if steps differ."""
+        if self.sizes is None or carry.place.clock is None:
+            return None
+        return self.sizes.progress(self.plain, carry.place.clock, carry.stats)
+
     def time(self, place: EventLoopState) -> FloatScalar:
         """Compute the current time of a run."""
+        if place.clock is not None:
+            return place.clock.t + place.offset
         return self.plain.time(place.node) + place.offset
 
     def init(self, y0: State | Checkpoint, noise: FunctionNoise | None) -> EventCarry:
@@ -209,6 +247,11 @@ class EventStepper(AbstractStepper[EventCarry, ReplayedIteration]):
         zero = jnp.zeros((), jnp.int32)
         failed = jnp.where(unknown, zero, carry.stats["failed_step"])
         stats = carry.stats | {"failed_step": failed, "num_events": zero}
+        clock = None
+        if self.sizes is not None:
+            clock, sized = self.sizes.first_clock(self.plain, y0, carry.step_state)
+            carry = replace(carry, result=result, stats=stats)
+            result, stats = started(carry, sized)
         place = EventLoopState(
             node=zero,
             offset=jnp.zeros_like(t),
@@ -220,6 +263,7 @@ class EventStepper(AbstractStepper[EventCarry, ReplayedIteration]):
             values_at_end=signs.value,
             signs=signs,
             pending=jnp.zeros(signs.sign.shape, bool),
+            clock=clock,
         )
         return EventCarry(carry.step_state, result, stats, place)
 
@@ -248,12 +292,27 @@ class EventStepper(AbstractStepper[EventCarry, ReplayedIteration]):
             pending=before.pending,
         )
         result = RESULTS.where(attempt.is_taken, step.outcome.result, carry.result)
+        if attempt.decision is not None:
+            # A step that is not solved may be repeated.
+            decided = attempt.decision.result
+            result = RESULTS.where(attempt.is_taken, decided, carry.result)
         result = RESULTS.where(attempt.meets, RESULTS.too_many_events, result)
         result = RESULTS.where(attempt.fires, outcome.result, result)
         ends = attempt.is_alive & (result != RESULTS.successful)
-        after = _place_after(self.plain.dt, before, attempt, outcome.pending, ends)
-        has_ended = carry.result != RESULTS.successful
-        fills = (after.node > before.node) | ends | has_ended
+        after = _place_after(before, attempt, outcome.pending, ends)
+        if self.sizes is None:
+            has_ended = carry.result != RESULTS.successful
+            fills = (after.node > before.node) | ends | has_ended
+        else:
+            after = replace(after, clock=self._clock_after(before, after, attempt))
+            number = self.num_iterations
+            is_spent = attempt.is_alive & (jnp.asarray(i, jnp.int32) + 1 >= number)
+            is_spent = is_spent & (result == RESULTS.successful)
+            is_spent = is_spent & ~cast(Clock, after.clock).is_done
+            result = RESULTS.where(is_spent, RESULTS.max_steps_reached, result)
+            ends = ends | is_spent
+            ended_here = ends & (result == RESULTS.event_occurred)
+            fills = (after.node > before.node) | ended_here
         signs = before.signs.after_step(attempt.reaches_node, step.values)
         after = replace(
             after,
@@ -283,9 +342,14 @@ class EventStepper(AbstractStepper[EventCarry, ReplayedIteration]):
         stats = _statistics_after(carry, attempt, after, ends, failed)
         row = jnp.where(fills, before.row, num_steps)
         carry = EventCarry(outcome.step_state, result, stats, after)
-        t = self.plain.time(row + 1)
-        t = jnp.where(result == RESULTS.event_occurred, self.time(after), t)
-        offered = StepResult(t, step.outcome.record, attempt.is_kept, row)
+        record = step.outcome.record
+        if after.clock is not None:
+            t = self.time(after)
+            record = replace(record, interval=(attempt.t, attempt.size))
+        else:
+            t = self.plain.time(row + 1)
+            t = jnp.where(result == RESULTS.event_occurred, self.time(after), t)
+        offered = StepResult(t, record, attempt.is_kept, row)
         return carry, self._with_log(offered, entry, slot)
 
     def _with_log(
@@ -300,14 +364,23 @@ class EventStepper(AbstractStepper[EventCarry, ReplayedIteration]):
     ) -> AttemptedStep:
         """Take the rest of a step, or the part up to an event that is known."""
         before, plain = carry.place, self.plain
-        alive = (carry.result == RESULTS.successful) & (before.node < plain.num_steps)
+        alive = ~self.is_over(carry)
         at_once = jnp.any(before.pending)
         is_taken = alive & ~at_once
-        t, h = self.time(before), plain.dt - before.offset
+        t, whole, next_step, decision = self.time(before), plain.dt, None, None
+        h = whole - before.offset
+        if self.sizes is not None and before.clock is not None:
+            next_step = self.sizes.next_step(before.clock, before.offset)
+            h, whole = next_step.h, before.offset + next_step.h
         if replay is not None:
             h = jnp.where(replay.which >= 0, replay.size, h)
         step = self._step(carry, t, h, ~is_taken, replay)
         solved = is_taken & (step.outcome.result == RESULTS.successful)
+        if self.sizes is not None and next_step is not None:
+            decision = self._decision(carry, next_step, step, solved)
+            # An event in an inaccurate step may not be one. A step that ends at an
+            # event is a part of a step that was accurate.
+            solved = solved & (decision.is_accepted | (step.fired >= 0))
         is_discarded = solved & (step.fired < 0) & jnp.any(step.crossed)
         if replay is not None:
             is_discarded = jnp.zeros_like(is_discarded)
@@ -319,7 +392,7 @@ class EventStepper(AbstractStepper[EventCarry, ReplayedIteration]):
         size = jnp.where(is_kept, step.h, 0)
         # Without this, an event could occur repeatedly at the same time.
         at_last = (before.num_events > 0) & before.signs.at_zero[which]
-        small = 16 * float(jnp.finfo(t.dtype).eps) * jnp.abs(plain.dt)
+        small = 16 * float(jnp.finfo(t.dtype).eps) * jnp.abs(whole)
         again = is_kept & at_last & (jnp.abs(size) <= small)
         has_room = before.num_events < self.actions.max_events
         return AttemptedStep(
@@ -335,6 +408,46 @@ class EventStepper(AbstractStepper[EventCarry, ReplayedIteration]):
             fires=meets & ~again & has_room,
             size=size,
             reached=reached.differentiated_in_state(),
+            whole=whole,
+            decision=decision,
+            next_step=next_step,
+        )
+
+    def _decision(
+        self,
+        carry: EventCarry,
+        next_step: NextStep,
+        step: TruncatedStep,
+        solved: BoolScalar,
+    ) -> Decision:
+        """Return what the controller decides on a step or on a part of one."""
+        assert self.sizes is not None and carry.place.clock is not None
+        clock, place = carry.place.clock, carry.place
+        attempt = Attempt(
+            *(next_step.t, step.h, clock.size, carry.step_state, step.outcome),
+            *(solved, next_step.is_whole, place.node),
+        )
+        context = self.sizes.context(self.plain)
+        decision = self.sizes.controller.adapt(context, attempt, clock.memory)
+        at_event = solved & (step.fired >= 0)
+        result = RESULTS.where(at_event, RESULTS.successful, decision.result)
+        return decision._replace(result=result)
+
+    def _clock_after(
+        self, before: EventLoopState, after: EventLoopState, attempt: AttemptedStep
+    ) -> Clock:
+        """Return the clock after an iteration, which may have reached a node."""
+        assert self.sizes is not None and before.clock is not None
+        assert attempt.decision is not None and attempt.next_step is not None
+        clock, decision = before.clock, attempt.decision
+        reaches = after.node > before.node
+        is_rejected = attempt.is_taken & ~attempt.is_kept & ~attempt.is_discarded
+        size = jnp.where(is_rejected, before.offset + decision.size, clock.size)
+        size = jnp.where(reaches & attempt.is_kept, decision.size, size)
+        end = two_sum(clock.t, attempt.whole + clock.compensation)
+        memory = tree_where(attempt.is_kept, decision.memory, clock.memory)
+        return self.sizes.after(
+            clock, end, attempt.next_step, reaches, size, memory, after.node
         )
 
     def _step(
@@ -374,6 +487,9 @@ class EventStepper(AbstractStepper[EventCarry, ReplayedIteration]):
         )
         entry = LogEntry(t, zero, y, y, zero, zero, t, t, t, zero, t)
         blank = self.plain.blank_result(carry)._replace(row=zero)
+        if self.sizes is not None:
+            record = replace(blank.record, interval=(t, t))
+            blank = blank._replace(record=record)
         return self._with_log(blank, entry, zero)
 
     def succeeded(self, carry: EventCarry) -> BoolScalar:
@@ -385,11 +501,10 @@ class EventStepper(AbstractStepper[EventCarry, ReplayedIteration]):
         self, carry: EventCarry, rows: Rows, log: LogEntry | None, given: Any
     ) -> RunEnd[Rows, EventLog]:
         """Return the end of the run, at the last node or at an event that ends it."""
-        t1 = jnp.where(
-            carry.result == RESULTS.event_occurred,
-            self.time(carry.place),
-            self.plain.time(self.plain.num_steps),
-        )
+        t1 = self.time(carry.place)
+        if carry.place.clock is None:
+            at_event = carry.result == RESULTS.event_occurred
+            t1 = jnp.where(at_event, t1, self.plain.time(self.plain.num_steps))
         found = carry.step_state.state, rows, log, t1
         found = nan_gradient_unless(self.succeeded(carry), found, given)
         state, rows, log, t1 = found
@@ -412,7 +527,6 @@ class EventStepper(AbstractStepper[EventCarry, ReplayedIteration]):
 
 
 def _place_after(
-    dt: FloatScalar,
     before: EventLoopState,
     attempt: AttemptedStep,
     pending: Bool[Array, " e"],
@@ -422,7 +536,7 @@ def _place_after(
 
     The events that are `pending` come before a node at the same time.
     """
-    here = before.offset + attempt.size
+    here, dt = before.offset + attempt.size, attempt.whole
     # If the rest of a step is only round-off, it is skipped.
     small = 4 * float(jnp.finfo(dt.dtype).eps)
     at_end = attempt.fires & ~ends & (jnp.abs(dt - here) <= small * jnp.abs(dt))
@@ -456,6 +570,10 @@ def _statistics_after(
         # A step that is discarded has not failed.
         stats[name] = jnp.where(ends, stats[name], carry.stats[name])
     stats["failed_step"] = jnp.where(failed, node, stats["failed_step"])
+    if attempt.decision is not None:
+        rejected = taken & ~kept & ~attempt.is_discarded & ~ends
+        number = carry.stats["num_rejected_steps"] + rejected.astype(jnp.int32)
+        stats["num_rejected_steps"] = number
     stats |= {"num_steps": after.node, "num_events": after.num_events}
     return jax.lax.stop_gradient(stats)
 
@@ -487,6 +605,11 @@ class EventReverseReplay(AbstractReverseReplay[EventCarry, ReplayedIteration]):
     start: EventCarry
     end: EventCarry
     log: LogEntry
+
+    @property
+    def num_iterations(self) -> int | IntScalar:
+        """Return the number of iterations of the run, idle ones included."""
+        return self.stepper.num_iterations
 
     @property
     def after_end(self) -> ReplayedIteration:

@@ -1,0 +1,655 @@
+"""The controllers of step sizes, the option `stepsize_controller` of `integrate`."""
+
+from abc import abstractmethod
+from typing import Any, NamedTuple, TypeAlias
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int, PyTree
+
+from .._custom_types import (
+    Args,
+    BoolScalar,
+    FloatScalar,
+    FloatScalarLike,
+    PhaseFunction,
+)
+from .._errors import DTypeError, is_traced, naming, ShapeError
+from .._manifold import AbstractLieGroup
+from .._method import AbstractMethod
+from .._numerics import ClosureConverted, inverse, max_norm, small_einsum
+from .._results import RESULTS
+from .._step import local_error, StepOutcome, StepState
+from .._system import AbstractMechanicalSystem, check_signature, linearise, State
+
+
+# The data that a controller carries from step to step.
+Memory: TypeAlias = PyTree[Array]
+
+
+class StepContext(NamedTuple):
+    """What is the same in all steps of a run.
+
+    - `direction`: 1.0 for a run forward in time, -1.0 for one backward.
+    - `dt`: the step size of the user, or None.
+    - `length`: the time from the start to the end of the run; infinite if it is not
+        known.
+    """
+
+    system: AbstractMechanicalSystem
+    method: AbstractMethod
+    args: Args
+    direction: FloatScalar
+    dt: FloatScalar | None
+    length: FloatScalar
+
+
+class Attempt(NamedTuple):
+    """A step that was tried: from the time t, of size h, with its outcome.
+
+    - `chosen`: the size that the controller chose. A step is shorter at the end of a
+        run, and before and after an event in it.
+    - `is_solved`: whether its equations were solved.
+    - `is_whole`: whether it ends where the controller wants it to end.
+    - `node`: the number of steps before it.
+    """
+
+    t: FloatScalar
+    h: FloatScalar
+    chosen: FloatScalar
+    start: StepState
+    outcome: StepOutcome
+    is_solved: BoolScalar
+    is_whole: BoolScalar
+    node: Int[Array, ""]
+
+
+class Decision(NamedTuple):
+    """What a controller decides on a step.
+
+    - `is_accepted`: whether the step is accepted. A step that is not solved is not.
+    - `result`: `RESULTS.successful`, or the reason why the run fails.
+    - `size`: the size of the next step, or of the next attempt at this one.
+    - `memory`: the data of the controller after an accepted step.
+    """
+
+    is_accepted: BoolScalar
+    result: RESULTS
+    size: FloatScalar
+    memory: Memory
+
+
+class AbstractStepSizeController(eqx.Module):
+    """The way in which a run chooses its steps, the option `stepsize_controller`."""
+
+    @abstractmethod
+    def init(
+        self, context: StepContext, t: FloatScalar, start: StepState
+    ) -> tuple[FloatScalar, Memory, RESULTS]:
+        """Choose the first step: its size, the first memory, and whether they exist."""
+
+    @abstractmethod
+    def adapt(self, context: StepContext, attempt: Attempt, memory: Memory) -> Decision:
+        """Accept or reject a step, and choose the size of the next one."""
+
+    def resume(
+        self, context: StepContext, size: FloatScalar, memory: Memory
+    ) -> tuple[FloatScalar, Memory]:
+        """Return the size and the memory with which a run goes on at a checkpoint."""
+        return jnp.abs(size) * context.direction, memory
+
+    def given_size(
+        self, context: StepContext, node: Int[Array, ""]
+    ) -> FloatScalar | None:
+        """Return the size of a step if the user gives it, or None."""
+        del context, node
+        return None
+
+    def check(
+        self,
+        system: AbstractMechanicalSystem,
+        method: AbstractMethod,
+        t: FloatScalar,
+        y: State,
+        args: Args,
+    ) -> None:
+        """Raise if the controller cannot be used for a run."""
+        del system, method, t, y, args
+
+    def closure_converted(
+        self, system: AbstractMechanicalSystem, t: FloatScalar, y: State, args: Args
+    ) -> "AbstractStepSizeController":
+        """Return the controller, with arrays that its functions read as leaves."""
+        del system, t, y, args
+        return self
+
+
+def _decided(attempt: Attempt, size: FloatScalar, memory: Memory) -> Decision:
+    """Accept a step that is solved; otherwise the run fails."""
+    result = RESULTS.where(
+        attempt.is_solved, RESULTS.successful, attempt.outcome.result
+    )
+    return Decision(attempt.is_solved, result, size, memory)
+
+
+class ConstantStepSize(AbstractStepSizeController):
+    """Steps of the size `dt`, the default of `nhjax.integrate`.
+
+    With `t1` in place of `num_steps`, the last step is shorter if it has to be.
+
+    !!! example
+
+        >>> import nhjax
+        >>> disc = nhjax.systems.VerticalRollingDisc()
+        >>> sol = nhjax.integrate(disc.system, nhjax.LobattoIIIAB(3),
+        ...     disc.initial_state(), dt=0.3, t1=1.0)
+        >>> float(sol.t1), int(sol.stats["num_steps"])
+        (1.0, 4)
+    """
+
+    def init(
+        self, context: StepContext, t: FloatScalar, start: StepState
+    ) -> tuple[FloatScalar, Memory, RESULTS]:
+        """Return `dt` in the direction of the run."""
+        del t, start
+        return _size_of_user(context), (), RESULTS.successful
+
+    def adapt(self, context: StepContext, attempt: Attempt, memory: Memory) -> Decision:
+        """Accept every step that is solved."""
+        return _decided(attempt, _size_of_user(context), memory)
+
+    def given_size(self, context: StepContext, node: Int[Array, ""]) -> FloatScalar:
+        """Return `dt` in the direction of the run."""
+        del node
+        return _size_of_user(context)
+
+
+def _size_of_user(context: StepContext) -> FloatScalar:
+    assert context.dt is not None
+    return jnp.abs(context.dt) * context.direction
+
+
+class GivenStepSizes(AbstractStepSizeController):
+    """Steps of given sizes, for an array `dt` of `nhjax.integrate`."""
+
+    sizes: Float[Array, " num_steps"]
+
+    def init(
+        self, context: StepContext, t: FloatScalar, start: StepState
+    ) -> tuple[FloatScalar, Memory, RESULTS]:
+        """Return the first size."""
+        del context, t, start
+        return self.sizes[0], (), RESULTS.successful
+
+    def adapt(self, context: StepContext, attempt: Attempt, memory: Memory) -> Decision:
+        """Accept every step that is solved."""
+        del context
+        following = jnp.minimum(attempt.node + 1, self.sizes.shape[0] - 1)
+        return _decided(attempt, self.sizes[following], memory)
+
+    def resume(
+        self, context: StepContext, size: FloatScalar, memory: Memory
+    ) -> tuple[FloatScalar, Memory]:
+        """Return the first size: a run that goes on is given its own sizes."""
+        del context, size
+        return self.sizes[0], memory
+
+    def given_size(self, context: StepContext, node: Int[Array, ""]) -> FloatScalar:
+        """Return the size of the step after a node."""
+        del context
+        return self.sizes[jnp.minimum(node, self.sizes.shape[0] - 1)]
+
+
+class PIDController(AbstractStepSizeController):
+    r"""Steps whose estimated error is at most a tolerance.
+
+    The error of a step is estimated from the forces at its stages; see
+    `docs/step_sizes.md`. Divided by atol + rtol |y| for each component of the state y,
+    it has a root mean square e_n. A step is accepted if e_n <= 1, and otherwise
+    repeated, as is a step whose equations are not solved. The next size is
+
+        h_{n+1} = h_n safety e_n^{-β1} e_{n-1}^{-β2} e_{n-2}^{-β3}
+
+    within the limits of `factormin` and `factormax`, where with the order p of the
+    method and k = p + 1
+
+        β1 = (pcoeff + icoeff + dcoeff) / k,  β2 = -(pcoeff + 2 dcoeff) / k,
+        β3 = dcoeff / k
+
+    (Söderlind, Digital filters in adaptive time-stepping, 2003, and the controller of
+    the same name in diffrax). Sizes that follow the error destroy the reversibility of
+    a method, so that energies may drift; see `nhjax.ReversibleController`.
+
+    **Arguments:**
+
+    - `rtol`, `atol`: the relative and the absolute tolerance. On a group, the size of a
+        position is that of its largest number.
+    - `pcoeff`, `icoeff`, `dcoeff`: the coefficients of the controller. The default
+        depends on the last error only.
+    - `dtmin`, `dtmax`: the smallest and the largest size of a step, in units of time,
+        both positive. A run that needs smaller steps fails. The last step of a run
+        and steps to events may be smaller.
+    - `factormin`, `factormax`: the limits of the change of size from step to step.
+    - `safety`: a factor below 1, which makes rejections rare.
+
+    **Raises:** `ValueError` if a number is outside of its range.
+
+    !!! example
+
+        >>> import nhjax
+        >>> disc = nhjax.systems.VerticalRollingDisc()
+        >>> sol = nhjax.integrate(disc.system, nhjax.LobattoIIIAB(3),
+        ...     disc.initial_state(), t1=10.0,
+        ...     stepsize_controller=nhjax.PIDController(rtol=1e-6, atol=1e-6))
+        >>> float(sol.t1)
+        10.0
+    """
+
+    rtol: FloatScalarLike
+    atol: FloatScalarLike
+    pcoeff: FloatScalarLike = 0.0
+    icoeff: FloatScalarLike = 1.0
+    dcoeff: FloatScalarLike = 0.0
+    dtmin: FloatScalarLike | None = None
+    dtmax: FloatScalarLike | None = None
+    factormin: FloatScalarLike = 0.2
+    factormax: FloatScalarLike = 10.0
+    safety: FloatScalarLike = 0.9
+
+    def __check_init__(self):
+        ranges = {
+            "rtol": (0, np.inf),
+            "atol": (0, np.inf),
+            "dtmin": (0, np.inf),
+            "dtmax": (0, np.inf),
+            "factormin": (0, 1),
+            "factormax": (1, np.inf),
+            "safety": (0, 1),
+            "pcoeff": (-np.inf, np.inf),
+            "icoeff": (-np.inf, np.inf),
+            "dcoeff": (-np.inf, np.inf),
+        }
+        for name, (least, most) in ranges.items():
+            value = getattr(self, name)
+            if value is None or is_traced(value):
+                continue
+            if not _is_number(value):
+                raise TypeError(
+                    f"PIDController: `{name}` must be a real number, got {value!r}."
+                )
+            number = float(value)
+            may_be_zero = name == "atol"
+            is_above = number >= least if may_be_zero else number > least
+            if not (np.isfinite(number) and is_above and number <= most):
+                least = f"{'>=' if may_be_zero else '>'} {least}"
+                advice = ""
+                if name == "rtol" and number == 0:
+                    advice = " Round-off is relative, so that rtol = 0 cannot be met."
+                raise ValueError(
+                    f"PIDController: `{name}` must be finite, {least} and <= {most}, "
+                    f"got {number}.{advice}"
+                )
+        both = self.dtmin, self.dtmax
+        if None not in both and not is_traced(*both) and not both[0] <= both[1]:
+            raise ValueError(
+                f"PIDController: `dtmin` = {both[0]} is larger than `dtmax` = "
+                f"{both[1]}."
+            )
+
+    def check(
+        self,
+        system: AbstractMechanicalSystem,
+        method: AbstractMethod,
+        t: FloatScalar,
+        y: State,
+        args: Args,
+    ) -> None:
+        """Raise for a method whose stages do not show its error."""
+        del system, t, y, args
+        if len(np.unique(method.c)) < 2:
+            raise ValueError(
+                "PIDController: the error of a step is estimated from two nodes or "
+                "more, but the method has one. Use a method with more stages, or "
+                "`nhjax.ReversibleController`."
+            )
+
+    def init(
+        self, context: StepContext, t: FloatScalar, start: StepState
+    ) -> tuple[FloatScalar, Memory, RESULTS]:
+        """Return `dt`, or a size for which the state changes by one percent."""
+        dtype = start.state.p.dtype
+        ones = jnp.ones((2,), dtype)
+        if context.dt is not None:
+            size = jnp.abs(context.dt)
+        else:
+            size = self._first_size(context, t, start)
+        size = jax.lax.stop_gradient(self._limited(size))
+        return size * context.direction, ones, RESULTS.successful
+
+    def _first_size(
+        self, context: StepContext, t: FloatScalar, start: StepState
+    ) -> FloatScalar:
+        # Hairer, Nørsett and Wanner, Solving ordinary differential equations I, II.4.
+        system, args = context.system, context.args
+        u = system.fibre_coordinate(start.state)
+        v = system.velocity(t, start.state.q, u, args)
+        in_position, in_fibre = self._scales(context, start, start)
+        manifold = system.manifold_of(start.state.q)
+        position = position_sizes(manifold, start.state.q, v)
+        state = max_norm(position / in_position, u / in_fibre)
+        rate = max_norm(v / in_position, start.lin.acceleration / in_fibre)
+        size = 0.01 * state / rate
+        is_known = (state > 1e-5) & (rate > 1e-5) & jnp.isfinite(size)
+        small = jnp.where(jnp.isfinite(context.length), context.length, 1) * 1e-6
+        size = jnp.where(is_known, size, small)
+        return jnp.minimum(size, context.length)
+
+    def _limited(self, size: FloatScalar) -> FloatScalar:
+        """Return a size (without sign) within `dtmin` and `dtmax`."""
+        if self.dtmax is not None:
+            size = jnp.minimum(size, jnp.asarray(self.dtmax, size.dtype))
+        if self.dtmin is not None:
+            size = jnp.maximum(size, jnp.asarray(self.dtmin, size.dtype))
+        return size
+
+    def _scales(
+        self, context: StepContext, before: StepState, after: StepState
+    ) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
+        """Return atol + rtol |y| for the positions and for the fibre coordinates."""
+        system, dtype = context.system, before.state.p.dtype
+        rtol, atol = (jnp.asarray(x, dtype) for x in (self.rtol, self.atol))
+        # A relative tolerance alone would allow no error where the state is zero.
+        atol = atol + float(jnp.finfo(dtype).tiny) ** 0.25
+        manifold = system.manifold_of(before.state.q)
+
+        def sizes(x: StepState) -> tuple[Array, Array]:
+            u = system.fibre_coordinate(x.state)
+            return position_sizes(manifold, x.state.q, u), jnp.abs(u)
+
+        both = zip(sizes(before), sizes(after), strict=True)
+        position, fibre = (jnp.maximum(one, other) for one, other in both)
+        return atol + rtol * position, atol + rtol * fibre
+
+    def adapt(self, context: StepContext, attempt: Attempt, memory: Memory) -> Decision:
+        """Accept a step if its estimated error is at most one tolerance."""
+        start, outcome, h = attempt.start, attempt.outcome, attempt.h
+        scales = self._scales(context, start, outcome.step_state)
+        error = local_error(
+            *(context.system, context.method, attempt.t, h),
+            *(start, outcome, scales, context.args),
+        )
+        error, size = jax.lax.stop_gradient((error, jnp.abs(h)))
+        is_known = attempt.is_solved & jnp.isfinite(error)
+        accepted = is_known & (error <= 1)
+        dtype = error.dtype
+        number = context.method.order + 1
+        p, i, d = (
+            jnp.asarray(x, dtype) for x in (self.pcoeff, self.icoeff, self.dcoeff)
+        )
+        least, most, safety = (
+            jnp.asarray(x, dtype) for x in (self.factormin, self.factormax, self.safety)
+        )
+        # Smaller errors do not change the size further, and have logarithms.
+        error = jnp.maximum(error, (safety / most) ** number)
+        factor = (
+            safety
+            * error ** (-(p + i + d) / number)
+            * memory[0] ** ((p + 2 * d) / number)
+            * memory[1] ** (-d / number)
+        )
+        factor = jnp.clip(factor, least, jnp.where(accepted, most, safety))
+        factor = jnp.where(is_known, factor, least)
+        following = self._limited(size * factor)
+        # A step that had to be shorter says little about the next step.
+        chosen = jax.lax.stop_gradient(jnp.abs(attempt.chosen))
+        is_shorter = size < (1 - 1e-9) * chosen
+        kept = jnp.maximum(following, chosen)
+        following = jnp.where(accepted & is_shorter, kept, following)
+        smallest = 16 * float(jnp.finfo(dtype).eps) * jnp.abs(attempt.t)
+        if self.dtmin is not None:
+            smallest = jnp.maximum(smallest, jnp.asarray(self.dtmin, dtype))
+        smallest = jnp.maximum(smallest, float(jnp.finfo(dtype).tiny))
+        result = RESULTS.where(
+            accepted | (size > smallest), RESULTS.successful, RESULTS.dt_min_reached
+        )
+        # A step that is not solved at any size has another reason.
+        result = RESULTS.where(
+            (result == RESULTS.successful) | attempt.is_solved,
+            result,
+            outcome.result,
+        )
+        memory = jnp.stack([error, memory[0]])
+        size = jax.lax.stop_gradient(following) * context.direction
+        return Decision(accepted, result, size, jax.lax.stop_gradient(memory))
+
+
+class ReversibleController(AbstractStepSizeController):
+    r"""Steps whose sizes follow a density, such that the run can be retraced.
+
+    The step density ρ is the number of steps per unit of time, divided by 1/ε. With
+    a function Q(y) of the state, the sizes are
+
+        ρ_{n+1/2} = ρ_{n-1/2} + ε G(y_n),  h_{n+1/2} = ε / ρ_{n+1/2},
+
+    where G = d/dt log Q along the motion and ρ_0 = Q(y_0) (Hairer and Söderlind,
+    Explicit, time reversible, adaptive step size control, 2005). The density follows Q
+    up to O(ε²). A run backward in time from the checkpoint of a run takes the same
+    steps back. In a reversible system with a symmetric method, energies that do not
+    drift with constant steps do not drift with these. No step is rejected.
+
+    **Arguments:**
+
+    - `eps`: ε > 0, the size of a step times the density. In units of Q times time.
+    - `density`: Q(t, q, v, args) > 0, for Hamiltonian systems a function of
+        (t, q, p, args). It should not change if velocities change their signs. The
+        default is an estimate of the fastest frequency of the motion, from the
+        derivatives of the accelerations by positions and velocities; `eps` is then
+        about the angle that the fastest oscillation turns in a step.
+
+    **Raises:** `ValueError` if `eps` is not positive. `integrate` raises a `ShapeError`
+    if the density has another shape than (), and an `IntegrationError` where it is not
+    positive.
+
+    !!! example
+
+        >>> import nhjax
+        >>> disc = nhjax.systems.VerticalRollingDisc()
+        >>> density = lambda t, q, v, args: 1.0 + q[0] ** 2
+        >>> sol = nhjax.integrate(disc.system, nhjax.LobattoIIIAB(3),
+        ...     disc.initial_state(), t1=1.0,
+        ...     stepsize_controller=nhjax.ReversibleController(0.1, density))
+        >>> float(sol.t1)
+        1.0
+    """
+
+    eps: FloatScalarLike
+    density: PhaseFunction | None = None
+
+    def __check_init__(self):
+        if self.density is not None and not callable(self.density):
+            raise TypeError(
+                "ReversibleController: `density` must be a function of (t, q, v, args) "
+                f"or None, got {self.density!r}."
+            )
+        if is_traced(self.eps):
+            return
+        if not _is_number(self.eps):
+            raise TypeError(
+                f"ReversibleController: `eps` must be a real number, got {self.eps!r}."
+            )
+        if not (np.isfinite(self.eps) and self.eps > 0):
+            raise ValueError(
+                "ReversibleController: `eps` must be finite and > 0, got "
+                f"{float(self.eps)}. For a run backward in time pass `t1` < `t0`."
+            )
+
+    def closure_converted(
+        self, system: AbstractMechanicalSystem, t: FloatScalar, y: State, args: Args
+    ) -> "ReversibleController":
+        """Return the controller, with arrays that the density reads as leaves."""
+        if self.density is None:
+            return self
+        given = t, y.q, system.fibre_coordinate(y), args
+        return ReversibleController(self.eps, ClosureConverted(self.density, *given))
+
+    def check(
+        self,
+        system: AbstractMechanicalSystem,
+        method: AbstractMethod,
+        t: FloatScalar,
+        y: State,
+        args: Args,
+    ) -> None:
+        """Raise unless the density is a function that returns one number."""
+        del method
+        if self.density is None:
+            return
+        q, u = y.q, system.fibre_coordinate(y)
+        coordinate = system.fibre_coordinate_name
+        names = ("t", "q", coordinate, "args")
+        check_signature("ReversibleController", "density", self.density, names)
+        called = f"density(t, q, {coordinate}, args)"
+        with naming(called, self.density, args):
+            out = eqx.filter_eval_shape(self.density, t, q, u, args)
+        if getattr(out, "shape", None) != ():
+            raise ShapeError(
+                f"ReversibleController: `{called}` must return a number of shape (), "
+                f"got {eqx.tree_pformat(out)}."
+            )
+        if out.dtype != u.dtype:
+            raise DTypeError(
+                f"ReversibleController: `{called}` returns dtype {out.dtype}, but the "
+                f"state has {u.dtype}."
+            )
+
+    def _density(
+        self, context: StepContext, t: FloatScalar, y: StepState
+    ) -> tuple[FloatScalar, FloatScalar]:
+        """Compute Q and its logarithmic rate along the motion."""
+        system, args = context.system, context.args
+        q, u = y.state.q, system.fibre_coordinate(y.state)
+        manifold = system.manifold_of(q)
+        density = self.density
+        if density is None:
+
+            def density(t: Any, q: Any, u: Any, args: Args) -> FloatScalar:
+                return fastest_frequency(system, t, q, u, args)
+
+        def along(t: FloatScalar, xi: Array, u: Array) -> FloatScalar:
+            return density(t, manifold.act(q, xi), u, args)
+
+        v = system.velocity(t, q, u, args)
+        given = t, jnp.zeros_like(u), u
+        rates = jnp.ones_like(t), v, y.lin.acceleration
+        value, rate = jax.jvp(along, given, rates)
+        return jax.lax.stop_gradient((value, rate / value))
+
+    def _size(
+        self, context: StepContext, density: FloatScalar, rate: FloatScalar
+    ) -> FloatScalar:
+        """Compute the size of the step after a node, given its density."""
+        eps = jnp.asarray(self.eps, density.dtype) * context.direction
+        return eps / (density + 0.5 * eps * rate)
+
+    def init(
+        self, context: StepContext, t: FloatScalar, start: StepState
+    ) -> tuple[FloatScalar, Memory, RESULTS]:
+        """Return the first size, for a density that equals that of the state."""
+        density, rate = self._density(context, t, start)
+        size = self._size(context, density, rate)
+        result = RESULTS.where(
+            _is_usable(density, size, context),
+            RESULTS.successful,
+            RESULTS.density_not_positive,
+        )
+        size = jnp.where(result == RESULTS.successful, size, context.direction)
+        return size, jnp.stack([density, rate]), result
+
+    def adapt(self, context: StepContext, attempt: Attempt, memory: Memory) -> Decision:
+        """Accept every step that is solved, and move the density on."""
+        density, rate = memory
+        end = attempt.t + attempt.h
+        _, following = self._density(context, end, attempt.outcome.step_state)
+        eps = jnp.asarray(self.eps, density.dtype) * context.direction
+        # A shorter step counts as one of a smaller ε, h = ε / (ρ + ε G / 2).
+        h = jax.lax.stop_gradient(attempt.h)
+        part = jnp.where(attempt.is_whole, eps, h * density / (1 - 0.5 * h * rate))
+        moved = (density + 0.5 * part * rate) + 0.5 * part * following
+        size = self._size(context, moved, following)
+        decision = _decided(attempt, size, jnp.stack([moved, following]))
+        is_bad = attempt.is_solved & ~_is_usable(moved, size, context)
+        result = RESULTS.where(is_bad, RESULTS.density_not_positive, decision.result)
+        return decision._replace(is_accepted=attempt.is_solved & ~is_bad, result=result)
+
+    def resume(
+        self, context: StepContext, size: FloatScalar, memory: Memory
+    ) -> tuple[FloatScalar, Memory]:
+        """Return the size after the node, in the direction of this run."""
+        del size
+        density, rate = memory
+        return self._size(context, density, rate), memory
+
+
+def _is_usable(
+    density: FloatScalar, size: FloatScalar, context: StepContext
+) -> BoolScalar:
+    return (density > 0) & (size * context.direction > 0) & jnp.isfinite(size)
+
+
+def _is_number(x: Any) -> bool:
+    is_scalar = eqx.is_array_like(x) and not isinstance(x, bool | complex)
+    return is_scalar and np.shape(x) == ()
+
+
+def position_sizes(
+    manifold: AbstractLieGroup, q: PyTree[Array], like: Float[Array, " n"]
+) -> Float[Array, " n"]:
+    """Return the sizes of the n coordinates of a position, of the shape of `like`.
+
+    They are |q| on a vector space. The elements of other groups have other numbers than
+    displacements, and all n sizes are that of the largest one.
+    """
+    leaves = [jnp.ravel(jnp.abs(x)) for x in jax.tree.leaves(q)]
+    flat = jnp.concatenate(leaves)
+    if manifold.is_flat and flat.shape == like.shape:
+        return flat
+    return jnp.full_like(like, jnp.max(flat))
+
+
+def fastest_frequency(
+    system: AbstractMechanicalSystem,
+    t: FloatScalar,
+    q: PyTree[Array],
+    u: Float[Array, " n"],
+    args: Args,
+) -> FloatScalar:
+    """Estimate the fastest angular frequency of the motion near a state.
+
+    With the acceleration a(q, u), constraints included, it is (|∂a/∂q| + |∂a/∂u|²)^½.
+    The norms are Frobenius norms in the metric of the kinetic energy, which do not
+    depend on the units of coordinates.
+    """
+    manifold = system.manifold_of(q)
+
+    def acceleration(xi: Array, u: Array) -> Array:
+        return linearise(system, t, manifold.act(q, xi), u, args).acceleration
+
+    by_position, by_fibre = jax.jacfwd(acceleration, argnums=(0, 1))(
+        jnp.zeros_like(u), u
+    )
+    # M for a Lagrangian system, and its inverse for a Hamiltonian one. The derivative of
+    # a momentum by a position is a form and not a map.
+    metric = system.metric(t, q, u, args)
+    inverse_metric = inverse(metric)
+    other = inverse_metric if system.fibre_coordinate_name == "v" else metric
+
+    def squared_norm(matrix: Array, other: Array) -> FloatScalar:
+        weighted = small_einsum("ij,jk->ik", metric, matrix)
+        return jnp.sum(small_einsum("ij,jk->ik", weighted, other) * matrix)
+
+    # A square root has no derivative at zero.
+    tiny = float(jnp.finfo(u.dtype).tiny) ** 0.5
+    stiffness = jnp.sqrt(jnp.maximum(squared_norm(by_position, other), tiny))
+    return jnp.sqrt(stiffness + squared_norm(by_fibre, inverse_metric))
