@@ -157,7 +157,7 @@ def variable_grid(
 def _numbers(
     t1: Any, num_steps: Any, max_steps: Any, is_given: bool
 ) -> tuple[int | None, int | None]:
-    """Return the number of steps and the limit of attempts, as far as they are given."""
+    """Return the number of steps and the limit of attempts, where they are given."""
     if t1 is not None and is_given:
         raise ValueError(
             "`t1` is given together with an array `dt`, which gives all steps. Leave "
@@ -194,8 +194,9 @@ def _default_limit(
     end: FloatScalar | None,
 ) -> int:
     """Return the limit of attempts if the user gives none."""
-    is_known = size is not None and end is not None and not is_traced(t0, size, end)
-    if isinstance(controller, ConstantStepSize) and is_known:
+    if not isinstance(controller, ConstantStepSize) or size is None or end is None:
+        return _MOST_STEPS
+    if not is_traced(t0, size, end):
         number = abs((float(end) - float(t0)) / float(size)) if float(size) else 0.0
         return int(min(np.ceil(number) + 1, 2**31 - 1)) if np.isfinite(number) else 1
     return _MOST_STEPS
@@ -204,7 +205,7 @@ def _default_limit(
 def checks_of_output(
     saveat: SaveAt, grid: VariableGrid, controller: AbstractStepSizeController
 ) -> list[Check]:
-    """Return the checks of the times of `SaveAt(ts=...)` in a run whose steps differ."""
+    """Return the checks of `SaveAt(ts=...)` in a run whose steps differ."""
     if saveat.ts is None:
         return []
     end = grid.t1

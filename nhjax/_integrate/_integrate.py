@@ -52,7 +52,7 @@ from ._checkpoint import (
     time_of,
 )
 from ._events import checked_events, Event
-from ._grid import checks_of_output, TimeGrid, variable_grid
+from ._grid import checks_of_output, Grid, TimeGrid, variable_grid
 from ._interpolation import (
     require_collocation,
 )
@@ -95,8 +95,8 @@ _TAKEN_OVER = (
     "`dt`."
 )
 _INTERRUPTED = (
-    "The run was interrupted after {} of {} steps, and the solution ends there. Its "
-    "`result` is `nhjax.RESULTS.interrupted`."
+    "The run was interrupted after {} steps, and the solution ends there, at t = "
+    "{:.6g}. Its `result` is `nhjax.RESULTS.interrupted`."
 )
 
 
@@ -254,7 +254,6 @@ def integrate(
         controller, grid, checks = variable_grid(
             stepsize_controller, t0, dt, t1, num_steps, max_steps
         )
-        num_steps = grid.most_steps
         controller.check(system, method, t0, state, args)
         checks += checks_of_output(saveat, grid, controller)
         if events is not None and isinstance(adjoint, ReversibleAdjoint):
@@ -271,7 +270,7 @@ def integrate(
         valid = hold(*checks)
     options = RunOptions(saveat.fn, invariants, events, controller)
     solver_options = SolverOptions(stage_solver, adjoint, progress_meter)
-    whole_run = _program_of_run(num_steps)
+    whole_run = _program_of_run(grid)
     sol = whole_run(system, method, y0, grid, args, options, saveat, solver_options)
     used_newton = not is_simplified_alone(stage_solver)
     if not _is_tracing() and leaves_steps_to_newton(stage_solver) and is_unsolved(sol):
@@ -285,7 +284,8 @@ def integrate(
         sol = _invalid_unless(valid, sol)
     if not _is_tracing() and ended_as(sol, "interrupted"):
         done = int(sol.stats["num_steps"])
-        warnings.warn(_INTERRUPTED.format(done, num_steps), stacklevel=2)
+        message = _INTERRUPTED.format(done, float(sol.t1))
+        warnings.warn(message, stacklevel=2)
     elif throw:
         _require_constraints(sol, system, t0, state, args)
         sol = raise_failures(sol, size, used_newton)
@@ -378,11 +378,11 @@ def step(
     return nan_unless(sol.result == RESULTS.successful, end)
 
 
-def _program_of_run(num_steps: int | IntScalar) -> Callable[..., Solution]:
+def _program_of_run(grid: Grid) -> Callable[..., Solution]:
     """Choose between one program for the whole run and chunks of steps."""
     # With `jax.disable_jit`, nothing is compiled, and the user wants to step through.
     no_jit = jax.config.jax_disable_jit  # pyright: ignore[reportAttributeAccessIssue]
-    if _is_tracing() or no_jit or not isinstance(num_steps, int):
+    if _is_tracing() or no_jit or not isinstance(grid.most_steps, int):
         return run
     return run_in_chunks
 

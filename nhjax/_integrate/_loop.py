@@ -53,8 +53,8 @@ class Loop(eqx.Module):
         carry, result = self.stepper.advance(carry, k, replay)
         if not self.meter.silent:
             if self.stepper.may_end_early:
-                parts = (self.stepper.progress(x) for x in (before, carry))
-                self.meter.report_part(*parts)
+                old, new = (self.stepper.progress(x) for x in (before, carry))
+                self.meter.report_part(old, new)
             else:
                 self._report(k)
         return carry, self._rows(carry, result, k)
@@ -202,7 +202,7 @@ class DirectAdjoint(AbstractAdjoint):
         """Run all steps of the loop from `carry`; return its end and all saved rows."""
         state = (carry, loop.empty_rows(carry))
         if loop.stepper.may_end_early:
-            return _run_until_over((loop, state))
+            return _run_until_over((loop, state), self)
         return iterate_steps(loop, np.int32(0), count(loop.num_iterations), state)
 
 
@@ -332,9 +332,7 @@ def _idle_after_the_end(loop: Loop) -> _Advance:
 
 
 @eqx.filter_custom_jvp
-def _run_until_over(
-    arguments: tuple[Loop, _Run], adjoint: AbstractAdjoint | None = None
-) -> _Run:
+def _run_until_over(arguments: tuple[Loop, _Run], adjoint: AbstractAdjoint) -> _Run:
     """Iterate until the run is over, within its largest number of iterations."""
     del adjoint
     loop, state = arguments

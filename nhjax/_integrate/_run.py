@@ -66,7 +66,7 @@ from ._chunks import (
 )
 from ._conservation import kept_invariants
 from ._events import Event, EventStepper
-from ._grid import Grid, VariableGrid
+from ._grid import Grid, TimeGrid, VariableGrid
 from ._interpolation import (
     DenseInterpolation,
     interpolate,
@@ -135,12 +135,14 @@ def run(
 
     This is one program, for runs inside transformations.
     """
-    t0, is_variable = grid.t0, isinstance(grid, VariableGrid)
+    t0 = grid.t0
     given = system, method, y0, grid, args, options, solver_options.stage_solver
     stepper, fn = _stepper(*given)
     plain = stepper.plain
     system, most = plain.system, plain.num_steps
-    sampled = None if is_variable else _sampled_steps(saveat, grid)
+    is_variable, sampled = isinstance(grid, VariableGrid), None
+    if not isinstance(grid, VariableGrid):
+        sampled = _sampled_steps(saveat, grid)
     # The steps in which times lie are not known before they are taken.
     keeps_all = saveat.dense or (is_variable and saveat.ts is not None)
     places = record_places(keeps_all, sampled, most)
@@ -448,9 +450,10 @@ def run_in_chunks(
     solver_options: SolverOptions,
 ) -> Solution:
     """Integrate by chunks of steps, outside of transformations."""
-    is_variable = isinstance(grid, VariableGrid)
+    is_variable, steps = isinstance(grid, VariableGrid), None
     num_steps = static_length(grid.most_steps)
-    steps = None if is_variable else _sampled_steps(saveat, grid)
+    if not isinstance(grid, VariableGrid):
+        steps = _sampled_steps(saveat, grid)
     keeps_records = saveat.dense or saveat.ts is not None
     # The chunks get the number of steps with their spans.
     whole, grid = grid, grid.of_length(None)
@@ -531,7 +534,7 @@ def _steps_taken(
     ts = np.asarray(saveat.ts)
     if records is None or records.interval is None or not len(records.force):
         return eqx.tree_at(lambda x: x.ts, saveat, ts[:0]), np.zeros((0,), np.int32)
-    reached = ts[np.asarray(is_within(ts, t0, t1))]
+    reached = ts[np.asarray(is_within(jnp.asarray(ts), t0, t1))]
     starts, sizes = (np.asarray(x) for x in records.interval)
     forward = np.sign(sizes[0])
     number = np.searchsorted(forward * starts, forward * reached, side="right")
@@ -549,6 +552,7 @@ def _sampled_in_chunks(
     reached = steps < output.num_steps
     ts, steps = np.asarray(saveat.ts)[reached], steps[reached]
     # The records are those of different steps, and all of them for dense output.
+    assert output.records is not None
     keeps_all = saveat.dense or len(output.records.force) == output.num_steps
     places = steps if keeps_all else np.unique(steps, return_inverse=True)[1]
     records = jax.tree.map(lambda x: x[places], output.records)
@@ -565,7 +569,7 @@ def _sampled_in_chunks(
     return pieces
 
 
-def _sampled_steps(saveat: SaveAt, grid: Grid) -> Int[Array, " k"] | None:
+def _sampled_steps(saveat: SaveAt, grid: TimeGrid) -> Int[Array, " k"] | None:
     """Find the steps in which the times of `SaveAt(ts=...)` lie; None without these."""
     if saveat.ts is None:
         return None

@@ -22,7 +22,13 @@ from .._method import AbstractMethod
 from .._numerics import ClosureConverted, inverse, max_norm, small_einsum
 from .._results import RESULTS
 from .._step import local_error, StepOutcome, StepState
-from .._system import AbstractMechanicalSystem, check_signature, linearise, State
+from .._system import (
+    AbstractMechanicalSystem,
+    check_signature,
+    linearise,
+    no_array,
+    State,
+)
 
 
 # The data that a controller carries from step to step.
@@ -284,18 +290,20 @@ class PIDController(AbstractStepSizeController):
             is_above = number >= least if may_be_zero else number > least
             if not (np.isfinite(number) and is_above and number <= most):
                 least = f"{'>=' if may_be_zero else '>'} {least}"
+                limit = "" if np.isinf(most) else f" and <= {most}"
                 advice = ""
                 if name == "rtol" and number == 0:
                     advice = " Round-off is relative, so that rtol = 0 cannot be met."
                 raise ValueError(
-                    f"PIDController: `{name}` must be finite, {least} and <= {most}, "
+                    f"PIDController: `{name}` must be finite, {least}{limit}, "
                     f"got {number}.{advice}"
                 )
-        both = self.dtmin, self.dtmax
-        if None not in both and not is_traced(*both) and not both[0] <= both[1]:
+        least, most = self.dtmin, self.dtmax
+        if least is None or most is None or is_traced(least, most):
+            return
+        if not least <= most:
             raise ValueError(
-                f"PIDController: `dtmin` = {both[0]} is larger than `dtmax` = "
-                f"{both[1]}."
+                f"PIDController: `dtmin` = {least} is larger than `dtmax` = {most}."
             )
 
     def check(
@@ -513,10 +521,11 @@ class ReversibleController(AbstractStepSizeController):
         called = f"density(t, q, {coordinate}, args)"
         with naming(called, self.density, args):
             out = eqx.filter_eval_shape(self.density, t, q, u, args)
-        if getattr(out, "shape", None) != ():
+        shape = getattr(out, "shape", None)
+        if shape != ():
             raise ShapeError(
                 f"ReversibleController: `{called}` must return a number of shape (), "
-                f"got {eqx.tree_pformat(out)}."
+                f"got {no_array(out) if shape is None else f'shape {shape}.'}"
             )
         if out.dtype != u.dtype:
             raise DTypeError(
@@ -531,14 +540,12 @@ class ReversibleController(AbstractStepSizeController):
         system, args = context.system, context.args
         q, u = y.state.q, system.fibre_coordinate(y.state)
         manifold = system.manifold_of(q)
-        density = self.density
-        if density is None:
-
-            def density(t: Any, q: Any, u: Any, args: Args) -> FloatScalar:
-                return fastest_frequency(system, t, q, u, args)
 
         def along(t: FloatScalar, xi: Array, u: Array) -> FloatScalar:
-            return density(t, manifold.act(q, xi), u, args)
+            moved = manifold.act(q, xi)
+            if self.density is None:
+                return fastest_frequency(system, t, moved, u, args)
+            return self.density(t, moved, u, args)
 
         v = system.velocity(t, q, u, args)
         given = t, jnp.zeros_like(u), u
@@ -639,8 +646,8 @@ def fastest_frequency(
     by_position, by_fibre = jax.jacfwd(acceleration, argnums=(0, 1))(
         jnp.zeros_like(u), u
     )
-    # M for a Lagrangian system, and its inverse for a Hamiltonian one. The derivative of
-    # a momentum by a position is a form and not a map.
+    # This is M for a Lagrangian system and its inverse for a Hamiltonian one. The
+    # derivative of a momentum by a position is a form and not a map.
     metric = system.metric(t, q, u, args)
     inverse_metric = inverse(metric)
     other = inverse_metric if system.fibre_coordinate_name == "v" else metric

@@ -118,8 +118,11 @@ class AbstractStepper(eqx.Module, Generic[C, R]):
         """Return whether all further iterations would leave the carry unchanged."""
         return carry.result != RESULTS.successful
 
-    def progress(self, carry: C) -> FloatScalar | None:
-        """Compute the part of the run that is done, from 0 to 1, if it may end early."""
+    def progress(self, carry: C) -> Any:
+        """Compute the part of the run that is done, from 0 to 1.
+
+        It is None unless the run may end early.
+        """
         del carry
         return None
 
@@ -372,8 +375,8 @@ class PlainStepper(AbstractStepper[PlainCarry, None]):
         def at_stages(x: Array) -> Array:
             return jnp.zeros((self.method.stages, *x.shape), x.dtype)
 
-        stages = map(at_stages, (state.v, state.p, state.multiplier))
-        record = StepRecord(state, *stages)
+        v, p, multiplier = map(at_stages, (state.v, state.p, state.multiplier))
+        record = StepRecord(state, v, p, multiplier)
         return StepResult(self.time(0), record, jnp.zeros((), bool))
 
     def succeeded(self, carry: PlainCarry) -> BoolScalar:

@@ -225,7 +225,7 @@ class EventStepper(AbstractStepper[EventCarry, ReplayedIteration]):
         """Return the same stepper with the measured round-off of the system."""
         return replace(self, plain=self.plain.with_round_off(round_off))
 
-    def progress(self, carry: EventCarry) -> FloatScalar | None:
+    def progress(self, carry: EventCarry) -> Any:
         """Compute the part of the run that is done, from 0 to 1, if steps differ."""
         if self.sizes is None or carry.place.clock is None:
             return None
