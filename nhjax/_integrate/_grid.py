@@ -151,7 +151,19 @@ def variable_grid(
     if most is None:
         most = _default_limit(controller, t0, size, end)
     grid = VariableGrid(t0, size, end, direction, number, most)
+    # As arrays, other tolerances do not recompile.
+    controller = jax.tree.map(
+        lambda x: real_scalar("stepsize_controller", x, dtype) if _is_real(x) else x,
+        controller,
+    )
     return controller, grid, checks
+
+
+def _is_real(x: Any) -> bool:
+    """Return whether a leaf of a controller is a number that may be traced."""
+    if isinstance(x, float | int):
+        return not isinstance(x, bool)
+    return eqx.is_inexact_array_like(x) and np.ndim(x) == 0
 
 
 def _numbers(

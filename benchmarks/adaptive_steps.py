@@ -1,0 +1,351 @@
+"""Steps that adapt: error against steps and time, on motions with fast and slow phases.
+
+Five motions have phases of very different speed: a rattleback that reverses its spin,
+Euler's disc down to an inclination of 1e-3, an orbit with close passes and a constraint,
+a whip of ten pendulums, and a bicycle that falls. Three are smooth, so that constant
+steps suit them. Each is run with constant steps, with the PID controller, and with the
+reversible controller, and beside them by diffrax with its PID controller on the
+index-reduced equations, where they are equations on a vector space.
+
+The error is the largest of (q, v) at the end against a run with s = 6 and the tolerance
+1e-12, over the size of the state. Steps are attempts, rejected ones included. Times are
+the least of three calls of compiled programs. For the comparison at equal error, the
+steps of a ladder are interpolated in logarithms.
+"""
+
+import argparse
+import math
+import time
+from collections.abc import Callable, Iterator
+from typing import Any, NamedTuple
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+import nhjax
+from nhjax import systems
+
+from . import rolling
+from ._report import add_keep, markdown_table, number, RESULTS, write
+
+
+LAST_BETA = 1e-3
+
+
+class Case(NamedTuple):
+    """A motion: its system, its start, its end, and the steps that are tried.
+
+    - `constant`: the numbers of constant steps.
+    - `eps`: values of ε for the reversible controller.
+    - `density`: its density, or None for the automatic one.
+    - `is_smooth`: whether constant steps suit the motion.
+    """
+
+    system: Any
+    start: nhjax.State
+    t1: float
+    constant: tuple[int, ...]
+    eps: tuple[float, ...] = ()
+    density: Callable[..., Any] | None = None
+    is_smooth: bool = False
+    stages: int = 4
+
+
+def doubled(first: int, number: int) -> tuple[int, ...]:
+    """Return numbers of steps, each twice the one before."""
+    return tuple(first * 2**k for k in range(number))
+
+
+def rattleback() -> Case:
+    """Create a rattleback whose spin reverses."""
+    stone = systems.Rattleback.spinning(5.0, (0.5, 0.5))
+    return Case(stone.system, stone.initial_state(), 10.0, doubled(250, 5))
+
+
+def eulers_disc() -> Case:
+    """Create Euler's disc on air, down to an inclination of 1e-3."""
+    machine = rolling.disc_on_its_side(rolling.viscous_rim)
+    half, sine = 0.5 * rolling.FIRST_BETA, math.sin(rolling.FIRST_BETA)
+    rate = rolling.precession_rate(rolling.FIRST_BETA)
+    height = rolling.EULER_RADIUS * sine
+    q0 = jnp.array([math.cos(half), math.sin(half), 0, 0, 0, 0, height])
+    v0 = jnp.zeros(6).at[4].set(rate * sine)
+    y0 = nhjax.initial_state(machine.system, q0, v0)
+
+    def is_flat(t: Any, y: nhjax.State, args: Any) -> Array:
+        return 4 * (y.q[1] ** 2 + y.q[2] ** 2) - LAST_BETA**2
+
+    end = nhjax.integrate(
+        machine.system,
+        nhjax.LobattoIIIAB(4),
+        y0,
+        t1=100.0,
+        stepsize_controller=nhjax.PIDController(1e-8, 1e-10),
+        max_steps=10**6,
+        event=nhjax.Event(is_flat),
+    )
+    return Case(machine.system, y0, float(end.t1), doubled(2**14, 5))
+
+
+def orbit() -> Case:
+    """Create ten orbits with close passes, and a constraint."""
+    system = nhjax.LagrangianSystem(
+        lambda t, q, v, args: 0.5 * v @ v + 1 / jnp.hypot(q[0], q[1]),
+        nonholonomic=lambda t, q, v, args: v[2] - 0.3 * q[1] * v[0],
+    )
+    eccentricity = 0.95
+    q0 = jnp.array([1 + eccentricity, 0.0, 0.0])
+    speed = math.sqrt((1 - eccentricity) / (1 + eccentricity))
+    y0 = nhjax.initial_state(system, q0, jnp.array([0.0, speed, 0.0]))
+    return Case(
+        system,
+        y0,
+        10 * 2 * math.pi,
+        doubled(2**10, 6),
+        (0.2, 0.1, 0.05, 0.025),
+        lambda t, q, v, args: (q[0] ** 2 + q[1] ** 2) ** -0.75,
+    )
+
+
+def whip() -> Case:
+    """Create a chain of ten pendulums that falls from the horizontal and whips."""
+    angles = tuple([0.5 * math.pi] * 10)
+    lengths, masses = (0.1,) * 10, tuple(0.1 * 0.8**k for k in range(10))
+    chain = systems.PendulumChain.swinging(
+        angles=angles, lengths=lengths, masses=masses, gravity=9.81
+    )
+    return Case(chain.system, chain.initial_state(), 0.6, doubled(32, 6))
+
+
+def falling_bicycle() -> Case:
+    """Create a bicycle that stands almost upright, until it leans by 1.3 rad."""
+    bicycle = systems.WhippleBicycle.running(speed=0.5, lean_rate=1e-4)
+    system, y0 = bicycle.system, bicycle.initial_state()
+    end = nhjax.integrate(
+        system,
+        nhjax.LobattoIIIAB(4),
+        y0,
+        t1=20.0,
+        stepsize_controller=nhjax.PIDController(1e-8, 1e-10),
+        event=nhjax.Event(lambda t, y, args: jnp.abs(y.q[3]) - 1.3),
+    )
+    return Case(system, y0, float(end.t1), doubled(16, 6))
+
+
+def smooth(name: str, t1: float, first: int) -> Case:
+    """Create a motion of the gallery without fast phases."""
+    example = getattr(systems, name)()
+    numbers = doubled(first, 5)
+    return Case(example.system, example.initial_state(), t1, numbers, is_smooth=True)
+
+
+CASES: dict[str, Callable[[], Case]] = {
+    "rattleback that reverses": rattleback,
+    "Euler's disc": eulers_disc,
+    "orbit with close passes": orbit,
+    "whip of ten pendulums": whip,
+    "bicycle that falls": falling_bicycle,
+    "particle": lambda: smooth("NonholonomicParticle", 20.0, 50),
+    "chaotic": lambda: smooth("ChaoticSystem", 20.0, 50),
+    "CVT": lambda: smooth("ContinuouslyVariableTransmission", 20.0, 50),
+}
+TOLERANCES = (1e-3, 1e-4, 1e-5, 1e-6, 1e-7, 1e-8, 1e-9, 1e-10)
+
+
+class Row(NamedTuple):
+    """A run: its case, its method, its setting, and what was measured."""
+
+    case: str
+    method: str
+    setting: float
+    error: float
+    steps: int
+    rejected: int
+    seconds: float
+
+
+def timed(call: Callable[[], Any]) -> tuple[Any, float]:
+    """Call three times after a first time; return the result and the least time."""
+    result, times = jax.block_until_ready(call()), []
+    for _ in range(3):
+        begin = time.perf_counter()
+        result = jax.block_until_ready(call())
+        times.append(time.perf_counter() - begin)
+    return result, min(times)
+
+
+def end_of(sol: nhjax.Solution) -> np.ndarray:
+    """Return (q, v) at the end of a run, or NaN if it failed."""
+    end = jax.tree.map(lambda x: x[-1], sol.ys)
+    y = np.concatenate([np.asarray(end.q), np.asarray(end.v)])
+    return y if sol.result == nhjax.RESULTS.successful else np.full_like(y, np.nan)
+
+
+def reference(case: Case) -> np.ndarray:
+    """Return the end of an accurate run."""
+    sol = nhjax.integrate(
+        case.system,
+        nhjax.LobattoIIIAB(6),
+        case.start,
+        t1=case.t1,
+        stepsize_controller=nhjax.PIDController(1e-12, 1e-13),
+        max_steps=10**6,
+    )
+    return end_of(sol)
+
+
+def measure(name: str, case: Case) -> Iterator[Row]:
+    """Run a case with all steps of all ladders."""
+    exact, method = reference(case), nhjax.LobattoIIIAB(case.stages)
+
+    def run(**options: Any) -> nhjax.Solution:
+        return nhjax.integrate(
+            case.system,
+            method,
+            case.start,
+            throw=False,
+            stage_solver=nhjax.SimplifiedNewton(fallback=False),
+            **options,
+        )
+
+    def row(kind: str, setting: float, **options: Any) -> Row:
+        sol, seconds = timed(lambda: run(**options))
+        rejected = int(sol.stats.get("num_rejected_steps", 0))
+        steps = int(sol.stats["num_steps"]) + rejected
+        error = np.max(np.abs(end_of(sol) - exact)) / np.max(np.abs(exact))
+        print(name, kind, setting, error, steps, rejected, seconds, flush=True)
+        return Row(name, kind, setting, float(error), steps, rejected, seconds)
+
+    for count in case.constant:
+        yield row("constant", count, dt=case.t1 / count, num_steps=count)
+    for rtol in TOLERANCES:
+        yield row(
+            "PID",
+            rtol,
+            t1=case.t1,
+            stepsize_controller=nhjax.PIDController(rtol, 1e-2 * rtol),
+            max_steps=10**6,
+        )
+    for eps in case.eps:
+        controller = nhjax.ReversibleController(eps, case.density)
+        yield row(
+            "reversible", eps, t1=case.t1, stepsize_controller=controller, max_steps=10**6
+        )
+    if case.system.manifold is None:
+        yield from of_diffrax(name, case, exact)
+
+
+def of_diffrax(name: str, case: Case, exact: np.ndarray) -> Iterator[Row]:
+    """Run a case by diffrax, on the accelerations that nhjax computes."""
+    n = case.start.v.shape[0]
+
+    def field(t: Any, y: Array, args: Any) -> Array:
+        q, v = y[:n], y[n:]
+        state = nhjax.State(q, v, v, jnp.zeros_like(case.start.multiplier))
+        return jnp.concatenate([v, nhjax.motion(case.system, t, state).acceleration])
+
+    y0 = jnp.concatenate([case.start.q, case.start.v])
+    for rtol in TOLERANCES:
+
+        @jax.jit
+        def solve(y0: Array, rtol: Any = rtol) -> Any:
+            return diffrax.diffeqsolve(
+                diffrax.ODETerm(field),
+                diffrax.Dopri8(),
+                0.0,
+                case.t1,
+                None,
+                y0,
+                stepsize_controller=diffrax.PIDController(rtol, 1e-2 * rtol),
+                max_steps=10**6,
+                adjoint=diffrax.ForwardMode(),
+                throw=False,
+            )
+
+        sol, seconds = timed(lambda solve=solve: solve(y0))
+        error = np.max(np.abs(np.asarray(sol.ys[-1]) - exact)) / np.max(np.abs(exact))
+        steps, rejected = sol.stats["num_steps"], sol.stats["num_rejected_steps"]
+        yield Row(
+            name, "diffrax Dopri8", rtol, float(error), int(steps), int(rejected), seconds
+        )
+
+
+def at_error(rows: list[Row], error: float, what: str) -> float:
+    """Interpolate the steps or seconds of a ladder at an error; NaN outside of it."""
+    points = sorted((x.error, getattr(x, what)) for x in rows if np.isfinite(x.error))
+    errors, values = np.log(np.array(points).T) if points else (np.zeros(0),) * 2
+    if len(points) < 2 or not errors[0] <= np.log(error) <= errors[-1]:
+        return math.nan
+    return float(np.exp(np.interp(np.log(error), errors, values)))
+
+
+ERRORS = (1e-4, 1e-6, 1e-8)
+
+
+def comparison(rows: list[Row]) -> list[list[str]]:
+    """Return a table of steps and times at equal error, over those of constant steps."""
+    table = []
+    for case in dict.fromkeys(row.case for row in rows):
+        for error in ERRORS:
+            line = [case, number(error)]
+            of = {
+                kind: [x for x in rows if x.case == case and x.method == kind]
+                for kind in ("constant", "PID", "reversible", "diffrax Dopri8")
+            }
+            base = {what: at_error(of["constant"], error, what) for what in ("steps", "seconds")}
+            line += [f"{base['steps']:.0f}", f"{1e3 * base['seconds']:.2f}"]
+            for kind in ("PID", "reversible"):
+                for what in ("steps", "seconds"):
+                    ratio = at_error(of[kind], error, what) / base[what]
+                    line.append("-" if math.isnan(ratio) else f"{ratio:.2f}")
+            ratio = at_error(of["diffrax Dopri8"], error, "seconds") / base["seconds"]
+            line.append("-" if math.isnan(ratio) else f"{ratio:.2f}")
+            table.append(line)
+    return table
+
+
+HEADER = [
+    "motion",
+    "error",
+    "constant: steps",
+    "ms",
+    "PID: steps, ratio",
+    "time, ratio",
+    "reversible: steps, ratio",
+    "time, ratio",
+    "diffrax: time, ratio",
+]
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--only", nargs="*", help="words of the names of cases")
+    add_keep(parser)
+    options = parser.parse_args()
+    jax.config.update("jax_enable_x64", True)
+    rows: list[Row] = []
+    for name, make in CASES.items():
+        if options.only and not any(word in name for word in options.only):
+            continue
+        rows += measure(name, make())
+    text = markdown_table(HEADER, comparison(rows))
+    details = [
+        [x.case, x.method, f"{x.setting:g}", number(x.error), str(x.steps)]
+        + [str(x.rejected), f"{1e3 * x.seconds:.2f}"]
+        for x in rows
+    ]
+    header = ["motion", "method", "setting", "error", "attempts", "rejected", "ms"]
+    text += "\n\n## All runs\n\n" + markdown_table(header, details)
+    write(
+        "adaptive_steps",
+        "Steps that adapt",
+        text,
+        {"rows": [x._asdict() for x in rows]},
+    )
+
+
+if __name__ == "__main__":
+    main()
