@@ -1,9 +1,9 @@
 """Steps that adapt: error against steps and time, on motions with fast and slow phases.
 
 Five motions have phases of very different speed: a rattleback that reverses its spin,
-Euler's disc down to an inclination of 1e-3, an orbit with close passes and a constraint,
-a whip of ten pendulums, and a bicycle that falls. Three are smooth, so that constant
-steps suit them. Each is run with constant steps, with the PID controller, and with the
+Euler's disc down to an inclination of 1e-3, an orbit with close passes and a
+constraint, a whip of ten pendulums, and a bicycle that falls. Three are smooth, so that
+constant steps suit them. Each is run with constant steps, with the PID controller, and with the
 reversible controller, and beside them by diffrax with its PID controller on the
 index-reduced equations, where they are equations on a vector space.
 
@@ -29,7 +29,7 @@ import nhjax
 from nhjax import systems
 
 from . import rolling
-from ._report import add_keep, markdown_table, number, RESULTS, write
+from ._report import add_keep, markdown_table, number, write
 
 
 LAST_BETA = 1e-3
@@ -232,7 +232,11 @@ def measure(name: str, case: Case) -> Iterator[Row]:
     for eps in case.eps:
         controller = nhjax.ReversibleController(eps, case.density)
         yield row(
-            "reversible", eps, t1=case.t1, stepsize_controller=controller, max_steps=10**6
+            "reversible",
+            eps,
+            t1=case.t1,
+            stepsize_controller=controller,
+            max_steps=10**6,
         )
     if case.system.manifold is None:
         yield from of_diffrax(name, case, exact)
@@ -269,7 +273,13 @@ def of_diffrax(name: str, case: Case, exact: np.ndarray) -> Iterator[Row]:
         error = np.max(np.abs(np.asarray(sol.ys[-1]) - exact)) / np.max(np.abs(exact))
         steps, rejected = sol.stats["num_steps"], sol.stats["num_rejected_steps"]
         yield Row(
-            name, "diffrax Dopri8", rtol, float(error), int(steps), int(rejected), seconds
+            name,
+            "diffrax Dopri8",
+            rtol,
+            float(error),
+            int(steps),
+            int(rejected),
+            seconds,
         )
 
 
@@ -286,7 +296,7 @@ ERRORS = (1e-4, 1e-6, 1e-8)
 
 
 def comparison(rows: list[Row]) -> list[list[str]]:
-    """Return a table of steps and times at equal error, over those of constant steps."""
+    """Return a table of steps and times at equal error, as ratios to constant steps."""
     table = []
     for case in dict.fromkeys(row.case for row in rows):
         for error in ERRORS:
@@ -295,7 +305,10 @@ def comparison(rows: list[Row]) -> list[list[str]]:
                 kind: [x for x in rows if x.case == case and x.method == kind]
                 for kind in ("constant", "PID", "reversible", "diffrax Dopri8")
             }
-            base = {what: at_error(of["constant"], error, what) for what in ("steps", "seconds")}
+            base = {
+                what: at_error(of["constant"], error, what)
+                for what in ("steps", "seconds")
+            }
             line += [f"{base['steps']:.0f}", f"{1e3 * base['seconds']:.2f}"]
             for kind in ("PID", "reversible"):
                 for what in ("steps", "seconds"):
@@ -333,8 +346,15 @@ def main() -> None:
         rows += measure(name, make())
     text = markdown_table(HEADER, comparison(rows))
     details = [
-        [x.case, x.method, f"{x.setting:g}", number(x.error), str(x.steps)]
-        + [str(x.rejected), f"{1e3 * x.seconds:.2f}"]
+        [
+            x.case,
+            x.method,
+            f"{x.setting:g}",
+            number(x.error),
+            str(x.steps),
+            str(x.rejected),
+            f"{1000.0 * x.seconds:.2f}",
+        ]
         for x in rows
     ]
     header = ["motion", "method", "setting", "error", "attempts", "rejected", "ms"]

@@ -56,6 +56,7 @@ from ._integrate import (
     SaveAt as SaveAt,
     Solution as Solution,
     step as step,
+    suggest_step as suggest_step,
     TextProgressMeter as TextProgressMeter,
     TqdmProgressMeter as TqdmProgressMeter,
 )

@@ -12,7 +12,11 @@ from ._dataset import (
     units_of_coordinates as units_of_coordinates,
 )
 from ._events import Event as Event
-from ._integrate import integrate as integrate, step as step
+from ._integrate import (
+    integrate as integrate,
+    step as step,
+    suggest_step as suggest_step,
+)
 from ._interpolation import DenseInterpolation as DenseInterpolation
 from ._loop import (
     AbstractAdjoint as AbstractAdjoint,

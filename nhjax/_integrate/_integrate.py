@@ -1,8 +1,9 @@
-"""The functions `integrate` and `step`: the checks of their arguments and results.
+"""The functions `integrate`, `step` and `suggest_step`, and checks of their arguments.
 
 The run itself is in `_run`.
 """
 
+import math
 import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -70,7 +71,11 @@ from ._solution import (
     raise_failures,
     Solution,
 )
-from ._step_sizes import AbstractStepSizeController, ConstantStepSize
+from ._step_sizes import (
+    AbstractStepSizeController,
+    ConstantStepSize,
+    PIDController,
+)
 
 
 METHODS = LobattoIIIAB, Gauss, PartitionedRungeKutta
@@ -376,6 +381,77 @@ def step(
     if throw:
         return end
     return nan_unless(sol.result == RESULTS.successful, end)
+
+
+def suggest_step(
+    system: AbstractMechanicalSystem,
+    method: AbstractMethod,
+    y0: State,
+    *,
+    t1: FloatScalarLike,
+    rtol: FloatScalarLike,
+    atol: FloatScalarLike | None = None,
+    t0: FloatScalarLike = 0.0,
+    args: Args = None,
+    stage_solver: AbstractStageSolver = SimplifiedNewton(),
+    max_steps: int = 4096,
+) -> float:
+    """Suggest a step size for runs with constant steps, from a trial run.
+
+    The trial run from `t0` to `t1` takes steps by `nhjax.PIDController(rtol, atol)`.
+    The suggested size is the smallest that it needed, without the first steps, whose
+    sizes are still being found, and the last one, which ends at `t1`. It is rounded
+    down so that whole steps lead from `t0` to `t1`. Constant steps of this size have
+    errors within the tolerance in the fastest phase of the motion, and smaller errors
+    elsewhere.
+
+    **Arguments:**
+
+    - `system`, `method`, `y0`, `args`, `stage_solver`: as for `nhjax.integrate`.
+    - `t0`, `t1`: the start and the end of the trial, which should contain the fastest
+        phase of the motion; [s] or whatever the unit of time is.
+    - `rtol`, `atol`: the tolerances of each step; `atol` is `rtol` by default.
+    - `max_steps`: the largest number of attempts at a step.
+
+    **Returns:** the step size, a float with the sign of t1 - t0.
+
+    **Raises:** `IntegrationError` if the trial fails; `RuntimeError` under `jit` and
+    other transformations; otherwise as `nhjax.integrate`.
+
+    !!! example
+
+        >>> import nhjax
+        >>> disc, method = nhjax.systems.VerticalRollingDisc(), nhjax.LobattoIIIAB(3)
+        >>> dt = nhjax.suggest_step(disc.system, method, disc.initial_state(), t1=1.0,
+        ...     rtol=1e-6)
+        >>> 0.0 < dt <= 1.0
+        True
+    """
+    if _is_tracing():
+        raise RuntimeError(
+            "`suggest_step` chooses a number on the host: call it outside of jit, vmap "
+            "and grad, and pass its result on."
+        )
+    sol = integrate(
+        system,
+        method,
+        y0,
+        t0=t0,
+        t1=t1,
+        args=args,
+        saveat=SaveAt(t0=True, steps=True, fn=lambda t, y, args: t),
+        stage_solver=stage_solver,
+        stepsize_controller=PIDController(rtol, rtol if atol is None else atol),
+        max_steps=max_steps,
+    )
+    ts = np.asarray(sol.ts, float)
+    sizes = np.abs(np.diff(ts))
+    # Sizes grow by large factors until the controller has found the first one.
+    growing = sizes[1:] > 2 * sizes[:-1]
+    first = int(np.argmin(growing)) if growing.size and not growing.all() else 0
+    needed = sizes[first:-1] if sizes[first:-1].size else sizes[-1:]
+    number = max(1, math.ceil(abs(ts[-1] - ts[0]) / np.min(needed) * (1 - 1e-9)))
+    return float((ts[-1] - ts[0]) / number)
 
 
 def _program_of_run(grid: Grid) -> Callable[..., Solution]:

@@ -421,7 +421,8 @@ class EventStepper(AbstractStepper[EventCarry, ReplayedIteration]):
         solved: BoolScalar,
     ) -> Decision:
         """Return what the controller decides on a step or on a part of one."""
-        assert self.sizes is not None and carry.place.clock is not None
+        assert self.sizes is not None
+        assert carry.place.clock is not None
         clock, place = carry.place.clock, carry.place
         attempt = Attempt(
             *(next_step.t, step.h, clock.size, carry.step_state, step.outcome),
@@ -437,8 +438,10 @@ class EventStepper(AbstractStepper[EventCarry, ReplayedIteration]):
         self, before: EventLoopState, after: EventLoopState, attempt: AttemptedStep
     ) -> Clock:
         """Return the clock after an iteration, which may have reached a node."""
-        assert self.sizes is not None and before.clock is not None
-        assert attempt.decision is not None and attempt.next_step is not None
+        assert self.sizes is not None
+        assert before.clock is not None
+        assert attempt.decision is not None
+        assert attempt.next_step is not None
         clock, decision = before.clock, attempt.decision
         reaches = after.node > before.node
         is_rejected = attempt.is_taken & ~attempt.is_kept & ~attempt.is_discarded
