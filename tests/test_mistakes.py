@@ -1057,8 +1057,8 @@ RUNS = [
     row(
         "gave several step sizes",
         lambda: run(Y0, dt=jnp.ones(3)),
-        ShapeError,
-        "`dt` has shape (3,)",
+        ValueError,
+        "`dt` has 3 sizes, but `num_steps` is",
         "`jax.vmap`",
     ),
     row(
@@ -1082,8 +1082,9 @@ RUNS = [
     row(
         "gave no step",
         lambda: run(Y0, dt=None),
-        DTypeError,
-        "`dt` must be a real number, got None",
+        TypeError,
+        "`dt` is missing",
+        "nhjax.PIDController(rtol=1e-6, atol=1e-6)",
     ),
     row(
         "started at a time next to which a step is nothing",

@@ -118,7 +118,8 @@ def variable_grid(
         if number is not None and number != length:
             raise ValueError(
                 f"`dt` has {length} sizes, but `num_steps` is {number}. Leave out "
-                "`num_steps`."
+                "`num_steps` to take these steps one after the other. For runs with "
+                "different sizes use `jax.vmap`."
             )
         known: Any = sizes if is_traced(sizes) else np.asarray(sizes)
         numpy: Any = jnp if is_traced(sizes) else np
