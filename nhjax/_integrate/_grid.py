@@ -17,6 +17,7 @@ from ._step_sizes import (
     AbstractStepSizeController,
     ConstantStepSize,
     GivenStepSizes,
+    PIDController,
 )
 
 
@@ -150,7 +151,7 @@ def variable_grid(
         agree = numpy.asarray(size) * numpy.asarray(direction) > 0
         checks.append(Check(agree, _wrong_sign, (size, t0, t0 if end is None else end)))
     if most is None:
-        most = _default_limit(controller, t0, size, end)
+        most = _default_limit(controller, t0, size, end, number)
     grid = VariableGrid(t0, size, end, direction, number, most)
     # As arrays, other tolerances do not recompile.
     controller = jax.tree.map(
@@ -205,8 +206,13 @@ def _default_limit(
     t0: FloatScalar,
     size: FloatScalar | None,
     end: FloatScalar | None,
+    num_steps: int | None,
 ) -> int:
     """Return the limit of attempts if the user gives none."""
+    if num_steps is not None:
+        # Steps of a PID controller may be repeated.
+        is_pid = isinstance(controller, PIDController)
+        return max(_MOST_STEPS, 4 * num_steps) if is_pid else num_steps
     if not isinstance(controller, ConstantStepSize) or size is None or end is None:
         return _MOST_STEPS
     if not is_traced(t0, size, end):

@@ -54,7 +54,9 @@ class Loop(eqx.Module):
         if not self.meter.silent:
             if self.stepper.may_end_early:
                 old, new = (self.stepper.progress(x) for x in (before, carry))
-                self.meter.report_part(old, new)
+                # A run that an event ends is complete as well.
+                over = self.stepper.is_over(carry)
+                self.meter.report_part(old, jnp.where(over, 1, new))
             else:
                 self._report(k)
         return carry, self._rows(carry, result, k)

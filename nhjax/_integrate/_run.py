@@ -494,6 +494,9 @@ def run_in_chunks(
         pieces += _sampled_in_chunks(given, saveat, np.asarray(steps), output)
     if saveat.saves_end(output.num_steps):
         pieces.append(_one(on_host(last.saved_end)))
+    if not pieces and saveat.saves_rows:
+        # A run whose steps differ may have fewer steps than the stride of its output.
+        pieces.append(jax.tree.map(lambda x: x[:0], _one(on_host(start.saved))))
     ts, ys = on_device(joined(pieces), last.end.t) if pieces else (None, None)
     interpolation, result = None, last.carry.result
     if saveat.dense and last.system is not None:

@@ -146,6 +146,11 @@ class SaveAt(eqx.Module):
         strided = static_length(num_steps) // self.steps if self.steps else 0
         return self.t0 + sampled + strided + self.saves_end(num_steps)
 
+    @property
+    def saves_rows(self) -> bool:
+        """Return whether output at times is asked for."""
+        return self.t0 or self.t1 or self.steps > 0 or self.ts is not None
+
     def saves_end(self, num_steps: int | IntScalar) -> bool:
         """Return whether `t1` adds a final state that `steps` does not save."""
         last_is_saved = bool(self.steps) and static_length(num_steps) % self.steps == 0

@@ -166,6 +166,13 @@ class ConstantStepSize(AbstractStepSizeController):
         """Accept every step that is solved."""
         return _decided(attempt, _size_of_user(context), memory)
 
+    def resume(
+        self, context: StepContext, size: FloatScalar, memory: Memory
+    ) -> tuple[FloatScalar, Memory]:
+        """Return `dt`, which may differ from that of the run before."""
+        del size
+        return _size_of_user(context), memory
+
     def given_size(self, context: StepContext, node: Int[Array, ""]) -> FloatScalar:
         """Return `dt` in the direction of the run."""
         del node
@@ -327,8 +334,8 @@ class PIDController(AbstractStepSizeController):
         self, context: StepContext, t: FloatScalar, start: StepState
     ) -> tuple[FloatScalar, Memory, RESULTS]:
         """Return `dt`, or a size for which the state changes by one percent."""
-        dtype = start.state.p.dtype
-        ones = jnp.ones((2,), dtype)
+        # Errors of one, for the two steps before the first.
+        ones = (jnp.ones((), t.dtype),) * 2
         if context.dt is not None:
             size = jnp.abs(context.dt)
         else:
@@ -428,9 +435,16 @@ class PIDController(AbstractStepSizeController):
             result,
             outcome.result,
         )
-        memory = jnp.stack([error, memory[0]])
         size = jax.lax.stop_gradient(following) * context.direction
-        return Decision(accepted, result, size, jax.lax.stop_gradient(memory))
+        return Decision(accepted, result, size, (error, memory[0]))
+
+    def resume(
+        self, context: StepContext, size: FloatScalar, memory: Memory
+    ) -> tuple[FloatScalar, Memory]:
+        """Return `dt` if it is given, or the next size of the run before."""
+        size = jnp.abs(size if context.dt is None else context.dt)
+        size = jax.lax.stop_gradient(self._limited(size))
+        return size * context.direction, memory
 
 
 class ReversibleController(AbstractStepSizeController):

@@ -115,7 +115,10 @@ class StepSizes(eqx.Module):
         if self.t1 is None:
             return NextStep(t, h, ~never, never)
         rest = (self.t1 - t) - clock.compensation
-        is_last = jnp.abs(rest) <= jnp.abs(h) * (1 + 1e-9)
+        # Times have rounding errors proportional to their size.
+        eps = float(jnp.finfo(t.dtype).eps)
+        slack = 1e-9 * jnp.abs(h) + 16 * eps * jnp.maximum(jnp.abs(t), jnp.abs(self.t1))
+        is_last = jnp.abs(rest) <= jnp.abs(h) + slack
         h = jnp.where(is_last, rest, h)
         return NextStep(t, h, ~is_last, is_last)
 

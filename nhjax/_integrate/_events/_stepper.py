@@ -145,6 +145,11 @@ class AttemptedStep(NamedTuple):
     next_step: NextStep | None
 
     @property
+    def is_rejected(self) -> BoolScalar:
+        """Return whether the step was not solved, or not accepted by the controller."""
+        return self.is_taken & ~self.is_kept & ~self.is_discarded
+
+    @property
     def reaches_node(self) -> BoolScalar:
         """Return whether the step led to the next node."""
         return self.is_kept & ~self.meets
@@ -305,8 +310,11 @@ class EventStepper(AbstractStepper[EventCarry, ReplayedIteration]):
             fills = (after.node > before.node) | ends | has_ended
         else:
             after = replace(after, clock=self._clock_after(before, after, attempt))
-            number = self.num_iterations
-            is_spent = attempt.is_alive & (jnp.asarray(i, jnp.int32) + 1 >= number)
+            # Iterations for events are not attempts at a step.
+            rejected = attempt.is_rejected.astype(jnp.int32)
+            number = after.node + carry.stats["num_rejected_steps"] + rejected
+            is_last = jnp.asarray(i, jnp.int32) + 1 >= self.num_iterations
+            is_spent = attempt.is_alive & (is_last | (number >= self.sizes.max_steps))
             is_spent = is_spent & (result == RESULTS.successful)
             is_spent = is_spent & ~cast(Clock, after.clock).is_done
             result = RESULTS.where(is_spent, RESULTS.max_steps_reached, result)
@@ -444,8 +452,7 @@ class EventStepper(AbstractStepper[EventCarry, ReplayedIteration]):
         assert attempt.next_step is not None
         clock, decision = before.clock, attempt.decision
         reaches = after.node > before.node
-        is_rejected = attempt.is_taken & ~attempt.is_kept & ~attempt.is_discarded
-        size = jnp.where(is_rejected, before.offset + decision.size, clock.size)
+        size = jnp.where(attempt.is_rejected, before.offset + decision.size, clock.size)
         size = jnp.where(reaches & attempt.is_kept, decision.size, size)
         end = two_sum(clock.t, attempt.whole + clock.compensation)
         memory = tree_where(attempt.is_kept, decision.memory, clock.memory)
@@ -574,7 +581,7 @@ def _statistics_after(
         stats[name] = jnp.where(ends, stats[name], carry.stats[name])
     stats["failed_step"] = jnp.where(failed, node, stats["failed_step"])
     if attempt.decision is not None:
-        rejected = taken & ~kept & ~attempt.is_discarded & ~ends
+        rejected = attempt.is_rejected & ~(ends & failed)
         number = carry.stats["num_rejected_steps"] + rejected.astype(jnp.int32)
         stats["num_rejected_steps"] = number
     stats |= {"num_steps": after.node, "num_events": after.num_events}
