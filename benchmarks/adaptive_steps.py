@@ -3,25 +3,32 @@
 Five motions have phases of very different speed: a rattleback that reverses its spin,
 Euler's disc down to an inclination of 1e-3, an orbit with close passes and a
 constraint, a whip of ten pendulums, and a bicycle that falls. Three are smooth, so that
-constant steps suit them. Each is run with constant steps, with the PID controller, and with the
-reversible controller, and beside them by diffrax with its PID controller on the
-index-reduced equations, where they are equations on a vector space.
+constant steps suit them. Each is run with constant steps, with the PID controller, and
+with the reversible controller, and beside them by diffrax with its PID controller on
+the index-reduced equations, where they are equations on a vector space.
 
 The error is the largest of (q, v) at the end against a run with s = 6 and the tolerance
 1e-12, over the size of the state. Steps are attempts, rejected ones included. Times are
 the least of three calls of compiled programs. For the comparison at equal error, the
 steps of a ladder are interpolated in logarithms.
+
+Two more parts: `long` follows the energy of the orbit over t = 1e5 with constant, PID
+and reversible steps, and draws docs/step_sizes.png. `stages` measures which number of
+stages needs the least time for an error.
 """
 
 import argparse
+import json
 import math
 import time
 from collections.abc import Callable, Iterator
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import diffrax
 import jax
 import jax.numpy as jnp
+import matplotlib.pyplot as plt
 import numpy as np
 from jaxtyping import Array
 
@@ -29,10 +36,13 @@ import nhjax
 from nhjax import systems
 
 from . import rolling
-from ._report import add_keep, markdown_table, number, write
+from ._report import markdown_table, number, RESULTS, write
 
 
 LAST_BETA = 1e-3
+PARTS = "cases", "long", "stages"
+DOCS = Path(__file__).parent.parent / "docs"
+SAVED = RESULTS / "adaptive_steps.json"
 
 
 class Case(NamedTuple):
@@ -333,15 +343,179 @@ HEADER = [
 ]
 
 
+# --- The energy over a long time ------------------------------------------------------
+
+LONG, ROWS = 1e5, 2000
+ECCENTRICITY = 0.8
+
+
+def ball_in_central_field() -> tuple[nhjax.LagrangianSystem, nhjax.State]:
+    """Create a homogeneous ball that rolls on a plane around an attracting point.
+
+    Its centre moves as a particle of 7/5 of its mass in the same field (Routh), so that
+    the motion is integrable: an ellipse. It starts where it is farthest from the point.
+    """
+    manifold = nhjax.ProductGroup(nhjax.Euclidean(2), nhjax.SO3())
+
+    def lagrangian(t: Any, q: Any, v: Array, args: Any) -> Array:
+        return 0.5 * v[:2] @ v[:2] + 0.2 * v[2:] @ v[2:] + 1 / jnp.hypot(*q[0])
+
+    def constraint(t: Any, q: Any, v: Array, args: Any) -> Array:
+        spin = nhjax.SO3().matrix(q[1]) @ v[2:]
+        return jnp.stack([v[0] - spin[1], v[1] + spin[0]])
+
+    system = nhjax.LagrangianSystem(
+        lagrangian, nonholonomic=constraint, manifold=manifold
+    )
+    speed = math.sqrt((1 - ECCENTRICITY) / (1 + ECCENTRICITY) / 1.4)
+    q0 = (jnp.array([1 + ECCENTRICITY, 0.0]), jnp.array([1.0, 0.0, 0.0, 0.0]))
+    v0 = jnp.array([0.0, speed, -speed, 0.0, 0.0])
+    return system, nhjax.initial_state(system, q0, v0)
+
+
+def energies() -> dict[str, tuple[np.ndarray, np.ndarray, int]]:
+    """Return times, relative energy errors and numbers of steps of long runs."""
+    system, y0 = ball_in_central_field()
+
+    def density(t: Any, q: Any, v: Array, args: Any) -> Array:
+        return (q[0] @ q[0]) ** -0.75
+
+    controllers = {
+        "PID, rtol = 1e-5": nhjax.PIDController(1e-5, 1e-5),
+        "reversible, ε = 0.15": nhjax.ReversibleController(0.15, density),
+    }
+    found, count = {}, 0
+
+    def run(stride: int, **options: Any) -> nhjax.Solution:
+        return nhjax.integrate(
+            system,
+            nhjax.LobattoIIIAB(3),
+            y0,
+            saveat=nhjax.SaveAt(
+                steps=stride, fn=lambda t, y, args: system.energy(t, y)
+            ),
+            throw=False,
+            stage_solver=nhjax.SimplifiedNewton(fallback=False),
+            **options,
+        )
+
+    start = float(system.energy(0.0, y0))
+    for name, controller in controllers.items():
+        options = {"stepsize_controller": controller, "max_steps": 10**8}
+        first = run(1, t1=LONG / 100, **options)
+        count = int(first.stats["num_steps"]) * 100
+        sol = run(max(1, count // ROWS), t1=LONG, **options)
+        errors = np.abs(np.asarray(sol.ys) / start - 1)
+        found[name] = np.asarray(sol.ts), errors, int(sol.stats["num_steps"])
+    sol = run(max(1, count // ROWS), dt=LONG / count, num_steps=count)
+    errors = np.abs(np.asarray(sol.ys) / start - 1)
+    found["constant"] = np.asarray(sol.ts), errors, int(sol.stats["num_steps"])
+    return found
+
+
+def measure_long() -> tuple[str, dict[str, Any]]:
+    """Measure and draw the energy over a long time."""
+    figure, ax = plt.subplots(figsize=(6.4, 3.2), layout="constrained")
+    table = []
+    for name, (ts, errors, count) in energies().items():
+        ax.semilogy(ts, np.maximum(errors, 1e-16), ".", markersize=2, label=name)
+        fifths = np.array_split(errors, 5)
+        table.append([name, str(count), *(number(np.max(x)) for x in fifths)])
+    ax.set(xlabel="t", ylabel="|E / E₀ - 1|", ylim=(1e-9, 10))
+    ax.legend(loc="upper left", markerscale=4, fontsize="small")
+    figure.savefig(DOCS / "step_sizes.png", dpi=150)
+    header = ["steps", "number", *(f"fifth {k}" for k in range(1, 6))]
+    text = (
+        "## The energy over a long time\n\n"
+        "A homogeneous ball rolls around an attracting point, on an ellipse of "
+        f"eccentricity {ECCENTRICITY}, over t = {LONG:g}, s = 3: the largest relative "
+        f"energy error in each fifth of the run, at about {ROWS} steps of it. Constant "
+        "steps are as many as those of the reversible controller.\n\n"
+    )
+    return text + markdown_table(header, table), {"long": table}
+
+
+# --- The number of stages -------------------------------------------------------------
+
+STAGE_CASES = ("particle", "chaotic", "CVT", "orbit with close passes")
+STAGE_ERRORS = tuple(10.0**-k for k in range(2, 13))
+SHOWN = (1e-4, 1e-6, 1e-8, 1e-10)
+
+
+def measure_stages() -> tuple[str, dict[str, Any]]:
+    """Measure the fastest number of stages for each error, with the PID controller."""
+    table, factors = [], []
+    for name in STAGE_CASES:
+        case = CASES[name]()
+        exact, of = reference(case), {}
+        for stages in range(2, 9):
+            of[stages] = [stage_row(name, case, exact, stages, k) for k in range(2, 13)]
+            shown = [x for x in of[stages] if x.setting in SHOWN]
+            ratios = [f"{x.error / x.setting:.2g}" for x in shown]
+            factors.append([name, str(stages), *ratios])
+        line = [name]
+        for error in STAGE_ERRORS:
+            times = {s: at_error(rows, error, "seconds") for s, rows in of.items()}
+            known = {s: x for s, x in times.items() if np.isfinite(x)}
+            line.append(str(min(known, key=lambda s: known[s])) if known else "-")
+        table.append(line)
+    text = "## The number of stages\n\nThe fastest number for an error at the end:\n\n"
+    text += markdown_table(["motion", *(number(x) for x in STAGE_ERRORS)], table)
+    text += "\n\nThe error at the end over the tolerance:\n\n"
+    text += markdown_table(["motion", "s", *(f"{x:g}" for x in SHOWN)], factors)
+    return text, {"stages": table, "factors": factors}
+
+
+def stage_row(
+    name: str, case: Case, exact: np.ndarray, stages: int, digits: int
+) -> Row:
+    """Run a case with a number of stages and the tolerance 10^-digits."""
+    rtol = 10.0**-digits
+
+    def call() -> nhjax.Solution:
+        return nhjax.integrate(
+            case.system,
+            nhjax.LobattoIIIAB(stages),
+            case.start,
+            t1=case.t1,
+            stepsize_controller=nhjax.PIDController(rtol, rtol),
+            max_steps=10**5,
+            throw=False,
+            stage_solver=nhjax.SimplifiedNewton(fallback=False),
+        )
+
+    sol, seconds = timed(call)
+    error = np.max(np.abs(end_of(sol) - exact)) / np.max(np.abs(exact))
+    steps, rejected = sol.stats["num_steps"], sol.stats["num_rejected_steps"]
+    given = float(error), int(steps), int(rejected), seconds
+    return Row(name, str(stages), rtol, *given)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--only", nargs="*", help="words of the names of cases")
-    add_keep(parser)
+    parser.add_argument("--parts", nargs="*", default=PARTS)
     options = parser.parse_args()
     jax.config.update("jax_enable_x64", True)
+    saved = json.loads(SAVED.read_text()) if SAVED.exists() else {}
+    data: dict[str, Any] = {"texts": {}} | saved
+    measured = {
+        "cases": lambda: measure_cases(options.only),
+        "long": measure_long,
+        "stages": measure_stages,
+    }
+    for part in options.parts:
+        data["texts"][part], more = measured[part]()
+        data |= more
+    texts = [data["texts"][part] for part in PARTS if part in data["texts"]]
+    write("adaptive_steps", "Steps that adapt", "\n\n".join(texts), data)
+
+
+def measure_cases(only: list[str] | None) -> tuple[str, dict[str, Any]]:
+    """Measure the cases whose names contain one of the words, or all of them."""
     rows: list[Row] = []
     for name, make in CASES.items():
-        if options.only and not any(word in name for word in options.only):
+        if only and not any(word in name for word in only):
             continue
         rows += measure(name, make())
     text = markdown_table(HEADER, comparison(rows))
@@ -358,13 +532,9 @@ def main() -> None:
         for x in rows
     ]
     header = ["motion", "method", "setting", "error", "attempts", "rejected", "ms"]
-    text += "\n\n## All runs\n\n" + markdown_table(header, details)
-    write(
-        "adaptive_steps",
-        "Steps that adapt",
-        text,
-        {"rows": [x._asdict() for x in rows]},
-    )
+    text = "## Error against steps and time\n\n" + text
+    text += "\n\nAll runs:\n\n" + markdown_table(header, details)
+    return text, {"rows": [x._asdict() for x in rows]}
 
 
 if __name__ == "__main__":
