@@ -141,7 +141,7 @@ def variable_grid(
     numpy = jnp if is_traced(*values) else np
     first, step = numpy.asarray(t0), numpy.asarray(1 if size is None else size)
     forward = step if end is None else numpy.asarray(end) - first
-    direction = jax.lax.stop_gradient(numpy.where(forward < 0, -1, 1).astype(dtype))
+    direction = numpy.where(forward < 0, -1, 1).astype(dtype)
     if end is not None:
         checks += [finite("t1", end), Check(forward != 0, _no_time, (t0, end))]
     if size is not None:
@@ -163,7 +163,8 @@ def _is_known_number(x: Any) -> bool:
     """Return whether a leaf of a controller is a real number that is not traced."""
     if isinstance(x, float | int):
         return not isinstance(x, bool)
-    return eqx.is_inexact_array_like(x) and not is_traced(x)
+    is_array = isinstance(x, np.ndarray | np.generic | jax.Array)
+    return is_array and not is_traced(x) and jnp.issubdtype(x.dtype, jnp.inexact)
 
 
 def _numbers(

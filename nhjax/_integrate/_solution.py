@@ -56,6 +56,8 @@ class Solution(eqx.Module):
         `num_iterations` (the total number of iterations of the stage solver),
         `num_newton_steps` (the number of steps for which the stage solver's own
         iteration failed, and which Newton's method solved),
+        `num_rejected_steps` (only in a run whose steps differ: the number of attempts
+        at a step that were repeated with another size),
         `num_redundant` (the number of redundant constraints at the start; if there are
         any, the reactions are not unique),
         `max_residual` (the largest residual of the stage equations, relative to the
@@ -83,6 +85,10 @@ class Solution(eqx.Module):
         otherwise. Then `stats` also has `num_events`, and `num_steps` is the number of
         nodes that were reached. After an event that ends the run, all entries of `ts`
         and `ys`, and `t1`, are the time and state of the event.
+
+    If the steps differ, the output of a plain call has exactly the steps that were
+    taken. Under `jit` it has room for `max_steps` steps, and entries that are not used
+    are infinite.
 
     Under `vmap` every array has a leading axis for the members of the batch.
     """
