@@ -89,7 +89,7 @@ class SaveAt(eqx.Module):
                 if name in ("t0", "t1"):
                     advice = (
                         " To save at given times, pass `ts`. A run starts at the `t0` "
-                        "of `integrate`, and ends at its `t1` or after `num_steps` steps."
+                        "of `integrate`, and ends at its `t1` or after `num_steps`."
                     )
                 raise ValueError(
                     f"SaveAt: `{name}` must be True or False, got {flag!r}.{advice}"

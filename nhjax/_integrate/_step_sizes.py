@@ -79,16 +79,24 @@ class Decision(NamedTuple):
     - `result`: `RESULTS.successful`, or the reason why the run fails.
     - `size`: the size of the next step, or of the next attempt at this one.
     - `memory`: the data of the controller after an accepted step.
+    - `error`: the estimated error of the step in units of the tolerance; None for a
+        controller without a tolerance.
     """
 
     is_accepted: BoolScalar
     result: RESULTS
     size: FloatScalar
     memory: Memory
+    error: FloatScalar | None = None
 
 
 class AbstractStepSizeController(eqx.Module):
     """The way in which a run chooses its steps, the option `stepsize_controller`."""
+
+    @property
+    def estimates_errors(self) -> bool:
+        """Return whether its decisions have an estimated `error`."""
+        return False
 
     @abstractmethod
     def init(
@@ -313,6 +321,11 @@ class PIDController(AbstractStepSizeController):
                 f"PIDController: `dtmin` = {least} is larger than `dtmax` = {most}."
             )
 
+    @property
+    def estimates_errors(self) -> bool:
+        """Return True: its decisions rest on the error of a step."""
+        return True
+
     def check(
         self,
         system: AbstractMechanicalSystem,
@@ -406,6 +419,7 @@ class PIDController(AbstractStepSizeController):
         least, most, safety = (
             jnp.asarray(x, dtype) for x in (self.factormin, self.factormax, self.safety)
         )
+        estimate = jnp.where(is_known, error, jnp.inf)
         # Smaller errors do not change the size further, and have logarithms.
         error = jnp.maximum(error, (safety / most) ** number)
         factor = (
@@ -436,7 +450,7 @@ class PIDController(AbstractStepSizeController):
             outcome.result,
         )
         size = jax.lax.stop_gradient(following) * context.direction
-        return Decision(accepted, result, size, (error, memory[0]))
+        return Decision(accepted, result, size, (error, memory[0]), estimate)
 
     def resume(
         self, context: StepContext, size: FloatScalar, memory: Memory

@@ -16,12 +16,13 @@ from jaxtyping import Array, Bool, Int
 from .._custom_types import BoolScalar, FloatScalar, IntScalar
 from .._numerics import nan_gradient_unless, tree_where, two_sum
 from .._results import RESULTS
-from .._step import RoundOff, StepOutcome, StepState
+from .._step import RoundOff, StepState
 from .._system import FunctionNoise, State
 from ._checkpoint import Checkpoint
 from ._step_sizes import (
     AbstractStepSizeController,
     Attempt,
+    Decision,
     Memory,
     StepContext,
 )
@@ -216,7 +217,7 @@ class VariableStepper(AbstractStepper[VariableCarry, StepLogEntry]):
         """Return the carry before the first attempt."""
         carry = self.plain.init(y0, noise)
         clock, sized = self.sizes.first_clock(self.plain, y0, carry.step_state)
-        result, stats = started(carry, sized)
+        result, stats = started(carry, sized, self.sizes.controller)
         return VariableCarry(carry.step_state, result, stats, clock)
 
     def is_over(self, carry: VariableCarry) -> BoolScalar:
@@ -256,9 +257,11 @@ class VariableStepper(AbstractStepper[VariableCarry, StepLogEntry]):
         step_state = tree_where(accepted, outcome.step_state, carry.step_state)
         result = RESULTS.where(alive, decision.result, carry.result)
         failed = alive & (result != RESULTS.successful)
-        stats = statistics_of_attempt(
-            carry.stats, outcome, alive, accepted, failed, node
-        )
+        stats = updated_statistics(carry.stats, outcome, alive, accepted, node)
+        for name in ("failed_step", "worst_coordinate"):
+            stats[name] = jnp.where(failed, stats[name], carry.stats[name])
+        rejected = alive & ~accepted & ~failed
+        stats |= statistics_of_attempt(carry.stats, decision, rejected, accepted)
         size = jnp.where(alive, decision.size, clock.size)
         end = two_sum(step.t, step.h + clock.compensation)
         clock = sizes.after(
@@ -338,29 +341,32 @@ class VariableStepper(AbstractStepper[VariableCarry, StepLogEntry]):
         )
 
 
-def started(carry: AbstractCarry, sized: RESULTS) -> tuple[RESULTS, Statistics]:
+def started(
+    carry: AbstractCarry, sized: RESULTS, controller: AbstractStepSizeController
+) -> tuple[RESULTS, Statistics]:
     """Return the result and the statistics of a start whose first step is `sized`."""
     bad = (carry.result == RESULTS.successful) & (sized != RESULTS.successful)
     result = RESULTS.where(bad, sized, carry.result)
     none = jnp.zeros_like(carry.stats["num_steps"])
     failed = jnp.where(bad, none, carry.stats["failed_step"])
-    return result, carry.stats | {"failed_step": failed, "num_rejected_steps": none}
+    more = {"failed_step": failed, "num_rejected_steps": none}
+    if controller.estimates_errors:
+        zero = jnp.zeros_like(carry.stats["max_residual"])
+        more["max_error_over_tolerance"] = zero
+    return result, carry.stats | more
 
 
 def statistics_of_attempt(
-    stats: Statistics,
-    outcome: StepOutcome,
-    alive: BoolScalar,
-    accepted: BoolScalar,
-    failed: BoolScalar,
-    node: Int[Array, ""],
+    stats: Statistics, decision: Decision, rejected: BoolScalar, accepted: BoolScalar
 ) -> Statistics:
-    """Return the statistics after an attempt, of which only a failure ends the run."""
-    new = updated_statistics(stats, outcome, alive, accepted, node)
-    for name in ("failed_step", "worst_coordinate"):
-        new[name] = jnp.where(failed, new[name], stats[name])
-    rejected = (alive & ~accepted & ~failed).astype(jnp.int32)
-    return new | {"num_rejected_steps": stats["num_rejected_steps"] + rejected}
+    """Return those statistics after an attempt that only controllers cause."""
+    number = stats["num_rejected_steps"] + rejected.astype(jnp.int32)
+    more: Statistics = {"num_rejected_steps": number}
+    name = "max_error_over_tolerance"
+    if decision.error is not None:
+        error = jnp.where(accepted, decision.error, 0)
+        more[name] = jnp.maximum(stats[name], error)
+    return more
 
 
 class VariableReverseReplay(AbstractReverseReplay[VariableCarry, StepLogEntry]):

@@ -34,7 +34,13 @@ from .._stepper import (
     StepResult,
     updated_statistics,
 )
-from .._variable import Clock, NextStep, started, StepSizes
+from .._variable import (
+    Clock,
+    NextStep,
+    started,
+    statistics_of_attempt,
+    StepSizes,
+)
 from ._event import Conditions, ConditionSigns, Event, EventActions, signs_at
 from ._log import LogEntry, reported_log
 from ._root import ImplicitTruncatedStep, TruncatedStep
@@ -256,7 +262,7 @@ class EventStepper(AbstractStepper[EventCarry, ReplayedIteration]):
         if self.sizes is not None:
             clock, sized = self.sizes.first_clock(self.plain, y0, carry.step_state)
             carry = replace(carry, result=result, stats=stats)
-            result, stats = started(carry, sized)
+            result, stats = started(carry, sized, self.sizes.controller)
         place = EventLoopState(
             node=zero,
             offset=jnp.zeros_like(t),
@@ -582,8 +588,8 @@ def _statistics_after(
     stats["failed_step"] = jnp.where(failed, node, stats["failed_step"])
     if attempt.decision is not None:
         rejected = attempt.is_rejected & ~(ends & failed)
-        number = carry.stats["num_rejected_steps"] + rejected.astype(jnp.int32)
-        stats["num_rejected_steps"] = number
+        given = carry.stats, attempt.decision, rejected
+        stats |= statistics_of_attempt(*given, kept & (attempt.step.fired < 0))
     stats |= {"num_steps": after.node, "num_events": after.num_events}
     return jax.lax.stop_gradient(stats)
 
