@@ -166,6 +166,13 @@ class ConstantStepSize(AbstractStepSizeController):
         """Accept every step that is solved."""
         return _decided(attempt, _size_of_user(context), memory)
 
+    def resume(
+        self, context: StepContext, size: FloatScalar, memory: Memory
+    ) -> tuple[FloatScalar, Memory]:
+        """Return `dt`: a run that goes on may have another one."""
+        del size
+        return _size_of_user(context), memory
+
     def given_size(self, context: StepContext, node: Int[Array, ""]) -> FloatScalar:
         """Return `dt` in the direction of the run."""
         del node
@@ -335,6 +342,12 @@ class PIDController(AbstractStepSizeController):
             size = self._first_size(context, t, start)
         size = jax.lax.stop_gradient(self._limited(size))
         return size * context.direction, ones, RESULTS.successful
+
+    def resume(
+        self, context: StepContext, size: FloatScalar, memory: Memory
+    ) -> tuple[FloatScalar, Memory]:
+        """Return the size within the limits of this run, in its direction."""
+        return self._limited(jnp.abs(size)) * context.direction, memory
 
     def _first_size(
         self, context: StepContext, t: FloatScalar, start: StepState
@@ -572,7 +585,9 @@ class ReversibleController(AbstractStepSizeController):
             RESULTS.density_not_positive,
         )
         size = jnp.where(result == RESULTS.successful, size, context.direction)
-        return size, jnp.stack([density, rate]), result
+        # Two numbers differ from the array of a `PIDController`, so that its
+        # checkpoints are not taken for those of this controller.
+        return size, (density, rate), result
 
     def adapt(self, context: StepContext, attempt: Attempt, memory: Memory) -> Decision:
         """Accept every step that is solved, and move the density on."""
@@ -585,7 +600,7 @@ class ReversibleController(AbstractStepSizeController):
         part = jnp.where(attempt.is_whole, eps, h * density / (1 - 0.5 * h * rate))
         moved = (density + 0.5 * part * rate) + 0.5 * part * following
         size = self._size(context, moved, following)
-        decision = _decided(attempt, size, jnp.stack([moved, following]))
+        decision = _decided(attempt, size, (moved, following))
         is_bad = attempt.is_solved & ~_is_usable(moved, size, context)
         result = RESULTS.where(is_bad, RESULTS.density_not_positive, decision.result)
         return decision._replace(is_accepted=attempt.is_solved & ~is_bad, result=result)
