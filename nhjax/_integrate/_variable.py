@@ -115,7 +115,12 @@ class StepSizes(eqx.Module):
         if self.t1 is None:
             return NextStep(t, h, ~never, never)
         rest = (self.t1 - t) - clock.compensation
-        is_last = jnp.abs(rest) <= jnp.abs(h) * (1 + 1e-9)
+        # The round-off of times may be larger than that of a step.
+        eps, largest = float(jnp.finfo(t.dtype).eps), jnp.maximum(
+            jnp.abs(self.t1), jnp.abs(t)
+        )
+        slack = jnp.maximum(1e-9 * jnp.abs(h), 4 * eps * largest)
+        is_last = jnp.abs(rest) <= jnp.abs(h) + jnp.minimum(slack, 1e-2 * jnp.abs(h))
         h = jnp.where(is_last, rest, h)
         return NextStep(t, h, ~is_last, is_last)
 
