@@ -149,7 +149,7 @@ def variable_grid(
         agree = numpy.asarray(size) * numpy.asarray(direction) > 0
         checks.append(Check(agree, _wrong_sign, (size, t0, t0 if end is None else end)))
     if most is None:
-        most = _default_limit(controller, t0, size, end)
+        most = _default_limit(controller, t0, size, end, number)
     grid = VariableGrid(t0, size, end, direction, number, most)
     return controller, grid, checks
 
@@ -192,8 +192,12 @@ def _default_limit(
     t0: FloatScalar,
     size: FloatScalar | None,
     end: FloatScalar | None,
+    number: int | None,
 ) -> int:
     """Return the limit of attempts if the user gives none."""
+    if number is not None:
+        # More than half of the attempts are accepted.
+        return min(max(_MOST_STEPS, 2 * number), 2**31 - 1) if controller.rejects_steps else number
     if not isinstance(controller, ConstantStepSize) or size is None or end is None:
         return _MOST_STEPS
     if not is_traced(t0, size, end):

@@ -90,6 +90,11 @@ class Decision(NamedTuple):
 class AbstractStepSizeController(eqx.Module):
     """The way in which a run chooses its steps, the option `stepsize_controller`."""
 
+    @property
+    def rejects_steps(self) -> bool:
+        """Return whether steps that are solved may be rejected, and repeated."""
+        return False
+
     @abstractmethod
     def init(
         self, context: StepContext, t: FloatScalar, start: StepState
@@ -270,6 +275,11 @@ class PIDController(AbstractStepSizeController):
     factormin: FloatScalarLike = 0.2
     factormax: FloatScalarLike = 10.0
     safety: FloatScalarLike = 0.9
+
+    @property
+    def rejects_steps(self) -> bool:
+        """Return True: steps with large errors are rejected."""
+        return True
 
     def __check_init__(self):
         ranges = {
