@@ -197,7 +197,8 @@ def _default_limit(
     """Return the limit of attempts if the user gives none."""
     if number is not None:
         # More than half of the attempts are accepted.
-        return min(max(_MOST_STEPS, 2 * number), 2**31 - 1) if controller.rejects_steps else number
+        most = max(_MOST_STEPS, 2 * number) if controller.rejects_steps else number
+        return min(most, 2**31 - 1)
     if not isinstance(controller, ConstantStepSize) or size is None or end is None:
         return _MOST_STEPS
     if not is_traced(t0, size, end):

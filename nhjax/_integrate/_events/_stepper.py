@@ -306,8 +306,13 @@ class EventStepper(AbstractStepper[EventCarry, ReplayedIteration]):
         else:
             after = replace(after, clock=self._clock_after(before, after, attempt))
             number = self.num_iterations
-            is_spent = attempt.is_alive & (jnp.asarray(i, jnp.int32) + 1 >= number)
-            is_spent = is_spent & (result == RESULTS.successful)
+            is_spent = jnp.asarray(i, jnp.int32) + 1 >= number
+            # Attempts that an event has truncated do not count.
+            rejected = carry.stats["num_rejected_steps"] + _is_rejected(
+                attempt
+            ).astype(jnp.int32)
+            is_spent = is_spent | (after.node + rejected >= self.sizes.max_steps)
+            is_spent = is_spent & attempt.is_alive & (result == RESULTS.successful)
             is_spent = is_spent & ~cast(Clock, after.clock).is_done
             result = RESULTS.where(is_spent, RESULTS.max_steps_reached, result)
             ends = ends | is_spent
@@ -441,8 +446,9 @@ class EventStepper(AbstractStepper[EventCarry, ReplayedIteration]):
         assert attempt.decision is not None and attempt.next_step is not None
         clock, decision = before.clock, attempt.decision
         reaches = after.node > before.node
-        is_rejected = attempt.is_taken & ~attempt.is_kept & ~attempt.is_discarded
-        size = jnp.where(is_rejected, before.offset + decision.size, clock.size)
+        size = jnp.where(
+            _is_rejected(attempt), before.offset + decision.size, clock.size
+        )
         size = jnp.where(reaches & attempt.is_kept, decision.size, size)
         end = two_sum(clock.t, attempt.whole + clock.compensation)
         memory = tree_where(attempt.is_kept, decision.memory, clock.memory)
@@ -526,6 +532,11 @@ class EventStepper(AbstractStepper[EventCarry, ReplayedIteration]):
         return EventReverseReplay(self, start, end, log)
 
 
+def _is_rejected(attempt: AttemptedStep) -> BoolScalar:
+    """Return whether a step was taken that the controller does not accept."""
+    return attempt.is_taken & ~attempt.is_kept & ~attempt.is_discarded
+
+
 def _place_after(
     before: EventLoopState,
     attempt: AttemptedStep,
@@ -571,7 +582,7 @@ def _statistics_after(
         stats[name] = jnp.where(ends, stats[name], carry.stats[name])
     stats["failed_step"] = jnp.where(failed, node, stats["failed_step"])
     if attempt.decision is not None:
-        rejected = taken & ~kept & ~attempt.is_discarded & ~ends
+        rejected = _is_rejected(attempt) & ~ends
         number = carry.stats["num_rejected_steps"] + rejected.astype(jnp.int32)
         stats["num_rejected_steps"] = number
     stats |= {"num_steps": after.node, "num_events": after.num_events}
