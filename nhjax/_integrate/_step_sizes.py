@@ -370,7 +370,14 @@ class PIDController(AbstractStepSizeController):
         manifold = system.manifold_of(start.state.q)
         position = position_sizes(manifold, start.state.q, v)
         state = max_norm(position / in_position, u / in_fibre)
-        rate = max_norm(v / in_position, start.lin.acceleration / in_fibre)
+        rates = v / in_position, start.lin.acceleration / in_fibre
+        # Numbers that are zero have no scale without an absolute tolerance.
+        least = 2 * _smallest_scale(u)
+        known = (
+            jnp.where(scale > least, rate, 0)
+            for scale, rate in zip((in_position, in_fibre), rates, strict=True)
+        )
+        rate = max_norm(*known)
         size = 0.01 * state / rate
         is_known = (state > 1e-5) & (rate > 1e-5) & jnp.isfinite(size)
         small = jnp.where(jnp.isfinite(context.length), context.length, 1) * 1e-6
@@ -392,7 +399,7 @@ class PIDController(AbstractStepSizeController):
         system, dtype = context.system, before.state.p.dtype
         rtol, atol = (jnp.asarray(x, dtype) for x in (self.rtol, self.atol))
         # A relative tolerance alone would allow no error where the state is zero.
-        atol = atol + float(jnp.finfo(dtype).tiny) ** 0.25
+        atol = atol + _smallest_scale(atol)
         manifold = system.manifold_of(before.state.q)
 
         def sizes(x: StepState) -> tuple[Array, Array]:
@@ -622,6 +629,11 @@ class ReversibleController(AbstractStepSizeController):
         del size
         density, rate = memory
         return self._size(context, density, rate), memory
+
+
+def _smallest_scale(like: Array) -> float:
+    """Return what is added to an absolute tolerance of zero, for a dtype."""
+    return float(jnp.finfo(like.dtype).tiny) ** 0.25
 
 
 def _is_usable(
