@@ -308,9 +308,9 @@ class EventStepper(AbstractStepper[EventCarry, ReplayedIteration]):
             number = self.num_iterations
             is_spent = jnp.asarray(i, jnp.int32) + 1 >= number
             # Attempts that an event has truncated do not count.
-            rejected = carry.stats["num_rejected_steps"] + _is_rejected(
-                attempt
-            ).astype(jnp.int32)
+            rejected = carry.stats["num_rejected_steps"] + _is_rejected(attempt).astype(
+                jnp.int32
+            )
             is_spent = is_spent | (after.node + rejected >= self.sizes.max_steps)
             is_spent = is_spent & attempt.is_alive & (result == RESULTS.successful)
             is_spent = is_spent & ~cast(Clock, after.clock).is_done
