@@ -19,6 +19,7 @@ from nhjax import (
     ReversibleController,
     SaveAt,
 )
+from nhjax._integrate import _chunks
 from support.particle_run import assert_trees_close, assert_trees_equal
 
 
@@ -278,7 +279,8 @@ def test_run_of_many_num_steps_with_a_controller_ends_after_them(name):
 def test_saved_steps_of_a_plain_run_are_those_taken(whole):
     number = int(whole.stats["num_steps"])
     assert whole.ts.shape == (number + 1,) == whole.ys.q.shape[:1]
-    assert np.all(np.isfinite(whole.ts)) and np.all(np.diff(whole.ts) > 0)
+    assert np.all(np.isfinite(whole.ts))
+    assert np.all(np.diff(whole.ts) > 0)
     assert whole.interpolation.num_steps == number
 
 
@@ -292,7 +294,8 @@ def test_saved_steps_under_jit_equal_those_of_a_plain_run_before_the_padding(nam
     saveat = SaveAt(t0=True, steps=True)
     got, expected = jitted(name, saveat=saveat), adaptive(name, saveat=saveat)
     number = int(got.stats["num_steps"]) + 1
-    assert got.ts.shape == (61,) and expected.ts.shape == (number,)
+    assert got.ts.shape == (61,)
+    assert expected.ts.shape == (number,)
     prefix, rest = (
         jax.tree.map(lambda x, part=part: x[part], (got.ts, got.ys))
         for part in (slice(number), slice(number, None))
@@ -508,11 +511,36 @@ def test_checkpoint_with_a_damaged_clock_starts_with_a_new_one(damage):
 # Progress and interruption -----------------------------------------------------------
 
 
+@pytest.fixture
+def short_chunks(monkeypatch):
+    """Chunks of at most three iterations and four rows."""
+    monkeypatch.setattr(_chunks, "_FIRST_ITERATIONS", 3)
+    monkeypatch.setattr(_chunks._Schedule, "finished", lambda *_: None)
+    monkeypatch.setattr(_chunks, "_LEAST_ROWS", 4)
+    monkeypatch.setattr(_chunks, "_MOST_ROWS", 4)
+
+
+@pytest.fixture
+def usual_handler():
+    """The handler that an interactive Python has."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
+SEEN: dict[int, list[tuple[int, int]]] = {}
+
+
 class Reports(AbstractProgressMeter):
     """A meter that keeps its reports, and presses Ctrl-C after some of them."""
 
-    seen: list = []
+    number: int
     at: int = 10**9
+
+    @property
+    def seen(self) -> list[tuple[int, int]]:
+        """Return the reports."""
+        return SEEN[self.number]
 
     def update(self, done: int, total: int) -> None:
         """Keep the report."""
@@ -520,8 +548,11 @@ class Reports(AbstractProgressMeter):
         if len(self.seen) == self.at:
             signal.raise_signal(signal.SIGINT)
 
-    def __hash__(self):
-        return id(self.seen)
+
+def new_meter(at=10**9):
+    number = len(SEEN)
+    SEEN[number] = []
+    return Reports(number, at)
 
 
 OPTIONS_OF_METERS = {
@@ -537,8 +568,9 @@ OPTIONS_OF_METERS = {
 
 @pytest.mark.parametrize("name", OPTIONS_OF_METERS)
 @pytest.mark.parametrize("is_jitted", [False, True])
-def test_progress_of_a_run_to_t1_grows_to_the_end(name, is_jitted, short_chunks):
-    meter = Reports([])
+@pytest.mark.usefixtures("short_chunks")
+def test_progress_of_a_run_to_t1_grows_to_the_end(name, is_jitted):
+    meter = new_meter()
 
     def end(y):
         options = {"t1": T1, "max_steps": 200, "progress_meter": meter}
@@ -548,21 +580,24 @@ def test_progress_of_a_run_to_t1_grows_to_the_end(name, is_jitted, short_chunks)
     jax.effects_barrier()
     done = [x for x, total in meter.seen if total == 100]
     assert len(done) == len(meter.seen) > 3
-    assert done == sorted(set(done)) and done[-1] == 100
+    assert done == sorted(set(done))
+    assert done[-1] == 100
 
 
-def test_progress_of_num_steps_steps_grows_with_the_steps(short_chunks):
-    meter = Reports([])
+@pytest.mark.usefixtures("short_chunks")
+def test_progress_of_num_steps_steps_grows_with_the_steps():
+    meter = new_meter()
     adaptive(t1=None, num_steps=30, progress_meter=meter)
     done = [x for x, _ in meter.seen]
-    assert done == sorted(set(done)) and done[-1] == 100
+    assert done == sorted(set(done))
+    assert done[-1] == 100
 
 
 @pytest.mark.xfail(
     strict=True, reason="each member reports each of its steps, in any order"
 )
 def test_progress_of_a_batch_is_that_of_its_slowest_member():
-    meter = Reports([])
+    meter = new_meter()
 
     def end(speed):
         y = start_with(speed * START.v)
@@ -571,11 +606,13 @@ def test_progress_of_a_batch_is_that_of_its_slowest_member():
     jax.block_until_ready(jax.jit(jax.vmap(end))(SPEEDS))
     jax.effects_barrier()
     done = [x for x, _ in meter.seen]
-    assert done == sorted(set(done)) and done[-1] == 100
+    assert done == sorted(set(done))
+    assert done[-1] == 100
 
 
 @pytest.mark.parametrize("is_jitted", [False, True])
-def test_text_meter_of_a_run_to_t1_prints_percents(is_jitted, capsys, short_chunks):
+@pytest.mark.usefixtures("short_chunks")
+def test_text_meter_of_a_run_to_t1_prints_percents(is_jitted, capsys):
     def end(y):
         meter = nhjax.TextProgressMeter()
         return adaptive(y0=y, max_steps=61, progress_meter=meter).t1
@@ -589,7 +626,8 @@ def test_text_meter_of_a_run_to_t1_prints_percents(is_jitted, capsys, short_chun
 
 
 @pytest.mark.parametrize("is_jitted", [False, True])
-def test_tqdm_meter_of_a_run_to_t1_closes_its_bar(is_jitted, capsys, short_chunks):
+@pytest.mark.usefixtures("short_chunks")
+def test_tqdm_meter_of_a_run_to_t1_closes_its_bar(is_jitted, capsys):
     meter = nhjax.TqdmProgressMeter("slide")
 
     def end(y):
@@ -601,32 +639,13 @@ def test_tqdm_meter_of_a_run_to_t1_closes_its_bar(is_jitted, capsys, short_chunk
     assert not meter._open.bars
 
 
-@pytest.fixture
-def short_chunks(monkeypatch):
-    """Chunks of at most three iterations and four rows."""
-    from nhjax._integrate import _chunks
-
-    monkeypatch.setattr(_chunks, "_FIRST_ITERATIONS", 3)
-    monkeypatch.setattr(_chunks._Schedule, "finished", lambda *_: None)
-    monkeypatch.setattr(_chunks, "_LEAST_ROWS", 4)
-    monkeypatch.setattr(_chunks, "_MOST_ROWS", 4)
-
-
-@pytest.fixture
-def usual_handler():
-    """The handler that an interactive Python has."""
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)
-    yield
-    signal.signal(signal.SIGINT, before)
-
-
 @pytest.mark.parametrize("name", CONTROLLERS)
 @pytest.mark.usefixtures("usual_handler", "short_chunks")
 def test_interrupted_run_returns_the_steps_before_and_resumes(name):
     saveat = SaveAt(t0=True, steps=True, checkpoint=True)
     expected = adaptive(name, saveat=saveat)
     with pytest.warns(UserWarning, match="interrupted after"):
-        got = adaptive(name, saveat=saveat, progress_meter=Reports([], 3))
+        got = adaptive(name, saveat=saveat, progress_meter=new_meter(3))
     number = int(got.stats["num_steps"])
     assert got.result == RESULTS.interrupted
     assert 0 < number < int(expected.stats["num_steps"])
@@ -641,7 +660,7 @@ def test_interrupted_run_returns_the_steps_before_and_resumes(name):
 def test_interrupted_run_with_samples_returns_those_before():
     saveat = SaveAt(ts=[0.0, 0.05, 1.99])
     with pytest.warns(UserWarning, match="interrupted after"):
-        got = adaptive(saveat=saveat, progress_meter=Reports([], 3))
+        got = adaptive(saveat=saveat, progress_meter=new_meter(3))
     assert got.ts.tolist() == [0.0, 0.05]
 
 
