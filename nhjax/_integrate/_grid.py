@@ -17,7 +17,6 @@ from ._step_sizes import (
     AbstractStepSizeController,
     ConstantStepSize,
     GivenStepSizes,
-    PIDController,
 )
 
 
@@ -209,9 +208,10 @@ def _default_limit(
 ) -> int:
     """Return the limit of attempts if the user gives none."""
     if num_steps is not None:
-        # Steps of a PID controller may be repeated.
-        is_pid = isinstance(controller, PIDController)
-        return max(_MOST_STEPS, 4 * num_steps) if is_pid else num_steps
+        if not controller.estimates_errors:
+            return num_steps
+        # Steps may be repeated.
+        return min(max(_MOST_STEPS, 4 * num_steps), 2**31 - 1)
     if not isinstance(controller, ConstantStepSize) or size is None or end is None:
         return _MOST_STEPS
     if not is_traced(t0, size, end):

@@ -17,6 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Int
 
+from .._custom_types import FloatScalar
 from .._numerics import with_zero_tangents
 from .._step import RoundOff
 from ._progress_meter import AbstractProgressMeter
@@ -53,13 +54,15 @@ class Loop(eqx.Module):
         carry, result = self.stepper.advance(carry, k, replay)
         if not self.meter.silent:
             if self.stepper.may_end_early:
-                old, new = (self.stepper.progress(x) for x in (before, carry))
-                # A run that an event ends is complete as well.
-                over = self.stepper.is_over(carry)
-                self.meter.report_part(old, jnp.where(over, 1, new))
+                self.meter.report_part(self._part(before), self._part(carry))
             else:
                 self._report(k)
         return carry, self._rows(carry, result, k)
+
+    def _part(self, carry: AbstractCarry) -> FloatScalar:
+        """Return the part of the run that is done: all of it if it has ended."""
+        part = self.stepper.progress(carry)
+        return jnp.where(self.stepper.is_over(carry), jnp.ones_like(part), part)
 
     def _report(self, k: Int[Array, ""]) -> None:
         """Report the steps that are certain to be complete after iteration k.

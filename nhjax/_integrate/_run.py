@@ -488,6 +488,9 @@ def run_in_chunks(
     pieces = [_one(on_host(start.saved))] if saveat.t0 else []
     if output.saved is not None:
         pieces.append(output.saved)
+    elif saveat.steps:
+        # The run has fewer steps than `steps`, and saves none of them.
+        pieces.append(jax.tree.map(lambda x: np.asarray(x)[:0], last.saved))
     if saveat.ts is not None:
         if steps is None:
             saveat, steps = _steps_taken(saveat, grid.t0, last.end.t, output.records)

@@ -356,6 +356,12 @@ class PIDController(AbstractStepSizeController):
         size = jax.lax.stop_gradient(self._limited(size))
         return size * context.direction, ones, RESULTS.successful
 
+    def resume(
+        self, context: StepContext, size: FloatScalar, memory: Memory
+    ) -> tuple[FloatScalar, Memory]:
+        """Return the size within the limits of this run, in its direction."""
+        return self._limited(jnp.abs(size)) * context.direction, memory
+
     def _first_size(
         self, context: StepContext, t: FloatScalar, start: StepState
     ) -> FloatScalar:
@@ -367,7 +373,14 @@ class PIDController(AbstractStepSizeController):
         manifold = system.manifold_of(start.state.q)
         position = position_sizes(manifold, start.state.q, v)
         state = max_norm(position / in_position, u / in_fibre)
-        rate = max_norm(v / in_position, start.lin.acceleration / in_fibre)
+        rates = v / in_position, start.lin.acceleration / in_fibre
+        # Numbers that are zero have no scale without an absolute tolerance.
+        least = 2 * _smallest_scale(u)
+        known = (
+            jnp.where(scale > least, rate, 0)
+            for scale, rate in zip((in_position, in_fibre), rates, strict=True)
+        )
+        rate = max_norm(*known)
         size = 0.01 * state / rate
         is_known = (state > 1e-5) & (rate > 1e-5) & jnp.isfinite(size)
         small = jnp.where(jnp.isfinite(context.length), context.length, 1) * 1e-6
@@ -389,7 +402,7 @@ class PIDController(AbstractStepSizeController):
         system, dtype = context.system, before.state.p.dtype
         rtol, atol = (jnp.asarray(x, dtype) for x in (self.rtol, self.atol))
         # A relative tolerance alone would allow no error where the state is zero.
-        atol = atol + float(jnp.finfo(dtype).tiny) ** 0.25
+        atol = atol + _smallest_scale(atol)
         manifold = system.manifold_of(before.state.q)
 
         def sizes(x: StepState) -> tuple[Array, Array]:
@@ -600,7 +613,9 @@ class ReversibleController(AbstractStepSizeController):
             RESULTS.density_not_positive,
         )
         size = jnp.where(result == RESULTS.successful, size, context.direction)
-        return size, jnp.stack([density, rate]), result
+        # Two numbers differ from the array of a `PIDController`, so that its
+        # checkpoints are not taken for those of this controller.
+        return size, (density, rate), result
 
     def adapt(self, context: StepContext, attempt: Attempt, memory: Memory) -> Decision:
         """Accept every step that is solved, and move the density on."""
@@ -613,7 +628,7 @@ class ReversibleController(AbstractStepSizeController):
         part = jnp.where(attempt.is_whole, eps, h * density / (1 - 0.5 * h * rate))
         moved = (density + 0.5 * part * rate) + 0.5 * part * following
         size = self._size(context, moved, following)
-        decision = _decided(attempt, size, jnp.stack([moved, following]))
+        decision = _decided(attempt, size, (moved, following))
         is_bad = attempt.is_solved & ~_is_usable(moved, size, context)
         result = RESULTS.where(is_bad, RESULTS.density_not_positive, decision.result)
         return decision._replace(is_accepted=attempt.is_solved & ~is_bad, result=result)
@@ -625,6 +640,11 @@ class ReversibleController(AbstractStepSizeController):
         del size
         density, rate = memory
         return self._size(context, density, rate), memory
+
+
+def _smallest_scale(like: Array) -> float:
+    """Return what is added to an absolute tolerance of zero, for a dtype."""
+    return float(jnp.finfo(like.dtype).tiny) ** 0.25
 
 
 def _is_usable(

@@ -116,10 +116,11 @@ class StepSizes(eqx.Module):
         if self.t1 is None:
             return NextStep(t, h, ~never, never)
         rest = (self.t1 - t) - clock.compensation
-        # Times have rounding errors proportional to their size.
-        eps = float(jnp.finfo(t.dtype).eps)
-        slack = 1e-9 * jnp.abs(h) + 16 * eps * jnp.maximum(jnp.abs(t), jnp.abs(self.t1))
-        is_last = jnp.abs(rest) <= jnp.abs(h) + slack
+        # The round-off of times may be larger than that of a step.
+        eps, size = float(jnp.finfo(t.dtype).eps), jnp.abs(h)
+        largest = jnp.maximum(jnp.abs(self.t1), jnp.abs(t))
+        slack = jnp.maximum(1e-9 * size, 4 * eps * largest)
+        is_last = jnp.abs(rest) <= size + jnp.minimum(slack, 1e-2 * size)
         h = jnp.where(is_last, rest, h)
         return NextStep(t, h, ~is_last, is_last)
 

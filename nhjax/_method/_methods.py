@@ -339,6 +339,42 @@ class LobattoIIIAB(AbstractMethod):
         check_choice("chart", chart, CHARTS)
         self.chart = chart
 
+    @classmethod
+    def for_tolerance(
+        cls, rtol: float, closure: str = "symmetric", chart: str = "middle"
+    ) -> "LobattoIIIAB":
+        """Return the method whose number of stages suits a tolerance.
+
+        More stages allow larger steps, which pays for small errors. The numbers are
+        those that took the least time for an error of this size in most of four
+        systems, measured by `benchmarks.adaptive_steps`.
+
+        **Arguments:**
+
+        - `rtol`: the relative tolerance of `nhjax.PIDController`, or the error at the
+            end of a run.
+        - `closure`, `chart`: as for `nhjax.LobattoIIIAB`.
+
+        **Returns:** a method with 3 to 7 stages.
+
+        **Raises:** `ValueError` unless `rtol` is a finite positive number.
+
+        !!! example
+
+            >>> import nhjax
+            >>> [nhjax.LobattoIIIAB.for_tolerance(rtol).stages
+            ...     for rtol in (1e-3, 1e-6, 1e-12)]
+            [3, 4, 7]
+        """
+        is_number = isinstance(rtol, float | int) and not isinstance(rtol, bool)
+        if not is_number or not 0 < rtol < math.inf:
+            raise ValueError(
+                f"LobattoIIIAB.for_tolerance: `rtol` must be a finite positive number, "
+                f"got {rtol!r}."
+            )
+        stages = 3 + sum(rtol < limit for limit in (1e-4, 1e-7, 1e-9, 1e-11))
+        return cls(stages, closure, chart)
+
     @property
     def order(self) -> int:
         """Return the order 2s - 2."""

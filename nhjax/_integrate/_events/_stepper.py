@@ -587,7 +587,8 @@ def _statistics_after(
         stats[name] = jnp.where(ends, stats[name], carry.stats[name])
     stats["failed_step"] = jnp.where(failed, node, stats["failed_step"])
     if attempt.decision is not None:
-        rejected = attempt.is_rejected & ~(ends & failed)
+        is_repeated = attempt.decision.result == RESULTS.successful
+        rejected = attempt.is_rejected & is_repeated
         given = carry.stats, attempt.decision, rejected
         stats |= statistics_of_attempt(*given, kept & (attempt.step.fired < 0))
     stats |= {"num_steps": after.node, "num_events": after.num_events}
