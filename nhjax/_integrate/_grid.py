@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from .._custom_types import FloatScalar, FloatScalarLike
-from .._errors import Check, is_traced
+from .._errors import Check, is_traced, ShapeError
 from .._system import finite, real_scalar, real_vector
 from ._interpolation import is_within
 from ._saving import SaveAt
@@ -106,6 +106,11 @@ def variable_grid(
     **Raises:** `TypeError` and `ValueError` for arguments that do not belong together.
     """
     dtype, checks = t0.dtype, [finite("t0", t0)]
+    if np.ndim(dt) > 1:
+        raise ShapeError(
+            f"`dt` has shape {np.shape(dt)}: give one size for all steps, or an array "
+            "of shape (num_steps,). For many runs, use `jax.vmap`."
+        )
     number, most = _numbers(t1, num_steps, max_steps, np.ndim(dt) == 1)
     if np.ndim(dt) == 1:
         if not isinstance(controller, ConstantStepSize):

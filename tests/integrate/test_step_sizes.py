@@ -20,11 +20,9 @@ from nhjax import (
     SaveAt,
 )
 from nhjax._integrate import _chunks
+from support.long import long_but
 from support.particle_run import assert_trees_close, assert_trees_equal
 
-
-# Programs agree bit for bit only in kernels as users have them.
-pytestmark = pytest.mark.usefixtures("optimised_kernels")
 
 METHOD = LobattoIIIAB(3)
 
@@ -98,7 +96,7 @@ def test_given_sizes_take_the_steps_of_single_steps(sign):
         t = t + h
         one = jax.tree.map(lambda x, k=k: x[k], got.ys)
         assert_trees_close((one.q, one.p), (y.q, y.p), rtol=0, atol=1e-14)
-        np.testing.assert_allclose(got.ts[k], t, rtol=1e-15)
+        np.testing.assert_allclose(got.ts[k], t, rtol=0, atol=1e-15)
     assert got.t1 == got.ts[-1]
 
 
@@ -109,7 +107,6 @@ def end_of(sizes):
 
 def test_given_sizes_have_the_derivatives_of_central_differences():
     got = jax.jacrev(end_of)(SIZES)
-    np.testing.assert_allclose(jax.jacfwd(end_of)(SIZES), got, rtol=0, atol=1e-13)
     d = 1e-5
     for k in range(len(SIZES)):
         two = (end_of(SIZES.at[k].add(x)) for x in (d, -d))
@@ -119,7 +116,11 @@ def test_given_sizes_have_the_derivatives_of_central_differences():
 
 
 @pytest.mark.parametrize(
-    "adjoint", [nhjax.RecursiveCheckpointAdjoint(), nhjax.ReversibleAdjoint()]
+    "adjoint",
+    long_but(
+        [nhjax.ReversibleAdjoint()],
+        [nhjax.RecursiveCheckpointAdjoint(), nhjax.ReversibleAdjoint()],
+    ),
 )
 def test_given_sizes_with_other_adjoints_have_the_same_gradient(adjoint):
     def end(sizes, v, args, adjoint):
@@ -156,8 +157,7 @@ def test_given_sizes_continued_from_a_checkpoint_repeat_one_run_bit_for_bit():
         ({"dt": jnp.array([0.1, 0.0])}, "`dt`: all step sizes must be positive"),
         ({"dt": jnp.array([0.1, jnp.nan])}, "`dt`"),
         ({"dt": jnp.zeros(0)}, "`dt`"),
-        ({"dt": jnp.ones((2, 2))}, "`dt`"),
-        ({"dt": jnp.array([1, 2])}, "`dt`"),
+        ({"dt": jnp.ones((2, 2))}, r"`dt` has shape \(2, 2\)"),
         ({"dt": SIZES, "num_steps": 11}, "`dt` has 12 sizes, but `num_steps` is 11"),
         ({"dt": SIZES, "t1": 1.0}, "`t1` is given together with an array `dt`"),
         ({"dt": SIZES, "stepsize_controller": PID}, "`dt` is an array"),
@@ -200,7 +200,7 @@ def test_given_sizes_continued_from_a_checkpoint_repeat_one_run_bit_for_bit():
 def test_step_sizes_that_do_not_belong_together_raise_an_error_that_names_them(
     options, message
 ):
-    with pytest.raises((ValueError, TypeError), match=message.split("(")[0]):
+    with pytest.raises((ValueError, TypeError), match=message):
         run(**options)
 
 
@@ -289,44 +289,8 @@ def jitted(name="pid", **options):
     return jax.jit(lambda y: adaptive(name, y0=y, **options))(START)
 
 
-@pytest.mark.parametrize("name", CONTROLLERS)
-def test_saved_steps_under_jit_equal_those_of_a_plain_run_before_the_padding(name):
-    saveat = SaveAt(t0=True, steps=True)
-    got, expected = jitted(name, saveat=saveat), adaptive(name, saveat=saveat)
-    number = int(got.stats["num_steps"]) + 1
-    assert got.ts.shape == (61,)
-    assert expected.ts.shape == (number,)
-    prefix, rest = (
-        jax.tree.map(lambda x, part=part: x[part], (got.ts, got.ys))
-        for part in (slice(number), slice(number, None))
-    )
-    assert_trees_equal(prefix, (expected.ts, expected.ys))
-    assert all(np.all(np.isinf(x)) for x in jax.tree.leaves(rest))
-    assert_trees_equal(got.stats, expected.stats)
-
-
 def value(t, y, args):
     return {"count": jnp.asarray(3, jnp.int32), "flag": y.q[0] > 0, "q": y.q[:2]}
-
-
-@pytest.mark.parametrize("steps", [3, 1000])
-@pytest.mark.parametrize("t1", [False, True])
-def test_every_kth_step_is_saved_and_the_end_once(whole, steps, t1):
-    taken = np.asarray(whole.ts)
-    expected = taken[steps::steps]
-    if t1 and (len(taken) - 1) % steps:
-        expected = np.append(expected, taken[-1])
-    saveat = SaveAt(steps=steps, t1=t1, fn=value)
-    plain = adaptive(saveat=saveat)
-    np.testing.assert_array_equal(plain.ts, expected)
-    assert plain.ys["count"].tolist() == [3] * len(expected)
-    assert plain.ys["q"].shape == (len(expected), 2)
-    got = jitted(saveat=saveat)
-    np.testing.assert_array_equal(got.ts[: len(expected)], expected)
-    assert np.all(np.isinf(got.ts[len(expected) :]))
-    head = jax.tree.map(lambda x: x[: len(expected)], got.ys)
-    assert_trees_equal(head, plain.ys)
-    assert got.ys["count"].dtype == jnp.int32
 
 
 def test_saved_times_equal_dense_output_plain_and_under_jit(whole):
@@ -389,7 +353,7 @@ def test_to_xarray_of_an_adaptive_run_has_its_times(whole):
 
 @pytest.mark.parametrize("name", CONTROLLERS)
 def test_solution_and_checkpoint_survive_files(name, tmp_path):
-    sol = adaptive(name, saveat=SaveAt(steps=True, dense=True, checkpoint=True))
+    sol = adaptive(name, saveat=SaveAt(steps=True, checkpoint=True))
     nhjax.save(tmp_path / "sol.npz", sol)
     got = nhjax.load(tmp_path / "sol.npz")
     assert_trees_equal((got.ts, got.ys, got.stats), (sol.ts, sol.ys, sol.stats))
@@ -402,7 +366,7 @@ def test_solution_and_checkpoint_survive_files(name, tmp_path):
 SPEEDS = jnp.array([0.2, 1.0, 3.0])
 
 
-@pytest.mark.parametrize("name", CONTROLLERS)
+@pytest.mark.parametrize("name", long_but(["pid"], CONTROLLERS))
 def test_vmap_of_adaptive_runs_gives_each_member_its_own_steps(name):
     saveat = SaveAt(t0=True, steps=True, dense=True)
 
@@ -670,7 +634,7 @@ def test_interrupted_run_with_samples_returns_those_before():
 def test_energy_kept_by_an_adaptive_run_is_constant_to_round_off(whole):
     kept = adaptive(invariants="energy", saveat=SaveAt(t0=True, steps=True))
     energies, others = (
-        jax.vmap(lambda y: SLIDE.energy(0.0, y.q, y.v, None))(x)
+        jax.vmap(lambda y: y.v @ y.v - lagrangian(0.0, y.q, y.v, None))(x)
         for x in (kept.ys, whole.ys)
     )
     assert np.ptp(energies) < 1e-14 < np.ptp(others)
@@ -678,13 +642,14 @@ def test_energy_kept_by_an_adaptive_run_is_constant_to_round_off(whole):
 
 
 def test_exported_adaptive_run_without_throw_gives_the_same_end():
-    def end(y):
+    def end(v):
+        y = nhjax.initial_state(SLIDE, START.q, v, project=True, throw=False)
         sol = adaptive(y0=y, max_steps=60, throw=False)
         return sol.ys.q[-1], sol.result._value
 
-    program = export.export(jax.jit(end))(START)
-    got = export.deserialize(program.serialize()).call(START)
-    assert_trees_close(got, jax.jit(end)(START), rtol=1e-12)
+    program = export.export(jax.jit(end))(START.v)
+    got = export.deserialize(program.serialize()).call(START.v)
+    assert_trees_close(got, jax.jit(end)(START.v), rtol=1e-12)
 
 
 def test_ensemble_of_adaptive_runs_equals_single_runs():
@@ -699,3 +664,47 @@ def test_ensemble_of_adaptive_runs_equals_single_runs():
             outcome.values.ys.q[i], single.ys.q, rtol=0, atol=1e-11
         )
         assert outcome.values.stats["num_steps"][i] == single.stats["num_steps"]
+
+
+# One program and chunks of steps ------------------------------------------------------
+
+# They agree bit for bit only in kernels as users have them, which the tests before do
+# not need.
+
+
+@pytest.mark.usefixtures("optimised_kernels")
+@pytest.mark.parametrize("name", CONTROLLERS)
+def test_saved_steps_under_jit_equal_those_of_a_plain_run_before_the_padding(name):
+    saveat = SaveAt(t0=True, steps=True)
+    got, expected = jitted(name, saveat=saveat), adaptive(name, saveat=saveat)
+    number = int(got.stats["num_steps"]) + 1
+    assert got.ts.shape == (61,)
+    assert expected.ts.shape == (number,)
+    prefix, rest = (
+        jax.tree.map(lambda x, part=part: x[part], (got.ts, got.ys))
+        for part in (slice(number), slice(number, None))
+    )
+    assert_trees_equal(prefix, (expected.ts, expected.ys))
+    assert all(np.all(np.isinf(x)) for x in jax.tree.leaves(rest))
+    assert_trees_equal(got.stats, expected.stats)
+
+
+@pytest.mark.usefixtures("optimised_kernels")
+@pytest.mark.parametrize("steps", [3, 1000])
+@pytest.mark.parametrize("t1", [False, True])
+def test_every_kth_step_is_saved_and_the_end_once(whole, steps, t1):
+    taken = np.asarray(whole.ts)
+    expected = taken[steps::steps]
+    if t1 and (len(taken) - 1) % steps:
+        expected = np.append(expected, taken[-1])
+    saveat = SaveAt(steps=steps, t1=t1, fn=value)
+    plain = adaptive(saveat=saveat)
+    np.testing.assert_array_equal(plain.ts, expected)
+    assert plain.ys["count"].tolist() == [3] * len(expected)
+    assert plain.ys["q"].shape == (len(expected), 2)
+    got = jitted(saveat=saveat)
+    np.testing.assert_array_equal(got.ts[: len(expected)], expected)
+    assert np.all(np.isinf(got.ts[len(expected) :]))
+    head = jax.tree.map(lambda x: x[: len(expected)], got.ys)
+    assert_trees_equal(head, plain.ys)
+    assert got.ys["count"].dtype == jnp.int32
