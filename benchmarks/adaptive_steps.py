@@ -72,7 +72,7 @@ def doubled(first: int, number: int) -> tuple[int, ...]:
 def rattleback() -> Case:
     """Create a rattleback whose spin reverses."""
     stone = systems.Rattleback.spinning(5.0, (0.5, 0.5))
-    return Case(stone.system, stone.initial_state(), 10.0, doubled(250, 5))
+    return Case(stone.system, stone.initial_state(), 10.0, doubled(2000, 6))
 
 
 def eulers_disc() -> Case:
@@ -97,7 +97,7 @@ def eulers_disc() -> Case:
         max_steps=10**6,
         event=nhjax.Event(is_flat),
     )
-    return Case(machine.system, y0, float(end.t1), doubled(2**14, 5))
+    return Case(machine.system, y0, float(end.t1), doubled(2**13, 6))
 
 
 def orbit() -> Case:
@@ -114,7 +114,7 @@ def orbit() -> Case:
         system,
         y0,
         10 * 2 * math.pi,
-        doubled(2**10, 6),
+        doubled(2**12, 6),
         (0.2, 0.1, 0.05, 0.025),
         lambda t, q, v, args: (q[0] ** 2 + q[1] ** 2) ** -0.75,
     )
@@ -127,7 +127,7 @@ def whip() -> Case:
     chain = systems.PendulumChain.swinging(
         angles=angles, lengths=lengths, masses=masses, gravity=9.81
     )
-    return Case(chain.system, chain.initial_state(), 0.6, doubled(32, 6))
+    return Case(chain.system, chain.initial_state(), 0.6, doubled(24, 6))
 
 
 def falling_bicycle() -> Case:
@@ -142,13 +142,13 @@ def falling_bicycle() -> Case:
         stepsize_controller=nhjax.PIDController(1e-8, 1e-10),
         event=nhjax.Event(lambda t, y, args: jnp.abs(y.q[3]) - 1.3),
     )
-    return Case(system, y0, float(end.t1), doubled(16, 6))
+    return Case(system, y0, float(end.t1), doubled(64, 6))
 
 
 def smooth(name: str, t1: float, first: int) -> Case:
     """Create a motion of the gallery without fast phases."""
     example = getattr(systems, name)()
-    numbers = doubled(first, 5)
+    numbers = doubled(first, 6)
     return Case(example.system, example.initial_state(), t1, numbers, is_smooth=True)
 
 
@@ -158,9 +158,9 @@ CASES: dict[str, Callable[[], Case]] = {
     "orbit with close passes": orbit,
     "whip of ten pendulums": whip,
     "bicycle that falls": falling_bicycle,
-    "particle": lambda: smooth("NonholonomicParticle", 20.0, 50),
-    "chaotic": lambda: smooth("ChaoticSystem", 20.0, 50),
-    "CVT": lambda: smooth("ContinuouslyVariableTransmission", 20.0, 50),
+    "particle": lambda: smooth("NonholonomicParticle", 20.0, 25),
+    "chaotic": lambda: smooth("ChaoticSystem", 20.0, 25),
+    "CVT": lambda: smooth("ContinuouslyVariableTransmission", 20.0, 25),
 }
 TOLERANCES = (1e-3, 1e-4, 1e-5, 1e-6, 1e-7, 1e-8, 1e-9, 1e-10)
 

@@ -356,12 +356,6 @@ class PIDController(AbstractStepSizeController):
         size = jax.lax.stop_gradient(self._limited(size))
         return size * context.direction, ones, RESULTS.successful
 
-    def resume(
-        self, context: StepContext, size: FloatScalar, memory: Memory
-    ) -> tuple[FloatScalar, Memory]:
-        """Return the size within the limits of this run, in its direction."""
-        return self._limited(jnp.abs(size)) * context.direction, memory
-
     def _first_size(
         self, context: StepContext, t: FloatScalar, start: StepState
     ) -> FloatScalar:
