@@ -39,6 +39,7 @@ from .._system import (
     finite,
     HamiltonianSystem,
     LagrangianSystem,
+    parameter,
     parameters,
     real_scalar,
     require_independent,
@@ -236,6 +237,10 @@ def integrate(
     )
     throw = check_flag("throw", throw)
     args = parameters(args)
+    # Other tolerances do not recompile, as other args do not.
+    stepsize_controller = jax.tree.map(
+        lambda x: parameter(x) if isinstance(x, float) else x, stepsize_controller
+    )
     state = check_start(system, y0, args)
     events = checked_events(event, saveat, invariants)
     _check_method(method, state, saveat)
