@@ -260,6 +260,25 @@ def test_pid_refuses_a_method_of_one_node():
         swing(method=nhjax.Gauss(1), t1=1.0)
 
 
+def test_controllers_with_other_numbers_do_not_trace_again():
+    traces = []
+
+    def lagrangian(t, q, v, args):
+        traces.append(1)
+        return 0.5 * v @ v + jnp.cos(q[0])
+
+    system = nhjax.LagrangianSystem(lagrangian)
+    y = start(system, 1.0, 0.5)
+    for kind in (
+        lambda x: PIDController(x, 0.1 * x, dtmax=1e4 * x),
+        lambda x: ReversibleController(1e4 * x, density),
+    ):
+        swing(kind(1e-5), y, system, t1=1.0)
+        count = len(traces)
+        swing(kind(2e-5), y, system, t1=1.5, max_steps=100)
+        assert len(traces) == count
+
+
 # Reversible controller ---------------------------------------------------------------
 
 
