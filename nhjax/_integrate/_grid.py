@@ -151,6 +151,7 @@ def variable_grid(
     if size is not None:
         agree = step * direction > 0
         checks.append(Check(agree, _wrong_sign, (size, t0, t0 if end is None else end)))
+    checks += controller.checks()
     if most is None:
         most = _default_limit(controller, t0, size, end, number)
     # As arrays, other tolerances do not recompile.

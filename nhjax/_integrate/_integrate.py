@@ -53,7 +53,7 @@ from ._checkpoint import (
     time_of,
 )
 from ._events import checked_events, Event
-from ._grid import checks_of_output, Grid, TimeGrid, variable_grid
+from ._grid import checks_of_output, Grid, TimeGrid, variable_grid, VariableGrid
 from ._interpolation import (
     require_collocation,
 )
@@ -289,7 +289,8 @@ def integrate(
         sol = _invalid_unless(valid, sol)
     if not _is_tracing() and ended_as(sol, "interrupted"):
         done = int(sol.stats["num_steps"])
-        message = _INTERRUPTED.format(done, float(sol.t1))
+        of = "" if isinstance(grid, VariableGrid) else f" of {grid.num_steps}"
+        message = _INTERRUPTED.format(f"{done}{of}", float(sol.t1))
         warnings.warn(message, stacklevel=2)
     elif throw:
         _require_constraints(sol, system, t0, state, args)

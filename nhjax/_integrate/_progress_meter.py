@@ -66,16 +66,32 @@ class AbstractProgressMeter(eqx.Module):
     def report_part(self, before: FloatScalar, after: FloatScalar) -> None:
         """Report from inside a traced loop that a part of the run is done.
 
-        The parts before and after a step are numbers from 0 to 1.
+        The parts before and after a step are numbers from 0 to 1. For a batch, the
+        part of its slowest member is reported.
         """
         if self.silent:
             return
-        old, new = ((100 * x).astype(jnp.int32) for x in (before, after))
+        # The members of a batch have different parts, and are reported as one run.
+        old, new = (_least((100 * x).astype(jnp.int32)) for x in (before, after))
 
         def callback(percent):
             self.update_part(int(percent))
 
         jax.lax.cond(new > old, lambda: jax.debug.callback(callback, new), lambda: None)
+
+
+@jax.custom_batching.custom_vmap
+def _least(x: Int[Array, ""]) -> Int[Array, ""]:
+    """Return a number; in a batch, the least number of all members."""
+    return x
+
+
+@_least.def_vmap
+def _least_of_batch(
+    size: int, is_batched: list[bool], x: Int[Array, " k"]
+) -> tuple[Int[Array, ""], bool]:
+    del size
+    return _least(jnp.min(x, axis=0)) if is_batched[0] else _least(x), False
 
 
 class NoProgressMeter(AbstractProgressMeter):

@@ -16,7 +16,7 @@ from .._custom_types import (
     FloatScalarLike,
     PhaseFunction,
 )
-from .._errors import DTypeError, is_traced, naming, ShapeError
+from .._errors import Check, DTypeError, is_traced, naming, ShapeError
 from .._manifold import AbstractLieGroup
 from .._method import AbstractMethod
 from .._numerics import ClosureConverted, inverse, max_norm, small_einsum
@@ -97,6 +97,10 @@ class AbstractStepSizeController(eqx.Module):
     def estimates_errors(self) -> bool:
         """Return whether its decisions have an estimated `error`."""
         return False
+
+    def checks(self) -> list[Check]:
+        """Return the checks of numbers that are traced."""
+        return []
 
     @abstractmethod
     def init(
@@ -240,8 +244,10 @@ class PIDController(AbstractStepSizeController):
         β3 = dcoeff / k
 
     (Söderlind, Digital filters in adaptive time-stepping, 2003, and the controller of
-    the same name in diffrax). Sizes that follow the error destroy the reversibility of
-    a method, so that energies may drift; see `nhjax.ReversibleController`.
+    the same name in diffrax). Take a method with three stages or more: with two, the
+    estimate vanishes for single steps. Sizes that follow the error destroy the
+    reversibility of a method, so that energies may drift; see
+    `nhjax.ReversibleController`.
 
     **Arguments:**
 
@@ -325,6 +331,17 @@ class PIDController(AbstractStepSizeController):
     def estimates_errors(self) -> bool:
         """Return True: its decisions rest on the error of a step."""
         return True
+
+    def checks(self) -> list[Check]:
+        """Return the checks of tolerances that are traced."""
+        if not is_traced(self.rtol, self.atol):
+            return []
+        rtol, atol = jnp.asarray(self.rtol), jnp.asarray(self.atol)
+        checks = [
+            Check((rtol > 0) & jnp.isfinite(rtol), _bad_rtol, (rtol,)),
+            Check((atol >= 0) & jnp.isfinite(atol), _bad_atol, (atol,)),
+        ]
+        return [check for check in checks if is_traced(*check.values)]
 
     def check(
         self,
@@ -528,6 +545,13 @@ class ReversibleController(AbstractStepSizeController):
                 f"{float(self.eps)}. For a run backward in time pass `t1` < `t0`."
             )
 
+    def checks(self) -> list[Check]:
+        """Return the check of an ε that is traced."""
+        if not is_traced(self.eps):
+            return []
+        eps = jnp.asarray(self.eps)
+        return [Check((eps > 0) & jnp.isfinite(eps), _bad_eps, (eps,))]
+
     def closure_converted(
         self, system: AbstractMechanicalSystem, t: FloatScalar, y: State, args: Args
     ) -> "ReversibleController":
@@ -607,9 +631,9 @@ class ReversibleController(AbstractStepSizeController):
             RESULTS.density_not_positive,
         )
         size = jnp.where(result == RESULTS.successful, size, context.direction)
-        # Two numbers differ from the array of a `PIDController`, so that its
+        # An array differs from the two numbers of a `PIDController`, so that its
         # checkpoints are not taken for those of this controller.
-        return size, (density, rate), result
+        return size, jnp.stack([density, rate]), result
 
     def adapt(self, context: StepContext, attempt: Attempt, memory: Memory) -> Decision:
         """Accept every step that is solved, and move the density on."""
@@ -622,7 +646,7 @@ class ReversibleController(AbstractStepSizeController):
         part = jnp.where(attempt.is_whole, eps, h * density / (1 - 0.5 * h * rate))
         moved = (density + 0.5 * part * rate) + 0.5 * part * following
         size = self._size(context, moved, following)
-        decision = _decided(attempt, size, (moved, following))
+        decision = _decided(attempt, size, jnp.stack([moved, following]))
         is_bad = attempt.is_solved & ~_is_usable(moved, size, context)
         result = RESULTS.where(is_bad, RESULTS.density_not_positive, decision.result)
         return decision._replace(is_accepted=attempt.is_solved & ~is_bad, result=result)
@@ -645,6 +669,20 @@ def _is_usable(
     density: FloatScalar, size: FloatScalar, context: StepContext
 ) -> BoolScalar:
     return (density > 0) & (size * context.direction > 0) & jnp.isfinite(size)
+
+
+def _bad_rtol(x: np.ndarray) -> ValueError:
+    return ValueError(f"PIDController: `rtol` must be finite and > 0, got {float(x)}.")
+
+
+def _bad_atol(x: np.ndarray) -> ValueError:
+    return ValueError(f"PIDController: `atol` must be finite and >= 0, got {float(x)}.")
+
+
+def _bad_eps(x: np.ndarray) -> ValueError:
+    return ValueError(
+        f"ReversibleController: `eps` must be finite and > 0, got {float(x)}."
+    )
 
 
 def _is_number(x: Any) -> bool:

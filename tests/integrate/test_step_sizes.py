@@ -11,7 +11,6 @@ from jax import export
 
 import nhjax
 from nhjax import (
-    AbstractProgressMeter,
     Event,
     LobattoIIIAB,
     PIDController,
@@ -22,6 +21,7 @@ from nhjax import (
 from nhjax._integrate import _chunks
 from support.long import long_but
 from support.particle_run import assert_trees_close, assert_trees_equal
+from support.reports import new_meter
 
 
 METHOD = LobattoIIIAB(3)
@@ -115,12 +115,9 @@ def test_given_sizes_have_the_derivatives_of_central_differences():
         )
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
-    "adjoint",
-    long_but(
-        [nhjax.ReversibleAdjoint()],
-        [nhjax.RecursiveCheckpointAdjoint(), nhjax.ReversibleAdjoint()],
-    ),
+    "adjoint", [nhjax.RecursiveCheckpointAdjoint(), nhjax.ReversibleAdjoint()]
 )
 def test_given_sizes_with_other_adjoints_have_the_same_gradient(adjoint):
     def end(sizes, v, args, adjoint):
@@ -267,7 +264,7 @@ def test_run_of_constant_steps_to_t1_in_float32_stays_in_float32():
     assert float(sol.t1) == T1
 
 
-@pytest.mark.parametrize("name", CONTROLLERS)
+@pytest.mark.parametrize("name", long_but(["reversible"], CONTROLLERS))
 def test_run_of_many_num_steps_with_a_controller_ends_after_them(name):
     sol = adaptive(name, t1=None, num_steps=4200)
     assert int(sol.stats["num_steps"]) == 4200
@@ -287,10 +284,6 @@ def test_saved_steps_of_a_plain_run_are_those_taken(whole):
 def jitted(name="pid", **options):
     options = {"max_steps": 60} | options
     return jax.jit(lambda y: adaptive(name, y0=y, **options))(START)
-
-
-def value(t, y, args):
-    return {"count": jnp.asarray(3, jnp.int32), "flag": y.q[0] > 0, "q": y.q[:2]}
 
 
 def test_saved_times_equal_dense_output_plain_and_under_jit(whole):
@@ -337,6 +330,7 @@ def test_dense_output_outside_of_the_run_raises_an_error(whole, t):
         under_jit.evaluate(t)
 
 
+@pytest.mark.long
 def test_dense_output_of_a_backward_run_meets_the_nodes():
     saveat = SaveAt(steps=True, dense=True)
     sol = adaptive(t0=1.0, t1=-1.0, saveat=saveat)
@@ -351,7 +345,7 @@ def test_to_xarray_of_an_adaptive_run_has_its_times(whole):
     assert int(data.stats_num_rejected_steps) == int(whole.stats["num_rejected_steps"])
 
 
-@pytest.mark.parametrize("name", CONTROLLERS)
+@pytest.mark.parametrize("name", long_but(["reversible"], CONTROLLERS))
 def test_solution_and_checkpoint_survive_files(name, tmp_path):
     sol = adaptive(name, saveat=SaveAt(steps=True, checkpoint=True))
     nhjax.save(tmp_path / "sol.npz", sol)
@@ -420,7 +414,7 @@ def test_run_cut_by_max_steps_and_resumed_repeats_the_whole_run_bit_for_bit(
     assert rejected == expected.stats["num_rejected_steps"]
 
 
-@pytest.mark.parametrize("name", CONTROLLERS)
+@pytest.mark.parametrize("name", long_but(["reversible"], CONTROLLERS))
 def test_checkpoint_of_constant_steps_continues_with_steps_that_differ(name):
     first = run(dt=0.1, num_steps=7, t0=0.5, saveat=SaveAt(checkpoint=True)).checkpoint
     got = adaptive(name, y0=first, saveat=SaveAt(t0=True, t1=True))
@@ -429,7 +423,7 @@ def test_checkpoint_of_constant_steps_continues_with_steps_that_differ(name):
     np.testing.assert_allclose(got.ys.q[-1], expected.ys.q[-1], rtol=0, atol=1e-13)
 
 
-@pytest.mark.parametrize("name", CONTROLLERS)
+@pytest.mark.parametrize("name", long_but(["reversible"], CONTROLLERS))
 def test_checkpoint_of_steps_that_differ_continues_with_constant_steps(name):
     first = adaptive(name, saveat=SaveAt(checkpoint=True)).checkpoint
     assert float(first.t) == T1
@@ -492,33 +486,6 @@ def usual_handler():
     signal.signal(signal.SIGINT, before)
 
 
-SEEN: dict[int, list[tuple[int, int]]] = {}
-
-
-class Reports(AbstractProgressMeter):
-    """A meter that keeps its reports, and presses Ctrl-C after some of them."""
-
-    number: int
-    at: int = 10**9
-
-    @property
-    def seen(self) -> list[tuple[int, int]]:
-        """Return the reports."""
-        return SEEN[self.number]
-
-    def update(self, done: int, total: int) -> None:
-        """Keep the report."""
-        self.seen.append((done, total))
-        if len(self.seen) == self.at:
-            signal.raise_signal(signal.SIGINT)
-
-
-def new_meter(at=10**9):
-    number = len(SEEN)
-    SEEN[number] = []
-    return Reports(number, at)
-
-
 OPTIONS_OF_METERS = {
     "pid": {"stepsize_controller": PID},
     "reversible": {"stepsize_controller": REVERSIBLE},
@@ -530,7 +497,7 @@ OPTIONS_OF_METERS = {
 }
 
 
-@pytest.mark.parametrize("name", OPTIONS_OF_METERS)
+@pytest.mark.parametrize("name", long_but(["pid", "stopped"], OPTIONS_OF_METERS))
 @pytest.mark.parametrize("is_jitted", [False, True])
 @pytest.mark.usefixtures("short_chunks")
 def test_progress_of_a_run_to_t1_grows_to_the_end(name, is_jitted):
@@ -548,6 +515,7 @@ def test_progress_of_a_run_to_t1_grows_to_the_end(name, is_jitted):
     assert done[-1] == 100
 
 
+@pytest.mark.long
 @pytest.mark.usefixtures("short_chunks")
 def test_progress_of_num_steps_steps_grows_with_the_steps():
     meter = new_meter()
@@ -557,9 +525,6 @@ def test_progress_of_num_steps_steps_grows_with_the_steps():
     assert done[-1] == 100
 
 
-@pytest.mark.xfail(
-    strict=True, reason="each member reports each of its steps, in any order"
-)
 def test_progress_of_a_batch_is_that_of_its_slowest_member():
     meter = new_meter()
 
@@ -589,6 +554,7 @@ def test_text_meter_of_a_run_to_t1_prints_percents(is_jitted, capsys):
         assert 3 < len(lines) <= 11
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("is_jitted", [False, True])
 @pytest.mark.usefixtures("short_chunks")
 def test_tqdm_meter_of_a_run_to_t1_closes_its_bar(is_jitted, capsys):
@@ -601,23 +567,6 @@ def test_tqdm_meter_of_a_run_to_t1_closes_its_bar(is_jitted, capsys):
     jax.effects_barrier()
     assert "100/100" in capsys.readouterr().err
     assert not meter._open.bars
-
-
-@pytest.mark.parametrize("name", CONTROLLERS)
-@pytest.mark.usefixtures("usual_handler", "short_chunks")
-def test_interrupted_run_returns_the_steps_before_and_resumes(name):
-    saveat = SaveAt(t0=True, steps=True, checkpoint=True)
-    expected = adaptive(name, saveat=saveat)
-    with pytest.warns(UserWarning, match="interrupted after"):
-        got = adaptive(name, saveat=saveat, progress_meter=new_meter(3))
-    number = int(got.stats["num_steps"])
-    assert got.result == RESULTS.interrupted
-    assert 0 < number < int(expected.stats["num_steps"])
-    assert got.t1 == got.ts[-1] == expected.ts[number]
-    assert_trees_equal(got.ys.q, expected.ys.q[: number + 1])
-    rest = adaptive(name, y0=got.checkpoint, saveat=saveat)
-    assert_trees_equal(last(rest.ys), last(expected.ys))
-    assert_trees_equal(rest.checkpoint, expected.checkpoint)
 
 
 @pytest.mark.usefixtures("usual_handler", "short_chunks")
@@ -652,6 +601,7 @@ def test_exported_adaptive_run_without_throw_gives_the_same_end():
     assert_trees_close(got, jax.jit(end)(START.v), rtol=1e-12)
 
 
+@pytest.mark.long
 def test_ensemble_of_adaptive_runs_equals_single_runs():
     def one(speed):
         y = start_with(speed * START.v)
@@ -664,47 +614,3 @@ def test_ensemble_of_adaptive_runs_equals_single_runs():
             outcome.values.ys.q[i], single.ys.q, rtol=0, atol=1e-11
         )
         assert outcome.values.stats["num_steps"][i] == single.stats["num_steps"]
-
-
-# One program and chunks of steps ------------------------------------------------------
-
-# They agree bit for bit only in kernels as users have them, which the tests before do
-# not need.
-
-
-@pytest.mark.usefixtures("optimised_kernels")
-@pytest.mark.parametrize("name", CONTROLLERS)
-def test_saved_steps_under_jit_equal_those_of_a_plain_run_before_the_padding(name):
-    saveat = SaveAt(t0=True, steps=True)
-    got, expected = jitted(name, saveat=saveat), adaptive(name, saveat=saveat)
-    number = int(got.stats["num_steps"]) + 1
-    assert got.ts.shape == (61,)
-    assert expected.ts.shape == (number,)
-    prefix, rest = (
-        jax.tree.map(lambda x, part=part: x[part], (got.ts, got.ys))
-        for part in (slice(number), slice(number, None))
-    )
-    assert_trees_equal(prefix, (expected.ts, expected.ys))
-    assert all(np.all(np.isinf(x)) for x in jax.tree.leaves(rest))
-    assert_trees_equal(got.stats, expected.stats)
-
-
-@pytest.mark.usefixtures("optimised_kernels")
-@pytest.mark.parametrize("steps", [3, 1000])
-@pytest.mark.parametrize("t1", [False, True])
-def test_every_kth_step_is_saved_and_the_end_once(whole, steps, t1):
-    taken = np.asarray(whole.ts)
-    expected = taken[steps::steps]
-    if t1 and (len(taken) - 1) % steps:
-        expected = np.append(expected, taken[-1])
-    saveat = SaveAt(steps=steps, t1=t1, fn=value)
-    plain = adaptive(saveat=saveat)
-    np.testing.assert_array_equal(plain.ts, expected)
-    assert plain.ys["count"].tolist() == [3] * len(expected)
-    assert plain.ys["q"].shape == (len(expected), 2)
-    got = jitted(saveat=saveat)
-    np.testing.assert_array_equal(got.ts[: len(expected)], expected)
-    assert np.all(np.isinf(got.ts[len(expected) :]))
-    head = jax.tree.map(lambda x: x[: len(expected)], got.ys)
-    assert_trees_equal(head, plain.ys)
-    assert got.ys["count"].dtype == jnp.int32
