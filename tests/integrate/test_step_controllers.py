@@ -1,6 +1,7 @@
 """The controllers of step sizes, and derivatives and events of runs with them."""
 
 import itertools
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -49,13 +50,19 @@ SLIDING = start(SLIDE, [0.4, 0.7, 0.0], [0.9, 0.8, 0.0])
 SWINGING = start(PENDULUM, 1.0, 0.5)
 
 
-def swing(controller=PID, y0=SWINGING, system=PENDULUM, method=METHOD, **options):
+def swing(
+    controller: Any = PID,
+    y0: Any = SWINGING,
+    system: Any = PENDULUM,
+    method: Any = METHOD,
+    **options: Any,
+):
     return nhjax.integrate(
         system, method, y0, stepsize_controller=controller, **options
     )
 
 
-def sizes_of(sol):
+def sizes_of(sol) -> Any:
     return np.diff(np.asarray(sol.ts))
 
 
@@ -447,7 +454,7 @@ def test_reversible_controller_with_a_bad_eps_raises_an_error(eps):
 
 def test_reversible_controller_with_a_density_that_is_no_function_raises_an_error():
     with pytest.raises(TypeError, match="`density` must be a function"):
-        ReversibleController(0.1, 3.0)
+        ReversibleController(0.1, 3.0)  # pyright: ignore[reportArgumentType]
 
 
 # Derivatives -------------------------------------------------------------------------

@@ -54,7 +54,7 @@ def run(y0=START, **options):
     return nhjax.integrate(SLIDE, METHOD, y0, **options)
 
 
-def adaptive(name="pid", y0=START, **options):
+def adaptive(name="pid", y0: Any = START, **options):
     options = {"t1": T1, "stepsize_controller": CONTROLLERS[name]} | options
     return run(y0, **options)
 
