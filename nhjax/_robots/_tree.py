@@ -1,0 +1,295 @@
+"""The kinematic tree of a robot: its joints, its configuration space and its poses.
+
+Each joint is a node of the tree, and the world is node 0. The pose of a node is the
+product of the poses of all joints on its path, each relative to the joint before it.
+Pointer doubling computes these products for all nodes at once: after k rounds a node
+knows its pose relative to its ancestor at the distance 2ᵏ. The number of operations in
+the program therefore grows as the logarithm of the depth, not as the number of joints.
+"""
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, PyTree
+
+from .._manifold import AbstractLieGroup, Euclidean, ProductGroup, SE3, SO3
+
+
+class Joint(NamedTuple):
+    """A joint of the tree.
+
+    - `name`, `kind`: the kind is "free", "ball", "slide" or "hinge".
+    - `parent`: the number of the joint before it on the path from the world, or -1.
+    - `offset`: the frame of its body at rest, relative to the frame after `parent`.
+    - `anchor`, `axis`: the point and the direction of the joint in its own frame.
+    - `reference`: the coordinate of a slide or a hinge at rest.
+    """
+
+    name: str
+    kind: str
+    parent: int
+    offset: Float[np.ndarray, "4 4"]
+    anchor: Float[np.ndarray, "3"]
+    axis: Float[np.ndarray, "3"]
+    reference: float
+
+
+class Part(NamedTuple):
+    """A factor of the configuration space: one free or ball joint, or some scalars."""
+
+    kind: str
+    joints: tuple[int, ...]
+    first_velocity: int
+
+    @property
+    def group(self) -> AbstractLieGroup:
+        """The factor as a Lie group."""
+        groups = {"free": SE3(), "ball": SO3()}
+        return groups.get(self.kind) or Euclidean(len(self.joints))
+
+
+def parts_of(joints: Sequence[Joint]) -> tuple[Part, ...]:
+    """Divide the joints, in the order of the file, into factors."""
+    parts: list[Part] = []
+    velocity = 0
+    for number, joint in enumerate(joints):
+        is_scalar = joint.kind in ("slide", "hinge")
+        kind = "scalars" if is_scalar else joint.kind
+        if is_scalar and parts and parts[-1].kind == "scalars":
+            last = parts.pop()
+            parts.append(last._replace(joints=(*last.joints, number)))
+        else:
+            parts.append(Part(kind, (number,), velocity))
+        velocity += {"free": 6, "ball": 3}.get(joint.kind, 1)
+    return tuple(parts)
+
+
+class Space:
+    """The configuration space of a robot, and MuJoCo's coordinates of it.
+
+    MuJoCo's velocities of a free joint are the velocity of its origin in space and the
+    angular velocity in the body. Those of SE(3) are both in the body.
+    """
+
+    def __init__(self, joints: Sequence[Joint]):
+        self.parts = parts_of(joints)
+        groups = [part.group for part in self.parts]
+        self.is_flat = len(groups) == 1 and self.parts[0].kind == "scalars"
+        self.is_product = len(groups) > 1
+        self.manifold: AbstractLieGroup | None = None
+        if not self.is_flat:
+            self.manifold = ProductGroup(*groups) if self.is_product else groups[0]
+        self.num_velocities = sum(group.dim for group in groups)
+        # The places of the scalar coordinates in a vector of velocities.
+        self.scalars = np.asarray(
+            [
+                part.first_velocity + i
+                for part in self.parts
+                if part.kind == "scalars"
+                for i in range(len(part.joints))
+            ],
+            int,
+        )
+        self.free = [part.first_velocity for part in self.parts if part.kind == "free"]
+
+    def split(self, q: PyTree[Array]) -> tuple[list[Array], Array]:
+        """Split q into the elements of free and ball joints, and all scalars."""
+        elements = q if self.is_product else (q,)
+        special, scalars = [], []
+        for part, element in zip(self.parts, elements, strict=True):
+            (scalars if part.kind == "scalars" else special).append(element)
+        if scalars:
+            vector = scalars[0] if len(scalars) == 1 else jnp.concatenate(scalars)
+        else:
+            vector = jnp.zeros((0,), special[0].dtype)
+        return special, vector
+
+    def tangent(self, q: PyTree[Array], v: Array) -> PyTree[Array]:
+        """Compute the rate of q from the velocity."""
+        return v if self.manifold is None else self.manifold.tangent(q, v)
+
+    def from_qpos(self, qpos: Float[Array, " nq"]) -> PyTree[Array]:
+        """Convert MuJoCo's coordinates."""
+        elements, place = [], 0
+        for part in self.parts:
+            size = {"free": 7, "ball": 4}.get(part.kind, len(part.joints))
+            own = qpos[place : place + size]
+            if part.kind == "free":
+                own = jnp.concatenate([own[3:], own[:3]])
+            elements.append(own)
+            place += size
+        return tuple(elements) if self.is_product else elements[0]
+
+    def to_qpos(self, q: PyTree[Array]) -> Float[Array, "*batch nq"]:
+        """Convert to MuJoCo's coordinates, with any leading axes."""
+        elements = q if self.is_product else (q,)
+        own = [
+            jnp.concatenate([x[..., 4:], x[..., :4]], axis=-1)
+            if part.kind == "free"
+            else x
+            for part, x in zip(self.parts, elements, strict=True)
+        ]
+        return jnp.concatenate(own, axis=-1)
+
+    def rotations(self, q: PyTree[Array]) -> list[Array]:
+        """Return the rotations of the free joints, by their first velocities."""
+        elements = q if self.is_product else (q,)
+        return [
+            SO3().matrix(element[:4])
+            for part, element in zip(self.parts, elements, strict=True)
+            if part.kind == "free"
+        ]
+
+    def to_space(self, q: PyTree[Array], v: Array) -> Array:
+        """Convert velocities, or covectors, of SE(3) to those of MuJoCo."""
+        return self._turn(self.rotations(q), v)
+
+    def to_body(self, q: PyTree[Array], v: Array) -> Array:
+        """Convert velocities, or covectors, of MuJoCo to those of SE(3)."""
+        return self._turn([rotation.T for rotation in self.rotations(q)], v)
+
+    def _turn(self, rotations: list[Array], v: Array) -> Array:
+        pieces, place = [], 0
+        for first, rotation in zip(self.free, rotations, strict=True):
+            pieces += [v[place:first], rotation @ v[first : first + 3]]
+            place = first + 3
+        return jnp.concatenate([*pieces, v[place:]]) if pieces else v
+
+
+class Tree:
+    """The joints on the paths to some nodes, as arrays."""
+
+    def __init__(self, joints: Sequence[Joint], space: Space, kept: Sequence[int]):
+        self.space = space
+        on_paths = set()
+        for number in kept:
+            while number >= 0 and number not in on_paths:
+                on_paths.add(number)
+                number = joints[number].parent
+        special = [j for part in space.parts if part.kind != "scalars" for j in part.joints]
+        scalar = [j for part in space.parts if part.kind == "scalars" for j in part.joints]
+        self.special = [
+            (i, joints[j]) for i, j in enumerate(special) if j in on_paths
+        ]
+        chosen = [(i, joints[j]) for i, j in enumerate(scalar) if j in on_paths]
+        self.scalar = np.asarray([i for i, _ in chosen], int)
+        self.takes_all = len(chosen) == len(scalar)
+        self.turns = np.asarray([x.kind == "hinge" for _, x in chosen], bool)
+        self.reference = np.asarray([x.reference for _, x in chosen], float)
+        self.constants = _motions([joint for _, joint in chosen])
+        order = [j for j in special if j in on_paths]
+        order += [j for j in scalar if j in on_paths]
+        # Node 0 is the world, which is its own parent.
+        self.node = {-1: 0} | {j: node for node, j in enumerate(order, 1)}
+        parent = np.asarray([0] + [self.node[joints[j].parent] for j in order])
+        self.rounds = []
+        while parent.any():
+            self.rounds.append(parent)
+            parent = parent[parent]
+
+    @property
+    def num_nodes(self) -> int:
+        """The number of joints on the paths, and one for the world."""
+        return len(self.node)
+
+    def poses(self, q: PyTree[Array]) -> tuple[Array, Array]:
+        """Compute the rotations and the positions of all nodes in space."""
+        rotation, position = self._relative(q)
+        for parent in self.rounds:
+            turn = rotation[parent]
+            moved = jnp.einsum("nij,nj->ni", turn, position)
+            position = position[parent] + moved
+            rotation = jnp.einsum("nij,njk->nik", turn, rotation)
+        return rotation, position
+
+    def _relative(self, q: PyTree[Array]) -> tuple[Array, Array]:
+        """Compute the pose of each node relative to the node before it."""
+        elements, scalars = self.space.split(q)
+        dtype = scalars.dtype
+        rotations = [jnp.eye(3, dtype=dtype)[None]]
+        positions = [jnp.zeros((1, 3), dtype)]
+        for place, joint in self.special:
+            element = elements[place]
+            rotation = SO3().matrix(element[:4])
+            if joint.kind == "free":
+                position = element[4:]
+            else:
+                offset = jnp.asarray(joint.offset, dtype)
+                anchor = jnp.asarray(joint.anchor, dtype)
+                turn = offset[:3, :3] @ rotation
+                position = offset[:3, 3] + offset[:3, :3] @ anchor - turn @ anchor
+                rotation = turn
+            rotations.append(rotation[None])
+            positions.append(position[None])
+        if len(self.scalar):
+            s = scalars if self.takes_all else scalars[self.scalar]
+            s = s - jnp.asarray(self.reference, dtype)
+            motion = jnp.stack([jnp.ones_like(s), jnp.sin(s), 1 - jnp.cos(s), s])
+            both = jnp.einsum("knm,kn->nm", jnp.asarray(self.constants, dtype), motion)
+            rotations.append(both[:, :9].reshape(-1, 3, 3))
+            positions.append(both[:, 9:])
+        return jnp.concatenate(rotations), jnp.concatenate(positions)
+
+
+def _motions(joints: Sequence[Joint]) -> Float[np.ndarray, "4 n 12"]:
+    """Return the coefficients of 1, sin s, 1 - cos s and s in the pose of a joint.
+
+    A hinge turns about its axis by Rodrigues' formula I + sin s â + (1 - cos s) â², and
+    its anchor p stays in place. Each row has the rotation and then the position.
+    """
+    found = np.zeros((4, len(joints), 12))
+    for number, joint in enumerate(joints):
+        turn, shift = joint.offset[:3, :3], joint.offset[:3, 3]
+        found[0, number] = [*turn.ravel(), *shift]
+        if joint.kind == "slide":
+            found[3, number, 9:] = turn @ joint.axis
+            continue
+        # Its columns are a × e_i, so that it maps x to a × x.
+        hat = np.cross(joint.axis, np.eye(3)).T
+        for row, matrix in ((1, hat), (2, hat @ hat)):
+            turned = turn @ matrix
+            found[row, number] = [*turned.ravel(), *(-turned @ joint.anchor)]
+    return found
+
+
+class Frame(NamedTuple):
+    """A frame that is fixed to a node: that of a body, a geom or a site."""
+
+    joint: int
+    matrix: Float[np.ndarray, "4 4"]
+
+
+class FramePoses:
+    """The poses of some frames as a function of (t, q, args)."""
+
+    def __init__(self, joints: Sequence[Joint], space: Space, frames: Sequence[Frame]):
+        self.tree = Tree(joints, space, [frame.joint for frame in frames])
+        self.nodes = np.asarray([self.tree.node[frame.joint] for frame in frames], int)
+        self.turns = np.stack([frame.matrix[:3, :3] for frame in frames])
+        self.places = np.stack([frame.matrix[:3, 3] for frame in frames])
+
+    def __call__(self, q: PyTree[Any]) -> tuple[Array, Array]:
+        """Compute positions and rotations of all frames in space."""
+        rotation, position = self.tree.poses(q)
+        rotation, position = rotation[self.nodes], position[self.nodes]
+        places = jnp.asarray(self.places, position.dtype)
+        turns = jnp.asarray(self.turns, position.dtype)
+        position = position + jnp.einsum("nij,nj->ni", rotation, places)
+        return position, jnp.einsum("nij,njk->nik", rotation, turns)
+
+
+def homogeneous(
+    position: Float[np.ndarray, "3"], quaternion: Float[np.ndarray, "4"]
+) -> Float[np.ndarray, "4 4"]:
+    """Return the matrix of a pose that MuJoCo gives by a position and a quaternion."""
+    w, x, y, z = np.asarray(quaternion) / np.linalg.norm(quaternion)
+    found = np.eye(4)
+    found[:3, :3] = [
+        [w * w + x * x - y * y - z * z, 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), w * w - x * x + y * y - z * z, 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), w * w - x * x - y * y + z * z],
+    ]
+    found[:3, 3] = position
+    return found
