@@ -1,8 +1,10 @@
 """The conversion of a compiled model of MuJoCo to the arrays that nhjax uses."""
 
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 
 from ..rolling import AbstractContact, AbstractGround, Contacts, Ellipsoid, Plane, Wheel
@@ -399,7 +401,11 @@ def rolling_options(rolling: Any) -> dict[str, tuple[Any, ...]]:
 
 
 def contacts_of(
-    model: Any, layout: Layout, options: Mapping[str, Any], ground: Any
+    model: Any,
+    layout: Layout,
+    options: Mapping[str, Any],
+    ground: Any,
+    without_height: Sequence[str] = (),
 ) -> Contacts | None:
     """Build the contacts of the geoms that roll."""
     if not options:
@@ -430,7 +436,8 @@ def contacts_of(
         size, kind = model.geom_size[geom], library.mjtGeom(model.geom_type[geom])
         shared: dict[str, Any] = {
             "no_slip": no_slip,
-            "touches": _height_varies(model, geom, surface, name),
+            "touches": name not in without_height
+            and _height_varies(model, geom, surface, name),
             "ground": surface,
             "manifold": layout.space.manifold,
         }
@@ -525,56 +532,83 @@ def _height_varies(model: Any, geom: int, ground: AbstractGround, name: str) -> 
     return False
 
 
-def is_dependent(model: Any, layout: Layout, contacts: Any, constraint: Any) -> bool:
-    """Return whether constraints depend on each other near the pose at rest."""
-    return _Ranks(model, layout.space).is_dependent(contacts, constraint)
+# --- Dependent constraints ------------------------------------------------------------
 
 
-class _Ranks:
-    def __init__(self, model: Any, space: Space):
-        self.model, self.space = model, space
+class Kept(NamedTuple):
+    """The rows of the constraints to enforce.
 
-    def is_dependent(self, contacts: Any, constraint: Any) -> bool:
-        """Return whether the matrix of the constraints lacks rank at some pose."""
-        import jax
-        import jax.numpy as jnp
+    - `slips`: for each contact, whether to keep each of its directions without slip.
+    - `heights`: for each contact that touches, whether to keep its height.
+    - `loops`: whether to keep each equation of the closed loops.
+    - `is_independent`: whether these rows are independent near the pose at rest.
+    """
 
-        space = self.space
-        n = space.num_velocities
+    slips: list[list[bool]]
+    heights: list[bool]
+    loops: list[bool]
+    is_independent: bool
 
-        def rates(q, v):
-            found = []
-            for x in () if contacts is None else contacts.contacts:
-                if x.no_slip:
-                    found.append(x.slip(0.0, q, v))
-            functions = [
-                lambda q, x=x: x.height(0.0, q)[None]
-                for x in (() if contacts is None else contacts.contacts)
-                if x.touches
-            ]
-            if constraint is not None:
-                functions.append(lambda q: constraint(0.0, q, None))
-            for function in functions:
-                tangent = space.tangent(q, v)
-                found.append(jax.jvp(function, (q,), (tangent,))[1])
-            return jnp.concatenate(found)
 
-        @jax.jit
-        def matrix(qpos):
-            q = space.from_qpos(qpos)
-            return jax.vmap(lambda v: rates(q, v))(jnp.eye(n, dtype=qpos.dtype)).T
+def independent_rows(
+    model: Any, space: Space, contacts: Contacts | None, loop: Any
+) -> Kept:
+    """Find the constraints that follow from the others in every pose.
 
-        rng, library = np.random.default_rng(1), mujoco()
-        for size in (0.0, 0.1, 0.1):
-            qpos = self.model.qpos0.copy()
-            library.mj_integratePos(self.model, qpos, rng.normal(size=n), size)
-            rows = np.asarray(matrix(jnp.asarray(qpos, jnp.result_type(float))), float)
+    Such rows are left out if the others are independent at the pose at rest and at
+    random poses. Otherwise all rows are kept, since a dependence that holds in some
+    poses only, such as that of the heights of four wheels, needs all of them.
+    """
+    touched = () if contacts is None else contacts.contacts
+    heights = [x for x in touched if x.touches]
+    slips = [x for x in touched if x.no_slip]
+
+    def positions(q):
+        rows = [x.height(0.0, q)[None] for x in heights]
+        if loop is not None:
+            rows.append(loop(0.0, q, None))
+        return jnp.concatenate(rows)
+
+    def rates(q, v):
+        # Positions come first: a velocity that follows from them is left out.
+        rows = []
+        if heights or loop is not None:
+            rows.append(jax.jvp(positions, (q,), (space.tangent(q, v),))[1])
+        return jnp.concatenate([*rows, *(x.slip(0.0, q, v) for x in slips)])
+
+    @jax.jit
+    def matrix(qpos):
+        q, unit = space.from_qpos(qpos), jnp.eye(model.nv, dtype=qpos.dtype)
+        return jax.vmap(lambda v: rates(q, v))(unit).T
+
+    rng, found = np.random.default_rng(1), []
+    for size in (0.3, 0.3, 0.0):
+        qpos = model.qpos0.copy()
+        mujoco().mj_integratePos(model, qpos, rng.normal(size=model.nv), size)
+        rows = np.asarray(matrix(jnp.asarray(qpos, jnp.result_type(float))), float)
+        if np.isfinite(rows).all():
             lengths = np.linalg.norm(rows, axis=1, keepdims=True)
-            tolerance = 1e-4 if rows.dtype == np.float32 else 1e-8
-            if not np.isfinite(rows).all():
-                continue
-            if np.any(lengths < tolerance):
-                return True
-            if np.linalg.matrix_rank(rows / lengths, tol=tolerance) < len(rows):
-                return True
-        return False
+            found.append(rows / np.where(lengths > 1e-8, lengths, np.inf))
+    count = len(found[0]) if found else 0
+    kept: list[int] = []
+    for row in range(count):
+        if _rank(found[0][[*kept, row]]) > len(kept):
+            kept.append(row)
+    is_independent = all(
+        _rank(x[kept]) == len(kept) and _rank(x) == len(kept) for x in found
+    )
+    keep = np.isin(np.arange(count), kept) | (not is_independent)
+    sizes = [len(x.no_slip) for x in touched]
+    first = count - sum(sizes)
+    ends = first + np.cumsum([0, *sizes])
+    return Kept(
+        [keep[a:b].tolist() for a, b in zip(ends[:-1], ends[1:], strict=True)],
+        keep[: len(heights)].tolist(),
+        keep[len(heights) : first].tolist(),
+        is_independent,
+    )
+
+
+def _rank(rows: np.ndarray) -> int:
+    tolerance = 1e-8 if jnp.result_type(float) == jnp.float64 else 1e-4
+    return int(np.linalg.matrix_rank(rows, tol=tolerance)) if len(rows) else 0

@@ -375,8 +375,17 @@ class Loops(NamedTuple):
         return (*points, *turns, *(loop.name for loop in self.couplings))
 
 
-def loops_of(joints: Sequence[Joint], space: Space, loops: Loops) -> Any:
-    """Return the holonomic constraints Γ(t, q, args) of closed loops, or None."""
+def loops_of(
+    joints: Sequence[Joint],
+    space: Space,
+    loops: Loops,
+    kept: Sequence[bool] | None = None,
+) -> Any:
+    """Return the holonomic constraints Γ(t, q, args) of closed loops, or None.
+
+    Only the equations that are `kept` are returned, by default all.
+    """
+    rows_kept = None if kept is None or all(kept) else np.flatnonzero(kept)
     pairs = (*loops.connections, *loops.welds)
     if not pairs and not loops.couplings:
         return None
@@ -406,7 +415,8 @@ def loops_of(joints: Sequence[Joint], space: Space, loops: Loops) -> Any:
             for coefficient in loop.coefficients[::-1].tolist():
                 value = coefficient + x * value
             rows.append((y - loop.first_rest - value)[None])
-        return jnp.concatenate(rows)
+        found = jnp.concatenate(rows)
+        return found if rows_kept is None else found[rows_kept]
 
     return constraint
 

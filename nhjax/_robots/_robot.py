@@ -17,7 +17,8 @@ from ..rolling import AbstractGround, Contacts
 from ._build import (
     actuators_of,
     contacts_of,
-    is_dependent,
+    independent_rows,
+    Kept,
     Layout,
     layout_of,
     loops_in,
@@ -240,8 +241,10 @@ def from_mujoco(
     - `ignore`: unsupported parts to leave out: `"actuators"`, `"contacts"`,
         `"equalities"`, `"fluid"`, `"friction loss"`, `"limits"`, `"plugins"`,
         `"springs"`, `"tendons"`.
-    - `constraints`: as for `LagrangianSystem`. By default it is `"redundant"` if
-        constraints depend on each other near the pose of the file.
+    - `constraints`: as for `LagrangianSystem`; all constraints are then kept. By
+        default, constraints that follow from others in every pose are left out, such as
+        `"across"` of the second of two wheels on one axle. If others depend on each
+        other near the pose of the file, it is `"redundant"`.
     - `friction_smoothing`: v₀ [rad/s or m/s] in the friction loss f tanh(q̇ / v₀) of a
         joint.
     - `limit_smoothing`: the width of the smooth transition at the limits of controls
@@ -285,10 +288,14 @@ def from_mujoco(
     contacts = contacts_of(compiled, layout, options, ground)
     loops = loops_in(compiled, layout, left_out["equalities"])
     loop = loops_of(layout.joints, layout.space, loops)
-    if constraints is None:
-        has_any = contacts is not None or loop is not None
-        dependent = has_any and is_dependent(compiled, layout, contacts, loop)
-        constraints = "redundant" if dependent else "independent"
+    names = loops.names
+    if constraints is None and (contacts is not None or loop is not None):
+        kept = independent_rows(compiled, layout.space, contacts, loop)
+        constraints = "independent" if kept.is_independent else "redundant"
+        names = tuple(x for x, keep in zip(names, kept.loops, strict=True) if keep)
+        loop = loops_of(layout.joints, layout.space, loops, kept.loops)
+        if contacts is not None:
+            contacts = _reduced(compiled, layout, contacts, kept, ground)
     heights = None if contacts is None else contacts.holonomic
     coordinates = _coordinates(layout)
     system = LagrangianSystem(
@@ -298,7 +305,7 @@ def from_mujoco(
         force=force_of(mechanics, known, actuators, controls, _to_mujoco(layout)),
         manifold=layout.space.manifold,
         coordinates=coordinates,
-        constraints=constraints,
+        constraints=constraints or "independent",
     )
     bodies = tuple(name_of(compiled, "body", i) for i in range(compiled.nbody))
     return Robot(
@@ -307,11 +314,25 @@ def from_mujoco(
         coordinates,
         actuators.names,
         contacts,
-        loops.names,
+        names,
         bodies,
         layout,
         tuple(np.asarray(compiled.qpos0).tolist()),
     )
+
+
+def _reduced(
+    model: Any, layout: Layout, contacts: Contacts, kept: Kept, ground: Any
+) -> Contacts | None:
+    """Return the contacts without the constraints that follow from others."""
+    pairs = list(zip(contacts.names, contacts.contacts, strict=True))
+    options = {
+        name: tuple(x for x, keep in zip(contact.no_slip, own, strict=True) if keep)
+        for (name, contact), own in zip(pairs, kept.slips, strict=True)
+    }
+    touching = [name for name, contact in pairs if contact.touches]
+    dropped = [x for x, keep in zip(touching, kept.heights, strict=True) if not keep]
+    return contacts_of(model, layout, options, ground, dropped)
 
 
 def _coordinates(layout: Layout) -> tuple[str, ...]:
