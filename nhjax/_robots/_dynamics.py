@@ -142,47 +142,44 @@ class Parameters(eqx.Module):
 def lagrangian_of(mechanics: Mechanics, parameters: Parameters) -> Any:
     """Return the Lagrangian L(t, q, v, args) of a robot.
 
-    The kinetic energy of a body with the pose T is ½ tr(Ṫ J Ṫᵀ) with its pseudo-inertia
-    J, so that the bodies of one joint add up before the motion is known.
+    The kinetic energy of all bodies between two joints is ½ ξ·M ξ with the body twist
+    ξ = (v, ω) of their frame and their constant spatial inertia M.
     """
     space, bodies = mechanics.space, mechanics.bodies
-    tree = Tree(mechanics.joints, space, bodies.joints)
+    tree = Tree(mechanics.joints, space, range(len(mechanics.joints)))
     nodes = np.asarray([tree.node[joint] for joint in bodies.joints], int)
+    spatial = np.asarray([_spatial_inertia(x) for x in bodies.inertia])
+    moments = bodies.weight[:, None] * bodies.inertia[:, 3]
+    total, total_moment = np.zeros((len(tree.node), 6, 6)), np.zeros((len(tree.node), 4))
+    np.add.at(total, nodes, spatial.reshape(-1, 6, 6))
+    np.add.at(total_moment, nodes, moments)
     has_masses = "mass" in parameters.names
-    total = np.zeros((tree.num_nodes, 4, 4))
-    np.add.at(total, nodes, bodies.inertia)
-    weights = np.zeros((tree.num_nodes, 4))
-    np.add.at(weights, nodes, bodies.weight[:, None] * bodies.inertia[:, 3])
     has_tendons = np.any(mechanics.tendon_armature) or np.any(mechanics.tendon_stiffness)
+    gravity = mechanics.gravity if np.any(mechanics.gravity) else None
 
     def inertias(args, dtype):
-        inertia, weight = jnp.asarray(total, dtype), jnp.asarray(weights, dtype)
+        inertia, moment = jnp.asarray(total, dtype), jnp.asarray(total_moment, dtype)
         if has_masses and args and args.get("mass"):
             # A body with another mass has the same shape and centre of mass.
             masses = parameters.replaced("mass", bodies.mass, args, dtype)
             change = masses / jnp.asarray(bodies.mass, dtype) - 1
-            own = change[:, None, None] * jnp.asarray(bodies.inertia, dtype)
-            inertia = inertia.at[nodes].add(own)
-            left = jnp.asarray(bodies.weight, dtype)[:, None]
-            weight = weight.at[nodes].add(left * own[:, 3])
-        return inertia, weight
+            added = change[:, None, None] * jnp.asarray(spatial, dtype)
+            inertia = inertia.at[nodes].add(added)
+            moment = moment.at[nodes].add(change[:, None] * jnp.asarray(moments, dtype))
+        return inertia, moment
 
     def lagrangian(t, q, v, args):
         parameters.check(args)
         dtype = v.dtype
-        inertia, weight = inertias(args, dtype)
-        (rotation, position), (turning, velocity) = jax.jvp(
-            tree.poses, (q,), (space.tangent(q, v),)
-        )
-        motion = jnp.concatenate([turning, velocity[..., None]], axis=-1)
-        energy = 0.5 * jnp.sum(jnp.einsum("nij,njk->nik", motion, inertia) * motion)
-        armature = parameters.replaced("armature", mechanics.armature, args, dtype)
+        inertia, moment = inertias(args, dtype)
+        twist, fall, depth = tree.motion(q, v, gravity)
+        energy = 0.5 * jnp.sum(jnp.einsum("nij,nj->ni", inertia, twist) * twist)
+        if fall is not None:
+            energy = energy + jnp.sum(moment[:, :3] * fall)
+            energy = energy + jnp.sum(moment[:, 3] * depth)
         if np.any(mechanics.armature) or "armature" in parameters.names:
+            armature = parameters.replaced("armature", mechanics.armature, args, dtype)
             energy = energy + 0.5 * jnp.sum(armature * v * v)
-        if np.any(mechanics.gravity):
-            moment = jnp.einsum("nij,nj->i", rotation, weight[:, :3])
-            moment = moment + jnp.einsum("n,ni->i", weight[:, 3], position)
-            energy = energy + jnp.sum(jnp.asarray(mechanics.gravity, dtype) * moment)
         energy = energy - _spring_energy(mechanics, parameters, q, args, dtype)
         if has_tendons:
             matrix = jnp.asarray(mechanics.tendons, dtype)
@@ -196,6 +193,21 @@ def lagrangian_of(mechanics: Mechanics, parameters: Parameters) -> Any:
         return energy
 
     return lagrangian
+
+
+def _spatial_inertia(
+    inertia: Float[np.ndarray, "4 4"],
+) -> Float[np.ndarray, "6 6"]:
+    """Return the matrix M of ½ ξ·M ξ = ½ m v² + v·(ω × m c) + ½ ω·I ω.
+
+    The pseudo-inertia gives the mass m, the moment m c and the inertia I about the
+    origin.
+    """
+    second, moment, mass = inertia[:3, :3], inertia[:3, 3], inertia[3, 3]
+    # This matrix maps ω to ω × m c.
+    across = -np.cross(moment, np.eye(3)).T
+    about = np.trace(second) * np.eye(3) - second
+    return np.block([[mass * np.eye(3), across], [across.T, about]])
 
 
 def _spring_energy(mechanics, parameters, q, args, dtype):

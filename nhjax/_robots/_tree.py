@@ -1,10 +1,9 @@
 """The kinematic tree of a robot: its joints, its configuration space and its poses.
 
-Each joint is a node of the tree, and the world is node 0. The pose of a node is the
-product of the poses of all joints on its path, each relative to the joint before it.
-Pointer doubling computes these products for all nodes at once: after k rounds a node
-knows its pose relative to its ancestor at the distance 2ᵏ. The number of operations in
-the program therefore grows as the logarithm of the depth, not as the number of joints.
+Each joint is a node of the tree. The recursions from the world to the ends of the tree
+treat all nodes at the same depth together, so that the number of operations in the
+program grows as the depth, not as the number of joints: the legs of a robot cost no
+more operations than one leg.
 """
 
 from collections.abc import Sequence
@@ -158,8 +157,23 @@ class Space:
         return jnp.concatenate([*pieces, v[place:]]) if pieces else v
 
 
+class Level(NamedTuple):
+    """The nodes at one depth.
+
+    - `nodes`: their places in the order of the joints.
+    - `parents`: for each, the place of its parent in the level before, which is the
+        world for the first level.
+    """
+
+    nodes: np.ndarray
+    parents: np.ndarray
+
+
 class Tree:
-    """The joints on the paths to some nodes, as arrays."""
+    """The joints on the paths to some joints, as arrays in the order of their depth.
+
+    `node` maps the number of a joint to its place in this order.
+    """
 
     def __init__(self, joints: Sequence[Joint], space: Space, kept: Sequence[int]):
         self.space = space
@@ -168,48 +182,117 @@ class Tree:
             while number >= 0 and number not in on_paths:
                 on_paths.add(number)
                 number = joints[number].parent
-        special = [j for part in space.parts if part.kind != "scalars" for j in part.joints]
-        scalar = [j for part in space.parts if part.kind == "scalars" for j in part.joints]
-        self.special = [
-            (i, joints[j]) for i, j in enumerate(special) if j in on_paths
+        special = _joints_of(space, ("free", "ball"))
+        scalar = _joints_of(space, ("scalars",))
+        self.special = [(i, joints[j]) for i, j in enumerate(special) if j in on_paths]
+        self.special_velocities = [
+            part.first_velocity
+            for part in space.parts
+            if part.kind != "scalars" and part.joints[0] in on_paths
         ]
         chosen = [(i, joints[j]) for i, j in enumerate(scalar) if j in on_paths]
         self.scalar = np.asarray([i for i, _ in chosen], int)
-        self.takes_all = len(chosen) == len(scalar)
-        self.turns = np.asarray([x.kind == "hinge" for _, x in chosen], bool)
+        self.num_scalars = len(scalar)
         self.reference = np.asarray([x.reference for _, x in chosen], float)
         self.constants = _motions([joint for _, joint in chosen])
-        order = [j for j in special if j in on_paths]
-        order += [j for j in scalar if j in on_paths]
-        # Node 0 is the world, which is its own parent.
-        self.node = {-1: 0} | {j: node for node, j in enumerate(order, 1)}
-        parent = np.asarray([0] + [self.node[joints[j].parent] for j in order])
-        self.rounds = []
-        while parent.any():
-            self.rounds.append(parent)
-            parent = parent[parent]
-
-    @property
-    def num_nodes(self) -> int:
-        """The number of joints on the paths, and one for the world."""
-        return len(self.node)
+        self.twists = _twists([joint for _, joint in chosen])
+        order = [j for j in (*special, *scalar) if j in on_paths]
+        self.levels: list[Level] = []
+        self.node: dict[int, int] = {}
+        before, parents = [-1], {-1}
+        while len(self.node) < len(order):
+            own = [j for j in order if joints[j].parent in parents]
+            self.levels.append(
+                Level(
+                    np.asarray([order.index(j) for j in own], int),
+                    np.asarray([before.index(joints[j].parent) for j in own], int),
+                )
+            )
+            self.node |= {j: len(self.node) + i for i, j in enumerate(own)}
+            before, parents = own, set(own)
 
     def poses(self, q: PyTree[Array]) -> tuple[Array, Array]:
         """Compute the rotations and the positions of all nodes in space."""
-        rotation, position = self._relative(q)
-        for parent in self.rounds:
-            turn = rotation[parent]
-            moved = jnp.einsum("nij,nj->ni", turn, position)
-            position = position[parent] + moved
-            rotation = jnp.einsum("nij,njk->nik", turn, rotation)
-        return rotation, position
+        all_rotations, all_positions = self._relative(q)
+        rotations, positions = [], []
+        for level in self.levels:
+            rotation = take(all_rotations, level.nodes)
+            position = take(all_positions, level.nodes)
+            if rotations:
+                turn = take(rotations[-1], level.parents)
+                moved = jnp.einsum("nij,nj->ni", turn, position)
+                position = take(positions[-1], level.parents) + moved
+                rotation = jnp.einsum("nij,njk->nik", turn, rotation)
+            rotations.append(rotation)
+            positions.append(position)
+        return jnp.concatenate(rotations), jnp.concatenate(positions)
+
+    def motion(
+        self, q: PyTree[Array], v: Array, gravity: Float[np.ndarray, "3"] | None
+    ) -> tuple[Array, Array | None, Array | None]:
+        """Compute the body twist (v, ω) of each node, and gravity in its frame.
+
+        The third result is the product of the position with gravity.
+        """
+        all_rotations, all_positions = self._relative(q)
+        all_twists = self._own_twists(v)
+        twists: list[Array] = []
+        falls: list[Array] = []
+        depths: list[Array] = []
+        for level in self.levels:
+            rotation = take(all_rotations, level.nodes)
+            position = take(all_positions, level.nodes)
+            twist = take(all_twists, level.nodes)
+            if twists:
+                parent = take(twists[-1], level.parents)
+                turning = parent[:, 3:]
+                moving = parent[:, :3] + jnp.cross(turning, position)
+                vectors = [moving, turning]
+                if gravity is not None:
+                    fall = take(falls[-1], level.parents)
+                    vectors.append(fall)
+                    depths.append(
+                        take(depths[-1], level.parents)
+                        + jnp.einsum("ni,ni->n", fall, position)
+                    )
+                turned = jnp.einsum(
+                    "nij,nki->nkj", rotation, jnp.stack(vectors, axis=1)
+                )
+                twist = twist + turned[:, :2].reshape(-1, 6)
+                if gravity is not None:
+                    falls.append(turned[:, 2])
+            elif gravity is not None:
+                constant = jnp.asarray(gravity, v.dtype)
+                falls.append(jnp.einsum("nij,i->nj", rotation, constant))
+                depths.append(jnp.einsum("ni,i->n", position, constant))
+            twists.append(twist)
+        if gravity is None:
+            return jnp.concatenate(twists), None, None
+        return tuple(map(jnp.concatenate, (twists, falls, depths)))
+
+    def _own_twists(self, v: Array) -> Array:
+        """Compute the twist of each node relative to the node before it."""
+        twists = []
+        for first, (_, joint) in zip(
+            self.special_velocities, self.special, strict=True
+        ):
+            if joint.kind == "free":
+                twist = v[first : first + 6]
+            else:
+                turning = v[first : first + 3]
+                moving = jnp.cross(jnp.asarray(joint.anchor, v.dtype), turning)
+                twist = jnp.concatenate([moving, turning])
+            twists.append(twist[None])
+        if len(self.scalar):
+            rates = take(v, self.space.scalars[self.scalar])
+            twists.append(jnp.asarray(self.twists, v.dtype) * rates[:, None])
+        return jnp.concatenate(twists)
 
     def _relative(self, q: PyTree[Array]) -> tuple[Array, Array]:
         """Compute the pose of each node relative to the node before it."""
         elements, scalars = self.space.split(q)
         dtype = scalars.dtype
-        rotations = [jnp.eye(3, dtype=dtype)[None]]
-        positions = [jnp.zeros((1, 3), dtype)]
+        rotations, positions = [], []
         for place, joint in self.special:
             element = elements[place]
             rotation = SO3().matrix(element[:4])
@@ -224,13 +307,36 @@ class Tree:
             rotations.append(rotation[None])
             positions.append(position[None])
         if len(self.scalar):
-            s = scalars if self.takes_all else scalars[self.scalar]
+            s = take(scalars, self.scalar)
             s = s - jnp.asarray(self.reference, dtype)
             motion = jnp.stack([jnp.ones_like(s), jnp.sin(s), 1 - jnp.cos(s), s])
             both = jnp.einsum("knm,kn->nm", jnp.asarray(self.constants, dtype), motion)
             rotations.append(both[:, :9].reshape(-1, 3, 3))
             positions.append(both[:, 9:])
         return jnp.concatenate(rotations), jnp.concatenate(positions)
+
+
+def _joints_of(space: Space, kinds: tuple[str, ...]) -> list[int]:
+    return [j for part in space.parts if part.kind in kinds for j in part.joints]
+
+
+def take(x: Array, places: np.ndarray) -> Array:
+    """Return rows of an array, by a slice where this is possible."""
+    first, count = (int(places[0]) if len(places) else 0), len(places)
+    if not np.array_equal(places, np.arange(first, first + count)):
+        return x[places]
+    return x if count == x.shape[0] else x[first : first + count]
+
+
+def _twists(joints: Sequence[Joint]) -> Float[np.ndarray, "n 6"]:
+    """Return the twists of scalar joints with unit rate, in their own frames."""
+    found = np.zeros((len(joints), 6))
+    for row, joint in zip(found, joints, strict=True):
+        if joint.kind == "slide":
+            row[:3] = joint.axis
+        else:
+            row[:3], row[3:] = np.cross(joint.anchor, joint.axis), joint.axis
+    return found
 
 
 def _motions(joints: Sequence[Joint]) -> Float[np.ndarray, "4 n 12"]:
@@ -262,20 +368,31 @@ class Frame(NamedTuple):
 
 
 class FramePoses:
-    """The poses of some frames as a function of (t, q, args)."""
+    """The poses of some frames in space; frames of the world are constant."""
 
     def __init__(self, joints: Sequence[Joint], space: Space, frames: Sequence[Frame]):
         self.tree = Tree(joints, space, [frame.joint for frame in frames])
-        self.nodes = np.asarray([self.tree.node[frame.joint] for frame in frames], int)
+        # The world comes after all nodes.
+        node = self.tree.node | {-1: len(self.tree.node)}
+        self.has_world = any(frame.joint < 0 for frame in frames)
+        self.nodes = np.asarray([node[frame.joint] for frame in frames], int)
         self.turns = np.stack([frame.matrix[:3, :3] for frame in frames])
         self.places = np.stack([frame.matrix[:3, 3] for frame in frames])
 
     def __call__(self, q: PyTree[Any]) -> tuple[Array, Array]:
         """Compute positions and rotations of all frames in space."""
-        rotation, position = self.tree.poses(q)
-        rotation, position = rotation[self.nodes], position[self.nodes]
-        places = jnp.asarray(self.places, position.dtype)
-        turns = jnp.asarray(self.turns, position.dtype)
+        dtype = self.tree.space.split(q)[1].dtype
+        rotations, positions = [], []
+        if self.tree.levels:
+            rotation, position = self.tree.poses(q)
+            rotations, positions = [rotation], [position]
+        if self.has_world:
+            rotations.append(jnp.eye(3, dtype=dtype)[None])
+            positions.append(jnp.zeros((1, 3), dtype))
+        rotation = take(jnp.concatenate(rotations), self.nodes)
+        position = take(jnp.concatenate(positions), self.nodes)
+        places = jnp.asarray(self.places, dtype)
+        turns = jnp.asarray(self.turns, dtype)
         position = position + jnp.einsum("nij,nj->ni", rotation, places)
         return position, jnp.einsum("nij,njk->nik", rotation, turns)
 
