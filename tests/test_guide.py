@@ -11,7 +11,7 @@ from support.pages import blocks, DOCS, page, run_page
 PAGES = (
     *("index", "start", "constraints", "forces", "friction", "lie_groups", "theory"),
     *("systems", "events", "derivatives", "engines", "performance", "machines"),
-    "gallery",
+    *("gallery", "robots"),
 )
 
 

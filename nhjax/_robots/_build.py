@@ -259,8 +259,9 @@ def actuators_of(
     moment = np.zeros((len(numbers), model.nv))
     gain, bias = np.zeros((2, len(numbers), 3))
     control_range = np.tile([-np.inf, np.inf], (len(numbers), 1))
-    force_range, joint_range = control_range.copy(), np.tile(
-        [-np.inf, np.inf], (model.nv, 1)
+    force_range, joint_range = (
+        control_range.copy(),
+        np.tile([-np.inf, np.inf], (model.nv, 1)),
     )
     tendons, tendon_numbers = fixed_tendons(model, space, False)
     for row, i in enumerate(numbers):
@@ -410,7 +411,6 @@ def contacts_of(
     """Build the contacts of the geoms that roll."""
     if not options:
         return None
-    library = mujoco()
     names = {name_of(model, "geom", i): i for i in range(model.ngeom)}
     surface = _ground(model, layout, ground)
     contacts: dict[str, AbstractContact] = {}
@@ -432,35 +432,46 @@ def contacts_of(
                 f"from_mujoco: `rolling` has {name!r}, which is fixed to the world and "
                 'cannot roll. For a URDF file pass `root="free"` or `root="planar"`.'
             )
-        pose = frame_pose(layout.joints, layout.space, frame)
-        size, kind = model.geom_size[geom], library.mjtGeom(model.geom_type[geom])
-        shared: dict[str, Any] = {
-            "no_slip": no_slip,
-            "touches": name not in without_height
-            and _height_varies(model, geom, surface, name),
-            "ground": surface,
-            "manifold": layout.space.manifold,
-        }
-        axle = (0.0, 0.0, 1.0)
-        if kind == library.mjtGeom.mjGEOM_CYLINDER:
-            contacts[name] = Wheel(pose, float(size[0]), axle=axle, **shared)
-        elif kind == library.mjtGeom.mjGEOM_CAPSULE:
-            contacts[name] = Wheel(
-                pose, 0.0, tube_radius=float(size[0]), axle=axle, **shared
-            )
-        elif kind == library.mjtGeom.mjGEOM_SPHERE:
-            contacts[name] = Ellipsoid(pose, float(size[0]), **shared)
-        elif kind == library.mjtGeom.mjGEOM_ELLIPSOID:
-            contacts[name] = Ellipsoid(pose, size.copy(), **shared)
-        else:
-            word = kind.name[7:].lower()
-            raise ValueError(
-                f"from_mujoco: the geom {name!r} is a {word}, but only a cylinder, a "
-                "capsule, a sphere or an ellipsoid can roll. Add such a geom to its "
-                'body, without mass and contacts (mass="0" contype="0" '
-                'conaffinity="0").'
-            )
+        contacts[name] = _contact(
+            model,
+            geom,
+            frame_pose(layout.joints, layout.space, frame),
+            name,
+            no_slip=no_slip,
+            ground=surface,
+            manifold=layout.space.manifold,
+            touches=name not in without_height,
+        )
     return Contacts(**contacts)
+
+
+def _contact(
+    model: Any, geom: int, pose: Any, name: str, **options: Any
+) -> AbstractContact:
+    kinds, size = mujoco().mjtGeom, model.geom_size[geom]
+    kind, radius = kinds(model.geom_type[geom]), float(size[0])
+    round_kinds = (
+        kinds.mjGEOM_CYLINDER,
+        kinds.mjGEOM_CAPSULE,
+        kinds.mjGEOM_SPHERE,
+        kinds.mjGEOM_ELLIPSOID,
+    )
+    if kind not in round_kinds:
+        word = kind.name[7:].lower()
+        raise ValueError(
+            f"from_mujoco: the geom {name!r} is a {word}, but only a cylinder, a "
+            "capsule, a sphere or an ellipsoid can roll. Add such a geom to its body, "
+            'without mass and contacts (mass="0" contype="0" conaffinity="0").'
+        )
+    if options["touches"]:
+        options["touches"] = _height_varies(model, geom, options["ground"], name)
+    axle = (0.0, 0.0, 1.0)
+    if kind == kinds.mjGEOM_CYLINDER:
+        return Wheel(pose, radius, axle=axle, **options)
+    if kind == kinds.mjGEOM_CAPSULE:
+        return Wheel(pose, 0.0, tube_radius=radius, axle=axle, **options)
+    is_sphere = kind == kinds.mjGEOM_SPHERE
+    return Ellipsoid(pose, radius if is_sphere else size.copy(), **options)
 
 
 def _ground(model: Any, layout: Layout, ground: Any) -> AbstractGround:

@@ -150,11 +150,16 @@ def lagrangian_of(mechanics: Mechanics, parameters: Parameters) -> Any:
     nodes = np.asarray([tree.node[joint] for joint in bodies.joints], int)
     spatial = np.asarray([_spatial_inertia(x) for x in bodies.inertia])
     moments = bodies.weight[:, None] * bodies.inertia[:, 3]
-    total, total_moment = np.zeros((len(tree.node), 6, 6)), np.zeros((len(tree.node), 4))
+    total, total_moment = (
+        np.zeros((len(tree.node), 6, 6)),
+        np.zeros((len(tree.node), 4)),
+    )
     np.add.at(total, nodes, spatial.reshape(-1, 6, 6))
     np.add.at(total_moment, nodes, moments)
     has_masses = "mass" in parameters.names
-    has_tendons = np.any(mechanics.tendon_armature) or np.any(mechanics.tendon_stiffness)
+    has_tendons = np.any(mechanics.tendon_armature) or np.any(
+        mechanics.tendon_stiffness
+    )
     gravity = mechanics.gravity if np.any(mechanics.gravity) else None
 
     def inertias(args, dtype):

@@ -6,7 +6,7 @@ MuJoCo is an optional dependency, and is imported when it is first needed.
 import importlib
 import os
 import xml.etree.ElementTree as ElementTree
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -85,7 +85,7 @@ def _compile_file(path: Path, root: str | None) -> Any:
     if root is not None:
         raise ValueError(
             f"from_mujoco: `root` is for URDF files only, and {path.name} is an MJCF "
-            f'file. Give its first body the joints that it needs, such as a "freejoint".'
+            'file. Give its first body the joints that it needs, such as a "freejoint".'
         )
     return _compile(_or_message(lambda: spec_of.from_file(str(path)), path), path)
 
@@ -103,8 +103,8 @@ def _set_root(robot: ElementTree.Element, path: Path, root: str | None) -> None:
     if roots == ["world"]:
         if root is not None:
             raise ValueError(
-                f"from_mujoco: {path.name} has a link named world, whose joints say how "
-                "the robot can move: omit `root`."
+                f"from_mujoco: {path.name} has a link named world, whose joints say "
+                "how the robot can move: omit `root`."
             )
         return
     if root in (None, "fixed"):
@@ -166,7 +166,7 @@ class Unsupported(NamedTuple):
 
 
 def check_supported(
-    model: Any, ignore: tuple[str, ...], rolling: tuple[str, ...]
+    model: Any, ignore: Sequence[str], rolling: Sequence[str]
 ) -> dict[str, set[int]]:
     """Raise a `ValueError` that names all parts that are neither supported nor ignored.
 
@@ -244,7 +244,9 @@ def _joints(model: Any) -> Iterator[Unsupported]:
             yield Unsupported("springs", f"joint {name!r}: a spring that yields")
         if not is_scalar:
             if np.any(model.jnt_stiffness[joint]) and model.jnt_type[joint] == 0:
-                yield Unsupported("springs", f"joint {name!r}: a spring of a free joint")
+                yield Unsupported(
+                    "springs", f"joint {name!r}: a spring of a free joint"
+                )
             if np.any(model.jnt_stiffnesspoly[joint]):
                 yield Unsupported(
                     "springs", f"joint {name!r}: a nonlinear spring of a ball joint"
@@ -319,10 +321,9 @@ def unsupported_actuators(
             int(transmissions.mjTRN_JOINTINPARENT),
         )
         is_vector = on_joint and model.jnt_type[target] < 2
-        is_motor = (
-            model.actuator_gaintype[i] == int(gains.mjGAIN_FIXED)
-            and model.actuator_biastype[i] == int(biases.mjBIAS_NONE)
-        )
+        is_motor = model.actuator_gaintype[i] == int(
+            gains.mjGAIN_FIXED
+        ) and model.actuator_biastype[i] == int(biases.mjBIAS_NONE)
         muscle = int(dynamics.mjDYN_MUSCLE), int(gains.mjGAIN_MUSCLE)
         if model.actuator_plugin[i] >= 0:
             reason = "a plugin"
@@ -356,8 +357,10 @@ def unsupported_actuators(
             reason = "a servo on a ball or free joint"
         if reason is None and np.any(model.actuator_dampingpoly[i]):
             reason = "nonlinear damping"
-        if reason is None and is_vector and (
-            model.actuator_damping[i] or model.actuator_armature[i]
+        if (
+            reason is None
+            and is_vector
+            and (model.actuator_damping[i] or model.actuator_armature[i])
         ):
             reason = "damping or armature on a ball or free joint"
         if reason is not None:
@@ -392,7 +395,7 @@ def active_equalities(model: Any) -> list[int]:
     return np.flatnonzero(model.eq_active0).tolist()
 
 
-def _contacts(model: Any, rolling: tuple[str, ...]) -> Iterator[Unsupported]:
+def _contacts(model: Any, rolling: Sequence[str]) -> Iterator[Unsupported]:
     """Yield one entry for all pairs of geoms that can touch in MuJoCo."""
     if has_flag(model, "CONTACT") or has_flag(model, "CONSTRAINT"):
         return
@@ -407,7 +410,7 @@ def _contacts(model: Any, rolling: tuple[str, ...]) -> Iterator[Unsupported]:
         )
 
 
-def _rolls(model: Any, pair: tuple[int, int], rolling: tuple[str, ...]) -> bool:
+def _rolls(model: Any, pair: tuple[int, int], rolling: Sequence[str]) -> bool:
     """Return whether a pair is a rolling geom and a geom of the world."""
     for one, other in (pair, pair[::-1]):
         is_rolling = name_of(model, "geom", one) in rolling

@@ -67,7 +67,7 @@ OPEN = {
         <geom type="ellipsoid" size="0.1 0.2 0.3" pos="0.05 0 0.3"/>
         <body name="arm" pos="0 0 0.5"><joint name="arm" axis="1 1 0"/>
         <geom type="box" size="0.2 0.05 0.05" pos="0.2 0 0"/></body></body>""",
-        """<actuator><motor name="twist" joint="top" gear="0.5 -1 2 0 0 0"/></actuator>""",
+        """<actuator><motor name="twist" joint="top" gear="0.5 -1 2"/></actuator>""",
     ),
     "arm with springs and servos": _model(
         """<body name="upper" pos="0 0 1">
@@ -78,7 +78,8 @@ OPEN = {
         <body name="tool" pos="0.4 0 0" gravcomp="0.6"><geom type="sphere" size="0.05"/>
           <body name="fore" pos="0 0 0.02">
           <joint name="elbow" axis="0 1 0" stiffness="2" ref="0.1"/>
-          <joint name="reach" type="slide" axis="1 0 0.2" stiffness="9" springref="0.1"/>
+          <joint name="reach" type="slide" axis="1 0 0.2" stiffness="9"
+            springref="0.1"/>
           <geom type="box" size="0.2 0.03 0.04" pos="0.2 0 0"/></body>
         </body></body>""",
         """<tendon><fixed name="belt" stiffness="3" damping="0.2" armature="0.05"
