@@ -284,12 +284,17 @@ def test_conversion_of_a_solution_without_states_raises():
 # --- Forces and parameters -----------------------------------------------------------
 
 
+def _force(robot, *arguments):
+    assert robot.system.force is not None
+    return robot.system.force(*arguments)
+
+
 def test_friction_loss_is_a_smooth_law_of_the_documented_scale():
     text = OPEN["cart and pole"].replace(
         'name="cart" type', 'name="cart" frictionloss="2" type'
     )
     robot = nhjax.from_mujoco(_compiled(text), friction_smoothing=0.1)
-    force = robot.system.force(0.0, jnp.zeros(2), jnp.array([0.05, 1.0]), None)
+    force = _force(robot, 0.0, jnp.zeros(2), jnp.array([0.05, 1.0]), None)
     np.testing.assert_allclose(force, [-2 * math.tanh(0.5), 0.0], atol=1e-15)
 
 
@@ -299,7 +304,7 @@ def test_friction_loss_is_a_smooth_law_of_the_documented_scale():
 def test_control_beyond_its_range_is_limited_smoothly(control, force):
     _, robot = _robot("cart and pole")
     args = {"controls": jnp.array([control])}
-    found = robot.system.force(0.0, jnp.zeros(2), jnp.zeros(2), args)
+    found = _force(robot, 0.0, jnp.zeros(2), jnp.zeros(2), args)
     np.testing.assert_allclose(found, [force, 0.0], atol=1e-14)
 
 
@@ -313,7 +318,7 @@ def test_feedback_receives_positions_and_velocities_of_mujoco():
     half = math.sqrt(0.5)
     q = (jnp.array([half, 0.0, 0.0, half, 0.0, 0.0, 0.4]), jnp.zeros(2))
     v = jnp.array([0.0, -3.0] + 6 * [0.0])
-    force = robot.system.force(0.0, q, v, None)
+    force = _force(robot, 0.0, q, v, None)
     np.testing.assert_allclose(force[6:], [0.4, 3.0], atol=1e-14)
 
 

@@ -1,6 +1,7 @@
 """The conversion of a compiled model of MuJoCo to the arrays that nhjax uses."""
 
 from collections.abc import Mapping, Sequence
+from itertools import pairwise
 from typing import Any, NamedTuple
 
 import jax
@@ -481,7 +482,7 @@ def _ground(model: Any, layout: Layout, ground: Any) -> AbstractGround:
     plane = int(mujoco().mjtGeom.mjGEOM_PLANE)
     planes = {
         name_of(model, "geom", i): i
-        for i in np.flatnonzero(model.geom_type == plane)
+        for i in np.flatnonzero(model.geom_type == plane).tolist()
         if layout.bodies[model.geom_bodyid[i]].joint < 0
     }
     if ground is None:
@@ -613,7 +614,7 @@ def independent_rows(
     first = count - sum(sizes)
     ends = first + np.cumsum([0, *sizes])
     return Kept(
-        [keep[a:b].tolist() for a, b in zip(ends[:-1], ends[1:], strict=True)],
+        [keep[a:b].tolist() for a, b in pairwise(ends.tolist())],
         keep[: len(heights)].tolist(),
         keep[len(heights) : first].tolist(),
         is_independent,

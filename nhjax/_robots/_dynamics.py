@@ -179,7 +179,7 @@ def lagrangian_of(mechanics: Mechanics, parameters: Parameters) -> Any:
         inertia, moment = inertias(args, dtype)
         twist, fall, depth = tree.motion(q, v, gravity)
         energy = 0.5 * jnp.sum(jnp.einsum("nij,nj->ni", inertia, twist) * twist)
-        if fall is not None:
+        if fall is not None and depth is not None:
             energy = energy + jnp.sum(moment[:, :3] * fall)
             energy = energy + jnp.sum(moment[:, 3] * depth)
         if np.any(mechanics.armature) or "armature" in parameters.names:

@@ -218,7 +218,7 @@ def _bodies(model: Any) -> Iterator[Unsupported]:
         yield Unsupported(None, "no joint: nothing in the model can move")
     if model.nflex:
         yield Unsupported(None, f"flexes ({model.nflex}): deformable bodies")
-    for body in np.flatnonzero(model.body_mocapid >= 0):
+    for body in np.flatnonzero(model.body_mocapid >= 0).tolist():
         name = name_of(model, "body", body)
         yield Unsupported(None, f"body {name!r}: its pose is given by mocap data")
     if model.opt.density or model.opt.viscosity:
@@ -227,7 +227,7 @@ def _bodies(model: Any) -> Iterator[Unsupported]:
             f"forces of a fluid (density {model.opt.density:g} kg/m³, viscosity "
             f"{model.opt.viscosity:g} Pa s)",
         )
-    for body in np.flatnonzero(model.body_plugin >= 0):
+    for body in np.flatnonzero(model.body_plugin >= 0).tolist():
         name = name_of(model, "body", body)
         yield Unsupported("plugins", f"body {name!r}: a plugin acts on it")
 

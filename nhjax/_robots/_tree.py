@@ -268,7 +268,8 @@ class Tree:
             twists.append(twist)
         if gravity is None:
             return jnp.concatenate(twists), None, None
-        return tuple(map(jnp.concatenate, (twists, falls, depths)))
+        joined = jnp.concatenate(twists)
+        return joined, jnp.concatenate(falls), jnp.concatenate(depths)
 
     def _own_twists(self, v: Array) -> Array:
         """Compute the twist of each node relative to the node before it."""
