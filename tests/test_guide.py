@@ -16,7 +16,9 @@ PAGES = (
 
 
 @pytest.mark.usefixtures("closed_figures")
-@pytest.mark.parametrize("name", long_but(sorted({*PAGES} - {"machines", "robots"}), PAGES))
+@pytest.mark.parametrize(
+    "name", long_but(sorted({*PAGES} - {"machines", "robots"}), PAGES)
+)
 def test_guide_page_code_runs_as_printed(name, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     run_page(name)
