@@ -12,6 +12,7 @@ from jaxtyping import Array, Float, PyTree
 from .._custom_types import Args, FloatScalarLike
 from .._errors import ShapeError
 from .._manifold import Exponential, SO3
+from . import _scalars as entries
 from ._tree import Frame, FramePoses, Joint, Space, Tree
 
 
@@ -176,12 +177,32 @@ def lagrangian_of(mechanics: Mechanics, parameters: Parameters) -> Any:
     def lagrangian(t, q, v, args):
         parameters.check(args)
         dtype = v.dtype
+        if tree.is_small and not has_masses:
+            return rest_of(q, v, args, scalar_energy(q, v))
         inertia, moment = inertias(args, dtype)
         twist, fall, depth = tree.motion(q, v, gravity)
         energy = 0.5 * jnp.sum(jnp.einsum("nij,nj->ni", inertia, twist) * twist)
         if fall is not None and depth is not None:
             energy = energy + jnp.sum(moment[:, :3] * fall)
             energy = energy + jnp.sum(moment[:, 3] * depth)
+        return rest_of(q, v, args, energy)
+
+    def scalar_energy(q, v):
+        energy: Any = 0.0
+        motion = tree.motion_of_scalars(q, v, gravity)
+        for (twist, fall, depth), own, rest in zip(
+            motion, total.tolist(), total_moment.tolist(), strict=True
+        ):
+            for i in range(6):
+                half = [0.5 * own[i][i], *own[i][i + 1 :]]
+                row = entries.dot(half, twist[i:])
+                energy = entries.add(energy, entries.times(row, twist[i]))
+            energy = entries.add(energy, entries.dot(rest, [*fall, depth]))
+        return jnp.asarray(energy, v.dtype)
+
+    def rest_of(q, v, args, energy):
+        """Add the energies of armatures, springs and tendons."""
+        dtype = v.dtype
         if np.any(mechanics.armature) or "armature" in parameters.names:
             armature = parameters.replaced("armature", mechanics.armature, args, dtype)
             energy = energy + 0.5 * jnp.sum(armature * v * v)

@@ -9,11 +9,17 @@ more operations than one leg.
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PyTree
 
 from .._manifold import AbstractLieGroup, Euclidean, ProductGroup, SE3, SO3
+from . import _scalars as entries
+
+
+# Trees with more joints are computed as arrays: tracing scalars takes longer then.
+LARGEST_OF_SCALARS = 8
 
 
 class Joint(NamedTuple):
@@ -211,6 +217,104 @@ class Tree:
             self.node |= {j: len(self.node) + i for i, j in enumerate(own)}
             before, parents = own, set(own)
 
+    @property
+    def is_small(self) -> bool:
+        """Whether the recursions are written in scalars."""
+        return len(self.node) <= LARGEST_OF_SCALARS
+
+    def poses_of_scalars(
+        self, q: PyTree[Array]
+    ) -> list[tuple[entries.Matrix, entries.Vector]]:
+        """Compute the rotation and the position of each node, entry by entry."""
+        own, poses, before = self._relative_scalars(q), [], []
+        for level in self.levels:
+            here = []
+            for node, parent in zip(level.nodes, level.parents, strict=True):
+                rotation, position = own[node]
+                if before:
+                    turn, place = before[parent]
+                    position = entries.sums(place, entries.apply(turn, position))
+                    rotation = entries.product(turn, rotation)
+                here.append((rotation, position))
+            poses, before = [*poses, *here], here
+        return poses
+
+    def motion_of_scalars(
+        self, q: PyTree[Array], v: Array, gravity: Float[np.ndarray, "3"] | None
+    ) -> list[tuple[entries.Vector, entries.Vector, entries.Entry]]:
+        """Compute what `motion` does for each node, entry by entry."""
+        own, twists = self._relative_scalars(q), self._own_twists_of_scalars(v)
+        weight = entries.known(np.zeros(3) if gravity is None else gravity)
+        found, before = [], []
+        for level in self.levels:
+            here = []
+            for node, parent in zip(level.nodes, level.parents, strict=True):
+                rotation, position = own[node]
+                above = before[parent] if before else (6 * [0.0], weight, 0.0)
+                moving, turning = above[0][:3], above[0][3:]
+                moving = entries.sums(moving, entries.cross(turning, position))
+                back = entries.transposed(rotation)
+                carried = entries.apply(back, moving) + entries.apply(back, turning)
+                depth = entries.add(above[2], entries.dot(above[1], position))
+                twist = entries.sums(carried, twists[node])
+                here.append((twist, entries.apply(back, above[1]), depth))
+            found, before = [*found, *here], here
+        return found
+
+    def _relative_scalars(
+        self, q: PyTree[Array]
+    ) -> list[tuple[entries.Matrix, entries.Vector]]:
+        special, scalars = self.space.split(q)
+        found = []
+        for place, joint in self.special:
+            matrix = SO3().matrix(special[place][:4])
+            rotation = [[matrix[i, j] for j in range(3)] for i in range(3)]
+            if joint.kind == "free":
+                position = [special[place][4 + i] for i in range(3)]
+            else:
+                offset = entries.known(joint.offset[:3, :3])
+                rotation = entries.product(offset, rotation)
+                anchor = joint.anchor.tolist()
+                start = joint.offset[:3, 3] + joint.offset[:3, :3] @ joint.anchor
+                moved = entries.apply(rotation, [-x for x in anchor])
+                position = entries.sums(start.tolist(), moved)
+            found.append((rotation, position))
+        for number, i in enumerate(self.scalar.tolist()):
+            s = jax.lax.index_in_dim(scalars, i, keepdims=False)
+            reference = float(self.reference[number])
+            s = entries.add(s, -reference)
+            first, sine, versine, linear = self.constants[:, number]
+            # In this form an axis of the frame leaves single sines and cosines.
+            parts = [1.0, 0.0, 0.0, 0.0]
+            if np.any(sine):
+                parts[1:3] = [jnp.sin(s), jnp.cos(s)]
+            if np.any(linear):
+                parts[3] = s
+            rows = entries.known(np.stack([first + versine, sine, -versine, linear]))
+            values = [entries.dot(column, parts) for column in zip(*rows, strict=True)]
+            rotation = [values[:3], values[3:6], values[6:9]]
+            found.append((rotation, values[9:]))
+        return found
+
+    def _own_twists_of_scalars(self, v: Array) -> list[entries.Vector]:
+        def component(i):
+            return jax.lax.index_in_dim(v, int(i), keepdims=False)
+
+        found = []
+        for first, (_, joint) in zip(
+            self.special_velocities, self.special, strict=True
+        ):
+            if joint.kind == "free":
+                found.append([component(first + i) for i in range(6)])
+            else:
+                turning = [component(first + i) for i in range(3)]
+                moving = entries.cross(joint.anchor.tolist(), turning)
+                found.append([*moving, *turning])
+        for twist, i in zip(self.twists, self.scalar, strict=True):
+            rate = component(self.space.scalars[i])
+            found.append([entries.times(x, rate) for x in entries.known(twist)])
+        return found
+
     def poses(self, q: PyTree[Array]) -> tuple[Array, Array]:
         """Compute the rotations and the positions of all nodes in space."""
         all_rotations, all_positions = self._relative(q)
@@ -383,6 +487,8 @@ class FramePoses:
     def __call__(self, q: PyTree[Any]) -> tuple[Array, Array]:
         """Compute positions and rotations of all frames in space."""
         dtype = self.tree.space.split(q)[1].dtype
+        if self.tree.is_small:
+            return self._of_scalars(q, dtype)
         rotations, positions = [], []
         if self.tree.levels:
             rotation, position = self.tree.poses(q)
@@ -396,6 +502,17 @@ class FramePoses:
         turns = jnp.asarray(self.turns, dtype)
         position = position + jnp.einsum("nij,nj->ni", rotation, places)
         return position, jnp.einsum("nij,njk->nik", rotation, turns)
+
+    def _of_scalars(self, q: PyTree[Any], dtype: Any) -> tuple[Array, Array]:
+        world = entries.known(np.eye(3)), 3 * [0.0]
+        poses = [*self.tree.poses_of_scalars(q), world]
+        positions, rotations = [], []
+        for node, turn, place in zip(self.nodes, self.turns, self.places, strict=True):
+            rotation, position = poses[node]
+            moved = entries.apply(rotation, entries.known(place))
+            positions.append(entries.sums(position, moved))
+            rotations.append(entries.product(rotation, entries.known(turn)))
+        return entries.stacked(positions, dtype), entries.stacked(rotations, dtype)
 
 
 def homogeneous(
