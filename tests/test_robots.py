@@ -121,8 +121,29 @@ def _by_kkt(model, data, qpos, qvel):
     return np.linalg.lstsq(matrix, right, rcond=1e-11)[0][: model.nv]
 
 
-@pytest.mark.parametrize("count", [20, pytest.param(200, marks=pytest.mark.long)])
 @pytest.mark.parametrize("name", sorted(CLOSED))
+def test_equations_of_closed_loops_at_rest_restrict_the_motions_of_mujoco(name):
+    model, robot = _robot(name)
+    data, space = mujoco.MjData(model), robot._space
+    model.opt.jacobian = int(mujoco.mjtJacobian.mjJAC_DENSE)
+    expected = _constraint_rows(model, data, model.qpos0, np.zeros(model.nv))
+    q = space.from_qpos(jnp.asarray(model.qpos0))
+
+    @jax.jit
+    def rates(qvel):
+        return robot.system.holonomic_rate(0.0, q, space.to_body(q, qvel))
+
+    found = np.stack([rates(x) for x in jnp.eye(model.nv)], axis=1)
+    rank = np.linalg.matrix_rank(expected, tol=1e-10)
+    assert np.linalg.matrix_rank(found, tol=1e-10) == rank == len(robot.loops)
+    both = np.concatenate([found, expected])
+    assert np.linalg.matrix_rank(both, tol=1e-10) == rank
+
+
+@pytest.mark.parametrize(
+    ("name", "count"),
+    [("four-bar", 20), *(pytest.param(x, 200, marks=pytest.mark.long) for x in CLOSED)],
+)
 def test_acceleration_of_closed_loops_equals_dense_equations(name, count):
     model, robot = _robot(name)
     model.opt.jacobian = int(mujoco.mjtJacobian.mjJAC_DENSE)

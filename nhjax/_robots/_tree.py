@@ -3,7 +3,8 @@
 Each joint is a node of the tree. The recursions from the world to the ends of the tree
 treat all nodes at the same depth together, so that the number of operations in the
 program grows as the depth, not as the number of joints: the legs of a robot cost no
-more operations than one leg.
+more operations than one leg. Small trees are written in scalars instead, because most
+entries of their frames are zero.
 """
 
 from collections.abc import Sequence
@@ -285,7 +286,7 @@ class Tree:
             s = entries.add(s, -reference)
             first, sine, versine, linear = self.constants[:, number]
             # In this form an axis of the frame leaves single sines and cosines.
-            parts = [1.0, 0.0, 0.0, 0.0]
+            parts: entries.Vector = [1.0, 0.0, 0.0, 0.0]
             if np.any(sine):
                 parts[1:3] = [jnp.sin(s), jnp.cos(s)]
             if np.any(linear):
