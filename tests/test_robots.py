@@ -168,7 +168,7 @@ def test_acceleration_of_closed_loops_equals_dense_equations(name, count):
     for i in range(count):
         expected = _by_kkt(model, data, qpos[i], qvel[i])
         scale = max(1.0, np.abs(expected).max())
-        np.testing.assert_allclose(found[i], expected, atol=2e-9 * scale, rtol=0)
+        np.testing.assert_allclose(found[i], expected, atol=1e-10 * scale, rtol=0)
         assert np.abs(data.efc_pos[: data.ne]).max() < 1e-10
 
 
@@ -219,6 +219,58 @@ def test_wheel_on_shared_axle_leaves_out_its_lateral_direction():
     )
     assert robot.system.constraints == "independent"
     assert robot.coordinates == ("root_TX", "root_TY", "root_RZ", "right", "left")
+
+
+def test_free_robot_with_caster_stands_on_three_heights():
+    text = OPEN["differential drive"].replace(
+        '<body name="right"',
+        '<geom name="caster" type="sphere" size="0.05" pos="0.3 0 -0.1"/>'
+        '<body name="right"',
+    )
+    for side in ("right", "left"):
+        text = text.replace(
+            f'<joint name="{side}" axis="0 1 0"/>\n        <geom',
+            f'<joint name="{side}" axis="0 1 0"/><geom name="{side}"',
+        )
+    options = {"right": "no slip", "left": "no slip", "caster": "slides"}
+    robot = nhjax.from_mujoco(_compiled(text), rolling=options)
+    assert robot.contacts is not None
+    assert robot.contacts.multiplier_names == (
+        "right along",
+        "right across",
+        "left along",
+        "right normal",
+        "left normal",
+        "caster normal",
+    )
+    forces = robot.contacts.forces(0.0, robot.initial_state(), robot.args)
+    weight = 9.81 * (5 + 3 * 0.7)
+    assert float(sum(force[2] for force in forces.values())) == pytest.approx(weight)
+
+
+def test_car_with_four_parallel_wheels_keeps_three_heights():
+    wheels = "".join(
+        f"""<body name="{x}{y}" pos="{x} {y} 0"><joint name="{x}{y}" axis="0 1 0"/>
+        <geom name="w{x}{y}" type="cylinder" size="0.15 0.02" euler="90 0 0"
+        contype="0"/></body>"""
+        for x in (-1, 1)
+        for y in (-1, 1)
+    )
+    spec = mujoco.MjSpec.from_string(
+        f"""<mujoco><worldbody><body name="car" pos="0 0 0.15"><freejoint name="car"/>
+        {BODY.format("trunk", "box")}{wheels}</body></worldbody></mujoco>"""
+    )
+    names = [f"w{x}{y}" for x in (-1, 1) for y in (-1, 1)]
+    robot = nhjax.from_mujoco(spec, rolling=names, ignore=["contacts"])
+    assert robot.system.constraints == "independent"
+    assert robot.contacts is not None
+    kept = [x.split()[1] for x in robot.contacts.multiplier_names]
+    assert {x: kept.count(x) for x in kept} == {"along": 4, "across": 2, "normal": 3}
+    every = nhjax.from_mujoco(
+        spec, rolling=names, ignore=["contacts"], constraints="redundant"
+    )
+    assert every.contacts is not None
+    assert len(every.contacts.multiplier_names) == 12
 
 
 def test_ball_that_rolls_down_a_slope_accelerates_by_five_sevenths():

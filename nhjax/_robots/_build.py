@@ -569,7 +569,7 @@ def independent_rows(
 
     Such rows are left out if the others are independent at the pose at rest and at
     random poses. Otherwise all rows are kept, since a dependence that holds in some
-    poses only, such as that of the heights of four wheels, needs all of them.
+    poses only needs all of them.
     """
     touched = () if contacts is None else contacts.contacts
     heights = [x for x in touched if x.touches]
