@@ -49,6 +49,7 @@ FLOORS = (
     ("_io",),
     ("_ensemble",),
     ("forces", "rolling"),
+    ("_robots",),
     ("friction", "systems", "diagnostics", "plot", "studies", "__main__"),
 )
 ROOMS = tuple(room for floor in FLOORS for room in floor)
@@ -459,6 +460,7 @@ _COLUMNS = {
     "_ensemble": 3.5,
     "forces": 0.7,
     "rolling": 1.2,
+    "_robots": 2.0,
     "friction": 0.8,
     "systems": 0.0,
     "diagnostics": 1.8,

@@ -79,6 +79,7 @@ from ._method import (
 )
 from ._models import from_sympy as from_sympy, SymPyModel as SymPyModel
 from ._results import RESULTS as RESULTS
+from ._robots import from_mujoco as from_mujoco, Robot as Robot
 from ._step import (
     AbstractStageSolver as AbstractStageSolver,
     Newton as Newton,

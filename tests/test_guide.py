@@ -11,12 +11,14 @@ from support.pages import blocks, DOCS, page, run_page
 PAGES = (
     *("index", "start", "constraints", "forces", "friction", "lie_groups", "theory"),
     *("systems", "events", "derivatives", "engines", "performance", "machines"),
-    *("gallery", "step_sizes"),
+    *("gallery", "robots", "step_sizes"),
 )
 
 
 @pytest.mark.usefixtures("closed_figures")
-@pytest.mark.parametrize("name", long_but(sorted({*PAGES} - {"machines"}), PAGES))
+@pytest.mark.parametrize(
+    "name", long_but(sorted({*PAGES} - {"machines", "robots"}), PAGES)
+)
 def test_guide_page_code_runs_as_printed(name, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     run_page(name)

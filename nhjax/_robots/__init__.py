@@ -1,0 +1,3 @@
+"""Robots from files in the formats MJCF and URDF, with wheels that roll."""
+
+from ._robot import from_mujoco as from_mujoco, Robot as Robot

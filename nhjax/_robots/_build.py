@@ -1,0 +1,626 @@
+"""The conversion of a compiled model of MuJoCo to the arrays that nhjax uses."""
+
+from collections.abc import Mapping, Sequence
+from itertools import pairwise
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from ..rolling import AbstractContact, AbstractGround, Contacts, Ellipsoid, Plane, Wheel
+from ._dynamics import (
+    Actuators,
+    BallSpring,
+    Bodies,
+    Connection,
+    Coupling,
+    frame_pose,
+    KINDS,
+    Loops,
+    Mechanics,
+    Parameters,
+)
+from ._read import active_equalities, has_flag, is_fixed_tendon, mujoco, name_of
+from ._tree import Frame, homogeneous, Joint, Space
+
+
+_KINDS = ("free", "ball", "slide", "hinge")
+
+
+class Layout:
+    """The joints of a model, and the frame of each body relative to its last joint.
+
+    It is compared by identity, so that it can be a part of the structure of a `Robot`.
+    """
+
+    def __init__(self, joints: Sequence[Joint], bodies: Sequence[Frame]):
+        self.joints = tuple(joints)
+        self.bodies = tuple(bodies)
+        self.space = Space(self.joints)
+
+
+def layout_of(model: Any) -> Layout:
+    """Read the kinematic tree."""
+    joints: list[Joint] = []
+    bodies = [Frame(-1, np.eye(4))]
+    for body in range(1, model.nbody):
+        parent = bodies[model.body_parentid[body]]
+        own = homogeneous(model.body_pos[body], model.body_quat[body])
+        last, offset = parent.joint, parent.matrix @ own
+        first = model.body_jntadr[body]
+        for number in range(first, first + model.body_jntnum[body]):
+            kind = _KINDS[model.jnt_type[number]]
+            place = model.jnt_qposadr[number]
+            joints.append(
+                Joint(
+                    name_of(model, "joint", number),
+                    kind,
+                    last,
+                    offset,
+                    model.jnt_pos[number].copy(),
+                    model.jnt_axis[number].copy(),
+                    float(model.qpos0[place]) if kind in ("slide", "hinge") else 0.0,
+                )
+            )
+            last, offset = number, np.eye(4)
+        bodies.append(Frame(last, offset))
+    return Layout(joints, bodies)
+
+
+def fixed_to(layout: Layout, body: int, position: Any, quaternion: Any) -> Frame:
+    """Return a frame that is fixed to a body, such as that of a geom or a site."""
+    frame = layout.bodies[body]
+    return Frame(frame.joint, frame.matrix @ homogeneous(position, quaternion))
+
+
+def mechanics_of(
+    model: Any, layout: Layout, ignore: Sequence[str], friction_smoothing: float
+) -> Mechanics:
+    """Read inertias, springs, damping, friction and tendons."""
+    space = layout.space
+    damping = np.concatenate(
+        [model.dof_damping[None], np.reshape(model.dof_dampingpoly, (-1, 2)).T]
+    )
+    armature = model.dof_armature.copy()
+    tendons, numbers = fixed_tendons(model, space, "tendons" in ignore)
+    tendon_armature = model.tendon_armature[numbers].copy()
+    tendon_damping = model.tendon_damping[numbers].copy()
+    # MuJoCo adds these numbers of actuators to those of joints and tendons.
+    for i in range(model.nactuator):
+        square = model.actuator_gear[model.actuator_outadr[i], 0] ** 2
+        target, kind = model.actuator_trnid[i, 0], model.actuator_trntype[i]
+        added = square * model.actuator_damping[i], square * model.actuator_armature[i]
+        if not any(added):
+            continue
+        if kind == int(mujoco().mjtTrn.mjTRN_TENDON):
+            tendon_damping[numbers.index(target)] += added[0]
+            tendon_armature[numbers.index(target)] += added[1]
+        else:
+            damping[0, model.jnt_dofadr[target]] += added[0]
+            armature[model.jnt_dofadr[target]] += added[1]
+    if has_flag(model, "DAMPER"):
+        damping, tendon_damping = 0 * damping, 0 * tendon_damping
+    friction = model.dof_frictionloss.copy()
+    without = "friction loss" in ignore
+    if without or has_flag(model, "FRICTIONLOSS") or has_flag(model, "CONSTRAINT"):
+        friction[:] = 0
+
+    scalar = [j for j, joint in enumerate(layout.joints) if joint.kind in _KINDS[2:]]
+    stiffness = np.concatenate(
+        [model.jnt_stiffness[None], np.reshape(model.jnt_stiffnesspoly, (-1, 2)).T]
+    )
+    stiffness[:, (model.jnt_springyield > 0)] = 0
+    if has_flag(model, "SPRING"):
+        stiffness[:] = 0
+    ball_springs = [
+        BallSpring(
+            j,
+            float(stiffness[0, j]),
+            model.qpos_spring[model.jnt_qposadr[j] :][:4].copy(),
+        )
+        for j, joint in enumerate(layout.joints)
+        if joint.kind == "ball" and stiffness[0, j]
+    ]
+    tendon_stiffness = model.tendon_stiffness[numbers].copy()
+    lengths = model.tendon_lengthspring[numbers]
+    is_linear = (lengths[:, 0] == lengths[:, 1]) & (
+        model.tendon_springyield[numbers] == 0
+    )
+    tendon_stiffness[~is_linear] = 0
+    if has_flag(model, "SPRING"):
+        tendon_stiffness[:] = 0
+    gravity = 0 * model.opt.gravity if has_flag(model, "GRAVITY") else model.opt.gravity
+    return Mechanics(
+        layout.joints,
+        space,
+        _bodies(model, layout),
+        np.array(gravity),
+        armature,
+        damping,
+        friction,
+        friction_smoothing,
+        stiffness[:, scalar],
+        model.qpos_spring[model.jnt_qposadr[scalar]].copy(),
+        tuple(ball_springs),
+        tendons,
+        tendon_armature,
+        tendon_damping,
+        tendon_stiffness,
+        lengths[:, 0].copy(),
+    )
+
+
+def _bodies(model: Any, layout: Layout) -> Bodies:
+    names, joints, inertias, masses, weights = [], [], [], [], []
+    for body in range(1, model.nbody):
+        frame, mass = layout.bodies[body], float(model.body_mass[body])
+        if frame.joint < 0 or (mass == 0 and not model.body_inertia[body].any()):
+            continue
+        own = homogeneous(model.body_ipos[body], model.body_iquat[body])
+        place = frame.matrix @ own
+        moments = model.body_inertia[body]
+        inner = np.diag([*(0.5 * moments.sum() - moments), mass])
+        names.append(name_of(model, "body", body))
+        joints.append(frame.joint)
+        inertias.append(place @ inner @ place.T)
+        masses.append(mass)
+        weights.append(1 - model.body_gravcomp[body])
+    return Bodies(
+        tuple(names),
+        tuple(joints),
+        np.stack(inertias) if inertias else np.zeros((0, 4, 4)),
+        np.asarray(masses, float),
+        np.asarray(weights, float),
+    )
+
+
+def fixed_tendons(
+    model: Any, space: Space, without: bool
+) -> tuple[np.ndarray, list[int]]:
+    """Return the rows of the fixed tendons, and their numbers."""
+    numbers = [
+        i for i in range(model.ntendon) if not without and is_fixed_tendon(model, i)
+    ]
+    rows = np.zeros((len(numbers), len(space.scalars)))
+    place = {int(dof): i for i, dof in enumerate(space.scalars)}
+    for row, tendon in zip(rows, numbers, strict=True):
+        first = model.tendon_adr[tendon]
+        for wrap in range(first, first + model.tendon_num[tendon]):
+            dof = int(model.jnt_dofadr[model.wrap_objid[wrap]])
+            row[place[dof]] += model.wrap_prm[wrap]
+    return rows, numbers
+
+
+def parameters_of(
+    model: Any,
+    mechanics: Mechanics,
+    controls: tuple[str, ...],
+    given: Mapping[str, Sequence[str]] | None,
+) -> tuple[Parameters, dict[str, Any]]:
+    """Return the parameters that `args` may replace, and their values."""
+    places: dict[str, dict[str, tuple[int, ...]]] = {}
+    values: dict[str, Any] = {}
+    bodies = {name: (i,) for i, name in enumerate(mechanics.bodies.names)}
+    scalars = [x.name for x in mechanics.joints if x.kind in _KINDS[2:]]
+    velocities = {}
+    for number, joint in enumerate(mechanics.joints):
+        first = int(model.jnt_dofadr[number])
+        size = {"free": 6, "ball": 3}.get(joint.kind, 1)
+        velocities[joint.name] = tuple(range(first, first + size))
+    of_scalars = {name: (i,) for i, name in enumerate(scalars)}
+    known = {
+        "mass": (bodies, mechanics.bodies.mass),
+        "damping": (velocities, mechanics.damping[0]),
+        "armature": (velocities, mechanics.armature),
+        "friction": ({x: velocities[x] for x in scalars}, mechanics.friction),
+        "stiffness": (of_scalars, mechanics.stiffness[0]),
+    }
+    if given is not None and not isinstance(given, Mapping):
+        raise TypeError(
+            "from_mujoco: `parameters` must be a dictionary such as "
+            f'{{"mass": ["arm"], "damping": ["hinge"]}}, got {type(given).__name__}.'
+        )
+    for kind, names in (given or {}).items():
+        if kind not in known:
+            raise ValueError(
+                f"from_mujoco: `parameters` has the unknown kind {kind!r}; the kinds "
+                f"are {', '.join(KINDS)}."
+            )
+        if isinstance(names, str):
+            raise TypeError(
+                f"from_mujoco: `parameters[{kind!r}]` must be a sequence of names, got "
+                f"{names!r}; write [{names!r}]."
+            )
+        all_places, numbers = known[kind]
+        for name in names:
+            if name not in all_places:
+                raise ValueError(
+                    f"from_mujoco: `parameters[{kind!r}]` has {name!r}, but the names "
+                    f"are {', '.join(all_places)}."
+                )
+        places[kind] = {name: all_places[name] for name in names}
+        values[kind] = {name: float(numbers[all_places[name][0]]) for name in names}
+    return Parameters(places, controls), values
+
+
+def actuators_of(
+    model: Any, space: Space, left_out: set[int], smoothing: float
+) -> Actuators:
+    """Read the actuators that are supported."""
+    library = mujoco()
+    disabled = model.opt.disableactuator
+    numbers = [
+        i
+        for i in range(model.nactuator)
+        if i not in left_out and not disabled >> int(model.actuator_group[i]) & 1
+    ]
+    if has_flag(model, "ACTUATION"):
+        numbers = []
+    moment = np.zeros((len(numbers), model.nv))
+    gain, bias = np.zeros((2, len(numbers), 3))
+    control_range = np.tile([-np.inf, np.inf], (len(numbers), 1))
+    force_range, joint_range = (
+        control_range.copy(),
+        np.tile([-np.inf, np.inf], (model.nv, 1)),
+    )
+    tendons, tendon_numbers = fixed_tendons(model, space, False)
+    for row, i in enumerate(numbers):
+        gear = model.actuator_gear[model.actuator_outadr[i]]
+        target = model.actuator_trnid[i, 0]
+        if model.actuator_trntype[i] == int(library.mjtTrn.mjTRN_TENDON):
+            moment[row, space.scalars] = gear[0] * tendons[tendon_numbers.index(target)]
+        else:
+            size = {0: 6, 1: 3}.get(int(model.jnt_type[target]), 1)
+            first = model.jnt_dofadr[target]
+            moment[row, first : first + size] = gear[:size]
+        gain[row, 0] = model.actuator_gainprm[i, 0]
+        if model.actuator_gaintype[i] == int(library.mjtGain.mjGAIN_AFFINE):
+            gain[row] = model.actuator_gainprm[i, :3]
+        if model.actuator_biastype[i] == int(library.mjtBias.mjBIAS_AFFINE):
+            bias[row] = model.actuator_biasprm[i, :3]
+        control = model.actuator_ctrladr[i]
+        if model.actuator_ctrllimited[control] and not has_flag(model, "CLAMPCTRL"):
+            control_range[row] = model.actuator_ctrlrange[control]
+        if model.actuator_forcelimited[i]:
+            force_range[row] = model.actuator_forcerange[i]
+    for joint in np.flatnonzero(model.jnt_actfrclimited):
+        if model.jnt_type[joint] >= 2:
+            joint_range[model.jnt_dofadr[joint]] = model.jnt_actfrcrange[joint]
+    return Actuators(
+        tuple(name_of(model, "actuator", i) for i in numbers),
+        moment,
+        gain,
+        bias,
+        control_range,
+        force_range,
+        joint_range,
+        smoothing,
+    )
+
+
+def loops_in(model: Any, layout: Layout, left_out: set[int]) -> Loops:
+    """Read the equality constraints that are supported."""
+    library = mujoco()
+    kinds, site = library.mjtEq, int(library.mjtObj.mjOBJ_SITE)
+    connections, welds, couplings = [], [], []
+    space = layout.space
+    place = {int(dof): i for i, dof in enumerate(space.scalars)}
+    tendons, tendon_numbers = fixed_tendons(model, space, False)
+
+    def joint_row(joint):
+        row = np.zeros(len(space.scalars))
+        row[place[int(model.jnt_dofadr[joint])]] = 1
+        return row, float(model.qpos0[model.jnt_qposadr[joint]])
+
+    def tendon_row(tendon):
+        row = tendons[tendon_numbers.index(tendon)]
+        return row, float(model.tendon_length0[tendon])
+
+    for i in active_equalities(model):
+        if i in left_out:
+            continue
+        kind, data, name = (
+            int(model.eq_type[i]),
+            model.eq_data[i],
+            name_of(model, "equality", i),
+        )
+        ends = int(model.eq_obj1id[i]), int(model.eq_obj2id[i])
+        if kind in (int(kinds.mjEQ_JOINT), int(kinds.mjEQ_TENDON)):
+            row_of = joint_row if kind == int(kinds.mjEQ_JOINT) else tendon_row
+            first, first_rest = row_of(ends[0])
+            second, second_rest = np.zeros(len(space.scalars)), 0.0
+            if ends[1] >= 0:
+                second, second_rest = row_of(ends[1])
+            couplings.append(
+                Coupling(name, second, second_rest, first, first_rest, data[:5].copy())
+            )
+            continue
+        none = np.array([1.0, 0, 0, 0])
+        is_weld = kind == int(kinds.mjEQ_WELD)
+        if model.eq_objtype[i] == site:
+            frames = [
+                fixed_to(
+                    layout, model.site_bodyid[x], model.site_pos[x], model.site_quat[x]
+                )
+                for x in ends
+            ]
+        elif is_weld:
+            # The first body has the pose data[3:10] relative to the anchor of the
+            # second one at data[:3].
+            frames = [
+                fixed_to(layout, ends[0], data[3:6], data[6:10]),
+                fixed_to(layout, ends[1], data[:3], none),
+            ]
+        else:
+            frames = [
+                fixed_to(layout, ends[0], data[:3], none),
+                fixed_to(layout, ends[1], data[3:6], none),
+            ]
+        if is_weld and data[10] != 0:
+            welds.append(Connection(name, *frames))
+        else:
+            connections.append(Connection(name, *frames))
+    return Loops(tuple(connections), tuple(welds), tuple(couplings))
+
+
+# --- Rolling --------------------------------------------------------------------------
+
+_WORDS = {
+    "no slip": ("along", "across"),
+    "no lateral slip": ("across",),
+    "no longitudinal slip": ("along",),
+    "slides": (),
+}
+
+
+def rolling_options(rolling: Any) -> dict[str, tuple[Any, ...]]:
+    """Convert `rolling` to the directions without slip of each geom."""
+    if rolling is None:
+        return {}
+    if isinstance(rolling, str):
+        raise TypeError(
+            f"from_mujoco: `rolling` must be a sequence or a dictionary, got "
+            f"{rolling!r}; write `rolling=({rolling!r},)`."
+        )
+    if not isinstance(rolling, Mapping):
+        rolling = dict.fromkeys(rolling, "no slip")
+    found = {}
+    for name, option in rolling.items():
+        if isinstance(option, str) and option in _WORDS:
+            found[name] = _WORDS[option]
+        elif isinstance(option, float | int):
+            found[name] = (float(option),)
+        elif isinstance(option, tuple):
+            found[name] = option
+        else:
+            raise ValueError(
+                f"from_mujoco: `rolling[{name!r}]` must be one of "
+                f"{', '.join(map(repr, _WORDS))}, an angle in radians, or a tuple such "
+                f"as `no_slip` of `nhjax.rolling.Wheel`, got {option!r}."
+            )
+    return found
+
+
+def contacts_of(
+    model: Any,
+    layout: Layout,
+    options: Mapping[str, Any],
+    ground: Any,
+    without_height: Sequence[str] = (),
+) -> Contacts | None:
+    """Build the contacts of the geoms that roll."""
+    if not options:
+        return None
+    names = {name_of(model, "geom", i): i for i in range(model.ngeom)}
+    surface = _ground(model, layout, ground)
+    contacts: dict[str, AbstractContact] = {}
+    for name, no_slip in options.items():
+        if name not in names:
+            listed = ", ".join(names) or "none; give the geom a name"
+            raise ValueError(
+                f"from_mujoco: `rolling` has {name!r}, but the geoms are {listed}."
+            )
+        geom = names[name]
+        frame = fixed_to(
+            layout,
+            model.geom_bodyid[geom],
+            model.geom_pos[geom],
+            model.geom_quat[geom],
+        )
+        if frame.joint < 0:
+            raise ValueError(
+                f"from_mujoco: `rolling` has {name!r}, which is fixed to the world and "
+                'cannot roll. For a URDF file pass `root="free"` or `root="planar"`.'
+            )
+        contacts[name] = _contact(
+            model,
+            geom,
+            frame_pose(layout.joints, layout.space, frame),
+            name,
+            no_slip=no_slip,
+            ground=surface,
+            manifold=layout.space.manifold,
+            touches=name not in without_height,
+        )
+    return Contacts(**contacts)
+
+
+def _contact(
+    model: Any, geom: int, pose: Any, name: str, **options: Any
+) -> AbstractContact:
+    kinds, size = mujoco().mjtGeom, model.geom_size[geom]
+    kind, radius = kinds(model.geom_type[geom]), float(size[0])
+    round_kinds = (
+        kinds.mjGEOM_CYLINDER,
+        kinds.mjGEOM_CAPSULE,
+        kinds.mjGEOM_SPHERE,
+        kinds.mjGEOM_ELLIPSOID,
+    )
+    if kind not in round_kinds:
+        word = kind.name[7:].lower()
+        raise ValueError(
+            f"from_mujoco: the geom {name!r} is a {word}, but only a cylinder, a "
+            "capsule, a sphere or an ellipsoid can roll. Add such a geom to its body, "
+            'without mass and contacts (mass="0" contype="0" conaffinity="0").'
+        )
+    if options["touches"]:
+        options["touches"] = _height_varies(model, geom, options["ground"], name)
+    axle = (0.0, 0.0, 1.0)
+    if kind == kinds.mjGEOM_CYLINDER:
+        return Wheel(pose, radius, axle=axle, **options)
+    if kind == kinds.mjGEOM_CAPSULE:
+        return Wheel(pose, 0.0, tube_radius=radius, axle=axle, **options)
+    is_sphere = kind == kinds.mjGEOM_SPHERE
+    return Ellipsoid(pose, radius if is_sphere else size.copy(), **options)
+
+
+def _ground(model: Any, layout: Layout, ground: Any) -> AbstractGround:
+    """Return the ground: the plane of the model, or z = 0."""
+    if isinstance(ground, AbstractGround):
+        return ground
+    plane = int(mujoco().mjtGeom.mjGEOM_PLANE)
+    planes = {
+        name_of(model, "geom", i): i
+        for i in np.flatnonzero(model.geom_type == plane).tolist()
+        if layout.bodies[model.geom_bodyid[i]].joint < 0
+    }
+    if ground is None:
+        if not planes:
+            return Plane()
+        if len(planes) > 1:
+            raise ValueError(
+                f"from_mujoco: the model has the planes {', '.join(planes)}: pass the "
+                "name of the one that the wheels touch as `ground`."
+            )
+        (ground,) = planes
+    if ground not in planes:
+        raise ValueError(
+            "from_mujoco: `ground` must be the name of a plane of the world "
+            f"({', '.join(planes) or 'there is none'}) or a ground of `nhjax.rolling`, "
+            f"got {ground!r}."
+        )
+    geom = planes[ground]
+    frame = fixed_to(
+        layout, model.geom_bodyid[geom], model.geom_pos[geom], model.geom_quat[geom]
+    )
+    normal = frame.matrix[:3, 2]
+    # An exact direction of an axis keeps zeros out of the program.
+    normal = np.where(np.abs(normal) < 1e-15, 0.0, normal)
+    return Plane(normal, height=float(normal @ frame.matrix[:3, 3]))
+
+
+def _height_varies(model: Any, geom: int, ground: AbstractGround, name: str) -> bool:
+    """Return whether the joints can change the height of a geom above the ground."""
+    if not isinstance(ground, Plane):
+        return True
+    normal = np.asarray(ground.unit_normal("float32"), float)
+    normal /= np.linalg.norm(normal)
+    data, heights = mujoco().MjData(model), []
+    rng = np.random.default_rng(0)
+    for _ in range(4):
+        data.qpos[:] = model.qpos0
+        mujoco().mj_integratePos(model, data.qpos, rng.normal(size=model.nv), 0.5)
+        mujoco().mj_kinematics(model, data)
+        turn = data.geom_xmat[geom].reshape(3, 3)
+        size = model.geom_size[geom]
+        kind = mujoco().mjtGeom(model.geom_type[geom])
+        reach = float(size[0])
+        if kind == mujoco().mjtGeom.mjGEOM_CYLINDER:
+            reach *= np.sqrt(max(0.0, 1 - (turn[:, 2] @ normal) ** 2))
+        elif kind == mujoco().mjtGeom.mjGEOM_ELLIPSOID:
+            reach = float(np.linalg.norm(size * (turn.T @ normal)))
+        height = float(np.asarray(ground.height))
+        heights.append(data.geom_xpos[geom] @ normal - reach - height)
+    scale = max(1.0, float(np.abs(model.geom_size[geom]).max()))
+    if np.ptp(heights) > 1e-9 * scale:
+        return True
+    if abs(heights[0]) > 1e-6 * scale:
+        place = "above" if heights[0] > 0 else "below"
+        raise ValueError(
+            f"from_mujoco: the geom {name!r} is {abs(heights[0]):.3g} m {place} the "
+            "ground, and no joint changes its height: move it, or pass another ground."
+        )
+    return False
+
+
+# --- Dependent constraints ------------------------------------------------------------
+
+
+class Kept(NamedTuple):
+    """The rows of the constraints to enforce.
+
+    - `slips`: for each contact, whether to keep each of its directions without slip.
+    - `heights`: for each contact that touches, whether to keep its height.
+    - `loops`: whether to keep each equation of the closed loops.
+    - `is_independent`: whether these rows are independent near the pose at rest.
+    """
+
+    slips: list[list[bool]]
+    heights: list[bool]
+    loops: list[bool]
+    is_independent: bool
+
+
+def independent_rows(
+    model: Any, space: Space, contacts: Contacts | None, loop: Any
+) -> Kept:
+    """Find the constraints that follow from the others in every pose.
+
+    Such rows are left out if the others are independent at the pose at rest and at
+    random poses. Otherwise all rows are kept, since a dependence that holds in some
+    poses only needs all of them.
+    """
+    touched = () if contacts is None else contacts.contacts
+    heights = [x for x in touched if x.touches]
+    slips = [x for x in touched if x.no_slip]
+
+    def positions(q):
+        rows = [x.height(0.0, q)[None] for x in heights]
+        if loop is not None:
+            rows.append(loop(0.0, q, None))
+        return jnp.concatenate(rows)
+
+    def rates(q, v):
+        # Positions come first: a velocity that follows from them is left out.
+        rows = []
+        if heights or loop is not None:
+            rows.append(jax.jvp(positions, (q,), (space.tangent(q, v),))[1])
+        return jnp.concatenate([*rows, *(x.slip(0.0, q, v) for x in slips)])
+
+    @jax.jit
+    def matrix(qpos):
+        q, unit = space.from_qpos(qpos), jnp.eye(model.nv, dtype=qpos.dtype)
+        return jax.vmap(lambda v: rates(q, v))(unit).T
+
+    rng, found = np.random.default_rng(1), []
+    for size in (0.3, 0.3, 0.0):
+        qpos = model.qpos0.copy()
+        mujoco().mj_integratePos(model, qpos, rng.normal(size=model.nv), size)
+        rows = np.asarray(matrix(jnp.asarray(qpos, jnp.result_type(float))), float)
+        if np.isfinite(rows).all():
+            lengths = np.linalg.norm(rows, axis=1, keepdims=True)
+            found.append(rows / np.where(lengths > 1e-8, lengths, np.inf))
+    count = len(found[0]) if found else 0
+    kept: list[int] = []
+    for row in range(count):
+        if _rank(found[0][[*kept, row]]) > len(kept):
+            kept.append(row)
+    is_independent = all(
+        _rank(x[kept]) == len(kept) and _rank(x) == len(kept) for x in found
+    )
+    keep = np.isin(np.arange(count), kept) | (not is_independent)
+    sizes = [len(x.no_slip) for x in touched]
+    first = count - sum(sizes)
+    ends = first + np.cumsum([0, *sizes])
+    return Kept(
+        [keep[a:b].tolist() for a, b in pairwise(ends.tolist())],
+        keep[: len(heights)].tolist(),
+        keep[len(heights) : first].tolist(),
+        is_independent,
+    )
+
+
+def _rank(rows: np.ndarray) -> int:
+    tolerance = 1e-8 if jnp.result_type(float) == jnp.float64 else 1e-4
+    return int(np.linalg.matrix_rank(rows, tol=tolerance)) if len(rows) else 0

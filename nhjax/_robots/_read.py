@@ -1,0 +1,453 @@
+"""Reading a model with MuJoCo's compiler, and the parts that nhjax does not support.
+
+MuJoCo is an optional dependency, and is imported when it is first needed.
+"""
+
+import importlib
+import os
+import xml.etree.ElementTree as ElementTree
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from .._errors import check_choice
+
+
+IGNORABLE = (
+    "actuators",
+    "contacts",
+    "equalities",
+    "fluid",
+    "friction loss",
+    "limits",
+    "plugins",
+    "springs",
+    "tendons",
+)
+
+
+def mujoco() -> Any:
+    """Import MuJoCo, or raise an `ImportError` that says how to install it."""
+    try:
+        return importlib.import_module("mujoco")
+    except ImportError as error:
+        raise ImportError(
+            'from_mujoco needs MuJoCo: pip install "nhjax[robots]".'
+        ) from error
+
+
+def compile_model(model: Any, root: str | None) -> Any:
+    """Return the compiled model of a file, an `MjSpec` or an `MjModel`."""
+    library = mujoco()
+    if root is not None:
+        check_choice("from_mujoco: `root`", root, ("free", "planar", "fixed"))
+    if isinstance(model, library.MjModel | library.MjSpec):
+        if root is not None:
+            raise ValueError(
+                "from_mujoco: `root` is for URDF files only. Give the first body of "
+                f"this {type(model).__name__} the joints that it needs."
+            )
+        if isinstance(model, library.MjModel):
+            return model
+        return _compile(model, "the MjSpec")
+    if not isinstance(model, str | os.PathLike):
+        raise TypeError(
+            "from_mujoco: `model` must be the path of an MJCF or URDF file, a "
+            f"mujoco.MjSpec or a mujoco.MjModel, got {type(model).__name__}."
+        )
+    return _compile_file(Path(model), root)
+
+
+def _compile_file(path: Path, root: str | None) -> Any:
+    if not path.is_file():
+        is_text = str(path).lstrip().startswith("<")
+        advice = (
+            " To read a string, pass `mujoco.MjSpec.from_string(text)`."
+            if is_text
+            else ""
+        )
+        shown = f"{str(path)[:60]}..." if is_text else str(path)
+        raise FileNotFoundError(f"from_mujoco: there is no file {shown}.{advice}")
+    try:
+        tree = ElementTree.parse(path)
+    except ElementTree.ParseError as error:
+        raise ValueError(f"from_mujoco: {path} is not an XML file: {error}.") from error
+    spec_of = mujoco().MjSpec
+    if tree.getroot().tag == "robot":
+        _set_root(tree.getroot(), path, root)
+        text = ElementTree.tostring(tree.getroot(), encoding="unicode")
+        spec = _or_message(lambda: spec_of.from_string(text), path)
+        # Meshes are searched for beside the file.
+        spec.modelfiledir = str(path.parent)
+        return _compile(spec, path)
+    if root is not None:
+        raise ValueError(
+            f"from_mujoco: `root` is for URDF files only, and {path.name} is an MJCF "
+            'file. Give its first body the joints that it needs, such as a "freejoint".'
+        )
+    return _compile(_or_message(lambda: spec_of.from_file(str(path)), path), path)
+
+
+def _set_root(robot: ElementTree.Element, path: Path, root: str | None) -> None:
+    """Add the joint between the world and the root link of a URDF file."""
+    links = [link.get("name") for link in robot.findall("link")]
+    children = [child.get("link") for child in robot.findall("joint/child")]
+    roots = [name for name in links if name not in children]
+    if len(roots) != 1:
+        raise ValueError(
+            f"from_mujoco: {path.name} has {len(roots)} root links "
+            f"({', '.join(map(str, roots))}), but a robot has one."
+        )
+    if roots == ["world"]:
+        if root is not None:
+            raise ValueError(
+                f"from_mujoco: {path.name} has a link named world, whose joints say "
+                "how the robot can move: omit `root`."
+            )
+        return
+    if root in (None, "fixed"):
+        return
+    kind = {"free": "floating", "planar": "planar"}[root]
+    ElementTree.SubElement(robot, "link", name="world")
+    joint = ElementTree.SubElement(robot, "joint", name="root", type=kind)
+    ElementTree.SubElement(joint, "parent", link="world")
+    ElementTree.SubElement(joint, "child", link=str(roots[0]))
+    ElementTree.SubElement(joint, "axis", xyz="0 0 1")
+
+
+def is_fixed_urdf(model: Any) -> bool:
+    """Return whether a file is a URDF whose root link MuJoCo fixes to the world."""
+    if not isinstance(model, str | os.PathLike):
+        return False
+    robot = ElementTree.parse(Path(model)).getroot()
+    return robot.tag == "robot" and all(
+        link.get("name") != "world" for link in robot.findall("link")
+    )
+
+
+def _compile(spec: Any, name: Any) -> Any:
+    return _or_message(spec.compile, name)
+
+
+def _or_message(function: Any, name: Any) -> Any:
+    try:
+        return function()
+    except ValueError as error:
+        raise ValueError(f"from_mujoco: MuJoCo cannot read {name}: {error}") from error
+
+
+def name_of(model: Any, kind: str, number: int) -> str:
+    """Return the name of a part, or its kind and its number if it has none."""
+    objects = mujoco().mjtObj
+    code = getattr(objects, f"mjOBJ_{kind.upper()}")
+    return mujoco().mj_id2name(model, code, number) or f"{kind}{number}"
+
+
+def has_flag(model: Any, name: str) -> bool:
+    """Return whether the options of a model disable a feature."""
+    return bool(
+        model.opt.disableflags & int(getattr(mujoco().mjtDisableBit, f"mjDSBL_{name}"))
+    )
+
+
+# --- Parts that are not supported -----------------------------------------------------
+
+
+class Unsupported(NamedTuple):
+    """A part of a model that nhjax does not support.
+
+    `category` is the word for `ignore`, or None if the part cannot be ignored.
+    """
+
+    category: str | None
+    what: str
+
+
+def check_supported(
+    model: Any, ignore: Sequence[str], rolling: Sequence[str]
+) -> dict[str, set[int]]:
+    """Raise a `ValueError` that names all parts that are neither supported nor ignored.
+
+    Return the numbers of the parts to leave out: actuators, tendons and equalities.
+    """
+    if isinstance(ignore, str):
+        raise TypeError(
+            f"from_mujoco: `ignore` must be a sequence of words, got {ignore!r}; write "
+            f"`ignore=({ignore!r},)`."
+        )
+    for word in ignore:
+        check_choice("from_mujoco: each word of `ignore`", word, IGNORABLE)
+    left_out: dict[str, set[int]] = {"actuators": set(), "equalities": set()}
+    found: list[Unsupported] = [*_bodies(model), *_joints(model)]
+    found += [*_tendons(model), *_contacts(model, rolling)]
+    for name, parts in (
+        ("actuators", unsupported_actuators(model, "tendons" in ignore)),
+        ("equalities", _equalities(model, "tendons" in ignore)),
+    ):
+        for number, what in parts:
+            left_out[name].add(number)
+            found.append(Unsupported(name, what))
+    refused = [x for x in found if x.category is None or x.category not in ignore]
+    if refused:
+        raise ValueError(_refusal(refused))
+    return left_out
+
+
+def _refusal(refused: list[Unsupported]) -> str:
+    lines = [f"- {x.what}" for x in refused[:8]]
+    if len(refused) > 8:
+        lines.append(f"- and {len(refused) - 8} more")
+    words = sorted({x.category for x in refused if x.category is not None})
+    listed = ", ".join(map(repr, words)) + ("," if len(words) == 1 else "")
+    advice = ""
+    if words:
+        advice = f" To simulate the model without them, pass `ignore=({listed})`."
+    if any(x.category is None for x in refused):
+        advice += " Some of them cannot be ignored: change the model."
+    return (
+        "from_mujoco: the model has parts that nhjax does not support:\n"
+        + "\n".join(lines)
+        + f"\n{advice.strip()}"
+    )
+
+
+def _bodies(model: Any) -> Iterator[Unsupported]:
+    if model.nv == 0:
+        yield Unsupported(None, "no joint: nothing in the model can move")
+    if model.nflex:
+        yield Unsupported(None, f"flexes ({model.nflex}): deformable bodies")
+    for body in np.flatnonzero(model.body_mocapid >= 0).tolist():
+        name = name_of(model, "body", body)
+        yield Unsupported(None, f"body {name!r}: its pose is given by mocap data")
+    if model.opt.density or model.opt.viscosity:
+        yield Unsupported(
+            "fluid",
+            f"forces of a fluid (density {model.opt.density:g} kg/m³, viscosity "
+            f"{model.opt.viscosity:g} Pa s)",
+        )
+    for body in np.flatnonzero(model.body_plugin >= 0).tolist():
+        name = name_of(model, "body", body)
+        yield Unsupported("plugins", f"body {name!r}: a plugin acts on it")
+
+
+def _joints(model: Any) -> Iterator[Unsupported]:
+    has_limits = not (has_flag(model, "LIMIT") or has_flag(model, "CONSTRAINT"))
+    for joint in range(model.njnt):
+        name = name_of(model, "joint", joint)
+        is_scalar = model.jnt_type[joint] >= 2
+        dof = model.jnt_dofadr[joint]
+        if has_limits and model.jnt_limited[joint]:
+            yield Unsupported("limits", f"joint {name!r}: a limit of its range")
+        if model.jnt_springyield[joint] > 0:
+            yield Unsupported("springs", f"joint {name!r}: a spring that yields")
+        if not is_scalar:
+            if np.any(model.jnt_stiffness[joint]) and model.jnt_type[joint] == 0:
+                yield Unsupported(
+                    "springs", f"joint {name!r}: a spring of a free joint"
+                )
+            if np.any(model.jnt_stiffnesspoly[joint]):
+                yield Unsupported(
+                    "springs", f"joint {name!r}: a nonlinear spring of a ball joint"
+                )
+            if model.dof_frictionloss[dof]:
+                yield Unsupported(
+                    "friction loss", f"joint {name!r}: friction of a ball or free joint"
+                )
+        if not is_scalar and np.any(model.dof_dampingpoly[dof]):
+            yield Unsupported(
+                None, f"joint {name!r}: nonlinear damping of a ball or free joint"
+            )
+        if model.jnt_actgravcomp[joint] and model.jnt_actfrclimited[joint]:
+            yield Unsupported(
+                None,
+                f"joint {name!r}: gravity compensation by an actuator with a limit",
+            )
+
+
+def _tendons(model: Any) -> Iterator[Unsupported]:
+    for tendon in range(model.ntendon):
+        name = name_of(model, "tendon", tendon)
+        if not is_fixed_tendon(model, tendon):
+            yield Unsupported(
+                "tendons", f"tendon {name!r}: a spatial tendon, with a path over sites"
+            )
+            continue
+        has_limits = not (has_flag(model, "LIMIT") or has_flag(model, "CONSTRAINT"))
+        if has_limits and model.tendon_limited[tendon]:
+            yield Unsupported("limits", f"tendon {name!r}: a limit of its length")
+        lengths = model.tendon_lengthspring[tendon]
+        has_spring = model.tendon_stiffness[tendon] or np.any(
+            model.tendon_stiffnesspoly[tendon]
+        )
+        is_plain = lengths[0] == lengths[1] and not model.tendon_springyield[tendon]
+        if has_spring and not (
+            is_plain and not np.any(model.tendon_stiffnesspoly[tendon])
+        ):
+            yield Unsupported(
+                "springs", f"tendon {name!r}: a spring that is not linear"
+            )
+        if model.tendon_frictionloss[tendon]:
+            yield Unsupported("friction loss", f"tendon {name!r}: friction")
+        if np.any(model.tendon_dampingpoly[tendon]):
+            yield Unsupported(None, f"tendon {name!r}: nonlinear damping")
+        if model.tendon_actfrclimited[tendon]:
+            yield Unsupported(
+                "limits", f"tendon {name!r}: a limit of the force of its actuators"
+            )
+
+
+def is_fixed_tendon(model: Any, tendon: int) -> bool:
+    """Return whether a tendon is a linear combination of joint coordinates."""
+    first = model.tendon_adr[tendon]
+    wraps = model.wrap_type[first : first + model.tendon_num[tendon]]
+    return bool(np.all(wraps == int(mujoco().mjtWrap.mjWRAP_JOINT)))
+
+
+def unsupported_actuators(
+    model: Any, without_tendons: bool
+) -> Iterator[tuple[int, str]]:
+    """Yield the number of each actuator that is not supported, and the reason."""
+    library = mujoco()
+    transmissions, gains = library.mjtTrn, library.mjtGain
+    biases, dynamics = library.mjtBias, library.mjtDyn
+    for i in range(model.nactuator):
+        reason = None
+        target = model.actuator_trnid[i, 0]
+        kind = model.actuator_trntype[i]
+        on_joint = kind in (
+            int(transmissions.mjTRN_JOINT),
+            int(transmissions.mjTRN_JOINTINPARENT),
+        )
+        is_vector = on_joint and model.jnt_type[target] < 2
+        is_motor = model.actuator_gaintype[i] == int(
+            gains.mjGAIN_FIXED
+        ) and model.actuator_biastype[i] == int(biases.mjBIAS_NONE)
+        muscle = int(dynamics.mjDYN_MUSCLE), int(gains.mjGAIN_MUSCLE)
+        if model.actuator_plugin[i] >= 0:
+            reason = "a plugin"
+        elif (
+            model.actuator_dyntype[i] == muscle[0]
+            or model.actuator_gaintype[i] == muscle[1]
+        ):
+            reason = "a muscle"
+        elif model.actuator_dyntype[i] != int(dynamics.mjDYN_NONE):
+            word = library.mjtDyn(model.actuator_dyntype[i]).name[6:].lower()
+            reason = f"internal dynamics ({word})"
+        elif model.actuator_gaintype[i] > int(gains.mjGAIN_AFFINE):
+            word = library.mjtGain(model.actuator_gaintype[i]).name[7:].lower()
+            reason = f"the gain {word}"
+        elif model.actuator_biastype[i] > int(biases.mjBIAS_AFFINE):
+            word = library.mjtBias(model.actuator_biastype[i]).name[7:].lower()
+            reason = f"the bias {word}"
+        elif model.actuator_delay[i]:
+            reason = "a delay"
+        elif model.actuator_ctrlnum[i] != 1 or model.actuator_outnum[i] != 1:
+            reason = "several controls or outputs"
+        elif kind == int(transmissions.mjTRN_TENDON):
+            if without_tendons or not is_fixed_tendon(model, target):
+                reason = "a tendon that is left out or not supported"
+        elif not on_joint:
+            word = library.mjtTrn(kind).name[6:].lower()
+            reason = f"the transmission {word}"
+        elif is_vector and kind == int(transmissions.mjTRN_JOINTINPARENT):
+            reason = "a transmission in the frame of the parent"
+        elif is_vector and not is_motor:
+            reason = "a servo on a ball or free joint"
+        if reason is None and np.any(model.actuator_dampingpoly[i]):
+            reason = "nonlinear damping"
+        if (
+            reason is None
+            and is_vector
+            and (model.actuator_damping[i] or model.actuator_armature[i])
+        ):
+            reason = "damping or armature on a ball or free joint"
+        if reason is not None:
+            name = name_of(model, "actuator", i)
+            yield i, f"actuator {name!r}: {reason}"
+
+
+def _equalities(model: Any, without_tendons: bool) -> Iterator[tuple[int, str]]:
+    library = mujoco()
+    supported = {
+        int(library.mjtEq.mjEQ_CONNECT),
+        int(library.mjtEq.mjEQ_WELD),
+        int(library.mjtEq.mjEQ_JOINT),
+    }
+    tendon = int(library.mjtEq.mjEQ_TENDON)
+    for i in active_equalities(model):
+        kind = int(model.eq_type[i])
+        name = name_of(model, "equality", i)
+        if kind == tendon:
+            ends = [x for x in (model.eq_obj1id[i], model.eq_obj2id[i]) if x >= 0]
+            if without_tendons or not all(is_fixed_tendon(model, x) for x in ends):
+                yield i, f"equality {name!r}: between tendons that are not supported"
+        elif kind not in supported:
+            word = library.mjtEq(kind).name[5:].lower()
+            yield i, f"equality {name!r}: of the kind {word}"
+
+
+def active_equalities(model: Any) -> list[int]:
+    """Return the numbers of the equalities that act from the start."""
+    if has_flag(model, "EQUALITY") or has_flag(model, "CONSTRAINT"):
+        return []
+    return np.flatnonzero(model.eq_active0).tolist()
+
+
+def _contacts(model: Any, rolling: Sequence[str]) -> Iterator[Unsupported]:
+    """Yield one entry for all pairs of geoms that can touch in MuJoCo."""
+    if has_flag(model, "CONTACT") or has_flag(model, "CONSTRAINT"):
+        return
+    pairs = [
+        pair for pair in _touching_pairs(model) if not _rolls(model, pair, rolling)
+    ]
+    if pairs:
+        first, second = (name_of(model, "geom", x) for x in pairs[0])
+        more = f" and {len(pairs) - 1} more pairs of geoms" if len(pairs) > 1 else ""
+        yield Unsupported(
+            "contacts", f"contacts: {first!r} and {second!r}{more} can touch"
+        )
+
+
+def _rolls(model: Any, pair: tuple[int, int], rolling: Sequence[str]) -> bool:
+    """Return whether a pair is a rolling geom and a geom of the world."""
+    for one, other in (pair, pair[::-1]):
+        is_rolling = name_of(model, "geom", one) in rolling
+        if is_rolling and model.body_weldid[model.geom_bodyid[other]] == 0:
+            return True
+    return False
+
+
+def _touching_pairs(model: Any) -> list[tuple[int, int]]:
+    """List the pairs of geoms whose collisions MuJoCo's filters admit."""
+    pairs = {
+        (min(a, b), max(a, b))
+        for a, b in zip(
+            model.pair_geom1.tolist(), model.pair_geom2.tolist(), strict=True
+        )
+    }
+    excluded = set(model.exclude_signature.tolist())
+    types, affinities = model.geom_contype, model.geom_conaffinity
+    body = model.geom_bodyid
+    weld = model.body_weldid
+    parent_of_weld = model.body_weldid[model.body_parentid[weld]]
+    filters_parents = not has_flag(model, "FILTERPARENT")
+    for a in range(model.ngeom):
+        for b in range(a + 1, model.ngeom):
+            one, other = int(body[a]), int(body[b])
+            if weld[one] == weld[other]:
+                continue
+            if not (types[a] & affinities[b] or types[b] & affinities[a]):
+                continue
+            is_parent = (
+                weld[one] == parent_of_weld[other] or weld[other] == parent_of_weld[one]
+            )
+            # The filter does not apply to the world.
+            if filters_parents and is_parent and weld[one] and weld[other]:
+                continue
+            low, high = min(one, other), max(one, other)
+            if (low << 16) + high in excluded:
+                continue
+            pairs.add((a, b))
+    return sorted(pairs)

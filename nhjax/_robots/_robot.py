@@ -1,0 +1,361 @@
+"""The function `from_mujoco`, and the robot that it returns."""
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, Literal
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, PyTree
+
+from .._custom_types import Args, FloatScalarLike
+from .._errors import ShapeError
+from .._initial import initial_state
+from .._system import LagrangianSystem, State
+from ..rolling import AbstractGround, Contacts
+from ._build import (
+    actuators_of,
+    contacts_of,
+    independent_rows,
+    Kept,
+    Layout,
+    layout_of,
+    loops_in,
+    mechanics_of,
+    parameters_of,
+    rolling_options,
+)
+from ._dynamics import force_of, frame_pose, lagrangian_of, loops_of
+from ._read import check_supported, compile_model, is_fixed_urdf, name_of
+
+
+class Robot(eqx.Module):
+    """A robot that `from_mujoco` has read from a model.
+
+    - `system`: the system, for `integrate`.
+    - `args`: the values of the file for all `parameters`, as a dictionary by kind and
+        name. Add the controls of the actuators as `args["controls"]`, of shape (nu,);
+        they are zero by default.
+    - `coordinates`: the names of the velocities, in the order of v, which is the order
+        of MuJoCo's `qvel`. A free joint has six and a ball joint three.
+    - `controls`: the names of the actuators, in the order of the controls.
+    - `contacts`: the `nhjax.rolling.Contacts` of the geoms that roll, or None.
+    - `loops`: the names of the equations of closed loops, whose multipliers are the
+        last ones.
+    - `bodies`: the names of all bodies.
+    """
+
+    system: LagrangianSystem
+    args: dict[str, dict[str, Array]]
+    coordinates: tuple[str, ...] = eqx.field(static=True)
+    controls: tuple[str, ...] = eqx.field(static=True)
+    contacts: Contacts | None
+    loops: tuple[str, ...] = eqx.field(static=True)
+    bodies: tuple[str, ...] = eqx.field(static=True)
+    _layout: Layout = eqx.field(static=True)
+    _rest: tuple[float, ...] = eqx.field(static=True)
+
+    def initial_state(
+        self,
+        qpos: Mapping[str, Any] | Float[Array, " nq"] | None = None,
+        qvel: Mapping[str, Any] | Float[Array, " nv"] | None = None,
+        *,
+        t: FloatScalarLike = 0.0,
+        args: Args = None,
+        project: bool = False,
+        keep_q: Any = None,
+        keep_v: Any = None,
+    ) -> State:
+        """Create a consistent state, as `nhjax.initial_state` does.
+
+        **Arguments:**
+
+        - `qpos`, `qvel`: positions and velocities in MuJoCo's conventions, of shape
+            (nq,) and (nv,), or dictionaries by the names of joints. The default is the
+            pose of the file at rest; joints that a dictionary omits have it too.
+        - `t`: the time.
+        - `args`: the parameters and controls. The default is `self.args`.
+        - `project`: whether to project the state onto the constraints.
+        - `keep_q`, `keep_v`: as for `nhjax.initial_state`. The names are those of
+            `self.coordinates`.
+
+        **Returns:** a `State`.
+
+        **Raises:** as `nhjax.initial_state`; `ValueError` for unknown joints and
+        `ShapeError` for wrong shapes.
+        """
+        rest = jnp.asarray(self._rest, jnp.result_type(float))
+        position = self._array("qpos", qpos, rest)
+        velocity = self._array("qvel", qvel, jnp.zeros(self._space.num_velocities))
+        q = self._space.from_qpos(position)
+        return initial_state(
+            self.system,
+            q,
+            self._space.to_body(q, velocity),
+            t=t,
+            args=self.args if args is None else args,
+            project=project,
+            keep_q=keep_q,
+            keep_v=keep_v,
+        )
+
+    def qpos(self, sol: Any) -> Float[Array, "*times nq"]:
+        """Return positions in MuJoCo's conventions.
+
+        A free joint has its position and then its quaternion.
+
+        **Arguments:**
+
+        - `sol`: a `Solution` with saved states, or a `State`.
+
+        **Raises:** `TypeError` if there are no states.
+        """
+        return self._space.to_qpos(_states(sol).q)
+
+    def qvel(self, sol: Any) -> Float[Array, "*times nv"]:
+        """Return velocities in MuJoCo's conventions.
+
+        A free joint has the velocity of its origin in space and then the angular
+        velocity in the frame of its body.
+
+        **Arguments:**
+
+        - `sol`: a `Solution` with saved states, or a `State`.
+
+        **Raises:** `TypeError` if there are no states.
+        """
+        y = _states(sol)
+        convert = self._space.to_space
+        for _ in range(jnp.ndim(y.v) - 1):
+            convert = jax.vmap(convert)
+        return convert(y.q, y.v)
+
+    def pose(
+        self, body: str, q: PyTree[Array]
+    ) -> tuple[Float[Array, "3"], Float[Array, "3 3"]]:
+        """Compute the position of a body [m] and its rotation to space.
+
+        **Arguments:**
+
+        - `body`: the name of the body.
+        - `q`: the configuration of one state.
+
+        **Raises:** `ValueError` if there is no such body.
+        """
+        if body not in self.bodies:
+            raise ValueError(
+                f"`body` must be one of {', '.join(self.bodies)}, got {body!r}."
+            )
+        frame = self._layout.bodies[self.bodies.index(body)]
+        return frame_pose(self._layout.joints, self._space, frame)(0.0, q, None)
+
+    @property
+    def _space(self) -> Any:
+        return self._layout.space
+
+    def _array(self, name: str, given: Any, rest: Array) -> Array:
+        """Convert a dictionary by joints, or check the shape of an array."""
+        if given is None:
+            return rest
+        if not isinstance(given, Mapping):
+            array = jnp.asarray(given)
+            if array.shape != rest.shape:
+                raise ShapeError(
+                    f"`{name}` must have shape {rest.shape}, got {array.shape}. For "
+                    "many states use `jax.vmap`."
+                )
+            return array
+        sizes = {"free": 7, "ball": 4} if name == "qpos" else {"free": 6, "ball": 3}
+        places, start = {}, 0
+        for joint in self._layout.joints:
+            size = sizes.get(joint.kind, 1)
+            places[joint.name] = slice(start, start + size)
+            start += size
+        for key, value in given.items():
+            if key not in places:
+                raise ValueError(
+                    f"`{name}` has {key!r}, but the joints are {', '.join(places)}."
+                )
+            own = jnp.asarray(value, rest.dtype)
+            size = places[key].stop - places[key].start
+            if own.size != size:
+                raise ShapeError(
+                    f"`{name}[{key!r}]` must have {size} numbers, got shape "
+                    f"{own.shape}."
+                )
+            rest = rest.at[places[key]].set(own.reshape(size))
+        return rest
+
+
+def _states(sol: Any) -> State:
+    y = sol if isinstance(sol, State) else getattr(sol, "ys", None)
+    if not isinstance(y, State):
+        raise TypeError(
+            "A robot converts a State, or a Solution that has saved states (without "
+            f"`fn` in `SaveAt`), got {type(sol).__name__}."
+        )
+    return y
+
+
+def from_mujoco(
+    model: Any,
+    *,
+    rolling: Mapping[str, Any] | Sequence[str] | None = None,
+    ground: str | AbstractGround | None = None,
+    root: Literal["free", "planar", "fixed"] | None = None,
+    controls: Callable[..., Any] | None = None,
+    parameters: Mapping[str, Sequence[str]] | None = None,
+    ignore: Sequence[str] = (),
+    constraints: Literal["independent", "redundant"] | None = None,
+    friction_smoothing: float = 0.01,
+    limit_smoothing: float = 0.01,
+) -> Robot:
+    """Read a robot from an MJCF or URDF file, with wheels that roll without slipping.
+
+    MuJoCo's own compiler reads the model. The Lagrangian is the kinetic energy
+    ½ Σ tr(Ṫ J Ṫᵀ) of all bodies with poses T and pseudo-inertias J, with ½ a q̇² for
+    each armature a, minus the energies of weight and springs. Free and ball joints are
+    on SE(3) and SO(3), all others on R^n. The equality constraints connect, weld,
+    joint and tendon are holonomic constraints. They hold exactly, unlike in MuJoCo,
+    and `solref` and `solimp` have no effect. Source: Featherstone, *Rigid body dynamics
+    algorithms* (2008); the MuJoCo documentation, chapter *Computation*.
+
+    **Arguments:**
+
+    - `model`: the path of a file, a `mujoco.MjSpec` or a `mujoco.MjModel`.
+    - `rolling`: the names of the geoms that roll on the ground. A dictionary says how:
+        `"no slip"`, `"no lateral slip"`, `"no longitudinal slip"`, `"slides"` (the geom
+        keeps touching), an angle [rad] for the rollers of a mecanum wheel, or a tuple
+        like `no_slip` of `nhjax.rolling.Wheel`. A cylinder is a wheel whose rim is in
+        the middle of its length, a capsule a wheel with a round tread; a sphere and an
+        ellipsoid roll in all directions. These geoms can never lift off.
+    - `ground`: the name of a plane that is fixed to the world, or a ground of
+        `nhjax.rolling`. The default is the only plane of the model, or z = 0.
+    - `root`: for a URDF file, how the root link can move. MuJoCo fixes it to the world;
+        `"free"` adds a free joint, and `"planar"` the coordinates x, y and heading.
+    - `controls`: a function of (t, qpos, qvel, args) that returns the controls of all
+        actuators, for feedback. By default they are in `args["controls"]`.
+    - `parameters`: names of bodies for `"mass"`, and of joints for `"damping"`,
+        `"stiffness"`, `"armature"` and `"friction"`: their values are then in
+        `args`. A body with another mass keeps its shape and its centre of mass.
+    - `ignore`: unsupported parts to leave out: `"actuators"`, `"contacts"`,
+        `"equalities"`, `"fluid"`, `"friction loss"`, `"limits"`, `"plugins"`,
+        `"springs"`, `"tendons"`.
+    - `constraints`: as for `LagrangianSystem`; all constraints are then kept. By
+        default, constraints that follow from others in every pose are left out, such as
+        `"across"` of the second of two wheels on one axle. If others depend on each
+        other near the pose of the file, it is `"redundant"`.
+    - `friction_smoothing`: v₀ [rad/s or m/s] in the friction loss f tanh(q̇ / v₀) of a
+        joint.
+    - `limit_smoothing`: the width of the smooth transition at the limits of controls
+        and forces of actuators, in parts of their range. Farther than 36 widths from
+        the limits, values are not changed.
+
+    **Returns:** a `Robot`.
+
+    **Raises:** `ImportError` without MuJoCo (`pip install "nhjax[robots]"`);
+    `FileNotFoundError`, `TypeError` and `ValueError` that name what cannot be read, and
+    all parts of the model that are neither supported nor ignored.
+
+    !!! example
+
+        >>> import mujoco, nhjax
+        >>> spec = mujoco.MjSpec.from_string('''<mujoco><worldbody><body pos="0 0 0.1">
+        ...     <freejoint name="ball"/> <geom name="ball" size="0.1" mass="2"/>
+        ...     </body></worldbody></mujoco>''')
+        >>> robot = nhjax.from_mujoco(spec, rolling=["ball"])
+        >>> y0 = robot.initial_state(qvel={"ball": [0.2, 0, 0, 0, 2, 0]})
+        >>> sol = nhjax.integrate(robot.system, nhjax.LobattoIIIAB(2), y0, dt=0.02,
+        ...     num_steps=50)
+        >>> robot.qpos(sol)[-1, :3].round(4)
+        Array([0.2, 0. , 0.1], dtype=float64)
+    """
+    options = rolling_options(rolling)
+    compiled = compile_model(model, root)
+    if options and root is None and is_fixed_urdf(model):
+        raise ValueError(
+            "from_mujoco: MuJoCo fixes the root link of a URDF file to the world. "
+            'Pass `root="free"` or `root="planar"` for a robot on wheels, or '
+            '`root="fixed"`.'
+        )
+    left_out = check_supported(compiled, ignore, tuple(options))
+    layout = layout_of(compiled)
+    mechanics = mechanics_of(compiled, layout, ignore, friction_smoothing)
+    actuators = actuators_of(
+        compiled, layout.space, left_out["actuators"], limit_smoothing
+    )
+    known, values = parameters_of(compiled, mechanics, actuators.names, parameters)
+    contacts = contacts_of(compiled, layout, options, ground)
+    loops = loops_in(compiled, layout, left_out["equalities"])
+    loop = loops_of(layout.joints, layout.space, loops)
+    names = loops.names
+    if constraints is None and (contacts is not None or loop is not None):
+        kept = independent_rows(compiled, layout.space, contacts, loop)
+        constraints = "independent" if kept.is_independent else "redundant"
+        names = tuple(x for x, keep in zip(names, kept.loops, strict=True) if keep)
+        loop = loops_of(layout.joints, layout.space, loops, kept.loops)
+        if contacts is not None:
+            contacts = _reduced(compiled, layout, contacts, kept, ground)
+    heights = None if contacts is None else contacts.holonomic
+    coordinates = _coordinates(layout)
+    system = LagrangianSystem(
+        lagrangian_of(mechanics, known),
+        nonholonomic=None if contacts is None else contacts.nonholonomic,
+        holonomic=_joined(heights, loop),
+        force=force_of(mechanics, known, actuators, controls, _to_mujoco(layout)),
+        manifold=layout.space.manifold,
+        coordinates=coordinates,
+        constraints=constraints or "independent",
+    )
+    bodies = tuple(name_of(compiled, "body", i) for i in range(compiled.nbody))
+    return Robot(
+        system,
+        jax.tree.map(lambda x: jnp.asarray(x, jnp.result_type(float)), values),
+        coordinates,
+        actuators.names,
+        contacts,
+        names,
+        bodies,
+        layout,
+        tuple(np.asarray(compiled.qpos0).tolist()),
+    )
+
+
+def _reduced(
+    model: Any, layout: Layout, contacts: Contacts, kept: Kept, ground: Any
+) -> Contacts | None:
+    """Return the contacts without the constraints that follow from others."""
+    pairs = list(zip(contacts.names, contacts.contacts, strict=True))
+    options = {
+        name: tuple(x for x, keep in zip(contact.no_slip, own, strict=True) if keep)
+        for (name, contact), own in zip(pairs, kept.slips, strict=True)
+    }
+    touching = [name for name, contact in pairs if contact.touches]
+    dropped = [x for x, keep in zip(touching, kept.heights, strict=True) if not keep]
+    return contacts_of(model, layout, options, ground, dropped)
+
+
+def _coordinates(layout: Layout) -> tuple[str, ...]:
+    names = []
+    for joint in layout.joints:
+        turns = [f"{joint.name}_r{x}" for x in "xyz"]
+        own = {"free": [*(f"{joint.name}_{x}" for x in "xyz"), *turns], "ball": turns}
+        names += own.get(joint.kind, [joint.name])
+    return tuple(names)
+
+
+def _to_mujoco(layout: Layout) -> Callable[..., Any]:
+    space = layout.space
+    return lambda q, v: (space.to_qpos(q), space.to_space(q, v))
+
+
+def _joined(heights: Any, loop: Any) -> Any:
+    """Return the constraints of both kinds as one function, or None."""
+    if heights is None or loop is None:
+        return loop if heights is None else heights
+
+    def holonomic(t, q, args):
+        return jnp.concatenate([heights(t, q, args), loop(t, q, args)])
+
+    return holonomic

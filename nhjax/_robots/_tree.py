@@ -1,0 +1,531 @@
+"""The kinematic tree of a robot: its joints, its configuration space and its poses.
+
+Each joint is a node of the tree. The recursions from the world to the ends of the tree
+treat all nodes at the same depth together, so that the number of operations in the
+program grows as the depth, not as the number of joints: the legs of a robot cost no
+more operations than one leg. Small trees are written in scalars instead, because most
+entries of their frames are zero.
+"""
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, PyTree
+
+from .._manifold import AbstractLieGroup, Euclidean, ProductGroup, SE3, SO3
+from . import _scalars as entries
+
+
+# Trees with more joints are computed as arrays: tracing scalars takes longer then.
+LARGEST_OF_SCALARS = 8
+
+
+class Joint(NamedTuple):
+    """A joint of the tree.
+
+    - `name`, `kind`: the kind is "free", "ball", "slide" or "hinge".
+    - `parent`: the number of the joint before it on the path from the world, or -1.
+    - `offset`: the frame of its body at rest, relative to the frame after `parent`.
+    - `anchor`, `axis`: the point and the direction of the joint in its own frame.
+    - `reference`: the coordinate of a slide or a hinge at rest.
+    """
+
+    name: str
+    kind: str
+    parent: int
+    offset: Float[np.ndarray, "4 4"]
+    anchor: Float[np.ndarray, "3"]
+    axis: Float[np.ndarray, "3"]
+    reference: float
+
+
+class Part(NamedTuple):
+    """A factor of the configuration space: one free or ball joint, or some scalars."""
+
+    kind: str
+    joints: tuple[int, ...]
+    first_velocity: int
+
+    @property
+    def group(self) -> AbstractLieGroup:
+        """The factor as a Lie group."""
+        groups = {"free": SE3(), "ball": SO3()}
+        return groups.get(self.kind) or Euclidean(len(self.joints))
+
+
+def parts_of(joints: Sequence[Joint]) -> tuple[Part, ...]:
+    """Divide the joints, in the order of the file, into factors."""
+    parts: list[Part] = []
+    velocity = 0
+    for number, joint in enumerate(joints):
+        is_scalar = joint.kind in ("slide", "hinge")
+        kind = "scalars" if is_scalar else joint.kind
+        if is_scalar and parts and parts[-1].kind == "scalars":
+            last = parts.pop()
+            parts.append(last._replace(joints=(*last.joints, number)))
+        else:
+            parts.append(Part(kind, (number,), velocity))
+        velocity += {"free": 6, "ball": 3}.get(joint.kind, 1)
+    return tuple(parts)
+
+
+class Space:
+    """The configuration space of a robot, and MuJoCo's coordinates of it.
+
+    MuJoCo's velocities of a free joint are the velocity of its origin in space and the
+    angular velocity in the body. Those of SE(3) are both in the body.
+    """
+
+    def __init__(self, joints: Sequence[Joint]):
+        self.parts = parts_of(joints)
+        groups = [part.group for part in self.parts]
+        self.is_flat = len(groups) == 1 and self.parts[0].kind == "scalars"
+        self.is_product = len(groups) > 1
+        self.manifold: AbstractLieGroup | None = None
+        if not self.is_flat:
+            self.manifold = ProductGroup(*groups) if self.is_product else groups[0]
+        self.num_velocities = sum(group.dim for group in groups)
+        # The places of the scalar coordinates in a vector of velocities.
+        self.scalars = np.asarray(
+            [
+                part.first_velocity + i
+                for part in self.parts
+                if part.kind == "scalars"
+                for i in range(len(part.joints))
+            ],
+            int,
+        )
+        self.free = [part.first_velocity for part in self.parts if part.kind == "free"]
+
+    def split(self, q: PyTree[Array]) -> tuple[list[Array], Array]:
+        """Split q into the elements of free and ball joints, and all scalars."""
+        elements = q if self.is_product else (q,)
+        special, scalars = [], []
+        for part, element in zip(self.parts, elements, strict=True):
+            (scalars if part.kind == "scalars" else special).append(element)
+        if scalars:
+            vector = scalars[0] if len(scalars) == 1 else jnp.concatenate(scalars)
+        else:
+            vector = jnp.zeros((0,), special[0].dtype)
+        return special, vector
+
+    def tangent(self, q: PyTree[Array], v: Array) -> PyTree[Array]:
+        """Compute the rate of q from the velocity."""
+        return v if self.manifold is None else self.manifold.tangent(q, v)
+
+    def from_qpos(self, qpos: Float[Array, " nq"]) -> PyTree[Array]:
+        """Convert MuJoCo's coordinates."""
+        elements, place = [], 0
+        for part in self.parts:
+            size = {"free": 7, "ball": 4}.get(part.kind, len(part.joints))
+            own = qpos[place : place + size]
+            if part.kind == "free":
+                own = jnp.concatenate([own[3:], own[:3]])
+            elements.append(own)
+            place += size
+        return tuple(elements) if self.is_product else elements[0]
+
+    def to_qpos(self, q: PyTree[Array]) -> Float[Array, "*batch nq"]:
+        """Convert to MuJoCo's coordinates, with any leading axes."""
+        elements = q if self.is_product else (q,)
+        own = [
+            jnp.concatenate([x[..., 4:], x[..., :4]], axis=-1)
+            if part.kind == "free"
+            else x
+            for part, x in zip(self.parts, elements, strict=True)
+        ]
+        return jnp.concatenate(own, axis=-1)
+
+    def rotations(self, q: PyTree[Array]) -> list[Array]:
+        """Return the rotations of the free joints, by their first velocities."""
+        elements = q if self.is_product else (q,)
+        return [
+            SO3().matrix(element[:4])
+            for part, element in zip(self.parts, elements, strict=True)
+            if part.kind == "free"
+        ]
+
+    def to_space(self, q: PyTree[Array], v: Array) -> Array:
+        """Convert velocities, or covectors, of SE(3) to those of MuJoCo."""
+        return self._turn(self.rotations(q), v)
+
+    def to_body(self, q: PyTree[Array], v: Array) -> Array:
+        """Convert velocities, or covectors, of MuJoCo to those of SE(3)."""
+        return self._turn([rotation.T for rotation in self.rotations(q)], v)
+
+    def _turn(self, rotations: list[Array], v: Array) -> Array:
+        pieces, place = [], 0
+        for first, rotation in zip(self.free, rotations, strict=True):
+            pieces += [v[place:first], rotation @ v[first : first + 3]]
+            place = first + 3
+        return jnp.concatenate([*pieces, v[place:]]) if pieces else v
+
+
+class Level(NamedTuple):
+    """The nodes at one depth.
+
+    - `nodes`: their places in the order of the joints.
+    - `parents`: for each, the place of its parent in the level before, which is the
+        world for the first level.
+    """
+
+    nodes: np.ndarray
+    parents: np.ndarray
+
+
+class Tree:
+    """The joints on the paths to some joints, as arrays in the order of their depth.
+
+    `node` maps the number of a joint to its place in this order.
+    """
+
+    def __init__(self, joints: Sequence[Joint], space: Space, kept: Sequence[int]):
+        self.space = space
+        on_paths = set()
+        for number in kept:
+            while number >= 0 and number not in on_paths:
+                on_paths.add(number)
+                number = joints[number].parent
+        special = _joints_of(space, ("free", "ball"))
+        scalar = _joints_of(space, ("scalars",))
+        self.special = [(i, joints[j]) for i, j in enumerate(special) if j in on_paths]
+        self.special_velocities = [
+            part.first_velocity
+            for part in space.parts
+            if part.kind != "scalars" and part.joints[0] in on_paths
+        ]
+        chosen = [(i, joints[j]) for i, j in enumerate(scalar) if j in on_paths]
+        self.scalar = np.asarray([i for i, _ in chosen], int)
+        self.num_scalars = len(scalar)
+        self.reference = np.asarray([x.reference for _, x in chosen], float)
+        self.constants = _motions([joint for _, joint in chosen])
+        self.twists = _twists([joint for _, joint in chosen])
+        order = [j for j in (*special, *scalar) if j in on_paths]
+        self.levels: list[Level] = []
+        self.node: dict[int, int] = {}
+        before, parents = [-1], {-1}
+        while len(self.node) < len(order):
+            own = [j for j in order if joints[j].parent in parents]
+            self.levels.append(
+                Level(
+                    np.asarray([order.index(j) for j in own], int),
+                    np.asarray([before.index(joints[j].parent) for j in own], int),
+                )
+            )
+            self.node |= {j: len(self.node) + i for i, j in enumerate(own)}
+            before, parents = own, set(own)
+
+    @property
+    def is_small(self) -> bool:
+        """Whether the recursions are written in scalars."""
+        return len(self.node) <= LARGEST_OF_SCALARS
+
+    def poses_of_scalars(
+        self, q: PyTree[Array]
+    ) -> list[tuple[entries.Matrix, entries.Vector]]:
+        """Compute the rotation and the position of each node, entry by entry."""
+        own, poses, before = self._relative_scalars(q), [], []
+        for level in self.levels:
+            here = []
+            for node, parent in zip(level.nodes, level.parents, strict=True):
+                rotation, position = own[node]
+                if before:
+                    turn, place = before[parent]
+                    position = entries.sums(place, entries.apply(turn, position))
+                    rotation = entries.product(turn, rotation)
+                here.append((rotation, position))
+            poses, before = [*poses, *here], here
+        return poses
+
+    def motion_of_scalars(
+        self, q: PyTree[Array], v: Array, gravity: Float[np.ndarray, "3"] | None
+    ) -> list[tuple[entries.Vector, entries.Vector, entries.Entry]]:
+        """Compute what `motion` does for each node, entry by entry."""
+        own, twists = self._relative_scalars(q), self._own_twists_of_scalars(v)
+        weight = entries.known(np.zeros(3) if gravity is None else gravity)
+        found, before = [], []
+        for level in self.levels:
+            here = []
+            for node, parent in zip(level.nodes, level.parents, strict=True):
+                rotation, position = own[node]
+                above = before[parent] if before else (6 * [0.0], weight, 0.0)
+                moving, turning = above[0][:3], above[0][3:]
+                moving = entries.sums(moving, entries.cross(turning, position))
+                back = entries.transposed(rotation)
+                carried = entries.apply(back, moving) + entries.apply(back, turning)
+                depth = entries.add(above[2], entries.dot(above[1], position))
+                twist = entries.sums(carried, twists[node])
+                here.append((twist, entries.apply(back, above[1]), depth))
+            found, before = [*found, *here], here
+        return found
+
+    def _relative_scalars(
+        self, q: PyTree[Array]
+    ) -> list[tuple[entries.Matrix, entries.Vector]]:
+        special, scalars = self.space.split(q)
+        found = []
+        for place, joint in self.special:
+            matrix = SO3().matrix(special[place][:4])
+            rotation = [[matrix[i, j] for j in range(3)] for i in range(3)]
+            if joint.kind == "free":
+                position = [special[place][4 + i] for i in range(3)]
+            else:
+                offset = entries.known(joint.offset[:3, :3])
+                rotation = entries.product(offset, rotation)
+                anchor = joint.anchor.tolist()
+                start = joint.offset[:3, 3] + joint.offset[:3, :3] @ joint.anchor
+                moved = entries.apply(rotation, [-x for x in anchor])
+                position = entries.sums(start.tolist(), moved)
+            found.append((rotation, position))
+        for number, i in enumerate(self.scalar.tolist()):
+            s = jax.lax.index_in_dim(scalars, i, keepdims=False)
+            reference = float(self.reference[number])
+            s = entries.add(s, -reference)
+            first, sine, versine, linear = self.constants[:, number]
+            # In this form an axis of the frame leaves single sines and cosines.
+            parts: entries.Vector = [1.0, 0.0, 0.0, 0.0]
+            if np.any(sine):
+                parts[1:3] = [jnp.sin(s), jnp.cos(s)]
+            if np.any(linear):
+                parts[3] = s
+            rows = entries.known(np.stack([first + versine, sine, -versine, linear]))
+            values = [entries.dot(column, parts) for column in zip(*rows, strict=True)]
+            rotation = [values[:3], values[3:6], values[6:9]]
+            found.append((rotation, values[9:]))
+        return found
+
+    def _own_twists_of_scalars(self, v: Array) -> list[entries.Vector]:
+        def component(i):
+            return jax.lax.index_in_dim(v, int(i), keepdims=False)
+
+        found = []
+        for first, (_, joint) in zip(
+            self.special_velocities, self.special, strict=True
+        ):
+            if joint.kind == "free":
+                found.append([component(first + i) for i in range(6)])
+            else:
+                turning = [component(first + i) for i in range(3)]
+                moving = entries.cross(joint.anchor.tolist(), turning)
+                found.append([*moving, *turning])
+        for twist, i in zip(self.twists, self.scalar, strict=True):
+            rate = component(self.space.scalars[i])
+            found.append([entries.times(x, rate) for x in entries.known(twist)])
+        return found
+
+    def poses(self, q: PyTree[Array]) -> tuple[Array, Array]:
+        """Compute the rotations and the positions of all nodes in space."""
+        all_rotations, all_positions = self._relative(q)
+        rotations, positions = [], []
+        for level in self.levels:
+            rotation = take(all_rotations, level.nodes)
+            position = take(all_positions, level.nodes)
+            if rotations:
+                turn = take(rotations[-1], level.parents)
+                moved = jnp.einsum("nij,nj->ni", turn, position)
+                position = take(positions[-1], level.parents) + moved
+                rotation = jnp.einsum("nij,njk->nik", turn, rotation)
+            rotations.append(rotation)
+            positions.append(position)
+        return jnp.concatenate(rotations), jnp.concatenate(positions)
+
+    def motion(
+        self, q: PyTree[Array], v: Array, gravity: Float[np.ndarray, "3"] | None
+    ) -> tuple[Array, Array | None, Array | None]:
+        """Compute the body twist (v, ω) of each node, and gravity in its frame.
+
+        The third result is the product of the position with gravity.
+        """
+        all_rotations, all_positions = self._relative(q)
+        all_twists = self._own_twists(v)
+        twists: list[Array] = []
+        falls: list[Array] = []
+        depths: list[Array] = []
+        for level in self.levels:
+            rotation = take(all_rotations, level.nodes)
+            position = take(all_positions, level.nodes)
+            twist = take(all_twists, level.nodes)
+            if twists:
+                parent = take(twists[-1], level.parents)
+                turning = parent[:, 3:]
+                moving = parent[:, :3] + jnp.cross(turning, position)
+                vectors = [moving, turning]
+                if gravity is not None:
+                    fall = take(falls[-1], level.parents)
+                    vectors.append(fall)
+                    depths.append(
+                        take(depths[-1], level.parents)
+                        + jnp.einsum("ni,ni->n", fall, position)
+                    )
+                turned = jnp.einsum(
+                    "nij,nki->nkj", rotation, jnp.stack(vectors, axis=1)
+                )
+                twist = twist + turned[:, :2].reshape(-1, 6)
+                if gravity is not None:
+                    falls.append(turned[:, 2])
+            elif gravity is not None:
+                constant = jnp.asarray(gravity, v.dtype)
+                falls.append(jnp.einsum("nij,i->nj", rotation, constant))
+                depths.append(jnp.einsum("ni,i->n", position, constant))
+            twists.append(twist)
+        if gravity is None:
+            return jnp.concatenate(twists), None, None
+        joined = jnp.concatenate(twists)
+        return joined, jnp.concatenate(falls), jnp.concatenate(depths)
+
+    def _own_twists(self, v: Array) -> Array:
+        """Compute the twist of each node relative to the node before it."""
+        twists = []
+        for first, (_, joint) in zip(
+            self.special_velocities, self.special, strict=True
+        ):
+            if joint.kind == "free":
+                twist = v[first : first + 6]
+            else:
+                turning = v[first : first + 3]
+                moving = jnp.cross(jnp.asarray(joint.anchor, v.dtype), turning)
+                twist = jnp.concatenate([moving, turning])
+            twists.append(twist[None])
+        if len(self.scalar):
+            rates = take(v, self.space.scalars[self.scalar])
+            twists.append(jnp.asarray(self.twists, v.dtype) * rates[:, None])
+        return jnp.concatenate(twists)
+
+    def _relative(self, q: PyTree[Array]) -> tuple[Array, Array]:
+        """Compute the pose of each node relative to the node before it."""
+        elements, scalars = self.space.split(q)
+        dtype = scalars.dtype
+        rotations, positions = [], []
+        for place, joint in self.special:
+            element = elements[place]
+            rotation = SO3().matrix(element[:4])
+            if joint.kind == "free":
+                position = element[4:]
+            else:
+                offset = jnp.asarray(joint.offset, dtype)
+                anchor = jnp.asarray(joint.anchor, dtype)
+                turn = offset[:3, :3] @ rotation
+                position = offset[:3, 3] + offset[:3, :3] @ anchor - turn @ anchor
+                rotation = turn
+            rotations.append(rotation[None])
+            positions.append(position[None])
+        if len(self.scalar):
+            s = take(scalars, self.scalar)
+            s = s - jnp.asarray(self.reference, dtype)
+            motion = jnp.stack([jnp.ones_like(s), jnp.sin(s), 1 - jnp.cos(s), s])
+            both = jnp.einsum("knm,kn->nm", jnp.asarray(self.constants, dtype), motion)
+            rotations.append(both[:, :9].reshape(-1, 3, 3))
+            positions.append(both[:, 9:])
+        return jnp.concatenate(rotations), jnp.concatenate(positions)
+
+
+def _joints_of(space: Space, kinds: tuple[str, ...]) -> list[int]:
+    return [j for part in space.parts if part.kind in kinds for j in part.joints]
+
+
+def take(x: Array, places: np.ndarray) -> Array:
+    """Return rows of an array, by a slice where this is possible."""
+    first, count = (int(places[0]) if len(places) else 0), len(places)
+    if not np.array_equal(places, np.arange(first, first + count)):
+        return x[places]
+    return x if count == x.shape[0] else x[first : first + count]
+
+
+def _twists(joints: Sequence[Joint]) -> Float[np.ndarray, "n 6"]:
+    """Return the twists of scalar joints with unit rate, in their own frames."""
+    found = np.zeros((len(joints), 6))
+    for row, joint in zip(found, joints, strict=True):
+        if joint.kind == "slide":
+            row[:3] = joint.axis
+        else:
+            row[:3], row[3:] = np.cross(joint.anchor, joint.axis), joint.axis
+    return found
+
+
+def _motions(joints: Sequence[Joint]) -> Float[np.ndarray, "4 n 12"]:
+    """Return the coefficients of 1, sin s, 1 - cos s and s in the pose of a joint.
+
+    A hinge turns about its axis by Rodrigues' formula I + sin s â + (1 - cos s) â², and
+    its anchor p stays in place. Each row has the rotation and then the position.
+    """
+    found = np.zeros((4, len(joints), 12))
+    for number, joint in enumerate(joints):
+        turn, shift = joint.offset[:3, :3], joint.offset[:3, 3]
+        found[0, number] = [*turn.ravel(), *shift]
+        if joint.kind == "slide":
+            found[3, number, 9:] = turn @ joint.axis
+            continue
+        # Its columns are a × e_i, so that it maps x to a × x.
+        hat = np.cross(joint.axis, np.eye(3)).T
+        for row, matrix in ((1, hat), (2, hat @ hat)):
+            turned = turn @ matrix
+            found[row, number] = [*turned.ravel(), *(-turned @ joint.anchor)]
+    return found
+
+
+class Frame(NamedTuple):
+    """A frame that is fixed to a node: that of a body, a geom or a site."""
+
+    joint: int
+    matrix: Float[np.ndarray, "4 4"]
+
+
+class FramePoses:
+    """The poses of some frames in space; frames of the world are constant."""
+
+    def __init__(self, joints: Sequence[Joint], space: Space, frames: Sequence[Frame]):
+        self.tree = Tree(joints, space, [frame.joint for frame in frames])
+        # The world comes after all nodes.
+        node = self.tree.node | {-1: len(self.tree.node)}
+        self.has_world = any(frame.joint < 0 for frame in frames)
+        self.nodes = np.asarray([node[frame.joint] for frame in frames], int)
+        self.turns = np.stack([frame.matrix[:3, :3] for frame in frames])
+        self.places = np.stack([frame.matrix[:3, 3] for frame in frames])
+
+    def __call__(self, q: PyTree[Any]) -> tuple[Array, Array]:
+        """Compute positions and rotations of all frames in space."""
+        dtype = self.tree.space.split(q)[1].dtype
+        if self.tree.is_small:
+            return self._of_scalars(q, dtype)
+        rotations, positions = [], []
+        if self.tree.levels:
+            rotation, position = self.tree.poses(q)
+            rotations, positions = [rotation], [position]
+        if self.has_world:
+            rotations.append(jnp.eye(3, dtype=dtype)[None])
+            positions.append(jnp.zeros((1, 3), dtype))
+        rotation = take(jnp.concatenate(rotations), self.nodes)
+        position = take(jnp.concatenate(positions), self.nodes)
+        places = jnp.asarray(self.places, dtype)
+        turns = jnp.asarray(self.turns, dtype)
+        position = position + jnp.einsum("nij,nj->ni", rotation, places)
+        return position, jnp.einsum("nij,njk->nik", rotation, turns)
+
+    def _of_scalars(self, q: PyTree[Any], dtype: Any) -> tuple[Array, Array]:
+        world = entries.known(np.eye(3)), 3 * [0.0]
+        poses = [*self.tree.poses_of_scalars(q), world]
+        positions, rotations = [], []
+        for node, turn, place in zip(self.nodes, self.turns, self.places, strict=True):
+            rotation, position = poses[node]
+            moved = entries.apply(rotation, entries.known(place))
+            positions.append(entries.sums(position, moved))
+            rotations.append(entries.product(rotation, entries.known(turn)))
+        return entries.stacked(positions, dtype), entries.stacked(rotations, dtype)
+
+
+def homogeneous(
+    position: Float[np.ndarray, "3"], quaternion: Float[np.ndarray, "4"]
+) -> Float[np.ndarray, "4 4"]:
+    """Return the matrix of a pose that MuJoCo gives by a position and a quaternion."""
+    w, x, y, z = np.asarray(quaternion) / np.linalg.norm(quaternion)
+    found = np.eye(4)
+    found[:3, :3] = [
+        [w * w + x * x - y * y - z * z, 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), w * w - x * x + y * y - z * z, 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), w * w - x * x - y * y + z * z],
+    ]
+    found[:3, 3] = position
+    return found

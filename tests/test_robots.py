@@ -1,0 +1,604 @@
+"""Robots from MJCF and URDF, against MuJoCo and against systems of the gallery."""
+
+import functools
+import math
+import re
+import sys
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import nhjax
+from nhjax import rolling
+from support.robot_models import CLOSED, OPEN
+
+
+mujoco: Any = pytest.importorskip("mujoco")
+
+TWO_WHEELS = Path(__file__).parent / "support" / "two_wheels.urdf"
+BODY = '<geom name="{}" type="{}" size="0.1 0.1 0.1" mass="1" contype="0"/>'
+
+
+def _compiled(text):
+    return mujoco.MjSpec.from_string(text).compile()
+
+
+@functools.cache
+def _robot(name):
+    model = _compiled((OPEN | CLOSED)[name])
+    return model, nhjax.from_mujoco(model)
+
+
+def _random_states(model, count):
+    """Positions, velocities and controls, with MuJoCo's own steps on groups."""
+    rng = np.random.default_rng(5)
+    found = []
+    for _ in range(count):
+        qpos = model.qpos0.copy()
+        mujoco.mj_integratePos(model, qpos, rng.normal(size=model.nv), 1.0)
+        velocity, controls = rng.normal(size=model.nv), rng.uniform(-1, 1, model.nu)
+        found.append((qpos, velocity, controls))
+    return [np.stack(x) for x in zip(*found, strict=True)]
+
+
+def _to_mujoco(robot, q, v, acceleration):
+    """Convert accelerations: v̇ of a free joint in space is R (v̇ + ω × v)."""
+    space = robot._space
+    for first in space.free:
+        moving, turning = v[first : first + 3], v[first + 3 : first + 6]
+        acceleration = acceleration.at[first : first + 3].add(
+            jnp.cross(turning, moving)
+        )
+    return space.to_space(q, acceleration)
+
+
+def _accelerations(robot):
+    """The accelerations and mass matrices of a robot without constraints."""
+    system, space = robot.system, robot._space
+
+    @jax.jit
+    @jax.vmap
+    def compute(qpos, qvel, controls):
+        args = {"controls": controls} if robot.controls else None
+        q = space.from_qpos(qpos)
+        v = space.to_body(q, qvel)
+        p, rate = jax.jvp(
+            lambda q: system.momentum(0.0, q, v, args), (q,), (space.tangent(q, v),)
+        )
+        force = system.free_force(0.0, q, v, jnp.zeros(0), args)
+        force = force + system.manifold_of(q).ad_dual(v, p) - rate
+        mass = system.metric(0.0, q, v, args)
+        acceleration = _to_mujoco(robot, q, v, jnp.linalg.solve(mass, force))
+        to_body = jax.vmap(lambda e: space.to_body(q, e))(jnp.eye(v.shape[0]))
+        return acceleration, to_body @ mass @ to_body.T
+
+    return compute
+
+
+@pytest.mark.parametrize("count", [20, pytest.param(200, marks=pytest.mark.long)])
+@pytest.mark.parametrize("name", sorted(OPEN))
+def test_acceleration_and_mass_matrix_on_random_states_equal_mujoco(name, count):
+    model, robot = _robot(name)
+    states = _random_states(model, count)
+    found, masses = _accelerations(robot)(*map(jnp.asarray, states))
+    data, mass = mujoco.MjData(model), np.zeros((model.nv, model.nv))
+    for i, (qpos, qvel, controls) in enumerate(zip(*states, strict=True)):
+        data.qpos[:], data.qvel[:], data.ctrl[:] = qpos, qvel, controls
+        mujoco.mj_forward(model, data)
+        scale = max(1.0, np.abs(data.qacc).max())
+        np.testing.assert_allclose(found[i], data.qacc, atol=1e-10 * scale, rtol=0)
+        mujoco.mj_fullM(model, data, mass)
+        np.testing.assert_allclose(masses[i], mass, atol=1e-10, rtol=0)
+
+
+def _constraint_rows(model, data, qpos, qvel):
+    data.qpos[:], data.qvel[:] = qpos, qvel
+    mujoco.mj_forward(model, data)
+    return data.efc_J.reshape(-1, model.nv)[: data.ne].copy()
+
+
+def _by_kkt(model, data, qpos, qvel):
+    """The acceleration from the dense equations M a = f + Jᵀ λ, J a = -J' v."""
+
+    def rates(time):
+        moved = qpos.copy()
+        mujoco.mj_integratePos(model, moved, qvel, time)
+        return _constraint_rows(model, data, moved, qvel) @ qvel
+
+    h = 1e-3
+    slopes = [(rates(k * h) - rates(-k * h)) / (2 * k * h) for k in (1, 2, 4)]
+    coarse = [(4 * slopes[i] - slopes[i + 1]) / 3 for i in range(2)]
+    slope = (16 * coarse[0] - coarse[1]) / 15
+    rows, mass = _constraint_rows(model, data, qpos, qvel), np.zeros((model.nv,) * 2)
+    mujoco.mj_fullM(model, data, mass)
+    zero = np.zeros((len(rows), len(rows)))
+    matrix = np.block([[mass, -rows.T], [rows, zero]])
+    right = np.concatenate([data.qfrc_smooth, -slope])
+    return np.linalg.lstsq(matrix, right, rcond=1e-11)[0][: model.nv]
+
+
+@pytest.mark.parametrize("name", sorted(CLOSED))
+def test_equations_of_closed_loops_at_rest_restrict_the_motions_of_mujoco(name):
+    model, robot = _robot(name)
+    data, space = mujoco.MjData(model), robot._space
+    model.opt.jacobian = int(mujoco.mjtJacobian.mjJAC_DENSE)
+    expected = _constraint_rows(model, data, model.qpos0, np.zeros(model.nv))
+    q = space.from_qpos(jnp.asarray(model.qpos0))
+
+    @jax.jit
+    def rates(qvel):
+        return robot.system.holonomic_rate(0.0, q, space.to_body(q, qvel))
+
+    found = np.stack([rates(x) for x in jnp.eye(model.nv)], axis=1)
+    rank = np.linalg.matrix_rank(expected, tol=1e-10)
+    assert np.linalg.matrix_rank(found, tol=1e-10) == rank == len(robot.loops)
+    both = np.concatenate([found, expected])
+    assert np.linalg.matrix_rank(both, tol=1e-10) == rank
+
+
+@pytest.mark.parametrize(
+    ("name", "count"),
+    [("four-bar", 20), *(pytest.param(x, 200, marks=pytest.mark.long) for x in CLOSED)],
+)
+def test_acceleration_of_closed_loops_equals_dense_equations(name, count):
+    model, robot = _robot(name)
+    model.opt.jacobian = int(mujoco.mjtJacobian.mjJAC_DENSE)
+    rng = np.random.default_rng(2)
+    starts = []
+    for _ in range(count):
+        qpos = model.qpos0.copy()
+        mujoco.mj_integratePos(model, qpos, rng.normal(size=model.nv), 0.15)
+        starts.append(qpos)
+    velocities = rng.normal(size=(count, model.nv))
+
+    @jax.jit
+    @jax.vmap
+    def compute(qpos, qvel):
+        y = robot.initial_state(qpos, qvel, project=True)
+        found = nhjax.motion(robot.system, 0.0, y).acceleration
+        return y, _to_mujoco(robot, y.q, y.v, found)
+
+    y, found = compute(jnp.asarray(np.stack(starts)), jnp.asarray(velocities))
+    data = mujoco.MjData(model)
+    qpos, qvel = np.asarray(robot.qpos(y)), np.asarray(robot.qvel(y))
+    for i in range(count):
+        expected = _by_kkt(model, data, qpos[i], qvel[i])
+        scale = max(1.0, np.abs(expected).max())
+        np.testing.assert_allclose(found[i], expected, atol=1e-10 * scale, rtol=0)
+        assert np.abs(data.efc_pos[: data.ne]).max() < 1e-10
+
+
+def test_planar_loop_in_space_keeps_only_independent_equations():
+    _, robot = _robot("four-bar")
+    assert robot.loops == ("loop x", "loop z")
+    assert robot.system.constraints == "independent"
+
+
+# --- Rolling -------------------------------------------------------------------------
+
+
+@functools.cache
+def _two_wheels():
+    return nhjax.from_mujoco(
+        TWO_WHEELS,
+        rolling=["right_tread", "left_tread"],
+        root="planar",
+        ground=rolling.Plane(height=-0.15),
+        ignore=["contacts"],
+    )
+
+
+def test_two_wheeled_robot_from_urdf_moves_like_that_of_the_gallery():
+    robot = _two_wheels()
+    hand_written = nhjax.systems.TwoWheeledRobot.rolling(1.0, 0.5)
+    runs = []
+    for system, y0 in (
+        (robot.system, robot.initial_state(hand_written.q0, hand_written.v0)),
+        (hand_written.system, hand_written.initial_state()),
+    ):
+        method, saveat = nhjax.LobattoIIIAB(2), nhjax.SaveAt(steps=20)
+        runs.append(
+            nhjax.integrate(system, method, y0, dt=0.05, num_steps=100, saveat=saveat)
+        )
+    sol, expected = runs
+    np.testing.assert_allclose(robot.qpos(sol), expected.ys.q, atol=1e-10)
+    np.testing.assert_allclose(robot.qvel(sol), expected.ys.v, atol=1e-10)
+
+
+def test_wheel_on_shared_axle_leaves_out_its_lateral_direction():
+    robot = _two_wheels()
+    assert robot.contacts is not None
+    assert robot.contacts.multiplier_names == (
+        "right_tread along",
+        "right_tread across",
+        "left_tread along",
+    )
+    assert robot.system.constraints == "independent"
+    assert robot.coordinates == ("root_TX", "root_TY", "root_RZ", "right", "left")
+
+
+def test_free_robot_with_caster_stands_on_three_heights():
+    text = OPEN["differential drive"].replace(
+        '<body name="right"',
+        '<geom name="caster" type="sphere" size="0.05" pos="0.3 0 -0.1"/>'
+        '<body name="right"',
+    )
+    for side in ("right", "left"):
+        text = text.replace(
+            f'<joint name="{side}" axis="0 1 0"/>\n        <geom',
+            f'<joint name="{side}" axis="0 1 0"/><geom name="{side}"',
+        )
+    options = {"right": "no slip", "left": "no slip", "caster": "slides"}
+    robot = nhjax.from_mujoco(_compiled(text), rolling=options)
+    assert robot.contacts is not None
+    assert robot.contacts.multiplier_names == (
+        "right along",
+        "right across",
+        "left along",
+        "right normal",
+        "left normal",
+        "caster normal",
+    )
+    forces = robot.contacts.forces(0.0, robot.initial_state(), robot.args)
+    weight = 9.81 * (5 + 3 * 0.7)
+    assert float(sum(force[2] for force in forces.values())) == pytest.approx(weight)
+
+
+def test_car_with_four_parallel_wheels_keeps_three_heights():
+    wheels = "".join(
+        f"""<body name="{x}{y}" pos="{x} {y} 0"><joint name="{x}{y}" axis="0 1 0"/>
+        <geom name="w{x}{y}" type="cylinder" size="0.15 0.02" euler="90 0 0"
+        contype="0"/></body>"""
+        for x in (-1, 1)
+        for y in (-1, 1)
+    )
+    spec = mujoco.MjSpec.from_string(
+        f"""<mujoco><worldbody><body name="car" pos="0 0 0.15"><freejoint name="car"/>
+        {BODY.format("trunk", "box")}{wheels}</body></worldbody></mujoco>"""
+    )
+    names = [f"w{x}{y}" for x in (-1, 1) for y in (-1, 1)]
+    robot = nhjax.from_mujoco(spec, rolling=names, ignore=["contacts"])
+    assert robot.system.constraints == "independent"
+    assert robot.contacts is not None
+    kept = [x.split()[1] for x in robot.contacts.multiplier_names]
+    assert {x: kept.count(x) for x in kept} == {"along": 4, "across": 2, "normal": 3}
+    every = nhjax.from_mujoco(
+        spec, rolling=names, ignore=["contacts"], constraints="redundant"
+    )
+    assert every.contacts is not None
+    assert len(every.contacts.multiplier_names) == 12
+
+
+def test_ball_that_rolls_down_a_slope_accelerates_by_five_sevenths():
+    spec = mujoco.MjSpec.from_string(
+        f"""<mujoco><compiler angle="radian"/><worldbody>
+        <geom name="slope" type="plane" size="1 1 1" axisangle="0 1 0 0.3"/>
+        <body name="ball"><freejoint name="ball"/>
+        {BODY.format("ball", "sphere")}</body></worldbody></mujoco>"""
+    )
+    robot = nhjax.from_mujoco(spec, rolling={"ball": "no slip"})
+    normal = np.array([math.sin(0.3), 0.0, math.cos(0.3)])
+    y = robot.initial_state({"ball": [*(0.1 * normal), 1.0, 0.0, 0.0, 0.0]})
+    found = nhjax.motion(robot.system, 0.0, y).acceleration
+    down = np.array([math.cos(0.3), 0.0, -math.sin(0.3)])
+    size = 5 / 7 * 9.81 * math.sin(0.3)
+    np.testing.assert_allclose(found[:3], size * down, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("kind", "expected"),
+    [
+        ("cylinder", rolling.Wheel),
+        ("capsule", rolling.Wheel),
+        ("sphere", rolling.Ellipsoid),
+        ("ellipsoid", rolling.Ellipsoid),
+    ],
+)
+def test_geom_that_rolls_touches_at_its_radius(kind, expected):
+    spec = mujoco.MjSpec.from_string(
+        f"""<mujoco><worldbody><body name="b"><freejoint name="b"/>
+        {BODY.format("tread", kind)}</body></worldbody></mujoco>"""
+    )
+    robot = nhjax.from_mujoco(spec, rolling={"tread": "slides"})
+    assert robot.contacts is not None
+    contact = robot.contacts["tread"]
+    assert type(contact) is expected
+    half = math.sqrt(0.5)
+    pose = jnp.array([half, half, 0.0, 0.0, 0.3, 0.2, 0.25])
+    assert float(contact.height(0.0, pose)) == pytest.approx(0.15)
+    assert contact.no_slip == ()
+
+
+# --- MuJoCo's conventions ------------------------------------------------------------
+
+
+def test_positions_and_velocities_of_free_and_ball_joints_come_back():
+    for name in ("quadruped", "ball joint", "two trees"):
+        model, robot = _robot(name)
+        (qpos,), (qvel,), _ = _random_states(model, 1)
+        q = robot._space.from_qpos(jnp.asarray(qpos))
+        v = robot._space.to_body(q, jnp.asarray(qvel))
+        y = nhjax.State(q, v, v, jnp.zeros(0))
+        np.testing.assert_allclose(robot.qpos(y), qpos, atol=1e-15)
+        np.testing.assert_allclose(robot.qvel(y), qvel, atol=1e-14)
+        data = mujoco.MjData(model)
+        data.qpos[:] = qpos
+        mujoco.mj_kinematics(model, data)
+        for body in ("shank3", "arm", "third"):
+            if body in robot.bodies:
+                number = robot.bodies.index(body)
+                position, rotation = robot.pose(body, q)
+                np.testing.assert_allclose(position, data.xpos[number], atol=1e-14)
+                expected = data.xmat[number].reshape(3, 3)
+                np.testing.assert_allclose(rotation, expected, atol=1e-14)
+
+
+def test_state_by_names_of_joints_has_the_rest_of_the_file():
+    model, robot = _robot("cart and pole")
+    y = robot.initial_state({"pole": 0.7}, {"cart": 2.0})
+    np.testing.assert_allclose(robot.qpos(y), [model.qpos0[0], 0.7])
+    np.testing.assert_allclose(robot.qvel(y), [2.0, 0.0])
+    with pytest.raises(ValueError, match="`qpos` has 'wheel', but the joints are cart"):
+        robot.initial_state({"wheel": 0.0})
+    with pytest.raises(nhjax.ShapeError, match=r"must have shape \(2,\), got \(3,\)"):
+        robot.initial_state(jnp.zeros(3))
+
+
+def test_conversion_of_a_solution_without_states_raises():
+    _, robot = _robot("cart and pole")
+    with pytest.raises(TypeError, match="converts a State, or a Solution"):
+        robot.qpos(jnp.zeros(3))
+
+
+# --- Forces and parameters -----------------------------------------------------------
+
+
+def _force(robot, *arguments):
+    assert robot.system.force is not None
+    return robot.system.force(*arguments)
+
+
+def test_friction_loss_is_a_smooth_law_of_the_documented_scale():
+    text = OPEN["cart and pole"].replace(
+        'name="cart" type', 'name="cart" frictionloss="2" type'
+    )
+    robot = nhjax.from_mujoco(_compiled(text), friction_smoothing=0.1)
+    force = _force(robot, 0.0, jnp.zeros(2), jnp.array([0.05, 1.0]), None)
+    np.testing.assert_allclose(force, [-2 * math.tanh(0.5), 0.0], atol=1e-15)
+
+
+@pytest.mark.parametrize(
+    ("control", "force"), [(0.3, 0.9), (50.0, 15.0), (-50.0, -15.0)]
+)
+def test_control_beyond_its_range_is_limited_smoothly(control, force):
+    _, robot = _robot("cart and pole")
+    args = {"controls": jnp.array([control])}
+    found = _force(robot, 0.0, jnp.zeros(2), jnp.zeros(2), args)
+    np.testing.assert_allclose(found, [force, 0.0], atol=1e-14)
+
+
+def test_feedback_receives_positions_and_velocities_of_mujoco():
+    model, _ = _robot("differential drive")
+
+    def controls(t, qpos, qvel, args):
+        return jnp.stack([qpos[2], qvel[0], 0 * t])
+
+    robot = nhjax.from_mujoco(model, controls=controls)
+    half = math.sqrt(0.5)
+    q = (jnp.array([half, 0.0, 0.0, half, 0.0, 0.0, 0.4]), jnp.zeros(2))
+    v = jnp.array([0.0, -3.0] + 6 * [0.0])
+    force = _force(robot, 0.0, q, v, None)
+    np.testing.assert_allclose(force[6:], [0.4, 3.0], atol=1e-14)
+
+
+SMALL = {"mass": ["cart", "pole"], "damping": ["pole"], "stiffness": ["cart"]}
+LARGE = {"mass": ["fore"], "damping": ["pitch"], "armature": ["yaw"]}
+
+
+@pytest.mark.parametrize(
+    ("name", "chosen"),
+    [
+        ("cart and pole", SMALL),
+        pytest.param("arm with springs and servos", LARGE, marks=pytest.mark.long),
+    ],
+)
+def test_gradient_by_parameters_of_the_file_agrees_with_differences(name, chosen):
+    model, _ = _robot(name)
+    robot = nhjax.from_mujoco(model, parameters=chosen)
+    assert float(robot.args["mass"][chosen["mass"][0]]) == pytest.approx(0.7)
+    velocity = jnp.linspace(1.0, 0.3, model.nv)
+
+    @jax.jit
+    def end(args):
+        y0 = robot.initial_state(qvel=velocity, args=args)
+        sol = nhjax.integrate(
+            robot.system, nhjax.LobattoIIIAB(2), y0, dt=0.02, num_steps=10, args=args
+        )
+        return robot.qpos(sol)[-1] @ jnp.arange(1.0, model.nv + 1)
+
+    slopes, h = jax.jit(jax.grad(end))(robot.args), 1e-3
+    leaves, structure = jax.tree.flatten(robot.args)
+    for i, slope in enumerate(jax.tree.leaves(slopes)):
+
+        def at(x, i=i):
+            moved = [leaf + x if j == i else leaf for j, leaf in enumerate(leaves)]
+            return end(structure.unflatten(moved))
+
+        near, far = [(at(k * h) - at(-k * h)) / (2 * k * h) for k in (1, 2)]
+        assert float(slope) == pytest.approx(float((4 * near - far) / 3), abs=1e-8)
+        assert abs(float(slope)) > 1e-6
+
+
+def test_mass_in_args_equals_a_model_with_this_mass():
+    body = '<body name="b"><joint name="j"/>{}</body>'
+    text = f"<mujoco><worldbody>{body}</worldbody></mujoco>"
+    geom = '<geom type="box" size="0.1 0.2 0.3" pos="0.1 0.2 0" mass="{}"/>'
+    robots = [
+        nhjax.from_mujoco(
+            _compiled(text.format(geom.format(mass))), parameters={"mass": ["b"]}
+        )
+        for mass in (2, 5)
+    ]
+    q, v = jnp.array([0.3]), jnp.array([0.7])
+    first = robots[0].system.lagrangian(0.0, q, v, {"mass": {"b": 5.0}})
+    second = robots[1].system.lagrangian(0.0, q, v, None)
+    assert float(first) == pytest.approx(float(second), abs=1e-14)
+
+
+@pytest.mark.parametrize(
+    ("args", "message"),
+    [
+        (3.0, "must be None or a dictionary"),
+        ({"control": 1.0}, "unknown key 'control'"),
+        ({"controls": np.zeros(3)}, r"must have shape \(1,\)"),
+    ],
+)
+def test_wrong_args_of_a_robot_raise(args, message):
+    _, robot = _robot("cart and pole")
+    with pytest.raises((TypeError, ValueError), match=message):
+        robot.system.lagrangian(0.0, jnp.zeros(2), jnp.zeros(2), args)
+
+
+# --- What cannot be read -------------------------------------------------------------
+
+JOINT = '<body name="b"><joint name="j" {}/><geom name="g" size="0.1" {}/></body>'
+APART = 'contype="0" conaffinity="0"'
+
+
+def _text(joint="", rest="", geom=APART, before=""):
+    bodies = JOINT.format(joint, geom)
+    return f"<mujoco>{before}<worldbody>{bodies}</worldbody>{rest}</mujoco>"
+
+
+def _actuator(text):
+    return _text(rest=f"<actuator>{text}</actuator>")
+
+
+REFUSED = {
+    "limit": (_text('range="-1 1" limited="true"'), "joint 'j': a limit", "limits"),
+    "muscle": (
+        _actuator('<muscle name="m" joint="j" lengthrange="0 1"/>'),
+        "actuator 'm': a muscle",
+        "actuators",
+    ),
+    "filter": (
+        _actuator('<general name="m" joint="j" dyntype="filter" dynprm="0.1"/>'),
+        "actuator 'm': internal dynamics",
+        "actuators",
+    ),
+    "site": (
+        _text(rest='<actuator><motor name="m" site="s"/></actuator>').replace(
+            "</body>", '<site name="s"/></body>'
+        ),
+        "actuator 'm': the transmission site",
+        "actuators",
+    ),
+    "fluid": (_text(before='<option density="1.2"/>'), "forces of a fluid", "fluid"),
+    "contacts": (
+        _text(geom="").replace(
+            "<worldbody>", '<worldbody><geom name="floor" size="1"/>'
+        ),
+        "'floor' and 'g' can touch",
+        "contacts",
+    ),
+    "friction": (
+        _text('type="ball" frictionloss="1"'),
+        "joint 'j': friction of a ball or free joint",
+        "friction loss",
+    ),
+    "spring": (
+        _text('stiffness="2" springyield="0.1"'),
+        "joint 'j': a spring that yields",
+        "springs",
+    ),
+    "tendon": (
+        _text(
+            rest='<tendon><spatial name="rope"><site site="s"/><site site="w"/>'
+            "</spatial></tendon>"
+        ).replace("</body>", '<site name="s"/></body><site name="w"/>'),
+        "tendon 'rope': a spatial tendon",
+        "tendons",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", sorted(REFUSED))
+def test_unsupported_part_is_refused_by_name_unless_ignored(name):
+    text, message, word = REFUSED[name]
+    with pytest.raises(ValueError, match=message) as caught:
+        nhjax.from_mujoco(_compiled(text))
+    assert f"ignore=({word!r},)" in str(caught.value)
+    assert nhjax.from_mujoco(_compiled(text), ignore=[word]).coordinates
+
+
+def test_part_that_cannot_be_ignored_says_so():
+    with pytest.raises(ValueError, match="cannot be ignored"):
+        nhjax.from_mujoco(_compiled("<mujoco><worldbody/></mujoco>"))
+
+
+WRONG = [
+    ("no_such_file.xml", {}, "there is no file no_such_file.xml"),
+    ("<mujoco/>", {}, "To read a string, pass `mujoco.MjSpec.from_string"),
+    (3, {}, "must be the path of an MJCF or URDF file"),
+    (TWO_WHEELS, {"root": "floating"}, "`root` must be one of 'free', 'planar'"),
+    (TWO_WHEELS, {"rolling": ["left_tread"]}, 'Pass `root="free"`'),
+    (_text(), {"ignore": ["walls"]}, "each word of `ignore` must be one of"),
+    (_text(), {"ignore": "limits"}, r"write `ignore=\('limits',\)`"),
+    (_text(), {"root": "free"}, "`root` is for URDF files only"),
+    (_text(), {"rolling": ["h"]}, "`rolling` has 'h', but the geoms are g"),
+    (_text(), {"rolling": "g"}, r"write `rolling=\('g',\)`"),
+    (_text(), {"rolling": {"g": "fast"}}, "must be one of 'no slip'"),
+    (_text(), {"rolling": ["g"]}, "is 0.1 m below the ground"),
+    (_text(), {"rolling": ["g"], "ground": "floor"}, "must be the name of a plane"),
+    (_text(), {"parameters": {"weight": ["b"]}}, "unknown kind 'weight'"),
+    (_text(), {"parameters": {"mass": ["c"]}}, "has 'c', but the names are b"),
+    (_text(), {"parameters": {"mass": "b"}}, r"write \['b'\]"),
+    (
+        _text(geom='type="box" size="1 1 1" contype="0"').replace('size="0.1"', ""),
+        {"rolling": ["g"]},
+        "is a box, but only a cylinder",
+    ),
+]
+
+
+@pytest.mark.parametrize("case", range(len(WRONG)))
+def test_wrong_argument_is_named_with_advice(case):
+    model, options, message = WRONG[case]
+    if isinstance(model, str) and model.startswith("<mujoco>"):
+        model = _compiled(model)
+    with pytest.raises((TypeError, ValueError, FileNotFoundError), match=message):
+        nhjax.from_mujoco(model, **options)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("<mujoco><worldbody>", "is not an XML file"),
+        ("<mujoco><worldbody><wheel/></worldbody></mujoco>", "MuJoCo cannot read"),
+        ('<robot name="r"><link name="a"/><link name="b"/></robot>', "2 root links"),
+    ],
+)
+def test_broken_file_is_refused_with_its_path(text, message, tmp_path):
+    path = tmp_path / "broken.xml"
+    path.write_text(text, encoding="utf-8")
+    with pytest.raises(ValueError, match=message) as caught:
+        nhjax.from_mujoco(path)
+    assert "broken.xml" in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("root", "count"), [("free", 8), ("planar", 5), ("fixed", 2), (None, 2)]
+)
+def test_root_of_urdf_moves_as_asked(root, count):
+    robot = nhjax.from_mujoco(TWO_WHEELS, root=root, ignore=["contacts"])
+    assert len(robot.coordinates) == count
+
+
+def test_missing_mujoco_is_named_with_its_extra(monkeypatch):
+    monkeypatch.setitem(sys.modules, "mujoco", None)
+    with pytest.raises(ImportError, match=re.escape('pip install "nhjax[robots]"')):
+        nhjax.from_mujoco("robot.xml")
