@@ -4,17 +4,19 @@ Five motions have phases of very different speed: a rattleback that reverses its
 Euler's disc down to an inclination of 1e-3, an orbit with close passes and a
 constraint, a whip of ten pendulums, and a bicycle that falls. Three are smooth, so that
 constant steps suit them. Each is run with constant steps, with the PID controller, and
-with the reversible controller, and beside them by diffrax with its PID controller on
-the index-reduced equations, where they are equations on a vector space.
+with the reversible controller. Beside them, where the equations are on a vector space,
+are diffrax with its PID controller on the index-reduced equations, and IDA of SUNDIALS
+on the equations with multipliers, with compiled residuals and Jacobians.
 
 The error is the largest of (q, v) at the end against a run with s = 6 and the tolerance
 1e-12, over the size of the state. Steps are attempts, rejected ones included. Times are
 the least of three calls of compiled programs. For the comparison at equal error, the
 steps of a ladder are interpolated in logarithms.
 
-Two more parts: `long` follows the energy of the orbit over t = 1e5 with constant, PID
+More parts: `long` follows the energy of the orbit over t = 1e5 with constant, PID
 and reversible steps, and draws docs/step_sizes.png. `stages` measures which number of
-stages needs the least time for an error.
+stages needs the least time for an error. `tolerance` compares errors with tolerances
+over the gallery, and draws docs/tolerances.png.
 """
 
 import argparse
@@ -31,6 +33,7 @@ import jax.numpy as jnp
 import matplotlib.pyplot as plt
 import numpy as np
 from jaxtyping import Array
+from sksundae.ida import IDA
 
 import nhjax
 from nhjax import systems
@@ -40,7 +43,7 @@ from ._report import markdown_table, number, RESULTS, write
 
 
 LAST_BETA = 1e-3
-PARTS = "cases", "long", "stages"
+PARTS = "cases", "long", "stages", "tolerance"
 DOCS = Path(__file__).parent.parent / "docs"
 SAVED = RESULTS / "adaptive_steps.json"
 
@@ -162,6 +165,8 @@ CASES: dict[str, Callable[[], Case]] = {
     "chaotic": lambda: smooth("ChaoticSystem", 20.0, 25),
     "CVT": lambda: smooth("ContinuouslyVariableTransmission", 20.0, 25),
 }
+IDA_NAME = "IDA, evaluations"
+OTHERS = "diffrax Dopri8", IDA_NAME
 TOLERANCES = (1e-3, 1e-4, 1e-5, 1e-6, 1e-7, 1e-8, 1e-9, 1e-10)
 
 
@@ -250,6 +255,7 @@ def measure(name: str, case: Case) -> Iterator[Row]:
         )
     if case.system.manifold is None:
         yield from of_diffrax(name, case, exact)
+        yield from of_ida(name, case, exact)
 
 
 def of_diffrax(name: str, case: Case, exact: np.ndarray) -> Iterator[Row]:
@@ -293,6 +299,79 @@ def of_diffrax(name: str, case: Case, exact: np.ndarray) -> Iterator[Row]:
         )
 
 
+def of_ida(name: str, case: Case, exact: np.ndarray) -> Iterator[Row]:
+    """Run a case by IDA, on q, v and the multipliers of the constraints' rates."""
+    system, start = case.system, case.start
+    n, m = start.v.shape[0], start.multiplier.shape[0]
+
+    def constraint_rates(t: Any, q: Array, v: Array) -> Array:
+        rates = [jnp.zeros(0)]
+        if system.holonomic is not None:
+            rates.append(
+                jax.jvp(
+                    lambda t, q: system.holonomic(t, q, None),
+                    (t, q),
+                    (jnp.ones_like(t), v),
+                )[1]
+            )
+        if system.nonholonomic is not None:
+            rates.append(jnp.atleast_1d(system.nonholonomic(t, q, v, None)))
+        return jnp.concatenate(rates)
+
+    def residual(t: Any, y: Array, rate: Array) -> Array:
+        (q, v, multiplier), v_rate = jnp.split(y, (n, 2 * n)), rate[n : 2 * n]
+        t, along = jnp.asarray(t), (jnp.ones(()), v, v_rate)
+        momentum = jax.grad(lambda t, q, v: system.lagrangian(t, q, v, None), argnums=2)
+        slope = jax.grad(lambda q: system.lagrangian(t, q, v, None))(q)
+        force = 0.0 if system.force is None else system.force(t, q, v, None)
+        momentum_rate = jax.jvp(momentum, (t, q, v), along)[1]
+        reaction = jax.vjp(lambda v: constraint_rates(t, q, v), v)[1](multiplier)[0]
+        return jnp.concatenate(
+            [
+                rate[:n] - v,
+                momentum_rate - slope - force - reaction,
+                jax.jvp(constraint_rates, (t, q, v), along)[1],
+            ]
+        )
+
+    compiled = jax.jit(residual)
+    both = jax.jit(jax.jacfwd(residual, argnums=(1, 2)))
+
+    def fill(t: float, y: Array, rate: Array, out: np.ndarray) -> None:
+        out[:] = compiled(t, y, rate)
+
+    def fill_jacobian(
+        t: float, y: Array, rate: Array, out: Any, factor: float, jacobian: np.ndarray
+    ) -> None:
+        by_y, by_rate = both(t, y, rate)
+        jacobian[:] = np.asarray(by_y) + factor * np.asarray(by_rate)
+
+    # The residual is linear in the accelerations and the multipliers.
+    y0, rate0 = np.zeros((2, 2 * n + m))
+    y0[:n], y0[n : 2 * n], rate0[:n] = start.q, start.v, start.v
+    by_y, by_rate = both(0.0, y0, rate0)
+    matrix = np.hstack([by_rate[n:, n : 2 * n], by_y[n:, 2 * n :]])
+    unknowns = np.linalg.lstsq(matrix, -np.asarray(compiled(0.0, y0, rate0))[n:])[0]
+    rate0[n : 2 * n], y0[2 * n :] = unknowns[:n], unknowns[n:]
+
+    ends = np.array([0.0, case.t1])
+    for rtol in TOLERANCES:
+        solver = IDA(
+            fill,
+            jacfn=fill_jacobian,
+            algebraic_idx=np.arange(2 * n, 2 * n + m) if m else None,
+            rtol=rtol,
+            atol=1e-2 * rtol,
+            max_num_steps=10**6,
+        )
+        out, seconds = timed(lambda s=solver: s.solve(ends, y0, rate0))
+        end = out.y[-1, : 2 * n] if out.success else np.full(2 * n, np.nan)
+        error = float(np.max(np.abs(end - exact)) / np.max(np.abs(exact)))
+        print(name, "IDA", rtol, error, out.nfev, seconds, flush=True)
+        # IDA does not report steps here; these are evaluations of the residual.
+        yield Row(name, IDA_NAME, rtol, error, int(out.nfev), 0, seconds)
+
+
 def at_error(rows: list[Row], error: float, what: str) -> float:
     """Interpolate the steps or seconds of a ladder at an error; NaN outside of it."""
     points = sorted((x.error, getattr(x, what)) for x in rows if np.isfinite(x.error))
@@ -313,7 +392,7 @@ def comparison(rows: list[Row]) -> list[list[str]]:
             line = [case, number(error)]
             of = {
                 kind: [x for x in rows if x.case == case and x.method == kind]
-                for kind in ("constant", "PID", "reversible", "diffrax Dopri8")
+                for kind in ("constant", "PID", "reversible", *OTHERS)
             }
             base = {
                 what: at_error(of["constant"], error, what)
@@ -324,8 +403,9 @@ def comparison(rows: list[Row]) -> list[list[str]]:
                 for what in ("steps", "seconds"):
                     ratio = at_error(of[kind], error, what) / base[what]
                     line.append("-" if math.isnan(ratio) else f"{ratio:.2f}")
-            ratio = at_error(of["diffrax Dopri8"], error, "seconds") / base["seconds"]
-            line.append("-" if math.isnan(ratio) else f"{ratio:.2f}")
+            for kind in OTHERS:
+                ratio = at_error(of[kind], error, "seconds") / base["seconds"]
+                line.append("-" if math.isnan(ratio) else f"{ratio:.2f}")
             table.append(line)
     return table
 
@@ -340,6 +420,7 @@ HEADER = [
     "reversible: steps, ratio",
     "time, ratio",
     "diffrax: time, ratio",
+    "IDA: time, ratio",
 ]
 
 
@@ -491,6 +572,58 @@ def stage_row(
     return Row(name, str(stages), rtol, *given)
 
 
+# --- Tolerance and error --------------------------------------------------------------
+
+# Machines of the gallery, and the time of about five periods of their fastest motion.
+MACHINES = {
+    "NonholonomicParticle": 20.0,
+    "ChaoticSystem": 20.0,
+    "ContinuouslyVariableTransmission": 20.0,
+    "KnifeEdge": 5.0,
+    "Unicycle": 20.0,
+    "RollingDisc": 5.0,
+    "RodSleigh": 5.0,
+    "FourBar": 2.0,
+    "DoublePendulum": 5.0,
+    "HeavyTop": 2.0,
+    "ChaplyginSphere": 5.0,
+    "BallInBowl": 5.0,
+}
+
+
+def measure_tolerances() -> tuple[str, dict[str, Any]]:
+    """Measure and draw the error at the end against the tolerance."""
+    figure, ax = plt.subplots(figsize=(6.4, 4.0), layout="constrained")
+    table, ratios = [], []
+    for k, (name, t1) in enumerate(MACHINES.items()):
+        case = smooth(name, t1, 1)
+        exact, line = reference(case), []
+        for digits in (4, 6, 8, 10):
+            stages = nhjax.LobattoIIIAB.for_tolerance(10.0**-digits).stages
+            row = stage_row(name, case, exact, stages, digits)
+            line.append(row.error / row.setting)
+            print(row, flush=True)
+        marker = "o-" if k < 10 else "s-"  # There are ten colours.
+        ax.loglog(SHOWN, np.array(line) * SHOWN, marker, label=name)
+        ratios += line
+        table.append([name, *(f"{x:.2g}" for x in line)])
+    ends = np.array(SHOWN)
+    ax.loglog(ends, ends, "k--", linewidth=1)
+    ax.fill_between(ends, 0.1 * ends, 10 * ends, color="0.9", zorder=0)
+    ax.set(xlabel="rtol", ylabel="error at the end")
+    ax.legend(fontsize="x-small", ncols=2)
+    figure.savefig(DOCS / "tolerances.png", dpi=150)
+    inside = np.mean([0.1 <= x <= 10 for x in ratios])
+    text = (
+        "## Tolerance and error\n\n"
+        "The error at the end over `rtol`, with `LobattoIIIAB.for_tolerance(rtol)`. "
+        f"{100 * inside:.0f} percent of the factors lie between 0.1 and 10, and the "
+        f"median is {np.median(ratios):.2g}.\n\n"
+    )
+    header = ["machine", *(f"{x:g}" for x in SHOWN)]
+    return text + markdown_table(header, table), {"tolerances": table}
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--only", nargs="*", help="words of the names of cases")
@@ -503,6 +636,7 @@ def main() -> None:
         "cases": lambda: measure_cases(options.only),
         "long": measure_long,
         "stages": measure_stages,
+        "tolerance": measure_tolerances,
     }
     for part in options.parts:
         data["texts"][part], more = measured[part]()
