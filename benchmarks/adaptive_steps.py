@@ -32,6 +32,7 @@ import jax
 import jax.numpy as jnp
 import matplotlib.pyplot as plt
 import numpy as np
+from jax.flatten_util import ravel_pytree
 from jaxtyping import Array
 from sksundae.ida import IDA
 
@@ -195,7 +196,7 @@ def timed(call: Callable[[], Any]) -> tuple[Any, float]:
 def end_of(sol: nhjax.Solution) -> np.ndarray:
     """Return (q, v) at the end of a run, or NaN if it failed."""
     end = jax.tree.map(lambda x: x[-1], sol.ys)
-    y = np.concatenate([np.asarray(end.q), np.asarray(end.v)])
+    y = np.asarray(ravel_pytree((end.q, end.v))[0])
     return y if sol.result == nhjax.RESULTS.successful else np.full_like(y, np.nan)
 
 
