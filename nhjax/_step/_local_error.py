@@ -7,6 +7,13 @@ is a multiple of U_{p+1}, a derivative of higher order than the samples show. Fr
 to order derivatives grow by a factor r, which the samples do show, so that
 
     U_{p+1} ≈ U_s r^(p+1-s).
+
+On a group, displacements are differentiated in a chart. There each further derivative
+brings a commutator with the velocity, so that
+
+    U_{p+1} ≈ U_s r^(p+1-s) + max_k U_k a^(p+1-k),
+
+where a is a multiple of the largest eigenvalue of ad(h v).
 """
 
 import functools
@@ -18,15 +25,16 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from .._custom_types import Args, FloatScalar
+from .._manifold import AbstractLieGroup
 from .._method import AbstractMethod
 from .._system import AbstractMechanicalSystem
 from ._step import StepOutcome, StepState
 
 
-# The error of a step is this power of a factor times the error of the quadrature b.
-# Both factors are medians over the gallery, measured by `benchmarks.adaptive_steps`. On
-# groups the chart contributes to the error.
-_GROWTH, _GROWTH_ON_GROUPS = 4.0, 20.0
+# The error of a step is the power p / 2 of the first of these times the error of the
+# quadrature b. The second is the factor of the eigenvalue of ad(h v). Both fit the
+# errors of steps of the gallery (`benchmarks.adaptive_steps`).
+_GROWTH, _GROWTH_BY_COMMUTATOR = 4.0, 1.2
 
 
 def local_error(
@@ -70,16 +78,36 @@ def local_error(
                 lambda u: system.velocity(t, start.state.q, u, args), (u,), (change,)
             )
         )(changes)
-    factor = error_factor(method, system.manifold_of(start.state.q).is_flat)
-    fibre = _extrapolated(changes / in_fibre[None], method.order + 1)
+    # The velocities of a step back are those of the step, in reverse order.
+    mean = jnp.asarray(method.b, h.dtype) @ outcome.record.velocity
+    by_chart = _growth_in_chart(system.manifold_of(start.state.q), h * mean)
     # The derivative of order k + 1 of q is that of order k of u.
-    position = _extrapolated(h * displacements / in_position[None], method.order)
-    return factor * jnp.sqrt(0.5 * (fibre**2 + position**2))
+    sizes = changes / in_fibre[None], h * displacements / in_position[None]
+    fibre, position = (
+        _extrapolated(jnp.sqrt(jnp.mean(x**2, axis=1)), order, by_chart)
+        for x, order in zip(sizes, (method.order + 1, method.order), strict=True)
+    )
+    return error_factor(method) * jnp.sqrt(0.5 * (fibre**2 + position**2))
 
 
-def _extrapolated(changes: Float[Array, "s n"], order: int) -> FloatScalar:
+def _growth_in_chart(
+    manifold: AbstractLieGroup, xi: Float[Array, " n"]
+) -> FloatScalar | None:
+    """Return by how much derivatives in a chart grow from order to order, or None."""
+    if manifold.is_flat:
+        return None
+    ad = jax.jacfwd(lambda eta: manifold.ad(xi, eta))(jnp.zeros_like(xi))
+    # Of a rotation, two eigenvalues are not zero. Their fourth powers are positive,
+    # and the trace of the power does not depend on the basis.
+    square = ad @ ad
+    trace = jnp.maximum(jnp.sum(square * square.T), float(jnp.finfo(xi.dtype).tiny))
+    return _GROWTH_BY_COMMUTATOR * (0.5 * trace) ** 0.25
+
+
+def _extrapolated(
+    sizes: Float[Array, " s"], order: int, by_chart: FloatScalar | None
+) -> FloatScalar:
     """Estimate the size of a derivative from scaled derivatives of orders 1, ..., s."""
-    sizes = jnp.sqrt(jnp.mean(changes**2, axis=1))
     number = sizes.shape[0]
     # The first derivative may vanish inside the step, but not at both of its ends.
     first = jnp.maximum(sizes[0], 0.5 * sizes[1])
@@ -90,7 +118,11 @@ def _extrapolated(changes: Float[Array, "s n"], order: int) -> FloatScalar:
         # One derivative may vanish at a time, but not the next one with it.
         growth = jnp.maximum(growth, (sizes[-2] / first) ** (1 / (number - 2)))
         last = jnp.sqrt(last**2 + (growth * sizes[-2]) ** 2)
-    return last * growth ** (order - number)
+    found = last * growth ** (order - number)
+    if by_chart is None:
+        return found
+    powers = [by_chart ** (order - 1 - k) for k in range(number)]
+    return found + jnp.max(sizes * jnp.stack(powers))
 
 
 @functools.cache
@@ -110,11 +142,10 @@ def derivative_weights(method: AbstractMethod) -> np.ndarray:
 
 
 @functools.cache
-def error_factor(method: AbstractMethod, is_flat: bool) -> float:
+def error_factor(method: AbstractMethod) -> float:
     """Return the typical error of a step of order p, divided by U_{p+1}."""
     p = method.order
     defect = abs(float(method.b @ method.c**p) - 1 / (p + 1)) / math.factorial(p)
     # Some methods have the order p for another reason than their quadrature.
     defect = max(defect, 1e-2 / math.factorial(2 * p))
-    growth = _GROWTH if is_flat else _GROWTH_ON_GROUPS
-    return defect * growth ** (p / 2)
+    return defect * _GROWTH ** (p / 2)
