@@ -161,7 +161,7 @@ def wheel(radius: float, half_width: float) -> str:
         cylinder((0, -half_width, 0), (0, half_width, 0), radius, DARK)
         + cylinder((0, -face, 0), (0, face, 0), 0.7 * radius, GREY)
         + box((0.68 * radius, mark, 0.07 * radius), ORANGE)
-        + box((0.07 * radius, mark, 0.68 * radius), ORANGE)
+        + box((0.07 * radius, 0.99 * mark, 0.68 * radius), ORANGE)
     )
 
 

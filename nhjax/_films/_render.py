@@ -136,7 +136,7 @@ def view_of(scene: Scene, camera: Any, size: tuple[int, int]) -> View:
     half_angle = np.deg2rad(scene.model.vis.global_.fovy) / 2
     # The narrower side of the picture must hold the machine.
     half_angle = np.arctan(np.tan(half_angle) * min(1.0, size[0] / size[1]))
-    distance = 1.05 * scene.reach(centres) / np.sin(half_angle)
+    distance = 1.2 * scene.reach(centres) / np.sin(half_angle)
     return View(
         None,
         centres,

@@ -170,9 +170,11 @@ class Scene:
         spec.stat.center = self.centres[0]
         spec.visual.quality.shadowsize = 4096
         spec.visual.quality.offsamples = 8
-        spec.visual.map.shadowclip = 1.6
+        spec.visual.quality.numslices = 64
+        spec.visual.quality.numstacks = 32
+        spec.visual.map.shadowclip = 4.0
         spec.visual.map.znear = 0.02
-        spec.visual.map.zfar = 60.0
+        spec.visual.map.zfar = 30.0
         spec.visual.map.haze = 0.35
         spec.visual.rgba.haze = [0.93, 0.95, 0.97, 1]
         spec.visual.headlight.ambient = [0.38, 0.38, 0.38]
@@ -215,7 +217,7 @@ class Scene:
         """Put the bodies and the light where they are at the k-th time."""
         if self._light is not None:
             # The shadows of a directional light reach only so far from it.
-            distance = 2 * self.model.stat.extent
+            distance = 5 * self.model.stat.extent
             self.model.light_pos[self._light] = self.centres[k] - distance * LIGHT
         self._move(self.model, self.data, k)
 
@@ -293,10 +295,10 @@ def _mark_wheels(mujoco: Any, spec: Any, robot: Robot) -> None:
             continue
         radius, half = geom.size[:2]
         body = next(x for x in spec.bodies if x.id == geom.bodyid[0])
-        for long, wide in ((0.72, 0.09), (0.09, 0.72)):
+        for long, wide, share in ((0.72, 0.09, 1.03), (0.09, 0.72, 1.02)):
             body.add_geom(
                 type=mujoco.mjtGeom.mjGEOM_BOX,
-                size=[long * radius, wide * radius, 1.03 * half],
+                size=[long * radius, wide * radius, share * half],
                 pos=geom.pos,
                 quat=geom.quat,
                 rgba=[0.98, 0.58, 0.10, 1],
