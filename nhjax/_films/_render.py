@@ -316,7 +316,11 @@ def _write_gif(
     sheet = image.new("RGB", (size[0], size[1] * len(some)))
     for k, picture in enumerate(some):
         sheet.paste(picture, (0, k * size[1]))
-    palette = sheet.quantize(96)
+    # The first colours are frequent, and the others keep those of small parts.
+    frequent = sheet.quantize(176, image.Quantize.MEDIANCUT).getpalette()
+    apart = sheet.quantize(80, image.Quantize.MAXCOVERAGE).getpalette()
+    palette = image.new("P", (1, 1))
+    palette.putpalette(frequent[: 3 * 176] + apart[: 3 * 80])
     first, *others = [
         x.quantize(palette=palette, dither=image.Dither.NONE) for x in pictures
     ]

@@ -172,7 +172,7 @@ class Scene:
         spec.visual.quality.offsamples = 8
         spec.visual.quality.numslices = 64
         spec.visual.quality.numstacks = 32
-        spec.visual.map.shadowclip = 4.0
+        spec.visual.map.shadowclip = 7.0
         spec.visual.map.znear = 0.02
         spec.visual.map.zfar = 30.0
         spec.visual.map.haze = 0.35
@@ -294,7 +294,7 @@ def _mark_wheels(mujoco: Any, spec: Any, robot: Robot) -> None:
         if geom.type[0] != mujoco.mjtGeom.mjGEOM_CYLINDER:
             continue
         radius, half = geom.size[:2]
-        body = next(x for x in spec.bodies if x.id == geom.bodyid[0])
+        body = spec.geom(name).parent
         for long, wide, share in ((0.72, 0.09, 1.03), (0.09, 0.72, 1.02)):
             body.add_geom(
                 type=mujoco.mjtGeom.mjGEOM_BOX,

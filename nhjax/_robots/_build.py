@@ -74,7 +74,7 @@ def layout_of(model: Any, source: Any = None) -> Layout:
             )
             last, offset = number, np.eye(4)
         bodies.append(Frame(last, offset))
-    return Layout(joints, bodies)
+    return Layout(joints, bodies, source)
 
 
 def fixed_to(layout: Layout, body: int, position: Any, quaternion: Any) -> Frame:
