@@ -1,8 +1,8 @@
 """The films of docs/films.md and of README.
 
-    python docs/films.py                writes docs/films/NAME.gif for all films
-    python docs/films.py bicycle        writes one of them
-    python docs/films.py --frames 6     writes single frames instead, to look at
+python docs/films.py                writes docs/films/NAME.gif for all films
+python docs/films.py bicycle        writes one of them
+python docs/films.py --frames 6     writes single frames instead, to look at
 """
 
 import argparse
@@ -131,7 +131,9 @@ def _run(system: Any, y0: Any, duration: float, steps: int, args: Any = None) ->
 films = {
     "bicycle": Film(bicycle, 1.0, {"azimuth": 130, "elevation": -12, "distance": 3.1}),
     "mecanum": Film(mecanum, 1.0, {"azimuth": 120, "elevation": -25, "distance": 1.9}),
-    "rattleback": Film(rattleback, 0.6, {"azimuth": 110, "elevation": -35, "distance": 0.55}),
+    "rattleback": Film(
+        rattleback, 0.6, {"azimuth": 110, "elevation": -35, "distance": 0.55}
+    ),
 }
 
 

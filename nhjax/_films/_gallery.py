@@ -180,7 +180,11 @@ def _car(machine: systems.CarWithTrailers) -> Looks:
         body(
             "car",
             box((long, 0.31 * base, 0.10 * base), BLUE, (middle, 0, 0.11 * base)),
-            box((0.42 * base, 0.27 * base, 0.09 * base), PALE, (0.4 * base, 0, 0.3 * base)),
+            box(
+                (0.42 * base, 0.27 * base, 0.09 * base),
+                PALE,
+                (0.4 * base, 0, 0.3 * base),
+            ),
             axle,
         ),
         body("front", axle, beam),
@@ -422,9 +426,16 @@ def _rattleback(machine: systems.Rattleback) -> Looks:
 def _torus(machine: systems.RollingTorus) -> Looks:
     radius, tube = float(machine.radius), float(machine.tube_radius)
     if tube == 0:
-        return _rolling(machine, frame(wheel(radius, 0.012 * radius), turn=AXLE_ALONG_Z))
+        return _rolling(
+            machine, frame(wheel(radius, 0.012 * radius), turn=AXLE_ALONG_Z)
+        )
     spokes = [
-        rod((0, 0, 0), (radius * math.cos(x), 0, radius * math.sin(x)), 0.3 * tube, color)
+        rod(
+            (0, 0, 0),
+            (radius * math.cos(x), 0, radius * math.sin(x)),
+            0.3 * tube,
+            color,
+        )
         for x, color in zip(
             np.arange(6) * math.pi / 3, (ORANGE, *(GREY,) * 5), strict=True
         )
@@ -440,7 +451,9 @@ def _chaplygin_sphere(machine: systems.ChaplyginSphere) -> Looks:
 
 def _chaplygin_top(machine: systems.ChaplyginTop) -> Looks:
     radius, offset = float(machine.radius), float(machine.offset)
-    pole = cylinder((0, 0, offset), (0, 0, offset + 1.01 * radius), 0.2 * radius, ORANGE)
+    pole = cylinder(
+        (0, 0, offset), (0, 0, offset + 1.01 * radius), 0.2 * radius, ORANGE
+    )
     ball_here = frame(banded_ball(radius), pos=(0, 0, offset))
     return _rolling(machine, ball_here, pole)
 
@@ -463,7 +476,9 @@ def _ball_in_bowl(machine: systems.BallInBowl) -> Looks:
     even = np.linspace(0, out[-1], 20)
     heights = np.interp(even, out, low)
     rim = [
-        ball(0.25 * radius, color, (edge * math.cos(x), edge * math.sin(x), heights[-1]))
+        ball(
+            0.25 * radius, color, (edge * math.cos(x), edge * math.sin(x), heights[-1])
+        )
         for edge in (even[-1],)
         for x, color in zip(
             np.arange(8) * math.pi / 4, (ORANGE, *(GREY,) * 7), strict=True
@@ -493,7 +508,11 @@ def _turntable_ball(machine: systems.TurntableBall) -> Looks:
     reach = 5 * radius
     spokes = (
         frame(
-            box((0.48 * reach, 0.03 * radius, 0.002 * radius), color, (0.5 * reach, 0, 0)),
+            box(
+                (0.48 * reach, 0.03 * radius, 0.002 * radius),
+                color,
+                (0.5 * reach, 0, 0),
+            ),
             turn=f"euler='0 0 {k * math.pi / 3}'",
         )
         for k, color in enumerate((ORANGE, *(GREY,) * 5))
@@ -749,7 +768,9 @@ def _car_axis(machine: systems.CarAxis) -> Looks:
     parts = [body("axle", link(length, tube, BLUE))]
     for side in ("left", "right"):
         parts += [
-            body(f"{side} piston", cylinder((0, 0, 0), (0, 0, 0.75 * rest), 0.6 * tube)),
+            body(
+                f"{side} piston", cylinder((0, 0, 0), (0, 0, 0.75 * rest), 0.6 * tube)
+            ),
             body(
                 f"{side} cylinder",
                 cylinder((0, 0, 0), (0, 0, 0.5 * rest), 1.2 * tube, ORANGE),

@@ -107,9 +107,7 @@ def box(
     size: Sequence[float], color: str = BLUE, pos: Sequence[float] = (0, 0, 0)
 ) -> str:
     """Return a box with the given half lengths."""
-    return (
-        f"<geom type='box' size='{_text(size)}' pos='{_text(pos)}' rgba='{color}'/>"
-    )
+    return f"<geom type='box' size='{_text(size)}' pos='{_text(pos)}' rgba='{color}'/>"
 
 
 def rod(

@@ -3,7 +3,9 @@
 import contextlib
 import importlib
 import os
+import subprocess
 import sys
+import tempfile
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -113,7 +115,7 @@ def view_of(scene: Scene, camera: Any, size: tuple[int, int]) -> View:
     if isinstance(camera, Mapping):
         given = dict(camera)
         for key in given:
-            check_choice('render: a key of `camera`', key, _FREE)
+            check_choice("render: a key of `camera`", key, _FREE)
         if "lookat" in given:
             point = np.asarray(given["lookat"], float)
             if point.shape != (3,):
@@ -290,20 +292,28 @@ def _write_mp4(
             'render needs an encoder for .mp4: pip install "nhjax[render]". A .gif '
             "needs none."
         ) from error
-    writer = encoder.write_frames(
-        str(path),
-        size,
-        fps=fps,
-        codec="libx264",
-        macro_block_size=2,
-        output_params=["-crf", "23", "-movflags", "+faststart"],
-    )
-    writer.send(None)
-    try:
-        for frame in frames:
-            writer.send(np.ascontiguousarray(frame))
-    finally:
-        writer.close()
+    width, height = size
+    command = [
+        *(encoder.get_ffmpeg_exe(), "-y", "-loglevel", "error", "-f", "rawvideo"),
+        *("-pix_fmt", "rgb24", "-s", f"{width}x{height}", "-r", f"{fps}", "-i", "-"),
+        # Players and browsers show no other format of pixels.
+        *("-c:v", "libx264", "-pix_fmt", "yuv420p", "-crf", "23"),
+        *("-movflags", "+faststart", str(path)),
+    ]
+    with tempfile.TemporaryFile() as messages:
+        with subprocess.Popen(
+            command, stdin=subprocess.PIPE, stderr=messages
+        ) as process:
+            assert process.stdin is not None
+            # If the encoder ends early, its message says why.
+            with contextlib.suppress(BrokenPipeError):
+                for frame in frames:
+                    process.stdin.write(frame.tobytes())
+                process.stdin.close()
+        if process.returncode:
+            messages.seek(0)
+            said = messages.read().decode(errors="replace").strip()
+            raise RuntimeError(f"render: the encoder could not write {path}: {said}")
 
 
 def _write_gif(

@@ -82,7 +82,11 @@ class Scene:
         if subject.robot is not None:
             is_spec = isinstance(spec, mujoco.MjSpec)
             model = spec.copy().compile() if is_spec else spec
-            return np.asarray(subject.robot.qpos(State(q, None, None, None))), None, model
+            return (
+                np.asarray(subject.robot.qpos(State(q, None, None, None))),
+                None,
+                model,
+            )
         assert subject.looks is not None
         poses = subject.looks.poses
         ts = jnp.asarray(self.times, jax.tree.leaves(q)[0].dtype)
@@ -139,7 +143,9 @@ class Scene:
         for k in range(len(self.times)):
             self._move(model, data, k)
             positions.append(data.geom_xpos[moving])
-            centres.append(mass @ data.xipos[1:] / np.sum(mass) if mass.size else [0] * 3)
+            centres.append(
+                mass @ data.xipos[1:] / np.sum(mass) if mass.size else [0] * 3
+            )
             lows.append(data.geom_xpos[moving] @ [0, 0, 1.0] - radii)
         places, middles = np.asarray(positions), np.asarray(centres)
         span = np.ptp(middles, axis=0)
@@ -168,10 +174,10 @@ class Scene:
             _mark_wheels(mujoco, spec, subject.robot)
         spec.stat.extent = size
         spec.stat.center = self.centres[0]
-        spec.visual.quality.shadowsize = 4096
-        spec.visual.quality.offsamples = 8
-        spec.visual.quality.numslices = 64
-        spec.visual.quality.numstacks = 32
+        spec.visual.quality.shadowsize = 2048
+        spec.visual.quality.offsamples = 4
+        spec.visual.quality.numslices = 48
+        spec.visual.quality.numstacks = 24
         spec.visual.map.shadowclip = 7.0
         spec.visual.map.znear = 0.02
         spec.visual.map.zfar = 30.0

@@ -86,7 +86,7 @@ def view(
 ) -> Show:
     """Show a run in a browser, with a slider for the time and a switch that plays it.
 
-    The function prints the address of the page. It needs no window and no OpenGL here:
+    viser prints the address of the page. The function needs no window and no OpenGL here:
     the browser draws.
 
     **Arguments:**
@@ -122,7 +122,6 @@ def view(
     times = frame_times("view", sol, speed / 60)
     scene = Scene("view", machine, sol, times, True)
     show = Show(viser.ViserServer(port=port, verbose=False), scene, speed)
-    print(f"nhjax.view: {show.url}")
     if not hasattr(sys, "ps1") if block is None else block:
         show.wait()
     return show
