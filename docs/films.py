@@ -6,6 +6,7 @@ python docs/films.py --frames 6     writes single frames instead, to look at
 """
 
 import argparse
+import importlib
 import math
 from collections.abc import Callable
 from pathlib import Path
@@ -54,8 +55,7 @@ def mecanum() -> tuple[Any, nhjax.Solution]:
 
 def mecanum_robot() -> nhjax.Robot:
     """Read a platform on four mecanum wheels, with rollers that are only drawn."""
-    import mujoco
-
+    mujoco: Any = importlib.import_module("mujoco")
     radius, half, lines, angles = 0.1, 0.035, [], {}
     for name, x, y, side in (
         ("front left", 0.22, 0.2, -1),
@@ -82,6 +82,7 @@ def mecanum_robot() -> nhjax.Robot:
                 f"zaxis='1 {side} 0' rgba='{color}'/></frame>"
             )
         lines.append("</body>")
+    motors = [f"<motor name='{x}' joint='{x}'/>" for x in angles]
     spec = mujoco.MjSpec.from_string(f"""
         <mujoco><compiler angle="radian"/>
         <default><geom contype="0" conaffinity="0"/></default>
@@ -96,7 +97,7 @@ def mecanum_robot() -> nhjax.Robot:
             rgba="0.98 0.58 0.1 1"/>
           {"".join(lines)}
         </body></worldbody>
-        <actuator>{"".join(f'<motor name="{x}" joint="{x}"/>' for x in angles)}</actuator>
+        <actuator>{"".join(motors)}</actuator>
         </mujoco>""")
     patterns = jnp.array([[-1.0, 1, 1, -1], [-1, 1, -1, 1], [1, 1, 1, 1]])
     mixing = patterns.T

@@ -100,8 +100,6 @@ from .lanes import engines as engines, EngineUse as EngineUse
 
 
 if TYPE_CHECKING:
-    from ._films import Looks as Looks, render as render, view as view
-    from ._robots import from_mujoco as from_mujoco, Robot as Robot
     from . import (
         forces as forces,
         friction as friction,
@@ -109,6 +107,8 @@ if TYPE_CHECKING:
         rolling as rolling,
         systems as systems,
     )
+    from ._films import Looks as Looks, render as render, view as view
+    from ._robots import from_mujoco as from_mujoco, Robot as Robot
 
 __version__ = "0.1.0"
 

@@ -2,6 +2,8 @@
 
 import math
 from collections.abc import Callable, Iterable, Mapping
+from dataclasses import replace
+from itertools import pairwise
 from typing import Any
 
 import jax.numpy as jnp
@@ -54,10 +56,6 @@ def looks_of(machine: Any) -> Looks | None:
 def names() -> list[str]:
     """Return the names of the machines that have looks."""
     return sorted(kind.__name__ for kind in _LOOKS)
-
-
-# A direction of view straight at a mechanism that moves in a vertical plane.
-FRONT = {"azimuth": 90.0, "elevation": -8.0}
 
 
 def _bicycle(machine: systems.WhippleBicycle) -> Looks:
@@ -117,7 +115,7 @@ def _bicycle(machine: systems.WhippleBicycle) -> Looks:
 
     def poses(t, q, args):
         points = machine.points(t, q)
-        # The coordinates have z down; here z is up, and all turns about y and z reverse.
+        # The coordinates have z down. With z up, turns about y and z change sign.
         rotation = about("z", -q[2]) @ about("x", q[3]) @ about("y", -q[4])
         steered = rotation @ _about(axis.astype(q.dtype), q[5])
         return {
@@ -674,7 +672,9 @@ def _linkage(
         here = in_space(t, q)
         return jnp.stack([here[name] for name in trails])
 
-    given = {"ground": None, **FRONT} | options
+    # The camera looks straight at the plane.
+    given: dict[str, Any] = {"ground": None, "azimuth": 90.0, "elevation": -8.0}
+    given |= options
     return Looks(model(*parts, *still), poses, paths if trails else None, **given)
 
 
@@ -702,7 +702,7 @@ def _pendulum_chain(machine: systems.PendulumChain) -> Looks:
     return _linkage(
         machine.points,
         machine.q0,
-        zip(names[:-1], names[1:], strict=True),
+        pairwise(names),
         masses=dict.fromkeys(names[1:], 0.1),
         fixed=("pivot",),
         trails=(names[-1],),
@@ -795,7 +795,9 @@ def _car_axis(machine: systems.CarAxis) -> Looks:
         points = machine.points(t, q)
         return jnp.stack([upright(points[f"{x}_end"]) for x in ("left", "right")])
 
-    return Looks(model(*parts), poses, trails, None, **FRONT)
+    return Looks(
+        model(*parts), poses, trails, ground=None, azimuth=90.0, elevation=-8.0
+    )
 
 
 def _trails(machine: Any, *names: str) -> Callable[..., Array]:
@@ -816,8 +818,6 @@ def _about(axis: Array, angle: Array) -> Array:
 
 
 def _with(looks: Looks, **changes: Any) -> Looks:
-    from dataclasses import replace
-
     return replace(looks, **changes)
 
 

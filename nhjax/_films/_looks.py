@@ -6,6 +6,7 @@ axle along y, and a body that lies between two points lies along its z axis.
 
 import math
 from collections.abc import Callable, Sequence
+from itertools import pairwise
 from typing import Any, TypeAlias
 
 import equinox as eqx
@@ -16,6 +17,7 @@ from jaxtyping import Array, Float
 from .._manifold import AbstractLieGroup
 
 
+Numbers: TypeAlias = Sequence[float] | np.ndarray
 Pose: TypeAlias = tuple[Float[Array, "3"], Float[Array, "3 3"]]
 
 
@@ -27,9 +29,9 @@ class Looks(eqx.Module):
 
     - `mjcf`: the shapes, as the text of an MJCF model. Its bodies are children of
         `<worldbody>`, have names and no joints. Geoms of the world itself do not move.
-    - `poses`: a function of (t, q, args) that returns a dictionary from the name of each
-        body to its position [m], of shape (3,), and its rotation to space, of shape
-        (3, 3). z points upwards. It is called with `args=None`.
+    - `poses`: a function of (t, q, args) that returns a dictionary from the names of
+        the bodies to pairs: the position [m], of shape (3,), and the rotation to space,
+        of shape (3, 3). z points upwards. It is called with `args=None`.
     - `trails`: a function of (t, q, args) that returns points [m], of shape (k, 3),
         whose paths are drawn, such as the contacts of wheels; None draws no paths.
     - `ground`: the height of the ground [m]. None is just below everything.
@@ -78,7 +80,7 @@ def body(name: str, *geoms: str) -> str:
     return f"<body name='{name}'>{''.join(geoms)}</body>"
 
 
-def frame(*geoms: str, pos: Sequence[float] = (0, 0, 0), turn: str = "") -> str:
+def frame(*geoms: str, pos: Numbers = (0, 0, 0), turn: str = "") -> str:
     """Return geoms in a frame; `turn` is its attribute of orientation."""
     return f"<frame pos='{_text(pos)}' {turn}>{''.join(geoms)}</frame>"
 
@@ -87,7 +89,7 @@ def frame(*geoms: str, pos: Sequence[float] = (0, 0, 0), turn: str = "") -> str:
 AXLE_ALONG_Z = f"euler='{-math.pi / 2} 0 0'"
 
 
-def ball(radius: float, color: str = BLUE, pos: Sequence[float] = (0, 0, 0)) -> str:
+def ball(radius: float, color: str = BLUE, pos: Numbers = (0, 0, 0)) -> str:
     """Return a sphere."""
     return f"<geom type='sphere' size='{radius}' pos='{_text(pos)}' rgba='{color}'/>"
 
@@ -103,23 +105,17 @@ def banded_ball(radius: float, color: str = BLUE, band: str = PALE) -> str:
     return ball(radius, color) + "".join(bands)
 
 
-def box(
-    size: Sequence[float], color: str = BLUE, pos: Sequence[float] = (0, 0, 0)
-) -> str:
+def box(size: Numbers, color: str = BLUE, pos: Numbers = (0, 0, 0)) -> str:
     """Return a box with the given half lengths."""
     return f"<geom type='box' size='{_text(size)}' pos='{_text(pos)}' rgba='{color}'/>"
 
 
-def rod(
-    start: Sequence[float], end: Sequence[float], radius: float, color: str = GREY
-) -> str:
+def rod(start: Numbers, end: Numbers, radius: float, color: str = GREY) -> str:
     """Return a round bar with round ends."""
     return _between("capsule", start, end, radius, color)
 
 
-def cylinder(
-    start: Sequence[float], end: Sequence[float], radius: float, color: str = GREY
-) -> str:
+def cylinder(start: Numbers, end: Numbers, radius: float, color: str = GREY) -> str:
     """Return a round bar with flat ends."""
     return _between("cylinder", start, end, radius, color)
 
@@ -133,10 +129,7 @@ def ring(radius: float, tube: float, color: str = DARK, num: int = 40) -> str:
     """Return a torus with its axle along y, made of round bars."""
     angles = 2 * np.pi * np.arange(num + 1) / num
     rim = radius * np.stack([np.cos(angles), 0 * angles, np.sin(angles)], axis=1)
-    return "".join(
-        rod(a.tolist(), b.tolist(), tube, color)
-        for a, b in zip(rim[:-1], rim[1:], strict=True)
-    )
+    return "".join(rod(a.tolist(), b.tolist(), tube, color) for a, b in pairwise(rim))
 
 
 def spoked_wheel(radius: float, tyre: float, num: int = 12) -> str:
@@ -163,7 +156,7 @@ def wheel(radius: float, half_width: float) -> str:
     )
 
 
-def half_ellipsoid(name: str, semiaxes: Sequence[float]) -> str:
+def half_ellipsoid(name: str, semiaxes: Numbers) -> str:
     """Return the asset of the lower half of an ellipsoid, as a mesh."""
     turn = np.linspace(0, 2 * np.pi, 48, endpoint=False)
     down = np.linspace(0, np.pi / 2, 13)[:-1]
@@ -175,7 +168,7 @@ def half_ellipsoid(name: str, semiaxes: Sequence[float]) -> str:
     return f"<mesh name='{name}' vertex='{_text(points.ravel())}'/>"
 
 
-def bowl(name: str, heights: Sequence[float], radius: float) -> str:
+def bowl(name: str, heights: Numbers, radius: float) -> str:
     """Return the asset of a surface of revolution, as a mesh with two sides.
 
     `heights` are its heights at equal distances from the axis, from 0 to `radius`.
@@ -245,9 +238,7 @@ def upright(point: Array) -> Float[Array, "3"]:
     return jnp.stack([point[0], jnp.zeros_like(point[0]), point[1]])
 
 
-def _between(
-    kind: str, start: Sequence[float], end: Sequence[float], radius: float, color: str
-) -> str:
+def _between(kind: str, start: Numbers, end: Numbers, radius: float, color: str) -> str:
     return (
         f"<geom type='{kind}' size='{radius}' fromto='{_text(start)} {_text(end)}' "
         f"rgba='{color}'/>"

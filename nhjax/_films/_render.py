@@ -7,6 +7,7 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Iterator, Mapping
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -93,7 +94,7 @@ def render(
 
 
 class View(NamedTuple):
-    """A camera of the model, or a free camera: centres (frames, 3), angles, distance."""
+    """A camera of the model, or a free camera with the points where it looks."""
 
     name: str | None
     centres: np.ndarray
@@ -150,7 +151,7 @@ def view_of(scene: Scene, camera: Any, size: tuple[int, int]) -> View:
 
 @contextlib.contextmanager
 def _renderer(scene: Scene, size: tuple[int, int]) -> Iterator[Any]:
-    """Give a function that draws the k-th frame with a camera, as an array of pixels."""
+    """Create a function that draws the k-th frame with a camera, as pixels."""
     mujoco, model = mujoco_of("nhjax.render", "render"), scene.model
     model.vis.global_.offwidth, model.vis.global_.offheight = size
     context = _gl_context(size)
@@ -198,7 +199,7 @@ def _draw_trails(mujoco: Any, drawn: Any, scene: Scene, k: int) -> None:
     kind = mujoco.mjtGeom.mjGEOM_CAPSULE
     width = 0.006 * scene.model.stat.extent
     for path in scene.trails:
-        for start, end in zip(path[:k], path[1 : k + 1], strict=True):
+        for start, end in pairwise(path[: k + 1]):
             if drawn.ngeom == drawn.maxgeom or np.allclose(start, end, atol=1e-9):
                 continue
             geom = drawn.geoms[drawn.ngeom]

@@ -37,8 +37,8 @@ def subject_of(who: str, machine: Any) -> Subject:
     looks = machine if isinstance(machine, Looks) else looks_of(machine)
     if looks is None:
         raise TypeError(
-            f"{who}: `machine` must be a robot of nhjax.from_mujoco, an nhjax.Looks, or "
-            f"one of these machines of nhjax.systems: {', '.join(names())}. Got "
+            f"{who}: `machine` must be a robot of nhjax.from_mujoco, an nhjax.Looks, "
+            f"or one of these machines of nhjax.systems: {', '.join(names())}. Got "
             f"{type(machine).__name__}, which has no shape: describe one with "
             "nhjax.Looks."
         )
@@ -49,7 +49,8 @@ def subject_of(who: str, machine: Any) -> Subject:
     for body in spec.worldbody.bodies:
         # The bodies are placed by their poses, not by dynamics.
         body.mocap = True
-    own = None if machine is looks else getattr(machine.system, "manifold", None)
+    system = getattr(machine, "system", None)
+    own = getattr(system, "manifold", None)
     return Subject(spec, None, looks, looks.manifold or own)
 
 
@@ -82,11 +83,9 @@ class Scene:
         if subject.robot is not None:
             is_spec = isinstance(spec, mujoco.MjSpec)
             model = spec.copy().compile() if is_spec else spec
-            return (
-                np.asarray(subject.robot.qpos(State(q, None, None, None))),
-                None,
-                model,
-            )
+            nothing = jnp.zeros((len(self.times), 0))
+            y = State(q, nothing, nothing, nothing)
+            return np.asarray(subject.robot.qpos(y)), None, model
         assert subject.looks is not None
         poses = subject.looks.poses
         ts = jnp.asarray(self.times, jax.tree.leaves(q)[0].dtype)
@@ -276,7 +275,7 @@ def _add_ground(mujoco: Any, spec: Any, height: float, size: float) -> None:
 
 
 def round_length(size: float) -> float:
-    """Return the largest of 1, 2 and 5 times a power of ten that is not above `size`."""
+    """Return the largest of 1, 2 and 5 times a power of ten, at most `size`."""
     power = 10.0 ** np.floor(np.log10(size))
     return float(power * max(x for x in (1, 2, 5) if x * power <= 1.000001 * size))
 

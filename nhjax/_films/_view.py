@@ -86,8 +86,8 @@ def view(
 ) -> Show:
     """Show a run in a browser, with a slider for the time and a switch that plays it.
 
-    viser prints the address of the page. The function needs no window and no OpenGL here:
-    the browser draws.
+    viser prints the address of the page. The function needs neither a window nor
+    OpenGL, because the browser draws.
 
     **Arguments:**
 
