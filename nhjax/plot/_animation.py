@@ -302,7 +302,7 @@ def _ground(ax: "Axes", height: float, reach: float, spatial: bool) -> Any:
             ends[:, :, 1 - axis] = centre[1 - axis] + reach * np.array([-1, 1])
             ends[:, :, 2] = height
             lines.append(ends)
-        grid.set_segments(np.concatenate(lines))
+        grid.set_segments([*np.concatenate(lines)])
 
     return move
 
