@@ -178,6 +178,31 @@ def test_robot_is_shown_with_ground_light_sky_and_marked_wheels(cart):
     assert len(cart.mujoco_model.geoms) == 2
 
 
+def test_robot_of_a_compiled_model_is_shown_as_it_is():
+    model = mujoco.MjSpec.from_string(CART).compile()
+    width = model.vis.global_.offwidth
+    robot = nhjax.from_mujoco(model, rolling={"wheel": "no longitudinal slip"})
+    sol = made_up([0], [[0.2, 0.0]], [[0.0, 0.0]])
+    scene = Scene("f", robot, sol, np.zeros(1), True)
+    scene.place(0)
+    assert scene.model.ngeom == 2
+    np.testing.assert_allclose(scene.data.body("base").xpos, [0.2, 0, 0.1])
+    scene.model.vis.global_.offwidth = width + 1
+    assert model.vis.global_.offwidth == width
+
+
+def test_ground_of_a_robot_is_where_its_wheels_touch():
+    text = CART.replace('pos="0 0 0.1"', 'pos="0 0 0.4"')
+    robot = nhjax.from_mujoco(
+        mujoco.MjSpec.from_string(text),
+        rolling={"wheel": "no longitudinal slip"},
+        ground=nhjax.rolling.Plane(height=0.3),
+    )
+    sol = made_up([0], [[0.0, 0.0]], [[0.0, 0.0]])
+    scene = Scene("f", robot, sol, np.zeros(1), True)
+    assert scene.model.geom("nhjax ground").pos[2] == pytest.approx(0.3)
+
+
 def test_camera_follows_stays_or_is_one_of_the_model(cart):
     sol = made_up([0, 1], [[0.0, 0.0], [9.0, 90.0]], [[9.0, 90.0], [9.0, 90.0]])
     scene = Scene("f", cart, sol, np.linspace(0, 1, 41), False)

@@ -1,5 +1,6 @@
 """The scene of a film: a model of MuJoCo with ground, light and sky, and its poses."""
 
+import copy
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
@@ -167,7 +168,8 @@ class Scene:
         """Compile the model with ground, light and sky, if it lacks them."""
         mujoco = self._mujoco
         if not isinstance(subject.spec, mujoco.MjSpec):
-            return subject.spec, None
+            # A copy, because the renderer sets the size of its pictures.
+            return copy.copy(subject.spec), None
         spec, size = subject.spec.copy(), self.reach(self.centres)
         if subject.robot is not None:
             _mark_wheels(mujoco, spec, subject.robot)
@@ -196,9 +198,9 @@ class Scene:
                 width=64,
                 height=384,
             )
-        planes = [x for x in spec.geoms if x.type == mujoco.mjtGeom.mjGEOM_PLANE]
-        if not planes:
-            _add_ground(mujoco, spec, self._ground(size), size)
+        grounds = (mujoco.mjtGeom.mjGEOM_PLANE, mujoco.mjtGeom.mjGEOM_HFIELD)
+        if not any(x.type in grounds for x in spec.geoms):
+            _add_ground(mujoco, spec, self._ground(subject.robot, size), size)
         if not spec.lights:
             spec.worldbody.add_light(
                 name="nhjax light",
@@ -212,11 +214,14 @@ class Scene:
         names = [model.light(i).name for i in range(model.nlight)]
         return model, names.index("nhjax light") if "nhjax light" in names else None
 
-    def _ground(self, size: float) -> float:
-        if self.looks is None:
-            return 0.0
+    def _ground(self, robot: Robot | None, size: float) -> float:
+        """Return the height of the ground that is added."""
         below = self.low - 0.02 * size
-        return below if self.looks.ground is None else self.looks.ground
+        if self.looks is not None:
+            return below if self.looks.ground is None else self.looks.ground
+        if robot is None or robot.contacts is None:
+            return min(0.0, below)
+        return float(getattr(robot.contacts.contacts[0].ground, "height", 0.0))
 
     def place(self, k: int) -> None:
         """Put the bodies and the light where they are at the k-th time."""

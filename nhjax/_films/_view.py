@@ -23,7 +23,7 @@ class Show:
     def __init__(self, server: Any, scene: Scene, speed: float):
         self.server, self._scene, self._speed = server, scene, speed
         self.url = f"http://localhost:{server.get_port()}"
-        self._stopped = threading.Event()
+        self._stopped, self._lock = threading.Event(), threading.Lock()
         self._frames = _add_shapes(server, scene)
         times = scene.times
         low, high = sorted((float(times[0]), float(times[-1])))
@@ -44,9 +44,10 @@ class Show:
     def show(self, t: float) -> None:
         """Show the machine at the frame nearest to a time."""
         k = int(np.argmin(np.abs(self._scene.times - t)))
-        self._scene.place(k)
         data = self._scene.data
-        with self.server.atomic():
+        # The slider and the playing are in threads of their own.
+        with self._lock, self.server.atomic():
+            self._scene.place(k)
             for body, handle in self._frames.items():
                 handle.position = data.xpos[body].copy()
                 handle.wxyz = data.xquat[body].copy()
