@@ -117,18 +117,39 @@ def test_looks_of_machine_place_all_bodies(machine):
     )
 
 
-def test_mark_of_a_rolling_disc_is_at_rest_where_it_touches():
-    disc, sol = rolling_disc()
-    times = np.array([0.0, 1e-4])
-    scene = Scene("f", disc, sol, times, True)
-    below = []
-    for k in (0, 1):
-        scene.place(k)
-        turn = scene.data.body("disc").xmat.reshape(3, 3)
-        # The point of the wheel that is at the contact at the first time.
-        below.append(scene.data.body("disc").xpos + turn @ [0, 0, -1])
-    assert np.linalg.norm(below[1] - below[0]) < 1e-7
-    np.testing.assert_allclose(scene.trails[0], [[0, 0, 0], [1.3e-4, 0, 0]], atol=1e-12)
+@pytest.mark.parametrize(
+    ("machine", "bodies"),
+    [
+        (systems.VerticalRollingDisc, ["disc"]),
+        (systems.RollingDisc, ["disc"]),
+        (systems.TwoWheeledRobot, ["right", "left"]),
+        (systems.WhippleBicycle, ["rear wheel", "front wheel"]),
+        (systems.RollingTorus, ["body"]),
+        (systems.Rattleback, ["body"]),
+        (systems.ChaplyginSphere, ["body"]),
+        (systems.ChaplyginTop, ["body"]),
+    ],
+    ids=lambda x: getattr(x, "__name__", None),
+)
+def test_wheels_of_a_film_do_not_slip_where_they_touch(machine, bodies):
+    example, step = machine(), 1e-5
+    group = example.system.manifold_of(example.q0)
+    after = group.act(example.q0, step * example.v0)
+    q = jax.tree.map(lambda x, y: jnp.stack([x, y]), example.q0, after)
+    sol = made_up([0, step], q, jnp.stack([example.v0] * 2))
+    scene = Scene("f", example, sol, np.array([0, step]), True)
+    for name, path in zip(bodies, scene.trails, strict=True):
+        places = []
+        for k in (0, 1):
+            scene.place(k)
+            body = scene.data.body(name)
+            rotation = body.xmat.reshape(3, 3).copy()
+            if k == 0:
+                touching = rotation.T @ (path[0] - body.xpos)
+            places.append(body.xpos + rotation @ touching)
+        # The contact itself moves by the step times the speed.
+        assert np.linalg.norm(places[1] - places[0]) < 1e-8
+        assert np.linalg.norm(path[1] - path[0]) > 1e-8
 
 
 def test_bicycle_wheels_touch_the_ground_in_a_leaned_pose():
