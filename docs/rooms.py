@@ -50,7 +50,7 @@ FLOORS = (
     ("_ensemble",),
     ("forces", "rolling"),
     ("_robots",),
-    ("friction", "systems", "diagnostics", "plot", "studies", "__main__"),
+    ("friction", "systems", "diagnostics", "plot", "_films", "studies", "__main__"),
 )
 ROOMS = tuple(room for floor in FLOORS for room in floor)
 
@@ -465,6 +465,7 @@ _COLUMNS = {
     "systems": 0.0,
     "diagnostics": 1.8,
     "plot": 2.5,
+    "_films": 0.9,
     "studies": 3.3,
     "__main__": 4.0,
 }

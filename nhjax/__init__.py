@@ -1,8 +1,7 @@
 """High-order geometric integrators for nonholonomic mechanical systems, in JAX."""
 
 from importlib import import_module
-from types import ModuleType
-from typing import TYPE_CHECKING
+from typing import Any, TYPE_CHECKING
 
 from . import lanes as lanes
 from ._analysis import (
@@ -79,7 +78,6 @@ from ._method import (
 )
 from ._models import from_sympy as from_sympy, SymPyModel as SymPyModel
 from ._results import RESULTS as RESULTS
-from ._robots import from_mujoco as from_mujoco, Robot as Robot
 from ._step import (
     AbstractStageSolver as AbstractStageSolver,
     Newton as Newton,
@@ -109,17 +107,28 @@ if TYPE_CHECKING:
         rolling as rolling,
         systems as systems,
     )
+    from ._films import Looks as Looks, render as render, view as view
+    from ._robots import from_mujoco as from_mujoco, Robot as Robot
 
 __version__ = "0.1.0"
 
-_LOADED_LATER = ("forces", "friction", "plot", "rolling", "systems")
+# These take a quarter of the time of `import nhjax`: modules, and names in rooms.
+_LOADED_LATER = {
+    **dict.fromkeys(("forces", "friction", "plot", "rolling", "systems")),
+    **dict.fromkeys(("Looks", "render", "view"), "._films"),
+    **dict.fromkeys(("from_mujoco", "Robot"), "._robots"),
+}
 
 
-def __getattr__(name: str) -> ModuleType:
-    # The gallery and the plots take a quarter of the time of `import nhjax`.
-    if name in _LOADED_LATER:
+def __getattr__(name: str) -> Any:
+    if name not in _LOADED_LATER:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    room = _LOADED_LATER[name]
+    if room is None:
         return import_module(f".{name}", __name__)
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    # The next access finds the name without this function.
+    value = globals()[name] = getattr(import_module(room, __name__), name)
+    return value
 
 
 def __dir__() -> list[str]:

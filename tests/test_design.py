@@ -22,7 +22,7 @@ def written_signatures():
         name, bracket, _ = code.partition("(")
         # Code with dots in place of arguments is not a signature.
         with contextlib.suppress(SyntaxError):
-            if bracket and name in vars(nhjax):
+            if bracket and name in dir(nhjax):
                 (definition,) = ast.parse(f"def {' '.join(code.split())}: pass").body
                 assert isinstance(definition, ast.FunctionDef)
                 found.setdefault(name, definition.args)

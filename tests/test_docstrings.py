@@ -29,7 +29,8 @@ def _examples():
 
 def _public_objects():
     for space in (nhjax, nhjax.systems):
-        for name, value in vars(space).items():
+        for name in dir(space):
+            value = getattr(space, name)
             if not name.startswith("_") and not inspect.ismodule(value):
                 yield f"{space.__name__}.{name}", value
 

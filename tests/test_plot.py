@@ -2,6 +2,7 @@
 
 import subprocess
 import sys
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -183,9 +184,42 @@ def test_plot_animation_backwards_in_time_follows_a_point(tmp_path):
     np.testing.assert_allclose(ax.get_ylim(), (-3.15, 3.15))
 
 
+@pytest.mark.parametrize("spatial", [False, True])
+def test_plot_animation_fills_wheels_and_marks_their_rim(tmp_path, spatial):
+    turn = 3 * TIMES
+    spoke = 0.5 * np.stack([np.cos(turn), np.sin(turn)], axis=1)
+    points = SLIDER | {"rim": SLIDER["hub"] + spoke}
+    wheel = ("hub", "rim")
+    if spatial:
+        points = in_space(points)
+        points["axle"], wheel = points["hub"] + [0, 0, 2.0], (*wheel, "axle")
+    animation = plot.animate(TIMES, points, wheels=[wheel], ground=-0.5, frame_rate=1)
+    animation.save(tmp_path / "motion.gif", dpi=20)
+    show: Any = animation._func  # pyright: ignore[reportAttributeAccessIssue]
+    outline, mark, filled = show(2)
+    x = np.stack(outline.get_data_3d() if spatial else outline.get_data(), axis=1)
+    hub = np.array([2.0, 0, 1])[: x.shape[1]]
+    np.testing.assert_allclose(np.linalg.norm(x - hub, axis=1), 0.5)
+    np.testing.assert_allclose(np.ptp(x[:, :2], axis=0), 1, rtol=1e-2)
+    ends = np.stack(mark.get_data_3d() if spatial else mark.get_data(), axis=1)
+    np.testing.assert_allclose(ends, [hub, points["rim"][-1]])
+    if not spatial:
+        np.testing.assert_allclose(filled.get_xy()[: len(x)], x)
+    (ax,) = animation._fig.axes  # pyright: ignore[reportAttributeAccessIssue]
+    # Units are equal on all axes, and the wheel stands on the ground.
+    limits = [ax.get_xlim(), ax.get_ylim(), *([ax.get_zlim()] if spatial else [])]
+    np.testing.assert_allclose(np.ptp(limits, axis=1), np.ptp(limits[0]))
+
+
 @pytest.mark.parametrize(
     ("changes", "error", "message"),
     [
+        ({"wheels": [("hub", "head")]}, ValueError, "`wheels` must name points"),
+        (
+            {"wheels": [("hub",)]},
+            ValueError,
+            "`wheels` must have 2 names each: the hub",
+        ),
         ({"ts": np.zeros((2, 4))}, ValueError, r"`ts` .* got shape \(2, 4\)"),
         ({"ts": [0, 2, 1, 3]}, ValueError, "`ts` must increase"),
         ({"ts": "now"}, TypeError, "`ts` must be an array of real numbers"),

@@ -44,13 +44,14 @@ def test_result_of_every_kind_is_on_the_troubleshooting_page(name):
 
 
 def test_exception_of_every_kind_is_on_the_troubleshooting_page():
-    for name, value in vars(nhjax).items():
+    for name in dir(nhjax):
+        value = getattr(nhjax, name)
         if inspect.isclass(value) and issubclass(value, Exception):
             assert f"`{name}`" in PAGE, name
 
 
 def test_messages_quoted_on_the_page_exist_in_the_package():
-    known = _written() + " ".join(vars(nhjax))
+    known = _written() + " ".join(dir(nhjax))
     parts = list(_quoted())
     assert len(parts) > 50
     assert [part for part in parts if part not in known and part != "TypeError"] == []

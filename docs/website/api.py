@@ -30,7 +30,8 @@ def public_names(space: str) -> dict[str, Any]:
     home = "nhjax" if hasattr(module, "__path__") else space
     return {
         name: value
-        for name, value in vars(module).items()
+        # Some names of nhjax are loaded when they are first used.
+        for name, value in ((name, getattr(module, name)) for name in dir(module))
         if not name.startswith("_") and callable(value)
         if getattr(value, "__module__", "").startswith(home)
     }

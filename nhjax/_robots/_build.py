@@ -31,16 +31,25 @@ _KINDS = ("free", "ball", "slide", "hinge")
 class Layout:
     """The joints of a model, and the frame of each body relative to its last joint.
 
+    `source` is the model as it was read, for its shapes.
+
     It is compared by identity, so that it can be a part of the structure of a `Robot`.
     """
 
-    def __init__(self, joints: Sequence[Joint], bodies: Sequence[Frame]):
+    def __init__(
+        self, joints: Sequence[Joint], bodies: Sequence[Frame], source: Any = None
+    ):
         self.joints = tuple(joints)
         self.bodies = tuple(bodies)
         self.space = Space(self.joints)
+        self.source = source
+
+    def __getstate__(self) -> dict[str, Any]:
+        # An MjSpec cannot be pickled. Only films need it.
+        return self.__dict__ | {"source": None}
 
 
-def layout_of(model: Any) -> Layout:
+def layout_of(model: Any, source: Any = None) -> Layout:
     """Read the kinematic tree."""
     joints: list[Joint] = []
     bodies = [Frame(-1, np.eye(4))]
@@ -65,7 +74,7 @@ def layout_of(model: Any) -> Layout:
             )
             last, offset = number, np.eye(4)
         bodies.append(Frame(last, offset))
-    return Layout(joints, bodies)
+    return Layout(joints, bodies, source)
 
 
 def fixed_to(layout: Layout, body: int, position: Any, quaternion: Any) -> Frame:

@@ -28,18 +28,27 @@ IGNORABLE = (
 )
 
 
-def mujoco() -> Any:
+def mujoco_of(who: str, extra: str) -> Any:
     """Import MuJoCo, or raise an `ImportError` that says how to install it."""
     try:
         return importlib.import_module("mujoco")
     except ImportError as error:
         raise ImportError(
-            'from_mujoco needs MuJoCo: pip install "nhjax[robots]".'
+            f'{who} needs MuJoCo: pip install "nhjax[{extra}]".'
         ) from error
 
 
-def compile_model(model: Any, root: str | None) -> Any:
-    """Return the compiled model of a file, an `MjSpec` or an `MjModel`."""
+def mujoco() -> Any:
+    """Import MuJoCo for `from_mujoco`."""
+    return mujoco_of("from_mujoco", "robots")
+
+
+def compile_model(model: Any, root: str | None) -> tuple[Any, Any]:
+    """Return the model of a file, an `MjSpec` or an `MjModel`, and it compiled.
+
+    The first one is an `MjSpec`, to which films can add a scene, except for an
+    `MjModel`.
+    """
     library = mujoco()
     if root is not None:
         check_choice("from_mujoco: `root`", root, ("free", "planar", "fixed"))
@@ -50,8 +59,9 @@ def compile_model(model: Any, root: str | None) -> Any:
                 f"this {type(model).__name__} the joints that it needs."
             )
         if isinstance(model, library.MjModel):
-            return model
-        return _compile(model, "the MjSpec")
+            return model, model
+        # The caller may go on to change the spec.
+        return model.copy(), _compile(model, "the MjSpec")
     if not isinstance(model, str | os.PathLike):
         raise TypeError(
             "from_mujoco: `model` must be the path of an MJCF or URDF file, a "
@@ -60,7 +70,7 @@ def compile_model(model: Any, root: str | None) -> Any:
     return _compile_file(Path(model), root)
 
 
-def _compile_file(path: Path, root: str | None) -> Any:
+def _compile_file(path: Path, root: str | None) -> tuple[Any, Any]:
     if not path.is_file():
         is_text = str(path).lstrip().startswith("<")
         advice = (
@@ -81,13 +91,14 @@ def _compile_file(path: Path, root: str | None) -> Any:
         spec = _or_message(lambda: spec_of.from_string(text), path)
         # Meshes are searched for beside the file.
         spec.modelfiledir = str(path.parent)
-        return _compile(spec, path)
+        return spec, _compile(spec, path)
     if root is not None:
         raise ValueError(
             f"from_mujoco: `root` is for URDF files only, and {path.name} is an MJCF "
             'file. Give its first body the joints that it needs, such as a "freejoint".'
         )
-    return _compile(_or_message(lambda: spec_of.from_file(str(path)), path), path)
+    spec = _or_message(lambda: spec_of.from_file(str(path)), path)
+    return spec, _compile(spec, path)
 
 
 def _set_root(robot: ElementTree.Element, path: Path, root: str | None) -> None:

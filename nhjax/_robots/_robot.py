@@ -151,6 +151,11 @@ class Robot(eqx.Module):
         return frame_pose(self._layout.joints, self._space, frame)(0.0, q, None)
 
     @property
+    def mujoco_model(self) -> Any:
+        """The `mujoco.MjSpec` that was read, or the `mujoco.MjModel` that was given."""
+        return self._layout.source
+
+    @property
     def _space(self) -> Any:
         return self._layout.space
 
@@ -272,7 +277,7 @@ def from_mujoco(
         Array([0.2, 0. , 0.1], dtype=float64)
     """
     options = rolling_options(rolling)
-    compiled = compile_model(model, root)
+    source, compiled = compile_model(model, root)
     if options and root is None and is_fixed_urdf(model):
         raise ValueError(
             "from_mujoco: MuJoCo fixes the root link of a URDF file to the world. "
@@ -280,7 +285,7 @@ def from_mujoco(
             '`root="fixed"`.'
         )
     left_out = check_supported(compiled, ignore, tuple(options))
-    layout = layout_of(compiled)
+    layout = layout_of(compiled, source)
     mechanics = mechanics_of(compiled, layout, ignore, friction_smoothing)
     actuators = actuators_of(
         compiled, layout.space, left_out["actuators"], limit_smoothing

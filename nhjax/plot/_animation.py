@@ -20,7 +20,9 @@ def animate(
     points: Mapping[str, Float[np.ndarray, "times ..."]],
     rods: Sequence[Sequence[str]] = (),
     *,
+    wheels: Sequence[Sequence[str]] = (),
     traced: Sequence[str] = (),
+    ground: float | None = None,
     follow: str | None = None,
     speed: float = 1.0,
     frame_rate: float = 25.0,
@@ -30,19 +32,25 @@ def animate(
 
     Positions are interpolated linearly between the saved times, so that the frame rate
     is constant for any step sizes. Save the animation with
-    `animation.save("motion.gif")`, or with `"motion.mp4"` if FFmpeg is installed.
+    `animation.save("motion.gif")`, or with `"motion.mp4"` if FFmpeg is installed. The
+    axes have equal units. `nhjax.render` draws shapes with light and shadows.
 
     **Arguments:**
 
     - `ts`: the saved times of one trajectory.
     - `points`: the saved positions by name: points of shape (times, 2) or (times, 3),
-        outlines of bodies of shape (times, corners, 2) or (times, corners, 3). The
+        outlines of bodies, which are filled, of shape (times, corners, 2) or (times,
+        corners, 3). The
         machines of `nhjax.systems` have a method `points`, which
         `SaveAt(fn=lambda t, y, args: machine.points(t, y.q))` saves. For a run that has
         saved states, use `jax.vmap(machine.points)(sol.ts, sol.ys.q)`.
     - `rods`: chains of names of points that are connected by lines, such as
         `[("hub", "end")]`.
+    - `wheels`: the hub and a point of the rim of each wheel, by name, and in space
+        another point of the axle. Wheels are filled, with a mark at the point of the
+        rim. A point that is fixed in the wheel shows the rolling.
     - `traced`: the names of points whose past paths are drawn.
+    - `ground`: the height of the ground, which is drawn below the machine.
     - `follow`: the name of a point that stays in the centre of the picture.
     - `speed`: the number of seconds of the motion in one second of the animation.
     - `frame_rate`: the number of frames per second.
@@ -72,6 +80,9 @@ def animate(
     for chain in rods:
         for name in chain:
             _check_point("rods", name, moving)
+    for wheel in wheels:
+        for name in wheel:
+            _check_point("wheels", name, moving)
     for name in traced:
         _check_point("traced", name, moving)
     if follow is not None:
@@ -87,9 +98,22 @@ def animate(
     shown = _frame_times(times, speed / frame_rate)
     frames = {name: _at(shown, times, x) for name, x in moving.items()}
     spatial = next(iter(frames.values())).shape[-1] == 3
+    if any(len(wheel) != 2 + spatial for wheel in wheels):
+        raise ValueError(
+            f"`wheels` must have {2 + spatial} names each: the hub, a point of the rim"
+            f"{', and another point of the axle' if spatial else ''}, got {wheels!r}."
+        )
+    frames |= {_rim(wheel): _circle(frames, wheel) for wheel in wheels}
     ax = new_axes(ax, projection="3d" if spatial else None)
     centres, reach = _window(frames, follow)
     bodies = [name for name, x in frames.items() if x.ndim == 3]
+    dark = [_rim(wheel) for wheel in wheels]
+    fills = [_filled(ax, "0.35" if x in dark else "0.8", spatial) for x in bodies]
+    marks = [
+        ax.plot(*_no_data(spatial), color="tab:orange", linewidth=2.5)[0]
+        for _ in wheels
+    ]
+    floor = None if ground is None else _ground(ax, ground, reach, spatial)
     lines: list[Any] = [
         *(ax.plot(*_no_data(spatial), color="0.25", linewidth=1.5)[0] for _ in bodies),
         *(ax.plot(*_no_data(spatial), "o-", color="0.1", ms=3)[0] for _ in rods),
@@ -101,14 +125,23 @@ def animate(
         drawn += [np.array([frames[name][frame] for name in chain]) for chain in rods]
         drawn += [frames[name][: frame + 1] for name in traced]
         for line, path in zip(lines, drawn, strict=True):
-            line.set_data(*path.T[:2])
-            if spatial:
-                line.set_3d_properties(path.T[2])
+            _draw(line, path, spatial)
+        for mark, (hub, rim, *_) in zip(marks, wheels, strict=True):
+            path = np.array([frames[hub][frame], frames[rim][frame]])
+            _draw(mark, path, spatial)
+        for fill, name in zip(fills, bodies, strict=True):
+            corners = frames[name][frame]
+            fill.set_verts([corners]) if spatial else fill.set_xy(corners)
+        if floor is not None:
+            floor(centres[frame])
         _set_limits(ax, centres[frame], reach)
-        return lines
+        return [*lines, *marks, *fills]
 
     if spatial:
         ax.set_box_aspect((1, 1, 1))  # pyright: ignore[reportArgumentType]
+        # Marks are in front of the wheels, which hide nothing else.
+        axes: Any = ax
+        axes.computed_zorder = False
     else:
         ax.set_aspect("equal", adjustable="box")
     show(0)
@@ -200,6 +233,78 @@ def _window(
 def _set_limits(ax: "Axes", centre: np.ndarray, reach: float) -> None:
     for axis, middle in zip("xyz", centre, strict=False):
         getattr(ax, f"set_{axis}lim")(middle - reach, middle + reach)
+
+
+def _draw(line: Any, path: np.ndarray, spatial: bool) -> None:
+    line.set_data(*path.T[:2])
+    if spatial:
+        line.set_3d_properties(path.T[2])
+
+
+def _rim(wheel: Sequence[str]) -> str:
+    return " ".join(wheel)
+
+
+def _circle(frames: Mapping[str, np.ndarray], wheel: Sequence[str]) -> np.ndarray:
+    """Compute the rim of a wheel, of shape (frames, corners, 2) or (.., 3)."""
+    hub, rim, *rest = (frames[name] for name in wheel)
+    spoke = rim - hub
+    if rest:
+        axle = rest[0] - hub
+        axle = axle / np.linalg.norm(axle, axis=1, keepdims=True)
+        across = np.cross(axle, spoke)
+    else:
+        across = np.stack([-spoke[:, 1], spoke[:, 0]], axis=1)
+    angle = np.linspace(0, 2 * np.pi, 49)[:, None]
+    return (
+        hub[:, None] + np.cos(angle) * spoke[:, None] + np.sin(angle) * across[:, None]
+    )
+
+
+def _filled(ax: "Axes", color: str, spatial: bool) -> Any:
+    """Add a polygon without corners, which has them once a frame is shown."""
+    if spatial:
+        from mpl_toolkits.mplot3d.art3d import Poly3DCollection
+
+        polygon = Poly3DCollection([np.zeros((3, 3))], facecolor=color, zorder=1.5)
+        axes: Any = ax
+        return axes.add_collection3d(polygon, autolim=False)
+    from matplotlib.patches import Polygon
+
+    return ax.add_patch(Polygon(np.zeros((3, 2)), facecolor=color, zorder=1.5))
+
+
+def _ground(ax: "Axes", height: float, reach: float, spatial: bool) -> Any:
+    """Add the ground; return a function that moves it to a centre of the picture.
+
+    Its lines stay in place as the picture moves.
+    """
+    if not spatial:
+        ax.axhspan(height - 100 * reach, height, color="0.88", zorder=0)
+        ax.axhline(height, color="0.5", linewidth=1, zorder=0.5)
+        return lambda centre: None
+    from mpl_toolkits.mplot3d.art3d import Line3DCollection
+
+    axes: Any = ax
+    grid = Line3DCollection(
+        np.zeros((1, 2, 3)), colors="0.75", linewidths=0.6, zorder=0
+    )
+    axes.add_collection3d(grid, autolim=False)
+    cell = reach / 4
+
+    def move(centre: np.ndarray) -> None:
+        lines = []
+        for axis in (0, 1):
+            low, high = centre[axis] - reach, centre[axis] + reach
+            places = cell * np.arange(np.ceil(low / cell), np.floor(high / cell) + 1)
+            ends = np.empty((len(places), 2, 3))
+            ends[:, :, axis] = places[:, None]
+            ends[:, :, 1 - axis] = centre[1 - axis] + reach * np.array([-1, 1])
+            ends[:, :, 2] = height
+            lines.append(ends)
+        grid.set_segments([*np.concatenate(lines)])
+
+    return move
 
 
 def _no_data(spatial: bool) -> list[list[float]]:
