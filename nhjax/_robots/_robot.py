@@ -27,6 +27,7 @@ from ._build import (
     rolling_options,
 )
 from ._dynamics import force_of, frame_pose, lagrangian_of, loops_of
+from ._kept import KeptPositions, KeptSlips
 from ._read import check_supported, compile_model, is_fixed_urdf, name_of
 
 
@@ -297,12 +298,14 @@ def from_mujoco(
         loop = loops_of(layout.joints, layout.space, loops, kept.loops)
         if contacts is not None:
             contacts = _reduced(compiled, layout, contacts, kept, ground)
+    slips = None if contacts is None else contacts.nonholonomic
     heights = None if contacts is None else contacts.holonomic
+    positions = _joined(heights, loop)
     coordinates = _coordinates(layout)
     system = LagrangianSystem(
         lagrangian_of(mechanics, known),
-        nonholonomic=None if contacts is None else contacts.nonholonomic,
-        holonomic=_joined(heights, loop),
+        nonholonomic=None if slips is None else KeptSlips(slips),
+        holonomic=None if positions is None else KeptPositions(positions),
         force=force_of(mechanics, known, actuators, controls, _to_mujoco(layout)),
         manifold=layout.space.manifold,
         coordinates=coordinates,

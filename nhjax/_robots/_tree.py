@@ -20,7 +20,7 @@ from . import _scalars as entries
 
 
 # Trees with more joints are computed as arrays: tracing scalars takes longer then.
-LARGEST_OF_SCALARS = 8
+LARGEST_OF_SCALARS = 40
 
 
 class Joint(NamedTuple):
@@ -98,6 +98,12 @@ class Space:
             ],
             int,
         )
+        # The place of the first velocity of each joint.
+        self.velocity_of: dict[int, int] = {
+            joint: part.first_velocity + i
+            for part in self.parts
+            for i, joint in enumerate(part.joints)
+        }
         self.free = [part.first_velocity for part in self.parts if part.kind == "free"]
 
     def split(self, q: PyTree[Array]) -> tuple[list[Array], Array]:
@@ -463,6 +469,15 @@ def _motions(joints: Sequence[Joint]) -> Float[np.ndarray, "4 n 12"]:
         for row, matrix in ((1, hat), (2, hat @ hat)):
             turned = turn @ matrix
             found[row, number] = [*turned.ravel(), *(-turned @ joint.anchor)]
+    return found
+
+
+def pose_of_joint(joint: Joint, angle: float) -> Float[np.ndarray, "4 4"]:
+    """Return the pose after a hinge that has turned by an angle from rest."""
+    parts = np.array([1.0, np.sin(angle), 1 - np.cos(angle), angle])
+    numbers = np.tensordot(parts, _motions([joint])[:, 0], axes=1)
+    found = np.eye(4)
+    found[:3, :3], found[:3, 3] = numbers[:9].reshape(3, 3), numbers[9:]
     return found
 
 
