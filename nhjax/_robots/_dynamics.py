@@ -13,9 +13,10 @@ from .._custom_types import Args, FloatScalarLike
 from .._errors import ShapeError
 from .._manifold import Exponential, SO3
 from . import _scalars as entries
+from ._joints import Joint
 from ._kept import Kept
 from ._rotors import merge_rotors, spatial_inertia
-from ._tree import Frame, FramePoses, Joint, Space, Tree
+from ._tree import Frame, FramePoses, Space, Tree
 
 
 class Bodies(NamedTuple):

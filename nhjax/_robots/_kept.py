@@ -1,10 +1,10 @@
 """Functions of a robot that are traced and differentiated once.
 
 A program of nhjax needs the Lagrangian of a system and its derivatives at more than ten
-places, and JAX traces and differentiates a function anew at each of them. The functions
-of a robot are long, so that this took most of the time of a first call. Here a function
-becomes one operation, `kept_call`, whose program is traced once. The programs of its
-derivatives are kept beside it.
+places, and JAX traces and differentiates a function again at each of them. The
+functions of a robot are long, so that this would take most of the time of a first call.
+Here a function becomes one operation, `kept_call`, whose program is traced once. The
+programs of its derivatives are kept with it.
 """
 
 from collections.abc import Callable, Sequence
@@ -20,7 +20,14 @@ from jaxtyping import PyTree
 
 from .._numerics import with_small_products
 from .._system import static_function
-from ..lanes import captures_tracers, cse_dce, KEPT_CALL, never_high
+from ..lanes import (
+    captures_tracers,
+    CompileOptions,
+    cse_dce,
+    KEPT_CALL,
+    never_high,
+    run_program,
+)
 
 
 class Kept(eqx.Module):
@@ -29,12 +36,10 @@ class Kept(eqx.Module):
     `function` is a function or a callable tree, whose arrays are operands too.
     """
 
-    function: Callable[..., PyTree[Any]]
-    _programs: dict[Any, Any] = eqx.field(static=True)
-
-    def __init__(self, function: Callable[..., PyTree[Any]]):
-        self.function = static_function(function)
-        self._programs = _Programs()
+    function: Callable[..., PyTree[Any]] = eqx.field(converter=static_function)
+    _programs: Any = eqx.field(
+        static=True, init=False, default_factory=lambda: _Programs()
+    )
 
     def call(self, *args: Any) -> PyTree[Any]:
         """Compute the function."""
@@ -146,7 +151,15 @@ def _inlined(*operands: Any, jaxpr: Any, kept: _Program) -> list[Any]:
     return kept.run(*operands)
 
 
+def _in_kernel(*operands: Any, jaxpr: Any, kept: _Program) -> list[Any]:
+    return run_program(jaxpr, list(operands), CompileOptions(is_brief=True))
+
+
+# XLA takes milliseconds to compile each operation, and these programs are long.
 mlir.register_lowering(kept_call, mlir.lower_fun(_inlined, multiple_results=True))
+mlir.register_lowering(
+    kept_call, mlir.lower_fun(_in_kernel, multiple_results=True), platform="cpu"
+)
 
 
 def _jvp(primals, tangents, *, jaxpr: Any, kept: _Program):

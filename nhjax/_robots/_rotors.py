@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from ._tree import Joint, pose_of_joint
+from ._joints import Joint, pose_of_joint
 
 
 class Rotor(NamedTuple):
