@@ -79,7 +79,12 @@ from ._method import (
 )
 from ._models import from_sympy as from_sympy, SymPyModel as SymPyModel
 from ._results import RESULTS as RESULTS
-from ._robots import from_mujoco as from_mujoco, Robot as Robot
+from ._robots import (
+    example_robot as example_robot,
+    example_robot_file as example_robot_file,
+    from_mujoco as from_mujoco,
+    Robot as Robot,
+)
 from ._step import (
     AbstractStageSolver as AbstractStageSolver,
     Newton as Newton,
