@@ -116,8 +116,10 @@ def example_robot(name: str, **options: Any) -> Robot:
         >>> robot.coordinates
         ('x', 'y', 'heading', 'pitch', 'left', 'right')
     """
-    own = _OPTIONS.get(name, ("", {}))[1]
+    path = example_robot_file(name)
+    own: dict[str, Any] = dict(_OPTIONS[name][1])
     if "ground" in own:
         # The plane has the precision of this call.
-        own = own | {"ground": Plane(height=own["ground"])}
-    return from_mujoco(example_robot_file(name), **(own | options))
+        own["ground"] = Plane(height=own["ground"])
+    own |= options
+    return from_mujoco(path, **own)

@@ -18,14 +18,17 @@ import numpy as np
 from jax.interpreters import ad, batching, mlir
 from jaxtyping import PyTree
 
+from .._compile import SHORTEST_IN_LOOP
 from .._numerics import with_small_products
 from .._system import static_function
 from ..lanes import (
+    batched_call,
     captures_tracers,
     CompileOptions,
     cse_dce,
     KEPT_CALL,
     never_high,
+    num_results,
     run_program,
 )
 
@@ -211,6 +214,19 @@ def _transpose(cotangents, *operands, jaxpr: Any, kept: _Program):
 
 
 def _batched(operands, axes, *, jaxpr: Any, kept: _Program):
+    sizes = [x.shape[a] for x, a in zip(operands, axes, strict=True) if a is not None]
+    if sizes[0] * num_results(jaxpr.jaxpr) >= SHORTEST_IN_LOOP:
+        # A long program is a loop over the members.
+        marks = tuple(axis is not None for axis in axes)
+        moved = [
+            x if axis is None else jnp.moveaxis(x, axis, 0)
+            for x, axis in zip(operands, axes, strict=True)
+        ]
+        options = CompileOptions(is_brief=True)
+        given = {"program": jaxpr, "is_batched": marks, "options": options}
+        out = batched_call.bind(*moved, **given)
+        return out, [0] * len(out)
+
     def function(*operands):
         return jax.vmap(kept.run, tuple(axes))(*operands)
 
