@@ -115,11 +115,12 @@ class Parameters(eqx.Module):
                     "`from_mujoco(..., parameters=...)`."
                 )
             if key == "controls":
-                if jnp.shape(given) != (len(self.controls),):
+                shape = jnp.asarray(given).shape
+                if shape != (len(self.controls),):
                     raise ShapeError(
                         f"`args['controls']` must have shape ({len(self.controls)},), "
                         f"one number for each of {', '.join(self.controls)}, got shape "
-                        f"{jnp.shape(given)}. For many runs use `jax.vmap`."
+                        f"{shape}. For many runs use `jax.vmap`."
                     )
                 continue
             if not isinstance(given, dict):

@@ -90,16 +90,40 @@ class Robot(eqx.Module):
         position = self._array("qpos", qpos, rest)
         velocity = self._array("qvel", qvel, jnp.zeros(self._space.num_velocities))
         q = self._space.from_qpos(position)
-        return initial_state(
-            self.system,
-            q,
-            self._space.to_body(q, velocity),
-            t=t,
-            args=self.args if args is None else args,
-            project=project,
-            keep_q=keep_q,
-            keep_v=keep_v,
-        )
+        given = self.args if args is None else args
+        try:
+            return initial_state(
+                self.system,
+                q,
+                self._space.to_body(q, velocity),
+                t=t,
+                args=given,
+                project=project,
+                keep_q=keep_q,
+                keep_v=keep_v,
+            )
+        except Exception as error:
+            self._add_note_on_heights(error, t, q, given)
+            raise
+
+    def _add_note_on_heights(self, error: Exception, t: Any, q: Any, args: Any) -> None:
+        """Name the wheels that do not touch the ground, if the positions are known."""
+        if self.contacts is None:
+            return
+        pairs = zip(self.contacts.names, self.contacts.contacts, strict=True)
+        found = {x: one.height(t, q, args) for x, one in pairs if one.touches}
+        try:
+            heights = {name: float(height) for name, height in found.items()}
+        except jax.errors.ConcretizationTypeError:
+            return
+        apart = [
+            f"{name!r} by {h:.3g} m" for name, h in heights.items() if abs(h) > 1e-6
+        ]
+        if apart:
+            error.add_note(
+                f"These geoms do not touch the ground: {', '.join(apart)} (negative "
+                "below it). Choose `qpos` so that they touch, or pass `project=True`."
+            )
 
     def qpos(self, sol: Any) -> Float[Array, "*times nq"]:
         """Return positions in MuJoCo's conventions.
