@@ -2,7 +2,7 @@
 
 There are four measurements:
 
-1. A robot on two wheels and a caster that slides moves for 60 s without motors and
+1. A robot on two wheels and two casters that slide moves for 60 s without motors and
    without damping, from the same state in nhjax and in MuJoCo. In MuJoCo its wheels
    are geoms with contacts on a plane, of the default stiffness. The centre of mass is
    above the axle, so that the robot runs on a circle. The slip is the sideways velocity
@@ -52,7 +52,9 @@ _WHEELED = """<mujoco><option gravity="0 0 -9.81" timestep="0.002"/>
 <geom name="floor" type="plane" size="100 100 1" contype="{c}" conaffinity="{c}"/>
 <body name="base" pos="0 0 0.1">{root}
 <geom type="box" size="0.2 0.13 0.05" pos="0 0 0.06" mass="9"/>
-<geom name="caster" type="sphere" size="0.04" pos="0.26 0 -0.06" mass="0"
+<geom type="sphere" size="0.04" pos="0.26 0 -0.06" mass="0"
+  contype="{c}" conaffinity="{c}" {slides}/>
+<geom type="sphere" size="0.04" pos="-0.26 0 -0.06" mass="0"
   contype="{c}" conaffinity="{c}" {slides}/>
 <body name="left" pos="0 0.16 0"><joint name="left" axis="0 1 0"/>
 <geom name="left" type="cylinder" size="0.1 0.02" euler="90 0 0" mass="0.8"
@@ -65,7 +67,7 @@ _PLANAR = (
     '<joint name="x" type="slide" axis="1 0 0"/><joint name="y" type="slide" '
     'axis="0 1 0"/><joint name="heading" axis="0 0 1"/>'
 )
-# A caster without friction, as a sphere that slides.
+# Casters in front and behind, as spheres without friction.
 _SLIDES = 'condim="1" priority="1"'
 
 
@@ -188,7 +190,8 @@ def draw(rows: dict[str, Any]) -> None:
     axes[0].set(xlabel="time [s]", ylabel="sideways slip [m/s]")
     axes[1].set(xlabel="time [s]", ylabel="change of energy")
     axes[1].legend()
-    figure.savefig(RESULTS / "robots.png", dpi=120)
+    for folder in (RESULTS, RESULTS.parents[1] / "docs"):
+        figure.savefig(folder / "robots.png", dpi=120)
     plt.close(figure)
 
 
