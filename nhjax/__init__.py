@@ -108,7 +108,12 @@ if TYPE_CHECKING:
         systems as systems,
     )
     from ._films import Looks as Looks, render as render, view as view
-    from ._robots import from_mujoco as from_mujoco, Robot as Robot
+    from ._robots import (
+        example_robot as example_robot,
+        example_robot_file as example_robot_file,
+        from_mujoco as from_mujoco,
+        Robot as Robot,
+    )
 
 __version__ = "0.1.0"
 
@@ -116,7 +121,9 @@ __version__ = "0.1.0"
 _LOADED_LATER = {
     **dict.fromkeys(("forces", "friction", "plot", "rolling", "systems")),
     **dict.fromkeys(("Looks", "render", "view"), "._films"),
-    **dict.fromkeys(("from_mujoco", "Robot"), "._robots"),
+    **dict.fromkeys(
+        ("example_robot", "example_robot_file", "from_mujoco", "Robot"), "._robots"
+    ),
 }
 
 

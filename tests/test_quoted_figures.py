@@ -290,3 +290,25 @@ def test_chart_in_the_middle_gains_quoted_agree_with_the_result():
     ]
     sentence = "over t = 1e4 is up to {} times smaller"
     assert_agree(quoted(page("groups"), sentence), [max(gains)])
+
+
+def test_robots_quoted_agree_with_the_result():
+    found, text = results("robots"), page("robots")
+    rows = rows_of(text, "program, step", "largest slip [m/s]")
+    for (name, *cells), (measured, row) in zip(
+        rows, found["contacts"].items(), strict=True
+    ):
+        assert name == measured
+        change = max(map(abs, row["energy"]))
+        assert_agree(cells, [max(row["slip"]), change, row["seconds"]])
+    for (_, *cells), key in zip(
+        rows_of(text, "model", "read"), ("file", "hand"), strict=True
+    ):
+        row = found["first_call"][key]
+        measured = [row[x] for x in ("load", "state", "run", "again", "megabytes")]
+        assert_agree(cells, measured)
+    ratio = quoted(text, "{} platforms by `vmap` take {} times as long as one")
+    ensemble = found["ensemble"]
+    assert_agree(ratio, [ensemble["members"], ensemble["ratio"]])
+    sentence = "agrees with central differences to {}"
+    assert_agree(quoted(text, sentence), [found["gradient"]["apart"]])

@@ -565,11 +565,45 @@ WRONG = [
 ]
 
 
+URDF = """<robot name="r"><link name="{}"/><link name="a"><inertial>
+<mass value="1"/><inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial>
+</link><joint name="k" type="floating"><parent link="{}"/><child link="a"/></joint>
+</robot>"""
+PLANES = (
+    f'<geom name="p" type="plane" size="1 1 1" {APART}/>'
+    f'<geom name="r" type="plane" size="1 1 1" {APART}/></worldbody>'
+)
+MESH = '<asset><mesh name="m" vertex="0 0 0 1 0 0 0 1 0 0 0 1"/></asset>'
+WRONG += [
+    (_text(), {"parameters": ["mass"]}, "must be a dictionary such as"),
+    (
+        _text().replace("</worldbody>", PLANES),
+        {"rolling": ["g"]},
+        "the model has the planes p, r",
+    ),
+    (
+        _text(geom='type="mesh" mesh="m" contype="0"', before=MESH).replace(
+            'size="0.1"', ""
+        ),
+        {"rolling": ["g"]},
+        "the geom 'g' is a mesh",
+    ),
+    (_text(geom='mass="0" contype="0"'), {}, "Give this body a geom with a mass"),
+    (
+        _text().replace("<worldbody>", '<worldbody><body name="m" mocap="true"/>'),
+        {},
+        "body 'm': its pose is given by mocap data",
+    ),
+    (nhjax.example_robot_file("wheeled_quadruped"), {"root": "free"}, "an MJCF file"),
+    (Path(__file__).parent, {}, "there is no file"),
+]
+
+
 @pytest.mark.parametrize("case", range(len(WRONG)))
 def test_wrong_argument_is_named_with_advice(case):
     model, options, message = WRONG[case]
-    if isinstance(model, str) and model.startswith("<mujoco>"):
-        model = _compiled(model)
+    if isinstance(model, str) and model.startswith("<mujoco><"):
+        model = mujoco.MjSpec.from_string(model)
     with pytest.raises((TypeError, ValueError, FileNotFoundError), match=message):
         nhjax.from_mujoco(model, **options)
 
@@ -588,6 +622,38 @@ def test_broken_file_is_refused_with_its_path(text, message, tmp_path):
     with pytest.raises(ValueError, match=message) as caught:
         nhjax.from_mujoco(path)
     assert "broken.xml" in str(caught.value)
+
+
+def test_urdf_with_a_link_named_world_refuses_root(tmp_path):
+    path = tmp_path / "free.urdf"
+    path.write_text(URDF.format("world", "world"), encoding="utf-8")
+    with pytest.raises(ValueError, match="has a link named world"):
+        nhjax.from_mujoco(path, root="free")
+
+
+def test_urdf_link_without_inertia_is_named(tmp_path):
+    path = tmp_path / "light.urdf"
+    text = URDF.format("base", "base").replace("floating", "continuous")
+    text = re.sub(r"<inertial>.*</inertial>", "", text, flags=re.DOTALL)
+    path.write_text(text, encoding="utf-8")
+    with pytest.raises(ValueError, match="Give this body a geom with a mass"):
+        nhjax.from_mujoco(path)
+
+
+def test_file_that_is_no_xml_is_refused(tmp_path):
+    path = tmp_path / "robot.py"
+    path.write_text("x = 1", encoding="utf-8")
+    with pytest.raises(ValueError, match=r"robot\.py is not an XML file"):
+        nhjax.from_mujoco(path)
+
+
+def test_wheel_above_the_ground_is_named_with_its_height():
+    text = _text('type="free"', geom='contype="0"').replace('"b"', '"b" pos="0 0 1"')
+    robot = nhjax.from_mujoco(_compiled(text), rolling={"g": "slides"})
+    with pytest.raises(Exception, match="holonomic constraints violated") as caught:
+        robot.initial_state()
+    (note,) = [x for x in caught.value.__notes__ if "touch" in x]
+    assert "'g' by 0.9 m" in note
 
 
 @pytest.mark.parametrize(

@@ -2,7 +2,7 @@
 
 from ._kernel import as_cpu_kernel as as_cpu_kernel, TraceCache as TraceCache
 from ._loop_start import started_like as started_like
-from ._rows import vmapped as vmapped
+from ._rows import SHORTEST_IN_LOOP as SHORTEST_IN_LOOP, vmapped as vmapped
 from ._small_product import (
     LONGEST_SUM as LONGEST_SUM,
     small_product as small_product,

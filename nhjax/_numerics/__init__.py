@@ -8,6 +8,7 @@ from ._contraction import (
     repeated as repeated,
     small_einsum as small_einsum,
     solve_by_rows as solve_by_rows,
+    with_small_products as with_small_products,
 )
 from ._floating_point import (
     largest_column as largest_column,

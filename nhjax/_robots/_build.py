@@ -21,8 +21,9 @@ from ._dynamics import (
     Mechanics,
     Parameters,
 )
+from ._joints import Joint
 from ._read import active_equalities, has_flag, is_fixed_tendon, mujoco, name_of
-from ._tree import Frame, homogeneous, Joint, Space
+from ._tree import Frame, homogeneous, Space
 
 
 _KINDS = ("free", "ball", "slide", "hinge")

@@ -13,7 +13,10 @@ from .._custom_types import Args, FloatScalarLike
 from .._errors import ShapeError
 from .._manifold import Exponential, SO3
 from . import _scalars as entries
-from ._tree import Frame, FramePoses, Joint, Space, Tree
+from ._joints import Joint
+from ._kept import Kept
+from ._rotors import merge_rotors, spatial_inertia
+from ._tree import Frame, FramePoses, Space, Tree
 
 
 class Bodies(NamedTuple):
@@ -112,11 +115,12 @@ class Parameters(eqx.Module):
                     "`from_mujoco(..., parameters=...)`."
                 )
             if key == "controls":
-                if jnp.shape(given) != (len(self.controls),):
+                shape = jnp.asarray(given).shape
+                if shape != (len(self.controls),):
                     raise ShapeError(
                         f"`args['controls']` must have shape ({len(self.controls)},), "
                         f"one number for each of {', '.join(self.controls)}, got shape "
-                        f"{jnp.shape(given)}. For many runs use `jax.vmap`."
+                        f"{shape}. For many runs use `jax.vmap`."
                     )
                 continue
             if not isinstance(given, dict):
@@ -147,58 +151,101 @@ def lagrangian_of(mechanics: Mechanics, parameters: Parameters) -> Any:
     ξ = (v, ω) of their frame and their constant spatial inertia M.
     """
     space, bodies = mechanics.space, mechanics.bodies
-    tree = Tree(mechanics.joints, space, range(len(mechanics.joints)))
-    nodes = np.asarray([tree.node[joint] for joint in bodies.joints], int)
-    spatial = np.asarray([_spatial_inertia(x) for x in bodies.inertia])
-    moments = bodies.weight[:, None] * bodies.inertia[:, 3]
+    changing = parameters.names.get("mass", {})
+    variable = {place for places in changing.values() for place in places}
+    merged = merge_rotors(
+        mechanics.joints,
+        bodies.joints,
+        bodies.inertia,
+        bodies.weight[:, None] * bodies.inertia[:, 3],
+        variable,
+    )
+    turned = {rotor.joint for rotor in merged.rotors}
+    kept_joints = [j for j in range(len(mechanics.joints)) if j not in turned]
+    tree = Tree(mechanics.joints, space, kept_joints)
+    # Bodies that are fixed to the world do not matter.
+    moving = [i for i, joint in enumerate(merged.joints) if joint >= 0]
+    nodes = np.asarray([tree.node[merged.joints[i]] for i in moving], int)
+    spatial = np.asarray([spatial_inertia(merged.inertia[i]) for i in moving])
+    moments = merged.moment[moving]
     total, total_moment = (
         np.zeros((len(tree.node), 6, 6)),
         np.zeros((len(tree.node), 4)),
     )
     np.add.at(total, nodes, spatial.reshape(-1, 6, 6))
     np.add.at(total_moment, nodes, moments)
-    has_masses = "mass" in parameters.names
+    has_masses = bool(variable)
+    velocity_of = space.velocity_of
     has_tendons = np.any(mechanics.tendon_armature) or np.any(
         mechanics.tendon_stiffness
     )
     gravity = mechanics.gravity if np.any(mechanics.gravity) else None
 
-    def inertias(args, dtype):
-        inertia, moment = jnp.asarray(total, dtype), jnp.asarray(total_moment, dtype)
-        if has_masses and args and args.get("mass"):
-            # A body with another mass has the same shape and centre of mass.
-            masses = parameters.replaced("mass", bodies.mass, args, dtype)
-            change = masses / jnp.asarray(bodies.mass, dtype) - 1
-            added = change[:, None, None] * jnp.asarray(spatial, dtype)
-            inertia = inertia.at[nodes].add(added)
-            moment = moment.at[nodes].add(change[:, None] * jnp.asarray(moments, dtype))
-        return inertia, moment
+    def changes(args, dtype):
+        """Compute by which part of its inertia each moving body changes."""
+        # A body with another mass has the same shape and centre of mass.
+        masses = parameters.replaced("mass", bodies.mass, args, dtype)
+        return (masses / jnp.asarray(bodies.mass, dtype) - 1)[np.asarray(moving, int)]
 
     def lagrangian(t, q, v, args):
         parameters.check(args)
+        numbers = {k: x for k, x in (args or {}).items() if k != "controls"}
+        numbers = jax.tree.map(lambda x: jnp.asarray(x, v.dtype), numbers)
+        return kept.call(q, v, numbers)
+
+    def value(q, v, args):
+        change = changes(args, v.dtype) if has_masses and args.get("mass") else None
+        if not tree.node:
+            energy, twists = jnp.zeros((), v.dtype), []
+        elif tree.is_small:
+            energy, twists = energy_of_scalars(q, v, change)
+        else:
+            energy, twists = energy_of_arrays(q, v, change)
+        for joint, parent, momentum, inertia in merged.rotors:
+            rate = v[velocity_of[joint]]
+            energy = energy + 0.5 * inertia * rate * rate
+            if parent >= 0:
+                twist = list(twists[tree.node[parent]])
+                with_parent = entries.dot(entries.known(momentum), twist)
+                energy = entries.add(energy, entries.times(with_parent, rate))
+        return rest_of(q, v, args, jnp.asarray(energy, v.dtype))
+
+    def energy_of_arrays(q, v, change):
         dtype = v.dtype
-        if tree.is_small and not has_masses:
-            return rest_of(q, v, args, scalar_energy(q, v))
-        inertia, moment = inertias(args, dtype)
+        inertia, moment = jnp.asarray(total, dtype), jnp.asarray(total_moment, dtype)
+        if change is not None:
+            added = change[:, None, None] * jnp.asarray(spatial, dtype)
+            inertia = inertia.at[nodes].add(added)
+            moment = moment.at[nodes].add(change[:, None] * jnp.asarray(moments, dtype))
         twist, fall, depth = tree.motion(q, v, gravity)
         energy = 0.5 * jnp.sum(jnp.einsum("nij,nj->ni", inertia, twist) * twist)
         if fall is not None and depth is not None:
             energy = energy + jnp.sum(moment[:, :3] * fall)
             energy = energy + jnp.sum(moment[:, 3] * depth)
-        return rest_of(q, v, args, energy)
+        return energy, twist
 
-    def scalar_energy(q, v):
+    def energy_of_scalars(q, v, change):
         energy: Any = 0.0
         motion = tree.motion_of_scalars(q, v, gravity)
+        inertia, moment = total.tolist(), total_moment.tolist()
+        for row, (number, node) in enumerate(zip(moving, nodes.tolist(), strict=True)):
+            if change is not None and number in variable:
+                for whole, part in (
+                    *zip(inertia[node], spatial[row].tolist(), strict=True),
+                    (moment[node], moments[row].tolist()),
+                ):
+                    whole[:] = entries.sums(
+                        whole, [entries.times(x, change[row]) for x in part]
+                    )
         for (twist, fall, depth), own, rest in zip(
-            motion, total.tolist(), total_moment.tolist(), strict=True
+            motion, inertia, moment, strict=True
         ):
             for i in range(6):
-                half = [0.5 * own[i][i], *own[i][i + 1 :]]
+                half = [entries.times(0.5, own[i][i]), *own[i][i + 1 :]]
                 row = entries.dot(half, twist[i:])
                 energy = entries.add(energy, entries.times(row, twist[i]))
             energy = entries.add(energy, entries.dot(rest, [*fall, depth]))
-        return jnp.asarray(energy, v.dtype)
+        return energy, [twist for twist, _, _ in motion]
 
     def rest_of(q, v, args, energy):
         """Add the energies of armatures, springs and tendons."""
@@ -218,22 +265,8 @@ def lagrangian_of(mechanics: Mechanics, parameters: Parameters) -> Any:
             energy = energy - 0.5 * jnp.sum(stiffness * stretch * stretch)
         return energy
 
+    kept = Kept(value)
     return lagrangian
-
-
-def _spatial_inertia(
-    inertia: Float[np.ndarray, "4 4"],
-) -> Float[np.ndarray, "6 6"]:
-    """Return the matrix M of ½ ξ·M ξ = ½ m v² + v·(ω × m c) + ½ ω·I ω.
-
-    The pseudo-inertia gives the mass m, the moment m c and the inertia I about the
-    origin.
-    """
-    second, moment, mass = inertia[:3, :3], inertia[:3, 3], inertia[3, 3]
-    # This matrix maps ω to ω × m c.
-    across = -np.cross(moment, np.eye(3)).T
-    about = np.trace(second) * np.eye(3) - second
-    return np.block([[mass * np.eye(3), across], [across.T, about]])
 
 
 def _spring_energy(mechanics, parameters, q, args, dtype):

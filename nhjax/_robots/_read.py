@@ -146,7 +146,15 @@ def _or_message(function: Any, name: Any) -> Any:
     try:
         return function()
     except ValueError as error:
-        raise ValueError(f"from_mujoco: MuJoCo cannot read {name}: {error}") from error
+        advice = ""
+        if "mjMINVAL" in str(error):
+            advice = (
+                " Give this body a geom with a mass, or masses and moments of inertia "
+                "(`inertial`), or fix it to its parent."
+            )
+        raise ValueError(
+            f"from_mujoco: MuJoCo cannot read {name}: {error}{advice}"
+        ) from error
 
 
 def name_of(model: Any, kind: str, number: int) -> str:

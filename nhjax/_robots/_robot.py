@@ -1,6 +1,9 @@
-"""The function `from_mujoco`, and the robot that it returns."""
+"""The function `from_mujoco`, the robot that it returns, and example robots."""
 
+import math
 from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from types import MappingProxyType
 from typing import Any, Literal
 
 import equinox as eqx
@@ -10,10 +13,10 @@ import numpy as np
 from jaxtyping import Array, Float, PyTree
 
 from .._custom_types import Args, FloatScalarLike
-from .._errors import ShapeError
+from .._errors import check_choice, ShapeError
 from .._initial import initial_state
 from .._system import LagrangianSystem, State
-from ..rolling import AbstractGround, Contacts
+from ..rolling import AbstractGround, Contacts, Plane
 from ._build import (
     actuators_of,
     contacts_of,
@@ -27,6 +30,7 @@ from ._build import (
     rolling_options,
 )
 from ._dynamics import force_of, frame_pose, lagrangian_of, loops_of
+from ._kept import KeptPositions, KeptSlips
 from ._read import check_supported, compile_model, is_fixed_urdf, name_of
 
 
@@ -89,16 +93,40 @@ class Robot(eqx.Module):
         position = self._array("qpos", qpos, rest)
         velocity = self._array("qvel", qvel, jnp.zeros(self._space.num_velocities))
         q = self._space.from_qpos(position)
-        return initial_state(
-            self.system,
-            q,
-            self._space.to_body(q, velocity),
-            t=t,
-            args=self.args if args is None else args,
-            project=project,
-            keep_q=keep_q,
-            keep_v=keep_v,
-        )
+        given = self.args if args is None else args
+        try:
+            return initial_state(
+                self.system,
+                q,
+                self._space.to_body(q, velocity),
+                t=t,
+                args=given,
+                project=project,
+                keep_q=keep_q,
+                keep_v=keep_v,
+            )
+        except Exception as error:
+            self._add_note_on_heights(error, t, q, given)
+            raise
+
+    def _add_note_on_heights(self, error: Exception, t: Any, q: Any, args: Any) -> None:
+        """Name the wheels that do not touch the ground, if the positions are known."""
+        if self.contacts is None:
+            return
+        pairs = zip(self.contacts.names, self.contacts.contacts, strict=True)
+        found = {x: one.height(t, q, args) for x, one in pairs if one.touches}
+        try:
+            heights = {name: float(height) for name, height in found.items()}
+        except jax.errors.ConcretizationTypeError:
+            return
+        apart = [
+            f"{name!r} by {h:.3g} m" for name, h in heights.items() if abs(h) > 1e-6
+        ]
+        if apart:
+            error.add_note(
+                f"These geoms do not touch the ground: {', '.join(apart)} (negative "
+                "below it). Choose `qpos` so that they touch, or pass `project=True`."
+            )
 
     def qpos(self, sol: Any) -> Float[Array, "*times nq"]:
         """Return positions in MuJoCo's conventions.
@@ -302,12 +330,14 @@ def from_mujoco(
         loop = loops_of(layout.joints, layout.space, loops, kept.loops)
         if contacts is not None:
             contacts = _reduced(compiled, layout, contacts, kept, ground)
+    slips = None if contacts is None else contacts.nonholonomic
     heights = None if contacts is None else contacts.holonomic
+    positions = _joined(heights, loop)
     coordinates = _coordinates(layout)
     system = LagrangianSystem(
         lagrangian_of(mechanics, known),
-        nonholonomic=None if contacts is None else contacts.nonholonomic,
-        holonomic=_joined(heights, loop),
+        nonholonomic=None if slips is None else KeptSlips(slips),
+        holonomic=None if positions is None else KeptPositions(positions),
         force=force_of(mechanics, known, actuators, controls, _to_mujoco(layout)),
         manifold=layout.space.manifold,
         coordinates=coordinates,
@@ -364,3 +394,119 @@ def _joined(heights: Any, loop: Any) -> Any:
         return jnp.concatenate([heights(t, q, args), loop(t, q, args)])
 
     return holonomic
+
+
+# --- Robots that come with nhjax ------------------------------------------------------
+
+_FOLDER = Path(__file__).parent / "models"
+
+_LEFT_ROLLERS, _RIGHT_ROLLERS = -math.pi / 4, math.pi / 4
+# The front wheel on the right of the car slips sideways, because a trapezoid does not
+# turn both wheels exactly about one centre. A wheel opposite to another one of the
+# quadruped would repeat its constraint when all wheels are parallel.
+_OPTIONS: Mapping[str, tuple[str, dict[str, Any]]] = MappingProxyType(
+    {
+        "ackermann_car": (
+            "ackermann_car.xml",
+            {
+                "rolling": {
+                    "rear_left_tread": "no slip",
+                    "rear_right_tread": "no longitudinal slip",
+                    "front_left_tread": "no slip",
+                    "front_right_tread": "no longitudinal slip",
+                }
+            },
+        ),
+        "balancing_robot": (
+            "balancing_robot.xml",
+            {"rolling": ("left_tread", "right_tread")},
+        ),
+        "differential_drive": (
+            "differential_drive.urdf",
+            {
+                "rolling": ("left_tread", "right_tread", "caster_tread"),
+                "root": "planar",
+                "ground": -0.1,
+                "ignore": ("contacts",),
+            },
+        ),
+        "mecanum_platform": (
+            "mecanum_platform.xml",
+            {
+                "rolling": {
+                    "front_left_tread": _LEFT_ROLLERS,
+                    "front_right_tread": _RIGHT_ROLLERS,
+                    "rear_left_tread": _RIGHT_ROLLERS,
+                    "rear_right_tread": _LEFT_ROLLERS,
+                }
+            },
+        ),
+        "wheeled_quadruped": (
+            "wheeled_quadruped.xml",
+            {
+                "rolling": {
+                    "front_left_tread": "no slip",
+                    "front_right_tread": "no longitudinal slip",
+                    "rear_left_tread": "no slip",
+                    "rear_right_tread": "no longitudinal slip",
+                }
+            },
+        ),
+    }
+)
+
+
+def example_robot_file(name: str) -> Path:
+    """Return the path of the model file of a robot that comes with nhjax.
+
+    **Arguments:**
+
+    - `name`: as for `example_robot`.
+
+    **Raises:** `ValueError` if there is no such robot.
+
+    !!! example
+
+        >>> import nhjax
+        >>> nhjax.example_robot_file("mecanum_platform").name
+        'mecanum_platform.xml'
+    """
+    check_choice("example_robot: `name`", name, tuple(_OPTIONS))
+    return _FOLDER / _OPTIONS[name][0]
+
+
+def example_robot(name: str, **options: Any) -> Robot:
+    """Read a robot that comes with nhjax.
+
+    | name | the robot | velocities |
+    | --- | --- | --- |
+    | `"ackermann_car"` | a car, whose steering has a tie rod that closes a loop | 10 |
+    | `"balancing_robot"` | a body on two wheels that falls without control | 6 |
+    | `"differential_drive"` | two driven wheels and a caster; a URDF file | 7 |
+    | `"mecanum_platform"` | a platform on four mecanum wheels | 7 |
+    | `"wheeled_quadruped"` | four legs with springs and a wheel each | 20 |
+
+    **Arguments:**
+
+    - `name`: the name of the robot.
+    - `options`: options of `from_mujoco`, such as `parameters` and `controls`. They
+        replace the options that belong to the robot, such as `rolling`.
+
+    **Returns:** a `Robot`.
+
+    **Raises:** `ValueError` if there is no such robot; otherwise as `from_mujoco`.
+
+    !!! example
+
+        >>> import nhjax
+        >>> robot = nhjax.example_robot("balancing_robot")
+        >>> robot.coordinates
+        ('x', 'y', 'heading', 'pitch', 'left', 'right')
+    """
+    path = example_robot_file(name)
+    own: dict[str, Any] = dict(_OPTIONS[name][1])
+    if "ground" in own:
+        # The plane has the precision of this call.
+        own["ground"] = Plane(height=own["ground"])
+    own |= options
+    return from_mujoco(path, **own)

@@ -9,6 +9,7 @@ otherwise.
 from collections.abc import Iterable, Sequence
 from typing import Any, TypeAlias
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
@@ -34,7 +35,9 @@ def add(a: Entry, b: Entry) -> Entry:
     """Compute a + b."""
     if isinstance(a, float) and a == 0:
         return b
-    return a if isinstance(b, float) and b == 0 else a + b
+    if isinstance(b, float) and b == 0:
+        return a
+    return _combined(jax.lax.add, a, b)
 
 
 def times(a: Entry, b: Entry) -> Entry:
@@ -45,7 +48,14 @@ def times(a: Entry, b: Entry) -> Entry:
                 return 0.0
             if x in (1.0, -1.0):
                 return y if x == 1 else -y
-    return a * b
+    return _combined(jax.lax.mul, a, b)
+
+
+def _combined(operation: Any, a: Entry, b: Entry) -> Entry:
+    """Combine two entries. JAX traces its basic operations in the least time."""
+    if isinstance(a, float) and isinstance(b, float):
+        return a + b if operation is jax.lax.add else a * b
+    return operation(a, b)
 
 
 def total(terms: Iterable[Entry]) -> Entry:

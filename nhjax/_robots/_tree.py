@@ -17,29 +17,12 @@ from jaxtyping import Array, Float, PyTree
 
 from .._manifold import AbstractLieGroup, Euclidean, ProductGroup, SE3, SO3
 from . import _scalars as entries
+from ._joints import Joint, motions, twists
 
 
-# Trees with more joints are computed as arrays: tracing scalars takes longer then.
-LARGEST_OF_SCALARS = 8
-
-
-class Joint(NamedTuple):
-    """A joint of the tree.
-
-    - `name`, `kind`: the kind is "free", "ball", "slide" or "hinge".
-    - `parent`: the number of the joint before it on the path from the world, or -1.
-    - `offset`: the frame of its body at rest, relative to the frame after `parent`.
-    - `anchor`, `axis`: the point and the direction of the joint in its own frame.
-    - `reference`: the coordinate of a slide or a hinge at rest.
-    """
-
-    name: str
-    kind: str
-    parent: int
-    offset: Float[np.ndarray, "4 4"]
-    anchor: Float[np.ndarray, "3"]
-    axis: Float[np.ndarray, "3"]
-    reference: float
+# Larger trees are computed as arrays, which have shorter programs. The code of
+# scalars is shorter: it has no products with zeros, and compiles in less time.
+LARGEST_OF_SCALARS = 40
 
 
 class Part(NamedTuple):
@@ -98,6 +81,12 @@ class Space:
             ],
             int,
         )
+        # The place of the first velocity of each joint.
+        self.velocity_of: dict[int, int] = {
+            joint: part.first_velocity + i
+            for part in self.parts
+            for i, joint in enumerate(part.joints)
+        }
         self.free = [part.first_velocity for part in self.parts if part.kind == "free"]
 
     def split(self, q: PyTree[Array]) -> tuple[list[Array], Array]:
@@ -201,8 +190,8 @@ class Tree:
         self.scalar = np.asarray([i for i, _ in chosen], int)
         self.num_scalars = len(scalar)
         self.reference = np.asarray([x.reference for _, x in chosen], float)
-        self.constants = _motions([joint for _, joint in chosen])
-        self.twists = _twists([joint for _, joint in chosen])
+        self.constants = motions([joint for _, joint in chosen])
+        self.twists = twists([joint for _, joint in chosen])
         order = [j for j in (*special, *scalar) if j in on_paths]
         self.levels: list[Level] = []
         self.node: dict[int, int] = {}
@@ -432,38 +421,6 @@ def take(x: Array, places: np.ndarray) -> Array:
     if not np.array_equal(places, np.arange(first, first + count)):
         return x[places]
     return x if count == x.shape[0] else x[first : first + count]
-
-
-def _twists(joints: Sequence[Joint]) -> Float[np.ndarray, "n 6"]:
-    """Return the twists of scalar joints with unit rate, in their own frames."""
-    found = np.zeros((len(joints), 6))
-    for row, joint in zip(found, joints, strict=True):
-        if joint.kind == "slide":
-            row[:3] = joint.axis
-        else:
-            row[:3], row[3:] = np.cross(joint.anchor, joint.axis), joint.axis
-    return found
-
-
-def _motions(joints: Sequence[Joint]) -> Float[np.ndarray, "4 n 12"]:
-    """Return the coefficients of 1, sin s, 1 - cos s and s in the pose of a joint.
-
-    A hinge turns about its axis by Rodrigues' formula I + sin s â + (1 - cos s) â², and
-    its anchor p stays in place. Each row has the rotation and then the position.
-    """
-    found = np.zeros((4, len(joints), 12))
-    for number, joint in enumerate(joints):
-        turn, shift = joint.offset[:3, :3], joint.offset[:3, 3]
-        found[0, number] = [*turn.ravel(), *shift]
-        if joint.kind == "slide":
-            found[3, number, 9:] = turn @ joint.axis
-            continue
-        # Its columns are a × e_i, so that it maps x to a × x.
-        hat = np.cross(joint.axis, np.eye(3)).T
-        for row, matrix in ((1, hat), (2, hat @ hat)):
-            turned = turn @ matrix
-            found[row, number] = [*turned.ravel(), *(-turned @ joint.anchor)]
-    return found
 
 
 class Frame(NamedTuple):

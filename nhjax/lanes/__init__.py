@@ -8,6 +8,7 @@ from ._jaxprs import (
     CALLING as CALLING,
     cse_dce as cse_dce,
     ELEMENTWISE as ELEMENTWISE,
+    KEPT_CALL as KEPT_CALL,
     LARGEST_REDUCTION as LARGEST_REDUCTION,
     num_results as num_results,
     SMALL_PRODUCT as SMALL_PRODUCT,

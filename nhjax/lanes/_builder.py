@@ -485,7 +485,7 @@ class Builder:
 CALLS = frozenset(
     """
     checkpoint closed_call core_call custom_jvp_call custom_vjp_call
-    custom_vjp_call_jaxpr eval_jaxpr jit cpu_kernel pjit remat remat2
+    custom_vjp_call_jaxpr eval_jaxpr jit kept_call cpu_kernel pjit remat remat2
     """.split()  # noqa: SIM905
 )
 # The primitive that has a method of Python which returns its program.

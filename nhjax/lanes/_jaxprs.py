@@ -49,9 +49,11 @@ ARITHMETIC_AND_SHAPES = (*ELEMENTWISE, *_REDUCING, *_SHAPING, *_MOVING)
 _ARITHMETIC = {"add", "add_any", "div", "mul", "neg", "sub"}
 # nhjax's own operation, which is lowered to arithmetic and shapes.
 SMALL_PRODUCT = "small_product"
+# nhjax's own operation, a call of a program that is kept with its derivatives.
+KEPT_CALL = "kept_call"
 # These operations contain programs; the operations of these programs are checked too.
 CALLING = """
-    checkpoint closed_call custom_jvp_call custom_vjp_call jit remat2
+    checkpoint closed_call custom_jvp_call custom_vjp_call jit kept_call remat2
 """.split()  # noqa: SIM905
 # nhjax's own operation, which computes a program for each row of its operands.
 BATCHED_CALL = "batched_call"
@@ -143,7 +145,7 @@ def num_results(program: Any) -> int:
 # Only these operations are removed when repeated. They have no state (random numbers
 # have one), and no parameters that a user chooses.
 _REPEATABLE = frozenset(
-    (*ARITHMETIC_AND_SHAPES, "dot_general", "gather", SMALL_PRODUCT)
+    (*ARITHMETIC_AND_SHAPES, "dot_general", "gather", KEPT_CALL, SMALL_PRODUCT)
 )
 # The operations whose inner programs are simplified, and the parameters that hold these
 # programs. The inner programs of other operations are not simplified, because the rules

@@ -1,0 +1,67 @@
+"""The joints of a robot, and their motions as numbers."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+
+class Joint(NamedTuple):
+    """A joint of the tree.
+
+    - `name`, `kind`: the kind is "free", "ball", "slide" or "hinge".
+    - `parent`: the number of the joint before it on the path from the world, or -1.
+    - `offset`: the frame of its body at rest, relative to the frame after `parent`.
+    - `anchor`, `axis`: the point and the direction of the joint in its own frame.
+    - `reference`: the coordinate of a slide or a hinge at rest.
+    """
+
+    name: str
+    kind: str
+    parent: int
+    offset: Float[np.ndarray, "4 4"]
+    anchor: Float[np.ndarray, "3"]
+    axis: Float[np.ndarray, "3"]
+    reference: float
+
+
+def twists(joints: Sequence[Joint]) -> Float[np.ndarray, "n 6"]:
+    """Return the twists of scalar joints with unit rate, in their own frames."""
+    found = np.zeros((len(joints), 6))
+    for row, joint in zip(found, joints, strict=True):
+        if joint.kind == "slide":
+            row[:3] = joint.axis
+        else:
+            row[:3], row[3:] = np.cross(joint.anchor, joint.axis), joint.axis
+    return found
+
+
+def motions(joints: Sequence[Joint]) -> Float[np.ndarray, "4 n 12"]:
+    """Return the coefficients of 1, sin s, 1 - cos s and s in the pose of a joint.
+
+    A hinge turns about its axis by Rodrigues' formula I + sin s â + (1 - cos s) â², and
+    its anchor p stays in place. Each row has the rotation and then the position.
+    """
+    found = np.zeros((4, len(joints), 12))
+    for number, joint in enumerate(joints):
+        turn, shift = joint.offset[:3, :3], joint.offset[:3, 3]
+        found[0, number] = [*turn.ravel(), *shift]
+        if joint.kind == "slide":
+            found[3, number, 9:] = turn @ joint.axis
+            continue
+        # Its columns are a × e_i, so that it maps x to a × x.
+        hat = np.cross(joint.axis, np.eye(3)).T
+        for row, matrix in ((1, hat), (2, hat @ hat)):
+            turned = turn @ matrix
+            found[row, number] = [*turned.ravel(), *(-turned @ joint.anchor)]
+    return found
+
+
+def pose_of_joint(joint: Joint, angle: float) -> Float[np.ndarray, "4 4"]:
+    """Return the pose after a hinge that has turned by an angle from rest."""
+    parts = np.array([1.0, np.sin(angle), 1 - np.cos(angle), angle])
+    numbers = np.tensordot(parts, motions([joint])[:, 0], axes=1)
+    found = np.eye(4)
+    found[:3, :3], found[:3, 3] = numbers[:9].reshape(3, 3), numbers[9:]
+    return found
