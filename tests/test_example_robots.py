@@ -1,6 +1,7 @@
 """The robots that come with nhjax, against dense equations of MuJoCo's matrices."""
 
 import functools
+import importlib
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +12,7 @@ import pytest
 import nhjax
 
 
-mujoco: Any = pytest.importorskip("mujoco")
+mujoco: Any = importlib.import_module("mujoco")
 
 # The number of velocities, and a motion to start from, which is projected.
 ROBOTS = {

@@ -24,7 +24,7 @@ from nhjax._films._view import _capsule, Show
 from support.pages import blocks, DOCS, page, run_page
 
 
-mujoco: Any = pytest.importorskip("mujoco")
+mujoco: Any = importlib.import_module("mujoco")
 
 
 def made_up(ts, q, v):
