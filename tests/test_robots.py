@@ -201,9 +201,9 @@ def test_two_wheeled_robot_from_urdf_moves_like_that_of_the_gallery():
         (robot.system, robot.initial_state(hand_written.q0, hand_written.v0)),
         (hand_written.system, hand_written.initial_state()),
     ):
-        method, saveat = nhjax.LobattoIIIAB(2), nhjax.SaveAt(steps=20)
+        method, saveat = nhjax.LobattoIIIAB(2), nhjax.SaveAt(steps=40)
         runs.append(
-            nhjax.integrate(system, method, y0, dt=0.05, num_steps=100, saveat=saveat)
+            nhjax.integrate(system, method, y0, dt=0.05, num_steps=200, saveat=saveat)
         )
     sol, expected = runs
     np.testing.assert_allclose(robot.qpos(sol), expected.ys.q, atol=1e-10)
