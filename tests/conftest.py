@@ -73,6 +73,13 @@ LONGEST = (
     "test_docstrings.py",
     "studies/test_studies.py",
     "integrate/test_invariants.py",
+    "integrate/test_step_controllers.py",
+    "step/test_accepted_steps.py",
+    "step/test_round_off.py",
+    "test_example_robots.py",
+    "test_friction.py",
+    "test_guide.py",
+    "test_robots.py",
 )
 
 

@@ -1,4 +1,4 @@
-"""The wheelset benchmark against Newton's and Euler's equations, and published digits.
+"""The wheelset benchmark against Newton's and Euler's equations.
 
 The equations here are written with vectors in space: forces and torques on a body, with
 contacts that a root finder locates. They share no formula with the benchmark.
@@ -10,7 +10,7 @@ from scipy.optimize import root
 from scipy.spatial.transform import Rotation
 
 import nhjax
-from benchmarks.wheelset import SOLUTION, START, Wheelset
+from benchmarks.wheelset import START, Wheelset
 
 
 MASS, G, V, R0, I1, I2 = 16.08, 9.81, 30.0, 0.1, 0.0605, 0.366
@@ -137,13 +137,6 @@ def test_wheelset_satisfies_the_equations_at_first():
         np.testing.assert_allclose(imbalance, 0, atol=1e-8)
         drift = np.array([at.gap for at in _contacts(q[k])]) - np.asarray(machine.gaps)
         np.testing.assert_allclose(drift, 0, atol=1e-15)
-
-
-@pytest.mark.long
-def test_wheelset_has_the_published_digits():
-    found = Wheelset().run(3, 160000).unknowns
-    # The published solution has let the wheels rise by 6e-11 m, the unknown y.
-    np.testing.assert_allclose(found, SOLUTION, rtol=2.5e-6, atol=7e-11)
 
 
 @pytest.mark.long

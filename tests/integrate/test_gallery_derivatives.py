@@ -107,20 +107,12 @@ QUICK = (
     long_but(
         QUICK,
         [
-            ("attracting and linear", 2, "symmetric"),
             ("attracting and linear", 2, "propagated"),
             ("chaotic and integrable", 3, "symmetric"),
-            ("chaotic and integrable", 2, "propagated"),
-            ("rod sleigh", 2, "symmetric"),
             ("rod sleigh", 2, "propagated"),
-            ("unicycle", 2, "symmetric"),
             ("unicycle", 2, "propagated"),
-            ("disc", 2, "symmetric"),
             ("disc", 2, "propagated"),
             ("ball", 2, "symmetric"),
-            ("ball", 2, "propagated"),
-            ("Suslov", 2, "symmetric"),
-            ("Suslov", 2, "propagated"),
             ("Suslov", 2, "consistent"),
             ("Veselova", 2, "symmetric"),
             # Without nonholonomic constraints there is nothing to close.

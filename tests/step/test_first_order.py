@@ -55,10 +55,8 @@ def contraction(example, method, h):
     ("example", "chart"),
     [
         (systems.ChaplyginSleigh(), "middle"),
-        long(systems.CarWithTrailers(), "middle"),
-        long(systems.Suslov(), "middle"),
         (systems.Unicycle(), "start"),
-        long(systems.HeavyTop(), "start"),
+        long(systems.Suslov(), "middle"),
         long(systems.HeavyTopSE3(), "middle"),
     ],
     ids=lambda x: x if isinstance(x, str) else type(x).__name__,

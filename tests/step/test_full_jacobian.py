@@ -49,8 +49,6 @@ def slope_at_solution(system, y0, method, h):
     [
         (systems.NonholonomicParticle(), nhjax.LobattoIIIAB(3)),
         (systems.RodSleigh(), nhjax.LobattoIIIAB(2, "consistent")),
-        long(systems.RodSleigh(), nhjax.LobattoIIIAB(4)),
-        long(systems.Suslov(), nhjax.LobattoIIIAB(3)),
         long(systems.Suslov(), nhjax.LobattoIIIAB(2, "propagated", chart="start")),
         long(systems.BallInBowl(), nhjax.LobattoIIIAB(2)),
         long(systems.HeavyTop(), nhjax.Gauss(2)),

@@ -195,7 +195,7 @@ def test_slow_bicycle_in_other_coordinates_is_accepted(lean):
             assert float(sol.stats["max_constraint_violation"]) < 1e-13
 
 
-@pytest.mark.parametrize("stages", [2, long(3), long(4), long(5), long(6)])
+@pytest.mark.parametrize("stages", [2, long(3), long(6)])
 def test_upright_bicycle_at_rest_falls_to_45_degrees(stages):
     bicycle = nhjax.systems.WhippleBicycle()
     system, y0 = bicycle.system, bicycle.initial_state()
