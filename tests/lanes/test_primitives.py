@@ -13,6 +13,7 @@ from jax import lax
 
 from nhjax._compile import started_like
 from nhjax._numerics import small_einsum
+from nhjax._robots._kept import Kept
 from nhjax.lanes import _jaxprs, _program, Unsupported
 from support import lanes_run
 from support.random_steps import Kind, numbers
@@ -203,6 +204,7 @@ _CASES = {
     "custom_jvp_call": _unary(_custom_jvp),
     "custom_vjp_call": _unary(_doubled),
     "jit": _unary(jax.jit(lambda x: x * 2)),
+    "kept_call": _unary(Kept(lambda x: x * 2).call),
     "cond": [
         (
             lambda p, x: lax.cond(p, lambda: x * 2, lambda: x[::-1]),
