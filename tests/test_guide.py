@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from support.long import long_but
+from support.long import exhaustive_but
 from support.pages import blocks, DOCS, page, run_page
 
 
@@ -17,7 +17,7 @@ PAGES = (
 
 @pytest.mark.usefixtures("closed_figures")
 @pytest.mark.parametrize(
-    "name", long_but(sorted({*PAGES} - {"machines", "robots"}), PAGES)
+    "name", exhaustive_but(sorted({*PAGES} - {"machines", "robots"}), PAGES)
 )
 def test_guide_page_code_runs_as_printed(name, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)

@@ -21,7 +21,7 @@ import nhjax
 from nhjax.systems import ChaplyginSleigh, NonholonomicParticle
 from support import helpers, paper_mechanics as paper
 from support.driven import FIELD, FRICTION
-from support.long import long_but
+from support.long import exhaustive_but
 from support.orders import assert_order, rms, SCIPY_FLOOR, trajectories
 
 
@@ -86,12 +86,12 @@ def solved_errors(part, stages, closure):
 
 
 every_part = pytest.mark.parametrize("part", PARTS)
-every_stages = pytest.mark.parametrize("stages", long_but((2, 3, 4), COUNTS))
+every_stages = pytest.mark.parametrize("stages", exhaustive_but((2, 3, 4), COUNTS))
 # Four stages are an even number as two are: in the quick suite the closure that depends
 # on the parity is enough for them.
 every_method = pytest.mark.parametrize(
     ("stages", "closure"),
-    long_but(
+    exhaustive_but(
         [*product((2, 3), helpers.CLOSURES), (4, "propagated")],
         product(COUNTS, helpers.CLOSURES),
     ),
@@ -126,7 +126,7 @@ def test_propagated_multiplier_converges_with_order_s_or_s_minus_1(part, stages)
 
 @pytest.mark.parametrize(
     ("stages", "closure"),
-    long_but(
+    exhaustive_but(
         product((2, 3), ("consistent", "symmetric")),
         product(COUNTS, ("consistent", "symmetric")),
     ),

@@ -11,7 +11,7 @@ import pytest
 import nhjax
 from benchmarks.engines import difference, FINAL_TIMES, gallery, program
 from nhjax import LobattoIIIAB, systems
-from support.long import long, long_but
+from support.long import exhaustive_but, long
 
 
 pytestmark = pytest.mark.usefixtures("optimised_kernels")
@@ -72,7 +72,7 @@ def by_both(function, args, monkeypatch):
     return found
 
 
-@pytest.mark.parametrize("name", long_but(QUICK, QUICK + LONG))
+@pytest.mark.parametrize("name", exhaustive_but(QUICK, QUICK + LONG))
 def test_ensemble_by_native_engine_equals_xla(name, monkeypatch):
     num_steps = 20
     function = program(GALLERY[name], "end", 2, num_steps)

@@ -10,7 +10,7 @@ import pytest
 import nhjax
 from nhjax import LobattoIIIAB, SaveAt, systems
 from support.helpers import central_difference, scalar
-from support.long import long, long_but
+from support.long import exhaustive_but, long
 
 
 def particle_at(y: float) -> systems.NonholonomicParticle:
@@ -146,7 +146,7 @@ NAMES = [
 
 
 @pytest.mark.parametrize(
-    "name", long_but(("Hamiltonian", "mass and constraint not constant"), NAMES)
+    "name", exhaustive_but(("Hamiltonian", "mass and constraint not constant"), NAMES)
 )
 def test_invariant_energy_with_multiples_of_constraints_changes_no_step(name):
     system, y0 = to_run(name)
@@ -208,7 +208,7 @@ def test_invariant_impulses_exclude_directions_of_reactions():
 # Symmetry, several functions, derivatives and ensembles.
 
 
-@pytest.mark.parametrize("stages", long_but((2,), (2, 3)))
+@pytest.mark.parametrize("stages", exhaustive_but((2,), (2, 3)))
 @pytest.mark.parametrize("closure", ["symmetric", "propagated"])
 def test_invariant_steps_forwards_and_back_return_to_the_start(closure, stages):
     @jax.jit
@@ -249,7 +249,7 @@ ADJOINTS = {
 }
 
 
-@pytest.mark.parametrize("name", long_but(["direct"], ADJOINTS))
+@pytest.mark.parametrize("name", exhaustive_but(["direct"], ADJOINTS))
 def test_invariant_gradients_on_constraints_match_finite_differences(name):
     y0 = particle_at(1.0).initial_state()
 

@@ -18,7 +18,7 @@ from support.helpers import (
     scalar,
     SideBySide,
 )
-from support.long import long_but
+from support.long import exhaustive_but
 
 
 def assert_gradients_of_examples(examples, method, turning):
@@ -104,7 +104,7 @@ QUICK = (
 
 @pytest.mark.parametrize(
     ("name", "stages", "closure"),
-    long_but(
+    exhaustive_but(
         QUICK,
         [
             ("attracting and linear", 2, "propagated"),

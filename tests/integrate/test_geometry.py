@@ -10,7 +10,7 @@ import pytest
 import nhjax
 from support import helpers
 from support.helpers import CLOSURES, GALLERY, integrate_recorded, problem, recorded
-from support.long import long, long_but
+from support.long import exhaustive_but, long
 
 
 # Linear, affine, nonlinear and time-dependent constraints, and chaos.
@@ -33,7 +33,7 @@ def on_their_own(names, closures):
         if closure == "symmetric" or name in EACH_CLOSURE or name not in QUICK
     ]
     short = [case for case in cases if case[0] in (*QUICK, "oscillator")]
-    return pytest.mark.parametrize(("name", "closure"), long_but(short, cases))
+    return pytest.mark.parametrize(("name", "closure"), exhaustive_but(short, cases))
 
 
 every_closure = pytest.mark.parametrize("closure", CLOSURES)
@@ -149,7 +149,7 @@ def test_symmetric_step_with_any_number_of_stages_is_undone_by_minus_h(stages, c
 # At s = 3 Appell's motion is integrated exactly, and the oscillator has no multiplier.
 @pytest.mark.parametrize(
     "name",
-    long_but(
+    exhaustive_but(
         ["particle", "sleigh", "chaotic"],
         [name for name in CONSTRAINED if name not in ("Appell", "driven")],
     ),

@@ -12,7 +12,7 @@ import nhjax
 from nhjax import systems
 from support import group_oracle
 from support.helpers import SideBySide
-from support.long import long, long_but
+from support.long import exhaustive_but, long
 from support.orders import assert_order, DURATION, rms, SCIPY_FLOOR, trajectories
 
 
@@ -29,7 +29,7 @@ COUNTS = {
     5: (6, 8, 12, 16, 24),
 }
 FLOOR = 2e-14
-every_stages = pytest.mark.parametrize("stages", long_but((2, 3), COUNTS))
+every_stages = pytest.mark.parametrize("stages", exhaustive_but((2, 3), COUNTS))
 
 
 @eqx.filter_jit
@@ -101,7 +101,7 @@ def assert_finest_order(order, errors, quantity):
 # The stages do not know of the retraction: an even and an odd number are enough.
 @pytest.mark.parametrize(
     ("retraction", "stages"),
-    long_but(
+    exhaustive_but(
         [("cayley", 3), ("exponential", 4)],
         [*(("cayley", s) for s in COUNTS), ("exponential", 3), ("exponential", 4)],
     ),
@@ -222,7 +222,7 @@ def holonomic_errors(stages, closure):
 
 @pytest.mark.parametrize(
     ("stages", "closure"),
-    long_but(
+    exhaustive_but(
         [(3, "symmetric"), (4, "propagated")],
         [*((s, "symmetric") for s in COUNTS), (3, "propagated"), (4, "propagated")],
     ),

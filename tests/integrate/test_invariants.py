@@ -15,7 +15,7 @@ from benchmarks._examples import suslov_in_a_potential
 from nhjax import LobattoIIIAB, SaveAt, systems
 from support import paper_equations as paper, paper_mechanics as mechanics
 from support.helpers import central_difference, scalar
-from support.long import long, long_but
+from support.long import exhaustive_but, long
 from support.orders import assert_order, rms, SCIPY_FLOOR, trajectories
 from support.pages import run_page
 
@@ -180,7 +180,7 @@ def test_invariant_energy_and_constraints_forwards_and_back_stay_at_round_off(
 COUNTS = {2: (32, 64, 128), 3: (16, 32, 64), 4: (8, 16, 32)}
 
 
-@pytest.mark.parametrize("stages", long_but((3,), COUNTS))
+@pytest.mark.parametrize("stages", exhaustive_but((3,), COUNTS))
 @pytest.mark.parametrize("part", ["R^n", "group"])
 def test_invariant_run_converges_with_order_2s_minus_2(part, stages):
     example = {"R^n": PARTICLE, "group": SUSLOV}[part]
@@ -279,7 +279,7 @@ def differences():
     )
 
 
-@pytest.mark.parametrize("name", long_but(["reversible"], ADJOINTS))
+@pytest.mark.parametrize("name", exhaustive_but(["reversible"], ADJOINTS))
 def test_invariant_gradients_match_finite_differences(name):
     gradient = jax.jit(jax.grad(loss_of(ADJOINTS[name])))(jnp.array([0.2, 1.0]))
     np.testing.assert_allclose(gradient, differences(), rtol=1e-9)

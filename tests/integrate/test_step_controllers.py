@@ -21,7 +21,7 @@ from nhjax import (
     ReversibleController,
     SaveAt,
 )
-from support.long import long_but
+from support.long import exhaustive_but
 from support.particle_run import assert_trees_close
 
 
@@ -99,7 +99,7 @@ def exact():
     return solve_ivp(reduced, (0, 6), x, **given).y[:, -1]
 
 
-@pytest.mark.parametrize("stages", long_but([3], [2, 3, 4]))
+@pytest.mark.parametrize("stages", exhaustive_but([3], [2, 3, 4]))
 def test_pid_with_a_smaller_tolerance_has_an_error_that_is_smaller_by_its_order(
     exact, stages
 ):
@@ -197,7 +197,7 @@ def test_pid_changes_sizes_within_factormin_and_factormax():
         assert np.min(changes) >= 0.9 * (1 - 1e-9)
 
 
-@pytest.mark.parametrize("name", long_but(["dcoeff"], ["pcoeff", "dcoeff"]))
+@pytest.mark.parametrize("name", exhaustive_but(["dcoeff"], ["pcoeff", "dcoeff"]))
 def test_pid_with_other_coefficients_takes_other_steps_to_the_same_end(name):
     other = PIDController(1e-8, 1e-8, **{name: 0.3}, icoeff=0.4)
     one = swing(PIDController(1e-8, 1e-8), t1=9.0)
@@ -491,7 +491,7 @@ def sizes_to_end(name, controller):
 
 @pytest.mark.parametrize(
     ("name", "which"),
-    long_but([("pendulum", "pid")], itertools.product(SYSTEMS, CONTROLLERS)),
+    exhaustive_but([("pendulum", "pid")], itertools.product(SYSTEMS, CONTROLLERS)),
 )
 def test_gradients_of_all_adjoints_are_those_of_the_run_with_the_same_sizes(
     name, which
@@ -520,7 +520,7 @@ def test_hessian_of_an_adaptive_run_is_that_of_the_run_with_the_same_sizes(name)
     np.testing.assert_allclose(got, expected, rtol=1e-9, atol=1e-9)
 
 
-@pytest.mark.parametrize("adjoint", long_but(["direct", "reversible"], ADJOINTS))
+@pytest.mark.parametrize("adjoint", exhaustive_but(["direct", "reversible"], ADJOINTS))
 def test_derivative_by_the_end_time_is_the_velocity(adjoint):
     options = {"max_steps": 40, "adjoint": ADJOINTS[adjoint]}
 
@@ -541,7 +541,7 @@ def test_derivative_by_the_end_time_of_the_time_itself_is_one():
     assert float(jax.grad(end)(1.1)) == 1.0
 
 
-@pytest.mark.parametrize("adjoint", long_but(["direct"], ADJOINTS))
+@pytest.mark.parametrize("adjoint", exhaustive_but(["direct"], ADJOINTS))
 def test_gradient_of_an_adaptive_run_that_failed_is_nan(adjoint):
     def end(v):
         sol = swing(
@@ -674,7 +674,7 @@ def test_event_run_takes_no_more_attempts_than_max_steps(is_jitted):
         assert np.sum(np.isfinite(sol.ts)) == number + 1
 
 
-@pytest.mark.parametrize("name", long_but(["pid"], ["pid", "reversible"]))
+@pytest.mark.parametrize("name", exhaustive_but(["pid"], ["pid", "reversible"]))
 def test_event_at_the_end_of_a_run_or_at_a_node_happens_once(name):
     way = dict(WAYS[name])
     if name == "reversible":
@@ -693,7 +693,7 @@ def test_event_at_the_end_of_a_run_or_at_a_node_happens_once(name):
 
 @pytest.mark.parametrize(
     ("name", "adjoint"),
-    long_but(
+    exhaustive_but(
         [("pid", "direct")],
         itertools.product(["pid", "reversible", "constant"], ["direct", "recursive"]),
     ),

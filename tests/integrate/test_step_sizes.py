@@ -19,7 +19,7 @@ from nhjax import (
     SaveAt,
 )
 from nhjax._integrate import _chunks
-from support.long import long_but
+from support.long import exhaustive_but
 from support.particle_run import assert_trees_close, assert_trees_equal
 from support.reports import new_meter
 
@@ -264,7 +264,7 @@ def test_run_of_constant_steps_to_t1_in_float32_stays_in_float32():
     assert float(sol.t1) == T1
 
 
-@pytest.mark.parametrize("name", long_but(["reversible"], CONTROLLERS))
+@pytest.mark.parametrize("name", exhaustive_but(["reversible"], CONTROLLERS))
 def test_run_of_many_num_steps_with_a_controller_ends_after_them(name):
     sol = adaptive(name, t1=None, num_steps=4200)
     assert int(sol.stats["num_steps"]) == 4200
@@ -345,7 +345,7 @@ def test_to_xarray_of_an_adaptive_run_has_its_times(whole):
     assert int(data.stats_num_rejected_steps) == int(whole.stats["num_rejected_steps"])
 
 
-@pytest.mark.parametrize("name", long_but(["reversible"], CONTROLLERS))
+@pytest.mark.parametrize("name", exhaustive_but(["reversible"], CONTROLLERS))
 def test_solution_and_checkpoint_survive_files(name, tmp_path):
     sol = adaptive(name, saveat=SaveAt(steps=True, checkpoint=True))
     nhjax.save(tmp_path / "sol.npz", sol)
@@ -360,7 +360,7 @@ def test_solution_and_checkpoint_survive_files(name, tmp_path):
 SPEEDS = jnp.array([0.2, 1.0, 3.0])
 
 
-@pytest.mark.parametrize("name", long_but(["pid"], CONTROLLERS))
+@pytest.mark.parametrize("name", exhaustive_but(["pid"], CONTROLLERS))
 def test_vmap_of_adaptive_runs_gives_each_member_its_own_steps(name):
     saveat = SaveAt(t0=True, steps=True, dense=True)
 
@@ -414,7 +414,7 @@ def test_run_cut_by_max_steps_and_resumed_repeats_the_whole_run_bit_for_bit(
     assert rejected == expected.stats["num_rejected_steps"]
 
 
-@pytest.mark.parametrize("name", long_but(["reversible"], CONTROLLERS))
+@pytest.mark.parametrize("name", exhaustive_but(["reversible"], CONTROLLERS))
 def test_checkpoint_of_constant_steps_continues_with_steps_that_differ(name):
     first = run(dt=0.1, num_steps=7, t0=0.5, saveat=SaveAt(checkpoint=True)).checkpoint
     got = adaptive(name, y0=first, saveat=SaveAt(t0=True, t1=True))
@@ -423,7 +423,7 @@ def test_checkpoint_of_constant_steps_continues_with_steps_that_differ(name):
     np.testing.assert_allclose(got.ys.q[-1], expected.ys.q[-1], rtol=0, atol=1e-13)
 
 
-@pytest.mark.parametrize("name", long_but(["reversible"], CONTROLLERS))
+@pytest.mark.parametrize("name", exhaustive_but(["reversible"], CONTROLLERS))
 def test_checkpoint_of_steps_that_differ_continues_with_constant_steps(name):
     first = adaptive(name, saveat=SaveAt(checkpoint=True)).checkpoint
     assert float(first.t) == T1
@@ -497,7 +497,7 @@ OPTIONS_OF_METERS = {
 }
 
 
-@pytest.mark.parametrize("name", long_but(["pid", "stopped"], OPTIONS_OF_METERS))
+@pytest.mark.parametrize("name", exhaustive_but(["pid", "stopped"], OPTIONS_OF_METERS))
 @pytest.mark.parametrize("is_jitted", [False, True])
 @pytest.mark.usefixtures("short_chunks")
 def test_progress_of_a_run_to_t1_grows_to_the_end(name, is_jitted):

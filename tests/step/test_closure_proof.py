@@ -20,7 +20,7 @@ from support.collocation import (
     rational,
     slope,
 )
-from support.long import long, long_but
+from support.long import exhaustive_but, long
 from support.orders import assert_order, rms, SCIPY_FLOOR, trajectories
 
 
@@ -36,7 +36,7 @@ METHODS = EXACT | {f"Lobatto, s = {s}": lobatto(s) for s in range(4, 9)}
 STAGES = range(2, 7)
 
 every_method = pytest.mark.parametrize("name", METHODS)
-every_stages = pytest.mark.parametrize("s", long_but((2, 3, 4), STAGES))
+every_stages = pytest.mark.parametrize("s", exhaustive_but((2, 3, 4), STAGES))
 
 
 def at_two_sizes(function, coarse=32):
@@ -403,7 +403,7 @@ def reduced(t, q, v):
 
 @pytest.mark.parametrize(
     ("s", "closure"),
-    long_but(
+    exhaustive_but(
         [(3, "symmetric")],
         [
             *((s, "symmetric") for s in (2, 3, 4, 5)),

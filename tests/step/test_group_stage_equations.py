@@ -24,7 +24,7 @@ from support.group_problems import (
     WITHOUT_CLOSURE,
 )
 from support.helpers import CLOSURES, SOLVERS
-from support.long import long_but
+from support.long import exhaustive_but
 
 
 TOLERANCE = 1e-14
@@ -79,7 +79,7 @@ def over(cases):
     """Return the cases; only one form of each problem belongs to the short tests."""
     quick = [case for case in cases if case in QUICK]
     return pytest.mark.parametrize(
-        "case", long_but(quick, cases), ids=lambda case: "-".join(map(str, case))
+        "case", exhaustive_but(quick, cases), ids=lambda case: "-".join(map(str, case))
     )
 
 

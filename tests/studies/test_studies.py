@@ -15,7 +15,7 @@ from nhjax import studies
 from nhjax.__main__ import main
 from nhjax.studies import _chaotic_energy
 from nhjax.systems import ChaoticSystem, NonholonomicParticle
-from support.long import long_but
+from support.long import exhaustive_but
 
 
 PNG = b"\x89PNG\r\n\x1a\n"
@@ -54,7 +54,7 @@ def test_studies_list_prints_all_names(capsys):
 
 @pytest.mark.parametrize(
     "study",
-    long_but(["particle-order", "cvt-energy", "chaotic-energy"], studies.STUDIES),
+    exhaustive_but(["particle-order", "cvt-energy", "chaotic-energy"], studies.STUDIES),
 )
 def test_study_run_writes_figures_data_and_record(study, tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)

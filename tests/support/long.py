@@ -1,4 +1,8 @@
-"""Cases of tests that take long, which `pytest -n 2 -m long` runs, as CI does."""
+"""Cases of tests that are not among the quick ones.
+
+CI runs the long ones with `pytest -n 2 -m long`. Exhaustive ones are further members of
+products of cases; `pytest -n 2 -m exhaustive` runs them.
+"""
 
 from collections.abc import Iterable
 from typing import Any
@@ -11,18 +15,19 @@ def long(*case: Any, id: str | None = None) -> Any:
     return pytest.param(*case, id=id, marks=pytest.mark.long)
 
 
-def long_but(short: Iterable[Any], cases: Iterable[Any]) -> list[Any]:
-    """The cases, of which all but the short ones take long.
+def exhaustive_but(short: Iterable[Any], cases: Iterable[Any]) -> list[Any]:
+    """The cases, of which all but the short ones are exhaustive.
 
-    Those that stay among the quick tests cover what the test is about: each kind of
-    system or method that takes another way through the library.
+    The short ones cover what the test is about: each kind of system or method that
+    takes another way through the library.
     """
     cases, short = list(cases), list(short)
     missing = [case for case in short if case not in cases]
     assert not missing, f"no such cases: {missing}"
-    return [case if case in short else _long_one(case) for case in cases]
+    return [case if case in short else _exhaustive(case) for case in cases]
 
 
-def _long_one(case: Any) -> Any:
+def _exhaustive(case: Any) -> Any:
     # A named tuple is one argument, a plain one holds several.
-    return long(*case) if type(case) is tuple else long(case)
+    values = case if type(case) is tuple else (case,)
+    return pytest.param(*values, marks=pytest.mark.exhaustive)
