@@ -6,7 +6,6 @@ python docs/films.py --frames 6     writes single frames instead, to look at
 """
 
 import argparse
-import importlib
 import math
 from collections.abc import Callable
 from pathlib import Path
@@ -49,58 +48,8 @@ def rattleback() -> tuple[Any, nhjax.Solution]:
 
 def mecanum() -> tuple[Any, nhjax.Solution]:
     """A platform whose wheels drive it sideways, turn it, and drive it ahead."""
-    robot = mecanum_robot()
-    return robot, _run(robot.system, robot.initial_state(), 6.0, 300, robot.args)
-
-
-def mecanum_robot() -> nhjax.Robot:
-    """Read a platform on four mecanum wheels, with rollers that are only drawn."""
-    mujoco: Any = importlib.import_module("mujoco")
-    radius, half, lines, angles = 0.1, 0.035, [], {}
-    for name, x, y, side in (
-        ("front left", 0.22, 0.2, -1),
-        ("front right", 0.22, -0.2, 1),
-        ("rear left", -0.22, 0.2, 1),
-        ("rear right", -0.22, -0.2, -1),
-    ):
-        angles[name] = side * math.pi / 4
-        lines.append(
-            f"<body name='{name}' pos='{x} {y} 0'>"
-            f"<joint name='{name}' axis='0 1 0' damping='0.05'/>"
-            f"<geom name='{name}' type='cylinder' size='{radius} {half}' mass='0.6' "
-            f"euler='{-math.pi / 2} 0 0' rgba='0 0 0 0'/>"
-            f"<geom type='cylinder' size='{0.62 * radius} {1.1 * half}' mass='0' "
-            f"euler='{-math.pi / 2} 0 0' rgba='0.62 0.64 0.67 1'/>"
-        )
-        for k in range(10):
-            turn = 2 * math.pi * k / 10
-            color = "0.98 0.58 0.1 1" if k == 0 else "0.13 0.13 0.15 1"
-            # The axle of a roller at the lowest point is at the angle of the wheel.
-            lines.append(
-                f"<frame euler='0 {turn} 0'><geom type='capsule' mass='0' "
-                f"size='{0.2 * radius} {0.95 * half}' pos='0 0 {-0.8 * radius}' "
-                f"zaxis='1 {side} 0' rgba='{color}'/></frame>"
-            )
-        lines.append("</body>")
-    motors = [f"<motor name='{x}' joint='{x}'/>" for x in angles]
-    spec = mujoco.MjSpec.from_string(f"""
-        <mujoco><compiler angle="radian"/>
-        <default><geom contype="0" conaffinity="0"/></default>
-        <worldbody><body name="platform" pos="0 0 {radius}">
-          <joint name="x" type="slide" axis="1 0 0"/>
-          <joint name="y" type="slide" axis="0 1 0"/>
-          <joint name="heading" axis="0 0 1"/>
-          <geom type="box" size="0.3 0.15 0.03" mass="8"/>
-          <geom type="box" size="0.16 0.1 0.03" pos="-0.05 0 0.06" mass="1"
-            rgba="0.9 0.88 0.82 1"/>
-          <geom type="cylinder" size="0.04 0.03" pos="0.2 0 0.06" mass="0.2"
-            rgba="0.98 0.58 0.1 1"/>
-          {"".join(lines)}
-        </body></worldbody>
-        <actuator>{"".join(motors)}</actuator>
-        </mujoco>""")
-    patterns = jnp.array([[-1.0, 1, 1, -1], [-1, 1, -1, 1], [1, 1, 1, 1]])
-    mixing = patterns.T
+    # The rates of the wheels, in the order of the model, for each of these motions.
+    mixing = jnp.array([[-1.0, 1, 1, -1], [-1, 1, -1, 1], [1, 1, 1, 1]]).T
 
     def controls(t, qpos, qvel, args):
         """Return torques that track the speeds of sideways, turning and ahead."""
@@ -108,7 +57,8 @@ def mecanum_robot() -> nhjax.Robot:
         wanted = mixing @ (jnp.array([6.0, 5.0, 8.0]) * shares)
         return 0.4 * (wanted - qvel[3:])
 
-    return nhjax.from_mujoco(spec, rolling=angles, controls=controls)
+    robot = nhjax.example_robot("mecanum_platform", controls=controls)
+    return robot, _run(robot.system, robot.initial_state(), 6.0, 300, robot.args)
 
 
 def _pulse(t: Any, start: float) -> Any:
@@ -120,7 +70,7 @@ def _pulse(t: Any, start: float) -> Any:
 def _run(system: Any, y0: Any, duration: float, steps: int, args: Any = None) -> Any:
     return nhjax.integrate(
         system,
-        nhjax.LobattoIIIAB(2),
+        nhjax.LobattoIIIAB(3),
         y0,
         dt=duration / steps,
         num_steps=steps,

@@ -35,7 +35,7 @@ def _robot(name):
 
 
 def _model(name):
-    """MuJoCo's model; that of a URDF file has a planar root, as `root` adds it."""
+    """Return MuJoCo's model. A URDF file gets the planar root that `root` adds."""
     path = nhjax.example_robot_file(name)
     text = path.read_text(encoding="utf-8")
     if path.suffix == ".urdf":

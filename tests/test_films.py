@@ -1,4 +1,4 @@
-"""Films show each machine where it is. What needs no OpenGL is tested here directly."""
+"""Films show each machine in the right place. Few of these tests need OpenGL."""
 
 import importlib.util
 import os
@@ -19,7 +19,7 @@ from nhjax import systems
 from nhjax._films._gallery import _LOOKS, looks_of
 from nhjax._films._render import _gl_context, view_of
 from nhjax._films._sampling import configurations, frame_times
-from nhjax._films._scene import round_length, Scene
+from nhjax._films._scene import round_length, Scene, visible_geoms
 from nhjax._films._view import _capsule, Show
 from support.pages import blocks, DOCS, page, run_page
 
@@ -219,6 +219,18 @@ def test_ground_of_a_robot_is_where_its_wheels_touch():
     sol = made_up([0], [[0.0, 0.0]], [[0.0, 0.0]])
     scene = Scene("f", robot, sol, np.zeros(1), True)
     assert scene.model.geom("nhjax ground").pos[2] == pytest.approx(0.3)
+
+
+def test_scene_of_a_robot_does_not_inherit_defaults_of_its_geoms():
+    colour = '<geom contype="0" conaffinity="0" rgba="0 0 1 1" group="4"/>'
+    text = CART.replace('<geom contype="0" conaffinity="0"/>', colour)
+    spec = mujoco.MjSpec.from_string(text)
+    robot = nhjax.from_mujoco(spec, rolling={"wheel": "no longitudinal slip"})
+    sol = made_up([0], [[0.0, 0.0]], [[0.0, 0.0]])
+    model = Scene("f", robot, sol, np.zeros(1), True).model
+    np.testing.assert_allclose(model.geom("nhjax ground").rgba, [0.5, 0.5, 0.5, 1])
+    # The ground and two bars are drawn; the geoms of the model are not.
+    assert len(visible_geoms(model)) == 3
 
 
 def test_camera_follows_stays_or_is_one_of_the_model(cart):

@@ -227,17 +227,14 @@ def _gl_context(size: tuple[int, int]) -> Any:
             create = importlib.import_module(f"mujoco.{chosen}").GLContext
         else:
             create = importlib.import_module("mujoco.gl_context").GLContext
+        return create(*size)
     except ImportError as error:
         if "OpenGL" in str(error) or "No module" in str(error):
             raise ImportError(
                 'nhjax.render needs MuJoCo\'s renderer: pip install "nhjax[render]".'
             ) from error
         raise _no_context(chosen, error) from error
-    except Exception as error:
-        raise _no_context(chosen, error) from error
-    try:
-        return create(*size)
-    except Exception as error:
+    except Exception as error:  # Drivers raise errors of all kinds.
         raise _no_context(chosen, error) from error
 
 

@@ -14,7 +14,7 @@ from .._robots import mujoco_of, Robot
 from .._system import State
 from ._gallery import looks_of, names
 from ._looks import Looks
-from ._sampling import check_solution, configurations
+from ._sampling import configurations
 
 
 class Subject(NamedTuple):
@@ -67,7 +67,6 @@ class Scene:
     def __init__(
         self, who: str, machine: Any, sol: Solution, times: np.ndarray, trail: bool
     ):
-        check_solution(who, sol)
         subject = subject_of(who, machine)
         self._mujoco = mujoco_of(f"nhjax.{who}", "robots")
         q = configurations(who, sol, times, subject.manifold)
@@ -246,6 +245,8 @@ class Scene:
 
 # The direction of the light: from the left, from behind the camera, and from above.
 LIGHT = np.array([0.35, 0.45, -0.82]) / np.linalg.norm([0.35, 0.45, -0.82])
+# MuJoCo's colour of geoms without one. With it, a material shows its own colour.
+PLAIN = [0.5, 0.5, 0.5, 1]
 
 
 def _add_ground(mujoco: Any, spec: Any, height: float, size: float) -> None:
@@ -276,6 +277,9 @@ def _add_ground(mujoco: Any, spec: Any, height: float, size: float) -> None:
         size=[0, 0, cell],
         pos=[0, 0, height],
         material="nhjax ground",
+        # The defaults of the model may have a colour, or a group that is not drawn.
+        rgba=PLAIN,
+        group=0,
     )
 
 
@@ -292,12 +296,11 @@ def _mark_wheels(mujoco: Any, spec: Any, robot: Robot) -> None:
     """
     model = spec.copy().compile()
     rolling = () if robot.contacts is None else robot.contacts.names
-    plain = np.array([0.5, 0.5, 0.5, 1])
     for geom in spec.geoms:
         if geom.type == mujoco.mjtGeom.mjGEOM_PLANE:
             continue
         is_wheel = geom.name in rolling and bool(geom.name)
-        if not geom.material and np.allclose(geom.rgba, plain):
+        if not geom.material and np.allclose(geom.rgba, PLAIN):
             geom.rgba = [0.13, 0.13, 0.15, 1] if is_wheel else [0.16, 0.42, 0.68, 1]
     for name in rolling:
         geom = model.geom(name)
@@ -312,6 +315,7 @@ def _mark_wheels(mujoco: Any, spec: Any, robot: Robot) -> None:
                 pos=geom.pos,
                 quat=geom.quat,
                 rgba=[0.98, 0.58, 0.10, 1],
+                group=0,
                 mass=0.0,
                 contype=0,
                 conaffinity=0,

@@ -10,7 +10,7 @@ import numpy as np
 from .._integrate import Solution
 from .._robots import mujoco_of
 from ._sampling import check_solution, frame_times
-from ._scene import Scene, visible_geoms
+from ._scene import PLAIN, Scene, visible_geoms
 
 
 class Show:
@@ -160,7 +160,7 @@ def _add_geom(
 ) -> None:
     kinds, size = mujoco.mjtGeom, model.geom_size[geom]
     rgba = model.geom_rgba[geom]
-    if model.geom_matid[geom] >= 0 and np.allclose(rgba, [0.5, 0.5, 0.5, 1]):
+    if model.geom_matid[geom] >= 0 and np.allclose(rgba, PLAIN):
         rgba = model.mat_rgba[model.geom_matid[geom]]
     if rgba[3] == 0:
         return
