@@ -4,7 +4,10 @@ import argparse
 import datetime
 import json
 import math
+import os
+import subprocess
 import sys
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +18,20 @@ import nhjax
 
 
 RESULTS = Path(__file__).parent / "results"
+
+
+def from_fresh_process(
+    name: str, *arguments: str, environment: Mapping[str, str] | None = None
+) -> Any:
+    """Run a benchmark in a fresh process, and return the JSON of its last line."""
+    done = subprocess.run(
+        [sys.executable, "-m", f"benchmarks.{name}", *arguments],
+        env=os.environ | (environment or {}),
+        stdout=subprocess.PIPE,
+        check=True,
+        text=True,
+    )
+    return json.loads(done.stdout.splitlines()[-1])
 
 
 def markdown_table(header: list[str], rows: list[list[str]]) -> str:

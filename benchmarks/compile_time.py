@@ -11,9 +11,6 @@ directory for JAX's compilation cache: the first stores what the second finds.
 import argparse
 import itertools
 import json
-import os
-import subprocess
-import sys
 import tempfile
 import time
 from collections.abc import Callable
@@ -26,7 +23,7 @@ import nhjax
 from nhjax import systems
 
 from ._examples import wheeled_inverted_pendulum
-from ._report import markdown_table, write
+from ._report import from_fresh_process, markdown_table, write
 
 
 NUM_STEPS = 20
@@ -144,14 +141,10 @@ def measure(index: int) -> None:
 
 def in_process(index: int, directory: str) -> list[float]:
     """Return the times of one of the cases, in a process of its own."""
-    done = subprocess.run(
-        [sys.executable, "-m", "benchmarks.compile_time", "--case", str(index)],
-        env={**os.environ, "JAX_COMPILATION_CACHE_DIR": directory},
-        stdout=subprocess.PIPE,
-        check=True,
-        text=True,
+    return from_fresh_process(
+        *("compile_time", "--case", str(index)),
+        environment={"JAX_COMPILATION_CACHE_DIR": directory},
     )
-    return json.loads(done.stdout.splitlines()[-1])
 
 
 def main() -> None:

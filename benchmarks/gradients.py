@@ -13,10 +13,7 @@ import argparse
 import functools
 import gc
 import json
-import os
 import statistics
-import subprocess
-import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -33,7 +30,7 @@ import nhjax
 from nhjax import systems
 
 from ._examples import of_the_gallery, suslov_in_a_potential
-from ._report import markdown_table, number, RESULTS, write
+from ._report import from_fresh_process, markdown_table, number, RESULTS, write
 
 
 DT, REPEATS, LONG, REPEATS_OF_LONG = 0.1, 7, 10**4, 3
@@ -177,15 +174,8 @@ def difference(tree, reference) -> float:
 
 def apart(kind: str, *args: Any) -> Any:
     """The outcome of `kind`, one of PARTS, in a process of its own."""
-    command = [sys.executable, "-m", "benchmarks.gradients", "--part"]
-    done = subprocess.run(
-        [*command, json.dumps([kind, *args])],
-        stdout=subprocess.PIPE,
-        check=True,
-        text=True,
-        env=os.environ | MALLOC,
-    )
-    return json.loads(done.stdout.splitlines()[-1])
+    part = json.dumps([kind, *args])
+    return from_fresh_process("gradients", "--part", part, environment=MALLOC)
 
 
 def compilation(name: str, stages: list[int]) -> list[tuple[int, float, float]]:

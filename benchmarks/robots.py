@@ -21,8 +21,6 @@ import argparse
 import importlib
 import json
 import resource
-import subprocess
-import sys
 import time
 from typing import Any
 
@@ -32,7 +30,7 @@ import numpy as np
 
 import nhjax
 
-from ._report import markdown_table, number, RESULTS, write
+from ._report import from_fresh_process, markdown_table, number, RESULTS, write
 
 
 mujoco: Any = importlib.import_module("mujoco")
@@ -323,20 +321,12 @@ def first_call(name: str) -> dict[str, float]:
     }
 
 
-def in_process(name: str) -> dict[str, Any]:
-    """Return the same from a process of its own."""
-    done = subprocess.run(
-        [sys.executable, "-m", "benchmarks.robots", "--first-call", name],
-        stdout=subprocess.PIPE,
-        check=True,
-        text=True,
-    )
-    return json.loads(done.stdout.splitlines()[-1])
-
-
 def measure_first_calls() -> tuple[str, dict[str, Any]]:
     """Measure the first call of the tree, and of the same tree written by hand."""
-    rows = {name: in_process(name) for name in ("file", "hand")}
+    rows = {
+        name: from_fresh_process("robots", "--first-call", name)
+        for name in ("file", "hand")
+    }
     apart = np.abs(np.subtract(rows["file"].pop("end"), rows["hand"].pop("end"))).max()
     sums = {k: row["load"] + row["state"] + row["run"] for k, row in rows.items()}
     ratio = sums["file"] / sums["hand"]

@@ -28,8 +28,6 @@ Errors are the largest of all components, at the end of a run.
 import argparse
 import json
 import math
-import subprocess
-import sys
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
@@ -45,7 +43,7 @@ from nhjax import forces, friction, rolling, systems
 from nhjax.systems import _whipple_bicycle as bicycle_parts
 from nhjax.systems._frames import about_y, about_z
 
-from ._report import markdown_table, number, write
+from ._report import from_fresh_process, markdown_table, number, write
 from .compile_time import compiled, program
 
 
@@ -976,17 +974,6 @@ def first_call(name: str) -> float:
     return sum(parts)
 
 
-def first_call_in_process(name: str) -> float:
-    """Return the same from a process of its own."""
-    done = subprocess.run(
-        [sys.executable, "-m", "benchmarks.rolling", "--first-call", name],
-        stdout=subprocess.PIPE,
-        check=True,
-        text=True,
-    )
-    return float(json.loads(done.stdout.splitlines()[-1]))
-
-
 def measure_bicycle() -> tuple[str, dict[str, Any]]:
     """Measure the bicycle."""
     gallery = systems.WhippleBicycle().system
@@ -999,7 +986,7 @@ def measure_bicycle() -> tuple[str, dict[str, Any]]:
     # The processes take turns, since the load of the machine changes.
     for _ in range(FIRST_CALLS):
         for name, found in seconds.items():
-            found.append(first_call_in_process(name))
+            found.append(from_fresh_process("rolling", "--first-call", name))
     print(errors, seconds, flush=True)
     best = {name: min(found) for name, found in seconds.items()}
     ratio = best["parts"] / best["gallery"]

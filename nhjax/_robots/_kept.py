@@ -103,7 +103,7 @@ def _is_number(x: Any) -> bool:
 
 
 class _Program:
-    """A program and those of its derivatives, which are traced when they are needed."""
+    """A program with the programs of its derivatives, each traced on its first use."""
 
     def __init__(self, jaxpr: Any):
         self.jaxpr = jaxpr

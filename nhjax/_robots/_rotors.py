@@ -51,7 +51,7 @@ def merge_rotors(
     moment: Float[np.ndarray, "b 4"],
     variable: set[int],
 ) -> Merged:
-    """Fix all rotors to their parents, from the ends of the tree on.
+    """Fix the rotors at the ends of branches to their parents.
 
     **Arguments:**
 
@@ -62,13 +62,10 @@ def merge_rotors(
     """
     own, inertia, moment = list(bodies), inertia.copy(), moment.copy()
     rotors: list[Rotor] = []
-    merged: set[int] = set()
     for number in reversed(range(len(joints))):
         joint = joints[number]
         on_it = [i for i, x in enumerate(own) if x == number]
-        is_end = all(
-            x.parent != number or i in merged for i, x in enumerate(joints)
-        ) and all(x.parent != number for x in rotors)
+        is_end = all(x.parent != number for x in joints)
         if joint.kind != "hinge" or not is_end or variable.intersection(on_it):
             continue
         total = inertia[on_it].sum(axis=0)
@@ -87,7 +84,6 @@ def merge_rotors(
         twist = np.concatenate([np.cross(anchor, axis), axis])
         momentum = spatial_inertia(carried[0]) @ twist
         rotors.append(Rotor(number, joint.parent, momentum, float(twist @ momentum)))
-        merged.add(number)
         for i in on_it:
             own[i] = joint.parent
             inertia[i] = pose @ inertia[i] @ pose.T

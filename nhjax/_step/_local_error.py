@@ -78,7 +78,7 @@ def local_error(
                 lambda u: system.velocity(t, start.state.q, u, args), (u,), (change,)
             )
         )(changes)
-    # The velocities of a step back are those of the step, in reverse order.
+    # The step back has the same velocities in reverse order, and so the same mean.
     mean = jnp.asarray(method.b, h.dtype) @ outcome.record.velocity
     by_chart = _growth_in_chart(system.manifold_of(start.state.q), h * mean)
     # The derivative of order k + 1 of q is that of order k of u.
@@ -97,8 +97,8 @@ def _growth_in_chart(
     if manifold.is_flat:
         return None
     ad = jax.jacfwd(lambda eta: manifold.ad(xi, eta))(jnp.zeros_like(xi))
-    # Of a rotation, two eigenvalues are not zero. Their fourth powers are positive,
-    # and the trace of the power does not depend on the basis.
+    # For a rotation by the angle a, the eigenvalues of ad are ia, -ia and 0. The trace
+    # of its fourth power is 2 a^4, and does not depend on the basis.
     square = ad @ ad
     trace = jnp.maximum(jnp.sum(square * square.T), float(jnp.finfo(xi.dtype).tiny))
     return _GROWTH_BY_COMMUTATOR * (0.5 * trace) ** 0.25
