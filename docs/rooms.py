@@ -21,7 +21,6 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
-import jax.extend
 import jax.numpy as jnp
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -246,9 +245,10 @@ class Stack(NamedTuple):
 def stacks(nhjax: Any, transformation: str) -> list[Stack]:
     """The stack at each evaluation of the Lagrangian of one call of `integrate`.
 
-    The Lagrangian is traced once, and then evaluated through its jaxpr. It contains an
-    arctangent, which nothing else computes, and the operation records the traceback
-    whenever it is evaluated. Frames of other packages are left out.
+    The Lagrangian is traced once, and then it is one operation, and so are its
+    derivatives. It contains an arctangent, by which its operations are told from those
+    of other functions. They record the traceback whenever they are bound. Frames of
+    other packages are left out.
 
     **Arguments:**
 
@@ -256,11 +256,12 @@ def stacks(nhjax: Any, transformation: str) -> list[Stack]:
     - `transformation`: `"plain"`, `"vmap"` or `"grad"`.
     """
     package, found = Path(nhjax.__file__).parent, []
-    operation = jax.extend.core.primitives.atan2_p
+    operation = importlib.import_module("nhjax._numerics._kept").kept_call
     bind = operation.bind
 
     def recorded(*args, **params):
-        found.append([frame for frame, _ in traceback.walk_stack(None)][::-1])
+        if "atan2" in str(params["jaxpr"]):
+            found.append([frame for frame, _ in traceback.walk_stack(None)][::-1])
         return bind(*args, **params)
 
     def lagrangian(t, q, v, args):

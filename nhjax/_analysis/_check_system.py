@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PyTree
 
-from .._compile import tracked_jit
+from .._compile import as_cpu_kernel, tracked_jit
 from .._custom_types import Args, FloatScalarLike
 from .._errors import is_traced, require
 from .._initial import checked_inputs
@@ -27,6 +27,7 @@ from .._system import (
     finite,
     linearise,
     parameters,
+    with_kept_functions,
 )
 from ._motion import convert_to_velocities
 
@@ -215,6 +216,29 @@ def _condition(reciprocal: np.ndarray) -> float:
 
 @tracked_jit("system", "args")
 def _measurements(system, t, q, u, args) -> dict[str, Any]:
+    system = with_kept_functions(system, t, q, u, args)
+    # These are constants: JAX's random numbers would take most of the time to compile.
+    shape = (2, _NUM_SAMPLES, u.shape[0])
+    random = np.random.default_rng(0).normal(scale=_SPREAD, size=shape)
+    xi, w = jnp.asarray(random, u.dtype)
+    near = xi, u[None] + w * (1 + jnp.abs(u))[None]
+    found = as_cpu_kernel(_derivatives, system, t, q, u, args, near, is_brief=True)
+    rows, compatibility = found["jacobian"], found["delassus"]
+    redundant, condition = jnp.zeros((), int), reciprocal_condition
+    if system.constraints == "redundant":
+        redundant = rows.shape[0] - rank_of_gram(compatibility)
+        condition = reciprocal_condition_of_range
+    return {
+        **found,
+        "regularity": reciprocal_condition(found["mass"]),
+        "compatibility": condition(compatibility),
+        "redundant": redundant,
+        "deficient": is_deficient(rows),
+    }
+
+
+def _derivatives(system, t, q, u, args, near) -> dict[str, Any]:
+    """Compute derivatives of the functions at a state and at states near it."""
     manifold = system.manifold_of(q)
 
     def hessian(t, xi, u):
@@ -238,8 +262,8 @@ def _measurements(system, t, q, u, args) -> dict[str, Any]:
     names = system.functions(t, q, u, multiplier, args)
     functions = {name: on_chart(name) for name in names}
 
-    def sample(xi, w):
-        point = (t, xi, u + w)
+    def sample(xi, u):
+        point = (t, xi, u)
         by_time = {
             name: jax.jacfwd(function)(*point) for name, function in functions.items()
         }
@@ -252,26 +276,15 @@ def _measurements(system, t, q, u, args) -> dict[str, Any]:
         }
         return by_time, jnp.concatenate(by_position), second
 
-    size = 1 + jnp.abs(u)
-    keys = jax.random.split(jax.random.key(0), 2)
-    shape = (_NUM_SAMPLES, u.shape[0])
-    xi, w = (_SPREAD * jax.random.normal(key, shape, u.dtype) for key in keys)
-    by_time, by_position, second = jax.vmap(sample)(xi, w * size[None])
+    by_time, by_position, second = jax.vmap(sample)(*near)
     rows = jax.jacfwd(system.constraint, argnums=2)(t, q, u, args)
     mass, rows = convert_to_velocities(system, hessian(t, jnp.zeros_like(u), u), rows)
-    compatibility = rows @ inverse(mass) @ rows.T
-    redundant, condition = jnp.zeros((), int), reciprocal_condition
-    if system.constraints == "redundant":
-        redundant = rows.shape[0] - rank_of_gram(compatibility)
-        condition = reciprocal_condition_of_range
     return {
         "constraints": system.constraint(t, q, u, args),
         "position_constraints": system.position_constraint(t, q, args),
-        "regularity": reciprocal_condition(mass),
-        "compatibility": condition(compatibility),
-        "redundant": redundant,
+        "mass": mass,
         "jacobian": rows,
-        "deficient": is_deficient(rows),
+        "delassus": rows @ inverse(mass) @ rows.T,
         "by_time": by_time,
         "by_position": by_position,
         **second,

@@ -21,7 +21,7 @@ from .._compile import as_cpu_kernel, tracked_jit
 from .._custom_types import Args, BoolScalar, FloatScalar
 from .._errors import Check, DependentConstraintsError, naming, ShapeError
 from .._numerics import is_deficient, jacobian_and_value, max_norm, nonzero_or_one
-from .._system import AbstractMechanicalSystem, linearise, State
+from .._system import AbstractMechanicalSystem, linearise, State, with_kept_functions
 
 
 Indices = tuple[int, ...]
@@ -95,6 +95,7 @@ def state_size(y: State) -> Array:
 def linearise_along_velocity(system, t, y, args) -> LinearisedEquations:
     """Differentiate the equations in a frame that moves with the velocity."""
     dim, count = y.p.shape[0], y.multiplier.shape[0]
+    system = with_kept_functions(system, t, y.q, system.fibre_coordinate(y), args)
 
     def equations(x):
         rates = rates_of_change(system, t, y, args)(x)
@@ -118,6 +119,7 @@ def linearise_along_symmetry(system, t, y, args, symmetry) -> LinearisedEquation
     """
     dim, count = y.p.shape[0], y.multiplier.shape[0]
     manifold = system.manifold_of(y.q)
+    system = with_kept_functions(system, t, y.q, system.fibre_coordinate(y), args)
 
     def fields(x):
         q, u = perturb(system, y, x)

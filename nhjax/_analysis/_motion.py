@@ -25,6 +25,7 @@ from .._system import (
     real_scalar,
     require_independent,
     State,
+    with_kept_functions,
 )
 
 
@@ -124,6 +125,7 @@ def motion(
 @tracked_jit("system", "args")
 def _motion(system, t, y, args) -> Motion:
     u = system.fibre_coordinate(y)
+    system = with_kept_functions(system, t, y.q, u, args)
     lin = linearise(system, t, y.q, u, args)
     manifold = system.manifold_of(y.q)
     velocity = system.velocity(t, y.q, u, args)

@@ -24,7 +24,13 @@ from .._numerics import (
     stop_gradient,
     UpdateNorms,
 )
-from .._system import AbstractMechanicalSystem, linearise, parameters, State
+from .._system import (
+    AbstractMechanicalSystem,
+    linearise,
+    parameters,
+    State,
+    with_kept_functions,
+)
 from ._linearisation import (
     check_relative_equilibrium,
     check_symmetry,
@@ -249,6 +255,7 @@ def solve_in_coordinates(
 ) -> SteadyMotionResult:
     """Solve for a state whose chosen positions and velocities do not change."""
     positions, velocities = (jnp.asarray(x, int) for x in steady)
+    system = with_kept_functions(system, t, y.q, system.fibre_coordinate(y), args)
 
     def residual(x):
         q, u = perturb(system, y, x)
@@ -272,6 +279,7 @@ def solve_along_symmetry(
 ) -> SteadyMotionResult:
     """Solve for a state that moves along symmetries, and for the generators' rates."""
     dim = y.p.shape[0]
+    system = with_kept_functions(system, t, y.q, system.fibre_coordinate(y), args)
 
     def fields(x):
         q, u = perturb(system, y, x)

@@ -256,6 +256,7 @@ class Captured:
         self.functions = functions
         self.atoms: list[Hashable] = []
         self.contents: dict[Place, tuple[object, Hashable]] = {}
+        self.is_repeatable = True
         numbers: dict[int, int] = {}
         stack: list[Part] = [(None, "", functions)]
         while stack and len(self.atoms) < MOST_ENTRIES:
@@ -267,6 +268,7 @@ class Captured:
             if isinstance(atom, _Unrepeatable):
                 # A function that stores a tracer stores another tracer after tracing.
                 content = _Identity(id(value), value)
+                self.is_repeatable = False
             has_objects = isinstance(value, np.ndarray) and value.dtype.hasobject
             if has_objects or not _is_leaf(type(value)):
                 content = _Identity(id(value), value)
@@ -276,6 +278,7 @@ class Captured:
                 atom = atom, numbers[id(value)]
             self.atoms.append((numbers.get(id(owner), -1), name, atom))
             self.contents[place] = owner, content
+        self.is_repeatable &= not stack
 
 
 @dataclass(frozen=True)

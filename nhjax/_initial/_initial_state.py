@@ -1,3 +1,5 @@
+from typing import NamedTuple
+
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PyTree
@@ -39,11 +41,13 @@ from .._system import (
     require_names,
     State,
     violation_scale,
+    with_kept_functions,
 )
 from ._checks import Found, list_checks
 from ._projection import (
     checked_keep,
     Chosen,
+    Fixed,
     Kept,
     project_fibre_coordinate,
     project_position,
@@ -157,8 +161,32 @@ def initial_state(
     return nan_unless(good, found.state)
 
 
-@tracked_jit("system", "args")
-def _solve(system, t, q, v, p, args, project: bool, keep: tuple[Kept, Kept]) -> Found:
+class _Projected(NamedTuple):
+    """The consistent state, and how it was found.
+
+    - `q`, `u`: the position and the fibre coordinate; `v`, `p`: those of the state.
+    - `lin`: the equations of motion, linearised at the state.
+    - `starts`: the Jacobians of the constraints where searches started.
+    - `off_group`, `legendre_solved`, `projected`, `fixed_positions`,
+        `fixed_velocities`: as in `Found`.
+    """
+
+    q: PyTree[Array]
+    u: Float[Array, " n"]
+    v: Float[Array, " n"]
+    p: Float[Array, " n"]
+    lin: Linearisation
+    starts: list[RankCondition]
+    off_group: FloatScalar
+    legendre_solved: BoolScalar
+    projected: BoolScalar
+    fixed_positions: Fixed | None
+    fixed_velocities: Fixed | None
+
+
+def _project(
+    system, t, q, v, p, args, project: bool, keep: tuple[Kept, Kept]
+) -> _Projected:
     manifold = system.manifold_of(q)
     given_q, given = q, p if v is None else v
     keep_q, keep_u = keep
@@ -188,7 +216,29 @@ def _solve(system, t, q, v, p, args, project: bool, keep: tuple[Kept, Kept]) -> 
         starts.append(RankCondition(nearest.jacobian, q, projected & ~nearest.found))
         u, projected = nearest.x, projected & nearest.found
         fixed_u = nearest.fixed
-    lin, found_v, found_p = as_cpu_kernel(_motion, system, t, q, u, args)
+    return _Projected(
+        q=q,
+        u=u,
+        v=system.velocity(t, q, u, args),
+        p=system.momentum(t, q, u, args),
+        lin=linearise(system, t, q, u, args),
+        starts=starts,
+        off_group=off_group,
+        legendre_solved=legendre_solved,
+        projected=projected,
+        fixed_positions=fixed_q,
+        fixed_velocities=fixed_u,
+    )
+
+
+@tracked_jit("system", "args")
+def _solve(system, t, q, v, p, args, project: bool, keep: tuple[Kept, Kept]) -> Found:
+    keep_u = keep[1]
+    system = with_kept_functions(system, t, q, p if v is None else v, args)
+    given = system, t, q, v, p, args, project, keep
+    at = as_cpu_kernel(_project, *given, is_brief=True)
+    q, u, found_v, found_p, lin = at.q, at.u, at.v, at.p, at.lin
+    projected, starts = at.projected, at.starts
     if not project:
         # The given velocity or momentum is returned bit for bit.
         found_v = found_v if v is None else v
@@ -214,7 +264,7 @@ def _solve(system, t, q, v, p, args, project: bool, keep: tuple[Kept, Kept]) -> 
         lin=lin,
         generator=system.call(system.generator, t, q, u, args),
         positions=positions,
-        off_group=off_group,
+        off_group=at.off_group,
         regularity=reciprocal_condition(system.metric(t, q, u, args)),
         ranks=ranks,
         deficient=deficient,
@@ -222,10 +272,10 @@ def _solve(system, t, q, v, p, args, project: bool, keep: tuple[Kept, Kept]) -> 
         allowed=allowed,
         allowed_positions=allowed_positions,
         allowed_off_group=tolerance,
-        legendre_solved=legendre_solved,
+        legendre_solved=at.legendre_solved,
         projected=projected,
-        fixed_positions=fixed_q,
-        fixed_velocities=fixed_u,
+        fixed_positions=at.fixed_positions,
+        fixed_velocities=at.fixed_velocities,
     )
 
 
@@ -249,19 +299,6 @@ def _allowed(
         jnp.maximum(on_positions, violations[1]),
         tolerance,
     )
-
-
-def _motion(
-    system: AbstractMechanicalSystem,
-    t: FloatScalar,
-    q: PyTree[Array],
-    u: Float[Array, " n"],
-    args: Args,
-) -> tuple[Linearisation, Float[Array, " n"], Float[Array, " n"]]:
-    """Compute the linearised equations of motion, the velocity and the momentum."""
-    lin = linearise(system, t, q, u, args)
-    v = system.velocity(t, q, u, args)
-    return lin, v, system.momentum(t, q, u, args)
 
 
 def _ranks_judged(

@@ -42,11 +42,11 @@ from .._step import (
 from .._system import (
     AbstractMechanicalSystem,
     check_multiplier,
-    closure_converted,
     function_noise,
     FunctionNoise,
     linearise,
     State,
+    with_kept_functions,
 )
 from ._checkpoint import (
     Checkpoint,
@@ -201,7 +201,8 @@ def _stepper(
     check_multiplier(system, state, args, called)
     _check_saved(fn, t0, state, args)
     # Arrays that the user's functions close over become leaves, for derivatives.
-    system = closure_converted(system, t0, state, args)
+    u = system.fibre_coordinate(state)
+    system = with_kept_functions(system, t0, state.q, u, args)
     # The type checker sees the property `plain` as a field.
     plain = PlainStepper(  # pyright: ignore[reportCallIssue]
         system=system,

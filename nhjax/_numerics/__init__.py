@@ -41,6 +41,7 @@ from ._iteration import (
     Solved as Solved,
     UpdateNorms as UpdateNorms,
 )
+from ._kept import kept_function as kept_function
 from ._operators import (
     AbstractOperator as AbstractOperator,
     block_tridiagonal_inverse as block_tridiagonal_inverse,

@@ -14,7 +14,6 @@ from .._errors import ShapeError
 from .._manifold import Exponential, SO3
 from . import _scalars as entries
 from ._joints import Joint
-from ._kept import Kept
 from ._rotors import merge_rotors, spatial_inertia
 from ._tree import Frame, FramePoses, Space, Tree
 
@@ -191,7 +190,7 @@ def lagrangian_of(mechanics: Mechanics, parameters: Parameters) -> Any:
         parameters.check(args)
         numbers = {k: x for k, x in (args or {}).items() if k != "controls"}
         numbers = jax.tree.map(lambda x: jnp.asarray(x, v.dtype), numbers)
-        return kept.call(q, v, numbers)
+        return value(q, v, numbers)
 
     def value(q, v, args):
         change = changes(args, v.dtype) if has_masses and args.get("mass") else None
@@ -265,7 +264,6 @@ def lagrangian_of(mechanics: Mechanics, parameters: Parameters) -> Any:
             energy = energy - 0.5 * jnp.sum(stiffness * stretch * stretch)
         return energy
 
-    kept = Kept(value)
     return lagrangian
 
 

@@ -30,7 +30,6 @@ from ._build import (
     rolling_options,
 )
 from ._dynamics import force_of, frame_pose, lagrangian_of, loops_of
-from ._kept import KeptPositions, KeptSlips
 from ._read import check_supported, compile_model, is_fixed_urdf, name_of
 
 
@@ -336,8 +335,8 @@ def from_mujoco(
     coordinates = _coordinates(layout)
     system = LagrangianSystem(
         lagrangian_of(mechanics, known),
-        nonholonomic=None if slips is None else KeptSlips(slips),
-        holonomic=None if positions is None else KeptPositions(positions),
+        nonholonomic=slips,
+        holonomic=positions,
         force=force_of(mechanics, known, actuators, controls, _to_mujoco(layout)),
         manifold=layout.space.manifold,
         coordinates=coordinates,

@@ -51,11 +51,11 @@ from ._systems import (
     AbstractOfSystem as AbstractOfSystem,
     as_given as as_given,
     check_time_and_state as check_time_and_state,
-    closure_converted as closure_converted,
     HamiltonianSystem as HamiltonianSystem,
     LagrangianSystem as LagrangianSystem,
     State as State,
     static_function as static_function,
     value_and_rate as value_and_rate,
     with_frames as with_frames,
+    with_kept_functions as with_kept_functions,
 )

@@ -26,7 +26,7 @@ from .._custom_types import (
 )
 from .._errors import naming, ShapeError
 from .._manifold import AbstractLieGroup, Euclidean, framed, is_framed, unframed
-from .._numerics import ClosureConverted, square_jacobian
+from .._numerics import ClosureConverted, kept_function, square_jacobian
 from ._arguments import (
     check_constraints,
     check_coordinates,
@@ -101,6 +101,22 @@ def static_function(function: Any) -> Any:
 def as_given(function: Any) -> Any:
     """Return the function that the user gave to `static_function`."""
     return function.function if isinstance(function, StaticFunction) else function
+
+
+class NamedFunction(eqx.Module):
+    """A function of a system; a note is added to the errors that it raises.
+
+    The note says which function of the system raised the error.
+    """
+
+    function: Callable[..., Any]
+    called: str = eqx.field(static=True)
+
+    def __call__(self, *arguments: Any) -> Any:
+        """Call the function."""
+        function = as_given(self.function)
+        with naming(self.called, function, arguments[-1]):
+            return function(*arguments)
 
 
 def value_and_rate(
@@ -235,10 +251,12 @@ class AbstractMechanicalSystem(eqx.Module):
 
         The note says which function of the system raised the error.
         """
-        function = as_given(getattr(self, name))
+        return self.named(name)(*arguments)
+
+    def named(self, name: str) -> "NamedFunction":
+        """Return a function of the system whose errors say which one it is."""
         called = f"{name}({', '.join(self.signatures()[name])})"
-        with naming(called, function, arguments[-1]):
-            return function(*arguments)
+        return NamedFunction(getattr(self, name), called)
 
     def external_force(
         self,
@@ -676,17 +694,26 @@ class HamiltonianSystem(AbstractMechanicalSystem):
 S = TypeVar("S", bound=AbstractMechanicalSystem)
 
 
-def closure_converted(system: S, t: FloatScalar, y: State, args: Args) -> S:
-    """Return the system with the arrays that its functions close over as leaves.
+def with_kept_functions(
+    system: S, t: FloatScalar, q: PyTree[Array], u: Float[Array, " n"], args: Args
+) -> S:
+    """Return the system with functions that are traced and differentiated once.
 
-    The derivative rules of a step reach only the leaves of its arguments.
+    The arrays that the functions read become leaves of the system, because the
+    derivative rules of a step reach only the leaves of its arguments.
     """
-    u = system.fibre_coordinate(y)
-    functions = system.functions(t, y.q, u, y.multiplier, args)
+    multiplier = None
+    if system.force_takes_multipliers:
+        shape = jax.eval_shape(system.constraint, t, q, u, args).shape
+        multiplier = jnp.zeros(shape, u.dtype)
+    functions = {}
+    for name, (_, example) in system.functions(t, q, u, multiplier, args).items():
+        kept = kept_function(system.named(name), *example)
+        functions[name] = kept or ClosureConverted(system.named(name), *example)
     return eqx.tree_at(
         lambda system: [getattr(system, name) for name in functions],
         system,
-        [ClosureConverted(f, *example) for f, example in functions.values()],
+        list(functions.values()),
     )
 
 

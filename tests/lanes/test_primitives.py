@@ -12,8 +12,7 @@ import pytest
 from jax import lax
 
 from nhjax._compile import started_like
-from nhjax._numerics import small_einsum
-from nhjax._robots._kept import Kept
+from nhjax._numerics import kept_function, small_einsum
 from nhjax.lanes import _jaxprs, _program, Unsupported
 from support import lanes_run
 from support.random_steps import Kind, numbers
@@ -58,6 +57,12 @@ def _kernel(x):
     from nhjax._compile import as_cpu_kernel
 
     return as_cpu_kernel(lambda x: x * 2, x)
+
+
+def _kept(x):
+    function = kept_function(lambda x: x * 2, x)
+    assert function is not None
+    return function(x)
 
 
 def _custom_jvp(x):
@@ -204,7 +209,7 @@ _CASES = {
     "custom_jvp_call": _unary(_custom_jvp),
     "custom_vjp_call": _unary(_doubled),
     "jit": _unary(jax.jit(lambda x: x * 2)),
-    "kept_call": _unary(Kept(lambda x: x * 2).call),
+    "kept_call": _unary(_kept),
     "cond": [
         (
             lambda p, x: lax.cond(p, lambda: x * 2, lambda: x[::-1]),
