@@ -38,7 +38,7 @@ import jax.numpy as jnp
 import nhjax
 from nhjax import systems
 
-from ._report import markdown_table, write
+from ._report import from_fresh_process, markdown_table, write
 
 
 H, BATCH, ROUNDS, CHUNKS = 0.1, 1000, 3, 200
@@ -295,10 +295,8 @@ def main() -> None:
         return
     rows = []
     for members in options.members:
-        command = [sys.executable, "-m", "benchmarks.ensembles", "--one", str(members)]
-        command += ["--num-steps", str(options.num_steps)]
-        done = subprocess.run(command, check=True, capture_output=True, text=True)
-        rows.append(json.loads(done.stdout.splitlines()[-1]))
+        of_one = "--one", str(members), "--num-steps", str(options.num_steps)
+        rows.append(from_fresh_process("ensembles", *of_one))
         print(rows[-1], flush=True)
     text = "Time of a member and step, and peak memory.\n\n" + table(rows)
     data: dict[str, Any] = {"rows": rows}

@@ -161,10 +161,59 @@ def initial_state(
     return nan_unless(good, found.state)
 
 
+@tracked_jit("system", "args")
+def _solve(system, t, q, v, p, args, project: bool, keep: tuple[Kept, Kept]) -> Found:
+    keep_u = keep[1]
+    system = with_kept_functions(system, t, q, p if v is None else v, args)
+    given = system, t, q, v, p, args, project, keep
+    at = as_cpu_kernel(_project, *given, is_brief=True)
+    q, u, found_v, found_p, lin = at.q, at.u, at.v, at.p, at.lin
+    projected, starts = at.projected, at.starts
+    if not project:
+        # The given velocity or momentum is returned bit for bit.
+        found_v = found_v if v is None else v
+        found_p = found_p if p is None else p
+    elif v is not None:
+        found_v = keep_u.restored(found_v, v)
+    else:
+        found_p = keep_u.restored(found_p, p)
+    state = State(q, found_v, found_p, lin.multiplier)
+    # The numbers that the checks need are not differentiated.
+    system, args, t, q, u, lin, starts = stop_gradient(
+        (system, args, t, q, u, lin, starts)
+    )
+    here = RankCondition(lin.dense[0], q, projected)
+    ranks = (
+        [here] if system.constraints == "redundant" else active_ranks([*starts, here])
+    )
+    positions = system.position_constraint(t, q, args)
+    deficient, compatibility = _ranks_judged(system, lin, ranks)
+    allowed, allowed_positions, tolerance = _allowed(system, lin, t, q, u, args)
+    return Found(
+        state=state,
+        lin=lin,
+        generator=system.call(system.generator, t, q, u, args),
+        positions=positions,
+        off_group=at.off_group,
+        regularity=reciprocal_condition(system.metric(t, q, u, args)),
+        ranks=ranks,
+        deficient=deficient,
+        compatibility=compatibility,
+        allowed=allowed,
+        allowed_positions=allowed_positions,
+        allowed_off_group=tolerance,
+        legendre_solved=at.legendre_solved,
+        projected=projected,
+        fixed_positions=at.fixed_positions,
+        fixed_velocities=at.fixed_velocities,
+    )
+
+
 class _Projected(NamedTuple):
     """The consistent state, and how it was found.
 
-    - `q`, `u`: the position and the fibre coordinate; `v`, `p`: those of the state.
+    - `q`, `u`, `v`, `p`: the position, the fibre coordinate, the velocity and the
+        momentum of the state.
     - `lin`: the equations of motion, linearised at the state.
     - `starts`: the Jacobians of the constraints where searches started.
     - `off_group`, `legendre_solved`, `projected`, `fixed_positions`,
@@ -228,54 +277,6 @@ def _project(
         projected=projected,
         fixed_positions=fixed_q,
         fixed_velocities=fixed_u,
-    )
-
-
-@tracked_jit("system", "args")
-def _solve(system, t, q, v, p, args, project: bool, keep: tuple[Kept, Kept]) -> Found:
-    keep_u = keep[1]
-    system = with_kept_functions(system, t, q, p if v is None else v, args)
-    given = system, t, q, v, p, args, project, keep
-    at = as_cpu_kernel(_project, *given, is_brief=True)
-    q, u, found_v, found_p, lin = at.q, at.u, at.v, at.p, at.lin
-    projected, starts = at.projected, at.starts
-    if not project:
-        # The given velocity or momentum is returned bit for bit.
-        found_v = found_v if v is None else v
-        found_p = found_p if p is None else p
-    elif v is not None:
-        found_v = keep_u.restored(found_v, v)
-    else:
-        found_p = keep_u.restored(found_p, p)
-    state = State(q, found_v, found_p, lin.multiplier)
-    # The numbers that the checks need are not differentiated.
-    system, args, t, q, u, lin, starts = stop_gradient(
-        (system, args, t, q, u, lin, starts)
-    )
-    here = RankCondition(lin.dense[0], q, projected)
-    ranks = (
-        [here] if system.constraints == "redundant" else active_ranks([*starts, here])
-    )
-    positions = system.position_constraint(t, q, args)
-    deficient, compatibility = _ranks_judged(system, lin, ranks)
-    allowed, allowed_positions, tolerance = _allowed(system, lin, t, q, u, args)
-    return Found(
-        state=state,
-        lin=lin,
-        generator=system.call(system.generator, t, q, u, args),
-        positions=positions,
-        off_group=at.off_group,
-        regularity=reciprocal_condition(system.metric(t, q, u, args)),
-        ranks=ranks,
-        deficient=deficient,
-        compatibility=compatibility,
-        allowed=allowed,
-        allowed_positions=allowed_positions,
-        allowed_off_group=tolerance,
-        legendre_solved=at.legendre_solved,
-        projected=projected,
-        fixed_positions=at.fixed_positions,
-        fixed_velocities=at.fixed_velocities,
     )
 
 

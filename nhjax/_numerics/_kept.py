@@ -45,7 +45,7 @@ class KeptFunction(eqx.Module):
     all arrays that the function reads.
     """
 
-    # JAX has a type of its own for constants that are no arrays yet.
+    # Constants may have a type of JAX that is not `jax.Array`.
     operands: list[Any]
     program: "_Program" = eqx.field(static=True)
     structure: Any = eqx.field(static=True)
@@ -71,7 +71,7 @@ _known: OrderedDict[Hashable, KeptFunction] = OrderedDict()
 def kept_function(
     function: Callable[..., PyTree[Array]], *example: Any
 ) -> KeptFunction | None:
-    """Trace a function for arguments like those of an example.
+    """Trace a function for arguments with the structure and the dtypes of an example.
 
     If the same function is traced again for the same kinds of arguments, and the values
     that it reads have not changed, its programs are found again. The result is None for
@@ -108,9 +108,9 @@ def kept_function(
             return None
 
         def with_operands(*leaves):
-            consts_now, rest = leaves[: len(consts)], leaves[len(consts) :]
-            run = jax.extend.core.ClosedJaxpr(closed.jaxpr, list(consts_now))
-            return with_small_products(run)(*rest)
+            given, rest = leaves[: len(consts)], leaves[len(consts) :]
+            run = jax.extend.core.ClosedJaxpr(closed.jaxpr, list(given))
+            return jax.extend.core.jaxpr_as_fun(run)(*rest)
 
         program = _traced(with_operands, [*map(_kind, consts), *kinds])
         if captures_tracers(closed) or not captured.is_repeatable:

@@ -7,7 +7,6 @@ Everything above this room uses the common interface, `AbstractMechanicalSystem`
 
 from abc import abstractmethod
 from collections.abc import Callable
-from functools import partial
 from types import BuiltinFunctionType, FunctionType
 from typing import Any, ClassVar, Literal, TypeVar
 
@@ -236,12 +235,12 @@ class AbstractMechanicalSystem(eqx.Module):
 
     def functions(
         self, t: Any, q: PyTree[Any], u: Any, multiplier: Any, args: Args
-    ) -> dict[str, tuple[Callable[..., Any], tuple[Any, ...]]]:
+    ) -> dict[str, tuple["NamedFunction", tuple[Any, ...]]]:
         """Map the name of each function to a callable and its arguments."""
         letter = self.fibre_coordinate_name
         values = {"t": t, "q": q, letter: u, "multipliers": multiplier, "args": args}
         return {
-            name: (partial(self.call, name), tuple(values[x] for x in arguments))
+            name: (self.named(name), tuple(values[x] for x in arguments))
             for name, arguments in self.signatures().items()
             if getattr(self, name) is not None
         }
@@ -706,14 +705,14 @@ def with_kept_functions(
     if system.force_takes_multipliers:
         shape = jax.eval_shape(system.constraint, t, q, u, args).shape
         multiplier = jnp.zeros(shape, u.dtype)
-    functions = {}
-    for name, (_, example) in system.functions(t, q, u, multiplier, args).items():
-        kept = kept_function(system.named(name), *example)
-        functions[name] = kept or ClosureConverted(system.named(name), *example)
+    functions = system.functions(t, q, u, multiplier, args)
     return eqx.tree_at(
         lambda system: [getattr(system, name) for name in functions],
         system,
-        list(functions.values()),
+        [
+            kept_function(function, *example) or ClosureConverted(function, *example)
+            for function, example in functions.values()
+        ],
     )
 
 
