@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from matplotlib import pyplot as plt, rc_context, rcParams
 from matplotlib.figure import Figure
 from PIL import Image, ImageSequence
 
@@ -54,9 +55,54 @@ def test_plot_trajectory_draws_coordinates_with_labels(sol):
 
 
 def test_plot_trajectory_of_three_coordinates_draws_in_space(sol):
-    ax = plot.trajectory(sol, (0, 1, 2))
-    assert ax.get_zlabel() == "$q_3$"  # pyright: ignore[reportAttributeAccessIssue]
+    ax: Any = plot.trajectory(sol, (0, 1, 2))
+    assert ax.get_zlabel() == "$q_3$"
     ax.figure.canvas.draw()
+    limits = [ax.get_xlim(), ax.get_ylim(), ax.get_zlim()]
+    sizes = np.ptp(limits, axis=1) / ax._box_aspect
+    np.testing.assert_allclose(sizes, sizes[0])
+
+
+def test_plot_trajectory_with_ground_draws_a_plane_inside_the_axes(sol):
+    ax: Any = plot.trajectory(sol, (0, 1, 2), ground=-50.0)
+    (_,) = ax.collections
+    low, high = ax.get_zlim()
+    assert low <= -50 < high
+    with pytest.raises(ValueError, match="`ground` needs three coordinates"):
+        plot.trajectory(sol, ground=0.0)
+
+
+def test_plot_style_in_with_statement_is_restored():
+    before = dict(rcParams)
+    with plot.style(dark=True):
+        figure, ax = plt.subplots()
+        assert figure.get_facecolor() == (0, 0, 0, 0)
+        assert ax.plot([0, 1])[0].get_color() == "#56B4E9"
+        assert rcParams["text.color"] == "0.9"
+    assert dict(rcParams) == before
+
+
+def test_plot_style_as_function_lasts_until_its_context_is_closed():
+    before = dict(rcParams)
+    restoration = plot.style()
+    try:
+        assert rcParams["axes.grid"]
+        assert plt.figure().subplots().plot([0, 1])[0].get_color() == "#0072B2"
+    finally:
+        restoration.close()
+    assert dict(rcParams) == before
+
+
+def test_plot_uses_the_style_only_for_figures_that_it_creates(disc, sol):
+    before = dict(rcParams)
+    assert plot.energy(disc.system, sol).lines[0].get_color() == "#0072B2"
+    given = Figure().add_subplot()
+    assert plot.energy(disc.system, sol, ax=given).lines[0].get_color() != "#0072B2"
+    with rc_context({"lines.linewidth": 7.0}):
+        assert plot.energy(disc.system, sol).lines[0].get_linewidth() == 7.0
+    with plot.style(dark=True):
+        assert plot.energy(disc.system, sol).lines[0].get_color() == "#56B4E9"
+    assert dict(rcParams) == before
 
 
 @pytest.mark.parametrize("kind", ["trajectory", "energy", "multiplier", "constraint"])

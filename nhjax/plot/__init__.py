@@ -1,8 +1,9 @@
 """Figures of trajectories and of convergence, and animations, drawn with matplotlib.
 
-Every function draws into the axes `ax` if they are given, and into the axes of a new
-figure otherwise. It returns the axes, or the animation, and never shows or saves
-anything. Matplotlib is imported by the first call that needs it.
+Every drawing function draws into the axes `ax` if they are given, and into the axes of
+a new figure otherwise, in the light form of `style`. It returns the axes, or the
+animation, and never shows or saves anything. Matplotlib is imported by the first call
+that needs it.
 """
 
 from ._animation import animate as animate
@@ -13,3 +14,4 @@ from ._figures import (
     multiplier as multiplier,
     trajectory as trajectory,
 )
+from ._style import style as style

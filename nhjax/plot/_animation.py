@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ..diagnostics import real_array
-from ._figures import new_axes
+from ._style import grey, new_axes, styled
 
 
 if TYPE_CHECKING:
@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 
+@styled
 def animate(
     ts: Float[np.ndarray, " times"],
     points: Mapping[str, Float[np.ndarray, "times ..."]],
@@ -108,16 +109,16 @@ def animate(
     centres, reach = _window(frames, follow)
     bodies = [name for name, x in frames.items() if x.ndim == 3]
     dark = [_rim(wheel) for wheel in wheels]
-    fills = [_filled(ax, "0.35" if x in dark else "0.8", spatial) for x in bodies]
-    marks = [
-        ax.plot(*_no_data(spatial), color="tab:orange", linewidth=2.5)[0]
-        for _ in wheels
-    ]
+    fills = [_filled(ax, grey(0.35 if x in dark else 0.8), spatial) for x in bodies]
+    marks = [ax.plot(*_no_data(spatial), color="C1", linewidth=2.5)[0] for _ in wheels]
     floor = None if ground is None else _ground(ax, ground, reach, spatial)
     lines: list[Any] = [
-        *(ax.plot(*_no_data(spatial), color="0.25", linewidth=1.5)[0] for _ in bodies),
-        *(ax.plot(*_no_data(spatial), "o-", color="0.1", ms=3)[0] for _ in rods),
-        *(ax.plot(*_no_data(spatial), color="tab:blue", lw=1)[0] for _ in traced),
+        *(
+            ax.plot(*_no_data(spatial), color=grey(0.25), linewidth=1.5)[0]
+            for _ in bodies
+        ),
+        *(ax.plot(*_no_data(spatial), "o-", color=grey(0.1), ms=3)[0] for _ in rods),
+        *(ax.plot(*_no_data(spatial), color="C0", lw=1)[0] for _ in traced),
     ]
 
     def show(frame: int) -> list[Any]:
@@ -280,14 +281,14 @@ def _ground(ax: "Axes", height: float, reach: float, spatial: bool) -> Any:
     Its lines stay in place as the picture moves.
     """
     if not spatial:
-        ax.axhspan(height - 100 * reach, height, color="0.88", zorder=0)
-        ax.axhline(height, color="0.5", linewidth=1, zorder=0.5)
+        ax.axhspan(height - 100 * reach, height, color=grey(0.88), zorder=0)
+        ax.axhline(height, color=grey(0.5), linewidth=1, zorder=0.5)
         return lambda centre: None
     from mpl_toolkits.mplot3d.art3d import Line3DCollection
 
     axes: Any = ax
     grid = Line3DCollection(
-        np.zeros((1, 2, 3)), colors="0.75", linewidths=0.6, zorder=0
+        np.zeros((1, 2, 3)), colors=grey(0.75), linewidths=0.6, zorder=0
     )
     axes.add_collection3d(grid, autolim=False)
     cell = reach / 4

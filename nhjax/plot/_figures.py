@@ -1,6 +1,5 @@
 """Figures of trajectories, of errors against time, and of convergence."""
 
-import reprlib
 from collections.abc import Sequence
 from typing import Any, TYPE_CHECKING
 
@@ -18,21 +17,26 @@ from ..diagnostics import (
     real_array,
     saved_states,
 )
+from ._style import grey, new_axes, styled
 
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 
+@styled
 def trajectory(
     sol: Solution,
     coordinates: Sequence[int] = (0, 1),
     *,
     names: Sequence[str] | None = None,
+    ground: float | None = None,
     ax: "Axes | None" = None,
     **style: Any,
 ) -> "Axes":
     """Draw the path of two or three coordinates of a trajectory.
+
+    All axes have the same unit length.
 
     **Arguments:**
 
@@ -42,13 +46,14 @@ def trajectory(
         the flattened numbers of an element; on a product, the numbers of all factors
         are joined in order.
     - `names`: the names of the coordinates, for the labels of the axes.
+    - `ground`: the value of the third coordinate at which a plane is drawn.
     - `ax`: the axes to draw into; three coordinates need a 3d projection.
     - `style`: passed on to `Axes.plot`.
 
     **Returns:** the axes.
 
-    **Raises:** `ValueError` if `sol` has fewer than two states, or if `coordinates` are
-    out of range.
+    **Raises:** `ValueError` if `sol` has fewer than two states, if `coordinates` are
+    out of range, or if `ground` is given for two coordinates.
 
     !!! example
 
@@ -82,16 +87,40 @@ def trajectory(
         )
     names = _names(names, [f"$q_{i % n + 1}$" for i in coordinates])
     spatial = len(coordinates) == 3
+    if ground is not None and not spatial:
+        raise ValueError("`ground` needs three coordinates, got two.")
     ax = new_axes(ax, projection="3d" if spatial else None)
     for path in q.reshape(-1, *q.shape[-2:])[..., list(coordinates)]:
         ax.plot(*path.T, **style)
     for letter, name in zip("xyz", names, strict=False):
         getattr(ax, f"set_{letter}label")(name)
-    if not spatial:
-        ax.set_aspect("equal", adjustable="datalim")
+    if spatial:
+        _set_box(ax, ground)
+    ax.set_aspect("equal", adjustable="datalim")
+    if ground is not None:
+        _add_ground(ax, ground)
     return ax
 
 
+def _set_box(ax: Any, ground: float | None) -> None:
+    """Set the proportions of the box to those of the data, with limits."""
+    if ground is not None:
+        low, high = ax.get_zlim()
+        ax.set_zlim(min(low, ground), max(high, ground))
+    sides = np.ptp([ax.get_xlim(), ax.get_ylim(), ax.get_zlim()], axis=1)
+    ax.set_box_aspect(np.maximum(sides, 0.5 * np.max(sides)), zoom=0.8)
+    ax.locator_params(nbins=5)
+
+
+def _add_ground(ax: Any, height: float) -> None:
+    """Draw a horizontal plane over the range of the axes."""
+    (x0, x1), (y0, y1) = ax.get_xlim(), ax.get_ylim()
+    x, y = np.array([[x0, x1], [x0, x1]]), np.array([[y0, y0], [y1, y1]])
+    z = np.full((2, 2), height)
+    ax.plot_surface(x, y, z, color=grey(0.8), alpha=0.5, shade=False, zorder=0)
+
+
+@styled
 def energy(
     system: AbstractMechanicalSystem,
     sol: Solution,
@@ -118,6 +147,7 @@ def energy(
     return ax
 
 
+@styled
 def multiplier(sol: Solution, *, ax: "Axes | None" = None, **style: Any) -> "Axes":
     """Draw the multipliers λ_a against time, with a line for each constraint.
 
@@ -139,6 +169,7 @@ def multiplier(sol: Solution, *, ax: "Axes | None" = None, **style: Any) -> "Axe
     return ax
 
 
+@styled
 def constraint(
     system: AbstractMechanicalSystem,
     sol: Solution,
@@ -181,6 +212,7 @@ def constraint(
     return ax
 
 
+@styled
 def convergence(
     step_sizes: Float[np.ndarray, " k"] | Sequence[float],
     errors: Float[np.ndarray, " k"] | Sequence[float],
@@ -271,21 +303,3 @@ def _names(names: Sequence[str] | None, default: list[str]) -> Sequence[str]:
     if len(names) != len(default):
         raise ValueError(f"`names` must have {len(default)} names, got {len(names)}.")
     return names
-
-
-def new_axes(ax: "Axes | None", projection: str | None = None) -> "Axes":
-    """Return the axes given by the user, or the axes of a new figure."""
-    if ax is not None:
-        if not hasattr(ax, "plot"):
-            raise TypeError(
-                "`ax` must be axes of matplotlib, for example from "
-                f"`matplotlib.pyplot.subplots()`, got {reprlib.repr(ax)} of type "
-                f"{type(ax).__name__}."
-            )
-        return ax
-    # The import is here, because drawing into the user's axes must not choose a backend
-    # of matplotlib.
-    from matplotlib import pyplot as plt
-
-    keywords = {} if projection is None else {"projection": projection}
-    return plt.figure(layout="constrained").add_subplot(**keywords)
