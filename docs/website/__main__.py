@@ -2,8 +2,6 @@
 
 python -m docs.website build    writes build/website/site
 python -m docs.website serve    shows it at http://localhost:8000
-
-With --run-notebooks the pages of notebooks have the outputs of runs at full size.
 """
 
 import argparse
@@ -29,9 +27,8 @@ def main() -> None:
     )
     parser.add_argument("command", choices=("build", "serve"))
     parser.add_argument("--port", default="8000")
-    parser.add_argument("--run-notebooks", action="store_true")
     options = parser.parse_args()
-    site = build(pages.ROOT / "build" / "website", options.run_notebooks)
+    site = build(pages.ROOT / "build" / "website")
     if found := complaints(site):
         sys.exit("\n".join(found))
     print(f"{sum(1 for _ in site.rglob('*.html'))} pages: {site / 'index.html'}")
@@ -41,13 +38,13 @@ def main() -> None:
             subprocess.run([*command, "-b", "localhost"])
 
 
-def build(folder: Path, run_notebooks: bool = False) -> Path:
+def build(folder: Path) -> Path:
     """Write pages and settings, run the generator, and return the folder of the site.
 
     The generator stops at links to pages, headings and names that do not exist.
     """
     shutil.rmtree(folder, ignore_errors=True)
-    pages.write(folder / "pages", run_notebooks)
+    pages.write(folder / "pages")
     groups = api.pages()
     overview = "".join(
         f"- [{title}]({next(iter(g))[4:]})\n" for title, g in groups.items()

@@ -2,10 +2,8 @@
 
 import base64
 import json
-import os
 import re
 import shutil
-import tempfile
 from pathlib import Path
 from typing import Any
 
@@ -35,7 +33,7 @@ def sources() -> dict[str, Path]:
     return written
 
 
-def write(folder: Path, run_notebooks: bool = False) -> None:
+def write(folder: Path) -> None:
     """Write all pages except those of the API into a folder."""
     for place, path in sources().items():
         target = folder / place
@@ -43,7 +41,7 @@ def write(folder: Path, run_notebooks: bool = False) -> None:
         if path.suffix == ".md":
             text = path.read_text(encoding="utf-8")
         elif path.suffix == ".ipynb":
-            text = notebook_page(run(path) if run_notebooks else read(path), target)
+            text = notebook_page(read(path), target)
         else:
             shutil.copyfile(path, target)
             continue
@@ -53,24 +51,8 @@ def write(folder: Path, run_notebooks: bool = False) -> None:
 
 
 def read(path: Path) -> dict[str, Any]:
-    """Read a notebook as it is stored, without outputs."""
+    """Read a notebook with the outputs that `docs/notebooks.py` has stored."""
     return json.loads(path.read_text(encoding="utf-8"))
-
-
-def run(path: Path) -> dict[str, Any]:
-    """Run a notebook at full size."""
-    # The site can be built without these packages.
-    import nbformat
-    from nbclient import NotebookClient
-
-    print(f"running {path.name}")
-    notebook = nbformat.read(path, as_version=4)
-    for name in ("NHJAX_SMALL", "MPLBACKEND"):
-        os.environ.pop(name, None)
-    with tempfile.TemporaryDirectory() as folder:
-        resources = {"metadata": {"path": folder}}
-        NotebookClient(notebook, timeout=1200, resources=resources).execute()
-    return json.loads(nbformat.writes(notebook))
 
 
 def notebook_page(notebook: dict[str, Any], target: Path) -> str:
@@ -78,6 +60,8 @@ def notebook_page(notebook: dict[str, Any], target: Path) -> str:
     parts: list[str] = []
     pictures = 0
     for cell in notebook["cells"]:
+        if "remove-cell" in cell.get("metadata", {}).get("tags", ()):
+            continue
         text = "".join(cell["source"])
         is_text = cell["cell_type"] == "markdown"
         parts.append(text if is_text else f"```python\n{text}\n```")
