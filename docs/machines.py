@@ -179,12 +179,12 @@ def draw(figure: Figure, place: tuple[int, int, int], machine: Machine) -> None:
     points = run(machine)
     ax = axes_for(figure, place, points)
     for name in machine.traced:
-        ax.plot(*points[name].T, linewidth=0.8, color="tab:blue")
+        ax.plot(*points[name].T, color="C0")
     shown = np.linspace(0, machine.num_steps, TIMES_SHOWN).astype(int)
     for k, shade in zip(shown, np.linspace(0.75, 0.0, TIMES_SHOWN), strict=True):
         rods = np.array([points[name][k] for name in machine.rods])
         ax.plot(*rods.T, "o-", color=str(shade), linewidth=1.0, markersize=2)
-    ax.set_title(machine.name, fontsize=9)
+    ax.set_title(machine.name)
 
 
 def axes_for(
@@ -256,6 +256,7 @@ def main() -> None:
     parser.add_argument("--animate", help="the name of a machine's class")
     name = parser.parse_args().animate
     jax.config.update("jax_enable_x64", True)
+    nhjax.plot.style()
     gallery = machines()
     if name:
         (machine,) = (machine for machine in gallery if machine.name == name)

@@ -36,7 +36,7 @@ class Snakeboard(AbstractGaitMachine):
     The joints are either prescribed by a `gait`, Γ = (ψ, φ_b, φ_f) - gait(t), or with
     `gait=None` they move freely under the torques (τ_ψ, τ_b, τ_f) [N m] in `args`, of
     shape (3,) or `None`. By default the rotor oscillates at the frequency of the
-    steering, which drives the board ahead from rest. With other ratios of the
+    steering, which drives the board from rest along its axis. With other ratios of the
     frequencies, the board turns in place or moves sideways (parking gait).
 
     **Parameters:** `mass` m [kg]; `inertia` J of the board, `rotor_inertia` J_r and
