@@ -1,4 +1,4 @@
-"""Draws a picture of the first page: `python docs/sleigh.py` writes docs/sleigh.png."""
+"""Draws a picture of docs/choosing.md: run `python docs/sleigh.py` to write it."""
 
 from pathlib import Path
 
@@ -29,11 +29,12 @@ def main() -> None:
 
     spins = np.linspace(0.2, 2.0, 9)
     paths = jax.vmap(path)(jnp.concatenate([-spins[::-1], spins]))
+    plot.style()
     figure = Figure(figsize=(9, 3.6), layout="constrained")
     left, right = figure.subplots(1, 2)
     shades = matplotlib.colormaps["viridis"](np.linspace(0, 0.85, 9))
     left.set_prop_cycle(color=np.concatenate([shades[::-1], shades]))
-    plot.trajectory(paths, names=("$x$", "$y$"), ax=left, linewidth=1.0)
+    plot.trajectory(paths, names=("$x$", "$y$"), ax=left)
     left.set_title("Chaplygin sleighs thrown backwards")
     sleigh = nhjax.systems.ChaplyginSleigh()
     for closure in ("propagated", "consistent", "symmetric"):
@@ -47,12 +48,12 @@ def main() -> None:
             throw=False,
         )
         error = np.abs(energy_error(sleigh.system, sol))
-        right.semilogy(sol.ts, np.maximum(error, 1e-17), linewidth=1, label=closure)
+        right.semilogy(sol.ts, np.maximum(error, 1e-17), label=closure)
     right.set_ylim(1e-20, 1e1)
     right.set_xlabel("time $t$")
     right.set_ylabel("$|E(t) - E(t_0)|$")
     right.set_title("energy error, s = 4, h = 0.1")
-    right.legend(title="closure", loc="lower right", fontsize="small")
+    right.legend(title="closure", loc="lower right")
     figure.savefig(Path(__file__).with_suffix(".png"), dpi=110)
 
 

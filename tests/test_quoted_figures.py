@@ -1,10 +1,12 @@
 """Figures that pages quote are those of the committed results of the benchmarks."""
 
+import re
+
 import numpy as np
 import pytest
 
 from benchmarks.near_rest import examples
-from support.pages import assert_agree, page, quoted, results, rows_of
+from support.pages import assert_agree, page, quoted, results, ROOT, rows_of
 
 
 @pytest.mark.parametrize(
@@ -25,6 +27,57 @@ def test_quoted_figure_of_another_value_does_not_agree(printed, value):
 def test_quoted_figure_found_twice_raises():
     with pytest.raises(AssertionError, match="found 2 times"):
         quoted("3 s and\n4 s", "{} s")
+
+
+FRONT = {
+    "README": (ROOT / "README.md").read_text(encoding="utf-8"),
+    "index": page("index"),
+}
+
+
+@pytest.mark.parametrize("text", FRONT.values(), ids=FRONT)
+def test_front_constraint_violation_agrees_with_the_result(text):
+    claims = [x for part in results("verdicts")["claims"].values() for x in part]
+    start = "Φ = 0 holds at the nodes"
+    (claim,) = (x for x in claims if x["claim"].startswith(start))
+    (measured,) = re.findall(r": (\S+)$", claim["measured"])
+    members, time, printed = quoted(
+        text, "{} members over t = {}, the largest violation of the constraint is {}"
+    )
+    assert f"over {members} members" in claim["measured"]
+    assert f"t <= {float(time):g}:" in claim["measured"]
+    assert float(printed) == float(measured)
+
+
+@pytest.mark.parametrize("text", FRONT.values(), ids=FRONT)
+def test_front_ratios_to_other_libraries_agree_with_the_result(text):
+    (case,) = (
+        case
+        for case in results("work_precision")["cases"]
+        if (case["name"], case["members"], case["t"]) == ("chaotic", 101, 20.0)
+    )
+    best = [x["best"] for x in case["contest"]]
+    faster = [1 / x["diffrax"]["ratio_seconds"] for x in best]
+    slower = [x["heyoka"]["ratio_seconds"] for x in best]
+    printed = quoted(text, "{} to {} times faster than diffrax")
+    assert_agree(printed, [min(faster), max(faster)])
+    printed = quoted(text, "{} to {} times slower than heyoka")
+    assert_agree(printed, [min(slower), max(slower)])
+
+
+def test_front_ensemble_memory_agrees_with_the_result():
+    rows = results("ensembles")["rows"]
+    million = next(row for row in rows if row["members"] == 1_000_000)
+    sentence = "A million members of {} steps take {} MB"
+    steps, memory = quoted(FRONT["index"], sentence)
+    assert int(steps) == million["num_steps"]
+    assert_agree([memory], [million["megabytes"]])
+
+
+def test_front_bicycle_eigenvalues_agree_with_the_machines_page():
+    (measured,) = quoted(page("machines"), "eigenvalues {};")
+    printed = quoted(FRONT["README"], "eigenvalues to {} ([machines]")
+    assert_agree(printed, [float(measured)])
 
 
 # The columns of the contest with others: members, and the library.

@@ -4,6 +4,7 @@ import re
 import tomllib
 
 import pytest
+from latex2mathml.converter import convert
 
 from docs import gallery
 from docs.website import api, pages
@@ -99,7 +100,64 @@ def test_website_gallery_has_a_small_picture_of_each_system():
         if hasattr(value, "initial_state"):
             assert f"](gallery/{name}.png)" in PAGES["gallery.md"], name
     drawn = [path.stat().st_size for path in gallery.PICTURES.glob("*.png")]
-    assert sum(drawn) < 1e6
+    assert len(drawn) == len(gallery.pictures())
+    assert max(drawn) < 6e4
+    assert sum(drawn) < 1.2e6
+
+
+def test_website_gallery_shows_the_formulas_and_the_model_of_each_system():
+    for picture in gallery.pictures():
+        name = picture.name
+        paragraphs, source = gallery.described(picture.example)
+        assert any(re.match(r"\$\$.*(L|\\ell) ?=", x) for x in paragraphs), name
+        assert source.startswith("**Source:**")
+        shown = gallery.model(picture.example)
+        assert shown[0].startswith("def lagrangian("), name
+        system, text = picture.example.system, "\n".join(shown)
+        assert ("def constraint(" in text) == (system.nonholonomic is not None), name
+        assert ("def holonomic(" in text) == (system.holonomic is not None), name
+        # The functions of the system are shown whole, so that some are longer.
+        assert sum(x.count("\n") + 2 for x in shown) <= gallery.MODEL_LINES + 12, name
+
+
+@pytest.mark.parametrize(
+    ("formula", "expected"),
+    [
+        ("m/2 (ẋ² + ẏ²)", r"\frac{m}{2} \left(\dot{x}^{2}+\dot{y}^{2}\right)"),
+        ("k m a²/2 |ω|²", r"\frac{k m a^{2}}{2} \left|\omega \right|^{2}"),
+        ("-sin θ ẋ + cos 2y", r"-\sin \theta \, \dot{x}+\cos 2 y"),
+        ("sin(θ + φ_b) ẍ", r"\sin\left(\theta +\varphi _{b}\right)\, \ddot{x}"),
+        ("½ ωᵀ I ω", r"\tfrac{1}{2} \omega ^{\top } I \omega"),
+        ("a/√(γ·(A γ))", r"\frac{a}{\sqrt{\gamma \cdot \left(A \gamma \right)}}"),
+        ("(J_s + J_m)/2 φ̇²", r"\frac{J_{s}+J_{m}}{2} \dot{\varphi}^{2}"),
+        ("(R (v + ω × s))₁₂", r"\left(R \left(v+\omega \times s\right)\right)_{12}"),
+        ("Σ_{i=1..m} q²_{m+1+i}", r"\sum_{i=1}^{m} q_{m+1+i}^{2}"),
+        ("∇Φ/|∇Φ|", r"\frac{\nabla \Phi }{\left|\nabla \Phi \right|}"),
+        ("Φ_hol = n·ṙ₁", r"\Phi _{\mathrm{hol}}=n\cdot \dot{r}_{1}"),
+    ],
+)
+def test_website_formulas_of_docstrings_become_latex(formula, expected):
+    assert gallery.latex(formula) == expected
+    assert "<merror" not in convert(gallery.latex(formula))
+
+
+def test_website_words_and_open_brackets_are_not_formulas():
+    for text in ("m over all bodies", "(x + y", "x in space", "x ? y"):
+        with pytest.raises(gallery.Unreadable):
+            gallery.latex(text)
+
+
+def test_website_equations_are_found_within_a_text():
+    text = "If I₁ = I₂, the rate (for k = 1) is Ω; `f(x = 1)` and E = a b hold [m]."
+    typeset = gallery.inline(text).replace("\0", " ")
+    assert typeset.startswith("If $I_{1}=I_{2}$, the rate (for $k=1$) is Ω; `f(x = 1)`")
+    paragraph = "L = m/2 v²,  Φ = v₁,  q = (x, y), with x ahead."
+    formulas, rest = gallery.display(paragraph)
+    assert formulas.split("\n\n") == [
+        r"$$L=\frac{m}{2} v^{2}$$",
+        r"$$\Phi =v_{1},\qquad q=\left(x,\;y\right)$$",
+    ]
+    assert rest == "with x ahead."
 
 
 def test_website_supported_versions_equal_package_metadata():

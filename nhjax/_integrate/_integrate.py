@@ -194,11 +194,11 @@ def integrate(
     !!! note
 
         Outside of transformations, the host calls a compiled program that takes a
-        chunk of steps. Another `num_steps`, `saveat`, `adjoint` or `progress_meter`
-        does not recompile; there are two programs, one of which keeps the records of
-        steps that `ts` and `dense` need. Ctrl-C ends a run after the current chunk,
-        within about a fifth of a second: `integrate` warns and returns the solution up
-        to there, whose `result` is `nhjax.RESULTS.interrupted`.
+        chunk of steps. Another `num_steps`, `SaveAt(steps=k)`, `adjoint` or
+        `progress_meter` does not recompile. The first run with `ts` or `dense` compiles
+        programs that keep the records of steps. Ctrl-C ends a run after the current
+        chunk, within about a fifth of a second: `integrate` warns and returns the
+        solution up to there, whose `result` is `nhjax.RESULTS.interrupted`.
 
         Under `jit` an int `num_steps` is static. An integer array is traced, and under
         `vmap` each member may have its own; then `saveat` must not depend on the

@@ -44,7 +44,9 @@ class SaveAt(eqx.Module):
     The output has exactly as many entries as are saved. Saving every k-th step
     (`steps=k`) and saving at given times (`ts`) need no buffer of the length of the
     run, unless `dense` needs one. The samples at `ts` are computed after the run, from
-    the records of the steps that contain them.
+    the records of the steps that contain them. Between steps, the polynomials have
+    larger errors than the states at the steps, and the constraint holds to their
+    accuracy only, not to round-off.
 
     **Raises:** `ValueError` if no output is selected, a flag is not a bool, `steps` is
     not a bool or an int >= 1, `ts` is not a sorted vector, or `ts` and `steps` are
