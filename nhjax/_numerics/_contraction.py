@@ -92,7 +92,7 @@ def inverse(matrix: Float[Array, "n *n"]) -> Float[Array, "n *n"]:
         return matrix
     if size > LARGEST:
         return jnp.linalg.inv(matrix)
-    return _eliminated(matrix)
+    return compiled_once_inverse(matrix)
 
 
 @inverse.defjvp
@@ -104,8 +104,12 @@ def _inverse_jvp(primals, tangents):
     return x, -small_einsum("ij,jk->ik", small_einsum("ij,jk->ik", x, rate), x)
 
 
-def _eliminated(matrix: Float[Array, "m m"]) -> Float[Array, "m m"]:
-    """Invert a matrix by Gauss-Jordan elimination in place, with row pivoting."""
+@jax.jit
+def compiled_once_inverse(matrix: Float[Array, "m m"]) -> Float[Array, "m m"]:
+    """Invert a matrix by Gauss-Jordan elimination in place, with row pivoting.
+
+    The name lets `nhjax.lanes` compile it once for all matrices of the same size.
+    """
     rows = jnp.arange(matrix.shape[0])
 
     def at(x, k):

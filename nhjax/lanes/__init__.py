@@ -6,6 +6,7 @@ from ._garbage_collection import rare_collections as rare_collections
 from ._graph import Unsupported as Unsupported
 from ._jaxprs import (
     CALLING as CALLING,
+    COMPILED_ONCE as COMPILED_ONCE,
     cse_dce as cse_dce,
     ELEMENTWISE as ELEMENTWISE,
     KEPT_CALL as KEPT_CALL,

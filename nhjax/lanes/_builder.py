@@ -18,7 +18,15 @@ from typing import Any, TypeAlias
 import numpy as np
 from jax.extend.core import DropVar, Literal
 
-from ._graph import Buffer, counted_loop, dtype_name, Graph, Node, Unsupported
+from ._graph import (
+    Buffer,
+    counted_loop,
+    dtype_name,
+    Functions,
+    Graph,
+    Node,
+    Unsupported,
+)
 
 
 # An array in registers: a node for each number.
@@ -308,6 +316,9 @@ class Builder:
         self.changing: dict[tuple[int, ...], set[int]] = {}
         # The constants with which numbers started that loops may have changed since.
         self.loop_starts: dict[Node, Node] = {}
+        self.functions = Functions()
+        # Whether programs are written out here and not called as functions.
+        self.is_written_out = False
         self._last_uses: dict[int, tuple[Any, list[list[Any]]]] = {}
 
     def run(
@@ -349,6 +360,14 @@ class Builder:
         for value in env.values():
             release(value)
         return outs
+
+    def run_body(self, body: Any, args: Sequence[ArrayValue]) -> list[ArrayValue]:
+        """Compute the results of the closed jaxpr of the body of a loop."""
+        outer = self.is_written_out
+        self.is_written_out = outer or not has_iteration(body.jaxpr)
+        out = self.run(body.jaxpr, body.consts, args)
+        self.is_written_out = outer
+        return out
 
     def equation(self, equation: Any, values: list[ArrayValue]) -> list[ArrayValue]:
         """Compute the results of one equation."""
@@ -497,6 +516,44 @@ def called_program(equation: Any) -> Any:
     """Return the inner program of an equation, or `None` if it has none."""
     params = equation.params
     return next((params[key] for key in _PROGRAM_KEYS if key in params), None)
+
+
+def inner_programs(equation: Any) -> Iterator[tuple[Any, int]]:
+    """List the inner programs of an equation, and where their operands start.
+
+    Constants of loops are listed too, which is harmless.
+    """
+    params, name = equation.params, equation.primitive.name
+    if name == "while":
+        # The operands of the body, without the operands of the predicate.
+        yield params["body_jaxpr"].jaxpr, params["cond_nconsts"]
+    elif name == "cond":
+        for branch in params["branches"]:
+            yield branch.jaxpr, 1
+    else:
+        inner = called_program(equation)
+        if inner is not None:
+            yield getattr(inner, "jaxpr", inner), 0
+
+
+def has_iteration(jaxpr: Any) -> bool:
+    """Return whether a program has a loop whose length is not known beforehand."""
+    return any(
+        _is_iteration(equation)
+        or any(has_iteration(inner) for inner, _ in inner_programs(equation))
+        for equation in jaxpr.eqns
+    )
+
+
+def _is_iteration(equation: Any) -> bool:
+    if equation.primitive.name != "while":
+        return False
+    tests = equation.params["cond_jaxpr"].jaxpr.eqns
+    is_counted = len(tests) == 1 and any(
+        isinstance(x, Literal) and np.issubdtype(x.aval.dtype, np.integer)  # pyright: ignore
+        for x in tests[0].invars
+    )
+    return not is_counted
 
 
 def sizes_of_scan(params: dict[str, Any]) -> tuple[int, int]:

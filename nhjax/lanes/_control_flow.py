@@ -13,7 +13,7 @@ written out number by number, or in a loop over the first index if they are long
 
 import math
 import string
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any, TypeAlias
 
@@ -30,6 +30,7 @@ from ._builder import (
     flat_indices,
     hold,
     InMemory,
+    inner_programs,
     MOST_IN_REGISTERS,
     Operation,
     Registers,
@@ -38,11 +39,16 @@ from ._builder import (
 )
 from ._graph import (
     BranchBuilder,
+    call,
     dtype_name,
+    Function,
     LoopBuilder,
     Node,
+    parameters_for,
+    Region,
     Unsupported,
 )
+from ._jaxprs import COMPILED_ONCE, KEPT_CALL
 
 
 # The indices of both factors and of the result of a sum of products, as for
@@ -62,6 +68,47 @@ def _call(
     inner = called_program(equation)
     jaxpr = getattr(inner, "jaxpr", inner)
     return builder.run(jaxpr, getattr(inner, "consts", ()), values)
+
+
+def _function_call(
+    builder: Builder, equation: Any, values: list[ArrayValue]
+) -> list[ArrayValue]:
+    """Call a program that is compiled once, or write it out."""
+    if builder.is_written_out or any(isinstance(x, InMemory) for x in values):
+        return _call(builder, equation, values)
+    numbers = [node for value in values for node in value.reshape(-1)]  # pyright: ignore
+    # A program that is kept is the same object at all places.
+    program = equation.params.get("kept", called_program(equation))
+    build = partial(_function, builder, equation, values)
+    function = builder.functions.of(program, numbers, build)
+    if function is None:
+        return _call(builder, equation, values)
+    args = [node for node in numbers if not node.is_constant]
+    results = iter(call(builder.graph, function, args))
+    return [_taken(results, variable.aval) for variable in equation.outvars]
+
+
+def _function(
+    builder: Builder, equation: Any, values: list[ArrayValue]
+) -> Function | None:
+    """Build the function of a program, unless its results are in memory."""
+    graph = builder.graph
+    region = Region(None, None, is_side=False)
+    arrays, parameters = parameters_for(graph, region, values)  # pyright: ignore
+    outer, graph.region = graph.region, region
+    try:
+        outs = _call(builder, equation, [*arrays])
+    finally:
+        graph.region = outer
+    if any(isinstance(out, InMemory) for out in outs):
+        return None
+    numbers = [node for out in outs for node in out.reshape(-1)]  # pyright: ignore
+    return Function(parameters, numbers)
+
+
+def _jit(builder: Builder, equation: Any, values: list[ArrayValue]) -> list[ArrayValue]:
+    is_function = equation.params.get("name", "").startswith(COMPILED_ONCE)
+    return (_function_call if is_function else _call)(builder, equation, values)
 
 
 def _linear_solve(
@@ -207,6 +254,9 @@ def _loop_start(
 
 BRANCHES: dict[str, Operation] = {
     **dict.fromkeys(CALLS, _call),
+    KEPT_CALL: _function_call,
+    "jit": _jit,
+    "pjit": _jit,
     EXPANDED: _expanded,
     "cond": _cond,
     "custom_linear_solve": _linear_solve,
@@ -243,7 +293,7 @@ def _while(
 
     def step(carry: list[ArrayValue]) -> list[ArrayValue]:
         args = [*of_body, *everything(carry)]
-        return _split(is_same, builder.run(body.jaxpr, body.consts, args))[1]
+        return _split(is_same, builder.run_body(body, args))[1]
 
     with builder.held([*of_test, *of_body, *same]):
         moving, _ = _split([not s for s in is_same], inits)
@@ -375,7 +425,7 @@ def _scanned(
     def iteration(
         carry: list[ArrayValue], row: list[ArrayValue]
     ) -> tuple[list[ArrayValue], list[ArrayValue]]:
-        outs = builder.run(body.jaxpr, body.consts, [*consts, *carry, *row])
+        outs = builder.run_body(body, [*consts, *carry, *row])
         return outs[:count], outs[count:]
 
     avals = [variable.aval for variable in equation.outvars[count:]]
@@ -396,7 +446,7 @@ def _each_row(
     ) -> tuple[list[ArrayValue], list[ArrayValue]]:
         del carry
         operands = _merged(is_row, row, shared)
-        return [], builder.run(program.jaxpr, program.consts, operands)
+        return [], builder.run_body(program, operands)
 
     avals = [variable.aval for variable in equation.outvars]
     order = rows[0].shape[0], False
@@ -754,21 +804,3 @@ def updated_inputs(jaxpr: Any) -> frozenset[int]:
                 if variable in origins:
                     found.add(origins[variable])
     return frozenset(found)
-
-
-def inner_programs(equation: Any) -> Iterator[tuple[Any, int]]:
-    """List the inner programs of an equation, and where their operands start.
-
-    Constants of loops are listed too, which is harmless.
-    """
-    params, name = equation.params, equation.primitive.name
-    if name == "while":
-        # The operands of the body, without the operands of the predicate.
-        yield params["body_jaxpr"].jaxpr, params["cond_nconsts"]
-    elif name == "cond":
-        for branch in params["branches"]:
-            yield branch.jaxpr, 1
-    else:
-        inner = called_program(equation)
-        if inner is not None:
-            yield getattr(inner, "jaxpr", inner), 0

@@ -16,12 +16,22 @@ A kernel allocates only its scratch memory: up to 64 kB on the stack, and more b
 
 import numpy as np
 
-from ._graph import BranchInfo, Buffer, LoopInfo, Node, Region, Unsupported
+from ._graph import (
+    BranchInfo,
+    Buffer,
+    Function,
+    LoopInfo,
+    needed,
+    Node,
+    Region,
+    Unsupported,
+)
 from ._instructions import write
 from ._writer import (
     bits,
     literal,
     memory_type,
+    result_type,
     scalar_type,
     splat,
     suffix,
@@ -64,11 +74,14 @@ def emit(
     writer = Writer(width, contract)
     writer.lines.extend(_members(width))
     memory = _Memory(writer, live.buffers)
-    _Regions(writer, memory, live).write(live.in_region.get(root, []))
+    functions = _Functions(live)
+    _Regions(writer, memory, live, functions).write(live.in_region.get(root, []))
     writer.add("ret void")
     if memory.size > _LARGEST_SCRATCH:
         raise Unsupported(f"{memory.size} bytes of scratch memory")
-    return _module(writer, memory.size), writer.wanted
+    kernel = _module(writer, memory.size)
+    parts = [kernel, *functions.definitions(writer)]
+    return "\n".join([*parts, ""]), writer.wanted
 
 
 def _members(width: int) -> list[str]:
@@ -302,11 +315,96 @@ def _type(writer: Writer, node: Node, as_vector: bool) -> str:
     return vector(scalar_type(node.dtype), writer.width if as_vector else 1)
 
 
+def _typed(writer: Writer, node: Node, as_vector: bool) -> str:
+    return f"{_type(writer, node, as_vector)} {_operand(writer, node, as_vector)}"
+
+
 def _define(writer: Writer, node: Node, name: str) -> None:
     """Record the name of a node, and broadcast it to a vector where one is needed."""
     node.name = name
     if node.is_broadcast and not node.is_divergent:
         node.vector_name = writer.broadcast(name, scalar_type(node.dtype))
+
+
+# Functions
+
+
+class _Functions:
+    """The functions that a kernel calls, for vectors and for numbers."""
+
+    def __init__(self, live: LiveNodes):
+        # The results that are used, with their places: no others are computed.
+        self._used: dict[Function, dict[int, int]] = {}
+        self._names: dict[tuple[Function, int], str] = {}
+        for node in live.nodes:
+            if node.op == "part":
+                function, _ = _called(node.args[0])
+                places = self._used.setdefault(function, {})
+                places.setdefault(node.attr, len(places))
+
+    def call(self, writer: Writer, node: Node) -> str:
+        """Write a call, and return the name of its results."""
+        function, args = _called(node)
+        width = writer.width if node.is_divergent else 1
+        name = f"@program.{len(self._names)}"
+        name = self._names.setdefault((function, width), name)
+        given = ", ".join(_typed(writer, x, node.is_divergent) for x in args)
+        return writer.value(f"call {self._result(function, width)} {name}({given})")
+
+    def part(self, writer: Writer, node: Node) -> str:
+        """Write one of the results of a call."""
+        (whole,) = node.args
+        function, _ = _called(whole)
+        result = self._result(function, writer.width if whole.is_divergent else 1)
+        if len(self._used[function]) == 1:
+            return whole.name
+        place = self._used[function][node.attr]
+        return writer.value(f"extractvalue {result} {whole.name}, {place}")
+
+    def _result(self, function: Function, width: int) -> str:
+        dtypes = [function.outs[index].dtype for index in self._used[function]]
+        return result_type([vector(scalar_type(x), width) for x in dtypes])
+
+    def definitions(self, outer: Writer) -> list[str]:
+        """Write the functions that are called."""
+        return [
+            self._definition(outer.for_function(width), function, name)
+            for (function, width), name in self._names.items()
+        ]
+
+    def _definition(self, writer: Writer, function: Function, name: str) -> str:
+        outs = [function.outs[index] for index in self._used[function]]
+        is_divergent = writer.width > 1
+        for index, node in enumerate(function.parameters):
+            node.name = f"%a{index}"
+        for node in (*function.parameters, *needed(outs)):
+            node.is_divergent = is_divergent
+            if node.op != "parameter":
+                args = [_operand(writer, arg, is_divergent) for arg in node.args]
+                node.name = write(writer, node, writer.width, args)
+        result = self._result(function, writer.width)
+        if len(outs) == 1:
+            whole = _operand(writer, outs[0], is_divergent)
+        else:
+            whole = "poison"
+            for index, out in enumerate(outs):
+                number = _typed(writer, out, is_divergent)
+                whole = writer.value(f"insertvalue {result} {whole}, {number}, {index}")
+        writer.add(f"ret {result} {whole}")
+        given = ", ".join(_typed(writer, x, is_divergent) for x in function.parameters)
+        # With these attributes LLVM moves calls and merges equal ones.
+        attributes = "noinline nounwind willreturn memory(none)"
+        head = f"define internal {result} {name}({given}) {attributes}"
+        return writer.definition(head)
+
+
+def _called(node: Node) -> tuple[Function, list[Node]]:
+    """Return the function that a node calls, and its arguments."""
+    function, args = node.attr, list(node.args)
+    while function.general is not None:
+        function, given = function.general
+        args = [args[x] if isinstance(x, int) else x for x in given]
+    return function, args
 
 
 # Regions: loops and branches
@@ -320,8 +418,15 @@ class _Regions:
     enters is jumped over.
     """
 
-    def __init__(self, writer: Writer, memory: "_Memory", live: LiveNodes):
+    def __init__(
+        self,
+        writer: Writer,
+        memory: "_Memory",
+        live: LiveNodes,
+        functions: "_Functions",
+    ):
         self.writer, self.memory, self.live = writer, memory, live
+        self.functions = functions
         self.mask: str | None = None
         self.labels = 0
 
@@ -340,6 +445,10 @@ class _Regions:
                 self.memory.store(node, self._mask_of_store(node))
             elif op == "load":
                 _define(writer, node, self.memory.load(node))
+            elif op == "call":
+                node.name = self.functions.call(writer, node)
+            elif op == "part":
+                _define(writer, node, self.functions.part(writer, node))
             else:
                 width = writer.width if node.is_divergent else 1
                 args = [_operand(writer, arg, node.is_divergent) for arg in node.args]

@@ -15,13 +15,15 @@ infinities, NaN and -0.0 are unchanged. Only a structural zero makes a product z
 every value of the other factor.
 
 The order of this file: the data (regions, nodes, memory), `Graph`, the rules of
-simplification, and the builders of loops and branches.
+simplification, the builders of loops and branches, and functions: programs that are
+compiled once and called at several places.
 """
 
+import itertools
 import sys
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Hashable, Iterable, Sequence
 from functools import cache
-from typing import Any, TypeVar
+from typing import Any, TypeAlias, TypeVar
 
 import numpy as np
 
@@ -254,7 +256,7 @@ class Graph:
             simpler = _folded(self, op, args)
             if simpler is not None:
                 return simpler
-        if op in _COMMUTATIVE and first.number > last.number:
+        if op in COMMUTATIVE and first.number > last.number:
             args = (last, first)
             last = first
         if dtype is None:
@@ -279,7 +281,7 @@ class Graph:
 
 
 COMPARISONS = frozenset(("eq", "ne", "lt", "le", "gt", "ge", "is_finite"))
-_COMMUTATIVE = frozenset(("add", "mul", "max", "min", "and", "or", "xor", "eq", "ne"))
+COMMUTATIVE = frozenset(("add", "mul", "max", "min", "and", "or", "xor", "eq", "ne"))
 
 
 def converted(value: Any, dtype: str) -> Any:
@@ -675,3 +677,155 @@ class BranchBuilder:
             for index, node in enumerate(yes)
         ]
         return info.results
+
+
+# Functions
+
+# A run calls each function of a system, and its derivatives, at ten places and more:
+# without functions, LLVM would compile a copy at each of them. A program becomes a
+# function if it is long and pure arithmetic on numbers. Operands that are constants are
+# part of the function, so that zeros and ones are simplified as in a copy.
+#
+# A copy shares its common subexpressions with its surroundings, and its invariant
+# operations are hoisted out of loops. Therefore programs are still written out in
+# loops, except in a loop that contains an iteration, such as the loop over the steps of
+# a run.
+#
+# A function is a region of its own, whose nodes depend on the nodes `parameter`. A node
+# `call` stands for all results, and a node `part` for one of them. Both are pure, so
+# that calls with equal arguments are merged, and calls without users are removed.
+
+# Shorter programs are written out: they gain too little time.
+_SHORTEST = 500
+# A function with constants is replaced by one without if it saves less than this part.
+_LEAST_GAIN = 0.1
+# A function needs neither memory nor jumps.
+_STATEMENTS = frozenset(
+    ("load", "store", "loop", "branch", "param", "result", "call", "part")
+)
+
+# The operands of a program: its constants, and `None` for the other numbers.
+_Pattern: TypeAlias = tuple[Node | None, ...]
+
+
+class Function:
+    """A program in a region of its own.
+
+    - `parameters`: the numbers that it is called with.
+    - `outs`: its results.
+    - `nodes`: the nodes that compute the results, in order.
+    - `general`: the function that is called instead, with its arguments: constants, and
+        indices of arguments of this function.
+    """
+
+    __slots__ = ("general", "nodes", "outs", "parameters")
+
+    def __init__(self, parameters: list[Node], outs: list[Node]):
+        self.parameters, self.outs = parameters, outs
+        self.nodes = needed(outs)
+        self.general: tuple[Function, list[Node | int]] | None = None
+
+    @property
+    def is_shared(self) -> bool:
+        """Whether the function is long, and computes with numbers only."""
+        is_pure = all(node.op not in _STATEMENTS for node in self.nodes)
+        return is_pure and len(self.nodes) >= _SHORTEST
+
+    def structure(self) -> Hashable:
+        """Return a value that is equal for functions that compute the same."""
+        places = {node: k for k, node in enumerate(self.parameters)}
+
+        def place(node: Node) -> int:
+            # Constants are the same nodes in all functions, whose numbers are positive.
+            return -node.number if node.is_constant else places[node]
+
+        lines: list[Hashable] = []
+        for node in self.nodes:
+            if node.op != "parameter":
+                args = list(map(place, node.args))
+                if node.op in COMMUTATIVE:
+                    args.sort()
+                lines.append((node.op, node.dtype, node.attr, *args))
+                places[node] = len(places)
+        kinds = [node.dtype for node in self.parameters]
+        return (*kinds, *lines, *map(place, self.outs))
+
+
+class Functions:
+    """The functions of a kernel."""
+
+    def __init__(self):
+        # For each program, its functions by the constants among the operands; `None`
+        # for those that are written out.
+        self._found: dict[Any, dict[_Pattern, Function | None]] = {}
+        self._by_structure: dict[Hashable, Function] = {}
+
+    def of(
+        self, program: Any, numbers: list[Node], build: Callable[[], Function | None]
+    ) -> Function | None:
+        """Return the function of a program, or `None` if it is to be written out."""
+        pattern = tuple(node if node.is_constant else None for node in numbers)
+        variants = self._found.setdefault(program, {})
+        if pattern not in variants:
+            made = build()
+            if made is not None and made.is_shared:
+                made = self._by_structure.setdefault(made.structure(), made)
+                for other, function in variants.items():
+                    if function is not None and function is not made:
+                        _unify(made, pattern, function, other)
+                        _unify(function, other, made, pattern)
+            else:
+                made = None
+            variants[pattern] = made
+        return variants[pattern]
+
+
+def _unify(one: Function, own: _Pattern, general: Function, wider: _Pattern) -> None:
+    """Let a function call another one that has fewer constants, if it is as short."""
+    pairs = list(zip(own, wider, strict=True))
+    is_wider = all(b is None or a is b for a, b in pairs)
+    is_short = len(one.nodes) >= (1 - _LEAST_GAIN) * len(general.nodes)
+    if is_wider and is_short and one.general is None:
+        indices = itertools.count()
+        given = [next(indices) if a is None else a for a in own]
+        kept = [x for x, b in zip(given, wider, strict=True) if b is None]
+        one.general = general, kept
+
+
+def needed(outs: Sequence[Node]) -> list[Node]:
+    """Return the nodes that some nodes depend on, without constants, in order."""
+    found, waiting = set(), list(outs)
+    while waiting:
+        node = waiting.pop()
+        if node not in found and not node.is_constant:
+            found.add(node)
+            waiting.extend(node.args)
+    return sorted(found, key=lambda node: node.number)
+
+
+def parameters_for(
+    graph: Graph, region: Region, values: Sequence[np.ndarray]
+) -> tuple[list[np.ndarray], list[Node]]:
+    """Return arrays of parameters in place of the numbers that are not constant."""
+    arrays, parameters = [], []
+    for value in values:
+        array = np.empty(value.size, object)
+        for index, node in enumerate(value.reshape(-1)):
+            if node.is_constant:
+                array[index] = node
+            else:
+                number = graph.next_number()
+                made = Node("parameter", (), node.dtype, region, number)
+                array[index] = made
+                parameters.append(made)
+        arrays.append(array.reshape(value.shape))
+    return arrays, parameters
+
+
+def call(graph: Graph, function: Function, args: Sequence[Node]) -> list[Node]:
+    """Create a call of a function, and return its results."""
+    node = graph.pure("call", tuple(args), "struct", function)
+    return [
+        out if out.is_constant else graph.pure("part", (node,), out.dtype, index)
+        for index, out in enumerate(function.outs)
+    ]

@@ -51,6 +51,8 @@ _ARITHMETIC = {"add", "add_any", "div", "mul", "neg", "sub"}
 SMALL_PRODUCT = "small_product"
 # nhjax's own operation, a call of a program that is kept with its derivatives.
 KEPT_CALL = "kept_call"
+# Functions under `jax.jit` whose names begin with this are compiled once, and called.
+COMPILED_ONCE = "compiled_once_"
 # These operations contain programs; the operations of these programs are checked too.
 CALLING = """
     checkpoint closed_call custom_jvp_call custom_vjp_call jit kept_call remat2

@@ -107,6 +107,13 @@ class Writer:
         self.wanted: dict[tuple[str, str, int], None] = {}
         self.helpers: dict[str, str] = {}
 
+    def for_function(self, width: int) -> "Writer":
+        """Return a writer for another function of the same module."""
+        writer = Writer(width)
+        writer.contract = self.contract
+        writer.wanted = self.wanted
+        return writer
+
     def new_name(self) -> str:
         """Return a name that is not in use."""
         self.count += 1
