@@ -28,6 +28,7 @@ DOCS = Path(__file__).parent
 FOLDER = DOCS.parent / "notebooks"
 THUMBNAILS = DOCS / "notebooks"
 LARGEST_FIGURE = 60_000  # bytes
+LARGEST_THUMBNAIL = 30_000  # bytes
 # In the order of the page and of the site.
 GROUPS = {
     "First steps": ("quickstart", "own_machine"),
@@ -144,13 +145,18 @@ def _kept(outputs: list[Any]) -> list[Any]:
 def _compressed(data: str) -> str:
     """Return a PNG with a palette and without metadata."""
     picture = Image.open(io.BytesIO(base64.b64decode(data))).convert("RGB")
-    for colours in (256, 64, 16):
+    return base64.b64encode(_with_palette(picture, LARGEST_FIGURE)).decode()
+
+
+def _with_palette(picture: Image.Image, largest: int) -> bytes:
+    """Return a PNG of at most `largest` bytes, with as many colours as they allow."""
+    for colours in (256, 64, 48, 32, 16):
         file = io.BytesIO()
         fewer = picture.quantize(colours, dither=Image.Dither.NONE)
         fewer.save(file, format="png", optimize=True)
-        if file.tell() <= LARGEST_FIGURE:
-            break
-    return base64.b64encode(file.getvalue()).decode()
+        if file.tell() <= largest:
+            return file.getvalue()
+    raise ValueError(f"A figure has more than {largest} bytes with 16 colours.")
 
 
 def _thumbnail(figure: bytes) -> bytes:
@@ -159,9 +165,7 @@ def _thumbnail(figure: bytes) -> bytes:
     picture.thumbnail((480, 300), Image.Resampling.LANCZOS)
     canvas = Image.new("RGB", (480, 300), "white")
     canvas.paste(picture, ((480 - picture.width) // 2, (300 - picture.height) // 2))
-    file = io.BytesIO()
-    canvas.quantize(64, dither=Image.Dither.NONE).save(file, "png", optimize=True)
-    return file.getvalue()
+    return _with_palette(canvas, LARGEST_THUMBNAIL)
 
 
 def page() -> str:

@@ -38,7 +38,10 @@ def test_notebook_outputs_are_small_and_equal_in_each_run(name):
     for picture in pictures:
         assert len(picture) <= notebooks.LARGEST_FIGURE
         assert Image.open(io.BytesIO(picture)).info.keys() <= {"dpi", "transparency"}
-    assert len((notebooks.THUMBNAILS / f"{name}.png").read_bytes()) < 30_000
+    assert (
+        len((notebooks.THUMBNAILS / f"{name}.png").read_bytes())
+        <= notebooks.LARGEST_THUMBNAIL
+    )
     for cell in notebook["cells"]:
         for output in cell.get("outputs", []):
             assert output.get("name") != "stderr"

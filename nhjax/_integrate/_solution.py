@@ -209,7 +209,7 @@ class Solution(eqx.Module):
                 "Solution.failures() needs a computed solution, outside jit and vmap. "
                 "Inside them, use `sol.result` and `sol.stats['failed_step']`."
             )
-        return _failures(outcome)
+        return _failures(outcome, self.coordinates)
 
 
 class _Outcome(NamedTuple):
@@ -256,24 +256,28 @@ def raise_failures(
     if sol.events is not None:
         bad = bad & (outcome.codes != messages().index(EVENT_OCCURRED))
     if is_traced(*outcome, dt):
-        return raise_where(sol, bad, partial(_failure, used_newton), (outcome, dt))
+        failure = partial(_failure, used_newton, sol.coordinates)
+        return raise_where(sol, bad, failure, (outcome, dt))
     if np.any(bad):
-        raise _failure(used_newton, bad, (outcome, dt))
+        raise _failure(used_newton, sol.coordinates, bad, (outcome, dt))
     return sol
 
 
 def _failure(
-    used_newton: bool, bad: Any, values: tuple[_Outcome, Any]
+    used_newton: bool,
+    names: tuple[str, ...] | None,
+    bad: Any,
+    values: tuple[_Outcome, Any],
 ) -> IntegrationError:
     outcome, dt = values
     first = tuple(np.argwhere(bad)[0])
     size = None if dt is None else float(np.broadcast_to(dt, np.shape(bad))[first])
-    message = _failure_message(_failures(outcome), size)
+    message = _failure_message(_failures(outcome, names), size)
     return IntegrationError(message.replace(FALLBACK, "") if used_newton else message)
 
 
 def _failures(
-    outcome: _Outcome,
+    outcome: _Outcome, names: tuple[str, ...] | None
 ) -> list[tuple[int | tuple[int, ...] | None, int, str]]:
     codes, steps, coordinates = map(np.asarray, outcome)
     texts, failures = messages(), []
@@ -281,9 +285,10 @@ def _failures(
         message, coordinate = texts[int(codes[index])], int(coordinates[index])
         # Other failures are not due to a single equation.
         if "stage equations" in message and coordinate >= 0:
+            name = "" if names is None else f" ({names[coordinate]})"
             message += (
-                " The largest residual, or one that is not a number, was that of "
-                f"coordinate {coordinate}."
+                " The equation with the largest residual, or with one that is not a "
+                f"number, belongs to coordinate {coordinate}{name}."
             )
         if message not in ("", EVENT_OCCURRED):
             failures.append((member_name(index), int(steps[index]), message))
@@ -302,4 +307,9 @@ def _failure_message(
     message = f"Integration failed in {where}step {k}{others}: {reason}"
     if k > 0:
         message += " With `throw=False` the part before the failure is returned."
+        if "stage equations" in reason:
+            message += (
+                " If its last steps are ever faster, as in a fall, the motion itself "
+                "leads to the failure: end the run earlier with an `nhjax.Event`."
+            )
     return message

@@ -159,15 +159,18 @@ class AbstractExample(eqx.Module):
         value, momentum = jax.value_and_grad(self.lagrangian, argnums=2)(t, q, v, None)
         return momentum @ v - value
 
-    def initial_state(self, dtype: DTypeLike | None = None) -> State:
+    def initial_state(
+        self, dtype: DTypeLike | None = None, *, args: Args = None
+    ) -> State:
         """Create the consistent state at (`q0`, `v0`).
 
-        `dtype` defaults to JAX's default float.
+        `dtype` defaults to JAX's default float. `args` are the `args` of the run: its
+        forces determine the multiplier.
         """
         if dtype is None:
             dtype = jnp.result_type(float)
         q0, v0 = jax.tree.map(lambda x: x.astype(dtype), (self.q0, self.v0))
-        return initial_state(self.system, q0, v=v0)
+        return initial_state(self.system, q0, v=v0, args=args)
 
 
 class AbstractNonholonomicExample(AbstractExample):

@@ -33,6 +33,18 @@ from ._frames import (
 )
 
 
+_COORDINATES = (
+    "x",
+    "y",
+    "yaw",
+    "lean",
+    "pitch",
+    "steer",
+    "rear_wheel",
+    "front_wheel",
+)
+
+
 class WhippleBicycle(AbstractNonholonomicExample):
     """A bicycle of four rigid bodies that rolls on two thin wheels.
 
@@ -43,15 +55,26 @@ class WhippleBicycle(AbstractNonholonomicExample):
     q = (x, y, ψ, φ, θ, δ, θ_R, θ_F): the contact point of the rear wheel [m], yaw, lean
     (to the right), pitch of the rear frame, steer (to the right) and the angles of the
     wheels relative to their frames [rad]; a wheel that rolls forward has a negative
-    rate. The coordinates imply that the rear wheel touches the ground. The holonomic
+    rate. Lean is `q[3]` and steer is `q[5]`; the names are x, y, yaw, lean, pitch,
+    steer, rear_wheel and front_wheel. In a plot of (x, y), a turn to the right looks
+    like a turn to the left, because y points to the right.
+
+    The coordinates imply that the rear wheel touches the ground. The holonomic
     constraint is the depth of the front wheel's lowest point below the ground, and Φ
     are the horizontal velocities in space of the points of the rear and of the front
     wheel that touch the ground. The multipliers are the forces (x, y) of the ground on
     the rear and on the front wheel, and the force z on the front wheel.
 
-    `steering` is the torque on the steer axis as a function (t, q, v, args):
-    `SteerTorque()`, `LeanToSteer()`, your own function, or None for an uncontrolled
-    bicycle, whose energy is conserved.
+    `WhippleBicycle.running(speed, lean=, lean_rate=, steer=, steer_rate=)` creates a
+    bicycle that rolls; all of them are zero by default, except the speed of 4.6 m/s.
+    `steering` is the torque on the steer axis: `SteerTorque()`, a number in `args`;
+    `LeanToSteer(lean_gain=0.0, lean_rate_gain=20.0)`, a rider; your own function
+    (t, q, v, args); or None for an uncontrolled bicycle, whose energy is conserved. If
+    your function needs `args`, pass them also to `initial_state(args=...)`.
+
+    A bicycle that falls moves faster and faster, until no step size is small enough:
+    nothing stops its handlebar. End a run by an `Event` while |lean| < 0.8 and
+    |steer| < 1.
 
     **Parameters:** `wheelbase` w, `trail` c [m], `tilt` λ of the steer axis [rad],
     `gravity` g [m/s²]; of the wheels `rear_radius`, `front_radius` [m],
@@ -154,6 +177,7 @@ class WhippleBicycle(AbstractNonholonomicExample):
             nonholonomic=self.constraint,
             holonomic=self.holonomic,
             force=None if self.steering is None else self.force,
+            coordinates=_COORDINATES,
         )
 
     def lagrangian(self, t: FloatScalarLike, q: Array, v: Array, args: Args) -> Array:

@@ -140,9 +140,31 @@ def test_failure_message_names_coordinate_and_smaller_dt():
     stats = run_with(0.25, throw=False).stats
     assert (stats["failed_step"], stats["worst_coordinate"]) == (0, 1)
     assert run_with(1e-6).stats["worst_coordinate"] == -1
-    message = r"of coordinate 1\. `dt` is 0\.25: if all forces are smooth, try 0\.125\."
+    message = r"to coordinate 1\. `dt` is 0\.25: if all forces are smooth, try 0\.125\."
     with pytest.raises(nhjax.IntegrationError, match=message):
         run_with(0.25)
     # Each lane has a step of its own.
     with pytest.raises(Exception, match=f"member 1, step 0: .*{message}"):
         jax.vmap(run_with)(jnp.asarray([1e-6, 0.25]))
+
+
+def test_failure_message_of_accelerating_motion_names_coordinate_and_event():
+    # The second coordinate goes to infinity as 1 / (1 - t).
+    system = nhjax.LagrangianSystem(
+        lambda t, q, v, args: 0.5 * (v @ v) + 0.5 * q[1] ** 4,
+        coordinates=("drift", "height"),
+    )
+    y0 = nhjax.initial_state(system, jnp.ones(2), jnp.ones(2))
+    with pytest.raises(nhjax.IntegrationError) as error:
+        nhjax.integrate(
+            system,
+            nhjax.LobattoIIIAB(3),
+            y0,
+            dt=0.0625,
+            t1=2.0,
+            stage_solver=nhjax.Newton(),
+        )
+    text = str(error.value)
+    assert "belongs to coordinate 1 (height)." in text
+    assert text.endswith("end the run earlier with an `nhjax.Event`.")
+    assert int(text.split("in step ")[1].split(":")[0]) in range(10, 18)

@@ -53,3 +53,17 @@ def test_initial_state_with_force_args_of_wrong_shape_raises():
     robot, _, _ = MACHINES["robot"]
     with pytest.raises(nhjax.ShapeError, match=r"torques of the motors .* \(2,\), got"):
         nhjax.initial_state(robot.system, robot.q0, robot.v0, args=jnp.ones((3, 2)))
+
+
+def test_initial_state_of_example_with_args_computes_multiplier_for_its_forces():
+    def steering(t, q, v, args):
+        return args["gain"] * v[3]
+
+    bicycle = WhippleBicycle(steering=steering)
+    args = {"gain": jnp.asarray(10.0)}
+    y0 = bicycle.initial_state(args=args)
+    expected = nhjax.continuous_multiplier(bicycle.system, 0.0, y0, args)
+    np.testing.assert_allclose(y0.multiplier, expected, rtol=1e-12, atol=1e-12)
+    free = WhippleBicycle().initial_state()
+    assert np.max(np.abs(y0.multiplier - free.multiplier)) > 1.0
+    assert bicycle.system.coordinates[5] == "steer"
