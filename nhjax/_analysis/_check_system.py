@@ -276,8 +276,17 @@ def _derivatives(system, t, q, u, args, near) -> dict[str, Any]:
         }
         return by_time, jnp.concatenate(by_position), second
 
+    def constraint_rows(xi, u):
+        g = manifold.act(q, xi)
+        return jax.jacfwd(system.constraint, argnums=2)(t, g, u, args)
+
     by_time, by_position, second = jax.vmap(sample)(*near)
-    rows = jax.jacfwd(system.constraint, argnums=2)(t, q, u, args)
+    rows = constraint_rows(jnp.zeros_like(u), u)
+    # The square of an expression has a row that is zero where the constraint holds.
+    elsewhere = jnp.max(jnp.abs(jax.vmap(constraint_rows)(*near)), axis=(0, 2))
+    zero = jnp.finfo(u.dtype).eps ** 0.75 * elsewhere
+    vanishes = jnp.max(jnp.abs(rows), axis=1) <= zero
+    rows = jnp.where(vanishes[:, None], 0, rows)
     mass, rows = convert_to_velocities(system, hessian(t, jnp.zeros_like(u), u), rows)
     return {
         "constraints": system.constraint(t, q, u, args),

@@ -161,6 +161,14 @@ def list_checks(
             Check(~deficient, _dependence_error, (*case, rank))
             for rank, deficient in zip(found.ranks, found.deficient, strict=True)
         ],
+        *[
+            Check(
+                all_finite(rank.jacobian) | ~rank.is_active,
+                _derivative_error,
+                (*case, rank),
+            )
+            for rank in found.ranks
+        ],
         Check(found.projected, _projection_error, case),
         Check(
             all_finite(
@@ -218,12 +226,28 @@ def _legendre_error(case: _Case) -> NewtonError:
     )
 
 
+def _derivative_error(case: _Case, rank: RankCondition) -> NonFiniteError:
+    rows, k = np.asarray(rank.jacobian), case.found.positions.shape[0]
+    bad = int(np.flatnonzero(~np.all(np.isfinite(rows), axis=1))[0])
+    m, words = rows.shape[0] - k, case.words
+    name, variable = (f"{words.constraint}[{bad}]", words.coordinate)
+    if bad >= m:
+        name, variable = f"Γ[{bad - m}]", "q"
+    return NonFiniteError(
+        f"{name}, or its derivative with respect to {variable}, is not finite at q = "
+        f"{rank.q}, {case.given_name} = {case.given}. Check it there. `jnp.sqrt` and "
+        "`jnp.linalg.norm` have no derivative at 0: in place of the length of a "
+        "vector, pass its components as constraints."
+    )
+
+
 def _projection_error(case: _Case) -> NewtonError:
     return NewtonError(
         f"The state could not be projected onto the constraints from {case.where}: "
         f"Newton's method stopped at q = {case.found.state.q}, {case.reached} with "
         f"{case.violations}. Start nearer to the constraints"
-        f"{_or_keep_fewer(*case.keep)}."
+        f"{_or_keep_fewer(*case.keep)}. In place of a square, pass the expression "
+        "itself: the derivative of a square is zero where the constraint holds."
     )
 
 

@@ -200,13 +200,16 @@ def dependence_error(
     zero = [a for a in range(m + k) if not np.any(rows[a])]
     if zero and zero[0] < m:
         advice = (
-            f"{names[zero[0]]} does not depend on velocities there; pass a "
-            "constraint on positions as `holonomic`."
+            f"The derivatives of {names[zero[0]]} with respect to velocities are zero "
+            "there. Pass a constraint on positions as `holonomic`. In place of a "
+            "square, pass the expression itself: the derivative of a square is zero "
+            "where the constraint holds."
         )
     elif zero:
         advice = (
-            f"{names[zero[0]]} has no gradient there; rewrite it so that its gradient "
-            "is nonzero where the constraint holds."
+            f"{names[zero[0]]} has no gradient there. In place of a square, pass the "
+            "expression itself: the derivative of a square is zero where the "
+            "constraint holds."
         )
     elif _rank(rows[:m]) + _rank(rows[m:]) > _rank(rows):
         advice = (

@@ -119,14 +119,16 @@ def _finite_or_zero(x: Array) -> Array:
 class FunctionNoise(NamedTuple):
     """The round-off of the functions of a system at a state, a number for each value.
 
-    The functions are the momentum, the free force, all constraints on velocities and
-    the holonomic constraints on positions.
+    The functions are the momentum, the free force, all constraints on velocities, the
+    holonomic constraints on positions and, with a `direction`, the derivatives of all
+    constraints along this direction of u.
     """
 
     momentum: Float[Array, " n"]
     force: Float[Array, " n"]
     on_velocities: Float[Array, " l"]
     on_positions: Float[Array, " k"]
+    slopes: Float[Array, " l"] | None = None
 
     @property
     def violations(self) -> tuple[Float[Array, " l"], Float[Array, " k"]]:
@@ -143,6 +145,7 @@ def function_noise(
     u: Float[Array, " n"],
     multiplier: Float[Array, " l"],
     args: Args,
+    direction: Float[Array, " n"] | None = None,
 ) -> FunctionNoise:
     """Measure the round-off of the functions of a system at (t, q, u).
 
@@ -153,14 +156,25 @@ def function_noise(
     system, args, multiplier = stop_gradient((system, args, multiplier))
 
     def values(t, q, u):
+        slopes = None
+        if direction is None:
+            constraint = system.constraint(t, q, u, args)
+        else:
+
+            def along(u):
+                return system.constraint(t, q, u, args)
+
+            constraint, slopes = jax.jvp(along, (u,), (direction,))
         return FunctionNoise(
             system.momentum(t, q, u, args),
             system.free_force(t, q, u, multiplier, args),
-            system.constraint(t, q, u, args),
+            constraint,
             system.position_constraint(t, q, args),
+            slopes,
         )
 
-    like = FunctionNoise(u, u, multiplier, positions)
+    slopes = None if direction is None else multiplier
+    like = FunctionNoise(u, u, multiplier, positions, slopes)
     return noise_near(values, system.manifold_of(q), t, q, u, like)
 
 
