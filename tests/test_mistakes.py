@@ -338,8 +338,8 @@ VALUES_OF_FUNCTIONS = [
         "gave a constraint on positions as a nonholonomic one",
         lambda: start(system_with(nonholonomic=lambda t, q, v, args: q[1] - Q[1])),
         DependentConstraintsError,
-        "nonholonomic[0] does not depend on velocities there",
-        "pass a constraint on positions as `holonomic`",
+        "nonholonomic[0] with respect to velocities are zero there",
+        "Pass a constraint on positions as `holonomic`",
     ),
     row(
         "wrote a holonomic constraint as a square",

@@ -503,7 +503,7 @@ REFUSED = {
         _text(geom="").replace(
             "<worldbody>", '<worldbody><geom name="floor" size="1"/>'
         ),
-        "'floor' and 'g' can touch",
+        r"'floor' \(a sphere of the world\) and 'g' \(a sphere of the body 'b'\) can",
         "contacts",
     ),
     "friction": (
@@ -550,7 +550,9 @@ WRONG = [
     (_text(), {"ignore": ["walls"]}, "each word of `ignore` must be one of"),
     (_text(), {"ignore": "limits"}, r"write `ignore=\('limits',\)`"),
     (_text(), {"root": "free"}, "`root` is for URDF files only"),
-    (_text(), {"rolling": ["h"]}, "`rolling` has 'h', but the geoms are g"),
+    (_text(), {"rolling": ["h"]}, "`rolling` has 'h', but the geoms are 'g' .a sphere"),
+    (_text(), {"motors": "x"}, r"write `motors=\('x',\)`"),
+    (_text(), {"motors": ["x"]}, "`motors` has 'x', but the joints that can have"),
     (_text(), {"rolling": "g"}, r"write `rolling=\('g',\)`"),
     (_text(), {"rolling": {"g": "fast"}}, "must be one of 'no slip'"),
     (_text(), {"rolling": ["g"]}, "is 0.1 m below the ground"),
@@ -669,3 +671,110 @@ def test_missing_mujoco_is_named_with_its_extra(monkeypatch):
     monkeypatch.setitem(sys.modules, "mujoco", None)
     with pytest.raises(ImportError, match=re.escape('pip install "nhjax[robots]"')):
         nhjax.from_mujoco("robot.xml")
+
+
+# Wheels and motors of a URDF file
+
+URDF_LINK = """<link name="{name}"><inertial><mass value="{mass}"/>
+<inertia ixx="{j}" iyy="{j}" izz="{j}" ixy="0" ixz="0" iyz="0"/></inertial>
+<collision><origin rpy="{turned}"/><geometry>{shape}</geometry></collision></link>"""
+URDF_JOINT = """<joint name="{side}_joint" type="continuous"><parent link="base"/>
+<child link="{side}_wheel"/><origin xyz="0 {y} 0" rpy="-1.5707963267948966 0 0"/>
+<axis xyz="{axis}"/></joint>"""
+CASTER = """<link name="caster"><inertial><mass value="0.1"/>
+<inertia ixx="1e-4" iyy="1e-4" izz="1e-4" ixy="0" ixz="0" iyz="0"/></inertial>
+<collision><geometry><sphere radius="0.03"/></geometry></collision></link>
+<joint name="holder" type="fixed"><parent link="base"/><child link="caster"/>
+<origin xyz="0.15 0 -0.04"/></joint>"""
+WHEELS = ["left_wheel", "right_wheel"]
+
+
+def _urdf_cart(folder, axis="0 0 1", turned="0 0 0", caster=False, **options):
+    """A cart on two wheels whose cylinders have no names."""
+    text = '<robot name="cart"><mujoco><compiler fusestatic="false"/></mujoco>'
+    given = {"name": "base", "mass": 4, "j": 0.03, "turned": "0 0 0"}
+    text += URDF_LINK.format(shape='<box size="0.4 0.2 0.05"/>', **given)
+    wheel = '<cylinder radius="0.07" length="0.03"/>'
+    for side, y in (("left", 0.15), ("right", -0.15)):
+        given = {"name": f"{side}_wheel", "mass": 0.3, "j": 5e-4, "turned": turned}
+        text += URDF_LINK.format(shape=wheel, **given)
+        text += URDF_JOINT.format(side=side, y=y, axis=axis)
+    path = folder / "cart.urdf"
+    path.write_text(text + CASTER * caster + "</robot>")
+    chosen = {
+        "rolling": WHEELS,
+        "root": "planar",
+        "ground": rolling.Plane(height=-0.07),
+        "motors": ["left_joint", "right_joint"],
+        "ignore": ("contacts",),
+    }
+    return nhjax.from_mujoco(path, **(chosen | options))
+
+
+def test_urdf_with_motors_drives_as_forces_on_its_joints(tmp_path):
+    robot = _urdf_cart(tmp_path)
+    assert robot.controls == ("left_joint", "right_joint")
+    assert robot.contacts.names == tuple(WHEELS)
+    args = {"controls": jnp.array([0.02, 0.05])}
+    y0 = robot.initial_state(args=args)
+    found = nhjax.motion(robot.system, 0.0, y0, args).acceleration
+    # Each wheel pushes with torque / radius; m_e and J_e include the turning wheels.
+    left, right = args["controls"] / 0.07
+    mass = 4.6 + 2 * 5e-4 / 0.07**2
+    inertia = 0.031 + 0.6 * 0.15**2 + 2 * 5e-4 * (0.15 / 0.07) ** 2
+    forward, turning = (left + right) / mass, 0.15 * (right - left) / inertia
+    np.testing.assert_allclose(found[:3], [forward, 0.0, turning], atol=1e-12)
+
+
+def test_robot_with_controls_of_user_takes_gains_of_any_structure(tmp_path):
+    def controls(t, qpos, qvel, args):
+        gains = args["controls"]
+        return gains["torque"] - gains["damping"] * qvel[3:]
+
+    robot = _urdf_cart(tmp_path, controls=controls)
+
+    def distance(damping):
+        args = {"controls": {"torque": jnp.full(2, 0.05), "damping": damping}}
+        y0 = robot.initial_state(args=args)
+        method = nhjax.LobattoIIIAB(2)
+        sol = nhjax.integrate(
+            robot.system, method, y0, dt=0.05, num_steps=10, args=args
+        )
+        return sol.ys.q[-1, 0]
+
+    slope = jax.jit(jax.grad(distance))(0.01)
+    run = jax.jit(distance)
+    change = (run(0.0101) - run(0.0099)) / 2e-4
+    np.testing.assert_allclose(slope, change, rtol=1e-5)
+    assert slope < 0
+
+
+def test_wheel_that_cannot_turn_about_its_axis_warns(tmp_path):
+    with pytest.warns(UserWarning, match="does not turn it about its axis"):
+        _urdf_cart(tmp_path, axis="0 1 0")
+
+
+def test_wheel_that_lies_flat_raises(tmp_path):
+    with pytest.raises(ValueError, match="'left_wheel' lies flat on the ground"):
+        _urdf_cart(tmp_path, turned="1.5707963267948966 0 0")
+
+
+def test_fixed_sphere_without_slip_warns_and_sliding_one_carries_load(tmp_path):
+    options = {"caster": True, "root": "free", "ground": None}
+    rolls = [*WHEELS, "caster"]
+    with pytest.warns(UserWarning, match=r"'caster': \"slides\"") as record:
+        _urdf_cart(tmp_path, rolling=rolls, **options)
+    assert len(record) == 1
+    kinds = dict.fromkeys(WHEELS, "no slip") | {"caster": "slides"}
+    robot = _urdf_cart(tmp_path, rolling=kinds, **options)
+    y0 = robot.initial_state(project=True)
+    forces = robot.contacts.forces(0.0, y0, robot.args)
+    # The caster is 0.15 m before the axle and carries its own weight only.
+    upwards = [float(forces[name][2]) for name in rolls]
+    np.testing.assert_allclose(upwards, [2.3 * 9.81, 2.3 * 9.81, 0.981], rtol=1e-10)
+
+
+def test_motors_of_compiled_model_raise():
+    model = _compiled(_text())
+    with pytest.raises(ValueError, match="an MjModel cannot get `motors`"):
+        nhjax.from_mujoco(model, motors=["x"])

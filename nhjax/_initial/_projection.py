@@ -456,7 +456,8 @@ def _nearest(
         value, pullback = jax.vjp(constraint, y)
         if idle is not None:
             value = value + idle * multiplier
-        return metric @ (y - x) - pullback(multiplier)[0], value
+        # With this sign the derivatives are symmetric.
+        return metric @ (y - x) - pullback(multiplier)[0], -value
 
     solved = root(
         stationarity,

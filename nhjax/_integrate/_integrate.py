@@ -23,7 +23,14 @@ from .._custom_types import (
     IntScalar,
     PhaseFunction,
 )
-from .._errors import Check, hold, is_traced, require, ShapeError
+from .._errors import (
+    Check,
+    hold,
+    IntegrationError,
+    is_traced,
+    require,
+    ShapeError,
+)
 from .._method import AbstractMethod, Gauss, LobattoIIIAB, PartitionedRungeKutta
 from .._numerics import nan_unless
 from .._results import RESULTS
@@ -37,6 +44,7 @@ from .._system import (
     AbstractMechanicalSystem,
     check_flag,
     check_type,
+    describe_inconsistency,
     finite,
     HamiltonianSystem,
     LagrangianSystem,
@@ -481,9 +489,15 @@ def _require_constraints(
     y0: State,
     args: Args,
 ) -> None:
-    """Raise for dependent constraints if they made a run fail at its start."""
-    if not _is_tracing() and is_singular_from_the_start(sol):
+    """Raise with the details if a run failed at its start because of constraints."""
+    if _is_tracing():
+        return
+    if is_singular_from_the_start(sol):
         require_independent(system, t0, y0, args)
+    if ended_as(sol, "inconsistent_start"):
+        message = sol.failures()[0][2]
+        details = describe_inconsistency(system, t0, y0, args)
+        raise IntegrationError(f"Integration failed in step 0: {message} {details}")
 
 
 def _invalid_unless(valid: BoolScalar, sol: Solution) -> Solution:

@@ -272,7 +272,9 @@ class AbstractMethod(eqx.Module):
             )
         if self.closure != "symmetric":
             return
-        alternatives = "use closure='propagated' or 'consistent'"
+        alternatives = "use closure='consistent'"
+        if size <= 1 + _UNIT_TOLERANCE:
+            alternatives = "use closure='propagated' or 'consistent'"
         if not math.isclose(size, 1, rel_tol=_UNIT_TOLERANCE):
             self._reject(
                 f"closure='symmetric' needs |R_A(∞)| = 1, but it is {size:.6g}; "

@@ -218,17 +218,13 @@ def _roots(matrix: Float[Array, "l l"]) -> Float[Array, " l"]:
 
 
 def least_norm_solve(matrix: Float[Array, "l l"], b: Array) -> Array:
-    """Solve nearly dependent equations, ignoring small singular values.
+    """Solve nearly dependent symmetric equations, ignoring small singular values.
 
     Rows and columns are first scaled to size one. This is for Newton's method with
     equations that are dependent at the solution.
     """
-
-    def sizes(x, axis):
-        largest = jnp.max(jnp.abs(x), axis=axis, keepdims=True)
-        return jnp.sqrt(jnp.where(largest > 0, largest, 1))
-
-    rows, columns = sizes(matrix, 1), sizes(matrix, 0)
-    scaled = matrix / rows / columns
-    found = jnp.linalg.pinv(scaled, rtol=NEARLY_DEPENDENT) @ (b / rows[:, 0])
-    return found / columns[0]
+    largest = jnp.max(jnp.abs(matrix), axis=1)
+    size = jnp.sqrt(jnp.where(largest > 0, largest, 1))
+    scaled = matrix / size[:, None] / size[None, :]
+    inverse = jnp.linalg.pinv(scaled, rtol=NEARLY_DEPENDENT, hermitian=True)
+    return inverse @ (b / size) / size

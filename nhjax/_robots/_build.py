@@ -1,5 +1,6 @@
 """The conversion of a compiled model of MuJoCo to the arrays that nhjax uses."""
 
+import warnings
 from collections.abc import Mapping, Sequence
 from itertools import pairwise
 from typing import Any, NamedTuple
@@ -22,7 +23,14 @@ from ._dynamics import (
     Parameters,
 )
 from ._joints import Joint
-from ._read import active_equalities, has_flag, is_fixed_tendon, mujoco, name_of
+from ._read import (
+    active_equalities,
+    has_flag,
+    is_fixed_tendon,
+    label_of,
+    mujoco,
+    name_of,
+)
 from ._tree import Frame, homogeneous, Space
 
 
@@ -205,7 +213,7 @@ def fixed_tendons(
 def parameters_of(
     model: Any,
     mechanics: Mechanics,
-    controls: tuple[str, ...],
+    controls: tuple[str, ...] | None,
     given: Mapping[str, Sequence[str]] | None,
 ) -> tuple[Parameters, dict[str, Any]]:
     """Return the parameters that `args` may replace, and their values."""
@@ -247,7 +255,9 @@ def parameters_of(
             if name not in all_places:
                 raise ValueError(
                     f"from_mujoco: `parameters[{kind!r}]` has {name!r}, but the names "
-                    f"are {', '.join(all_places)}."
+                    f"are {', '.join(all_places)}. In a URDF file, MuJoCo merges links "
+                    "that are fixed to each other, unless it contains "
+                    '`<mujoco><compiler fusestatic="false"/></mujoco>`.'
                 )
         places[kind] = {name: all_places[name] for name in names}
         values[kind] = {name: float(numbers[all_places[name][0]]) for name in names}
@@ -412,6 +422,32 @@ def rolling_options(rolling: Any) -> dict[str, tuple[Any, ...]]:
     return found
 
 
+def rolling_geoms(model: Any, options: Mapping[str, Any]) -> dict[str, int]:
+    """Return the numbers of the geoms that roll.
+
+    The name of a body means its only round geom.
+    """
+    geoms = {name_of(model, "geom", i): i for i in range(model.ngeom)}
+    bodies = {name_of(model, "body", i): i for i in range(1, model.nbody)}
+    round_kinds = [int(kind) for kind in _round_kinds()]
+    found = {}
+    for name in options:
+        own: list[int] = []
+        if name in bodies:
+            of_body = np.flatnonzero(model.geom_bodyid == bodies[name])
+            own = [int(x) for x in of_body if model.geom_type[x] in round_kinds]
+        if name not in geoms and len(own) != 1:
+            listed = ", ".join(label_of(model, i) for i in range(model.ngeom))
+            raise ValueError(
+                f"from_mujoco: `rolling` has {name!r}, but the geoms are "
+                f"{listed or 'none'}. Give the geom a name, in a URDF file by "
+                f"`<collision name={name!r}>`, or pass the name of a body with one "
+                "round geom."
+            )
+        found[name] = geoms[name] if name in geoms else own[0]
+    return found
+
+
 def contacts_of(
     model: Any,
     layout: Layout,
@@ -422,22 +458,10 @@ def contacts_of(
     """Build the contacts of the geoms that roll."""
     if not options:
         return None
-    names = {name_of(model, "geom", i): i for i in range(model.ngeom)}
     surface = _ground(model, layout, ground)
     contacts: dict[str, AbstractContact] = {}
-    for name, no_slip in options.items():
-        if name not in names:
-            listed = ", ".join(names) or "none; give the geom a name"
-            raise ValueError(
-                f"from_mujoco: `rolling` has {name!r}, but the geoms are {listed}."
-            )
-        geom = names[name]
-        frame = fixed_to(
-            layout,
-            model.geom_bodyid[geom],
-            model.geom_pos[geom],
-            model.geom_quat[geom],
-        )
+    for name, geom in rolling_geoms(model, options).items():
+        frame = _frame_of_geom(model, layout, geom)
         if frame.joint < 0:
             raise ValueError(
                 f"from_mujoco: `rolling` has {name!r}, which is fixed to the world and "
@@ -448,7 +472,7 @@ def contacts_of(
             geom,
             frame_pose(layout.joints, layout.space, frame),
             name,
-            no_slip=no_slip,
+            no_slip=options[name],
             ground=surface,
             manifold=layout.space.manifold,
             touches=name not in without_height,
@@ -456,18 +480,69 @@ def contacts_of(
     return Contacts(**contacts)
 
 
+def _frame_of_geom(model: Any, layout: Layout, geom: int) -> Frame:
+    place = model.geom_bodyid[geom], model.geom_pos[geom], model.geom_quat[geom]
+    return fixed_to(layout, *place)
+
+
+def _round_kinds() -> tuple[Any, ...]:
+    kinds = mujoco().mjtGeom
+    axial = kinds.mjGEOM_CYLINDER, kinds.mjGEOM_CAPSULE
+    return (*axial, kinds.mjGEOM_SPHERE, kinds.mjGEOM_ELLIPSOID)
+
+
+def check_wheels(
+    model: Any, layout: Layout, options: Mapping[str, Any], contacts: Contacts | None
+) -> None:
+    """Raise for wheels that lie flat, and warn of geoms that cannot roll."""
+    if contacts is None:
+        return
+    kinds, data = mujoco().mjtGeom, mujoco().MjData(model)
+    mujoco().mj_kinematics(model, data)
+    geoms = rolling_geoms(model, options)
+    for contact, (name, geom) in zip(contacts.contacts, geoms.items(), strict=True):
+        frame = _frame_of_geom(model, layout, geom)
+        joint = layout.joints[frame.joint]
+        kind = kinds(model.geom_type[geom])
+        if kind in (kinds.mjGEOM_CYLINDER, kinds.mjGEOM_CAPSULE):
+            ground, axis = contact.ground, data.geom_xmat[geom].reshape(3, 3)[:, 2]
+            if joint.kind != "free" and isinstance(ground, Plane):
+                normal = np.asarray(ground.unit_normal("float32"), float)
+                if abs(axis @ normal) > 1 - 1e-6:
+                    raise ValueError(
+                        f"from_mujoco: the wheel {name!r} lies flat on the ground in "
+                        "the pose of the file: its axis, the z axis of the geom, is "
+                        "vertical. Turn it: in a URDF file, write "
+                        '`rpy="1.5708 0 0"` into the `<origin>` of its `<collision>`.'
+                    )
+            # Without slip along its track, the wheel has to turn about its axis.
+            turns = options[name] not in ((), ("across",))
+            parallel = abs(frame.matrix[:3, 2] @ joint.axis) > 1 - 1e-6
+            if turns and joint.kind in ("hinge", "slide") and not parallel:
+                warnings.warn(
+                    f"from_mujoco: the last joint before the geom {name!r}, "
+                    f"{joint.name!r}, does not turn it about its axis, so that it "
+                    "cannot roll. In a URDF file, `<axis>` of a joint is given in the "
+                    "frame of the joint, and `rpy` of `<collision>` turns a cylinder, "
+                    "whose axis is z.",
+                    stacklevel=4,
+                )
+        elif options[name] and len(geoms) > 1 and joint.kind in ("free", "slide"):
+            warnings.warn(
+                f"from_mujoco: the geom {name!r} rolls without slipping, but is fixed "
+                f"to the body that {joint.name!r} moves, together with other wheels, "
+                "so that the robot can hardly move. For a caster write "
+                f'`rolling={{..., {name!r}: "slides"}}`.',
+                stacklevel=4,
+            )
+
+
 def _contact(
     model: Any, geom: int, pose: Any, name: str, **options: Any
 ) -> AbstractContact:
     kinds, size = mujoco().mjtGeom, model.geom_size[geom]
     kind, radius = kinds(model.geom_type[geom]), float(size[0])
-    round_kinds = (
-        kinds.mjGEOM_CYLINDER,
-        kinds.mjGEOM_CAPSULE,
-        kinds.mjGEOM_SPHERE,
-        kinds.mjGEOM_ELLIPSOID,
-    )
-    if kind not in round_kinds:
+    if kind not in _round_kinds():
         word = kind.name[7:].lower()
         raise ValueError(
             f"from_mujoco: the geom {name!r} is a {word}, but only a cylinder, a "

@@ -79,11 +79,12 @@ class Parameters(eqx.Module):
     """The numbers of a robot that `args` may replace.
 
     - `names`: for each kind, the bodies or joints, with their places in the arrays.
-    - `controls`: the names of the actuators.
+    - `controls`: the names of the actuators, or None if a function of the user computes
+        the controls: `args["controls"]` may then have any structure.
     """
 
     names: dict[str, dict[str, tuple[int, ...]]] = eqx.field(static=True)
-    controls: tuple[str, ...] = eqx.field(static=True)
+    controls: tuple[str, ...] | None = eqx.field(static=True)
 
     def replaced(self, kind: str, values: np.ndarray, args: Args, dtype: Any) -> Any:
         """Return an array of numbers with those of `args` in their places."""
@@ -111,8 +112,11 @@ class Parameters(eqx.Module):
                 raise ValueError(
                     f"`args` of the robot has the unknown key {key!r}; its keys can be "
                     f"{', '.join(known)}. Parameters must be named in "
-                    "`from_mujoco(..., parameters=...)`."
+                    "`from_mujoco(..., parameters=...)`. Put the gains of a function "
+                    "`controls` into `args['controls']`."
                 )
+            if key == "controls" and self.controls is None:
+                continue
             if key == "controls":
                 shape = jnp.asarray(given).shape
                 if shape != (len(self.controls),):

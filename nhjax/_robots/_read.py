@@ -6,7 +6,7 @@ MuJoCo is an optional dependency, and is imported when it is first needed.
 import importlib
 import os
 import xml.etree.ElementTree as ElementTree
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -43,13 +43,20 @@ def mujoco() -> Any:
     return mujoco_of("from_mujoco", "robots")
 
 
-def compile_model(model: Any, root: str | None) -> tuple[Any, Any]:
+def compile_model(
+    model: Any, root: str | None, motors: Sequence[str]
+) -> tuple[Any, Any]:
     """Return the model of a file, an `MjSpec` or an `MjModel`, and it compiled.
 
     The first one is an `MjSpec`, to which films can add a scene, except for an
-    `MjModel`.
+    `MjModel`. Each joint in `motors` gets a motor.
     """
     library = mujoco()
+    if isinstance(motors, str):
+        raise TypeError(
+            "from_mujoco: `motors` must be a sequence of names of joints, got "
+            f"{motors!r}; write `motors=({motors!r},)`."
+        )
     if root is not None:
         check_choice("from_mujoco: `root`", root, ("free", "planar", "fixed"))
     if isinstance(model, library.MjModel | library.MjSpec):
@@ -59,18 +66,44 @@ def compile_model(model: Any, root: str | None) -> tuple[Any, Any]:
                 f"this {type(model).__name__} the joints that it needs."
             )
         if isinstance(model, library.MjModel):
+            if motors:
+                raise ValueError(
+                    "from_mujoco: an MjModel cannot get `motors`: pass an MjSpec."
+                )
             return model, model
         # The caller may go on to change the spec.
-        return model.copy(), _compile(model, "the MjSpec")
+        spec = model.copy()
+        _add_motors(spec, motors)
+        return spec, _compile(spec, "the MjSpec")
     if not isinstance(model, str | os.PathLike):
         raise TypeError(
             "from_mujoco: `model` must be the path of an MJCF or URDF file, a "
             f"mujoco.MjSpec or a mujoco.MjModel, got {type(model).__name__}."
         )
-    return _compile_file(Path(model), root)
+    return _compile_file(Path(model), root, motors)
 
 
-def _compile_file(path: Path, root: str | None) -> tuple[Any, Any]:
+def _add_motors(spec: Any, motors: Sequence[str]) -> None:
+    """Add a motor with the gear 1 to each of these joints."""
+    library = mujoco()
+    joints = {joint.name: joint for joint in spec.joints}
+    scalar = library.mjtJoint.mjJNT_HINGE, library.mjtJoint.mjJNT_SLIDE
+    names = [name for name, joint in joints.items() if name and joint.type in scalar]
+    for name in motors:
+        if name not in names:
+            raise ValueError(
+                f"from_mujoco: `motors` has {name!r}, but the joints that can have a "
+                f"motor are {', '.join(names)}."
+            )
+        motor = spec.add_actuator(
+            name=name, target=name, trntype=library.mjtTrn.mjTRN_JOINT
+        )
+        motor.set_to_motor()
+
+
+def _compile_file(
+    path: Path, root: str | None, motors: Sequence[str]
+) -> tuple[Any, Any]:
     if not path.is_file():
         is_text = str(path).lstrip().startswith("<")
         advice = (
@@ -91,6 +124,7 @@ def _compile_file(path: Path, root: str | None) -> tuple[Any, Any]:
         spec = _or_message(lambda: spec_of.from_string(text), path)
         # Meshes are searched for beside the file.
         spec.modelfiledir = str(path.parent)
+        _add_motors(spec, motors)
         return spec, _compile(spec, path)
     if root is not None:
         raise ValueError(
@@ -98,6 +132,7 @@ def _compile_file(path: Path, root: str | None) -> tuple[Any, Any]:
             'file. Give its first body the joints that it needs, such as a "freejoint".'
         )
     spec = _or_message(lambda: spec_of.from_file(str(path)), path)
+    _add_motors(spec, motors)
     return spec, _compile(spec, path)
 
 
@@ -164,6 +199,16 @@ def name_of(model: Any, kind: str, number: int) -> str:
     return mujoco().mj_id2name(model, code, number) or f"{kind}{number}"
 
 
+def label_of(model: Any, geom: int) -> str:
+    """Return the name of a geom, or its number, its shape and its body."""
+    number = int(model.geom_bodyid[geom])
+    body = name_of(model, "body", number) if number else "the world"
+    word = mujoco().mjtGeom(model.geom_type[geom]).name[7:].lower()
+    name = name_of(model, "geom", geom)
+    owner = f"the body {body!r}" if number else body
+    return f"{name!r} (a {word} of {owner})"
+
+
 def has_flag(model: Any, name: str) -> bool:
     """Return whether the options of a model disable a feature."""
     return bool(
@@ -185,11 +230,12 @@ class Unsupported(NamedTuple):
 
 
 def check_supported(
-    model: Any, ignore: Sequence[str], rolling: Sequence[str]
+    model: Any, ignore: Sequence[str], rolling: Collection[int]
 ) -> dict[str, set[int]]:
     """Raise a `ValueError` that names all parts that are neither supported nor ignored.
 
-    Return the numbers of the parts to leave out: actuators, tendons and equalities.
+    `rolling` has the numbers of the geoms that roll. Return the numbers of the parts to
+    leave out: actuators, tendons and equalities.
     """
     if isinstance(ignore, str):
         raise TypeError(
@@ -422,18 +468,15 @@ def _contacts(model: Any, rolling: Sequence[str]) -> Iterator[Unsupported]:
         pair for pair in _touching_pairs(model) if not _rolls(model, pair, rolling)
     ]
     if pairs:
-        first, second = (name_of(model, "geom", x) for x in pairs[0])
+        first, second = (label_of(model, x) for x in pairs[0])
         more = f" and {len(pairs) - 1} more pairs of geoms" if len(pairs) > 1 else ""
-        yield Unsupported(
-            "contacts", f"contacts: {first!r} and {second!r}{more} can touch"
-        )
+        yield Unsupported("contacts", f"contacts: {first} and {second}{more} can touch")
 
 
-def _rolls(model: Any, pair: tuple[int, int], rolling: Sequence[str]) -> bool:
+def _rolls(model: Any, pair: tuple[int, int], rolling: Collection[int]) -> bool:
     """Return whether a pair is a rolling geom and a geom of the world."""
     for one, other in (pair, pair[::-1]):
-        is_rolling = name_of(model, "geom", one) in rolling
-        if is_rolling and model.body_weldid[model.geom_bodyid[other]] == 0:
+        if one in rolling and model.body_weldid[model.geom_bodyid[other]] == 0:
             return True
     return False
 

@@ -19,6 +19,7 @@ from .._system import LagrangianSystem, State
 from ..rolling import AbstractGround, Contacts, Plane
 from ._build import (
     actuators_of,
+    check_wheels,
     contacts_of,
     independent_rows,
     Kept,
@@ -27,6 +28,7 @@ from ._build import (
     loops_in,
     mechanics_of,
     parameters_of,
+    rolling_geoms,
     rolling_options,
 )
 from ._dynamics import force_of, frame_pose, lagrangian_of, loops_of
@@ -236,6 +238,7 @@ def from_mujoco(
     rolling: Mapping[str, Any] | Sequence[str] | None = None,
     ground: str | AbstractGround | None = None,
     root: Literal["free", "planar", "fixed"] | None = None,
+    motors: Sequence[str] = (),
     controls: Callable[..., Any] | None = None,
     parameters: Mapping[str, Sequence[str]] | None = None,
     ignore: Sequence[str] = (),
@@ -256,7 +259,8 @@ def from_mujoco(
     **Arguments:**
 
     - `model`: the path of a file, a `mujoco.MjSpec` or a `mujoco.MjModel`.
-    - `rolling`: the names of the geoms that roll on the ground. A dictionary says how:
+    - `rolling`: the names of the geoms that roll on the ground, or of bodies with one
+        round geom. A dictionary says how:
         `"no slip"`, `"no lateral slip"`, `"no longitudinal slip"`, `"slides"` (the geom
         keeps touching), an angle [rad] for the rollers of a mecanum wheel, or a tuple
         like `no_slip` of `nhjax.rolling.Wheel`. A cylinder is a wheel whose rim is in
@@ -266,8 +270,12 @@ def from_mujoco(
         `nhjax.rolling`. The default is the only plane of the model, or z = 0.
     - `root`: for a URDF file, how the root link can move. MuJoCo fixes it to the world;
         `"free"` adds a free joint, and `"planar"` the coordinates x, y and heading.
+    - `motors`: the names of joints that get a motor, in addition to the actuators of
+        the file: the control is its torque [N m] or force [N]. URDF files have no
+        actuators; `<transmission>` is not read.
     - `controls`: a function of (t, qpos, qvel, args) that returns the controls of all
-        actuators, for feedback. By default they are in `args["controls"]`.
+        actuators, for feedback. `args["controls"]` may then have any structure, such as
+        a dictionary of gains. By default the controls are `args["controls"]`.
     - `parameters`: names of bodies for `"mass"`, and of joints for `"damping"`,
         `"stiffness"`, `"armature"` and `"friction"`: their values are then in
         `args`. A body with another mass keeps its shape and its centre of mass.
@@ -304,21 +312,24 @@ def from_mujoco(
         Array([0.2, 0. , 0.1], dtype=float64)
     """
     options = rolling_options(rolling)
-    source, compiled = compile_model(model, root)
+    source, compiled = compile_model(model, root, motors)
     if options and root is None and is_fixed_urdf(model):
         raise ValueError(
             "from_mujoco: MuJoCo fixes the root link of a URDF file to the world. "
             'Pass `root="free"` or `root="planar"` for a robot on wheels, or '
             '`root="fixed"`.'
         )
-    left_out = check_supported(compiled, ignore, tuple(options))
+    geoms = rolling_geoms(compiled, options)
+    left_out = check_supported(compiled, ignore, geoms.values())
     layout = layout_of(compiled, source)
     mechanics = mechanics_of(compiled, layout, ignore, friction_smoothing)
     actuators = actuators_of(
         compiled, layout.space, left_out["actuators"], limit_smoothing
     )
-    known, values = parameters_of(compiled, mechanics, actuators.names, parameters)
+    own = actuators.names if controls is None else None
+    known, values = parameters_of(compiled, mechanics, own, parameters)
     contacts = contacts_of(compiled, layout, options, ground)
+    check_wheels(compiled, layout, options, contacts)
     loops = loops_in(compiled, layout, left_out["equalities"])
     loop = loops_of(layout.joints, layout.space, loops)
     names = loops.names

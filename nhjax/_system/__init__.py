@@ -23,6 +23,7 @@ from ._checks import (
     check_state as check_state,
     dependence_error as dependence_error,
     dependent_names as dependent_names,
+    describe_inconsistency as describe_inconsistency,
     enumerated as enumerated,
     require_independent as require_independent,
     require_manifold as require_manifold,

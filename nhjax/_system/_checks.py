@@ -17,7 +17,7 @@ from .._errors import (
     ShapeError,
 )
 from .._manifold import AbstractLieGroup
-from .._numerics import dependent_rows, has_zero_row, is_deficient
+from .._numerics import dependent_rows, has_zero_row, is_deficient, max_norm
 from ._arguments import dtype_advice, finite, floating, no_array
 from ._systems import AbstractMechanicalSystem, State
 
@@ -256,6 +256,33 @@ def require_independent(
     letter = "Φ" if system.fibre_coordinate_name == "v" else "Ψ"
     where = f"q = {y.q}, {system.fibre_coordinate_name} = {u}"
     raise dependence_error(jacobian, k, letter, where)
+
+
+def describe_inconsistency(
+    system: AbstractMechanicalSystem, t: FloatScalar, y: State, args: Args
+) -> str:
+    """Describe how far a state is from being consistent, in a sentence."""
+    parts = []
+    values = np.asarray(system.constraint_violation(t, y, args))
+    if values.size:
+        k = system.position_constraint(t, y.q, args).shape[0]
+        m = values.size - 2 * k
+        letter = "Φ" if system.fibre_coordinate_name == "v" else "Ψ"
+        names = [f"{letter}[{a}]" for a in range(m)]
+        names += [f"dΓ[{a}]/dt" for a in range(k)] + [f"Γ[{a}]" for a in range(k)]
+        # NaN counts as the largest value.
+        worst = int(np.argmax(np.abs(values)))
+        parts.append(f"the largest constraint is {names[worst]} = {values[worst]:.3g}")
+    u = system.fibre_coordinate(y)
+    kind = system.fibre_coordinate_name
+    dual, given = (y.p, "p") if kind == "v" else (y.v, "v")
+    off = max_norm(dual - system.fibre_derivative(t, y.q, u, args))
+    if not off <= 1e3 * jnp.finfo(u.dtype).eps * max_norm(dual):
+        parts.append(f"{given} differs from its value for {kind} by {float(off):.3g}")
+    off = float(system.manifold_of(y.q).distance_to_group(y.q))
+    if not off <= 1e3 * jnp.finfo(u.dtype).eps:
+        parts.append(f"q is off the group by {off:.3g}")
+    return f"At t = {float(t):.6g}, {enumerated(parts)}." if parts else ""
 
 
 def _rank(rows: np.ndarray) -> int:

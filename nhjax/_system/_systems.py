@@ -267,7 +267,16 @@ class AbstractMechanicalSystem(eqx.Module):
     ) -> Float[Array, " n"]:
         """Compute the user's force F. There must be one."""
         given = (multiplier,) if self.force_takes_multipliers else ()
-        return self.call("force", t, q, u, *given, args)
+        force = self.call("force", t, q, u, *given, args)
+        # A scalar would act on all coordinates. `initial_state` finds this only for the
+        # system with which it is called.
+        if jnp.shape(force) != u.shape:
+            raise ShapeError(
+                f"`force({', '.join(self.signatures()['force'])})` must return shape "
+                f"{u.shape}, got shape {jnp.shape(force)}. Give one component for each "
+                "coordinate."
+            )
+        return force
 
     def free_force(
         self,

@@ -227,8 +227,8 @@ def convergence(
 
     - `step_sizes`, `errors`: vectors of the same length; errors that are not positive
         are ignored.
-    - `order`: the slope of a dashed reference line, which is drawn through the error
-        at the median step size.
+    - `order`: the slope of a dashed reference line, which is drawn below the errors
+        and labelled with its slope.
     - `ax`: the axes to draw into.
     - `style`: passed on to `Axes.plot`.
 
@@ -259,8 +259,17 @@ def convergence(
         # The largest step may not be in the asymptotic regime, and the error of the
         # smallest step may be round-off.
         middle = np.argsort(h)[len(h) // 2]
-        reference = e[middle] * (h / h[middle]) ** order
+        reference = 0.3 * e[middle] * (h / h[middle]) ** order
         ax.plot(h, reference, linestyle="--", linewidth=0.8, color=line.get_color())
+        last = np.argmin(h)
+        ax.annotate(
+            f"slope {order:g}",
+            (h[last], reference[last]),
+            textcoords="offset points",
+            xytext=(4, -9),
+            fontsize="small",
+            color=line.get_color(),
+        )
     ax.set_xscale("log")
     ax.set_yscale("log")
     ax.set_xlabel("step size $h$")

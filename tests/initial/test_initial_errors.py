@@ -86,7 +86,7 @@ BY_VALUE = {
     "no velocity": (
         adjusted(rows=ROWS.at[1].set(0)),
         nhjax.DependentConstraintsError,
-        r"nonholonomic\[1\] does not depend on velocities there; .* as `holonomic`",
+        r"nonholonomic\[1\] with respect to velocities are zero .* as `holonomic`",
     ),
     "incompatible": (
         adjusted(mass=jnp.array([1.0, 1.0, -1.0])),
@@ -247,3 +247,71 @@ def test_projection_onto_empty_constraint_is_refused():
     system = system_with(nonholonomic=lambda t, q, v, args: v @ v + 1.0)
     with pytest.raises(nhjax.NewtonError, match=r"projected.*v = .*Φ = .*Start nearer"):
         start(system, project=True)
+
+
+HEADINGS = np.linspace(0.1, 1.5, 15)
+
+
+def _skate(constraint):
+    def lagrangian(t, q, v, args):
+        along = 0.25 * v[2]
+        centre = v[:2] + along * jnp.stack([-jnp.sin(q[2]), jnp.cos(q[2])])
+        return 0.5 * (centre @ centre) + 0.2 * v[2] ** 2
+
+    return nhjax.LagrangianSystem(lagrangian, nonholonomic=constraint)
+
+
+def _slip(q, v):
+    return v[1] * jnp.cos(q[2]) - v[0] * jnp.sin(q[2])
+
+
+@pytest.mark.parametrize("speed", [1e-6, 1.0, 300.0])
+def test_square_of_constraint_raises_although_its_derivative_is_only_nearly_zero(speed):
+    skate = _skate(lambda t, q, v, args: _slip(q, v) ** 2)
+    for heading in HEADINGS:
+        v = speed * jnp.array([np.cos(heading), np.sin(heading), 1.0])
+        q = jnp.array([0.0, 0.0, heading])
+        with pytest.raises(nhjax.DependentConstraintsError, match="In place of a sq"):
+            nhjax.initial_state(skate, q, v)
+    report = nhjax.check_system(skate, q, v)
+    assert report.dependent == ("Φ[0]",)
+    assert report.compatibility_condition == np.inf
+
+
+@pytest.mark.parametrize("scale", [1e-12, 1.0, 1e12])
+def test_constraint_of_any_scale_is_accepted_at_all_headings(scale):
+    skate = _skate(lambda t, q, v, args: scale * _slip(q, v))
+    for heading in [*HEADINGS, 0.0]:
+        for speed in (0.0, 1e-9, 1.0):
+            v = speed * jnp.array([np.cos(heading), np.sin(heading), 1.0])
+            q = jnp.array([0.0, 0.0, heading])
+            y0 = nhjax.initial_state(skate, q, v)
+            assert np.all(np.isfinite(y0.multiplier))
+
+
+def test_nearly_slow_nonlinear_constraint_is_accepted():
+    """The speed is constant, but its derivative is small if the speed is small."""
+    for speed in (1e-10, 1e-3, 1.0):
+        system = nhjax.LagrangianSystem(
+            lambda t, q, v, args: 0.5 * (v @ v),
+            nonholonomic=lambda t, q, v, speed: v @ v - speed**2,
+        )
+        v = speed * jnp.array([0.6, 0.8])
+        nhjax.initial_state(system, jnp.zeros(2), v, args=jnp.asarray(speed))
+
+
+@pytest.mark.parametrize("project", [False, True])
+@pytest.mark.parametrize("kind", ["nonholonomic", "holonomic"])
+def test_length_as_constraint_raises_because_its_derivative_is_not_finite(
+    kind, project
+):
+    functions = {
+        "nonholonomic": lambda t, q, v, args: jnp.linalg.norm(v[:2]),
+        "holonomic": lambda t, q, args: jnp.linalg.norm(q[:2]),
+    }
+    system = nhjax.LagrangianSystem(
+        lambda t, q, v, args: 0.5 * (v @ v), **{kind: functions[kind]}
+    )
+    v = jnp.array([0.0, 0.0, 1.0])
+    with pytest.raises(nhjax.NonFiniteError, match=r"\[0\], or its derivative with"):
+        nhjax.initial_state(system, jnp.zeros(3), v, project=project)

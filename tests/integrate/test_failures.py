@@ -168,3 +168,42 @@ def test_failure_message_of_accelerating_motion_names_coordinate_and_event():
     assert "belongs to coordinate 1 (height)." in text
     assert text.endswith("end the run earlier with an `nhjax.Event`.")
     assert int(text.split("in step ")[1].split(":")[0]) in range(10, 18)
+
+
+def test_inconsistent_start_names_the_constraint_and_its_value():
+    system = nhjax.LagrangianSystem(
+        lambda t, q, v, args: 0.5 * args * (v @ v),
+        nonholonomic=lambda t, q, v, args: v[1] - jnp.sin(t) * q[0],
+    )
+    q, v = jnp.array([1.0, 0.0]), jnp.array([1.0, 0.0])
+    y0 = nhjax.initial_state(system, q, v, args=2.0)
+
+    def run_from(t0, args):
+        method = nhjax.LobattoIIIAB(2)
+        return nhjax.integrate(
+            system, method, y0, t0=t0, dt=0.1, num_steps=2, args=args
+        )
+
+    with pytest.raises(
+        nhjax.IntegrationError, match=r"At t = 2, .* Φ\[0\] = -0\.909\."
+    ):
+        run_from(2.0, 2.0)
+    with pytest.raises(
+        nhjax.IntegrationError, match="p differs from its value for v by 1"
+    ):
+        run_from(0.0, 3.0)
+
+
+@pytest.mark.parametrize("shape", [(), (1,), (2,)])
+def test_force_of_wrong_shape_in_another_system_than_of_the_start_raises(shape):
+    def lagrangian(t, q, v, args):
+        return 0.5 * (v @ v)
+
+    y0 = nhjax.initial_state(
+        nhjax.LagrangianSystem(lagrangian), jnp.zeros(3), jnp.ones(3)
+    )
+    damped = nhjax.LagrangianSystem(
+        lagrangian, force=lambda t, q, v, args: -0.1 * jnp.ones(shape) * v[0]
+    )
+    with pytest.raises(nhjax.ShapeError, match=r"must return shape \(3,\), got shape"):
+        nhjax.integrate(damped, nhjax.LobattoIIIAB(2), y0, dt=0.1, num_steps=2)

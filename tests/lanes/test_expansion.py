@@ -94,6 +94,84 @@ def test_transposed_solve_in_lanes_equals_jax():
     _assert_same(jax.vmap(pulled), a, b)
 
 
+@pytest.mark.parametrize("dtype", ["float64", "float32"])
+@pytest.mark.parametrize("size", [1, 2, 3, 7, 12])
+def test_eigenvectors_in_lanes_diagonalise_matrix(size, dtype):
+    """The signs of vectors, and their choice for equal eigenvalues, are not unique."""
+    a = _matrices(size, size, dtype=dtype)
+    a[0] = np.eye(size)  # equal eigenvalues
+    a[1] = np.outer(a[1, 0], a[1, 0])  # rank one
+    a[2] *= np.float32(1e15) ** 2 if dtype == "float64" else 1e10
+    symmetric = a + a.transpose(0, 2, 1)
+    # Only one triangle is read.
+    values, vectors = lanes_run.run_batched(
+        lambda a: jnp.linalg.eigh(a, symmetrize_input=False), 4, np.tril(symmetric)
+    )
+    eps = np.finfo(dtype).eps
+    for matrix, w, v in zip(symmetric, values, vectors, strict=True):
+        scale = 100 * eps * np.max(np.abs(matrix))
+        expected = np.linalg.eigvalsh(matrix.astype(float))
+        np.testing.assert_allclose(w, expected, rtol=0, atol=scale)
+        np.testing.assert_allclose(v @ np.diag(w) @ v.T, matrix, rtol=0, atol=scale)
+        np.testing.assert_allclose(v.T @ v, np.eye(size), atol=100 * eps)
+
+
+def test_eigenvalues_and_pseudoinverse_in_lanes_equal_jax():
+    a = _matrices(3, 6, 6)
+    a = a + a.transpose(0, 1, 3, 2)
+    _assert_same(jnp.linalg.eigvalsh, a)
+    thin = _matrices(6, 3)
+    gram = thin @ thin.transpose(0, 2, 1)
+
+    def inverse(a):
+        return jnp.linalg.pinv(a, rtol=1e-10, hermitian=True)
+
+    np.testing.assert_allclose(
+        lanes_run.run_batched(inverse, 4, gram),
+        np.linalg.pinv(gram, rtol=1e-10, hermitian=True),
+        rtol=1e-9,
+        atol=1e-9,
+    )
+    along = gram * np.arange(6)
+    _assert_same(jax.vmap(lambda x: jnp.sum(jnp.linalg.eigvalsh(x))), a)
+    # The derivative of a pseudoinverse on matrices of the same rank.
+    change = np.matmul(along, gram) + np.matmul(along, gram).transpose(0, 2, 1)
+    change = np.matmul(gram, np.matmul(change, gram))
+    size = np.max(np.abs(change))
+
+    def derivative(a, b):
+        return jax.jvp(inverse, (a,), (b,))[1]
+
+    got = lanes_run.run_batched(derivative, 4, gram, change / size)
+    expected = jax.vmap(derivative)(gram, change / size)
+    np.testing.assert_allclose(
+        got, expected, rtol=0, atol=1e-9 * np.max(np.abs(expected))
+    )
+
+
+def test_eigenvalues_of_matrix_with_nan_in_lanes_are_nan():
+    a = np.ones((5, 3, 3))
+    a[1, 0, 0] = np.nan
+    values = lanes_run.run_batched(jnp.linalg.eigvalsh, 4, a)
+    assert np.all(np.isnan(values[1]))
+    assert np.all(np.isfinite(values[[0, 2, 3, 4]]))
+
+
+@pytest.mark.parametrize("num_operands", [1, 2])
+def test_sorted_real_numbers_in_lanes_equal_jax(num_operands):
+    keys = RNG.integers(-2, 3, size=(5, 8)).astype("float64")
+    keys[:, 2], keys[:, 5], keys[0, 1], keys[1, 4] = np.nan, -np.inf, np.inf, np.nan
+    values = RNG.normal(size=(5, 8))
+    given = (keys, values)[:num_operands]
+
+    def ordered(*x):
+        return lax.sort(x, num_keys=1)
+
+    got, expected = lanes_run.run_batched(ordered, 4, *given), jax.vmap(ordered)(*given)
+    for x, y in zip(got, expected, strict=True):
+        np.testing.assert_array_equal(x, y)
+
+
 @pytest.mark.parametrize("shape", [(1,), (7,), (3, 5)])
 @pytest.mark.parametrize("num_operands", [1, 2])
 def test_sorted_integers_in_lanes_equal_jax(shape, num_operands):
