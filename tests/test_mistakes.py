@@ -1661,10 +1661,10 @@ RESULTS_OF_RUNS = [
         "`system` must be an nhjax.LagrangianSystem",
     ),
     row(
-        "named the coordinates of a figure",
+        "named the coordinates of a figure, which the system does not name",
         lambda: ANY_PLOT.trajectory(trajectory(), "xy"),
-        TypeError,
-        "`coordinates` must be a sequence of ints",
+        ValueError,
+        "`coordinates` has 'x', but there are no names",
     ),
     row(
         "drew a coordinate that is not there",

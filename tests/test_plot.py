@@ -284,3 +284,37 @@ def test_plot_animation_fills_wheels_and_marks_their_rim(tmp_path, spatial):
 def test_plot_animation_with_invalid_argument_raises(changes, error, message):
     with pytest.raises(error, match=message):
         plot.animate(**({"ts": TIMES, "points": SLIDER} | changes))
+
+
+def test_plot_trajectory_takes_names_of_coordinates_and_labels_axes():
+    system = nhjax.LagrangianSystem(
+        lambda t, q, v, args: 0.5 * (v @ v), coordinates=("east", "north", "heading")
+    )
+    y0 = nhjax.initial_state(system, jnp.zeros(3), jnp.array([1.0, 2.0, 3.0]))
+    saveat = nhjax.SaveAt(t0=True, steps=True)
+    sol = nhjax.integrate(
+        system, nhjax.Gauss(1), y0, dt=0.5, num_steps=4, saveat=saveat
+    )
+    ax = plot.trajectory(sol, ("heading", "east"))
+    assert (ax.get_xlabel(), ax.get_ylabel()) == ("heading", "east")
+    (line,) = ax.lines
+    np.testing.assert_allclose(np.asarray(line.get_xydata())[-1], [6.0, 2.0])
+    assert plot.trajectory(sol, (0, 1), names=("x", "y")).get_xlabel() == "x"
+    with pytest.raises(ValueError, match="has 'up', but the names are east, north"):
+        plot.trajectory(sol, ("east", "up"))
+
+
+def test_plot_trajectory_of_system_without_names_refuses_a_name(sol):
+    with pytest.raises(ValueError, match="has 'x', but there are no names"):
+        plot.trajectory(sol, ("x", 1))
+
+
+def test_animation_of_flat_motion_in_space_has_a_flat_box(tmp_path):
+    ts = np.linspace(0, 1, 5)
+    flat = np.stack([ts, 0 * ts, 0.02 * ts], axis=1)
+    animation = plot.animate(ts, {"a": flat}, traced=["a"], ground=0.0)
+    animation.save(tmp_path / "motion.gif", dpi=20)
+    (ax,) = animation._fig.axes  # pyright: ignore[reportAttributeAccessIssue]
+    (x0, x1), (z0, z1) = ax.get_xlim(), ax.get_zlim()
+    assert z1 - z0 == pytest.approx(0.5 * (x1 - x0))
+    assert z0 <= 0.0 <= z1

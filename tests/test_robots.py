@@ -714,6 +714,7 @@ def _urdf_cart(folder, axis="0 0 1", turned="0 0 0", caster=False, **options):
 def test_urdf_with_motors_drives_as_forces_on_its_joints(tmp_path):
     robot = _urdf_cart(tmp_path)
     assert robot.controls == ("left_joint", "right_joint")
+    assert robot.contacts is not None
     assert robot.contacts.names == tuple(WHEELS)
     args = {"controls": jnp.array([0.02, 0.05])}
     y0 = robot.initial_state(args=args)
@@ -768,6 +769,7 @@ def test_fixed_sphere_without_slip_warns_and_sliding_one_carries_load(tmp_path):
     kinds = dict.fromkeys(WHEELS, "no slip") | {"caster": "slides"}
     robot = _urdf_cart(tmp_path, rolling=kinds, **options)
     y0 = robot.initial_state(project=True)
+    assert robot.contacts is not None
     forces = robot.contacts.forces(0.0, y0, robot.args)
     # The caster is 0.15 m before the axle and carries its own weight only.
     upwards = [float(forces[name][2]) for name in rolls]

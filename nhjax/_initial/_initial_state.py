@@ -299,6 +299,7 @@ def _noise(
     direction = jnp.asarray(sizes, u.dtype)
     given = system, t, q, u, lin.multiplier, args, direction
     noise = as_cpu_kernel(function_noise, *given, is_brief=True)
+    assert noise.slopes is not None
     jacobian = lin.dense[0]
     slopes = jnp.abs(small_einsum("ln,n->l", jacobian, direction))
     return noise, jnp.where((slopes <= 10 * noise.slopes)[:, None], 0, jacobian)

@@ -115,9 +115,9 @@ class Parameters(eqx.Module):
                     "`from_mujoco(..., parameters=...)`. Put the gains of a function "
                     "`controls` into `args['controls']`."
                 )
-            if key == "controls" and self.controls is None:
-                continue
             if key == "controls":
+                if self.controls is None:
+                    continue
                 shape = jnp.asarray(given).shape
                 if shape != (len(self.controls),):
                     raise ShapeError(

@@ -460,7 +460,7 @@ def active_equalities(model: Any) -> list[int]:
     return np.flatnonzero(model.eq_active0).tolist()
 
 
-def _contacts(model: Any, rolling: Sequence[str]) -> Iterator[Unsupported]:
+def _contacts(model: Any, rolling: Collection[int]) -> Iterator[Unsupported]:
     """Yield one entry for all pairs of geoms that can touch in MuJoCo."""
     if has_flag(model, "CONTACT") or has_flag(model, "CONSTRAINT"):
         return

@@ -107,6 +107,9 @@ def animate(
     frames |= {_rim(wheel): _circle(frames, wheel) for wheel in wheels}
     ax = new_axes(ax, projection="3d" if spatial else None)
     centres, reach = _window(frames, follow)
+    sides = [reach, reach]
+    if spatial:
+        sides.append(_height(frames, centres, reach, ground))
     bodies = [name for name, x in frames.items() if x.ndim == 3]
     dark = [_rim(wheel) for wheel in wheels]
     fills = [_filled(ax, grey(0.35 if x in dark else 0.8), spatial) for x in bodies]
@@ -135,11 +138,11 @@ def animate(
             fill.set_verts([corners]) if spatial else fill.set_xy(corners)
         if floor is not None:
             floor(centres[frame])
-        _set_limits(ax, centres[frame], reach)
+        _set_limits(ax, centres[frame], sides)
         return [*lines, *marks, *fills]
 
     if spatial:
-        ax.set_box_aspect((1, 1, 1))  # pyright: ignore[reportArgumentType]
+        ax.set_box_aspect(tuple(sides))  # pyright: ignore[reportArgumentType]
         # Marks are in front of the wheels, which hide nothing else.
         axes: Any = ax
         axes.computed_zorder = False
@@ -231,9 +234,23 @@ def _window(
     return centres, 1.05 * float(reach) or 1.0
 
 
-def _set_limits(ax: "Axes", centre: np.ndarray, reach: float) -> None:
-    for axis, middle in zip("xyz", centre, strict=False):
-        getattr(ax, f"set_{axis}lim")(middle - reach, middle + reach)
+def _height(
+    frames: dict[str, np.ndarray],
+    centres: np.ndarray,
+    reach: float,
+    ground: float | None,
+) -> float:
+    """Compute half the height of a picture in space, from 0.5 to 1 times `reach`."""
+    heights = [x[..., 2].reshape(len(x), -1) for x in frames.values()]
+    if ground is not None:
+        heights.append(np.full((len(centres), 1), ground))
+    largest = np.max(np.abs(np.concatenate(heights, axis=1) - centres[:, 2:]))
+    return float(np.clip(1.05 * largest, 0.5 * reach, reach))
+
+
+def _set_limits(ax: "Axes", centre: np.ndarray, sides: Sequence[float]) -> None:
+    for axis, middle, side in zip("xyz", centre, sides, strict=False):
+        getattr(ax, f"set_{axis}lim")(middle - side, middle + side)
 
 
 def _draw(line: Any, path: np.ndarray, spatial: bool) -> None:

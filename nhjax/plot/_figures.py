@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 @styled
 def trajectory(
     sol: Solution,
-    coordinates: Sequence[int] = (0, 1),
+    coordinates: Sequence[int | str] = (0, 1),
     *,
     names: Sequence[str] | None = None,
     ground: float | None = None,
@@ -42,10 +42,11 @@ def trajectory(
 
     - `sol`: a `Solution` with saved states; for a batch, one path is drawn for each
         member.
-    - `coordinates`: the indices of two or three entries of q. On a group, they index
-        the flattened numbers of an element; on a product, the numbers of all factors
-        are joined in order.
-    - `names`: the names of the coordinates, for the labels of the axes.
+    - `coordinates`: the indices of two or three entries of q, or their names if the
+        system has `coordinates`. On a group, they index the flattened numbers of an
+        element; on a product, the numbers of all factors are joined in order.
+    - `names`: the labels of the axes. The default is the names of the system, or
+        q₁, q₂, ....
     - `ground`: the value of the third coordinate at which a plane is drawn.
     - `ax`: the axes to draw into; three coordinates need a 3d projection.
     - `style`: passed on to `Axes.plot`.
@@ -74,23 +75,16 @@ def trajectory(
     parts = [np.asarray(leaf).reshape(*lead, -1) for leaf in jax.tree.leaves(ys.q)]
     q = np.concatenate(parts, axis=-1)
     n = q.shape[-1]
-    if not isinstance(coordinates, Sequence | np.ndarray) or not all(
-        isinstance(i, int | np.integer) for i in coordinates
-    ):
-        raise TypeError(
-            f"`coordinates` must be a sequence of ints, got {coordinates!r}."
-        )
-    if len(coordinates) not in (2, 3) or not all(-n <= i < n for i in coordinates):
-        raise ValueError(
-            f"`coordinates` must be two or three indices into the {n} coordinates of "
-            f"the system, got {tuple(coordinates)}."
-        )
-    names = _names(names, [f"$q_{i % n + 1}$" for i in coordinates])
-    spatial = len(coordinates) == 3
+    # The names of a system on a group count velocities, not the numbers of an element.
+    known = sol.coordinates or ()
+    known = known if len(known) == n else ()
+    chosen = _indices(coordinates, n, known)
+    names = _names(names, [known[i] if known else f"$q_{i % n + 1}$" for i in chosen])
+    spatial = len(chosen) == 3
     if ground is not None and not spatial:
         raise ValueError("`ground` needs three coordinates, got two.")
     ax = new_axes(ax, projection="3d" if spatial else None)
-    for path in q.reshape(-1, *q.shape[-2:])[..., list(coordinates)]:
+    for path in q.reshape(-1, *q.shape[-2:])[..., chosen]:
         ax.plot(*path.T, **style)
     for letter, name in zip("xyz", names, strict=False):
         getattr(ax, f"set_{letter}label")(name)
@@ -100,6 +94,31 @@ def trajectory(
     if ground is not None:
         _add_ground(ax, ground)
     return ax
+
+
+def _indices(coordinates: Any, n: int, known: tuple[str, ...]) -> list[int]:
+    """Return the indices of the coordinates, which may be given by name."""
+    if not isinstance(coordinates, Sequence | np.ndarray) or not all(
+        isinstance(i, int | np.integer | str) for i in coordinates
+    ):
+        raise TypeError(
+            "`coordinates` must be a sequence of ints, or of names of coordinates of "
+            f"the system, got {coordinates!r}."
+        )
+    unknown = [x for x in coordinates if isinstance(x, str) and x not in known]
+    if unknown:
+        listed = f"the names are {', '.join(known)}" if known else "there are no names"
+        raise ValueError(
+            f"`coordinates` has {unknown[0]!r}, but {listed}. Names are the "
+            "`coordinates` of the system."
+        )
+    chosen = [known.index(x) if isinstance(x, str) else int(x) for x in coordinates]
+    if len(chosen) not in (2, 3) or not all(-n <= i < n for i in chosen):
+        raise ValueError(
+            f"`coordinates` must be two or three indices into the {n} coordinates of "
+            f"the system, got {tuple(coordinates)}."
+        )
+    return chosen
 
 
 def _set_box(ax: Any, ground: float | None) -> None:

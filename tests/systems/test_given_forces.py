@@ -66,4 +66,5 @@ def test_initial_state_of_example_with_args_computes_multiplier_for_its_forces()
     np.testing.assert_allclose(y0.multiplier, expected, rtol=1e-12, atol=1e-12)
     free = WhippleBicycle().initial_state()
     assert np.max(np.abs(y0.multiplier - free.multiplier)) > 1.0
+    assert bicycle.system.coordinates is not None
     assert bicycle.system.coordinates[5] == "steer"
