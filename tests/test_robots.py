@@ -750,6 +750,27 @@ def test_robot_with_controls_of_user_takes_gains_of_any_structure(tmp_path):
     assert slope < 0
 
 
+@pytest.mark.parametrize("rounded", ["-1.5708", "-1.57"])
+def test_rounded_quarter_turns_of_urdf_are_exact(tmp_path, rounded):
+    exact = _urdf_cart(tmp_path).contacts
+    text = (tmp_path / "cart.urdf").read_text().replace("-1.5707963267948966", rounded)
+    (tmp_path / "rounded.urdf").write_text(text)
+    found = nhjax.from_mujoco(
+        tmp_path / "rounded.urdf",
+        rolling=WHEELS,
+        root="planar",
+        ground=rolling.Plane(height=-0.07),
+        ignore=("contacts",),
+    )
+    assert found.contacts is not None
+    assert exact is not None
+    assert found.contacts.multiplier_names == exact.multiplier_names
+    q, v = jnp.arange(5.0), jnp.arange(5.0) + 1
+    for name in WHEELS:
+        slips = [x[name].slip(0.0, q, v) for x in (found.contacts, exact)]
+        np.testing.assert_array_equal(*slips)
+
+
 def test_wheel_that_cannot_turn_about_its_axis_warns(tmp_path):
     with pytest.warns(UserWarning, match="does not turn it about its axis"):
         _urdf_cart(tmp_path, axis="0 1 0")

@@ -4,6 +4,7 @@ MuJoCo is an optional dependency, and is imported when it is first needed.
 """
 
 import importlib
+import math
 import os
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Collection, Iterator, Sequence
@@ -14,6 +15,9 @@ import numpy as np
 
 from .._errors import check_choice
 
+
+# Angles of URDF files that are closer to quarter turns were meant as such [rad].
+_ROUNDED_ANGLE = 1e-3
 
 IGNORABLE = (
     "actuators",
@@ -120,6 +124,7 @@ def _compile_file(
     spec_of = mujoco().MjSpec
     if tree.getroot().tag == "robot":
         _set_root(tree.getroot(), path, root)
+        _complete_quarter_turns(tree.getroot())
         text = ElementTree.tostring(tree.getroot(), encoding="unicode")
         spec = _or_message(lambda: spec_of.from_string(text), path)
         # Meshes are searched for beside the file.
@@ -161,6 +166,26 @@ def _set_root(robot: ElementTree.Element, path: Path, root: str | None) -> None:
     ElementTree.SubElement(joint, "parent", link="world")
     ElementTree.SubElement(joint, "child", link=str(roots[0]))
     ElementTree.SubElement(joint, "axis", xyz="0 0 1")
+
+
+def _complete_quarter_turns(robot: ElementTree.Element) -> None:
+    """Replace rounded angles such as 1.5708 by quarter turns.
+
+    Axles that are tilted by the rounding would give nearly dependent constraints.
+    """
+    quarter = math.pi / 2
+    for element in robot.iter():
+        words = element.get("rpy", "").split()
+        for place, word in enumerate(words):
+            try:
+                turns = float(word) / quarter
+            except ValueError:
+                continue  # MuJoCo names the mistake.
+            number = round(turns)
+            if number and abs(turns - number) * quarter < _ROUNDED_ANGLE:
+                words[place] = repr(number * quarter)
+        if words:
+            element.set("rpy", " ".join(words))
 
 
 def is_fixed_urdf(model: Any) -> bool:

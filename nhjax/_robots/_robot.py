@@ -258,7 +258,9 @@ def from_mujoco(
 
     **Arguments:**
 
-    - `model`: the path of a file, a `mujoco.MjSpec` or a `mujoco.MjModel`.
+    - `model`: the path of a file, a `mujoco.MjSpec` or a `mujoco.MjModel`. Angles in
+        `rpy` of a URDF file that differ by less than 1e-3 rad from quarter turns, such
+        as 1.5708, are taken as quarter turns.
     - `rolling`: the names of the geoms that roll on the ground, or of bodies with one
         round geom. A dictionary says how:
         `"no slip"`, `"no lateral slip"`, `"no longitudinal slip"`, `"slides"` (the geom
