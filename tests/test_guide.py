@@ -11,7 +11,7 @@ from support.pages import blocks, DOCS, page, run_page
 PAGES = (
     *("index", "start", "constraints", "forces", "friction", "lie_groups", "theory"),
     *("systems", "events", "derivatives", "engines", "performance", "machines"),
-    *("gallery", "robots", "step_sizes"),
+    *("gallery", "robots", "step_sizes", "choosing"),
     *("first_calls", "recipe_controller", "recipe_fit", "recipe_million"),
     *("recipe_resume", "recipe_stability", "recipe_steer", "recipe_stop"),
     *("from_scipy", "from_diffrax", "from_pydy", "from_mujoco"),
