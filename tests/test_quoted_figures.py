@@ -365,3 +365,15 @@ def test_robots_quoted_agree_with_the_result():
     assert_agree(ratio, [ensemble["members"], ensemble["ratio"]])
     sentence = "agrees with central differences to {}"
     assert_agree(quoted(text, sentence), [found["gradient"]["apart"]])
+
+
+def test_cost_of_redundant_constraints_quoted_agrees_with_the_result():
+    found = results("redundant")
+    sentence = "with a third crank takes {} times as long as with two"
+    assert_agree(quoted(page("systems"), sentence), [found["ratio"]])
+    sentence = (
+        "takes {} s for its first state and {} s for its first run, and then {} µs"
+    )
+    cart = found["cart"]
+    measured = [cart["state"], cart["run"], 1e6 * cart["step"]]
+    assert_agree(quoted(page("robots"), sentence), measured)
