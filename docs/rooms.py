@@ -385,19 +385,16 @@ def page(sources: Mapping[str, str]) -> str:
         "# The rooms",
         "",
         "The package consists of rooms. A room is a folder or a file with one purpose.",
-        "It imports only from rooms below it. From a folder it imports only "
-        "the names in",
-        "`__init__`. `tests/test_rooms.py` reads the imports and fails if a "
-        "room imports",
-        "from a room above it. `python docs/rooms.py` draws the picture from "
-        "the imports",
-        "and writes this page. Grey arrows lead to the rooms at the bottom.",
+        "It imports only from rooms below it. From a folder it imports only the",
+        "names in `__init__`. `tests/test_rooms.py` reads the imports and fails if a",
+        "room imports from a room above it. `python docs/rooms.py` draws the picture",
+        "from the imports and writes this page. Grey arrows lead to the rooms at the",
+        "bottom.",
         "",
         "![The rooms of nhjax and their imports](rooms.png)",
         "",
-        'The table lists the rooms from top to bottom. The column "floors" is '
-        "the length of",
-        "the longest chain of imports inside the room:",
+        'The table lists the rooms from top to bottom. The column "floors" is the',
+        "length of the longest chain of imports inside the room:",
         "",
         "| room | purpose | imports from | files | floors |",
         "| --- | --- | --- | --- | --- |",

@@ -244,9 +244,15 @@ def _derivatives(system, t, q, u, args, near) -> dict[str, Any]:
     def hessian(t, xi, u):
         return system.metric(t, manifold.act(q, xi), u, args)
 
-    def constraint_jacobian(t, xi, u):
-        g = manifold.act(q, xi)
-        return jax.jacfwd(system.kinematic_constraint, argnums=2)(t, g, u, args)
+    def by_velocity(constraint):
+        def derivative(t, xi, u):
+            g = manifold.act(q, xi)
+            return jax.jacfwd(constraint, argnums=2)(t, g, u, args)
+
+        return derivative
+
+    constraint_jacobian = by_velocity(system.kinematic_constraint)
+    constraint_rows = by_velocity(system.constraint)
 
     def on_chart(name):
         def value(t, xi, u):
@@ -276,14 +282,11 @@ def _derivatives(system, t, q, u, args, near) -> dict[str, Any]:
         }
         return by_time, jnp.concatenate(by_position), second
 
-    def constraint_rows(xi, u):
-        g = manifold.act(q, xi)
-        return jax.jacfwd(system.constraint, argnums=2)(t, g, u, args)
-
     by_time, by_position, second = jax.vmap(sample)(*near)
-    rows = constraint_rows(jnp.zeros_like(u), u)
+    rows = constraint_rows(t, jnp.zeros_like(u), u)
     # The square of an expression has a row that is zero where the constraint holds.
-    elsewhere = jnp.max(jnp.abs(jax.vmap(constraint_rows)(*near)), axis=(0, 2))
+    rows_near = jax.vmap(lambda xi, u: constraint_rows(t, xi, u))(*near)
+    elsewhere = jnp.max(jnp.abs(rows_near), axis=(0, 2))
     zero = jnp.finfo(u.dtype).eps ** 0.75 * elsewhere
     vanishes = jnp.max(jnp.abs(rows), axis=1) <= zero
     rows = jnp.where(vanishes[:, None], 0, rows)

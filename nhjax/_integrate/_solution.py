@@ -309,7 +309,7 @@ def _failure_message(
         message += " With `throw=False` the part before the failure is returned."
         if "stage equations" in reason:
             message += (
-                " If its last steps are ever faster, as in a fall, the motion itself "
-                "leads to the failure: end the run earlier with an `nhjax.Event`."
+                " If the velocities grow without bound there, as in a fall, no `dt` is "
+                "small enough: end the run earlier with an `nhjax.Event`."
             )
     return message

@@ -452,6 +452,7 @@ def contacts_of(
     model: Any,
     layout: Layout,
     options: Mapping[str, Any],
+    geoms: Mapping[str, int],
     ground: Any,
     without_height: Sequence[str] = (),
 ) -> Contacts | None:
@@ -460,7 +461,7 @@ def contacts_of(
         return None
     surface = _ground(model, layout, ground)
     contacts: dict[str, AbstractContact] = {}
-    for name, geom in rolling_geoms(model, options).items():
+    for name, geom in geoms.items():
         frame = _frame_of_geom(model, layout, geom)
         if frame.joint < 0:
             raise ValueError(
@@ -492,14 +493,17 @@ def _round_kinds() -> tuple[Any, ...]:
 
 
 def check_wheels(
-    model: Any, layout: Layout, options: Mapping[str, Any], contacts: Contacts | None
+    model: Any,
+    layout: Layout,
+    options: Mapping[str, Any],
+    geoms: Mapping[str, int],
+    contacts: Contacts | None,
 ) -> None:
     """Raise for wheels that lie flat, and warn of geoms that cannot roll."""
     if contacts is None:
         return
     kinds, data = mujoco().mjtGeom, mujoco().MjData(model)
     mujoco().mj_kinematics(model, data)
-    geoms = rolling_geoms(model, options)
     for contact, (name, geom) in zip(contacts.contacts, geoms.items(), strict=True):
         frame = _frame_of_geom(model, layout, geom)
         joint = layout.joints[frame.joint]

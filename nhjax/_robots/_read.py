@@ -77,8 +77,7 @@ def compile_model(
             return model, model
         # The caller may go on to change the spec.
         spec = model.copy()
-        _add_motors(spec, motors)
-        return spec, _compile(spec, "the MjSpec")
+        return spec, _compile(spec, motors, "the MjSpec")
     if not isinstance(model, str | os.PathLike):
         raise TypeError(
             "from_mujoco: `model` must be the path of an MJCF or URDF file, a "
@@ -129,16 +128,14 @@ def _compile_file(
         spec = _or_message(lambda: spec_of.from_string(text), path)
         # Meshes are searched for beside the file.
         spec.modelfiledir = str(path.parent)
-        _add_motors(spec, motors)
-        return spec, _compile(spec, path)
+        return spec, _compile(spec, motors, path)
     if root is not None:
         raise ValueError(
             f"from_mujoco: `root` is for URDF files only, and {path.name} is an MJCF "
             'file. Give its first body the joints that it needs, such as a "freejoint".'
         )
     spec = _or_message(lambda: spec_of.from_file(str(path)), path)
-    _add_motors(spec, motors)
-    return spec, _compile(spec, path)
+    return spec, _compile(spec, motors, path)
 
 
 def _set_root(robot: ElementTree.Element, path: Path, root: str | None) -> None:
@@ -198,7 +195,8 @@ def is_fixed_urdf(model: Any) -> bool:
     )
 
 
-def _compile(spec: Any, name: Any) -> Any:
+def _compile(spec: Any, motors: Sequence[str], name: Any) -> Any:
+    _add_motors(spec, motors)
     return _or_message(spec.compile, name)
 
 

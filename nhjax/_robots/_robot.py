@@ -276,8 +276,9 @@ def from_mujoco(
         the file: the control is its torque [N m] or force [N]. URDF files have no
         actuators; `<transmission>` is not read.
     - `controls`: a function of (t, qpos, qvel, args) that returns the controls of all
-        actuators, for feedback. `args["controls"]` may then have any structure, such as
-        a dictionary of gains. By default the controls are `args["controls"]`.
+        actuators, for feedback. It can read gains from `args["controls"]`, which may
+        then have any structure, such as a dictionary. Without a function,
+        `args["controls"]` are the controls themselves.
     - `parameters`: names of bodies for `"mass"`, and of joints for `"damping"`,
         `"stiffness"`, `"armature"` and `"friction"`: their values are then in
         `args`. A body with another mass keeps its shape and its centre of mass.
@@ -330,8 +331,8 @@ def from_mujoco(
     )
     own = actuators.names if controls is None else None
     known, values = parameters_of(compiled, mechanics, own, parameters)
-    contacts = contacts_of(compiled, layout, options, ground)
-    check_wheels(compiled, layout, options, contacts)
+    contacts = contacts_of(compiled, layout, options, geoms, ground)
+    check_wheels(compiled, layout, options, geoms, contacts)
     loops = loops_in(compiled, layout, left_out["equalities"])
     loop = loops_of(layout.joints, layout.space, loops)
     names = loops.names
@@ -341,7 +342,7 @@ def from_mujoco(
         names = tuple(x for x, keep in zip(names, kept.loops, strict=True) if keep)
         loop = loops_of(layout.joints, layout.space, loops, kept.loops)
         if contacts is not None:
-            contacts = _reduced(compiled, layout, contacts, kept, ground)
+            contacts = _reduced(compiled, layout, contacts, kept, geoms, ground)
     slips = None if contacts is None else contacts.nonholonomic
     heights = None if contacts is None else contacts.holonomic
     positions = _joined(heights, loop)
@@ -370,7 +371,12 @@ def from_mujoco(
 
 
 def _reduced(
-    model: Any, layout: Layout, contacts: Contacts, kept: Kept, ground: Any
+    model: Any,
+    layout: Layout,
+    contacts: Contacts,
+    kept: Kept,
+    geoms: Mapping[str, int],
+    ground: Any,
 ) -> Contacts | None:
     """Return the contacts without the constraints that follow from others."""
     pairs = list(zip(contacts.names, contacts.contacts, strict=True))
@@ -380,7 +386,7 @@ def _reduced(
     }
     touching = [name for name, contact in pairs if contact.touches]
     dropped = [x for x, keep in zip(touching, kept.heights, strict=True) if not keep]
-    return contacts_of(model, layout, options, ground, dropped)
+    return contacts_of(model, layout, options, geoms, ground, dropped)
 
 
 def _coordinates(layout: Layout) -> tuple[str, ...]:

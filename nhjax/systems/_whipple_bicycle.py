@@ -33,16 +33,7 @@ from ._frames import (
 )
 
 
-_COORDINATES = (
-    "x",
-    "y",
-    "yaw",
-    "lean",
-    "pitch",
-    "steer",
-    "rear_wheel",
-    "front_wheel",
-)
+_ANGLES = ("yaw", "lean", "pitch", "steer", "rear_wheel", "front_wheel")
 
 
 class WhippleBicycle(AbstractNonholonomicExample):
@@ -72,9 +63,9 @@ class WhippleBicycle(AbstractNonholonomicExample):
     (t, q, v, args); or None for an uncontrolled bicycle, whose energy is conserved. If
     your function needs `args`, pass them also to `initial_state(args=...)`.
 
-    A bicycle that falls moves faster and faster, until no step size is small enough:
-    nothing stops its handlebar. End a run by an `Event` while |lean| < 0.8 and
-    |steer| < 1.
+    Nothing stops the handlebar of a bicycle that falls: its velocities grow without
+    bound, until no step size is small enough. End a run by an `Event` while
+    |lean| < 0.8 and |steer| < 1.
 
     **Parameters:** `wheelbase` w, `trail` c [m], `tilt` λ of the steer axis [rad],
     `gravity` g [m/s²]; of the wheels `rear_radius`, `front_radius` [m],
@@ -177,7 +168,7 @@ class WhippleBicycle(AbstractNonholonomicExample):
             nonholonomic=self.constraint,
             holonomic=self.holonomic,
             force=None if self.steering is None else self.force,
-            coordinates=_COORDINATES,
+            coordinates=("x", "y", *_ANGLES),
         )
 
     def lagrangian(self, t: FloatScalarLike, q: Array, v: Array, args: Args) -> Array:
