@@ -20,6 +20,7 @@ from ._graph import (
     BranchInfo,
     Buffer,
     Function,
+    is_float,
     LoopInfo,
     needed,
     Node,
@@ -47,6 +48,8 @@ _LARGEST_SCRATCH = 2**26
 # A side of a divergent branch with more nodes than this is jumped over if no member
 # takes it. Shorter sides are always computed.
 _LONGEST_SIDE = 24
+# A function that returns this many floats, or more, returns them in memory.
+_FLOATS_IN_MEMORY = 5
 _STATEMENTS = ("loop", "branch", "store", "load")
 _ALL = "splat (i1 true)"
 
@@ -363,6 +366,12 @@ class _Functions:
 
     def _result(self, function: Function, width: int) -> str:
         dtypes = [function.outs[index].dtype for index in self._used[function]]
+        if width == 1 and len(dtypes) > 1:
+            # On x86-64 LLVM returns a third and a fourth float in registers of the x87
+            # unit, without optimisation by instructions that do not exist. More floats
+            # are returned in memory.
+            floats = [x for x in dtypes if is_float(x)]
+            dtypes += floats[:1] * (_FLOATS_IN_MEMORY - len(floats))
         return result_type([vector(scalar_type(x), width) for x in dtypes])
 
     def definitions(self, outer: Writer) -> list[str]:

@@ -123,3 +123,35 @@ def test_program_with_loop_inside_is_written_out():
 
     _, text = module_of(compiled_once_loop, 0.5, 0.7)
     assert definitions_and_calls(text) == (0, 0)
+
+
+@pytest.mark.parametrize("dtype", ["float32", "float64"])
+@pytest.mark.parametrize("number", [2, 3, 4, 5, 7])
+def test_function_of_numbers_returns_three_or_more_floats_in_memory(number, dtype):
+    def floats(x):
+        for k in range(150):
+            x = [
+                0.5 * a * b - 0.001 * k * b
+                for a, b in zip(x, x[1:] + x[:1], strict=True)
+            ]
+        return x
+
+    @jax.jit
+    def compiled_once_floats(*x):
+        return *floats([*x]), x[0] > 1
+
+    def whole(x):
+        *first, is_large = compiled_once_floats(*(x * (k + 1) for k in range(number)))
+        return *compiled_once_floats(*first)[:number], is_large
+
+    x = np.linspace(0.2, 0.9, 5).astype(dtype)
+    program, text = module_of(whole, x[0], is_batched=(True,), width=1)
+    (results,) = re.findall(r"^define internal \{ (.*) \} @program", text, re.MULTILINE)
+    # Three or four would be returned in registers of the x87 unit.
+    assert len(re.findall("double|float", results)) not in (3, 4)
+    assert results.count("i1") == 1
+    found = run(program, [x], [True], 1)
+    for one, other in zip(found, jax.vmap(whole)(x), strict=True):
+        np.testing.assert_allclose(
+            one, other, rtol=1e-4 if dtype == "float32" else 1e-12
+        )
