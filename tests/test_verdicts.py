@@ -11,7 +11,7 @@ from benchmarks import _baselines as baselines
 from benchmarks._report import RESULTS
 from benchmarks._tableaux import rolling
 from benchmarks._verdicts._claim import Claim, RECONSTRUCTED
-from benchmarks._verdicts._errata import stability_at_infinity
+from benchmarks._verdicts._errata import mixed_assumption
 from benchmarks._verdicts._growth import Curve, growth, in_stretches
 from benchmarks._verdicts._orders import (
     BASELINE_ORDERS,
@@ -76,11 +76,6 @@ def test_growth_of_a_power_law_is_its_exponent(alpha):
     assert growth(Curve(times, 0 * times + 1.0, times)).alpha == 0.0
 
 
-def test_stability_at_infinity_alternates_in_sign():
-    found = [stability_at_infinity(s) for s in (2, 3, 4, 5)]
-    np.testing.assert_allclose(found, [-1, 1, -1, 1], atol=1e-7)
-
-
 def test_verdict_table_escapes_vertical_bars():
     line = table([Claim("|E|", "1", "x", "confirmed", "y")]).splitlines()[-1]
     assert line == "| \\|E\\| | 1 | `x` | **confirmed**: y |"
@@ -106,3 +101,10 @@ def test_verdicts_about_spark_state_that_it_is_reconstructed():
     resting = [x for x in lines if "SPARK" in x["claim"] + x["measured"]]
     assert resting
     assert all(RECONSTRUCTED in line["why"] for line in resting)
+
+
+def test_printed_mixed_assumption_holds_for_lobatto_pairs_alone():
+    _, numbers = mixed_assumption()
+    assert len(numbers) == 4
+    for name, row in numbers.items():
+        assert (row["found"] == row["printed"]) == name.startswith("Lobatto")
