@@ -377,3 +377,17 @@ def test_cost_of_redundant_constraints_quoted_agrees_with_the_result():
     cart = found["cart"]
     measured = [cart["state"], cart["run"], 1e6 * cart["step"]]
     assert_agree(quoted(page("robots"), sentence), measured)
+
+
+def test_times_of_first_calls_agree_with_the_result():
+    stored = {
+        f"{row['system']}, {row['kind']}": row
+        for row in results("compile_time")["rows"]
+        if row["stages"] == 3
+    }
+    rows = rows_of(page("first_calls"), "call", "first call", "later calls")
+    assert [row[0] for row in rows] == list(stored)
+    for name, first, following in rows:
+        row = stored[name]
+        assert_agree(quoted(first, "{} s"), [sum(row["seconds"])])
+        assert_agree(quoted(following, "{} ms"), [1e3 * row["later"]])
