@@ -1,4 +1,4 @@
-"""Where the benchmarks put what they measured."""
+"""How the benchmarks measure times, and where they put what they measured."""
 
 import argparse
 import datetime
@@ -7,7 +7,8 @@ import math
 import os
 import subprocess
 import sys
-from collections.abc import Mapping
+import time
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +19,20 @@ import nhjax
 
 
 RESULTS = Path(__file__).parent / "results"
+
+
+def least_time(
+    call: Callable[[], Any],
+    rounds: int,
+    clock: Callable[[], float] = time.perf_counter,
+) -> float:
+    """Return the seconds of a call, the least of some rounds."""
+    times = []
+    for _ in range(rounds):
+        start = clock()
+        jax.block_until_ready(call())
+        times.append(clock() - start)
+    return min(times)
 
 
 def from_fresh_process(

@@ -11,6 +11,7 @@ three calls; compile time is separate.
 import argparse
 import time
 from collections.abc import Callable
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -20,7 +21,7 @@ import numpy as np
 import nhjax
 from nhjax import systems
 
-from ._report import markdown_table, number, write
+from ._report import least_time, markdown_table, number, write
 
 
 NUM_STEPS, ROUNDS = 50, 3
@@ -114,12 +115,8 @@ def measure(ensemble: Ensemble, members: int) -> dict[str, Any]:
             compiled = program(ensemble).lower(start).compile()
             found[f"{name}, compile"] = time.perf_counter() - before
             q, good, iterations, count = jax.block_until_ready(compiled(start))
-            times = []
-            for _ in range(ROUNDS):
-                before = time.perf_counter()
-                jax.block_until_ready(compiled(start))
-                times.append(time.perf_counter() - before)
-        found[name] = 1e6 * min(times) / float(np.sum(count))
+            seconds = least_time(partial(compiled, start), ROUNDS)
+        found[name] = 1e6 * seconds / float(np.sum(count))
         found[f"{name}, failed"] = int(members - np.sum(good))
         found[f"{name}, iterations"] = float(np.sum(iterations) / np.sum(count))
         positions[name] = np.asarray(q)

@@ -22,7 +22,6 @@ over the gallery, and draws docs/tolerances.png.
 import argparse
 import json
 import math
-import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -40,7 +39,7 @@ import nhjax
 from nhjax import systems
 
 from . import rolling
-from ._report import markdown_table, number, RESULTS, write
+from ._report import least_time, markdown_table, number, RESULTS, write
 
 
 LAST_BETA = 1e-3
@@ -185,12 +184,7 @@ class Row(NamedTuple):
 
 def timed(call: Callable[[], Any]) -> tuple[Any, float]:
     """Call three times after a first time; return the result and the least time."""
-    result, times = jax.block_until_ready(call()), []
-    for _ in range(3):
-        begin = time.perf_counter()
-        result = jax.block_until_ready(call())
-        times.append(time.perf_counter() - begin)
-    return result, min(times)
+    return jax.block_until_ready(call()), least_time(call, 3)
 
 
 def end_of(sol: nhjax.Solution) -> np.ndarray:

@@ -25,7 +25,7 @@ import nhjax
 from nhjax import systems
 
 from ._examples import wheeled_inverted_pendulum
-from ._report import from_fresh_process, markdown_table, write
+from ._report import from_fresh_process, least_time, markdown_table, write
 
 
 NUM_STEPS = 20
@@ -138,12 +138,8 @@ def measure(index: int) -> None:
     _, system, y0, stages, kind = cases()[index]
     dt = jnp.full((8,), 0.05) if kind == "ensemble" else jnp.asarray(0.05)
     ready, parts = compiled(program(system, stages, kind), y0, dt)
-    times = []
-    for _ in range(15):
-        start = time.perf_counter()
-        jax.block_until_ready(ready(y0, dt))
-        times.append(time.perf_counter() - start)
-    print(json.dumps({"parts": parts, "later": min(times)}))
+    later = least_time(lambda: ready(y0, dt), 15)
+    print(json.dumps({"parts": parts, "later": later}))
 
 
 def in_process(index: int, directory: str) -> dict[str, Any]:

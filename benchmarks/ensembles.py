@@ -29,6 +29,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -38,7 +39,7 @@ import jax.numpy as jnp
 import nhjax
 from nhjax import systems
 
-from ._report import from_fresh_process, markdown_table, write
+from ._report import from_fresh_process, least_time, markdown_table, write
 
 
 H, BATCH, ROUNDS, CHUNKS = 0.1, 1000, 3, 200
@@ -68,16 +69,6 @@ def problem(num_steps: int) -> tuple[Callable[[Any], Any], Callable[[Any], Any]]
     return run, member
 
 
-def fastest(function: Callable[[], Any], rounds: int) -> float:
-    """Seconds of the processor, the least of some rounds."""
-    times = []
-    for _ in range(rounds):
-        start = time.process_time()
-        jax.block_until_ready(function())
-        times.append(time.process_time() - start)
-    return min(times)
-
-
 def measure(members: int, num_steps: int, rounds: int = ROUNDS) -> dict[str, Any]:
     """Time of a member and step both ways, and peak memory of this process."""
     run, member = problem(num_steps)
@@ -91,12 +82,14 @@ def measure(members: int, num_steps: int, rounds: int = ROUNDS) -> dict[str, Any
     indices = jnp.arange(BATCH)
     jax.block_until_ready(bare(indices))
     chunks(BATCH)
-    one = fastest(lambda: bare(indices), rounds) / BATCH
-    start, outcomes = time.perf_counter(), []
-    many = fastest(lambda: outcomes.append(chunks(members)), 1) / members
+    one = least_time(partial(bare, indices), rounds, time.process_time) / BATCH
+    start, before = time.perf_counter(), time.process_time()
+    outcome = chunks(members)
+    many = (time.process_time() - before) / members
     seconds = time.perf_counter() - start
     # Before and after, so that what else runs hits both.
-    one = min(one, fastest(lambda: bare(indices), rounds) / BATCH)
+    after = least_time(partial(bare, indices), rounds, time.process_time) / BATCH
+    one = min(one, after)
     return {
         "members": members,
         "num_steps": num_steps,
@@ -104,8 +97,8 @@ def measure(members: int, num_steps: int, rounds: int = ROUNDS) -> dict[str, Any
         "ensemble": 1e6 * many / num_steps,
         "ratio": many / one,
         "seconds": seconds,
-        "failed": len(outcomes[0].failed),
-        "mean": float(outcomes[0].statistics["mean"].ys[0]),
+        "failed": len(outcome.failed),
+        "mean": float(outcome.statistics["mean"].ys[0]),
         "megabytes": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
     }
 

@@ -10,6 +10,7 @@ time to trace, lower and compile each run, and the time of a step of both.
 
 import argparse
 import time
+from functools import partial
 from typing import Any
 
 import jax
@@ -18,7 +19,7 @@ import numpy as np
 
 import nhjax
 
-from ._report import markdown_table, number, write
+from ._report import least_time, markdown_table, number, write
 from .near_rest import examples
 
 
@@ -51,14 +52,11 @@ def measure(example: Any) -> dict[str, float]:
         # Andrews' squeezer wants shorter steps than the others.
         while not fallback and int(compiled(y0, dt).stats["num_steps"]) < NUM_STEPS:
             dt = dt / 10
-        sol, times = compiled(y0, dt), []
-        for _ in range(REPEATS):
-            start = time.perf_counter()
-            jax.block_until_ready(compiled(y0, dt))
-            times.append(time.perf_counter() - start)
+        sol = compiled(y0, dt)
+        seconds = least_time(partial(compiled, y0, dt), REPEATS)
         assert int(sol.stats["num_newton_steps"]) == 0
         steps = max(int(sol.stats["num_steps"]), 1)
-        found[f"step {name}"] = 1e6 * min(times) / steps
+        found[f"step {name}"] = 1e6 * seconds / steps
         jax.clear_caches()
     return found
 

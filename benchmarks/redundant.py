@@ -18,7 +18,7 @@ import jax.numpy as jnp
 
 import nhjax
 
-from ._report import from_fresh_process, markdown_table, write
+from ._report import from_fresh_process, least_time, markdown_table, write
 
 
 NUM_STEPS = 2000
@@ -84,16 +84,12 @@ def measure(name: str) -> dict[str, float]:
         return sol.ys.q, sol.stats["num_redundant"]
 
     _, redundant = jax.block_until_ready(run(y0))
-    done, times = time.process_time(), []
-    for _ in range(7):
-        start = time.perf_counter()
-        jax.block_until_ready(run(y0))
-        times.append(time.perf_counter() - start)
+    done = time.process_time()
     return {
         "redundant": int(redundant),
         "state": ready - begin,
         "run": done - ready,
-        "step": min(times) / NUM_STEPS,
+        "step": least_time(lambda: run(y0), 7) / NUM_STEPS,
     }
 
 

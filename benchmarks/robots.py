@@ -30,7 +30,14 @@ import numpy as np
 
 import nhjax
 
-from ._report import from_fresh_process, markdown_table, number, RESULTS, write
+from ._report import (
+    from_fresh_process,
+    least_time,
+    markdown_table,
+    number,
+    RESULTS,
+    write,
+)
 
 
 mujoco: Any = importlib.import_module("mujoco")
@@ -370,12 +377,7 @@ def measure_ensemble() -> tuple[str, dict[str, Any]]:
     def seconds(function, torque):
         function = jax.jit(function)
         jax.block_until_ready(function(torque))
-        times = []
-        for _ in range(5):
-            start = time.perf_counter()
-            jax.block_until_ready(function(torque))
-            times.append(time.perf_counter() - start)
-        return min(times)
+        return least_time(lambda: function(torque), 5)
 
     torques = jnp.linspace(0.1, 1.0, MEMBERS)
     one, many = seconds(end, torques[0]), seconds(jax.vmap(end), torques)

@@ -22,6 +22,8 @@ from ._claim import (
 
 
 PART = "errata"
+# Nodes of collocation methods other than Lobatto's.
+NODES = "0, 1/3, 2/3, 1", "0, .25, .5, .75, 1"
 
 
 def body_step(stages: int, form: str):
@@ -134,7 +136,10 @@ def found(quick: bool) -> Found:
     return Found(claims, {"errata": numbers})
 
 
-NODES = "0, 1/3, 2/3, 1", "0, .25, .5, .75, 1"
+def printed_order(method: nhjax.PartitionedRungeKutta) -> int:
+    """Compute the order of p as printed."""
+    p, q, r, _ = method.orders
+    return min(p, 2 * q, q + r)
 
 
 def order_of_tableaux() -> tuple[Claim, dict[str, dict[str, float]]]:
@@ -144,10 +149,9 @@ def order_of_tableaux() -> tuple[Claim, dict[str, dict[str, float]]]:
     } | {"RK4 and its conjugate": _tableaux.RK4}
     numbers = {}
     for name, method in methods.items():
-        p, q, r, _ = method.orders
         counts = (40, 80) if method.order < 4 else (20, 40)
         observed = _tableaux.observed(*_tableaux.pendulum(), method, counts, 2.0)
-        numbers[name] = {"printed": min(p, 2 * q, q + r), "observed": observed.q}
+        numbers[name] = {"printed": printed_order(method), "observed": observed.q}
     differ = all(abs(x["printed"] - x["observed"]) > 0.5 for x in numbers.values())
     text = "; ".join(
         f"{name}: {x['observed']:.2f} (printed: {x['printed']}"
@@ -169,13 +173,12 @@ def order_with_constraint() -> tuple[Claim, dict[str, dict[str, float]]]:
     numbers, texts = {}, []
     for name in NODES:
         method = _tableaux.collocation(_tableaux.CLOSED[name], "propagated")
-        p, q, r, _ = method.orders
         loses_one = abs(method.stability_at_infinity - 1) < 1e-6
         observed = _tableaux.observed(*_tableaux.rolling(), method, (80, 160), 2.0)
         row = {
-            "printed p": min(p, 2 * q, q + r),
+            "printed p": printed_order(method),
             "observed p": float(observed.p),
-            "printed multiplier": q - loses_one,
+            "printed multiplier": method.orders.C - loses_one,
             "observed multiplier": float(observed.multiplier),
         }
         numbers[name] = row

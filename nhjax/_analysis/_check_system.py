@@ -285,7 +285,7 @@ def _derivatives(system, t, q, u, args, near) -> dict[str, Any]:
     by_time, by_position, second = jax.vmap(sample)(*near)
     rows = constraint_rows(t, jnp.zeros_like(u), u)
     # The square of an expression has a row that is zero where the constraint holds.
-    rows_near = jax.vmap(lambda xi, u: constraint_rows(t, xi, u))(*near)
+    rows_near = jax.vmap(constraint_rows, (None, 0, 0))(t, *near)
     elsewhere = jnp.max(jnp.abs(rows_near), axis=(0, 2))
     zero = jnp.finfo(u.dtype).eps ** 0.75 * elsewhere
     vanishes = jnp.max(jnp.abs(rows), axis=1) <= zero

@@ -48,8 +48,6 @@ _LARGEST_SCRATCH = 2**26
 # A side of a divergent branch with more nodes than this is jumped over if no member
 # takes it. Shorter sides are always computed.
 _LONGEST_SIDE = 24
-# A function that returns this many floats, or more, returns them in memory.
-_FLOATS_IN_MEMORY = 5
 _STATEMENTS = ("loop", "branch", "store", "load")
 _ALL = "splat (i1 true)"
 
@@ -366,12 +364,12 @@ class _Functions:
 
     def _result(self, function: Function, width: int) -> str:
         dtypes = [function.outs[index].dtype for index in self._used[function]]
-        if width == 1 and len(dtypes) > 1:
+        floats = [x for x in dtypes if is_float(x)]
+        if width == 1 and len(floats) in (3, 4):
             # On x86-64 LLVM returns a third and a fourth float in registers of the x87
-            # unit, without optimisation by instructions that do not exist. More floats
+            # unit, without optimisation by instructions that do not exist. Five floats
             # are returned in memory.
-            floats = [x for x in dtypes if is_float(x)]
-            dtypes += floats[:1] * (_FLOATS_IN_MEMORY - len(floats))
+            dtypes += floats[: 5 - len(floats)]
         return result_type([vector(scalar_type(x), width) for x in dtypes])
 
     def definitions(self, outer: Writer) -> list[str]:

@@ -127,7 +127,7 @@ def test_program_with_loop_inside_is_written_out():
 
 @pytest.mark.parametrize("dtype", ["float32", "float64"])
 @pytest.mark.parametrize("number", [2, 3, 4, 5, 7])
-def test_function_of_numbers_returns_three_or_more_floats_in_memory(number, dtype):
+def test_function_of_numbers_returns_three_or_four_floats_in_memory(number, dtype):
     def floats(x):
         for k in range(150):
             x = [
@@ -147,8 +147,9 @@ def test_function_of_numbers_returns_three_or_more_floats_in_memory(number, dtyp
     x = np.linspace(0.2, 0.9, 5).astype(dtype)
     program, text = module_of(whole, x[0], is_batched=(True,), width=1)
     (results,) = re.findall(r"^define internal \{ (.*) \} @program", text, re.MULTILINE)
-    # Three or four would be returned in registers of the x87 unit.
-    assert len(re.findall("double|float", results)) not in (3, 4)
+    # Three or four would be returned in registers of the x87 unit, five are not.
+    expected = 5 if number in (3, 4) else number
+    assert len(re.findall("double|float", results)) == expected
     assert results.count("i1") == 1
     found = run(program, [x], [True], 1)
     for one, other in zip(found, jax.vmap(whole)(x), strict=True):
