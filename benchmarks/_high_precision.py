@@ -15,6 +15,8 @@ import mpmath
 import numpy as np
 from jax import Array
 
+from nhjax.lanes._builder import called_program, CALLS
+
 
 DIGITS = 50
 
@@ -95,18 +97,6 @@ _MOVES = {
     "transpose",
     "unstack",
 }
-_CALLS = (
-    "jit",
-    "pjit",
-    "closed_call",
-    "core_call",
-    "custom_jvp_call",
-    "custom_vjp_call",
-    "custom_vjp_call_jaxpr",
-    "remat",
-    "checkpoint",
-    "remat2",
-)
 
 
 def evaluate(function: Callable[..., Any], *arguments: Any) -> Any:
@@ -155,9 +145,10 @@ def _run(jaxpr: Any, consts: list, arguments: list) -> list:
 
 def _results(equation: Any, x: list) -> list:
     name, params = equation.primitive.name, equation.params
-    if name in _CALLS:
-        inner = params.get("jaxpr") or params.get("call_jaxpr") or params["fun_jaxpr"]
-        return _run(getattr(inner, "jaxpr", inner), getattr(inner, "consts", []), x)
+    if name in CALLS:
+        return _called(equation, x)
+    if name == "batched_call":
+        return _for_each_member(equation, x)
     if not any(_is_float(v) for v in equation.invars):
         found = _by_jax(equation, x)
         return [
@@ -189,6 +180,23 @@ def _results(equation: Any, x: list) -> list:
     if name == "convert_element_type" and not _is_float(equation.outvars[0]):
         return _by_jax(equation, [to_float(x[0])])
     return _moved(equation, x)
+
+
+def _called(equation: Any, x: list) -> list:
+    inner = called_program(equation)
+    return _run(getattr(inner, "jaxpr", inner), getattr(inner, "consts", []), x)
+
+
+def _for_each_member(equation: Any, x: list) -> list:
+    marks = equation.params["is_batched"]
+    members = x[marks.index(True)].shape[0]
+    rows = [
+        _called(
+            equation, [y[k] if mark else y for y, mark in zip(x, marks, strict=True)]
+        )
+        for k in range(members)
+    ]
+    return [np.stack(column) for column in zip(*rows, strict=True)]
 
 
 def _array(x: Any) -> np.ndarray:

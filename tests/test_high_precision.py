@@ -6,6 +6,7 @@ import mpmath
 import numpy as np
 
 from benchmarks._high_precision import evaluate, to_float
+from nhjax import lanes
 
 
 def test_high_precision_function_has_fifty_digits():
@@ -32,3 +33,18 @@ def test_high_precision_gradient_agrees_with_float64():
     x = jnp.array([0.3, -0.8, 1.1])
     slope = jax.grad(energy)
     np.testing.assert_allclose(to_float(evaluate(slope, x)), slope(x), rtol=1e-14)
+
+
+def test_high_precision_evaluates_compiled_programs_member_by_member():
+    def wave(x, speed):
+        return jnp.sin(x / 3) * speed, x.sum()
+
+    x = jnp.array([[0.1, 0.2], [0.3, 0.4], [0.5, 0.6]])
+    single, many = lanes.jit(wave), lanes.vmap(wave, in_axes=(0, None))
+    expected = [evaluate(wave, row, 0.7) for row in x]
+    for row, (wanted, _) in zip(x, expected, strict=True):
+        assert (evaluate(single, row, 0.7)[0] == wanted).all()
+    for got, column in zip(
+        evaluate(many, x, 0.7), zip(*expected, strict=True), strict=True
+    ):
+        assert (got == np.stack(column)).all()
