@@ -10,6 +10,16 @@ their terms; and the distance between the ends of the two solvers. Where one sol
 alone accepts a step, the distance is the change of its stages in one more iteration of
 Newton's method.
 
+Doubtful steps are judged once more: accepted steps with a residual above 1e-13, or with
+an end that differs by more than 1e-11. Newton's method takes them again from states
+that are moved by one unit in the last place. How far this moves the end is the floor,
+which is at least the unit round-off: a start is never known better. An end within 400
+floors is solved; so many units of round-off count as noise in the solvers. Of the other
+steps with a residual of at most 1e-13, ends that differ by more than 1e-3 are two
+solutions of the same equations, and ends that are nearer have a nearly singular
+Jacobian. Where the coordinates are so large that the distance overflows, the residual
+decides. All other doubtful steps are wrongly accepted.
+
 The terms of an equation r(x; q) = 0 have the size |∂r/∂x| |x| + |∂r/∂q| |q|, where |x|
 is the largest velocity, the largest multiplier and so on. No residual smaller than this
 size times the unit round-off can be demanded (Oettli and Prager, 1964). An acceleration
@@ -45,7 +55,7 @@ from jaxtyping import Array, Float
 import nhjax
 from nhjax import systems
 from nhjax._method import AbstractMethod
-from nhjax._numerics import max_norm, nonzero_or_one
+from nhjax._numerics import max_norm, NOISE_UNITS, nonzero_or_one
 from nhjax._step import step, StepOutcome, StepState
 from nhjax._step._equations import (
     stage_residual,
@@ -65,7 +75,8 @@ from ._report import add_keep, markdown_table, number, RESULTS, with_saved, writ
 
 
 SMALLEST, LARGEST, SIZES = 0.004, 4.0, 10
-ALLOWED, SAME = 1e-13, 1e-11
+ALLOWED, SAME, FAR = 1e-13, 1e-11, 1e-3
+JUDGEMENTS = "at the floor", "two solutions", "nearly singular", "overflow", "wrong"
 # More stages than these take many minutes to compile.
 MOST_STAGES = {"Whipple bicycle": 3}
 NUDGE = 2.0**-26
@@ -113,9 +124,21 @@ class Judged(NamedTuple):
 class Row(NamedTuple):
     """Both solvers on one step, and how far apart their ends are."""
 
+    start: nhjax.State
     simplified: Judged
     newton: Judged
     distance: Array
+
+
+def compared(
+    start: nhjax.State,
+    stages: StageEquations,
+    simplified: StepOutcome,
+    newton: StepOutcome,
+) -> Row:
+    """Judge both solvers on one step."""
+    judged = judge(stages, simplified), judge(stages, newton)
+    return Row(start, *judged, apart(simplified, newton))
 
 
 def judge(stages: StageEquations, outcome: StepOutcome) -> Judged:
@@ -219,7 +242,7 @@ def run(
             first, second = (
                 step(arguments, method, solver, go_on) for solver in solvers
             )
-            row = Row(judge(stages, first), judge(stages, second), apart(first, second))
+            row = compared(step_state.state, stages, first, second)
             good = first.result == nhjax.RESULTS.successful
             # Where the faster solver fails, the run goes on with the other one.
             other = second.result == nhjax.RESULTS.successful
@@ -255,7 +278,7 @@ def single_steps(
         arguments = near_rest.first_arguments(system, method, *start)
         stages = equations_of_step(arguments, method)
         first, second = (step(arguments, method, solver, go_on) for solver in solvers)
-        return Row(judge(stages, first), judge(stages, second), apart(first, second))
+        return compared(start[0], stages, first, second)
 
     return jax.lax.map(one, (starts, sizes))
 
@@ -299,9 +322,11 @@ def measure_starts(name: str, stages: int, number: int, seed: int = 0) -> dict:
     v = jnp.asarray(2 * generator.standard_normal((number, n)))
     sizes = jnp.asarray(10 ** generator.uniform(-3, 0.5, number))
     starts = jax.vmap(lambda q, v: nhjax.initial_state(system, q, v))(q, v)
-    rows = single_steps(system, nhjax.LobattoIIIAB(stages), starts, sizes)
-    alive = np.ones(number, bool)
-    return {"system": name, "stages": stages} | table_row(rows, alive)
+    method = nhjax.LobattoIIIAB(stages)
+    rows = single_steps(system, method, starts, sizes)
+    figures = table_row(rows, np.ones(number, bool))
+    figures |= judge_doubtful(system, method, rows, np.asarray(sizes))
+    return {"system": name, "stages": stages} | figures
 
 
 def apart(first: StepOutcome, second: StepOutcome) -> Float[Array, ""]:
@@ -322,13 +347,30 @@ FAILURES = {
 }
 
 
+def accepted_steps(rows: Row, alive: np.ndarray) -> list[np.ndarray]:
+    """Return which steps each solver accepts."""
+    code = int(nhjax.RESULTS.successful._value)
+    return [
+        alive & (np.asarray(judged.result) == code)
+        for judged in (rows.simplified, rows.newton)
+    ]
+
+
+def distances(rows: Row, first: np.ndarray, second: np.ndarray) -> np.ndarray:
+    """Return how far apart two accepted ends are, or how far one would still move."""
+    alone = np.where(first, rows.simplified.correction, rows.newton.correction)
+    return np.where(first & second, rows.distance, alone)
+
+
 def table_row(rows: Row, alive: np.ndarray) -> dict[str, float | int]:
     """Counts of what became of the steps, and the worst figures of accepted ones."""
     figures: dict[str, float | int] = {}
-    accepted = []
-    for name, judged in (("simplified", rows.simplified), ("newton", rows.newton)):
+    first, second = accepted_steps(rows, alive)
+    for name, judged, good in (
+        ("simplified", rows.simplified, first),
+        ("newton", rows.newton, second),
+    ):
         result = np.asarray(judged.result)
-        good = alive & (result == int(nhjax.RESULTS.successful._value))
         figures[f"{name} accepted"] = int(np.sum(good))
         for failure, code in FAILURES.items():
             count = np.sum(alive & (result == int(code._value)))
@@ -338,25 +380,88 @@ def table_row(rows: Row, alive: np.ndarray) -> dict[str, float | int]:
         for figure in ("residual", "violation"):
             values = np.asarray(getattr(judged, figure))[good]
             figures[f"{name} {figure}"] = float(np.max(values, initial=0))
-        accepted.append(good)
-    first, second = accepted
-    distance = np.where(
-        first & second,
-        rows.distance,
-        np.where(first, rows.simplified.correction, rows.newton.correction),
-    )[first | second]
+    distance = distances(rows, first, second)[first | second]
     figures["distance"] = float(np.max(distance, initial=0))
     # What is not a number is not the same either.
     figures["apart"] = int(np.sum(~(distance <= SAME)))
     return figures
 
 
+def judge_doubtful(
+    system: nhjax.LagrangianSystem,
+    method: AbstractMethod,
+    rows: Row,
+    sizes: np.ndarray,
+    alive: np.ndarray | bool = True,
+) -> dict[str, dict[str, float | int]]:
+    """Judge the doubtful steps, and return their number, judgements and extremes."""
+    first, second = accepted_steps(rows, np.broadcast_to(alive, sizes.shape))
+    distance = distances(rows, first, second)
+    residuals = [
+        np.where(good, judged.residual, 0)
+        for judged, good in ((rows.simplified, first), (rows.newton, second))
+    ]
+    residual = np.maximum(*residuals)
+    is_doubtful = (first | second) & ~((distance <= SAME) & (residual <= ALLOWED))
+    counts = dict.fromkeys(JUDGEMENTS, 0)
+    extremes = {"least h": np.inf, "largest distance": 0.0, "most floors": 0.0}
+    for place in map(tuple, np.argwhere(is_doubtful)):
+        start = jax.tree.map(lambda x, place=place: x[place], rows.start)
+        h = sizes[place]
+        moved = float(moved_by_last_digit(system, method, start, jnp.asarray(h)))
+        d, floor = float(distance[place]), max(moved, float(np.finfo(float).eps))
+        extremes["least h"] = min(extremes["least h"], float(h))
+        if d <= NOISE_UNITS * floor:
+            judgement = "at the floor"
+            extremes["largest distance"] = max(extremes["largest distance"], d)
+            extremes["most floors"] = max(extremes["most floors"], d / floor)
+        elif not residual[place] <= ALLOWED:
+            judgement = "wrong"
+        elif np.isnan(d):
+            judgement = "overflow"
+        else:
+            judgement = "two solutions" if d > FAR else "nearly singular"
+        counts[judgement] += 1
+    return {"doubtful": counts | extremes} if is_doubtful.any() else {}
+
+
+@eqx.filter_jit
+def moved_by_last_digit(
+    system: nhjax.LagrangianSystem,
+    method: AbstractMethod,
+    start: nhjax.State,
+    h: Float[Array, ""],
+) -> Float[Array, ""]:
+    """How far a step ends from another that starts one unit in the last place away.
+
+    It is the largest of four such distances, each relative to the size of the end.
+    """
+    z, unravel = ravel_pytree(start)
+    signs = np.random.default_rng(0).choice([-1.0, 1.0], (4, len(z)))
+    moves = jnp.asarray(np.concatenate([np.zeros((1, len(z))), signs]))
+    eps = float(jnp.finfo(z.dtype).eps)
+
+    def end(move):
+        arguments = near_rest.first_arguments(
+            system, method, unravel(z * (1 + eps * move)), h
+        )
+        return step(arguments, method, nhjax.Newton(), jnp.asarray(False))
+
+    ends = jax.lax.map(end, moves)
+    first, *others = (jax.tree.map(lambda x, k=k: x[k], ends) for k in range(5))
+    return jnp.max(jnp.stack([apart(other, first) for other in others]))
+
+
 def measure(name: str, stages: int, make: Callable, num_steps: int) -> dict:
     """The figures of one system and one number of stages."""
     system, y0 = make()
     sizes = jnp.asarray(np.geomspace(SMALLEST, LARGEST, SIZES))
-    rows, alive = run(system, nhjax.LobattoIIIAB(stages), y0, sizes, num_steps)
-    return {"system": name, "stages": stages} | table_row(rows, np.asarray(alive))
+    method = nhjax.LobattoIIIAB(stages)
+    rows, alive = run(system, method, y0, sizes, num_steps)
+    figures = table_row(rows, np.asarray(alive))
+    each = np.broadcast_to(np.asarray(sizes)[:, None], alive.shape)
+    figures |= judge_doubtful(system, method, rows, each, np.asarray(alive))
+    return {"system": name, "stages": stages} | figures
 
 
 FIGURES = ("accepted", *FAILURES, "other", "residual", "violation")
@@ -637,6 +742,7 @@ def main() -> None:
         (__doc__ or "").strip(),
         f"## Steps\n\nMeasured on {dates['steps']}. {summary(data['rows'])}",
         table_of_steps(data["rows"]),
+        f"### Doubtful steps\n\n{table_of_doubtful(data['rows'])}",
         f"## Starts\n\nMeasured on {dates['starts']}. {of_starts(data['starts'])}",
         f"## Starts near zero\n\nMeasured on {dates['near_zero']}; refused of "
         f"{data['near_zero'][0]['number']}:",
@@ -654,6 +760,24 @@ def table_of_steps(data: list[dict]) -> str:
         cells = [number(x) if isinstance(x, float) else str(x) for x in figures]
         rows.append([row["system"], str(row["stages"]), *cells])
     return markdown_table(["system", "s", *COLUMNS], rows)
+
+
+def table_of_doubtful(data: list[dict]) -> str:
+    """Say how the doubtful steps are judged, with a table."""
+    found = [row for row in data if row.get("doubtful")]
+    total = {key: sum(row["doubtful"][key] for row in found) for key in JUDGEMENTS}
+    text = f"{sum(total.values())} steps are doubtful: "
+    text += ", ".join(f"{count} {key}" for key, count in total.items()) + "."
+    keys = [*JUDGEMENTS, "least h", "largest distance", "most floors"]
+    rows = [
+        [row["system"], str(row["stages"])]
+        + [
+            number(x) if isinstance(x, float) else str(x)
+            for x in (row["doubtful"][key] for key in keys)
+        ]
+        for row in found
+    ]
+    return f"{text}\n\n{markdown_table(['system', 's', *keys], rows)}"
 
 
 def of_starts(starts: dict[str, Any]) -> str:

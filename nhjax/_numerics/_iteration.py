@@ -21,7 +21,8 @@ Aux = TypeVar("Aux")
 NOISE_UNITS = 400
 # When an increment fails to fall for the first time, this many units of round-off are
 # treated as noise. Each time that this happens again, the level grows by one of the two
-# factors below. The factor is smaller for iterations that may be slow, since their
+# factors below, and each time that an increment is the smallest so far, it falls by the
+# same factor. The factor is smaller for iterations that may be slow, since their
 # increments may rise and fall before they have converged.
 _FIRST_UNITS = 30.0
 _GROWTH, _GROWTH_IF_SLOW = 30.0, 2.0
@@ -68,6 +69,7 @@ class _Rules(NamedTuple):
     round_off: FloatScalar
     least: FloatScalar
     tolerance_or_eps: FloatScalar
+    quietest: float
     noisiest: float
     growth: float
     max_iterations: int
@@ -121,11 +123,12 @@ def iterate(
     The size of round-off depends on the conditioning of the problem, so that a fixed
     threshold would be either too coarse or never met (Hairer, Lubich, Wanner, GNI,
     section VIII.6). Each time that an increment fails to fall, the level of increments
-    that are treated as noise is raised, up to `noise_units` of round-off. By default
-    the highest level is the square root of the unit round-off, which suits iterations
-    that converge so fast that only noise can slow them down. After many iterations all
-    levels fall again, in proportion to the number of iterations, because the error of a
-    slow iteration is much larger than its increment.
+    that are treated as noise is raised, up to `noise_units` of round-off. An increment
+    that is smaller than all before it lowers the level again. By default the highest
+    level is the square root of the unit round-off, which suits iterations that converge
+    so fast that only noise can slow them down. After many iterations all levels fall
+    again, in proportion to the number of iterations, because the error of a slow
+    iteration is much larger than its increment.
     """
     # `jit` makes JAX trace the iteration once, for the shapes and for the loop: that is
     # most of the work of tracing a step.
@@ -136,13 +139,15 @@ def iterate(
     eps = float(jnp.finfo(dtype).eps)
     scale, round_off = jnp.asarray(scale, dtype), jnp.asarray(round_off, dtype)
     tolerance = jnp.asarray(tolerance, dtype)
+    growth = _GROWTH if noise_units is None else _GROWTH_IF_SLOW
     rules = _Rules(
         scale=scale,
         round_off=round_off,
         least=jnp.maximum(eps * (scale + round_off), tolerance * scale),
         tolerance_or_eps=jnp.maximum(tolerance, eps),
+        quietest=_FIRST_UNITS / growth * eps,
         noisiest=eps**0.5 if noise_units is None else noise_units * eps,
-        growth=_GROWTH if noise_units is None else _GROWTH_IF_SLOW,
+        growth=growth,
         max_iterations=max_iterations,
     )
 
@@ -153,8 +158,7 @@ def iterate(
 
     zero = jnp.zeros((), jnp.int32)
     skip = jnp.asarray(skip)
-    least = _FIRST_UNITS / rules.growth * eps
-    one, infinite, least = (jnp.asarray(x, dtype) for x in (1, jnp.inf, least))
+    one, infinite, least = (jnp.asarray(x, dtype) for x in (1, jnp.inf, rules.quietest))
     never = jnp.zeros_like(skip)
     start = _Progress(one, infinite, least, zero, skip, skip, never)
     x, aux, progress = jax.lax.while_loop(
@@ -187,7 +191,9 @@ def _progress(rules: _Rules, before: _Progress, sizes: UpdateNorms) -> _Progress
     may_be_noise = left <= rules.noisiest * magnified
     stalls = may_be_noise & (increment >= before.smallest)
     more = jnp.minimum(rules.growth * before.believed, rules.noisiest)
+    less = jnp.maximum(before.believed / rules.growth, rules.quietest)
     believed = jnp.where(stalls, more, before.believed)
+    believed = jnp.where(increment < before.smallest, less, believed)
     stagnant = stalls & (left <= believed * magnified)
     # A tolerance is relative to x itself, and does not depend on the round-off of x.
     least = jnp.maximum(rules.least, rules.tolerance_or_eps * sizes.iterate)

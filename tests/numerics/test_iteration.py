@@ -49,6 +49,15 @@ def test_slow_iteration_that_spirals_leaves_no_more_error_than_noise(rate, angle
     assert float(jnp.max(jnp.abs(solved.x))) < 400 * np.finfo(float).eps
 
 
+@pytest.mark.parametrize(
+    ("rate", "angle", "most"), [(0.7, 1.4, 30), (0.8, 0.3, 300), (0.8, 1.9, 50)]
+)
+def test_iteration_that_reaches_smaller_increments_is_not_noise(rate, angle, most):
+    solved = circling(rate, angle, 400, max_iterations=1000)
+    assert solved.converged
+    assert float(jnp.max(jnp.abs(solved.x))) < most * np.finfo(float).eps
+
+
 def test_iteration_with_increments_of_noise_ends():
     def sweep(k):
         # Some 150 units of round-off, with both signs.

@@ -11,7 +11,14 @@ import pytest
 import nhjax
 from benchmarks import near_rest
 from benchmarks._random_systems import random_systems
-from benchmarks.acceptance import ALLOWED, gallery, measure, measure_starts, SAME
+from benchmarks.acceptance import (
+    ALLOWED,
+    gallery,
+    JUDGEMENTS,
+    measure,
+    measure_starts,
+    SAME,
+)
 from nhjax import RESULTS
 from support.long import long
 
@@ -254,6 +261,7 @@ def test_accepted_steps_of_growing_size_are_solved(name, stages):
     # The search continues until steps fail.
     assert figures["simplified accepted"] < 200
     assert figures["distance"] <= SAME
+    assert "doubtful" not in figures
 
 
 @pytest.mark.parametrize("name", ["Morse", long("body, exponential")])
@@ -263,6 +271,14 @@ def test_accepted_steps_from_random_starts_are_solved(name):
         assert figures[f"{solver} accepted"] > 300
         assert figures[f"{solver} accepted"] < 1500
         assert figures[f"{solver} residual"] <= ALLOWED
+    assert figures.get("doubtful", {"wrong": 0})["wrong"] == 0
+
+
+def test_doubtful_step_with_two_solutions_is_judged():
+    # Both solvers solve one of 3000 steps, and end far apart.
+    doubtful = measure_starts("Morse", 3, number=3000)["doubtful"]
+    assert doubtful["two solutions"] == 1
+    assert sum(doubtful[judgement] for judgement in JUDGEMENTS) == 1
 
 
 @pytest.mark.parametrize(
