@@ -87,6 +87,11 @@ def function_or_numbers(value: Any) -> Any:
     return static_function(value)
 
 
+def function_or_not_negative(value: Any) -> Any:
+    """Convert a number, positive or zero, or check a function."""
+    return function_or_numbers(value) if callable(value) else not_negative(value)
+
+
 def position_function(value: Any) -> Any:
     """Check a function of (t, q, args) of a force: a point, an angle, a rotation."""
     check_signature("A force", "its point or angle", value, ("t", "q", "args"))
@@ -548,7 +553,8 @@ class Brake(_AbstractPulledBack):
         which is held still turns slowly.
     - `manifold`: the `manifold` of the system, required if it has one.
 
-    **Raises:** when called, `ShapeError` if φ or τ is not a scalar.
+    **Raises:** `ValueError` if τ is a negative number; when called, `ShapeError` if φ
+    or τ is not a scalar.
 
     !!! example
 
@@ -560,7 +566,7 @@ class Brake(_AbstractPulledBack):
     """
 
     angle: PositionFunction = eqx.field(converter=position_function)
-    torque: ArrayLike | PhaseFunction = eqx.field(converter=function_or_numbers)
+    torque: ArrayLike | PhaseFunction = eqx.field(converter=function_or_not_negative)
     smoothing: ArrayLike = eqx.field(converter=positive, kw_only=True)
     manifold: AbstractLieGroup | None = eqx.field(default=None, kw_only=True)
 

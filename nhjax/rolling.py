@@ -337,6 +337,12 @@ class AbstractContact(eqx.Module):
                 '`no_slip` must be a tuple of "along", "across" and angles in radians, '
                 f"got {self.no_slip!r}."
             )
+        weights = [_direction(x) for x in self.no_slip]
+        if len(weights) > 2 or np.linalg.matrix_rank(np.array(weights)) < len(weights):
+            raise ValueError(
+                "`no_slip` must name at most two directions that are not parallel, got "
+                f"{self.no_slip!r}. Leave out those that follow from the others."
+            )
 
     @abc.abstractmethod
     def offset(
@@ -441,12 +447,15 @@ class AbstractContact(eqx.Module):
 
     def weights(self, dtype: Any) -> Float[Array, "k 2"]:
         """Return the parts along and across of the directions without slip."""
-        unit = {"along": (1.0, 0.0), "across": (0.0, 1.0)}
-        weights = [
-            unit[x] if isinstance(x, str) else (math.cos(x), math.sin(x))
-            for x in self.no_slip
-        ]
+        weights = [_direction(x) for x in self.no_slip]
         return jnp.asarray(weights, dtype).reshape(-1, 2)
+
+
+def _direction(name: str | float) -> tuple[float, float]:
+    """Return the parts along and across of a direction without slip."""
+    if isinstance(name, str):
+        return {"along": (1.0, 0.0), "across": (0.0, 1.0)}[name]
+    return math.cos(name), math.sin(name)
 
 
 class Wheel(AbstractContact):
@@ -477,8 +486,8 @@ class Wheel(AbstractContact):
     - `ground`: a `Plane` or a `Surface`; by default the plane z = 0.
     - `manifold`: the manifold of the system, if it has one.
 
-    **Raises:** `ValueError` if `no_slip` has another name; when called, `ShapeError` if
-    the pose has other shapes.
+    **Raises:** `ValueError` if `no_slip` has another name, or directions that follow
+    from each other; when called, `ShapeError` if the pose has other shapes.
 
     !!! example
 

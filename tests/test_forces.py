@@ -434,6 +434,11 @@ def test_several_numbers_for_one_parameter_are_refused():
         forces.Spring(_point, _other, jnp.array([1.0, 2.0]))
 
 
+def test_brake_with_negative_torque_is_refused():
+    with pytest.raises(ValueError, match=r"must be positive or zero, got -3\.0"):
+        forces.Brake(lambda t, q, args: q[0], -3.0, smoothing=0.1)
+
+
 def test_whole_numbers_of_a_force_are_differentiable():
     force = forces.PointForce(_point, np.array([0, 1]))
     assert jnp.issubdtype(cast(Any, force.vector).dtype, jnp.floating)

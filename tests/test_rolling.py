@@ -444,6 +444,21 @@ def test_contacts_keep_the_precision_of_the_state(dtype):
             ValueError,
             "`no_slip` must be a tuple",
         ),
+        (
+            lambda: rolling.Wheel(_free_body, 0.3, no_slip=("along", "along")),
+            ValueError,
+            "`no_slip` must name at most two directions",
+        ),
+        (
+            lambda: rolling.Wheel(_free_body, 0.3, no_slip=(0.3, 0.3 + np.pi)),
+            ValueError,
+            "that are not parallel",
+        ),
+        (
+            lambda: rolling.Wheel(_free_body, 0.3, no_slip=("along", "across", 0.8)),
+            ValueError,
+            "at most two directions",
+        ),
         (lambda: rolling.Plane((0.0, 1.0)), nhjax.ShapeError, r"shape \(3,\)"),
         (
             lambda: rolling.Ellipsoid(_free_body, [1.0, 2.0]),
