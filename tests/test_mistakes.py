@@ -304,7 +304,7 @@ VALUES_OF_FUNCTIONS = [
         lambda: start(system_with(nonholonomic=lambda t, q, v, args: v[None])),
         ShapeError,
         "`nonholonomic(t, q, v, args)` must return",
-        "got shape (1, 3)",
+        "got shape (1, 3). For constraints A(q) v = 0 return `A @ v`.",
     ),
     row(
         "gave no constraint at all",

@@ -91,6 +91,8 @@ def check_functions(
                 f"{called} must return an array of {wanted}, got {no_array(out)}"
             )
         if not fits(shape):
+            if name == "nonholonomic" and len(shape) == 2:
+                advice = f" For constraints A(q) {letter} = 0 return `A @ {letter}`."
             raise ShapeError(
                 f"{called} must return {wanted}, got shape {shape}.{advice}"
             )
