@@ -643,6 +643,42 @@ def test_urdf_link_without_inertia_is_named(tmp_path):
         nhjax.from_mujoco(path)
 
 
+def _urdf_with_mesh(folder, address):
+    """A free body whose mass is that of a mesh, a tetrahedron with edges of 0.1 m."""
+    path = folder / "carrier_description" / "urdf" / "carrier.urdf"
+    meshes = folder / "carrier_description" / "meshes"
+    for made in (path.parent, meshes):
+        made.mkdir(parents=True)
+    corners = 0.1 * np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]], "<f4")
+    faces = [(0, 2, 1), (0, 1, 3), (0, 3, 2), (1, 2, 3)]
+    normal, last = np.zeros(3, "<f4").tobytes(), bytes(2)
+    parts = [normal + corners[list(face)].tobytes() + last for face in faces]
+    count = len(faces).to_bytes(4, "little")
+    (meshes / "body.stl").write_bytes(bytes(80) + count + b"".join(parts))
+    path.write_text(
+        '<robot name="carrier"><link name="body"><collision><geometry>'
+        f'<mesh filename="{address}"/></geometry></collision></link></robot>',
+        encoding="utf-8",
+    )
+    return path
+
+
+def test_mesh_of_a_ros_package_is_found_around_the_file(tmp_path):
+    path = _urdf_with_mesh(tmp_path, "package://carrier_description/meshes/body.stl")
+    robot = nhjax.from_mujoco(path, root="free", parameters={"mass": ["body"]})
+    # The density is that of water.
+    np.testing.assert_allclose(robot.args["mass"]["body"], 1000 * 0.1**3 / 6, rtol=1e-6)
+
+
+@pytest.mark.parametrize("package", ["package://other/meshes/", "meshes/"])
+def test_mesh_that_is_missing_is_named_with_advice(package, tmp_path):
+    path = _urdf_with_mesh(tmp_path, f"{package}body.stl")
+    with pytest.raises(
+        ValueError, match=r"body\.stl.* package://NAME/\.\.\. in a folder NAME"
+    ):
+        nhjax.from_mujoco(path, root="free")
+
+
 def test_file_that_is_no_xml_is_refused(tmp_path):
     path = tmp_path / "robot.py"
     path.write_text("x = 1", encoding="utf-8")

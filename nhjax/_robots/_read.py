@@ -18,6 +18,8 @@ from .._errors import check_choice
 
 # Angles of URDF files that are closer to quarter turns were meant as such [rad].
 _ROUNDED_ANGLE = 1e-3
+# The addresses of files in URDF files that were written for ROS begin with this.
+_PACKAGE = "package://"
 
 IGNORABLE = (
     "actuators",
@@ -124,6 +126,7 @@ def _compile_file(
     if tree.getroot().tag == "robot":
         _set_root(tree.getroot(), path, root)
         _complete_quarter_turns(tree.getroot())
+        _find_packages(tree.getroot(), path)
         text = ElementTree.tostring(tree.getroot(), encoding="unicode")
         spec = _or_message(lambda: spec_of.from_string(text), path)
         # Meshes are searched for beside the file.
@@ -185,6 +188,18 @@ def _complete_quarter_turns(robot: ElementTree.Element) -> None:
             element.set("rpy", " ".join(words))
 
 
+def _find_packages(robot: ElementTree.Element, path: Path) -> None:
+    """Replace addresses of ROS packages around the file by the paths of their files."""
+    for mesh in robot.iter("mesh"):
+        address = mesh.get("filename", "")
+        package, _, rest = address.removeprefix(_PACKAGE).partition("/")
+        if address.startswith(_PACKAGE):
+            for folder in path.resolve().parents:
+                if folder.name == package and (folder / rest).is_file():
+                    mesh.set("filename", str(folder / rest))
+                    break
+
+
 def is_fixed_urdf(model: Any) -> bool:
     """Return whether a file is a URDF whose root link MuJoCo fixes to the world."""
     if not isinstance(model, str | os.PathLike):
@@ -209,6 +224,13 @@ def _or_message(function: Any, name: Any) -> Any:
             advice = (
                 " Give this body a geom with a mass, or masses and moments of inertia "
                 "(`inertial`), or fix it to its parent."
+            )
+        if "Error opening file" in str(error):
+            advice = (
+                ". A mesh is searched for beside the file, and the mesh "
+                "package://NAME/... in a folder NAME around it. If the file gives "
+                "masses and inertias, delete the mesh from it: nhjax does not simulate "
+                "contacts between shapes."
             )
         raise ValueError(
             f"from_mujoco: MuJoCo cannot read {name}: {error}{advice}"
