@@ -36,9 +36,10 @@ from .._numerics import nan_unless
 from .._results import RESULTS
 from .._step import (
     AbstractStageSolver,
+    ForceSlopeError,
     is_simplified_alone,
-    leaves_steps_to_newton,
     SimplifiedNewton,
+    solvers_of_unsolved_steps,
 )
 from .._system import (
     AbstractMechanicalSystem,
@@ -99,13 +100,15 @@ _TOO_LARGE = (
     "equations of each step are solved, but the trajectory is meaningless. Try `dt` = "
     "{:.6g}."
 )
-_TAKEN_OVER = (
+_REPEATED = (
     "`SimplifiedNewton` did not solve step {} of this run, which is therefore repeated "
-    "with Newton's method for such steps. This compiles a second program. To compile "
-    'only one, pass `stage_solver=nhjax.SimplifiedNewton(jacobian="full")`, which '
-    "includes stiffness and damping and is much faster than Newton's method, "
-    "`nhjax.SimplifiedNewton(fallback=True)` or `nhjax.Newton()`, or take a smaller "
-    "`dt`."
+    "with {}. This compiles another program. To compile only one, pass "
+    "`stage_solver={}`, or take a smaller `dt`."
+)
+_BY_FULL = "the full Jacobian", 'nhjax.SimplifiedNewton(jacobian="full")'
+_BY_NEWTON = (
+    "Newton's method for such steps",
+    "nhjax.SimplifiedNewton(fallback=True)` or `nhjax.Newton()",
 )
 _INTERRUPTED = (
     "The run was interrupted after {} steps, and the solution ends there, at t = "
@@ -286,13 +289,22 @@ def integrate(
     whole_run = _program_of_run(grid)
     sol = whole_run(system, method, y0, grid, args, options, saveat, solver_options)
     used_newton = not is_simplified_alone(stage_solver)
-    if not _is_tracing() and leaves_steps_to_newton(stage_solver) and is_unsolved(sol):
-        used_newton = True
-        warnings.warn(_TAKEN_OVER.format(int(sol.stats["failed_step"])), stacklevel=2)
-        # The progress meter has already shown this run: the repeated run shows none.
-        solver = replace(stage_solver, fallback=True)
-        solver_options = SolverOptions(solver, adjoint, NoProgressMeter())
-        sol = whole_run(system, method, y0, grid, args, options, saveat, solver_options)
+    repeats = [] if _is_tracing() else solvers_of_unsolved_steps(stage_solver)
+    for solver in repeats:
+        if not is_unsolved(sol):
+            break
+        used_newton = not is_simplified_alone(solver)
+        told = _BY_NEWTON if used_newton else _BY_FULL
+        failed = int(sol.stats["failed_step"])
+        warnings.warn(_REPEATED.format(failed, *told), stacklevel=2)
+        # The progress meter has already shown this run.
+        again = SolverOptions(solver, adjoint, NoProgressMeter())
+        try:
+            sol = whole_run(system, method, y0, grid, args, options, saveat, again)
+        except ForceSlopeError:
+            # Newton's method needs the same derivatives.
+            used_newton = True
+            break
     if valid is not None:
         sol = _invalid_unless(valid, sol)
     if not _is_tracing() and ended_as(sol, "interrupted"):

@@ -8,6 +8,7 @@ from ._invariants import (
     Invariants as Invariants,
     LEAST_PART as LEAST_PART,
 )
+from ._jacobian import ForceSlopeError as ForceSlopeError
 from ._local_error import local_error as local_error
 from ._round_off import (
     round_off_of_steps as round_off_of_steps,
@@ -15,9 +16,9 @@ from ._round_off import (
 )
 from ._solvers import (
     is_simplified_alone as is_simplified_alone,
-    leaves_steps_to_newton as leaves_steps_to_newton,
     Newton as Newton,
     SimplifiedNewton as SimplifiedNewton,
+    solvers_of_unsolved_steps as solvers_of_unsolved_steps,
 )
 from ._step import (
     AbstractStageSolver as AbstractStageSolver,

@@ -700,11 +700,15 @@ def _first_order_factors(
     )
 
 
+class ForceSlopeError(ValueError):
+    """The full Jacobian needs a derivative that a force does not have."""
+
+
 def _with_full_factors(
     stages: StageEquations, x: StageUnknowns, lin: Linearisation
 ) -> StageJacobianFactors:
     if not forces_have_slopes(stages):
-        raise ValueError(
+        raise ForceSlopeError(
             '`SimplifiedNewton(jacobian="full")` needs derivatives of forces in forward'
             " mode, which callbacks and functions with a rule for reverse mode only do "
             'not have; use "leading" or None.'

@@ -4,6 +4,7 @@ Both stop when their increments are round-off, relative to the scale of the step
 """
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import NamedTuple
 
 import equinox as eqx
@@ -97,10 +98,10 @@ class SimplifiedNewton(AbstractStageSolver):
     still converge. With the fallback, Newton's method takes over in such a step, and
     `Solution.stats["num_newton_steps"]` counts these steps. A program that contains
     both methods takes about three times as long to compile. For this reason a plain
-    call of `integrate` first runs without the fallback, and repeats the run with it if
-    a step was not solved. In your own transformed program (`jax.jit`, `jax.vmap`,
-    `jax.grad`), a step that is not solved ends the run, unless you ask for the
-    fallback.
+    call of `integrate` first runs without the fallback. If a step was not solved, the
+    call repeats the run with the full Jacobian, and if that does not help, with the
+    fallback. In your own transformed program (`jax.jit`, `jax.vmap`, `jax.grad`), a
+    step that is not solved ends the run, unless you ask for one of these.
 
     **Arguments:**
 
@@ -197,9 +198,17 @@ def is_simplified_alone(stage_solver: AbstractStageSolver) -> bool:
     return isinstance(stage_solver, SimplifiedNewton) and not stage_solver.fallback
 
 
-def leaves_steps_to_newton(stage_solver: AbstractStageSolver) -> bool:
-    """Return whether a plain call that fails is repeated with the fallback."""
-    return isinstance(stage_solver, SimplifiedNewton) and stage_solver.fallback is None
+def solvers_of_unsolved_steps(
+    stage_solver: AbstractStageSolver,
+) -> list[SimplifiedNewton]:
+    """List the solvers with which a plain call repeats a run that fails."""
+    is_simplified = isinstance(stage_solver, SimplifiedNewton)
+    if not is_simplified or stage_solver.fallback is not None:
+        return []
+    by_newton = replace(stage_solver, fallback=True)
+    if stage_solver.jacobian is not None:
+        return [by_newton]
+    return [replace(stage_solver, jacobian="full"), by_newton]
 
 
 class Newton(AbstractStageSolver):

@@ -21,6 +21,7 @@ from benchmarks.acceptance import (
 )
 from nhjax import RESULTS
 from support.long import long
+from support.particle_run import assert_trees_equal
 
 
 ROUND_OFF = 1e-13
@@ -138,6 +139,51 @@ def test_fallback_in_steps_that_need_newton_solves_them(compiled):
         np.testing.assert_allclose(
             getattr(sol.ys, name), getattr(expected.ys, name), rtol=1e-9
         )
+
+
+def stiff_spring(force=None, stage_solver=None):
+    """A few steps that are far too long for the leading part of the Jacobian."""
+    system = nhjax.LagrangianSystem(
+        lambda t, q, v, args: 0.5 * v @ v - 0.5 * 1e4 * q @ q, force=force
+    )
+    y0 = nhjax.initial_state(system, jnp.array([1.0, 0.5]), jnp.zeros(2))
+    options = {} if stage_solver is None else {"stage_solver": stage_solver}
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        sol = nhjax.integrate(
+            system, nhjax.LobattoIIIAB(3), y0, dt=0.05, num_steps=4, **options
+        )
+    return sol, [str(x.message) for x in caught if "did not solve" in str(x.message)]
+
+
+def test_plain_call_with_unsolved_step_is_repeated_with_the_full_jacobian():
+    sol, told = stiff_spring()
+    assert len(told) == 1
+    assert "did not solve step 0 of this run" in told[0]
+    assert '`stage_solver=nhjax.SimplifiedNewton(jacobian="full")`' in told[0]
+    assert int(sol.stats["num_newton_steps"]) == 0
+    full, none = stiff_spring(stage_solver=nhjax.SimplifiedNewton(jacobian="full"))
+    assert none == []
+    assert_trees_equal(sol.ys, full.ys)
+
+
+def test_plain_call_without_slopes_of_forces_fails_without_advice_of_newton():
+    @jax.custom_vjp
+    def drag(v):
+        return -v
+
+    drag.defvjp(lambda v: (-v, None), lambda _, change: (-change,))
+    with pytest.raises(nhjax.IntegrationError, match="smaller `dt`") as failure:
+        stiff_spring(lambda t, q, v, args: drag(v))
+    assert "jacobian" not in str(failure.value)
+
+
+def test_plain_call_with_a_jacobian_of_the_users_is_repeated_with_newton():
+    solver = nhjax.SimplifiedNewton(jacobian="leading")
+    sol, told = stiff_spring(stage_solver=solver)
+    assert len(told) == 1
+    assert "Newton's method for such steps" in told[0]
+    assert int(sol.stats["num_newton_steps"]) == 4
 
 
 def test_message_of_unsolved_step_under_jit_names_the_fallback():
