@@ -8,3 +8,4 @@ from ._small_product import (
     small_product as small_product,
 )
 from ._tracked_jit import captured_by as captured_by, tracked_jit as tracked_jit
+from ._write_row import write_row as write_row

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, PyTree
 
+from .._compile import write_row
 from .._custom_types import Args, BoolScalar, FloatScalar, IntScalar
 from .._errors import Check, DTypeError, is_traced, NonFiniteError
 from .._step import StepRecord
@@ -385,7 +386,7 @@ class Saving(eqx.Module):
 
         def put(buffer, row, slot):
             return jax.tree.map(
-                lambda x, new: jax.lax.dynamic_update_index_in_dim(x, new, slot, 0),
+                lambda x, new: write_row(x, new, slot),
                 buffer,
                 row,
             )

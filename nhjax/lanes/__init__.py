@@ -13,6 +13,7 @@ from ._jaxprs import (
     LARGEST_REDUCTION as LARGEST_REDUCTION,
     num_results as num_results,
     SMALL_PRODUCT as SMALL_PRODUCT,
+    WRITE_ROW as WRITE_ROW,
 )
 from ._kernel import (
     captures_tracers as captures_tracers,

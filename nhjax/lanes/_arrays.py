@@ -23,7 +23,8 @@ from ._builder import (
     MOST_ONE_BY_ONE,
     Operation,
 )
-from ._graph import dtype_name, is_float, Node, Unsupported
+from ._graph import dtype_name, is_float, LoopBuilder, Node, Unsupported
+from ._jaxprs import WRITE_ROW
 
 
 # A function that rearranges a NumPy array, and returns a view.
@@ -302,18 +303,36 @@ def _dynamic_update_slice(
     builder: Builder, equation: Any, values: list[ArrayValue]
 ) -> ArrayValue:
     value, update, *starts = values
+    return _updated(builder, value, update, starts)
+
+
+def _write_row(builder: Builder, equation: Any, values: list[ArrayValue]) -> ArrayValue:
+    value, row, slot = values
+    axis = equation.params["axis"]
+    update = row.reshape((*row.shape[:axis], 1, *row.shape[axis:]))
+    starts: list[ArrayValue] = [
+        slot if k == axis else builder.array(0, "int64")
+        for k in range(len(value.shape))
+    ]
+    return _updated(builder, value, update, starts)
+
+
+def _updated(
+    builder: Builder, value: ArrayValue, update: ArrayValue, starts: list[ArrayValue]
+) -> ArrayValue:
+    """Write an array into another one, at the given start on each axis."""
     if update.size == 0:
         return value
-    starts = _starts(builder, value.shape, update.shape, starts)
-    is_known = all(start.is_constant for start in starts)
+    places = _starts(builder, value.shape, update.shape, starts)
+    is_known = all(place.is_constant for place in places)
     if is_known and not isinstance(value, InMemory) and value.size <= MOST_ONE_BY_ONE:
         out = value.copy()
-        window = _window(starts, update.shape)
+        window = _window(places, update.shape)
         out[window] = builder.memory.registers(update)
         return out
     target = builder.memory.owned(value)
     view = flat_indices(value.shape)[tuple(map(slice, update.shape))]
-    shift = place_in_memory(builder, value.shape, starts)
+    shift = place_in_memory(builder, value.shape, places)
     builder.memory.write(target.buffer, view, update, shift)
     return target
 
@@ -321,6 +340,7 @@ def _dynamic_update_slice(
 INDEXING: dict[str, Operation] = {
     "dynamic_slice": _dynamic_slice,
     "dynamic_update_slice": _dynamic_update_slice,
+    WRITE_ROW: _write_row,
 }
 
 
@@ -564,8 +584,11 @@ def _rows(x: np.ndarray, axes: Sequence[int]) -> tuple[tuple[int, ...], np.ndarr
 def _reduce(builder: Builder, equation: Any, values: list[ArrayValue]) -> ArrayValue:
     op, empty = _REDUCTIONS[equation.primitive.name]
     dtype = dtype_name(equation.outvars[0].aval.dtype)
-    x = builder.memory.registers(values[0])
-    shape, rows = _rows(x, [int(axis) for axis in equation.params["axes"]])
+    value, axes = values[0], [int(axis) for axis in equation.params["axes"]]
+    is_whole = len(axes) == len(value.shape)
+    if isinstance(value, InMemory) and is_whole and value.size > MOST_ONE_BY_ONE:
+        return _reduced_in_loop(builder, op, value)
+    shape, rows = _rows(builder.memory.registers(value), axes)
     out = np.empty(len(rows), object)
     for index, row in enumerate(rows):
         out[index] = builder.graph.folded(op, row)
@@ -574,6 +597,22 @@ def _reduce(builder: Builder, equation: Any, values: list[ArrayValue]) -> ArrayV
                 np.array(empty(dtype)).astype(dtype), dtype
             )
     return out.reshape(shape)
+
+
+def _reduced_in_loop(builder: Builder, op: str, value: InMemory) -> ArrayValue:
+    """Combine all numbers of an array one after the other, in a loop."""
+    graph, memory = builder.graph, builder.memory
+    first = memory.load(value.buffer, None)
+    with LoopBuilder(graph) as loop:
+        k = loop.parameter(builder.integer(1))
+        total = loop.parameter(first)
+        loop.goes_on_while(graph.op("lt", k, builder.integer(value.size)))
+        number = memory.load(value.buffer, k)
+        after = graph.op("add", k, builder.integer(1)), graph.op(op, total, number)
+        loop.end(after)
+    out = np.empty((), object)
+    out[()] = loop.results()[1]
+    return out
 
 
 def _arg(

@@ -48,7 +48,7 @@ from ._graph import (
     Region,
     Unsupported,
 )
-from ._jaxprs import COMPILED_ONCE, KEPT_CALL
+from ._jaxprs import COMPILED_ONCE, KEPT_CALL, WRITE_ROW
 
 
 # The indices of both factors and of the result of a sum of products, as for
@@ -772,7 +772,7 @@ class _Attempt:
         return out
 
 
-_UPDATES = ("dynamic_update_slice", "scatter")
+_UPDATES = ("dynamic_update_slice", WRITE_ROW, "scatter")
 _SAME = ("reshape", "squeeze", "expand_dims", "copy", "copy_p", "optimization_barrier")
 
 
@@ -788,8 +788,8 @@ def updated_inputs(jaxpr: Any) -> frozenset[int]:
         ins = [None if isinstance(v, Literal) else v for v in equation.invars]
         if name.startswith(_UPDATES):
             origin = origins.get(ins[0])
-            is_slice = name == "dynamic_update_slice"
-            places = equation.invars[2:] if is_slice else equation.invars[1:2]
+            is_scatter = name.startswith("scatter")
+            places = equation.invars[1:2] if is_scatter else equation.invars[2:]
             if origin is not None:
                 if any(not isinstance(v, Literal) for v in places):
                     found.add(origin)

@@ -43,12 +43,14 @@ _SHAPING = """
 # only a part of an array is moved.
 _MOVING = """
     broadcast_in_dim dynamic_slice dynamic_update_slice empty empty2 iota
-    loop_start reshape
+    loop_start reshape write_row
 """.split()  # noqa: SIM905
 ARITHMETIC_AND_SHAPES = (*ELEMENTWISE, *_REDUCING, *_SHAPING, *_MOVING)
 _ARITHMETIC = {"add", "add_any", "div", "mul", "neg", "sub"}
 # nhjax's own operation, which is lowered to arithmetic and shapes.
 SMALL_PRODUCT = "small_product"
+# nhjax's own operation, which writes a row of an array.
+WRITE_ROW = "write_row"
 # nhjax's own operation, a call of a program that is kept with its derivatives.
 KEPT_CALL = "kept_call"
 # Functions under `jax.jit` whose names begin with this are compiled once, and called.

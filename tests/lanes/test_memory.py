@@ -52,6 +52,17 @@ def test_lanes_scatter_with_function_applies_it_at_an_index(width):
 
 
 @WIDTHS
+def test_lanes_reduction_of_many_numbers_in_memory_is_a_loop(width):
+    def function(i, x):
+        rows = lax.dynamic_update_index_in_dim(jnp.ones((2500, 2)), x, i, 0)
+        once = jnp.sum(rows), jnp.max(rows)
+        # The first number changes after the sum.
+        return *once, jnp.sum(rows.at[0, 0].add(x[1]))
+
+    assert_as_jax(function, width, 500 * count(5), sample(2))
+
+
+@WIDTHS
 def test_lanes_array_updated_twice_keeps_both_versions(width):
     def function(i, x):
         changed = x.at[i].set(7.0)

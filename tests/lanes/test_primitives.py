@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from jax import lax
 
-from nhjax._compile import started_like
+from nhjax._compile import started_like, write_row
 from nhjax._numerics import kept_function, small_einsum
 from nhjax.lanes import _jaxprs, _program, Unsupported
 from support import lanes_run
@@ -198,6 +198,19 @@ _CASES = {
             lambda x, y, i: lax.dynamic_update_slice(x, y[None], (i, i)),
             [Kind(*MATRIX), _of("float64"), _of("int32", ())],
         )
+    ],
+    "write_row": [
+        (
+            lambda x, row, i: write_row(x, row, jnp.abs(i) % 2),
+            [Kind(*MATRIX), _of("float64"), _of("int32", ())],
+        ),
+        # In a batch, the axis of the rows is the second one.
+        (
+            lambda x, rows, i: jax.vmap(write_row, (None, 0, None))(
+                x, rows, jnp.abs(i) % 2
+            ),
+            [Kind(*MATRIX), _of("float64", (2, 3)), _of("int32", ())],
+        ),
     ],
     "empty": _unary(lambda x: lax.full_like(x, 2)),
     "empty2": _unary(lambda x: lax.full_like(x, 2)),
