@@ -33,6 +33,7 @@ from ._examples import of_the_gallery, suslov_in_a_potential
 from ._report import from_fresh_process, markdown_table, number, RESULTS, write
 
 
+SAVED_SYSTEM, SAVED_LENGTHS = "sleigh", [10**2, 10**3, 10**4]
 DT, REPEATS, LONG, REPEATS_OF_LONG = 0.1, 7, 10**4, 3
 # So that freed memory goes back at once, and is not taken for what a run needs.
 MALLOC = {"MALLOC_MMAP_THRESHOLD_": "65536", "MALLOC_TRIM_THRESHOLD_": "65536"}
@@ -55,9 +56,18 @@ ADJOINTS = {
 
 
 def problem(
-    name: str, stages: int, num_steps: int, adjoint: str = "direct"
+    name: str,
+    stages: int,
+    num_steps: int,
+    adjoint: str = "direct",
+    every: int | None = None,
 ) -> tuple[Callable[..., Array], tuple]:
-    """A loss, and the state, step and parameters that it is a function of."""
+    """A loss, and the state, step and parameters that it is a function of.
+
+    It is the sum of the squares of the final state, or with `every` of the states after
+    each so many steps.
+    """
+    saveat = nhjax.SaveAt(t1=every is None, steps=every or 0)
     system, y0 = EXAMPLES[name]()
     parameters, fixed = eqx.partition(system, eqx.is_inexact_array)
 
@@ -69,10 +79,11 @@ def problem(
             dt=dt,
             num_steps=num_steps,
             adjoint=ADJOINTS[adjoint],
+            saveat=saveat,
             throw=False,
         )
-        ends = [sol.ys.v[-1], *(leaf[-1] for leaf in jax.tree.leaves(sol.ys.q))]
-        return jnp.sum(jnp.concatenate(ends) ** 2)
+        squares = [jnp.sum(x**2) for x in (sol.ys.v, *jax.tree.leaves(sol.ys.q))]
+        return jnp.sum(jnp.stack(squares))
 
     return loss, (y0, jnp.asarray(DT), parameters)
 
@@ -261,7 +272,31 @@ def batch(stages: int, num_steps: int, members: int) -> dict[str, float]:
     return times
 
 
-PARTS = {"case": case, "compilation": compilation, "modes": modes, "batch": batch}
+def saved(name: str, stages: int, lengths: list[int]) -> list[dict[str, Any]]:
+    """Microseconds a step of gradients that depend on the states of each step.
+
+    Beside them stand those of gradients that depend on the last state.
+    """
+    rows = []
+    for num_steps in lengths:
+        runs = {}
+        for key, every in (("last", None), ("each", 1), ("each tenth", 10)):
+            loss, args = problem(name, stages, num_steps, every=every)
+            runs[key] = (jax.jit(gradient(loss)), args)
+            seconds(*runs[key])
+        times = medians(runs, REPEATS)
+        microseconds = {key: 1e6 * x / num_steps for key, x in times.items()}
+        rows.append({"num_steps": num_steps} | microseconds)
+    return rows
+
+
+PARTS = {
+    "case": case,
+    "compilation": compilation,
+    "modes": modes,
+    "batch": batch,
+    "saved": saved,
+}
 
 
 def case_table(cases: list[dict[str, Any]]) -> str:
@@ -283,7 +318,8 @@ def case_table(cases: list[dict[str, Any]]) -> str:
                     f"{row['compile'] / forward['compile']:.2f}",
                     megabytes(row["temp"]),
                     megabytes(row["resident"]),
-                    number(row["error"]),
+                    # JSON has no NaN.
+                    "nan" if row["error"] is None else number(row["error"]),
                 ]
             )
     header = ["system", "N", "adjoint", "run [µs/step]", "gradient / run"]
@@ -340,6 +376,11 @@ def main() -> None:
     parser.add_argument("--adjoints", nargs="+", default=list(ADJOINTS))
     parser.add_argument("--members", type=int, default=101)
     parser.add_argument("--smoke", action="store_true", help="little, and not saved")
+    parser.add_argument(
+        "--only-saved",
+        action="store_true",
+        help="measure the gradients of saved states, and keep the other tables",
+    )
     parser.add_argument("--part", help=argparse.SUPPRESS)
     options = parser.parse_args()
     jax.config.update("jax_enable_x64", True)
@@ -353,15 +394,44 @@ def main() -> None:
         pairs.insert(len(options.num_steps), (options.systems[0], options.longest))
     if options.smoke:
         pairs, compile_stages, steps = [("CVT", 20)], [2, 3], 20
-    cases = []
+    if options.only_saved:
+        data = json.loads((RESULTS / "gradients.json").read_text(encoding="utf-8"))
+    else:
+        data = measure_but_saved(options, pairs, compile_stages, steps)
+    lengths = [20] if options.smoke else SAVED_LENGTHS
+    data["saved"] = apart("saved", SAVED_SYSTEM, s, lengths)
+    text = report(data, s, steps, pairs[0][0], options.members)
+    if options.smoke:
+        print(text)
+        return
+    write("gradients", "Cost of gradients", text, data)
+    draw(data["cases"], RESULTS / "gradients.png")
+
+
+def measure_but_saved(
+    options: argparse.Namespace,
+    pairs: list[tuple[str, int]],
+    compile_stages: list[int],
+    steps: int,
+) -> dict[str, Any]:
+    """Measure everything but the gradients of saved states."""
+    s, cases = options.stages, []
     for name, num_steps in pairs:
         cases.append(apart("case", name, s, num_steps, options.adjoints))
         print(*case_table(cases[-1:]).splitlines()[2:], sep="\n", flush=True)
     first = pairs[0][0]
-    compilations = apart("compilation", first, compile_stages)
-    ratios = apart("modes", first, s, steps)
-    batches = apart("batch", s, min(steps, 200), options.members)
-    sections = [f"s = {s}, dt = {DT}.", case_table(cases)]
+    return {
+        "cases": cases,
+        "compilation": apart("compilation", first, compile_stages),
+        "modes": apart("modes", first, s, steps),
+        "batch": apart("batch", s, min(steps, 200), options.members),
+    }
+
+
+def report(data: dict[str, Any], s: int, steps: int, first: str, members: int) -> str:
+    """Return all tables as text."""
+    compilations, ratios, batches = (data[k] for k in ("compilation", "modes", "batch"))
+    sections = [f"s = {s}, dt = {DT}.", case_table(data["cases"])]
     rows = [
         [str(k), f"{a:.2f}", f"{b:.2f}", f"{b / a:.2f}"] for k, a, b in compilations
     ]
@@ -374,20 +444,15 @@ def main() -> None:
         [key, f"{batches[f'batch of {key}s'] / batches[key]:.1f}"]
         for key in ("run", "gradient")
     ]
-    title = f"chaotic, direct: a batch of {options.members} over one"
+    title = f"chaotic, direct: a batch of {members} over one"
     sections += [title, markdown_table(["what", "ratio"], rows)]
-    data = {
-        "cases": cases,
-        "compilation": compilations,
-        "modes": ratios,
-        "batch": batches,
-    }
-    text = "\n\n".join(sections)
-    if options.smoke:
-        print(text)
-        return
-    write("gradients", "Cost of gradients", text, data)
-    draw(cases, RESULTS / "gradients.png")
+    keys = [key for key in data["saved"][0] if key != "num_steps"]
+    rows = [
+        [str(row["num_steps"]), *(f"{row[key]:.2f}" for key in keys)]
+        for row in data["saved"]
+    ]
+    title = f"{SAVED_SYSTEM}, direct: microseconds a step, by the states in the loss"
+    return "\n\n".join([*sections, title, markdown_table(["N", *keys], rows)])
 
 
 if __name__ == "__main__":

@@ -113,19 +113,32 @@ def _programs(params: Any) -> Iterator[Any]:
 
 
 def rms_array_size(program: Any) -> float:
-    """Return the root mean square of the sizes of arrays in arithmetic."""
-    sizes = [size * size for size in _arithmetic_sizes(program)]
-    return math.sqrt(sum(sizes) / len(sizes)) if sizes else 0.0
+    """Return the root mean square of the sizes of arrays in arithmetic.
+
+    In a program with loops, large arrays outside of them do not count: they are often
+    the rows of all steps, and the steps take far longer than an operation on the rows.
+    """
+    found = list(_arithmetic_sizes(program, is_repeated=False))
+    has_loop = any(is_repeated for _, is_repeated in found)
+    squares = [
+        size * size
+        for size, is_repeated in found
+        if is_repeated or not has_loop or size <= LARGEST_REDUCTION
+    ]
+    return math.sqrt(sum(squares) / len(squares)) if squares else 0.0
 
 
-def _arithmetic_sizes(program: Any) -> Iterator[int]:
+def _arithmetic_sizes(program: Any, is_repeated: bool) -> Iterator[tuple[int, bool]]:
+    """List the sizes of arrays in arithmetic, and whether a loop repeats it."""
     for equation in program.eqns:
-        if equation.primitive.name in _ARITHMETIC:
-            yield _size(equation.outvars[0])
-        if equation.primitive.name == SMALL_PRODUCT:
-            yield from _sizes_of_product(equation)
+        name = equation.primitive.name
+        if name in _ARITHMETIC:
+            yield _size(equation.outvars[0]), is_repeated
+        if name == SMALL_PRODUCT:
+            for size in _sizes_of_product(equation):
+                yield size, is_repeated
         for part in _programs(equation.params):
-            yield from _arithmetic_sizes(part)
+            yield from _arithmetic_sizes(part, is_repeated or name in ("scan", "while"))
 
 
 def _sizes_of_product(product: Any) -> Iterator[int]:

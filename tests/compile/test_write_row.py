@@ -106,7 +106,7 @@ def test_gradient_of_many_saved_rows_is_compiled_and_exact():
             nhjax.LobattoIIIAB(2),
             y,
             dt=1e-3,
-            num_steps=2000,
+            num_steps=5000,
             saveat=saveat,
             throw=False,
         ).ys.q.sum()
