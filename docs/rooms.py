@@ -414,7 +414,9 @@ def page(sources: Mapping[str, str]) -> str:
         "counts the frames of nhjax from `integrate` to the deepest evaluation of the",
         "Lagrangian inside the stage iteration. The rows `grad, derivative` count the",
         "frames to the deepest evaluation that only the derivative of the run makes.",
-        "[One call, followed](one_call.md) explains the frames.",
+        "[One call, followed](one_call.md) explains the frames. Between the second",
+        "and the third column came rolling contacts, friction, robots, films and",
+        "steps that adapt, and functions that are traced once for all uses.",
         "",
         *table(recorded_figures()),
     ]
