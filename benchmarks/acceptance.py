@@ -757,9 +757,14 @@ def table_of_steps(data: list[dict]) -> str:
     rows = []
     for row in data:
         figures = [row[key] for key in COLUMNS.values()]
-        cells = [number(x) if isinstance(x, float) else str(x) for x in figures]
-        rows.append([row["system"], str(row["stages"]), *cells])
+        rows.append([row["system"], str(row["stages"]), *map(_cell, figures)])
     return markdown_table(["system", "s", *COLUMNS], rows)
+
+
+def _cell(x: Any) -> str:
+    if x is None:
+        return "nan"  # JSON has no NaN.
+    return number(x) if isinstance(x, float) else str(x)
 
 
 def table_of_doubtful(data: list[dict]) -> str:
@@ -770,11 +775,7 @@ def table_of_doubtful(data: list[dict]) -> str:
     text += ", ".join(f"{count} {key}" for key, count in total.items()) + "."
     keys = [*JUDGEMENTS, "least h", "largest distance", "most floors"]
     rows = [
-        [row["system"], str(row["stages"])]
-        + [
-            number(x) if isinstance(x, float) else str(x)
-            for x in (row["doubtful"][key] for key in keys)
-        ]
+        [row["system"], str(row["stages"]), *(_cell(row["doubtful"][k]) for k in keys)]
         for row in found
     ]
     return f"{text}\n\n{markdown_table(['system', 's', *keys], rows)}"
