@@ -821,12 +821,13 @@ def table_near_zero(data: list[dict[str, Any]]) -> str:
 def summary(data: list[dict]) -> str:
     """What the table comes to."""
     worst = max(
-        row[f"{solver} {figure}"]
+        row[f"{solver} {figure}"] or 0.0
         for row in data
         for solver in ("simplified", "newton")
         for figure in ("residual", "violation")
     )
-    total = {key: sum(row[key] for row in data) for key in COLUMNS.values()}
+    counted = "simplified accepted", "newton accepted", "apart"
+    total = {key: sum(row[key] for row in data) for key in counted}
     return (
         f"{total['simplified accepted']} steps accepted by `SimplifiedNewton`, "
         f"{total['newton accepted']} by `Newton`; the largest relative residual or "
