@@ -644,7 +644,7 @@ def test_urdf_link_without_inertia_is_named(tmp_path):
 
 
 def _urdf_with_mesh(folder, address):
-    """A free body whose mass is that of a mesh, a tetrahedron with edges of 0.1 m."""
+    """Write a URDF file of one body, whose shape is a tetrahedron in a mesh file."""
     path = folder / "carrier_description" / "urdf" / "carrier.urdf"
     meshes = folder / "carrier_description" / "meshes"
     for made in (path.parent, meshes):

@@ -123,12 +123,12 @@ def iterate(
     The size of round-off depends on the conditioning of the problem, so that a fixed
     threshold would be either too coarse or never met (Hairer, Lubich, Wanner, GNI,
     section VIII.6). Each time that an increment fails to fall, the level of increments
-    that are treated as noise is raised, up to `noise_units` of round-off. An increment
-    that is smaller than all before it lowers the level again. By default the highest
-    level is the square root of the unit round-off, which suits iterations that converge
-    so fast that only noise can slow them down. After many iterations all levels fall
-    again, in proportion to the number of iterations, because the error of a slow
-    iteration is much larger than its increment.
+    that are treated as noise is raised, up to `noise_units` of round-off. Each new
+    smallest increment lowers it again. By default the highest level is the square root
+    of the unit round-off, which suits iterations that converge so fast that only noise
+    can slow them down. After many iterations all levels fall again, in proportion to
+    the number of iterations, because the error of a slow iteration is much larger than
+    its increment.
     """
     # `jit` makes JAX trace the iteration once, for the shapes and for the loop: that is
     # most of the work of tracing a step.

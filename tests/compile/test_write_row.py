@@ -98,7 +98,7 @@ def test_gradient_of_many_saved_rows_is_compiled_and_exact():
     disc = nhjax.systems.VerticalRollingDisc()
     y0 = disc.initial_state()
 
-    def sum_of_squares(scale):
+    def sum_of_rows(scale):
         y = jax.tree.map(lambda x: scale * x, y0)
         saveat = nhjax.SaveAt(steps=True)
         return nhjax.integrate(
@@ -111,8 +111,8 @@ def test_gradient_of_many_saved_rows_is_compiled_and_exact():
             throw=False,
         ).ys.q.sum()
 
-    slope = jax.grad(sum_of_squares)
+    slope = jax.grad(sum_of_rows)
     assert {use.engine for use in lanes.engines(slope, 1.0)} == {"lanes"}
     # The motion is linear in time and in the scale.
-    expected = jax.jvp(sum_of_squares, (1.0,), (1.0,))[1]
+    expected = jax.jvp(sum_of_rows, (1.0,), (1.0,))[1]
     np.testing.assert_allclose(slope(1.0), expected, rtol=1e-10)
