@@ -27,7 +27,7 @@ from .._numerics import (
     uneven_perturbations,
     UpdateNorms,
 )
-from .._system import all_finite, check_flag, Linearisation, position_scale, real_scalar
+from .._system import all_finite, check_flag, Linearisation, position_terms, real_scalar
 from ._equations import (
     Evaluation,
     invariant_correction,
@@ -447,7 +447,7 @@ def fibre_coordinate_scale(
     t, q, args = stages.t, unframed(stages.q), stages.args
 
     if k:
-        sizes = position_scale(stages.system, t, q, args, lin)
+        sizes = position_terms(stages.system, t, q, args, lin)
         correction = lin.largest_correction(jnp.pad(sizes, (m, 0)))
         round_off = round_off + correction / h
     if m:

@@ -44,6 +44,7 @@ from ._scales import (
     keeps_constraints as keeps_constraints,
     noise_near as noise_near,
     position_scale as position_scale,
+    position_terms as position_terms,
     velocity_scale as velocity_scale,
     violation_scale as violation_scale,
 )

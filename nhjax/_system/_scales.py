@@ -10,6 +10,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, PyTree
 
 from .._custom_types import Args, BoolScalar, FloatScalar, FloatScalarLike
@@ -58,32 +59,56 @@ def velocity_scale(
 
 
 def position_scale(
+    system: AbstractMechanicalSystem, t: FloatScalar, q: PyTree[Array], args: Args
+) -> Float[Array, " k"]:
+    """Estimate, row by row, how large the terms of Γ are for a q of the given size.
+
+    The estimate treats Γ as affine in q. It is not the size of the terms at q itself;
+    see `violation_scale`. If q is zero, its size is taken as one.
+    """
+    size = nonzero_or_one(max_norm(*jax.tree.leaves(q)))
+    sizes = jax.tree.map(lambda x: jnp.full_like(x, size), q)
+    return _affine_terms(system, t, q, args, sizes)
+
+
+def position_terms(
     system: AbstractMechanicalSystem,
     t: FloatScalar,
     q: PyTree[Array],
     args: Args,
-    lin: Linearisation | None = None,
+    lin: Linearisation,
 ) -> Float[Array, " k"]:
-    """Estimate, row by row, how large the terms of Γ are for a q of the given size.
+    """Estimate, row by row, how large the terms of Γ are at q.
 
-    The estimate treats Γ as affine in q. If q is zero, its size is taken as one. A
-    sparse linearisation `lin` at q already has the derivatives of Γ; they are used.
+    These terms, times the unit round-off, bound the change of Γ if each entry of q is
+    rounded. A machine far from the origin has large entries that Γ does not depend on.
+    A sparse linearisation `lin` at q already has the derivatives of Γ; they are used.
     """
+    sizes = jax.tree.map(jnp.abs, q)
+    if lin.is_sparse and lin.fibre_coordinate_name == "v":
+        products = lin.jacobian.absolute().matvec(ravel_pytree(sizes)[0])
+        return products + _terms_at_zero(system, t, q, args)
+    return _affine_terms(system, t, q, args, sizes)
 
-    def gamma(q):
-        return system.position_constraint(t, q, args)
 
-    constant = _finite_or_zero(gamma(jax.tree.map(jnp.zeros_like, q)))
+def _affine_terms(system, t, q, args, sizes: PyTree[Array]) -> Float[Array, " k"]:
+    """Compute Σ_j |∂Γ/∂q_j| s_j + |Γ(0)| for sizes s of the entries of q."""
+    constant = _terms_at_zero(system, t, q, args)
     if system.holonomic is None:
         return constant
-    size = nonzero_or_one(max_norm(*jax.tree.leaves(q)))
-    if lin is not None and lin.is_sparse and lin.fibre_coordinate_name == "v":
-        return lin.jacobian.absolute_row_sums() * size + constant
-    slopes = jax.tree.map(
-        lambda slope: jnp.sum(jnp.abs(slope), axis=tuple(range(1, slope.ndim))),
-        jax.jacrev(gamma)(q),
+    slopes = jax.jacrev(lambda q: system.position_constraint(t, q, args))(q)
+    terms = jax.tree.map(
+        lambda slope, size: jnp.tensordot(jnp.abs(slope), size, axes=size.ndim),
+        slopes,
+        sizes,
     )
-    return sum(jax.tree.leaves(slopes)) * size + constant
+    return sum(jax.tree.leaves(terms)) + constant
+
+
+def _terms_at_zero(system, t, q, args) -> Float[Array, " k"]:
+    """Compute the sizes of the terms of Γ that do not depend on q."""
+    zero = jax.tree.map(jnp.zeros_like, q)
+    return _finite_or_zero(system.position_constraint(t, zero, args))
 
 
 def keeps_constraints(

@@ -37,6 +37,42 @@ def test_steps_of_slow_bicycle_are_accepted_by_both_solvers(dt, solver):
         assert float(sol.stats["max_constraint_violation"]) < 1e-15
 
 
+@pytest.mark.parametrize(
+    "machine", [nhjax.systems.Rattleback, long(nhjax.systems.RollingTorus)]
+)
+def test_run_far_from_origin_of_plane_equals_run_at_origin(machine):
+    example = machine()
+    system, y0 = example.system, example.initial_state()
+    method = nhjax.LobattoIIIAB(3)
+
+    def end(distance):
+        q = y0.q.at[4].add(distance)
+        y = nhjax.initial_state(system, q, y0.v, project=True)
+        return nhjax.integrate(system, method, y, dt=0.01, num_steps=20).ys
+
+    # Neither the Lagrangian nor the constraints depend on x, so that the round-off of
+    # x must not end an iteration early.
+    near, far = end(0.0), end(1e6)
+    np.testing.assert_array_equal(far.v, near.v)
+    np.testing.assert_array_equal(far.multiplier, near.multiplier)
+
+
+def test_slow_spin_of_rattleback_agrees_between_solvers():
+    rattleback = nhjax.systems.Rattleback()
+    system, y0 = rattleback.system, rattleback.initial_state()
+    y = nhjax.initial_state(system, y0.q, 1e-8 * y0.v, project=True)
+
+    def end(solver):
+        method = nhjax.LobattoIIIAB(3)
+        options = {"dt": 0.01, "num_steps": 10, "stage_solver": solver}
+        return nhjax.integrate(system, method, y, **options).ys.v
+
+    # The velocities are 1e-9 to 5e-8. Here the unit round-off of the quaternion,
+    # divided by the step, is 2e-14, although rounding it does not change the height.
+    simplified = end(nhjax.SimplifiedNewton())
+    np.testing.assert_allclose(simplified, end(NEWTON), rtol=0, atol=2e-16)
+
+
 def test_noise_of_function_includes_constants_that_cancel():
     x = jnp.array([1e-7, 1e-7, 0.0])
 
