@@ -37,6 +37,8 @@ from .._results import RESULTS
 from .._step import (
     AbstractStageSolver,
     ForceSlopeError,
+    has_default_jacobian,
+    has_force_slopes,
     is_simplified_alone,
     SimplifiedNewton,
     solvers_of_unsolved_steps,
@@ -109,6 +111,14 @@ _BY_FULL = "the full Jacobian", 'nhjax.SimplifiedNewton(jacobian="full")'
 _BY_NEWTON = (
     "Newton's method for such steps",
     "nhjax.SimplifiedNewton(fallback=True)` or `nhjax.Newton()",
+)
+# With more iterations a step than this, the full Jacobian takes less time on the
+# machines that were measured (`benchmarks.iterations`).
+_MANY_ITERATIONS = 40
+_SLOW = (
+    "The steps of this run took {:.0f} iterations on average. "
+    '`stage_solver=nhjax.SimplifiedNewton(jacobian="full")` takes fewer and often '
+    "allows larger steps. Its first call takes two to three times as long."
 )
 _INTERRUPTED = (
     "The run was interrupted after {} steps, and the solution ends there, at t = "
@@ -288,12 +298,12 @@ def integrate(
     solver_options = SolverOptions(stage_solver, adjoint, progress_meter)
     whole_run = _program_of_run(grid)
     sol = whole_run(system, method, y0, grid, args, options, saveat, solver_options)
-    used_newton = not is_simplified_alone(stage_solver)
+    used, used_newton = stage_solver, not is_simplified_alone(stage_solver)
     repeats = [] if _is_tracing() else solvers_of_unsolved_steps(stage_solver)
     for solver in repeats:
         if not is_unsolved(sol):
             break
-        used_newton = not is_simplified_alone(solver)
+        used, used_newton = solver, not is_simplified_alone(solver)
         told = _BY_NEWTON if used_newton else _BY_FULL
         failed = int(sol.stats["failed_step"])
         warnings.warn(_REPEATED.format(failed, *told), stacklevel=2)
@@ -317,6 +327,8 @@ def integrate(
         sol = raise_failures(sol, size, used_newton)
     if size is not None:
         _warn_of_errors(sol, size)
+    if not _is_tracing() and has_default_jacobian(used):
+        _warn_of_iterations(sol, system, t0, state, args)
     return sol
 
 
@@ -492,6 +504,25 @@ def _warn_of_errors(sol: Solution, dt: FloatScalar) -> None:
     if float(estimate) > _TOO_LARGE_ERROR:
         size = float(dt)
         warnings.warn(_TOO_LARGE.format(size, float(estimate), size / 4), stacklevel=3)
+
+
+def _warn_of_iterations(
+    sol: Solution,
+    system: AbstractMechanicalSystem,
+    t: FloatScalar,
+    y: State,
+    args: Args,
+) -> None:
+    """Warn if steps with the approximate Jacobian converged slowly.
+
+    The full Jacobian must be available, and y is the start of the run.
+    """
+    number = int(sol.stats["num_iterations"]) / max(1, int(sol.stats["num_steps"]))
+    if number <= _MANY_ITERATIONS or is_unsolved(sol):
+        return
+    u = system.fibre_coordinate(y)
+    if has_force_slopes(system, t, y.q, u, y.multiplier, args):
+        warnings.warn(_SLOW.format(number), stacklevel=3)
 
 
 def _require_constraints(

@@ -3,6 +3,7 @@
 from .._numerics import Solved as Solved
 from ._chart import chart_of_step as chart_of_step
 from ._equations import stage_residual as stage_residual
+from ._first_order import has_force_slopes as has_force_slopes
 from ._invariants import (
     invariant_values as invariant_values,
     Invariants as Invariants,
@@ -15,6 +16,7 @@ from ._round_off import (
     RoundOff as RoundOff,
 )
 from ._solvers import (
+    has_default_jacobian as has_default_jacobian,
     is_simplified_alone as is_simplified_alone,
     Newton as Newton,
     SimplifiedNewton as SimplifiedNewton,

@@ -12,11 +12,11 @@ from typing import Literal, NamedTuple, TypeAlias
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, PyTree
 
-from .._custom_types import FloatScalar
+from .._custom_types import Args, FloatScalar
 from .._numerics import full_jacobian, jacobian_sparsity, small_einsum
-from .._system import Linearisation, total_force
+from .._system import AbstractMechanicalSystem, Linearisation, total_force
 from ._equations import StageEquations, StageUnknowns
 
 
@@ -61,6 +61,19 @@ def uses_first_order_terms(
 
 
 def forces_have_slopes(stages: StageEquations) -> bool:
+    """Return whether the forces in these equations have slopes in velocities."""
+    at_start = stages.t, stages.q, stages.p, stages.multiplier, stages.args
+    return has_force_slopes(stages.system, *at_start)
+
+
+def has_force_slopes(
+    system: AbstractMechanicalSystem,
+    t: FloatScalar,
+    q: PyTree[Array],
+    u: Float[Array, " n"],
+    multiplier: Float[Array, " l"],
+    args: Args,
+) -> bool:
     """Return whether forces have forward-mode derivatives in the velocities.
 
     Callbacks and functions with a custom rule for reverse mode only do not have them.
@@ -68,13 +81,10 @@ def forces_have_slopes(stages: StageEquations) -> bool:
     """
 
     def force(u):
-        return total_force(
-            stages.system, stages.t, stages.q, u, stages.multiplier, stages.args
-        )
+        return total_force(system, t, q, u, multiplier, args)
 
-    zero = jnp.zeros_like(stages.p)
     try:
-        jax.eval_shape(lambda u: full_jacobian(force, u), zero)
+        jax.eval_shape(lambda u: full_jacobian(force, u), jnp.zeros_like(u))
     except (NotImplementedError, TypeError, ValueError):
         return False
     return True

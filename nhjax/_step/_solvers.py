@@ -198,6 +198,11 @@ def is_simplified_alone(stage_solver: AbstractStageSolver) -> bool:
     return isinstance(stage_solver, SimplifiedNewton) and not stage_solver.fallback
 
 
+def has_default_jacobian(stage_solver: AbstractStageSolver) -> bool:
+    """Return whether the solver is simplified Newton with its approximate Jacobian."""
+    return isinstance(stage_solver, SimplifiedNewton) and stage_solver.jacobian is None
+
+
 def solvers_of_unsolved_steps(
     stage_solver: AbstractStageSolver,
 ) -> list[SimplifiedNewton]:

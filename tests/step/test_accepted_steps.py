@@ -167,14 +167,52 @@ def test_plain_call_with_unsolved_step_is_repeated_with_the_full_jacobian():
     assert_trees_equal(sol.ys, full.ys)
 
 
-def test_plain_call_without_slopes_of_forces_fails_without_advice_of_newton():
-    @jax.custom_vjp
-    def drag(v):
-        return -v
+@jax.custom_vjp
+def drag_without_forward_derivative(v):
+    return -v
 
-    drag.defvjp(lambda v: (-v, None), lambda _, change: (-change,))
+
+drag_without_forward_derivative.defvjp(
+    lambda v: (-v, None), lambda _, change: (-change,)
+)
+
+
+@pytest.mark.parametrize(
+    ("jacobian", "force", "is_told"),
+    [
+        (None, None, True),
+        ("full", None, False),
+        (None, lambda t, q, v, args: drag_without_forward_derivative(0.01 * v), False),
+    ],
+)
+def test_plain_call_with_many_iterations_a_step_names_the_full_jacobian(
+    jacobian, force, is_told
+):
+    system = nhjax.LagrangianSystem(
+        lambda t, q, v, args: 0.5 * v @ v - 0.5 * q @ q, force=force
+    )
+    y0 = nhjax.initial_state(system, jnp.array([1.0, 0.0]), jnp.array([0.0, 1.0]))
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        sol = nhjax.integrate(
+            system,
+            nhjax.LobattoIIIAB(4),
+            y0,
+            dt=4.3,
+            num_steps=10,
+            stage_solver=nhjax.SimplifiedNewton(jacobian=jacobian),
+        )
+    assert (int(sol.stats["num_iterations"]) > 400) == (jacobian is None)
+    told = [str(x.message) for x in caught if "iterations on average" in str(x.message)]
+    assert len(told) == is_told
+    assert all(
+        '`stage_solver=nhjax.SimplifiedNewton(jacobian="full")`' in x for x in told
+    )
+
+
+def test_plain_call_without_slopes_of_forces_fails_without_advice_of_newton():
     with pytest.raises(nhjax.IntegrationError, match="smaller `dt`") as failure:
-        stiff_spring(lambda t, q, v, args: drag(v))
+        stiff_spring(lambda t, q, v, args: drag_without_forward_derivative(v))
     assert "jacobian" not in str(failure.value)
 
 
