@@ -155,7 +155,7 @@ def few_compiled_programs():
     params=("lanes", "kernels", pytest.param("xla", marks=pytest.mark.long))
 )
 def engine(request, monkeypatch):
-    """The first engine that may be taken; programs of others are forgotten."""
+    """The engine that compiles all programs; programs of others are forgotten."""
     monkeypatch.setenv("NHJAX_ENGINE", request.param)
     jax.clear_caches()
     yield request.param

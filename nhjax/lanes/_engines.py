@@ -44,7 +44,7 @@ class EngineUse(NamedTuple):
 
 
 def chosen_engine() -> str | None:
-    """Read `NHJAX_ENGINE` from the environment: the engine to be tried first."""
+    """Read `NHJAX_ENGINE` from the environment: the engine that the user chose."""
     chosen = os.environ.get("NHJAX_ENGINE")
     if chosen is not None and chosen not in ENGINES:
         raise ValueError(
@@ -72,9 +72,9 @@ def engines(function: Callable[..., Any], *args: Any) -> tuple[EngineUse, ...]:
     `nhjax.lanes.vmap` and `nhjax.lanes.jit`. The function is compiled, but not run. On
     the CPU, nhjax compiles an ensemble (a run under `jax.vmap`) itself if possible, and
     vectorises over its members (SIMD). The environment variable `NHJAX_ENGINE` chooses
-    the engine: `lanes`, `kernels` or `xla`. The next one compiles what it cannot
-    compile. Programs that were compiled before keep their engine until
-    `jax.clear_caches()`.
+    the engine: `lanes`, `kernels` or `xla`. A program that it cannot compile raises a
+    `RuntimeError` with the reason. Programs that were compiled before keep their engine
+    until `jax.clear_caches()`.
 
     **Arguments:**
 

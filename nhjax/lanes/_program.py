@@ -388,6 +388,12 @@ def _suits_vectors(program: Any) -> bool:
     return size > _LARGE_ARRAYS
 
 
+_NOT_OBEYED = (
+    "The environment variable NHJAX_ENGINE is {!r}, but this engine cannot compile the "
+    "program: {}. Unset the variable, so that another engine compiles it."
+)
+
+
 class _Ways(NamedTuple):
     """How an operation is lowered: to native code of a name, by XLA, or to kernels."""
 
@@ -454,6 +460,10 @@ def _by_first_engine(
             record_engine("lanes", f"the first choice{options.note}", members)
             return jax.ffi.ffi_lowering(name)(ctx, *operands)
     against = _reason_against_kernel(params["program"], options, reason)
+    chosen = chosen_engine()
+    by_kernels = against is None or "kernels" not in options.engines
+    if chosen == "lanes" or (chosen == "kernels" and not by_kernels):
+        raise RuntimeError(_NOT_OBEYED.format(chosen, against or reason))
     if against is not None:
         record_engine("xla", f"{against}{options.note}", members)
         return ways.by_xla(ctx, *operands, **params)
