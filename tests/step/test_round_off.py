@@ -101,10 +101,32 @@ def test_noise_of_function_with_large_constant_includes_its_round_off(constant):
     assert 1e-17 * constant**2 < noise < 1e-15 * constant**2
 
 
-def test_noise_of_smooth_function_in_small_units_is_round_off():
-    # The function changes direction within a length of 1e-8 units.
-    (noise,) = measured_noise(lambda dx: jnp.sin(0.4 + dx / 1e-8), 1, jnp.zeros(1))
-    assert noise < 1e-14
+@pytest.mark.parametrize("phase", [0.0, 0.4, np.pi / 2])
+def test_noise_of_smooth_function_in_units_of_any_size_is_round_off(phase):
+    # The function changes direction within a length of 1 to 1e-10.
+    lengths = 10.0 ** jnp.arange(-10, 0.25, 0.25)
+
+    def noise(length):
+        return measured_noise(lambda dx: jnp.sin(phase + dx / length), 1, jnp.zeros(1))
+
+    assert jnp.max(jax.vmap(noise)(lengths)) < 1e-15
+
+
+def test_run_with_time_in_units_of_a_million_seconds_equals_run_in_seconds():
+    def after(unit):
+        """Drive at 10 rad/s, with the time measured in so many seconds."""
+        system = nhjax.LagrangianSystem(
+            lambda t, q, v, args: 0.5 * v @ v / unit**2 - 0.5 * q @ q,
+            holonomic=lambda t, q, args: q[0] - q[1] ** 2 - jnp.sin(10 * unit * t),
+        )
+        y0 = nhjax.initial_state(
+            system, jnp.array([0.25, 0.5]), unit * jnp.array([11.0, 1.0])
+        )
+        method, dt = nhjax.LobattoIIIAB(3), 0.02 / unit
+        sol = nhjax.integrate(system, method, y0, dt=dt, num_steps=8)
+        return sol.ys.v / unit
+
+    np.testing.assert_allclose(after(1e6), after(1.0), rtol=1e-13)
 
 
 def test_starts_near_upright_with_round_off_in_a_height_are_accepted():
