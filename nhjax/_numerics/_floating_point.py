@@ -149,8 +149,8 @@ def measured_noise(
     shape = len(_DISTANCES), _NUM_RAYS, size
     rays = rng.uniform(0.5, 1.5, shape) * rng.choice([-1.0, 1.0], shape)
     rays *= np.reshape([eps**power for power in _DISTANCES], (-1, 1, 1))
-    # One row for each point of a ray: its distance, and its weights in the third, fourth
-    # and fifth differences.
+    # One row for each point of a ray: its distance, and its weights in the differences of
+    # orders 3 to 5.
     numbers = np.arange(1.0, _NUM_POINTS + 1)
     weights = [np.pad(_weights(k), (0, 5 - k)) for k in (3, 4, 5)]
     points = jnp.asarray(np.stack([numbers, *weights], axis=1), dtype)
