@@ -101,6 +101,7 @@ def iterate(
     max_iterations: int,
     tolerance: FloatScalarLike = 0.0,
     round_off: FloatScalarLike = 0.0,
+    noise: FloatScalarLike = 0.0,
     noise_units: float | None = None,
     skip: Bool[Array, ""] | bool = False,
 ) -> Solved[X, Aux]:
@@ -111,11 +112,12 @@ def iterate(
     size of x, or relative to the size of the iterate if that is larger, because x may
     start from zero. If both are zero, increments are measured relative to the first
     one. The round-off of x is proportional to the same size or, if data are larger than
-    x, to `scale` plus `round_off`.
+    x, to `scale` plus `round_off`. `noise` is a size whose round-off increments have
+    for certain, because it was measured.
 
     The iteration ends
 
-    - when an increment is below the unit round-off or `tolerance`;
+    - when an increment is below the round-off of these sizes or `tolerance`;
     - when small increments have stopped falling, because they are then round-off;
     - when an increment is not finite, or far larger than the first increment and the
         iterate.
@@ -138,12 +140,14 @@ def iterate(
     dtype = jnp.result_type(*[leaf.dtype for leaf in jax.tree.leaves(x)])
     eps = float(jnp.finfo(dtype).eps)
     scale, round_off = jnp.asarray(scale, dtype), jnp.asarray(round_off, dtype)
-    tolerance = jnp.asarray(tolerance, dtype)
+    noise, tolerance = jnp.asarray(noise, dtype), jnp.asarray(tolerance, dtype)
     growth = _GROWTH if noise_units is None else _GROWTH_IF_SLOW
     rules = _Rules(
         scale=scale,
         round_off=round_off,
-        least=jnp.maximum(eps * (scale + round_off), tolerance * scale),
+        least=jnp.maximum(
+            eps * jnp.maximum(scale + round_off, noise), tolerance * scale
+        ),
         tolerance_or_eps=jnp.maximum(tolerance, eps),
         quietest=_FIRST_UNITS / growth * eps,
         noisiest=eps**0.5 if noise_units is None else noise_units * eps,

@@ -393,12 +393,15 @@ def _minus(tree: StageResiduals, other: StageResiduals) -> StageResiduals:
 class Scale(NamedTuple):
     """The size of the fibre coordinates of a step, and their additional round-off.
 
-    Both are in units of fibre coordinates. The round-off of fibre coordinates is about
-    the unit round-off times the sum of the two.
+    All are in units of fibre coordinates. The round-off of fibre coordinates is about
+    the unit round-off times the sum of the first two. `noise` is the measured
+    round-off of the functions of the system: increments below the unit round-off times
+    `noise` are noise.
     """
 
     size: FloatScalar
     round_off: FloatScalar
+    noise: FloatScalar
 
 
 def _iterated(
@@ -417,6 +420,7 @@ def _iterated(
         max_iterations=max_iterations,
         tolerance=stage_solver.tolerance,
         round_off=scale.round_off,
+        noise=scale.noise,
         noise_units=NOISE_UNITS,
         skip=skip,
     )
@@ -460,9 +464,11 @@ def fibre_coordinate_scale(
         round_off = round_off + lin.largest_correction(sizes)
     if stages.invariants is not None:
         round_off = round_off + invariant_correction(stages, x0).noise
+    noise = jnp.zeros_like(size)
     if stages.round_off is not None:
-        round_off = jnp.maximum(round_off, stages.round_off.size(h))
-    return Scale(size, round_off)
+        measured = stages.round_off.size(h)
+        round_off, noise = jnp.maximum(round_off, measured), measured / PART
+    return Scale(size, round_off, noise)
 
 
 def _kinematic_scale(
