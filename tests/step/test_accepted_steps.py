@@ -62,6 +62,7 @@ def test_slow_iteration_of_stages_is_not_accepted():
         swing(stage_solver=nhjax.SimplifiedNewton(fallback=False), throw=True)
 
 
+@pytest.mark.filterwarnings("ignore:The steps of this run took")
 def test_slow_iteration_of_stages_that_contracts_solves_its_step():
     newton = swing(num_steps=2, stage_solver=nhjax.Newton())
     for limit, result in ((100, RESULTS.nonlinear_max_iterations), (1000, None)):
