@@ -115,6 +115,8 @@ _BY_NEWTON = (
 # With more iterations a step than this, the full Jacobian takes less time on the
 # machines that were measured (`benchmarks.iterations`).
 _MANY_ITERATIONS = 40
+# Runs with fewer steps than this are over before another program is compiled.
+_FEW_STEPS = 10
 _SLOW = (
     "The steps of this run took {:.0f} iterations on average. "
     '`stage_solver=nhjax.SimplifiedNewton(jacobian="full")` takes fewer and often '
@@ -481,7 +483,7 @@ def suggest_step(
     sizes = np.abs(np.diff(ts))
     # Sizes grow by large factors until the controller has found the first one.
     growing = sizes[1:] > 2 * sizes[:-1]
-    first = int(np.argmin(growing)) if growing.size and not growing.all() else 0
+    first = len(growing) if growing.all() else int(np.argmin(growing))
     needed = sizes[first:-1] if sizes[first:-1].size else sizes[-1:]
     number = max(1, math.ceil(abs(ts[-1] - ts[0]) / np.min(needed) * (1 - 1e-9)))
     return float((ts[-1] - ts[0]) / number)
@@ -517,8 +519,11 @@ def _warn_of_iterations(
 
     The full Jacobian must be available, and y is the start of the run.
     """
-    number = int(sol.stats["num_iterations"]) / max(1, int(sol.stats["num_steps"]))
-    if number <= _MANY_ITERATIONS or is_unsolved(sol):
+    steps = int(sol.stats["num_steps"]) + int(sol.stats.get("num_rejected_steps", 0))
+    if steps < _FEW_STEPS or is_unsolved(sol):
+        return
+    number = int(sol.stats["num_iterations"]) / steps
+    if number <= _MANY_ITERATIONS:
         return
     u = system.fibre_coordinate(y)
     if has_force_slopes(system, t, y.q, u, y.multiplier, args):

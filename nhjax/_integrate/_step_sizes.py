@@ -364,14 +364,15 @@ class PIDController(AbstractStepSizeController):
         self, context: StepContext, t: FloatScalar, start: StepState
     ) -> tuple[FloatScalar, Memory, RESULTS]:
         """Return `dt`, or a size for which the state changes by one percent."""
-        # Errors of one, for the two steps before the first.
-        ones = (jnp.ones((), t.dtype),) * 2
+        # Errors of one, and unknown growth, for the steps before the first.
+        one = jnp.ones((), t.dtype)
+        memory = one, one, jnp.full(2, jnp.inf, t.dtype)
         if context.dt is not None:
             size = jnp.abs(context.dt)
         else:
             size = self._first_size(context, t, start)
         size = jax.lax.stop_gradient(self._limited(size))
-        return size * context.direction, ones, RESULTS.successful
+        return size * context.direction, memory, RESULTS.successful
 
     def _first_size(
         self, context: StepContext, t: FloatScalar, start: StepState
@@ -428,11 +429,16 @@ class PIDController(AbstractStepSizeController):
         """Accept a step if its estimated error is at most one tolerance."""
         start, outcome, h = attempt.start, attempt.outcome, attempt.h
         scales = self._scales(context, start, outcome.step_state)
-        error = local_error(
+        last, before_last, growth_rates = memory
+        error, found = local_error(
             *(context.system, context.method, attempt.t, h),
-            *(start, outcome, scales, context.args),
+            *(start, outcome, scales, context.args, growth_rates),
         )
-        error, size = jax.lax.stop_gradient((error, jnp.abs(h)))
+        error, found, size = jax.lax.stop_gradient((error, found, jnp.abs(h)))
+        is_first = jnp.isinf(growth_rates)
+        growth_rates = jnp.where(
+            is_first, found, jnp.maximum(found, 0.5 * growth_rates)
+        )
         is_known = attempt.is_solved & jnp.isfinite(error)
         accepted = is_known & (error <= 1)
         dtype = error.dtype
@@ -449,8 +455,8 @@ class PIDController(AbstractStepSizeController):
         factor = (
             safety
             * error ** (-(p + i + d) / number)
-            * memory[0] ** ((p + 2 * d) / number)
-            * memory[1] ** (-d / number)
+            * last ** ((p + 2 * d) / number)
+            * before_last ** (-d / number)
         )
         factor = jnp.clip(factor, least, jnp.where(accepted, most, safety))
         factor = jnp.where(is_known, factor, least)
@@ -474,7 +480,8 @@ class PIDController(AbstractStepSizeController):
             outcome.result,
         )
         size = jax.lax.stop_gradient(following) * context.direction
-        return Decision(accepted, result, size, (error, memory[0]), estimate)
+        memory = error, last, growth_rates
+        return Decision(accepted, result, size, memory, estimate)
 
     def resume(
         self, context: StepContext, size: FloatScalar, memory: Memory

@@ -8,6 +8,11 @@ to order derivatives grow by a factor r, which the samples do show, so that
 
     U_{p+1} ≈ U_s r^(p+1-s).
 
+In an oscillation the rate of u, and with it U_1, passes through zero twice in each
+period, and so does U_3. Their ratio still shows r. The ratio of U_2 and U_1 serves
+where U_3 alone vanishes. It grows near a zero of U_1, and is therefore limited by the r
+of the steps before.
+
 On a group, displacements are differentiated in a chart. There each further derivative
 brings a commutator with the velocity, so that
 
@@ -46,7 +51,8 @@ def local_error(
     outcome: StepOutcome,
     scales: tuple[Float[Array, " n"], Float[Array, " n"]],
     args: Args,
-) -> FloatScalar:
+    growth_rates: Float[Array, "2"],
+) -> tuple[FloatScalar, Float[Array, "2"]]:
     """Estimate the error of a step relative to `scales`, as a root mean square.
 
     **Arguments:**
@@ -55,8 +61,9 @@ def local_error(
     - `start`, `outcome`: the state before the step, and its outcome.
     - `scales`: the sizes that count as an error of one, for the n coordinates of a
         displacement in q and for the n fibre coordinates.
+    - `growth_rates`: r / h of the steps before, for u and for q; infinite if unknown.
 
-    **Returns:** the root mean square over all 2n components.
+    **Returns:** the root mean square over all 2n components, and r / h of this step.
     """
     lin, in_position, in_fibre = start.lin, *scales
     changes = jnp.asarray(derivative_weights(method), h.dtype) @ (
@@ -83,11 +90,15 @@ def local_error(
     by_chart = _growth_in_chart(system.manifold_of(start.state.q), h * mean)
     # The derivative of order k + 1 of q is that of order k of u.
     sizes = changes / in_fibre[None], h * displacements / in_position[None]
-    fibre, position = (
-        _extrapolated(jnp.sqrt(jnp.mean(x**2, axis=1)), order, by_chart)
-        for x, order in zip(sizes, (method.order + 1, method.order), strict=True)
+    orders = method.order + 1, method.order
+    (fibre, in_u), (position, in_q) = (
+        _extrapolated(jnp.sqrt(jnp.mean(x**2, axis=1)), order, by_chart, known)
+        for x, order, known in zip(
+            sizes, orders, jnp.abs(h) * growth_rates, strict=True
+        )
     )
-    return error_factor(method) * jnp.sqrt(0.5 * (fibre**2 + position**2))
+    error = error_factor(method) * jnp.sqrt(0.5 * (fibre**2 + position**2))
+    return error, jnp.stack([in_u, in_q]) / jnp.abs(h)
 
 
 def _growth_in_chart(
@@ -105,9 +116,15 @@ def _growth_in_chart(
 
 
 def _extrapolated(
-    sizes: Float[Array, " s"], order: int, by_chart: FloatScalar | None
-) -> FloatScalar:
-    """Estimate the size of a derivative from scaled derivatives of orders 1, ..., s."""
+    sizes: Float[Array, " s"],
+    order: int,
+    by_chart: FloatScalar | None,
+    known_growth: FloatScalar,
+) -> tuple[FloatScalar, FloatScalar]:
+    """Estimate the size of a derivative from scaled derivatives of orders 1, ..., s.
+
+    **Returns:** the size, and the growth r from order to order.
+    """
     number = sizes.shape[0]
     # The first derivative may vanish inside the step, but not at both of its ends.
     first = jnp.maximum(sizes[0], 0.5 * sizes[1])
@@ -116,13 +133,14 @@ def _extrapolated(
     growth = (last / first) ** (1 / (number - 1))
     if number > 2:
         # One derivative may vanish at a time, but not the next one with it.
-        growth = jnp.maximum(growth, (sizes[-2] / first) ** (1 / (number - 2)))
+        other = (sizes[-2] / first) ** (1 / (number - 2))
+        growth = jnp.maximum(growth, jnp.minimum(other, known_growth))
         last = jnp.sqrt(last**2 + (growth * sizes[-2]) ** 2)
     found = last * growth ** (order - number)
-    if by_chart is None:
-        return found
-    powers = [by_chart ** (order - 1 - k) for k in range(number)]
-    return found + jnp.max(sizes * jnp.stack(powers))
+    if by_chart is not None:
+        powers = [by_chart ** (order - 1 - k) for k in range(number)]
+        found = found + jnp.max(sizes * jnp.stack(powers))
+    return found, growth
 
 
 @functools.cache

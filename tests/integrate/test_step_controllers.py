@@ -176,14 +176,14 @@ def test_pid_keeps_sizes_within_dtmin_and_dtmax():
 
 
 def test_pid_that_needs_steps_below_dtmin_fails_and_returns_the_part_before():
-    limited = PIDController(1e-8, 1e-8, dtmin=0.06)
-    sol = swing(limited, dt=0.06, t1=9.0, throw=False, saveat=STEPS)
+    limited = PIDController(1e-8, 1e-8, dtmin=0.1)
+    sol = swing(limited, dt=0.1, t1=9.0, throw=False, saveat=STEPS)
     assert sol.result == RESULTS.dt_min_reached
     number = int(sol.stats["num_steps"])
     assert len(sol.ts) == number + 1 == int(sol.stats["failed_step"]) + 1
     assert float(sol.t1) == float(sol.ts[-1]) < 9.0
     with pytest.raises(nhjax.IntegrationError, match="`dtmin`"):
-        swing(limited, dt=0.06, t1=9.0)
+        swing(limited, dt=0.1, t1=9.0)
 
 
 def test_pid_changes_sizes_within_factormin_and_factormax():
@@ -222,6 +222,8 @@ FIRST = {
 }
 
 
+# The largest steps of the slowest motion are not solved, and are rejected.
+@pytest.mark.filterwarnings("ignore:The steps of this run took")
 @pytest.mark.parametrize("name", FIRST)
 def test_pid_without_dt_takes_a_sensible_first_step(name):
     system, q, v, controller = FIRST[name]
@@ -729,3 +731,31 @@ def test_gradient_of_an_event_time_matches_closed_form(name, adjoint):
 def test_reversible_adjoint_of_events_with_steps_that_differ_is_refused():
     with pytest.raises(ValueError, match="ReversibleAdjoint cannot retrace"):
         swing(PID, DROP, BALL, t1=2.4, event=BOUNCE, adjoint=ReversibleAdjoint())
+
+
+def test_suggested_step_solves_a_run_to_the_tolerance_and_divides_its_length():
+    y0 = nhjax.initial_state(PENDULUM, jnp.array([2.0]), jnp.zeros(1))
+    dt = nhjax.suggest_step(PENDULUM, METHOD, y0, t1=6.0, rtol=1e-6)
+    number = round(6.0 / dt)
+    assert dt == pytest.approx(6.0 / number, rel=1e-14)
+    sol = nhjax.integrate(PENDULUM, METHOD, y0, dt=dt, num_steps=number)
+    exact = solve_ivp(
+        lambda t, x: [x[1], -np.sin(x[0])], (0, 6), [2.0, 0.0], rtol=1e-12, atol=1e-12
+    ).y[0, -1]
+    # Errors of steps add up, and a step that is far too small has a far smaller error.
+    assert 1e-8 < abs(float(sol.ys.q[-1, 0]) - exact) < 1e-5
+
+
+def test_suggested_step_of_run_that_ends_while_its_steps_grow_is_not_the_first():
+    # The motion is as small as the tolerance, so that each step could be the last.
+    y0 = nhjax.initial_state(PENDULUM, jnp.array([1e-6]), jnp.array([1e-6]))
+    dt = nhjax.suggest_step(PENDULUM, METHOD, y0, t1=0.4, rtol=1e-6)
+    assert 0.1 < dt <= 0.4
+
+
+def test_suggested_step_inside_of_jit_is_refused():
+    y0 = nhjax.initial_state(PENDULUM, jnp.ones(1), jnp.zeros(1))
+    with pytest.raises(RuntimeError, match="outside of jit"):
+        jax.jit(lambda y: nhjax.suggest_step(PENDULUM, METHOD, y, t1=1.0, rtol=1e-6))(
+            y0
+        )

@@ -31,11 +31,12 @@ class Probe(AbstractStepSizeController):
         """Accept each step, and estimate its error in units of the scales."""
         del memory
         ones = jnp.ones_like(attempt.start.state.p)
-        error = local_error(
+        error, _ = local_error(
             *(context.system, context.method, attempt.t, attempt.h),
             *(attempt.start, attempt.outcome),
             (self.position * ones, self.fibre * ones),
             context.args,
+            jnp.full(2, jnp.inf),
         )
         result = attempt.outcome.result
         return Decision(attempt.is_solved, result, attempt.chosen, error)
