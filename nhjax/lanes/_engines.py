@@ -72,9 +72,9 @@ def engines(function: Callable[..., Any], *args: Any) -> tuple[EngineUse, ...]:
     `nhjax.lanes.vmap` and `nhjax.lanes.jit`. The function is compiled, but not run. On
     the CPU, nhjax compiles an ensemble (a run under `jax.vmap`) itself if possible, and
     vectorises over its members (SIMD). The environment variable `NHJAX_ENGINE` chooses
-    the engine: `lanes`, `kernels` or `xla`. A program that it cannot compile raises a
-    `RuntimeError` with the reason. Programs that were compiled before keep their engine
-    until `jax.clear_caches()`.
+    the engine: `lanes`, `kernels` or `xla`. A program that `lanes` cannot compile then
+    raises a `RuntimeError` with the reason. Programs that were compiled before keep
+    their engine until `jax.clear_caches()`.
 
     **Arguments:**
 

@@ -388,9 +388,9 @@ def _suits_vectors(program: Any) -> bool:
     return size > _LARGE_ARRAYS
 
 
-_NOT_OBEYED = (
-    "The environment variable NHJAX_ENGINE is {!r}, but this engine cannot compile the "
-    "program: {}. Unset the variable, so that another engine compiles it."
+_NOT_LANES = (
+    "The environment variable NHJAX_ENGINE is 'lanes', but this engine cannot compile "
+    "the program: {}. Unset the variable, so that another engine compiles it."
 )
 
 
@@ -459,11 +459,9 @@ def _by_first_engine(
         else:
             record_engine("lanes", f"the first choice{options.note}", members)
             return jax.ffi.ffi_lowering(name)(ctx, *operands)
+    if chosen_engine() == "lanes":
+        raise RuntimeError(_NOT_LANES.format(reason))
     against = _reason_against_kernel(params["program"], options, reason)
-    chosen = chosen_engine()
-    by_kernels = against is None or "kernels" not in options.engines
-    if chosen == "lanes" or (chosen == "kernels" and not by_kernels):
-        raise RuntimeError(_NOT_OBEYED.format(chosen, against or reason))
     if against is not None:
         record_engine("xla", f"{against}{options.note}", members)
         return ways.by_xla(ctx, *operands, **params)
