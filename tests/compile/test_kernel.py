@@ -315,5 +315,5 @@ def test_lanes_chosen_for_a_program_they_cannot_compile_raise_with_reason(monkey
         (use,) = nhjax.engines(run, x)
         assert use.engine == "xla"
     monkeypatch.setenv("NHJAX_ENGINE", "lanes")
-    with pytest.raises(RuntimeError, match="NHJAX_ENGINE is 'lanes'.*svd"):
+    with pytest.raises(RuntimeError, match=r"NHJAX_ENGINE is 'lanes'.*svd"):
         jax.jit(run)(x)
