@@ -298,6 +298,7 @@ COLUMNS = {
     "accepted": "accepted",
     "judged": "accepted judged",
     "largest distance": "largest distance accepted",
+    "doubtful": "doubtful",
     "wrongly accepted": "wrongly accepted",
     "refused": "refused",
     "judged ": "refused judged",
@@ -325,6 +326,7 @@ def save(rows: list[dict[str, Any]]) -> None:
         for key in (
             "accepted",
             "accepted judged",
+            "doubtful",
             "wrongly accepted",
             "refused",
             "refused judged",
@@ -333,9 +335,9 @@ def save(rows: list[dict[str, Any]]) -> None:
     }
     summary = (
         "{accepted} steps were accepted, of which {accepted judged} were judged: "
-        "{wrongly accepted} of them wrongly. {refused} were refused, of which "
-        "{refused judged} were judged: {wrongly refused} of them wrongly. Distances "
-        "are in units of the noise."
+        "{doubtful} are doubtful, and {wrongly accepted} were accepted wrongly. "
+        "{refused} were refused, of which {refused judged} were judged: {wrongly "
+        "refused} of them wrongly. Distances are in units of the noise."
     ).format(**total)
     text = "\n\n".join([(__doc__ or "").strip(), summary])
     text += "\n\n" + markdown_table(["system", *COLUMNS], cells)
