@@ -314,7 +314,12 @@ def test_accepted_step_errors_quoted_agree_with_the_result():
     assert_agree(quoted(text, sentence), [count["nearly singular"]])
     sentence = "In {} steps the coordinates are so large"
     assert_agree(quoted(text, sentence), [count["overflow"]])
-    assert count["wrong"] == 0
+    wrong = [row for row in rows if (row.get("doubtful") or {}).get("wrong")]
+    assert {(x["system"], x["stages"]) for x in wrong} == {("RodSleigh", 3)}
+    assert max(x["newton residual"] for x in wrong) < 1e-13
+    assert_agree(quoted(text, "The other {} steps"), [count["wrong"]])
+    farthest = max(x["distance"] for x in wrong)
+    assert_agree(quoted(text, "up to {} of the state from Newton's"), [farthest])
     least = min(row["least h"] for row in doubtful)
     assert_agree(quoted(text, "step sizes from {} on"), [least])
 
