@@ -435,6 +435,7 @@ class PIDController(AbstractStepSizeController):
             *(start, outcome, scales, context.args, growth_rates),
         )
         error, found, size = jax.lax.stop_gradient((error, found, jnp.abs(h)))
+        # The growth may fall in a step by chance. Each step forgets a half of it.
         is_first = jnp.isinf(growth_rates)
         growth_rates = jnp.where(
             is_first, found, jnp.maximum(found, 0.5 * growth_rates)

@@ -112,8 +112,8 @@ def iterate(
     size of x, or relative to the size of the iterate if that is larger, because x may
     start from zero. If both are zero, increments are measured relative to the first
     one. The round-off of x is proportional to the same size or, if data are larger than
-    x, to `scale` plus `round_off`. `noise` is a size whose round-off increments have
-    for certain, because it was measured.
+    x, to `scale` plus `round_off`. `noise` is a measured size: increments always
+    contain its round-off.
 
     The iteration ends
 
@@ -126,11 +126,11 @@ def iterate(
     threshold would be either too coarse or never met (Hairer, Lubich, Wanner, GNI,
     section VIII.6). Each time that an increment fails to fall, the level of increments
     that are treated as noise is raised, up to `noise_units` of round-off. Each new
-    smallest increment lowers it again. By default the highest level is the square root
-    of the unit round-off, which suits iterations that converge so fast that only noise
-    can slow them down. After many iterations all levels fall again, in proportion to
-    the number of iterations, because the error of a slow iteration is much larger than
-    its increment.
+    smallest increment lowers it again. The default of the highest level is the square
+    root of the unit round-off. It suits iterations that converge so fast that only
+    noise can slow them down. After many iterations all levels fall again, in proportion
+    to the number of iterations, because the error of a slow iteration is much larger
+    than its increment.
     """
     # `jit` makes JAX trace the iteration once, for the shapes and for the loop: that is
     # most of the work of tracing a step.

@@ -1,6 +1,8 @@
 """Derivatives in brief, and the programs that are compiled, as users run them."""
 
+import contextlib
 import os
+from collections.abc import Iterator
 
 import jax
 import jax.numpy as jnp
@@ -17,6 +19,17 @@ from support.user_features import (
     run,
     TWO,
 )
+
+
+@contextlib.contextmanager
+def compiled_by(engine: str) -> Iterator[None]:
+    """Let one engine compile all programs, also if a feature fails."""
+    os.environ["NHJAX_ENGINE"] = engine
+    try:
+        yield
+    finally:
+        del os.environ["NHJAX_ENGINE"]
+        jax.clear_caches()
 
 
 @feature
@@ -68,10 +81,8 @@ def gradients_of_an_ensemble_in_its_projected_starts():
     starts = sleigh.q0 + 1e-3 * jnp.arange(40.0)[:, None]
     many = {}
     for engine in ("kernels", "lanes"):
-        os.environ["NHJAX_ENGINE"] = engine
-        many[engine] = jax.jit(jax.vmap(jax.grad(loss)))(starts)
-        jax.clear_caches()
-    del os.environ["NHJAX_ENGINE"]
+        with compiled_by(engine):
+            many[engine] = jax.jit(jax.vmap(jax.grad(loss)))(starts)
     close(many["kernels"], many["lanes"])
     assert jnp.all(jnp.ptp(many["lanes"], axis=0) > 0)
 
@@ -103,12 +114,10 @@ def one_kernel_in_the_compiled_program():
     y0 = PARTICLE.initial_state()
     compiled = {}
     for engine in ("lanes", "kernels") if is_available() else ("kernels",):
-        os.environ["NHJAX_ENGINE"] = engine
         function = jax.jit(lambda y0: run(y0=y0).ys.q)
-        _, use = nhjax.engines(function, y0)
-        compiled[use.engine] = function.lower(y0).compile().as_text()
-        jax.clear_caches()
-    del os.environ["NHJAX_ENGINE"]
+        with compiled_by(engine):
+            _, use = nhjax.engines(function, y0)
+            compiled[use.engine] = function.lower(y0).compile().as_text()
     assert 'xla_cpu_small_call="true"' in compiled["kernels"]
     if "lanes" in compiled:
         assert compiled["lanes"].count('custom_call_target="nhjax_lanes_') == 2
