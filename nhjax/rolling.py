@@ -61,6 +61,29 @@ def _pose(value: Any) -> Any:
     return static_function(value)
 
 
+Length: TypeAlias = ArrayLike | Callable[[Args], ArrayLike]
+
+
+def _length(name: str) -> Callable[[Any], Any]:
+    """Return a converter of numbers, and of functions of `args` that return them."""
+
+    def converted(value):
+        if callable(value):
+            check_signature("A contact", name, value, ("args",))
+            return static_function(value)
+        return parameter(value) if np.ndim(value) == 0 else jnp.asarray(value)
+
+    return converted
+
+
+def _length_in(args: Args, name: str, value: Any, dtype: Any) -> Array:
+    """Evaluate a length that may be a function of `args`."""
+    if callable(value):
+        with naming(f"{name}(args)", as_given(value), args):
+            value = value(args)
+    return jnp.asarray(value).astype(dtype)
+
+
 def _unit(vector: Array) -> Array:
     return vector / jnp.sqrt(vector @ vector)
 
@@ -314,8 +337,8 @@ class AbstractContact(eqx.Module):
 
     To define a shape, write a subclass with the fields below and two methods:
 
-    - `offset(rotation, normal)`: the vector from the origin of the body to its point
-        that is farthest in the direction -normal, in space.
+    - `offset(rotation, normal, args)`: the vector from the origin of the body to its
+        point that is farthest in the direction -normal, in space.
     - `axes(rotation, normal)`: two directions along the ground that are perpendicular
         to each other, `along` and `across`, of shape (2, 3).
     """
@@ -346,7 +369,7 @@ class AbstractContact(eqx.Module):
 
     @abc.abstractmethod
     def offset(
-        self, rotation: Float[Array, "3 3"], normal: Float[Array, "3"]
+        self, rotation: Float[Array, "3 3"], normal: Float[Array, "3"], args: Args
     ) -> Float[Array, "3"]:
         """Compute the vector from the origin of the body to the contact, in space."""
 
@@ -382,7 +405,7 @@ class AbstractContact(eqx.Module):
 
     def _touch(self, position: Array, rotation: Array, args: Args) -> Touch:
         def support(normal):
-            return position + self.offset(rotation, normal)
+            return position + self.offset(rotation, normal, args)
 
         return self.ground.touch(support, position, args)
 
@@ -473,8 +496,9 @@ class Wheel(AbstractContact):
     - `pose`: called as `pose(t, q, args)`; returns the position of the hub [m], of
         shape (3,), and the rotation from the frame of the wheel to space, of shape
         (3, 3). The turn of the wheel about its axle is a part of the rotation.
-    - `radius`: from the axle to the thin rim, or to the middle of the tube [m].
-    - `tube_radius`: the radius of the tube of a torus [m].
+    - `radius`: from the axle to the thin rim, or to the middle of the tube [m]. It is a
+        number, or a function of `args` that returns it.
+    - `tube_radius`: the radius of the tube of a torus [m], in the same way.
     - `axle`: the direction of the axle in the frame of the wheel.
     - `no_slip`: the directions in which the wheel does not slip: `"along"`, `"across"`,
         or an angle [rad] from `along` towards `across`. An omni wheel has
@@ -504,8 +528,10 @@ class Wheel(AbstractContact):
     """
 
     pose: PositionFunction = eqx.field(converter=_pose)
-    radius: ArrayLike = eqx.field(converter=parameter)
-    tube_radius: ArrayLike = eqx.field(default=0.0, converter=parameter, kw_only=True)
+    radius: Length = eqx.field(converter=_length("radius"))
+    tube_radius: Length = eqx.field(
+        default=0.0, converter=_length("tube_radius"), kw_only=True
+    )
     axle: Float[ArrayLike, "3"] = eqx.field(
         default=(0.0, 1.0, 0.0), converter=_vector, kw_only=True
     )
@@ -515,13 +541,12 @@ class Wheel(AbstractContact):
     manifold: AbstractLieGroup | None = eqx.field(default=None, kw_only=True)
 
     def offset(
-        self, rotation: Float[Array, "3 3"], normal: Float[Array, "3"]
+        self, rotation: Float[Array, "3 3"], normal: Float[Array, "3"], args: Args
     ) -> Float[Array, "3"]:
         """Compute the vector from the hub to the lowest point."""
         axle = self._axle(rotation)
-        radius, tube = (
-            jnp.asarray(x).astype(axle.dtype) for x in (self.radius, self.tube_radius)
-        )
+        radius = _length_in(args, "radius", self.radius, axle.dtype)
+        tube = _length_in(args, "tube_radius", self.tube_radius, axle.dtype)
         # In this form a disc that lies nearly flat loses no digits.
         down = jnp.cross(axle, self.axes(rotation, normal)[0])
         return radius * down - tube * normal
@@ -548,7 +573,7 @@ class Ellipsoid(AbstractContact):
     - `pose`: called as `pose(t, q, args)`; returns the position of the centre of the
         ellipsoid [m], of shape (3,), and the rotation to space, of shape (3, 3).
     - `semi_axes`: three lengths [m] along the axes of the body, or the radius of a
-        ball.
+        ball; or a function of `args` that returns them.
     - `no_slip`: the directions in which the body does not slip; `()` if it slides.
     - `touches`, `ground`, `manifold`: as for `Wheel`.
 
@@ -564,24 +589,29 @@ class Ellipsoid(AbstractContact):
     """
 
     pose: PositionFunction = eqx.field(converter=_pose)
-    semi_axes: ArrayLike = eqx.field(converter=jnp.asarray)
+    semi_axes: Length = eqx.field(converter=_length("semi_axes"))
     no_slip: NoSlip = eqx.field(default=("along", "across"), static=True, kw_only=True)
     touches: bool = eqx.field(default=True, static=True, kw_only=True)
     ground: AbstractGround = eqx.field(default_factory=Plane, kw_only=True)
     manifold: AbstractLieGroup | None = eqx.field(default=None, kw_only=True)
 
     def __check_init__(self) -> None:
-        if jnp.shape(self.semi_axes) not in ((), (3,)):
+        if not callable(self.semi_axes):
+            self._check_shape(jnp.asarray(self.semi_axes))
+
+    def _check_shape(self, axes: Array) -> None:
+        if axes.shape not in ((), (3,)):
             raise ShapeError(
                 "`semi_axes` must be three lengths or one radius, got shape "
-                f"{jnp.shape(self.semi_axes)}."
+                f"{axes.shape}."
             )
 
     def offset(
-        self, rotation: Float[Array, "3 3"], normal: Float[Array, "3"]
+        self, rotation: Float[Array, "3 3"], normal: Float[Array, "3"], args: Args
     ) -> Float[Array, "3"]:
         """Compute the vector from the centre to the lowest point."""
-        axes = jnp.asarray(self.semi_axes).astype(rotation.dtype)
+        axes = _length_in(args, "semi_axes", self.semi_axes, rotation.dtype)
+        self._check_shape(axes)
         if axes.shape == ():
             return -axes * normal
         # The support function of the ellipsoid in the direction -n.
@@ -631,7 +661,7 @@ class Blade(AbstractContact):
     manifold: AbstractLieGroup | None = eqx.field(default=None, kw_only=True)
 
     def offset(
-        self, rotation: Float[Array, "3 3"], normal: Float[Array, "3"]
+        self, rotation: Float[Array, "3 3"], normal: Float[Array, "3"], args: Args
     ) -> Float[Array, "3"]:
         """Return zero: the position of the pose is the point that touches."""
         return jnp.zeros_like(normal)

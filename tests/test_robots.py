@@ -15,6 +15,7 @@ import pytest
 
 import nhjax
 from nhjax import rolling
+from nhjax._robots import _tree
 from support.robot_models import CLOSED, OPEN
 
 
@@ -62,9 +63,9 @@ def _accelerations(robot):
     system, space = robot.system, robot._space
 
     @jax.jit
-    @jax.vmap
-    def compute(qpos, qvel, controls):
-        args = {"controls": controls} if robot.controls else None
+    @functools.partial(jax.vmap, in_axes=(0, 0, 0, None))
+    def compute(qpos, qvel, controls, args):
+        args = args | ({"controls": controls} if robot.controls else {})
         q = space.from_qpos(qpos)
         v = space.to_body(q, qvel)
         p, rate = jax.jvp(
@@ -84,8 +85,13 @@ def _accelerations(robot):
 @pytest.mark.parametrize("name", sorted(OPEN))
 def test_acceleration_and_mass_matrix_on_random_states_equal_mujoco(name, count):
     model, robot = _robot(name)
+    _assert_moves_as_in_mujoco(robot, model, count, {})
+
+
+def _assert_moves_as_in_mujoco(robot, model, count, args):
+    """Compare accelerations and mass matrices on random states."""
     states = _random_states(model, count)
-    found, masses = _accelerations(robot)(*map(jnp.asarray, states))
+    found, masses = _accelerations(robot)(*map(jnp.asarray, states), args)
     data, mass = mujoco.MjData(model), np.zeros((model.nv, model.nv))
     for i, (qpos, qvel, controls) in enumerate(zip(*states, strict=True)):
         data.qpos[:], data.qvel[:], data.ctrl[:] = qpos, qvel, controls
@@ -182,15 +188,20 @@ def test_planar_loop_in_space_keeps_only_independent_equations():
 # --- Rolling -------------------------------------------------------------------------
 
 
-@functools.cache
-def _two_wheels():
+def _read_two_wheels(**options):
     return nhjax.from_mujoco(
         TWO_WHEELS,
         rolling=["right_tread", "left_tread"],
         root="planar",
         ground=rolling.Plane(height=-0.15),
         ignore=["contacts"],
+        **options,
     )
+
+
+@functools.cache
+def _two_wheels():
+    return _read_two_wheels()
 
 
 def test_two_wheeled_robot_from_urdf_moves_like_that_of_the_gallery():
@@ -398,12 +409,14 @@ def test_feedback_receives_positions_and_velocities_of_mujoco():
 
 SMALL = {"mass": ["cart", "pole"], "damping": ["pole"], "stiffness": ["cart"]}
 LARGE = {"mass": ["fore"], "damping": ["pitch"], "armature": ["yaw"]}
+LENGTHS = {"mass": ["link0"], "position": ["link1", "link2"]}
 
 
 @pytest.mark.parametrize(
     ("name", "chosen"),
     [
         ("cart and pole", SMALL),
+        ("pendulum chain", LENGTHS),
         pytest.param("arm with springs and servos", LARGE, marks=pytest.mark.long),
     ],
 )
@@ -424,14 +437,15 @@ def test_gradient_by_parameters_of_the_file_agrees_with_differences(name, chosen
     slopes, h = jax.jit(jax.grad(end))(robot.args), 1e-3
     leaves, structure = jax.tree.flatten(robot.args)
     for i, slope in enumerate(jax.tree.leaves(slopes)):
-
+        # A position is moved in all directions at once.
         def at(x, i=i):
             moved = [leaf + x if j == i else leaf for j, leaf in enumerate(leaves)]
             return end(structure.unflatten(moved))
 
         near, far = [(at(k * h) - at(-k * h)) / (2 * k * h) for k in (1, 2)]
-        assert float(slope) == pytest.approx(float((4 * near - far) / 3), abs=1e-8)
-        assert abs(float(slope)) > 1e-6
+        expected = float((4 * near - far) / 3)
+        assert float(slope.sum()) == pytest.approx(expected, abs=1e-8)
+        assert abs(expected) > 1e-6
 
 
 def test_mass_in_args_equals_a_model_with_this_mass():
@@ -448,6 +462,107 @@ def test_mass_in_args_equals_a_model_with_this_mass():
     first = robots[0].system.lagrangian(0.0, q, v, {"mass": {"b": 5.0}})
     second = robots[1].system.lagrangian(0.0, q, v, None)
     assert float(first) == pytest.approx(float(second), abs=1e-14)
+
+
+MOVABLE = {
+    "pendulum chain": ("link0", "link2", "link3"),
+    "ball joint": ("top", "arm"),
+    "arm with springs and servos": ("upper", "tool", "fore"),
+    "differential drive": ("right", "left"),
+}
+
+
+@pytest.mark.parametrize("largest", [0, 40])
+@pytest.mark.parametrize("name", sorted(MOVABLE))
+def test_positions_in_args_equal_a_model_with_these_positions(
+    name, largest, monkeypatch
+):
+    monkeypatch.setattr(_tree, "LARGEST_OF_SCALARS", largest)
+    spec = mujoco.MjSpec.from_string(OPEN[name])
+    rng, places = np.random.default_rng(8), {}
+    for body in spec.bodies:
+        if body.name in MOVABLE[name]:
+            body.pos = np.asarray(body.pos) + 0.3 * rng.normal(size=3)
+            places[body.name] = jnp.asarray(body.pos)
+    model, args = spec.compile(), {"position": places}
+    chosen = {"position": MOVABLE[name], "mass": MOVABLE[name][:1]}
+    robot = nhjax.from_mujoco(_compiled(OPEN[name]), parameters=chosen)
+    _assert_moves_as_in_mujoco(robot, model, 3, args)
+    data = mujoco.MjData(model)
+    data.qpos[:] = _random_states(model, 1)[0][0]
+    mujoco.mj_kinematics(model, data)
+    q = robot._space.from_qpos(jnp.asarray(data.qpos))
+    for body in MOVABLE[name]:
+        position, rotation = robot.pose(body, q, args)
+        np.testing.assert_allclose(position, data.body(body).xpos, atol=1e-13)
+        turn = data.body(body).xmat.reshape(3, 3)
+        np.testing.assert_allclose(rotation, turn, atol=1e-13)
+
+
+def test_positions_in_args_move_the_ends_of_a_closed_loop():
+    bodies, text = ("coupler", "rocker"), CLOSED["four-bar"]
+    robot = nhjax.from_mujoco(_compiled(text), parameters={"position": bodies})
+    spec = mujoco.MjSpec.from_string(text)
+    places = {"coupler": np.array([0.0, 0.0, 0.35]), "rocker": np.array([0.6, 0, 0.1])}
+    for name, place in places.items():
+        spec.body(name).pos = place
+    model, anchors = spec.compile(), _compiled(text).eq_data[0]
+    data = mujoco.MjData(model)
+    data.qpos[:] = 0.2, -0.4, 0.1
+    mujoco.mj_kinematics(model, data)
+    ends = [
+        data.body(name).xpos + data.body(name).xmat.reshape(3, 3) @ anchor
+        for name, anchor in zip(bodies, (anchors[:3], anchors[3:6]), strict=True)
+    ]
+    args = {"position": jax.tree.map(jnp.asarray, places)}
+    gap = jax.jit(robot.system.position_constraint)
+    # The loop lies in the plane of x and z.
+    expected = (ends[0] - ends[1])[[0, 2]]
+    found = gap(0.0, jnp.asarray(data.qpos), args)
+    np.testing.assert_allclose(found, expected, atol=1e-15)
+    y0 = robot.initial_state(args=args, project=True)
+    np.testing.assert_allclose(gap(0.0, y0.q, args), 0, atol=1e-15)
+
+
+def test_radii_and_track_in_args_equal_a_robot_with_these_lengths():
+    wheels, half_track, radius = ("right_wheel", "left_wheel"), 0.6, 0.2
+    robot = _read_two_wheels(
+        parameters={"position": wheels, "radius": ["right_tread", "left_tread"]}
+    )
+    args = {
+        "position": {
+            name: jnp.array([0.0, y, 0.0])
+            for name, y in zip(wheels, (-half_track, half_track), strict=True)
+        },
+        "radius": dict.fromkeys(("right_tread", "left_tread"), jnp.asarray(radius)),
+    }
+    other = nhjax.systems.TwoWheeledRobot.rolling(
+        1.0, 0.5, radius=radius, half_track=half_track
+    )
+    method, ends = nhjax.LobattoIIIAB(2), []
+    for system, y0, own in (
+        (robot.system, robot.initial_state(other.q0, other.v0, args=args), args),
+        (other.system, other.initial_state(), None),
+    ):
+        sol = nhjax.integrate(system, method, y0, dt=0.05, num_steps=40, args=own)
+        ends.append((sol.ys.q[-1], sol.ys.v[-1]))
+    for found, expected in zip(*ends, strict=True):
+        np.testing.assert_allclose(found, expected, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("args", "message"),
+    [
+        ({"position": {"top": 1.0}}, r"\['top'\]` must have shape \(3,\), got shape"),
+        ({"position": {"b": jnp.zeros(3)}}, "unknown name 'b'; the names are top"),
+    ],
+)
+def test_wrong_position_in_args_raises(args, message):
+    robot = nhjax.from_mujoco(
+        _compiled(OPEN["ball joint"]), parameters={"position": ["top"]}
+    )
+    with pytest.raises(ValueError, match=message):
+        robot.initial_state(args=args)
 
 
 @pytest.mark.parametrize(
@@ -560,6 +675,12 @@ WRONG = [
     (_text(), {"parameters": {"weight": ["b"]}}, "unknown kind 'weight'"),
     (_text(), {"parameters": {"mass": ["c"]}}, "has 'c', but the names are b"),
     (_text(), {"parameters": {"mass": "b"}}, r"write \['b'\]"),
+    (_text(), {"parameters": {"radius": ["g"]}}, "names are none. They are those of"),
+    (
+        OPEN["free body"],
+        {"parameters": {"position": ["stone"]}},
+        "names are none. The position of a body with a free joint is a coordinate",
+    ),
     (
         _text(geom='type="box" size="1 1 1" contype="0"').replace('size="0.1"', ""),
         {"rolling": ["g"]},

@@ -401,6 +401,32 @@ def test_radius_of_a_wheel_is_differentiated_through_a_run():
     np.testing.assert_allclose(jax.grad(end)(0.5), difference, rtol=1e-6)
 
 
+def test_lengths_of_a_contact_as_functions_of_args_equal_numbers():
+    y = nhjax.systems.RollingTorus.steady(1.0, 2.0, tube_radius=0.1).initial_state()
+    args = {"radius": 0.3, "tube": jnp.asarray(0.1), "axes": jnp.array([0.1, 0.2, 0.3])}
+    pairs = (
+        (
+            rolling.Wheel(_free_body, 0.3, tube_radius=0.1, manifold=SE3),
+            rolling.Wheel(
+                _free_body,
+                lambda args: args["radius"],
+                tube_radius=lambda args: args["tube"],
+                manifold=SE3,
+            ),
+        ),
+        (
+            rolling.Ellipsoid(_free_body, [0.1, 0.2, 0.3], manifold=SE3),
+            rolling.Ellipsoid(_free_body, lambda args: args["axes"], manifold=SE3),
+        ),
+    )
+    for numbers, functions in pairs:
+        for a, b in (
+            (numbers.height(0.0, y.q), functions.height(0.0, y.q, args)),
+            (numbers.slip(0.0, y.q, y.v), functions.slip(0.0, y.q, y.v, args)),
+        ):
+            np.testing.assert_array_equal(a, b)
+
+
 @pytest.mark.parametrize("tilt", [1e-2, 1e-4, 1e-6])
 def test_height_of_a_disc_that_lies_flat_keeps_all_digits(tilt):
     def pose(t, q, args):
@@ -462,6 +488,18 @@ def test_contacts_keep_the_precision_of_the_state(dtype):
         (lambda: rolling.Plane((0.0, 1.0)), nhjax.ShapeError, r"shape \(3,\)"),
         (
             lambda: rolling.Ellipsoid(_free_body, [1.0, 2.0]),
+            nhjax.ShapeError,
+            "three lengths or one radius",
+        ),
+        (
+            lambda: rolling.Wheel(_free_body, lambda q, args: 0.3),
+            TypeError,
+            r"`radius` must take \(args\)",
+        ),
+        (
+            lambda: rolling.Ellipsoid(_free_body, lambda args: jnp.ones(2)).height(
+                0.0, jnp.array([1.0, 0, 0, 0, 0, 0, 1])
+            ),
             nhjax.ShapeError,
             "three lengths or one radius",
         ),

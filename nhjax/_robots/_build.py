@@ -1,7 +1,7 @@
 """The conversion of a compiled model of MuJoCo to the arrays that nhjax uses."""
 
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from itertools import pairwise
 from typing import Any, NamedTuple
 
@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from .._custom_types import Args
 from ..rolling import AbstractContact, AbstractGround, Contacts, Ellipsoid, Plane, Wheel
 from ._dynamics import (
     Actuators,
@@ -22,7 +23,7 @@ from ._dynamics import (
     Mechanics,
     Parameters,
 )
-from ._joints import Joint
+from ._joints import Joint, Shift
 from ._read import (
     active_equalities,
     has_flag,
@@ -58,14 +59,21 @@ class Layout:
         return self.__dict__ | {"source": None}
 
 
-def layout_of(model: Any, source: Any = None) -> Layout:
-    """Read the kinematic tree."""
+def layout_of(model: Any, source: Any, moving: Collection[str]) -> Layout:
+    """Read the kinematic tree.
+
+    The positions of the bodies with the names `moving` are parameters.
+    """
     joints: list[Joint] = []
     bodies = [Frame(-1, np.eye(4))]
     for body in range(1, model.nbody):
         parent = bodies[model.body_parentid[body]]
         own = homogeneous(model.body_pos[body], model.body_quat[body])
-        last, offset = parent.joint, parent.matrix @ own
+        last, offset, shifts = parent.joint, parent.matrix @ own, parent.shifts
+        name = name_of(model, "body", body)
+        if name in moving:
+            turn, place = parent.matrix[:3, :3], model.body_pos[body].copy()
+            shifts = (*shifts, Shift(name, turn, place))
         first = model.body_jntadr[body]
         for number in range(first, first + model.body_jntnum[body]):
             kind = _KINDS[model.jnt_type[number]]
@@ -79,17 +87,18 @@ def layout_of(model: Any, source: Any = None) -> Layout:
                     model.jnt_pos[number].copy(),
                     model.jnt_axis[number].copy(),
                     float(model.qpos0[place]) if kind in ("slide", "hinge") else 0.0,
+                    shifts,
                 )
             )
-            last, offset = number, np.eye(4)
-        bodies.append(Frame(last, offset))
+            last, offset, shifts = number, np.eye(4), ()
+        bodies.append(Frame(last, offset, shifts))
     return Layout(joints, bodies, source)
 
 
 def fixed_to(layout: Layout, body: int, position: Any, quaternion: Any) -> Frame:
     """Return a frame that is fixed to a body, such as that of a geom or a site."""
     frame = layout.bodies[body]
-    return Frame(frame.joint, frame.matrix @ homogeneous(position, quaternion))
+    return frame._replace(matrix=frame.matrix @ homogeneous(position, quaternion))
 
 
 def mechanics_of(
@@ -170,7 +179,7 @@ def mechanics_of(
 
 
 def _bodies(model: Any, layout: Layout) -> Bodies:
-    names, joints, inertias, masses, weights = [], [], [], [], []
+    names, joints, inertias, masses, weights, shifts = [], [], [], [], [], []
     for body in range(1, model.nbody):
         frame, mass = layout.bodies[body], float(model.body_mass[body])
         if frame.joint < 0 or (mass == 0 and not model.body_inertia[body].any()):
@@ -184,12 +193,14 @@ def _bodies(model: Any, layout: Layout) -> Bodies:
         inertias.append(place @ inner @ place.T)
         masses.append(mass)
         weights.append(1 - model.body_gravcomp[body])
+        shifts.append(frame.shifts)
     return Bodies(
         tuple(names),
         tuple(joints),
         np.stack(inertias) if inertias else np.zeros((0, 4, 4)),
         np.asarray(masses, float),
         np.asarray(weights, float),
+        tuple(shifts),
     )
 
 
@@ -210,37 +221,17 @@ def fixed_tendons(
     return rows, numbers
 
 
-def parameters_of(
-    model: Any,
-    mechanics: Mechanics,
-    controls: tuple[str, ...] | None,
-    given: Mapping[str, Sequence[str]] | None,
-) -> tuple[Parameters, dict[str, Any]]:
-    """Return the parameters that `args` may replace, and their values."""
-    places: dict[str, dict[str, tuple[int, ...]]] = {}
-    values: dict[str, Any] = {}
-    bodies = {name: (i,) for i, name in enumerate(mechanics.bodies.names)}
-    scalars = [x.name for x in mechanics.joints if x.kind in _KINDS[2:]]
-    velocities = {}
-    for number, joint in enumerate(mechanics.joints):
-        first = int(model.jnt_dofadr[number])
-        size = {"free": 6, "ball": 3}.get(joint.kind, 1)
-        velocities[joint.name] = tuple(range(first, first + size))
-    of_scalars = {name: (i,) for i, name in enumerate(scalars)}
-    known = {
-        "mass": (bodies, mechanics.bodies.mass),
-        "damping": (velocities, mechanics.damping[0]),
-        "armature": (velocities, mechanics.armature),
-        "friction": ({x: velocities[x] for x in scalars}, mechanics.friction),
-        "stiffness": (of_scalars, mechanics.stiffness[0]),
-    }
-    if given is not None and not isinstance(given, Mapping):
+def check_kinds(given: Any) -> Mapping[str, Sequence[str]]:
+    """Raise unless `parameters` has sequences of names by known kinds; return it."""
+    if given is None:
+        return {}
+    if not isinstance(given, Mapping):
         raise TypeError(
             "from_mujoco: `parameters` must be a dictionary such as "
             f'{{"mass": ["arm"], "damping": ["hinge"]}}, got {type(given).__name__}.'
         )
-    for kind, names in (given or {}).items():
-        if kind not in known:
+    for kind, names in given.items():
+        if kind not in KINDS:
             raise ValueError(
                 f"from_mujoco: `parameters` has the unknown kind {kind!r}; the kinds "
                 f"are {', '.join(KINDS)}."
@@ -250,18 +241,81 @@ def parameters_of(
                 f"from_mujoco: `parameters[{kind!r}]` must be a sequence of names, got "
                 f"{names!r}; write [{names!r}]."
             )
+    return given
+
+
+def parameters_of(
+    model: Any,
+    mechanics: Mechanics,
+    controls: tuple[str, ...] | None,
+    geoms: Mapping[str, "RollingGeom"],
+    given: Mapping[str, Sequence[str]],
+) -> tuple[Parameters, dict[str, Any]]:
+    """Return the parameters that `args` may replace, and their values."""
+    places: dict[str, dict[str, tuple[int, ...]]] = {}
+    values: dict[str, dict[str, np.ndarray]] = {}
+    bodies = {name: (i,) for i, name in enumerate(mechanics.bodies.names)}
+    scalars = [x.name for x in mechanics.joints if x.kind in _KINDS[2:]]
+    velocities = {}
+    for number, joint in enumerate(mechanics.joints):
+        first = int(model.jnt_dofadr[number])
+        size = {"free": 6, "ball": 3}.get(joint.kind, 1)
+        velocities[joint.name] = tuple(range(first, first + size))
+    of_scalars = {name: (i,) for i, name in enumerate(scalars)}
+    everywhere = {
+        name_of(model, "body", i): (i,)
+        for i in range(1, model.nbody)
+        if not _is_free(model, i)
+    }
+    known = {
+        "mass": (bodies, mechanics.bodies.mass),
+        "damping": (velocities, mechanics.damping[0]),
+        "armature": (velocities, mechanics.armature),
+        "friction": ({x: velocities[x] for x in scalars}, mechanics.friction),
+        "stiffness": (of_scalars, mechanics.stiffness[0]),
+        "position": (everywhere, model.body_pos),
+        "radius": (
+            {name: (x.geom,) for name, x in geoms.items() if x.has_radius(model)},
+            model.geom_size[:, 0],
+        ),
+    }
+    for kind, names in given.items():
         all_places, numbers = known[kind]
         for name in names:
             if name not in all_places:
+                listed = ", ".join(all_places) or "none"
                 raise ValueError(
                     f"from_mujoco: `parameters[{kind!r}]` has {name!r}, but the names "
-                    f"are {', '.join(all_places)}. In a URDF file, MuJoCo merges links "
-                    "that are fixed to each other, unless it contains "
-                    '`<mujoco><compiler fusestatic="false"/></mujoco>`.'
+                    f"are {listed}. {_ADVICE_ON_NAMES.get(kind, '')}".rstrip()
                 )
         places[kind] = {name: all_places[name] for name in names}
-        values[kind] = {name: float(numbers[all_places[name][0]]) for name in names}
+        values[kind] = {
+            name: np.array(numbers[all_places[name][0]], float) for name in names
+        }
+    for name, mass in values.get("mass", {}).items():
+        if mass == 0:
+            raise ValueError(
+                f"from_mujoco: `parameters['mass']` has {name!r}, whose mass is zero "
+                "in the file, so that its shape is unknown: give it a mass there."
+            )
     return Parameters(places, controls), values
+
+
+_FUSED = (
+    "In a URDF file, MuJoCo merges links that are fixed to each other, unless it "
+    'contains `<mujoco><compiler fusestatic="false"/></mujoco>`.'
+)
+_ADVICE_ON_NAMES = {
+    "mass": _FUSED,
+    "position": "The position of a body with a free joint is a coordinate. " + _FUSED,
+    "radius": "They are those of `rolling`, but an ellipsoid has no radius.",
+}
+
+
+def _is_free(model: Any, body: int) -> bool:
+    """Return whether a free joint moves this body."""
+    first = model.body_jntadr[body]
+    return bool(model.body_jntnum[body]) and _KINDS[model.jnt_type[first]] == "free"
 
 
 def actuators_of(
@@ -422,16 +476,35 @@ def rolling_options(rolling: Any) -> dict[str, tuple[Any, ...]]:
     return found
 
 
-def rolling_geoms(model: Any, options: Mapping[str, Any]) -> dict[str, int]:
-    """Return the numbers of the geoms that roll.
+class RollingGeom(NamedTuple):
+    """A geom that rolls: its number, and the directions in which it does not slip.
 
-    The name of a body means its only round geom.
+    If `is_parameter`, its radius can be given in `args`.
+    """
+
+    geom: int
+    no_slip: tuple[Any, ...]
+    is_parameter: bool
+
+    def has_radius(self, model: Any) -> bool:
+        """Return whether a single number describes its shape."""
+        ellipsoid = mujoco().mjtGeom.mjGEOM_ELLIPSOID
+        return model.geom_type[self.geom] != int(ellipsoid)
+
+
+def rolling_geoms(
+    model: Any, options: Mapping[str, tuple[Any, ...]], radii: Collection[str]
+) -> dict[str, RollingGeom]:
+    """Return the geoms that roll, by name.
+
+    The name of a body means its only round geom. The radii of those named in `radii`
+    are parameters.
     """
     geoms = {name_of(model, "geom", i): i for i in range(model.ngeom)}
     bodies = {name_of(model, "body", i): i for i in range(1, model.nbody)}
     round_kinds = [int(kind) for kind in _round_kinds()]
     found = {}
-    for name in options:
+    for name, no_slip in options.items():
         own: list[int] = []
         if name in bodies:
             of_body = np.flatnonzero(model.geom_bodyid == bodies[name])
@@ -444,25 +517,25 @@ def rolling_geoms(model: Any, options: Mapping[str, Any]) -> dict[str, int]:
                 f"`<collision name={name!r}>`, or pass the name of a body with one "
                 "round geom."
             )
-        found[name] = geoms[name] if name in geoms else own[0]
+        geom = geoms[name] if name in geoms else own[0]
+        found[name] = RollingGeom(geom, no_slip, name in radii)
     return found
 
 
 def contacts_of(
     model: Any,
     layout: Layout,
-    options: Mapping[str, Any],
-    geoms: Mapping[str, int],
+    geoms: Mapping[str, RollingGeom],
     ground: Any,
     without_height: Sequence[str] = (),
 ) -> Contacts | None:
     """Build the contacts of the geoms that roll."""
-    if not options:
+    if not geoms:
         return None
     surface = _ground(model, layout, ground)
     contacts: dict[str, AbstractContact] = {}
     for name, geom in geoms.items():
-        frame = _frame_of_geom(model, layout, geom)
+        frame = _frame_of_geom(model, layout, geom.geom)
         if frame.joint < 0:
             raise ValueError(
                 f"from_mujoco: `rolling` has {name!r}, which is fixed to the world and "
@@ -473,7 +546,7 @@ def contacts_of(
             geom,
             frame_pose(layout.joints, layout.space, frame),
             name,
-            no_slip=options[name],
+            no_slip=geom.no_slip,
             ground=surface,
             manifold=layout.space.manifold,
             touches=name not in without_height,
@@ -495,8 +568,7 @@ def _round_kinds() -> tuple[Any, ...]:
 def check_wheels(
     model: Any,
     layout: Layout,
-    options: Mapping[str, Any],
-    geoms: Mapping[str, int],
+    geoms: Mapping[str, RollingGeom],
     contacts: Contacts | None,
 ) -> None:
     """Raise for wheels that lie flat, and warn of geoms that cannot roll."""
@@ -504,7 +576,9 @@ def check_wheels(
         return
     kinds, data = mujoco().mjtGeom, mujoco().MjData(model)
     mujoco().mj_kinematics(model, data)
-    for contact, (name, geom) in zip(contacts.contacts, geoms.items(), strict=True):
+    for contact, (name, (geom, no_slip, _)) in zip(
+        contacts.contacts, geoms.items(), strict=True
+    ):
         frame = _frame_of_geom(model, layout, geom)
         joint = layout.joints[frame.joint]
         kind = kinds(model.geom_type[geom])
@@ -520,7 +594,7 @@ def check_wheels(
                         '`rpy="1.5708 0 0"` into the `<origin>` of its `<collision>`.'
                     )
             # Without slip along its track, the wheel has to turn about its axis.
-            turns = options[name] not in ((), ("across",))
+            turns = no_slip not in ((), ("across",))
             parallel = abs(frame.matrix[:3, 2] @ joint.axis) > 1 - 1e-6
             if turns and joint.kind in ("hinge", "slide") and not parallel:
                 warnings.warn(
@@ -531,7 +605,7 @@ def check_wheels(
                     "whose axis is z.",
                     stacklevel=4,
                 )
-        elif options[name] and len(geoms) > 1 and joint.kind in ("free", "slide"):
+        elif no_slip and len(geoms) > 1 and joint.kind in ("free", "slide"):
             warnings.warn(
                 f"from_mujoco: the geom {name!r} rolls without slipping, but is fixed "
                 f"to the body that {joint.name!r} moves, together with other wheels, "
@@ -542,10 +616,12 @@ def check_wheels(
 
 
 def _contact(
-    model: Any, geom: int, pose: Any, name: str, **options: Any
+    model: Any, rolling: RollingGeom, pose: Any, name: str, **options: Any
 ) -> AbstractContact:
+    geom = rolling.geom
     kinds, size = mujoco().mjtGeom, model.geom_size[geom]
-    kind, radius = kinds(model.geom_type[geom]), float(size[0])
+    kind = kinds(model.geom_type[geom])
+    radius: Any = float(size[0])
     if kind not in _round_kinds():
         word = kind.name[7:].lower()
         raise ValueError(
@@ -555,6 +631,8 @@ def _contact(
         )
     if options["touches"]:
         options["touches"] = _height_varies(model, geom, options["ground"], name)
+    if rolling.is_parameter:
+        radius = _radius_in_args(name, radius)
     axle = (0.0, 0.0, 1.0)
     if kind == kinds.mjGEOM_CYLINDER:
         return Wheel(pose, radius, axle=axle, **options)
@@ -562,6 +640,14 @@ def _contact(
         return Wheel(pose, 0.0, tube_radius=radius, axle=axle, **options)
     is_sphere = kind == kinds.mjGEOM_SPHERE
     return Ellipsoid(pose, radius if is_sphere else size.copy(), **options)
+
+
+def _radius_in_args(name: str, default: float) -> Callable[[Args], Any]:
+    def radius(args):
+        given = args.get("radius", {}) if isinstance(args, dict) else {}
+        return given.get(name, default)
+
+    return radius
 
 
 def _ground(model: Any, layout: Layout, ground: Any) -> AbstractGround:
@@ -593,6 +679,11 @@ def _ground(model: Any, layout: Layout, ground: Any) -> AbstractGround:
     frame = fixed_to(
         layout, model.geom_bodyid[geom], model.geom_pos[geom], model.geom_quat[geom]
     )
+    if frame.shifts:
+        raise ValueError(
+            f"from_mujoco: the ground {ground!r} belongs to a body whose position is "
+            "a parameter. Only positions of other bodies can be parameters."
+        )
     normal = frame.matrix[:3, 2]
     # An exact direction of an axis keeps zeros out of the program.
     normal = np.where(np.abs(normal) < 1e-15, 0.0, normal)

@@ -13,9 +13,9 @@ from .._custom_types import Args, FloatScalarLike
 from .._errors import ShapeError
 from .._manifold import Exponential, SO3
 from . import _scalars as entries
-from ._joints import Joint
-from ._rotors import merge_rotors, spatial_inertia
-from ._tree import Frame, FramePoses, Space, Tree
+from ._joints import Joint, Shift
+from ._rotors import merge_rotors, moved_inertia, spatial_inertia
+from ._tree import displacement, Frame, FramePoses, Space, Tree
 
 
 class Bodies(NamedTuple):
@@ -26,6 +26,7 @@ class Bodies(NamedTuple):
         after that joint.
     - `mass`: in kg.
     - `weight`: the part of the weight that gravity compensation leaves.
+    - `shifts`: the parameters that move each body relative to that frame.
     """
 
     names: tuple[str, ...]
@@ -33,6 +34,7 @@ class Bodies(NamedTuple):
     inertia: Float[np.ndarray, "b 4 4"]
     mass: Float[np.ndarray, " b"]
     weight: Float[np.ndarray, " b"]
+    shifts: tuple[tuple[Shift, ...], ...]
 
 
 class BallSpring(NamedTuple):
@@ -72,13 +74,22 @@ class Mechanics(NamedTuple):
 
 # --- Parameters -----------------------------------------------------------------------
 
-KINDS = ("mass", "damping", "stiffness", "armature", "friction")
+KINDS = (
+    "mass",
+    "damping",
+    "stiffness",
+    "armature",
+    "friction",
+    "position",
+    "radius",
+)
 
 
 class Parameters(eqx.Module):
     """The numbers of a robot that `args` may replace.
 
-    - `names`: for each kind, the bodies or joints, with their places in the arrays.
+    - `names`: for each kind, the bodies, joints or geoms, with their places in the
+        arrays. Positions and radii have no places.
     - `controls`: the names of the actuators, or None if a function of the user computes
         the controls: `args["controls"]` may then have any structure.
     """
@@ -137,9 +148,11 @@ class Parameters(eqx.Module):
                         f"`args[{key!r}]` has the unknown name {name!r}; the names are "
                         f"{', '.join(self.names[key])}."
                     )
-                if jnp.shape(value) != ():
+                shape = (3,) if key == "position" else ()
+                if jnp.shape(value) != shape:
+                    expected = f"have shape {shape}" if shape else "be one number"
                     raise ShapeError(
-                        f"`args[{key!r}][{name!r}]` must be one number, got shape "
+                        f"`args[{key!r}][{name!r}]` must {expected}, got shape "
                         f"{jnp.shape(value)}. For many runs use `jax.vmap`."
                     )
 
@@ -151,11 +164,14 @@ def lagrangian_of(mechanics: Mechanics, parameters: Parameters) -> Any:
     """Return the Lagrangian L(t, q, v, args) of a robot.
 
     The kinetic energy of all bodies between two joints is ½ ξ·M ξ with the body twist
-    ξ = (v, ω) of their frame and their constant spatial inertia M.
+    ξ = (v, ω) of their frame and their spatial inertia M, which depends on nothing but
+    parameters.
     """
     space, bodies = mechanics.space, mechanics.bodies
     changing = parameters.names.get("mass", {})
-    variable = {place for places in changing.values() for place in places}
+    changing_mass = {places[0]: name for name, places in changing.items()}
+    variable = {i for i, shifts in enumerate(bodies.shifts) if shifts}
+    variable.update(changing_mass)
     merged = merge_rotors(
         mechanics.joints,
         bodies.joints,
@@ -168,27 +184,39 @@ def lagrangian_of(mechanics: Mechanics, parameters: Parameters) -> Any:
     tree = Tree(mechanics.joints, space, kept_joints)
     # Bodies that are fixed to the world do not matter.
     moving = [i for i, joint in enumerate(merged.joints) if joint >= 0]
-    nodes = np.asarray([tree.node[merged.joints[i]] for i in moving], int)
-    spatial = np.asarray([spatial_inertia(merged.inertia[i]) for i in moving])
-    moments = merged.moment[moving]
+    changed = sorted(variable.intersection(moving))
     total, total_moment = (
         np.zeros((len(tree.node), 6, 6)),
         np.zeros((len(tree.node), 4)),
     )
-    np.add.at(total, nodes, spatial.reshape(-1, 6, 6))
-    np.add.at(total_moment, nodes, moments)
-    has_masses = bool(variable)
+    for i in moving:
+        if i not in variable:
+            node = tree.node[merged.joints[i]]
+            total[node] += np.asarray(spatial_inertia(merged.inertia[i].tolist()))
+            total_moment[node] += merged.moment[i]
     velocity_of = space.velocity_of
     has_tendons = np.any(mechanics.tendon_armature) or np.any(
         mechanics.tendon_stiffness
     )
     gravity = mechanics.gravity if np.any(mechanics.gravity) else None
 
-    def changes(args, dtype):
-        """Compute by which part of its inertia each moving body changes."""
-        # A body with another mass has the same shape and centre of mass.
-        masses = parameters.replaced("mass", bodies.mass, args, dtype)
-        return (masses / jnp.asarray(bodies.mass, dtype) - 1)[np.asarray(moving, int)]
+    def inertias(args, dtype):
+        """Compute the inertia of each node, and its moment for weight, as entries."""
+        inertia, moment = total.tolist(), total_moment.tolist()
+        masses = args.get("mass", {})
+        for i in changed:
+            # A body with another mass has the same shape and centre of mass.
+            factor, name = 1.0, changing_mass.get(i)
+            if name in masses:
+                factor = entries.times(masses[name], float(1 / bodies.mass[i]))
+            shift = displacement(bodies.shifts[i], args, dtype)
+            own = moved_inertia(merged.inertia[i].tolist(), shift, factor)
+            weight, node = float(bodies.weight[i]), tree.node[merged.joints[i]]
+            for row, added in zip(inertia[node], spatial_inertia(own), strict=True):
+                row[:] = entries.sums(row, added)
+            lifted = [entries.times(weight, row[3]) for row in own]
+            moment[node] = entries.sums(moment[node], lifted)
+        return inertia, moment
 
     def lagrangian(t, q, v, args):
         parameters.check(args)
@@ -197,13 +225,12 @@ def lagrangian_of(mechanics: Mechanics, parameters: Parameters) -> Any:
         return value(q, v, numbers)
 
     def value(q, v, args):
-        change = changes(args, v.dtype) if has_masses and args.get("mass") else None
         if not tree.node:
             energy, twists = jnp.zeros((), v.dtype), []
         elif tree.is_small:
-            energy, twists = energy_of_scalars(q, v, change)
+            energy, twists = energy_of_scalars(q, v, args)
         else:
-            energy, twists = energy_of_arrays(q, v, change)
+            energy, twists = energy_of_arrays(q, v, args)
         for joint, parent, momentum, inertia in merged.rotors:
             rate = v[velocity_of[joint]]
             energy = energy + 0.5 * inertia * rate * rate
@@ -213,33 +240,24 @@ def lagrangian_of(mechanics: Mechanics, parameters: Parameters) -> Any:
                 energy = entries.add(energy, entries.times(with_parent, rate))
         return rest_of(q, v, args, jnp.asarray(energy, v.dtype))
 
-    def energy_of_arrays(q, v, change):
+    def energy_of_arrays(q, v, args):
         dtype = v.dtype
+        own, own_moment = inertias(args, dtype)
         inertia, moment = jnp.asarray(total, dtype), jnp.asarray(total_moment, dtype)
-        if change is not None:
-            added = change[:, None, None] * jnp.asarray(spatial, dtype)
-            inertia = inertia.at[nodes].add(added)
-            moment = moment.at[nodes].add(change[:, None] * jnp.asarray(moments, dtype))
-        twist, fall, depth = tree.motion(q, v, gravity)
+        for node in sorted({tree.node[merged.joints[i]] for i in changed}):
+            inertia = inertia.at[node].set(entries.stacked(own[node], dtype))
+            moment = moment.at[node].set(entries.stacked(own_moment[node], dtype))
+        twist, fall, depth = tree.motion(q, v, gravity, args)
         energy = 0.5 * jnp.sum(jnp.einsum("nij,nj->ni", inertia, twist) * twist)
         if fall is not None and depth is not None:
             energy = energy + jnp.sum(moment[:, :3] * fall)
             energy = energy + jnp.sum(moment[:, 3] * depth)
         return energy, twist
 
-    def energy_of_scalars(q, v, change):
+    def energy_of_scalars(q, v, args):
         energy: Any = 0.0
-        motion = tree.motion_of_scalars(q, v, gravity)
-        inertia, moment = total.tolist(), total_moment.tolist()
-        for row, (number, node) in enumerate(zip(moving, nodes.tolist(), strict=True)):
-            if change is not None and number in variable:
-                for whole, part in (
-                    *zip(inertia[node], spatial[row].tolist(), strict=True),
-                    (moment[node], moments[row].tolist()),
-                ):
-                    whole[:] = entries.sums(
-                        whole, [entries.times(x, change[row]) for x in part]
-                    )
+        motion = tree.motion_of_scalars(q, v, gravity, args)
+        inertia, moment = inertias(args, v.dtype)
         for (twist, fall, depth), own, rest in zip(
             motion, inertia, moment, strict=True
         ):
@@ -470,7 +488,7 @@ def loops_of(
     def constraint(t, q, args):
         rows = []
         if poses is not None:
-            position, rotation = poses(q)
+            position, rotation = poses(q, args)
             a, b = jnp.split(position, 2)
             rows.append((a - b).ravel())
             if loops.welds:
@@ -499,7 +517,7 @@ def frame_pose(joints: Sequence[Joint], space: Space, frame: Frame) -> Any:
     poses = FramePoses(joints, space, [frame])
 
     def pose(t: FloatScalarLike, q: PyTree[Array], args: Args) -> tuple[Array, Array]:
-        position, rotation = poses(q)
+        position, rotation = poses(q, args)
         return position[0], rotation[0]
 
     return pose

@@ -7,6 +7,18 @@ import numpy as np
 from jaxtyping import Float
 
 
+class Shift(NamedTuple):
+    """How a frame depends on the position of a body that is a parameter.
+
+    `args["position"][body]` moves the origin of the frame by `rotation` times the
+    difference of this position from `reference`, the position in the file.
+    """
+
+    body: str
+    rotation: Float[np.ndarray, "3 3"]
+    reference: Float[np.ndarray, "3"]
+
+
 class Joint(NamedTuple):
     """A joint of the tree.
 
@@ -15,6 +27,7 @@ class Joint(NamedTuple):
     - `offset`: the frame of its body at rest, relative to the frame after `parent`.
     - `anchor`, `axis`: the point and the direction of the joint in its own frame.
     - `reference`: the coordinate of a slide or a hinge at rest.
+    - `shifts`: the parameters that move the origin of `offset`.
     """
 
     name: str
@@ -24,6 +37,7 @@ class Joint(NamedTuple):
     anchor: Float[np.ndarray, "3"]
     axis: Float[np.ndarray, "3"]
     reference: float
+    shifts: tuple[Shift, ...] = ()
 
 
 def twists(joints: Sequence[Joint]) -> Float[np.ndarray, "n 6"]:

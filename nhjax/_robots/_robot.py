@@ -19,6 +19,7 @@ from .._system import LagrangianSystem, State
 from ..rolling import AbstractGround, Contacts, Plane
 from ._build import (
     actuators_of,
+    check_kinds,
     check_wheels,
     contacts_of,
     independent_rows,
@@ -30,6 +31,7 @@ from ._build import (
     parameters_of,
     rolling_geoms,
     rolling_options,
+    RollingGeom,
 )
 from ._dynamics import force_of, frame_pose, lagrangian_of, loops_of
 from ._read import check_supported, compile_model, is_fixed_urdf, name_of
@@ -161,7 +163,7 @@ class Robot(eqx.Module):
         return convert(y.q, y.v)
 
     def pose(
-        self, body: str, q: PyTree[Array]
+        self, body: str, q: PyTree[Array], args: Args = None
     ) -> tuple[Float[Array, "3"], Float[Array, "3 3"]]:
         """Compute the position of a body [m] and its rotation to space.
 
@@ -169,6 +171,7 @@ class Robot(eqx.Module):
 
         - `body`: the name of the body.
         - `q`: the configuration of one state.
+        - `args`: the parameters; those that are missing have the values of the file.
 
         **Raises:** `ValueError` if there is no such body.
         """
@@ -177,7 +180,7 @@ class Robot(eqx.Module):
                 f"`body` must be one of {', '.join(self.bodies)}, got {body!r}."
             )
         frame = self._layout.bodies[self.bodies.index(body)]
-        return frame_pose(self._layout.joints, self._space, frame)(0.0, q, None)
+        return frame_pose(self._layout.joints, self._space, frame)(0.0, q, args)
 
     @property
     def mujoco_model(self) -> Any:
@@ -279,9 +282,13 @@ def from_mujoco(
         actuators, for feedback. It can read gains from `args["controls"]`, which may
         then have any structure, such as a dictionary. Without a function,
         `args["controls"]` are the controls themselves.
-    - `parameters`: names of bodies for `"mass"`, and of joints for `"damping"`,
-        `"stiffness"`, `"armature"` and `"friction"`: their values are then in
-        `args`. A body with another mass keeps its shape and its centre of mass.
+    - `parameters`: names of bodies for `"mass"` and `"position"`, of joints for
+        `"damping"`, `"stiffness"`, `"armature"` and `"friction"`, and of `rolling` for
+        `"radius"`: their values are then in `args`. A body with another mass keeps its
+        shape and its centre of mass. The position of a body is the vector [m] from the
+        frame of its parent to its own, of shape (3,), such as the length of a link; the
+        body and all that is attached to it move along. A wheel with another radius
+        keeps its mass and its inertia. Films show the lengths of the file.
     - `ignore`: unsupported parts to leave out: `"actuators"`, `"contacts"`,
         `"equalities"`, `"fluid"`, `"friction loss"`, `"limits"`, `"plugins"`,
         `"springs"`, `"tendons"`.
@@ -314,7 +321,7 @@ def from_mujoco(
         >>> robot.qpos(sol)[-1, :3].round(4)
         Array([0.2, 0. , 0.1], dtype=float64)
     """
-    options = rolling_options(rolling)
+    options, chosen = rolling_options(rolling), check_kinds(parameters)
     source, compiled = compile_model(model, root, motors)
     if options and root is None and is_fixed_urdf(model):
         raise ValueError(
@@ -322,17 +329,17 @@ def from_mujoco(
             'Pass `root="free"` or `root="planar"` for a robot on wheels, or '
             '`root="fixed"`.'
         )
-    geoms = rolling_geoms(compiled, options)
-    left_out = check_supported(compiled, ignore, geoms.values())
-    layout = layout_of(compiled, source)
+    geoms = rolling_geoms(compiled, options, chosen.get("radius", ()))
+    left_out = check_supported(compiled, ignore, [x.geom for x in geoms.values()])
+    layout = layout_of(compiled, source, chosen.get("position", ()))
     mechanics = mechanics_of(compiled, layout, ignore, friction_smoothing)
     actuators = actuators_of(
         compiled, layout.space, left_out["actuators"], limit_smoothing
     )
     own = actuators.names if controls is None else None
-    known, values = parameters_of(compiled, mechanics, own, parameters)
-    contacts = contacts_of(compiled, layout, options, geoms, ground)
-    check_wheels(compiled, layout, options, geoms, contacts)
+    known, values = parameters_of(compiled, mechanics, own, geoms, chosen)
+    contacts = contacts_of(compiled, layout, geoms, ground)
+    check_wheels(compiled, layout, geoms, contacts)
     loops = loops_in(compiled, layout, left_out["equalities"])
     loop = loops_of(layout.joints, layout.space, loops)
     names = loops.names
@@ -375,18 +382,19 @@ def _reduced(
     layout: Layout,
     contacts: Contacts,
     kept: Kept,
-    geoms: Mapping[str, int],
+    geoms: Mapping[str, RollingGeom],
     ground: Any,
 ) -> Contacts | None:
     """Return the contacts without the constraints that follow from others."""
     pairs = list(zip(contacts.names, contacts.contacts, strict=True))
-    options = {
-        name: tuple(x for x, keep in zip(contact.no_slip, own, strict=True) if keep)
-        for (name, contact), own in zip(pairs, kept.slips, strict=True)
-    }
+    reduced = {}
+    for (name, contact), own in zip(pairs, kept.slips, strict=True):
+        rows = zip(contact.no_slip, own, strict=True)
+        no_slip = tuple(x for x, keep in rows if keep)
+        reduced[name] = geoms[name]._replace(no_slip=no_slip)
     touching = [name for name, contact in pairs if contact.touches]
     dropped = [x for x, keep in zip(touching, kept.heights, strict=True) if not keep]
-    return contacts_of(model, layout, options, geoms, ground, dropped)
+    return contacts_of(model, layout, reduced, ground, dropped)
 
 
 def _coordinates(layout: Layout) -> tuple[str, ...]:

@@ -12,6 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
+from . import _scalars as entries
 from ._joints import Joint, pose_of_joint
 
 
@@ -58,7 +59,7 @@ def merge_rotors(
     - `joints`: all joints.
     - `bodies`, `inertia`, `moment`: the joint of each body, its pseudo-inertia, and the
         part of it that has weight.
-    - `variable`: bodies whose mass can change, which stay as they are.
+    - `variable`: bodies whose inertia can change, which stay as they are.
     """
     own, inertia, moment = list(bodies), inertia.copy(), moment.copy()
     rotors: list[Rotor] = []
@@ -66,7 +67,8 @@ def merge_rotors(
         joint = joints[number]
         on_it = [i for i, x in enumerate(own) if x == number]
         is_end = all(x.parent != number for x in joints)
-        if joint.kind != "hinge" or not is_end or variable.intersection(on_it):
+        can_move = joint.shifts or variable.intersection(on_it)
+        if joint.kind != "hinge" or not is_end or can_move:
             continue
         total = inertia[on_it].sum(axis=0)
         weight = moment[on_it].sum(axis=0)
@@ -82,7 +84,7 @@ def merge_rotors(
         axis = pose[:3, :3] @ joint.axis
         anchor = pose[:3, :3] @ joint.anchor + pose[:3, 3]
         twist = np.concatenate([np.cross(anchor, axis), axis])
-        momentum = spatial_inertia(carried[0]) @ twist
+        momentum = np.asarray(spatial_inertia(carried[0].tolist())) @ twist
         rotors.append(Rotor(number, joint.parent, momentum, float(twist @ momentum)))
         for i in on_it:
             own[i] = joint.parent
@@ -91,16 +93,42 @@ def merge_rotors(
     return Merged(own, inertia, moment, rotors)
 
 
-def spatial_inertia(
-    inertia: Float[np.ndarray, "4 4"],
-) -> Float[np.ndarray, "6 6"]:
+def spatial_inertia(inertia: entries.Matrix) -> entries.Matrix:
     """Return the matrix M of ½ ξ·M ξ = ½ m v² + v·(ω × m c) + ½ ω·I ω.
 
     The pseudo-inertia gives the mass m, the moment m c and the inertia I about the
     origin.
     """
-    second, moment, mass = inertia[:3, :3], inertia[:3, 3], inertia[3, 3]
+    mass, (x, y, z) = inertia[3][3], [row[3] for row in inertia[:3]]
+    trace = entries.total(inertia[i][i] for i in range(3))
+
+    def minus(entry):
+        return entries.times(-1.0, entry)
+
     # This matrix maps ω to ω × m c.
-    across = -np.cross(moment, np.eye(3)).T
-    about = np.trace(second) * np.eye(3) - second
-    return np.block([[mass * np.eye(3), across], [across.T, about]])
+    across = [[0.0, z, minus(y)], [minus(z), 0.0, x], [y, minus(x), 0.0]]
+    rows = []
+    for i, row in enumerate(across):
+        rows.append([mass if i == j else 0.0 for j in range(3)] + row)
+    for i, column in enumerate(entries.transposed(across)):
+        about = [minus(inertia[i][j]) for j in range(3)]
+        about[i] = entries.add(trace, about[i])
+        rows.append(column + about)
+    return rows
+
+
+def moved_inertia(
+    inertia: entries.Matrix, shift: entries.Vector, factor: entries.Entry
+) -> entries.Matrix:
+    """Return the pseudo-inertia of a body that is moved and has another mass.
+
+    **Arguments:**
+
+    - `inertia`: the pseudo-inertia.
+    - `shift`: the vector by which all points of the body move.
+    - `factor`: by which its mass and its moments of inertia grow.
+    """
+    to = [[float(i == j) for j in range(3)] + [shift[i]] for i in range(3)]
+    to.append([0.0, 0.0, 0.0, 1.0])
+    moved = entries.product(entries.product(to, inertia), entries.transposed(to))
+    return [[entries.times(factor, x) for x in row] for row in moved]

@@ -15,9 +15,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PyTree
 
+from .._custom_types import Args
 from .._manifold import AbstractLieGroup, Euclidean, ProductGroup, SE3, SO3
 from . import _scalars as entries
-from ._joints import Joint, motions, twists
+from ._joints import Joint, motions, Shift, twists
 
 
 # Larger trees are computed as arrays, which have shorter programs. The code of
@@ -153,6 +154,21 @@ class Space:
         return jnp.concatenate([*pieces, v[place:]]) if pieces else v
 
 
+def displacement(shifts: Sequence[Shift], args: Args, dtype: Any) -> entries.Vector:
+    """Compute by how much the parameters in `args` move the origin of a frame."""
+    given = args.get("position", {}) if isinstance(args, dict) else {}
+    found: entries.Vector = 3 * [0.0]
+    for body, rotation, reference in shifts:
+        if body in given:
+            position = jnp.asarray(given[body], dtype)
+            moved = [
+                entries.add(jax.lax.index_in_dim(position, i, keepdims=False), -x)
+                for i, x in enumerate(reference.tolist())
+            ]
+            found = entries.sums(found, entries.apply(entries.known(rotation), moved))
+    return found
+
+
 class Level(NamedTuple):
     """The nodes at one depth.
 
@@ -188,6 +204,7 @@ class Tree:
         ]
         chosen = [(i, joints[j]) for i, j in enumerate(scalar) if j in on_paths]
         self.scalar = np.asarray([i for i, _ in chosen], int)
+        self.shifts = [x.shifts for _, x in chosen]
         self.num_scalars = len(scalar)
         self.reference = np.asarray([x.reference for _, x in chosen], float)
         self.constants = motions([joint for _, joint in chosen])
@@ -213,10 +230,10 @@ class Tree:
         return len(self.node) <= LARGEST_OF_SCALARS
 
     def poses_of_scalars(
-        self, q: PyTree[Array]
+        self, q: PyTree[Array], args: Args
     ) -> list[tuple[entries.Matrix, entries.Vector]]:
         """Compute the rotation and the position of each node, entry by entry."""
-        own, poses, before = self._relative_scalars(q), [], []
+        own, poses, before = self._relative_scalars(q, args), [], []
         for level in self.levels:
             here = []
             for node, parent in zip(level.nodes, level.parents, strict=True):
@@ -230,10 +247,14 @@ class Tree:
         return poses
 
     def motion_of_scalars(
-        self, q: PyTree[Array], v: Array, gravity: Float[np.ndarray, "3"] | None
+        self,
+        q: PyTree[Array],
+        v: Array,
+        gravity: Float[np.ndarray, "3"] | None,
+        args: Args,
     ) -> list[tuple[entries.Vector, entries.Vector, entries.Entry]]:
         """Compute what `motion` does for each node, entry by entry."""
-        own, twists = self._relative_scalars(q), self._own_twists_of_scalars(v)
+        own, twists = self._relative_scalars(q, args), self._own_twists_of_scalars(v)
         weight = entries.known(np.zeros(3) if gravity is None else gravity)
         found, before = [], []
         for level in self.levels:
@@ -252,7 +273,7 @@ class Tree:
         return found
 
     def _relative_scalars(
-        self, q: PyTree[Array]
+        self, q: PyTree[Array], args: Args
     ) -> list[tuple[entries.Matrix, entries.Vector]]:
         special, scalars = self.space.split(q)
         found = []
@@ -268,6 +289,8 @@ class Tree:
                 start = joint.offset[:3, 3] + joint.offset[:3, :3] @ joint.anchor
                 moved = entries.apply(rotation, [-x for x in anchor])
                 position = entries.sums(start.tolist(), moved)
+                shift = displacement(joint.shifts, args, matrix.dtype)
+                position = entries.sums(position, shift)
             found.append((rotation, position))
         for number, i in enumerate(self.scalar.tolist()):
             s = jax.lax.index_in_dim(scalars, i, keepdims=False)
@@ -283,7 +306,8 @@ class Tree:
             rows = entries.known(np.stack([first + versine, sine, -versine, linear]))
             values = [entries.dot(column, parts) for column in zip(*rows, strict=True)]
             rotation = [values[:3], values[3:6], values[6:9]]
-            found.append((rotation, values[9:]))
+            shift = displacement(self.shifts[number], args, scalars.dtype)
+            found.append((rotation, entries.sums(values[9:], shift)))
         return found
 
     def _own_twists_of_scalars(self, v: Array) -> list[entries.Vector]:
@@ -305,9 +329,9 @@ class Tree:
             found.append([entries.times(x, rate) for x in entries.known(twist)])
         return found
 
-    def poses(self, q: PyTree[Array]) -> tuple[Array, Array]:
+    def poses(self, q: PyTree[Array], args: Args) -> tuple[Array, Array]:
         """Compute the rotations and the positions of all nodes in space."""
-        all_rotations, all_positions = self._relative(q)
+        all_rotations, all_positions = self._relative(q, args)
         rotations, positions = [], []
         for level in self.levels:
             rotation = take(all_rotations, level.nodes)
@@ -322,13 +346,17 @@ class Tree:
         return jnp.concatenate(rotations), jnp.concatenate(positions)
 
     def motion(
-        self, q: PyTree[Array], v: Array, gravity: Float[np.ndarray, "3"] | None
+        self,
+        q: PyTree[Array],
+        v: Array,
+        gravity: Float[np.ndarray, "3"] | None,
+        args: Args,
     ) -> tuple[Array, Array | None, Array | None]:
         """Compute the body twist (v, ω) of each node, and gravity in its frame.
 
         The third result is the product of the position with gravity.
         """
-        all_rotations, all_positions = self._relative(q)
+        all_rotations, all_positions = self._relative(q, args)
         all_twists = self._own_twists(v)
         twists: list[Array] = []
         falls: list[Array] = []
@@ -383,7 +411,7 @@ class Tree:
             twists.append(jnp.asarray(self.twists, v.dtype) * rates[:, None])
         return jnp.concatenate(twists)
 
-    def _relative(self, q: PyTree[Array]) -> tuple[Array, Array]:
+    def _relative(self, q: PyTree[Array], args: Args) -> tuple[Array, Array]:
         """Compute the pose of each node relative to the node before it."""
         elements, scalars = self.space.split(q)
         dtype = scalars.dtype
@@ -398,6 +426,8 @@ class Tree:
                 anchor = jnp.asarray(joint.anchor, dtype)
                 turn = offset[:3, :3] @ rotation
                 position = offset[:3, 3] + offset[:3, :3] @ anchor - turn @ anchor
+                shift = displacement(joint.shifts, args, dtype)
+                position = position + entries.stacked(shift, dtype)
                 rotation = turn
             rotations.append(rotation[None])
             positions.append(position[None])
@@ -407,8 +437,18 @@ class Tree:
             motion = jnp.stack([jnp.ones_like(s), jnp.sin(s), 1 - jnp.cos(s), s])
             both = jnp.einsum("knm,kn->nm", jnp.asarray(self.constants, dtype), motion)
             rotations.append(both[:, :9].reshape(-1, 3, 3))
-            positions.append(both[:, 9:])
+            shifts = [displacement(x, args, dtype) for x in self.shifts]
+            positions.append(both[:, 9:] + _rows_of(shifts, dtype))
         return jnp.concatenate(rotations), jnp.concatenate(positions)
+
+
+def _rows_of(vectors: list[entries.Vector], dtype: Any) -> Array:
+    """Convert vectors to the rows of an array. Those of floats are zero."""
+    rows = jnp.zeros((len(vectors), 3), dtype)
+    for number, vector in enumerate(vectors):
+        if not all(isinstance(x, float) for x in vector):
+            rows = rows.at[number].set(entries.stacked(vector, dtype))
+    return rows
 
 
 def _joints_of(space: Space, kinds: tuple[str, ...]) -> list[int]:
@@ -424,10 +464,14 @@ def take(x: Array, places: np.ndarray) -> Array:
 
 
 class Frame(NamedTuple):
-    """A frame that is fixed to a node: that of a body, a geom or a site."""
+    """A frame that is fixed to a node: that of a body, a geom or a site.
+
+    `shifts` are the parameters that move its origin relative to the node.
+    """
 
     joint: int
     matrix: Float[np.ndarray, "4 4"]
+    shifts: tuple[Shift, ...] = ()
 
 
 class FramePoses:
@@ -441,33 +485,41 @@ class FramePoses:
         self.nodes = np.asarray([node[frame.joint] for frame in frames], int)
         self.turns = np.stack([frame.matrix[:3, :3] for frame in frames])
         self.places = np.stack([frame.matrix[:3, 3] for frame in frames])
+        self.shifts = [frame.shifts for frame in frames]
 
-    def __call__(self, q: PyTree[Any]) -> tuple[Array, Array]:
+    def __call__(self, q: PyTree[Any], args: Args) -> tuple[Array, Array]:
         """Compute positions and rotations of all frames in space."""
         dtype = self.tree.space.split(q)[1].dtype
         if self.tree.is_small:
-            return self._of_scalars(q, dtype)
+            return self._of_scalars(q, args, dtype)
         rotations, positions = [], []
         if self.tree.levels:
-            rotation, position = self.tree.poses(q)
+            rotation, position = self.tree.poses(q, args)
             rotations, positions = [rotation], [position]
         if self.has_world:
             rotations.append(jnp.eye(3, dtype=dtype)[None])
             positions.append(jnp.zeros((1, 3), dtype))
         rotation = take(jnp.concatenate(rotations), self.nodes)
         position = take(jnp.concatenate(positions), self.nodes)
-        places = jnp.asarray(self.places, dtype)
+        shifts = [displacement(x, args, dtype) for x in self.shifts]
+        places = jnp.asarray(self.places, dtype) + _rows_of(shifts, dtype)
         turns = jnp.asarray(self.turns, dtype)
         position = position + jnp.einsum("nij,nj->ni", rotation, places)
         return position, jnp.einsum("nij,njk->nik", rotation, turns)
 
-    def _of_scalars(self, q: PyTree[Any], dtype: Any) -> tuple[Array, Array]:
+    def _of_scalars(
+        self, q: PyTree[Any], args: Args, dtype: Any
+    ) -> tuple[Array, Array]:
         world = entries.known(np.eye(3)), 3 * [0.0]
-        poses = [*self.tree.poses_of_scalars(q), world]
+        poses = [*self.tree.poses_of_scalars(q, args), world]
         positions, rotations = [], []
-        for node, turn, place in zip(self.nodes, self.turns, self.places, strict=True):
+        for node, turn, place, shifts in zip(
+            self.nodes, self.turns, self.places, self.shifts, strict=True
+        ):
             rotation, position = poses[node]
-            moved = entries.apply(rotation, entries.known(place))
+            shift = displacement(shifts, args, dtype)
+            place = entries.sums(entries.known(place), shift)
+            moved = entries.apply(rotation, place)
             positions.append(entries.sums(position, moved))
             rotations.append(entries.product(rotation, entries.known(turn)))
         return entries.stacked(positions, dtype), entries.stacked(rotations, dtype)
