@@ -12,8 +12,8 @@ Newton's method.
 
 Doubtful steps are judged once more: accepted steps with a residual above 1e-13, or with
 an end that differs by more than 1e-11. Newton's method takes them again from states
-that are moved by one unit in the last place. The distance by which this moves the end
-is the floor, at least the unit round-off: float64 does not know a start better. A step
+of which one number is moved by one unit in the last place. The largest distance by
+which this moves the end is the floor, at least the unit round-off: float64 does not know a start better. A step
 is solved if its end is within 400 floors, because the solvers treat 400 units of
 round-off as noise. The other steps are solved too if their residual is at most 1e-13.
 If their ends differ by more than 1e-3, the equations have two solutions. Otherwise
@@ -434,11 +434,12 @@ def moved_by_last_digit(
 ) -> Float[Array, ""]:
     """How far a step ends from another that starts one unit in the last place away.
 
-    It is the largest of four such distances, each relative to the size of the end.
+    It is the largest of such distances, each relative to the size of the end. Each
+    number of the start is moved alone: moved together, the two ends of a rod can keep
+    its direction.
     """
     z, unravel = ravel_pytree(start)
-    signs = np.random.default_rng(0).choice([-1.0, 1.0], (4, len(z)))
-    moves = jnp.asarray(np.concatenate([np.zeros((1, len(z))), signs]))
+    moves = jnp.asarray(np.eye(len(z) + 1, len(z), -1))
     eps = float(jnp.finfo(z.dtype).eps)
 
     def end(move):
@@ -448,7 +449,9 @@ def moved_by_last_digit(
         return step(arguments, method, nhjax.Newton(), jnp.asarray(False))
 
     ends = jax.lax.map(end, moves)
-    first, *others = (jax.tree.map(lambda x, k=k: x[k], ends) for k in range(5))
+    first, *others = (
+        jax.tree.map(lambda x, k=k: x[k], ends) for k in range(len(moves))
+    )
     return jnp.max(jnp.stack([apart(other, first) for other in others]))
 
 
