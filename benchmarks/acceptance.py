@@ -13,12 +13,13 @@ Newton's method.
 Doubtful steps are judged once more: accepted steps with a residual above 1e-13, or with
 an end that differs by more than 1e-11. Newton's method takes them again from states
 of which one number is moved by one unit in the last place. The largest distance by
-which this moves the end is the floor, at least the unit round-off: float64 does not know a start better. A step
-is solved if its end is within 400 floors, because the solvers treat 400 units of
-round-off as noise. The other steps are solved too if their residual is at most 1e-13.
-If their ends differ by more than 1e-3, the equations have two solutions. Otherwise
-their Jacobian is nearly singular. Where the coordinates are so large that the distance
-overflows, the residual decides. All other doubtful steps are wrongly accepted.
+which this moves the end is the floor, at least the unit round-off: float64 does not
+know a start better. A step is solved if its end is within 400 floors, because the
+solvers treat 400 units of round-off as noise. The other steps are solved too if their
+residual is at most 1e-13. If their ends differ by more than 1e-3, the equations have
+two solutions. Otherwise their Jacobian is nearly singular. Where the coordinates are so
+large that the distance overflows, the residual decides. All other doubtful steps are
+wrongly accepted.
 
 The terms of an equation r(x; q) = 0 have the size |∂r/∂x| |x| + |∂r/∂q| |q|, where |x|
 is the largest velocity, the largest multiplier and so on. No residual smaller than this
