@@ -288,7 +288,7 @@ class Sliding(_AbstractOnContact):
 
     def __check_init__(self) -> None:
         _check_law(self.law)
-        if len(self.contacts[self.contact].no_slip) > 1:
+        if self.contacts[self.contact].num_directions > 1:
             raise ValueError(
                 f"The contact {self.contact!r} does not slip in any direction: give "
                 "it fewer directions `no_slip`."

@@ -7,7 +7,8 @@ height above the ground is the holonomic constraint, and the components of its v
     u = ẋ + Ṙ Rᵀ (c - x) - w
 
 along the ground are the nonholonomic ones, with the velocity w of the ground. Each
-multiplier is the force in newtons in its direction.
+multiplier is the force in newtons in its direction. A body may also be kept from
+spinning about the normal of the ground; this multiplier is a torque in N m.
 """
 
 import abc
@@ -329,7 +330,7 @@ class ContactState(NamedTuple):
     angular_velocity: Float[Array, "3"]
 
 
-NoSlip: TypeAlias = tuple[Literal["along", "across"] | float, ...]
+NoSlip: TypeAlias = tuple[Literal["along", "across", "spin"] | float, ...]
 
 
 class AbstractContact(eqx.Module):
@@ -351,17 +352,17 @@ class AbstractContact(eqx.Module):
 
     def __check_init__(self) -> None:
         check_type("ground", self.ground, AbstractGround)
-        names = ("along", "across")
+        names = ("along", "across", "spin")
         if not isinstance(self.no_slip, tuple) or any(
             x not in names if isinstance(x, str) else not isinstance(x, int | float)
             for x in self.no_slip
         ):
             raise ValueError(
-                '`no_slip` must be a tuple of "along", "across" and angles in radians, '
-                f"got {self.no_slip!r}."
+                '`no_slip` must be a tuple of "along", "across", "spin" and angles in '
+                f"radians, got {self.no_slip!r}."
             )
         weights = [_direction(x) for x in self.no_slip]
-        if len(weights) > 2 or np.linalg.matrix_rank(np.array(weights)) < len(weights):
+        if np.linalg.matrix_rank(np.array(weights)) < len(weights):
             raise ValueError(
                 "`no_slip` must name at most two directions that are not parallel, got "
                 f"{self.no_slip!r}. Leave out those that follow from the others."
@@ -457,28 +458,48 @@ class AbstractContact(eqx.Module):
         v: Float[Array, " n"],
         args: Args = None,
     ) -> Float[Array, " k"]:
-        """Compute the velocity at the contact in the directions without slip."""
+        """Compute what must vanish: the velocity in the directions without slip.
+
+        For `"spin"` it is the angular velocity about the normal, relative to the
+        ground.
+        """
         at = self.state(t, q, v, args)
-        return self.directions(at.rotation, at.normal) @ at.velocity
+        rates = self.directions(at.rotation, at.normal) @ at.velocity
+        if "spin" not in self.no_slip:
+            return rates
+        spin = at.angular_velocity @ at.normal
+        velocity = self.ground.velocity
+        if velocity is not None:
+            slopes = jax.jacfwd(lambda x: velocity(t, x, args))(at.point)
+            turning = slopes - slopes.T
+            curl = jnp.stack([turning[2, 1], turning[0, 2], turning[1, 0]])
+            spin = spin - 0.5 * curl @ at.normal
+        is_spin = jnp.asarray([x == "spin" for x in self.no_slip], rates.dtype)
+        return rates + is_spin * spin
 
     def directions(
         self, rotation: Float[Array, "3 3"], normal: Float[Array, "3"]
     ) -> Float[Array, "k 3"]:
-        """Compute the directions in which the body does not slip."""
+        """Compute the directions in which the body does not slip; zero for "spin"."""
         axes = self.axes(rotation, normal)
         return self.weights(axes.dtype) @ axes
 
     def weights(self, dtype: Any) -> Float[Array, "k 2"]:
         """Return the parts along and across of the directions without slip."""
-        weights = [_direction(x) for x in self.no_slip]
+        weights = [_direction(x)[:2] for x in self.no_slip]
         return jnp.asarray(weights, dtype).reshape(-1, 2)
 
+    @property
+    def num_directions(self) -> int:
+        """The number of directions along the ground in which it does not slip."""
+        return sum(x != "spin" for x in self.no_slip)
 
-def _direction(name: str | float) -> tuple[float, float]:
-    """Return the parts along and across of a direction without slip."""
+
+def _direction(name: str | float) -> tuple[float, float, float]:
+    """Return the parts of a direction without slip: along, across and spin."""
     if isinstance(name, str):
-        return {"along": (1.0, 0.0), "across": (0.0, 1.0)}[name]
-    return math.cos(name), math.sin(name)
+        return float(name == "along"), float(name == "across"), float(name == "spin")
+    return math.cos(name), math.sin(name), 0.0
 
 
 class Wheel(AbstractContact):
@@ -501,7 +522,8 @@ class Wheel(AbstractContact):
     - `tube_radius`: the radius of the tube of a torus [m], in the same way.
     - `axle`: the direction of the axle in the frame of the wheel.
     - `no_slip`: the directions in which the wheel does not slip: `"along"`, `"across"`,
-        or an angle [rad] from `along` towards `across`. An omni wheel has
+        or an angle [rad] from `along` towards `across`; with `"spin"` it does not turn
+        about the normal of the ground either. An omni wheel has
         `("along",)`, a mecanum wheel the angle of the axle of its rollers, π/4 or -π/4,
         and a wheel that slides `()`. If two wheels share an axle, only one of them
         needs `"across"`.
@@ -574,7 +596,9 @@ class Ellipsoid(AbstractContact):
         ellipsoid [m], of shape (3,), and the rotation to space, of shape (3, 3).
     - `semi_axes`: three lengths [m] along the axes of the body, or the radius of a
         ball; or a function of `args` that returns them.
-    - `no_slip`: the directions in which the body does not slip; `()` if it slides.
+    - `no_slip`: the directions in which the body does not slip; `()` if it slides. With
+        `"spin"` it does not turn about the normal of the ground either, as a ball of
+        rubber.
     - `touches`, `ground`, `manifold`: as for `Wheel`.
 
     **Raises:** when called, `ShapeError` if the pose has other shapes.
@@ -941,7 +965,7 @@ def margin(
         6.0
     """
     touched = checked_contacts(contacts)[contact]
-    if not touched.no_slip:
+    if not touched.num_directions:
         raise ValueError(
             f"The contact {contact!r} has no directions `no_slip`, so that it slips."
         )

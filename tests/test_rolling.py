@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import scipy.integrate
 import scipy.optimize
 
 import nhjax
@@ -258,6 +259,63 @@ def test_height_of_an_ellipsoid_over_a_hill_equals_the_smallest_distance():
         np.testing.assert_allclose(height, np.sqrt(found), rtol=1e-7)
 
 
+def test_ball_of_rubber_moves_as_in_the_reduced_equations():
+    radius, mass, moments = 0.3, 1.3, np.array([0.02, 0.03, 0.045])
+    ball = rolling.Ellipsoid(
+        _free_body, radius, no_slip=("along", "across", "spin"), manifold=SE3
+    )
+    contacts = rolling.Contacts(ball=ball)
+    system = nhjax.LagrangianSystem(
+        lambda t, q, v, args: 0.5 * (mass * v[:3] @ v[:3] + v[3:] @ (moments * v[3:])),
+        nonholonomic=contacts.nonholonomic,
+        holonomic=contacts.holonomic,
+        manifold=SE3,
+    )
+    attitude = jnp.array([0.8, 0.1, -0.5, np.sqrt(0.1)])
+    up = np.asarray(SO3.matrix(attitude))[2]
+    omega = np.cross(up, [1.0, -0.4, 2.0])
+    q0 = jnp.concatenate([attitude, jnp.array([0.0, 0.0, radius])])
+    velocity = radius * np.cross(omega, up)
+    y0 = nhjax.initial_state(system, q0, jnp.concatenate([velocity, omega]))
+    sol = nhjax.integrate(system, nhjax.LobattoIIIAB(5), y0, dt=0.02, num_steps=100)
+
+    # With D = m a², I = J + D and ω·γ = 0 they are I ω' = I ω × ω + μ γ, γ' = γ × ω:
+    # Borisov and Mamaev, The rolling of a rubber ball (2007).
+    inertia = moments + mass * radius**2
+
+    def rates(t, y):
+        omega, up = y[:3], y[3:]
+        torque = np.cross(inertia * omega, omega)
+        mu = -(up @ (torque / inertia)) / (up @ (up / inertia))
+        return np.append((torque + mu * up) / inertia, np.cross(up, omega))
+
+    exact = scipy.integrate.solve_ivp(
+        rates, (0, 2), np.append(omega, up), "DOP853", rtol=1e-13, atol=1e-13
+    )
+    np.testing.assert_allclose(sol.ys.v[-1, 3:], exact.y[:3, -1], atol=1e-10)
+    end = SO3.matrix(sol.ys.q[-1, :4])[2]
+    np.testing.assert_allclose(end, exact.y[3:, -1], atol=1e-10)
+    assert contacts.multiplier_names[2] == "ball spin"
+    # The torque of the ground about the normal.
+    w, n = exact.y[:3, -1], exact.y[3:, -1]
+    torque = np.cross(inertia * w, w)
+    mu = -(n @ (torque / inertia)) / (n @ (n / inertia))
+    np.testing.assert_allclose(sol.ys.multiplier[-1, 2], mu, atol=1e-9)
+
+
+def test_ball_that_does_not_spin_turns_with_its_turntable():
+    rate = 2.5
+    ground = rolling.Plane(
+        velocity=lambda t, x, args: rate * jnp.stack([-x[1], x[0], 0.0 * x[2]])
+    )
+    ball = rolling.Ellipsoid(
+        _free_body, 0.3, no_slip=("spin",), ground=ground, manifold=SE3
+    )
+    q = jnp.array([1.0, 0.0, 0.0, 0.0, 0.7, 0.2, 0.3])
+    v = jnp.array([0.0, 0.0, 0.0, 0.4, 0.1, 3.0])
+    assert float(ball.slip(0.0, q, v)[0]) == pytest.approx(3.0 - rate, abs=1e-15)
+
+
 def test_heightfield_passes_through_its_heights_with_continuous_curvature():
     heights = RNG.normal(size=(7, 5))
     ground = rolling.Heightfield(heights, 0.5, (-1.0, 2.0))
@@ -482,6 +540,11 @@ def test_contacts_keep_the_precision_of_the_state(dtype):
         ),
         (
             lambda: rolling.Wheel(_free_body, 0.3, no_slip=("along", "across", 0.8)),
+            ValueError,
+            "at most two directions",
+        ),
+        (
+            lambda: rolling.Wheel(_free_body, 0.3, no_slip=("spin", "spin")),
             ValueError,
             "at most two directions",
         ),
