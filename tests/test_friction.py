@@ -696,6 +696,27 @@ def _driven_wheel(no_slip, *terms):
 SLIP_TIME = 0.5 * G * (INERTIA + MASS * RADIUS**2) / (4.0 * RADIUS)
 
 
+def test_pivoting_friction_vanishes_on_a_ball_that_turns_with_its_turntable():
+    rate, group = 3.0, nhjax.SE3()
+    table = rolling.Plane(
+        velocity=lambda t, x, args: rate * jnp.stack([-x[1], x[0], 0.0 * x[2]])
+    )
+    contacts = rolling.Contacts(
+        ball=rolling.Ellipsoid(
+            lambda t, q, args: (q[4:], nhjax.SO3().matrix(q[:4])),
+            0.1,
+            ground=table,
+            manifold=group,
+        )
+    )
+    force = friction.PivotingFriction(contacts, "ball", 0.01, smoothing=1e-3, load=10.0)
+    q = group.identity().at[6].set(0.1)
+    for spin, torque in ((rate, 0.0), (0.0, 0.1), (2 * rate, -0.1)):
+        v = jnp.zeros(6).at[5].set(spin)
+        found = force(0.0, q, v, jnp.zeros(3), None)
+        np.testing.assert_allclose(found[5], torque, atol=1e-15)
+
+
 def test_slip_event_ends_the_run_when_the_friction_is_used_up():
     contacts, system = _driven_wheel(("along",))
     y0 = nhjax.initial_state(system, jnp.array([0.0, RADIUS, 0.0]), jnp.zeros(3))

@@ -329,6 +329,16 @@ def test_heightfield_passes_through_its_heights_with_continuous_curvature():
         np.testing.assert_allclose(curvature(x - e), curvature(x + e), atol=1e-5)
 
 
+@pytest.mark.parametrize("shape", [(4, 4), (20, 7)])
+def test_heightfield_of_an_inclined_plane_is_a_plane(shape):
+    i, j = np.indices(shape)
+    field = rolling.Heightfield(0.3 * i + 0.2 * j, 1.0)
+    for x in ((0.5, 0.5), (1.7, 2.9), (0.0, 0.0), (-0.7, 1.2)):
+        height, slope = jax.value_and_grad(field)(jnp.asarray(x))
+        assert float(height) == pytest.approx(0.3 * x[0] + 0.2 * x[1], abs=1e-13)
+        np.testing.assert_allclose(slope, [0.3, 0.2], atol=1e-13)
+
+
 def test_ball_on_a_heightfield_moves_like_on_the_surface_that_it_samples():
     ball, elevation, _ = _gallery_bowl()
     x = np.linspace(-0.64, 0.64, 129)
