@@ -550,6 +550,72 @@ def test_radii_and_track_in_args_equal_a_robot_with_these_lengths():
         np.testing.assert_allclose(found, expected, atol=1e-12)
 
 
+_HEAD_OF_CARTS = """<mujoco><compiler angle="radian"/>
+<default><geom contype="0" conaffinity="0" mass="1"/></default>
+<worldbody>{}</worldbody></mujoco>"""
+PLANAR = """<body name="base" pos="0 0 0.1">
+<joint name="x" type="slide" axis="1 0 0"/><joint name="y" type="slide" axis="0 1 0"/>
+<joint name="heading" axis="0 0 1"/><geom type="box" size="0.2 0.1 0.04"/>{}{}</body>"""
+WHEEL = """<body name="{0}" pos="0 {1} 0"><joint name="{0}" axis="0 1 0"/>
+<geom name="{0}" type="cylinder" size="0.1 0.02" euler="1.5707963267948966 0 0"/></body>
+"""
+
+
+def test_wheel_that_positions_in_args_move_off_the_axle_is_named():
+    wheels = WHEEL.format("right", -0.2), WHEEL.format("left", 0.2)
+    model = _compiled(_HEAD_OF_CARTS.format(PLANAR.format(*wheels)))
+    robot = nhjax.from_mujoco(
+        model, rolling=["right", "left"], parameters={"position": ["right"]}
+    )
+    assert robot.contacts is not None
+    assert "left across" not in robot.contacts.multiplier_names
+    wider = {"position": {"right": jnp.array([0.0, -0.3, 0.0])}}
+    robot.initial_state(args=wider)
+    ahead = {"position": {"right": jnp.array([0.1, -0.2, 0.0])}}
+    with pytest.raises(ValueError, match="'left across' is not a constraint of"):
+        robot.initial_state(args=ahead)
+
+
+def test_height_that_positions_in_args_change_is_named():
+    body = """<body name="base" pos="0 0 0.1">
+    <joint name="x" type="slide" axis="1 0 0"/><joint name="pitch" axis="0 1 0"/>
+    <geom type="box" size="0.2 0.1 0.04"/>{}</body>"""
+    model = _compiled(_HEAD_OF_CARTS.format(body.format(WHEEL.format("w", 0.2))))
+    robot = nhjax.from_mujoco(
+        model, rolling=["w"], parameters={"position": ["w"], "mass": ["w"]}
+    )
+    assert robot.contacts is not None
+    assert robot.contacts.multiplier_names == ("w along",)
+    robot.initial_state()
+    with pytest.raises(ValueError, match="'w' is not a constraint of the system"):
+        robot.initial_state(args={"position": {"w": jnp.array([0.15, 0.2, 0.0])}})
+
+
+@pytest.mark.parametrize("offset", [0.02, -0.02])
+def test_caster_that_cannot_touch_with_the_other_wheels_is_named(offset):
+    body = f"""<body name="base" pos="0 0 0.1"><freejoint name="root"/>
+    <geom type="box" size="0.3 0.1 0.02"/>
+    <geom name="front" size="0.03" pos="0.3 0 -0.07"/>
+    <geom name="rear" size="0.03" pos="-0.3 0 {offset - 0.07}"/>
+    {WHEEL.format("right", -0.2)}{WHEEL.format("left", 0.2)}</body>"""
+    rolling = {"left": "no slip", "right": "no slip"}
+    rolling |= {"front": "slides", "rear": "slides"}
+    robot = nhjax.from_mujoco(_compiled(_HEAD_OF_CARTS.format(body)), rolling=rolling)
+    with pytest.raises(ValueError, match=f"is {offset:.3g} m from its place"):
+        robot.initial_state(project=True)
+
+
+def test_equality_that_contradicts_another_one_is_named():
+    text = CLOSED["joint equality"]
+    first = text[text.index('<joint name="gears') : text.index("</equality>")]
+    second = first.replace("gears", "more").replace('"0.1 ', '"0.4 ')
+    model = _compiled(text.replace(first, first + second))
+    robot = nhjax.from_mujoco(model)
+    assert robot.loops == ("gears",)
+    with pytest.raises(ValueError, match=r"'more' is .* from its place"):
+        robot.initial_state(project=True)
+
+
 @pytest.mark.parametrize(
     ("args", "message"),
     [

@@ -1,5 +1,6 @@
 """The conversion of a compiled model of MuJoCo to the arrays that nhjax uses."""
 
+import copy
 import warnings
 from collections.abc import Callable, Collection, Mapping, Sequence
 from itertools import pairwise
@@ -8,8 +9,10 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, PyTree
 
 from .._custom_types import Args
+from .._errors import is_traced
 from ..rolling import AbstractContact, AbstractGround, Contacts, Ellipsoid, Plane, Wheel
 from ._dynamics import (
     Actuators,
@@ -41,14 +44,20 @@ _KINDS = ("free", "ball", "slide", "hinge")
 class Layout:
     """The joints of a model, and the frame of each body relative to its last joint.
 
-    `source` is the model as it was read, for its shapes.
+    `source` is the model as it was read, for its shapes. The positions of the bodies
+    with the names `moving` are parameters.
 
     It is compared by identity, so that it can be a part of the structure of a `Robot`.
     """
 
     def __init__(
-        self, joints: Sequence[Joint], bodies: Sequence[Frame], source: Any = None
+        self,
+        joints: Sequence[Joint],
+        bodies: Sequence[Frame],
+        source: Any = None,
+        moving: Collection[str] = (),
     ):
+        self.moving = tuple(moving)
         self.joints = tuple(joints)
         self.bodies = tuple(bodies)
         self.space = Space(self.joints)
@@ -92,7 +101,7 @@ def layout_of(model: Any, source: Any, moving: Collection[str]) -> Layout:
             )
             last, offset, shifts = number, np.eye(4), ()
         bodies.append(Frame(last, offset, shifts))
-    return Layout(joints, bodies, source)
+    return Layout(joints, bodies, source, moving)
 
 
 def fixed_to(layout: Layout, body: int, position: Any, quaternion: Any) -> Frame:
@@ -546,6 +555,7 @@ def contacts_of(
             geom,
             frame_pose(layout.joints, layout.space, frame),
             name,
+            layout.moving,
             no_slip=geom.no_slip,
             ground=surface,
             manifold=layout.space.manifold,
@@ -616,7 +626,12 @@ def check_wheels(
 
 
 def _contact(
-    model: Any, rolling: RollingGeom, pose: Any, name: str, **options: Any
+    model: Any,
+    rolling: RollingGeom,
+    pose: Any,
+    name: str,
+    moving: Sequence[str],
+    **options: Any,
 ) -> AbstractContact:
     geom = rolling.geom
     kinds, size = mujoco().mjtGeom, model.geom_size[geom]
@@ -630,7 +645,9 @@ def _contact(
             'without mass and contacts (mass="0" contype="0" conaffinity="0").'
         )
     if options["touches"]:
-        options["touches"] = _height_varies(model, geom, options["ground"], name)
+        options["touches"] = _height_varies(
+            model, geom, options["ground"], name, moving
+        )
     if rolling.is_parameter:
         radius = _radius_in_args(name, radius)
     axle = (0.0, 0.0, 1.0)
@@ -690,10 +707,41 @@ def _ground(model: Any, layout: Layout, ground: Any) -> AbstractGround:
     return Plane(normal, height=float(normal @ frame.matrix[:3, 3]))
 
 
-def _height_varies(model: Any, geom: int, ground: AbstractGround, name: str) -> bool:
-    """Return whether the joints can change the height of a geom above the ground."""
+def _height_varies(
+    model: Any, geom: int, ground: AbstractGround, name: str, moving: Sequence[str]
+) -> bool:
+    """Return whether the joints can change the height of a geom above the ground.
+
+    The positions of the bodies with the names `moving` can change too.
+    """
     if not isinstance(ground, Plane):
         return True
+    if moving:
+        other, rng = copy.copy(model), np.random.default_rng(2)
+        for body in range(model.nbody):
+            if name_of(model, "body", body) in moving:
+                other.body_pos[body, :] += 0.1 * rng.normal(size=3)
+        if np.ptp(_heights(other, geom, ground)) > _flat(model, geom):
+            return True
+    heights, scale = _heights(model, geom, ground), _flat(model, geom)
+    if np.ptp(heights) > scale:
+        return True
+    if abs(heights[0]) > 1e3 * scale:
+        place = "above" if heights[0] > 0 else "below"
+        raise ValueError(
+            f"from_mujoco: the geom {name!r} is {abs(heights[0]):.3g} m {place} the "
+            "ground, and no joint changes its height: move it, or pass another ground."
+        )
+    return False
+
+
+def _flat(model: Any, geom: int) -> float:
+    """Return the size of heights that are round-off."""
+    return 1e-9 * max(1.0, float(np.abs(model.geom_size[geom]).max()))
+
+
+def _heights(model: Any, geom: int, ground: Plane) -> list[float]:
+    """Compute the heights of a geom above the ground in random poses."""
     normal = np.asarray(ground.unit_normal("float32"), float)
     normal /= np.linalg.norm(normal)
     data, heights = mujoco().MjData(model), []
@@ -712,16 +760,7 @@ def _height_varies(model: Any, geom: int, ground: AbstractGround, name: str) -> 
             reach = float(np.linalg.norm(size * (turn.T @ normal)))
         height = float(np.asarray(ground.height))
         heights.append(data.geom_xpos[geom] @ normal - reach - height)
-    scale = max(1.0, float(np.abs(model.geom_size[geom]).max()))
-    if np.ptp(heights) > 1e-9 * scale:
-        return True
-    if abs(heights[0]) > 1e-6 * scale:
-        place = "above" if heights[0] > 0 else "below"
-        raise ValueError(
-            f"from_mujoco: the geom {name!r} is {abs(heights[0]):.3g} m {place} the "
-            "ground, and no joint changes its height: move it, or pass another ground."
-        )
-    return False
+    return heights
 
 
 # --- Dependent constraints ------------------------------------------------------------
@@ -734,16 +773,103 @@ class Kept(NamedTuple):
     - `heights`: for each contact that touches, whether to keep its height.
     - `loops`: whether to keep each equation of the closed loops.
     - `is_independent`: whether these rows are independent near the pose at rest.
+    - `left_out`: the rows that are not kept, or None if all are.
     """
 
     slips: list[list[bool]]
     heights: list[bool]
     loops: list[bool]
     is_independent: bool
+    left_out: "LeftOut | None"
+
+
+class _Rows:
+    """All constraints of a robot: heights, equations of closed loops, and slips."""
+
+    def __init__(
+        self, space: Space, contacts: Contacts | None, loops: Loops, loop: Any
+    ):
+        named = {}
+        if contacts is not None:
+            named = dict(zip(contacts.names, contacts.contacts, strict=True))
+        self.space, self.loop = space, loop
+        self.contacts = list(named.values())
+        self.heights = [x for x in self.contacts if x.touches]
+        heights = [name for name, x in named.items() if x.touches]
+        slips = [f"{name} {x}" for name, one in named.items() for x in one.no_slip]
+        self.names = (*heights, *(loops.names if loop is not None else ()), *slips)
+        self.num_positions = len(self.names) - len(slips)
+        self.evaluate = jax.jit(self._evaluate)
+
+    def _positions(self, q: PyTree[Array], args: Args) -> Array:
+        # Positions come first: a velocity that follows from them is left out.
+        rows = [x.height(0.0, q, args)[None] for x in self.heights]
+        if self.loop is not None:
+            rows.append(self.loop(0.0, q, args))
+        return jnp.concatenate([jnp.zeros(0), *rows])
+
+    def _evaluate(self, q: PyTree[Array], args: Args) -> tuple[Array, Array]:
+        """Compute the constraints on positions, and the rates of all constraints."""
+        space = self.space
+
+        def rates(v):
+            moved = space.tangent(q, v)
+            positions = jax.jvp(lambda q: self._positions(q, args), (q,), (moved,))[1]
+            slips = [x.slip(0.0, q, v, args) for x in self.contacts if x.no_slip]
+            return jnp.concatenate([positions, *slips])
+
+        unit = jnp.eye(space.num_velocities, dtype=jnp.result_type(float))
+        return self._positions(q, args), jax.vmap(rates)(unit).T
+
+
+class LeftOut:
+    """The constraints of a robot that follow from the others with the file's lengths.
+
+    It is compared by identity, so that it can be a part of the structure of a `Robot`.
+    """
+
+    def __init__(self, rows: _Rows, keep: np.ndarray):
+        self.rows, self.keep = rows, keep
+
+    def __getstate__(self) -> dict[str, Any]:
+        # A compiled function cannot be pickled.
+        return {"rows": None, "keep": self.keep}
+
+    def check(self, q: PyTree[Array], args: Args) -> None:
+        """Raise unless the constraints hold, and still follow from the others.
+
+        Nothing is checked while JAX traces q or the lengths in `args`.
+        """
+        given = args if isinstance(args, dict) else {}
+        lengths = {x: given[x] for x in ("position", "radius") if given.get(x)} or None
+        if self.rows is None or is_traced(*jax.tree.leaves((q, lengths))):
+            return
+        positions, rows = map(np.asarray, self.rows.evaluate(q, lengths))
+        names = self.rows.names
+        size = np.abs(np.where(self.keep[: len(positions)], 0, positions))
+        if np.max(size, initial=0.0) > 1e-6:
+            place = int(np.argmax(size))
+            raise ValueError(
+                f"Robot.initial_state: {names[place]!r} is {positions[place]:.3g} m "
+                "from its place where the other wheels touch the ground and the other "
+                "loops are closed: no pose satisfies all constraints. Correct the "
+                "lengths, or leave it out of `rolling` or of the equalities."
+            )
+        rows = _normalised(rows)
+        rank = _rank(rows[self.keep])
+        for place in np.flatnonzero(~self.keep).tolist():
+            if _rank(np.concatenate([rows[self.keep], rows[place][None]])) > rank:
+                raise ValueError(
+                    f"Robot.initial_state: {names[place]!r} is not a constraint of the "
+                    "system, because it follows from the others with the lengths of "
+                    "the file; with the lengths in `args` it does not. Pass "
+                    '`constraints="redundant"` to `from_mujoco` to keep it, or choose '
+                    "another option of `rolling` for it."
+                )
 
 
 def independent_rows(
-    model: Any, space: Space, contacts: Contacts | None, loop: Any
+    model: Any, space: Space, contacts: Contacts | None, loops: Loops, loop: Any
 ) -> Kept:
     """Find the constraints that follow from the others in every pose.
 
@@ -751,36 +877,15 @@ def independent_rows(
     random poses. Otherwise all rows are kept, since a dependence that holds in some
     poses only needs all of them.
     """
-    touched = () if contacts is None else contacts.contacts
-    heights = [x for x in touched if x.touches]
-    slips = [x for x in touched if x.no_slip]
-
-    def positions(q):
-        rows = [x.height(0.0, q)[None] for x in heights]
-        if loop is not None:
-            rows.append(loop(0.0, q, None))
-        return jnp.concatenate(rows)
-
-    def rates(q, v):
-        # Positions come first: a velocity that follows from them is left out.
-        rows = []
-        if heights or loop is not None:
-            rows.append(jax.jvp(positions, (q,), (space.tangent(q, v),))[1])
-        return jnp.concatenate([*rows, *(x.slip(0.0, q, v) for x in slips)])
-
-    @jax.jit
-    def matrix(qpos):
-        q, unit = space.from_qpos(qpos), jnp.eye(model.nv, dtype=qpos.dtype)
-        return jax.vmap(lambda v: rates(q, v))(unit).T
-
+    all_rows = _Rows(space, contacts, loops, loop)
     rng, found = np.random.default_rng(1), []
     for size in (0.3, 0.3, 0.0):
         qpos = model.qpos0.copy()
         mujoco().mj_integratePos(model, qpos, rng.normal(size=model.nv), size)
-        rows = np.asarray(matrix(jnp.asarray(qpos, jnp.result_type(float))), float)
+        q = space.from_qpos(jnp.asarray(qpos, jnp.result_type(float)))
+        rows = np.asarray(all_rows.evaluate(q, None)[1], float)
         if np.isfinite(rows).all():
-            lengths = np.linalg.norm(rows, axis=1, keepdims=True)
-            found.append(rows / np.where(lengths > 1e-8, lengths, np.inf))
+            found.append(_normalised(rows))
     count = len(found[0]) if found else 0
     kept: list[int] = []
     for row in range(count):
@@ -790,15 +895,22 @@ def independent_rows(
         _rank(x[kept]) == len(kept) and _rank(x) == len(kept) for x in found
     )
     keep = np.isin(np.arange(count), kept) | (not is_independent)
-    sizes = [len(x.no_slip) for x in touched]
+    sizes = [len(x.no_slip) for x in all_rows.contacts]
     first = count - sum(sizes)
     ends = first + np.cumsum([0, *sizes])
+    num_heights = len(all_rows.heights)
     return Kept(
         [keep[a:b].tolist() for a, b in pairwise(ends.tolist())],
-        keep[: len(heights)].tolist(),
-        keep[len(heights) : first].tolist(),
+        keep[:num_heights].tolist(),
+        keep[num_heights:first].tolist(),
         is_independent,
+        None if keep.all() else LeftOut(all_rows, keep),
     )
+
+
+def _normalised(rows: np.ndarray) -> np.ndarray:
+    lengths = np.linalg.norm(rows, axis=1, keepdims=True)
+    return rows / np.where(lengths > 1e-8, lengths, np.inf)
 
 
 def _rank(rows: np.ndarray) -> int:

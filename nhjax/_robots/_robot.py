@@ -26,6 +26,7 @@ from ._build import (
     Kept,
     Layout,
     layout_of,
+    LeftOut,
     loops_in,
     mechanics_of,
     parameters_of,
@@ -62,6 +63,7 @@ class Robot(eqx.Module):
     bodies: tuple[str, ...] = eqx.field(static=True)
     _layout: Layout = eqx.field(static=True)
     _rest: tuple[float, ...] = eqx.field(static=True)
+    _left_out: LeftOut | None = eqx.field(static=True)
 
     def initial_state(
         self,
@@ -89,8 +91,10 @@ class Robot(eqx.Module):
 
         **Returns:** a `State`.
 
-        **Raises:** as `nhjax.initial_state`; `ValueError` for unknown joints and
-        `ShapeError` for wrong shapes.
+        **Raises:** as `nhjax.initial_state`; `ValueError` for unknown joints, and for
+        constraints that the system leaves out because they follow from the others, if
+        they do not hold in this state or no longer follow with the lengths in `args`
+        (unless JAX traces the call); `ShapeError` for wrong shapes.
         """
         rest = jnp.asarray(self._rest, jnp.result_type(float))
         position = self._array("qpos", qpos, rest)
@@ -98,7 +102,7 @@ class Robot(eqx.Module):
         q = self._space.from_qpos(position)
         given = self.args if args is None else args
         try:
-            return initial_state(
+            y = initial_state(
                 self.system,
                 q,
                 self._space.to_body(q, velocity),
@@ -111,6 +115,9 @@ class Robot(eqx.Module):
         except Exception as error:
             self._add_note_on_heights(error, t, q, given)
             raise
+        if self._left_out is not None:
+            self._left_out.check(y.q, given)
+        return y
 
     def _add_note_on_heights(self, error: Exception, t: Any, q: Any, args: Any) -> None:
         """Name the wheels that do not touch the ground, if the positions are known."""
@@ -342,9 +349,10 @@ def from_mujoco(
     check_wheels(compiled, layout, geoms, contacts)
     loops = loops_in(compiled, layout, left_out["equalities"])
     loop = loops_of(layout.joints, layout.space, loops)
-    names = loops.names
+    names, left_out_rows = loops.names, None
     if constraints is None and (contacts is not None or loop is not None):
-        kept = independent_rows(compiled, layout.space, contacts, loop)
+        kept = independent_rows(compiled, layout.space, contacts, loops, loop)
+        left_out_rows = kept.left_out
         constraints = "independent" if kept.is_independent else "redundant"
         names = tuple(x for x, keep in zip(names, kept.loops, strict=True) if keep)
         loop = loops_of(layout.joints, layout.space, loops, kept.loops)
@@ -374,6 +382,7 @@ def from_mujoco(
         bodies,
         layout,
         tuple(np.asarray(compiled.qpos0).tolist()),
+        left_out_rows,
     )
 
 
