@@ -245,10 +245,12 @@ class InvariantCorrection(eqx.Module):
     invariant by an impulse at the start persists until the end. In each row, the
     equation r = 0 for the errors r of the invariants is blended with ε = 0:
 
-    a r / g + (1 - a) ε = 0,    g = G_ii,    a = g² / (g² + ϵ S²).
+    a r / g + (1 - a) ε = 0,    g = G_ii,    a = x² / (x² + ϵ),    x = |g| δ / S.
 
-    Here ϵ is the unit round-off and S is the size of the terms of I. Unless g is small,
-    a is 1 up to round-off. At rest g vanishes, and no impulse can keep I.
+    Here ϵ is the unit round-off, S is the size of the terms of I, and δ is the impulse
+    that would change velocities by their own size, so that x does not depend on units.
+    Unless x is small, a is 1 up to round-off. At rest x vanishes, and no impulse can
+    keep I.
 
     With an indefinite mass matrix, G can also be singular away from rest. Then a = 0
     for all functions; see `LEAST_PART`.
@@ -290,8 +292,11 @@ class InvariantCorrection(eqx.Module):
         eps = float(jnp.finfo(gram.dtype).eps)
         one = jnp.eye(gram.shape[0], dtype=gram.dtype)
         g = jnp.sum(gram * one, axis=1)
-        denominator = nonzero_or_one(g**2 + eps * at_start.sizes**2)
-        errors, a = g / denominator, g**2 / denominator
+        terms = jnp.abs(at_start.slopes * start) + jnp.abs(slopes * end)
+        unit = (at_start.moving + moving) / nonzero_or_one(jnp.sum(terms, 1))
+        x = jnp.abs(g) * unit / nonzero_or_one(at_start.sizes)
+        a = x**2 / (x**2 + eps)
+        errors = a / nonzero_or_one(g)
         matrix = errors[:, None] * gram + (1 - a)[:, None] * one
         # If one function follows from others, the matrix is singular.
         solved = inverse(matrix + eps**0.5 * one)
@@ -303,14 +308,11 @@ class InvariantCorrection(eqx.Module):
         gain = roots[:, None] * solved * (errors * roots)[None]
         acts = ~(at_start.functions.least_part * max_norm(gain) > 1)
         pushes = jnp.abs(jnp.concatenate([start, end], axis=1))
-        terms = jnp.abs(at_start.slopes * start) + jnp.abs(slopes * end)
         return cls(
             errors=jnp.where(acts, errors, 0),
             rest=jnp.where(acts, 1 - a, 1),
             inverse=jnp.where(acts, solved, one),
-            limits=_LARGEST_PART
-            * (at_start.moving + moving)
-            / nonzero_or_one(jnp.sum(terms, 1)),
+            limits=_LARGEST_PART * unit,
             start=start,
             end=end,
             velocity=at_start.slopes if hamiltonian else start,

@@ -532,3 +532,51 @@ def test_invariant_run_with_limited_impulse_is_not_reversible(dt, limited):
 def test_invariants_page_runs_as_printed():
     found = run_page("invariants")["sol"].ys
     np.testing.assert_allclose(found, found[0], rtol=0, atol=1e-15)
+
+
+# Units.
+
+
+@pytest.mark.parametrize(
+    ("dtype", "scale"),
+    [("float64", 1e-9), ("float64", 1e-4), ("float64", 1e9), ("float32", 1e-4)],
+)
+def test_invariant_in_other_units_is_kept_as_well(dtype, scale):
+    system = nhjax.LagrangianSystem(
+        lambda t, q, v, args: 0.5 * v @ v - 0.5 * q @ q - 0.25 * (q @ q) ** 2
+    )
+
+    def energy(q, v):
+        return 0.5 * v @ v + 0.5 * q @ q + 0.25 * (q @ q) ** 2
+
+    start = (jnp.array(x, dtype) for x in ((1.0, 0.2), (0.3, 0.8)))
+    y0 = nhjax.initial_state(system, *start)
+    sol = nhjax.integrate(
+        system,
+        LobattoIIIAB(2),
+        y0,
+        dt=0.1,
+        num_steps=100,
+        invariants=lambda t, q, v, args: scale * energy(q, v),
+    )
+    error = energy(sol.ys.q[-1], sol.ys.v[-1]) / energy(y0.q, y0.v) - 1
+    assert abs(float(error)) < 4 * float(jnp.finfo(dtype).eps)
+
+
+@pytest.mark.parametrize("unit", [1e-9, 1e6])
+def test_invariants_in_another_unit_of_time_are_kept_as_well(unit):
+    def lagrangian(t, q, v, args):
+        return 0.5 * v @ v - (0.5 * q @ q + 0.25 * (q @ q) ** 2) / unit**2
+
+    def kept(t, q, v, args):
+        energy = 0.5 * v @ v + (0.5 * q @ q + 0.25 * (q @ q) ** 2) / unit**2
+        return jnp.stack([energy, q[0] * v[1] - q[1] * v[0]])
+
+    system = nhjax.LagrangianSystem(lagrangian)
+    q0, v0 = jnp.array([1.0, 0.2]), jnp.array([0.3, 0.8]) / unit
+    y0 = nhjax.initial_state(system, q0, v0)
+    sol = nhjax.integrate(
+        system, LobattoIIIAB(2), y0, dt=0.1 * unit, num_steps=100, invariants=kept
+    )
+    ends = kept(0.0, sol.ys.q[-1], sol.ys.v[-1], None)
+    np.testing.assert_allclose(ends, kept(0.0, q0, v0, None), rtol=4e-15)
