@@ -1,10 +1,17 @@
-"""An estimate of the error of one step, from the forces at its stages.
+"""An estimate of the error of one step, from the forces and velocities at its stages.
 
-The estimate needs no further evaluations. The stages sample the rate of u, the fibre
-coordinate, at s points of the step. Their Legendre coefficients give the sizes
-U_k = |h^k u^(k)| of its derivatives for k = 1, ..., s. The error of a method of order p
-is a multiple of U_{p+1}, a derivative of higher order than the samples show. From order
-to order derivatives grow by a factor r, which the samples do show, so that
+The estimate needs no further evaluations. The forces of the stages sample the rate of
+the momentum at s points of the step, and with the mass matrix at its start that of u,
+the fibre coordinate. Their Legendre coefficients give the sizes U_k = |h^k u^(k)| of
+its derivatives for k = 1, ..., s. Velocities also change where momenta do not: if the
+mass matrix depends on time, or when a free body turns. Therefore each U_k is at least
+the derivative that the velocities of the stages show, with the accelerations at both
+ends. On a group, the velocities of the stages are those in a chart; without these
+accelerations they show U_k for k < s alone.
+
+The error of a method of order p is a multiple of U_{p+1}, a derivative of higher order
+than the samples show. From order to order derivatives grow by a factor r, which the
+samples do show, so that
 
     U_{p+1} ≈ U_s r^(p+1-s).
 
@@ -36,10 +43,11 @@ from .._system import AbstractMechanicalSystem
 from ._step import StepOutcome, StepState
 
 
-# The error of a step is the power p / 2 of the first of these times the error of the
-# quadrature b. The second is the factor of the eigenvalue of ad(h v). Both fit the
-# errors of steps of the gallery (`benchmarks.adaptive_steps`).
-_GROWTH, _GROWTH_BY_COMMUTATOR = 4.0, 1.2
+# The error of a step is the power p + 1 - s of the first of these, the number of orders
+# beyond the samples, times the error of the quadrature b. The second is the factor of
+# the eigenvalue of ad(h v). Both fit the errors of steps of the gallery
+# (`benchmarks.adaptive_steps`).
+_GROWTH, _GROWTH_BY_COMMUTATOR = 2.8, 1.2
 
 
 def local_error(
@@ -66,7 +74,8 @@ def local_error(
     **Returns:** the root mean square over all 2n components, and r / h of this step.
     """
     lin, in_position, in_fibre = start.lin, *scales
-    changes = jnp.asarray(derivative_weights(method), h.dtype) @ (
+    weights = jnp.asarray(derivative_weights(method), h.dtype)
+    changes = weights @ (
         h * jax.vmap(lin.momentum_inverse.matvec)(outcome.record.force)
     )
     if start.state.multiplier.shape[0]:
@@ -79,7 +88,17 @@ def local_error(
         changes = changes - jnp.where(first, 0, reactions)
     u = system.fibre_coordinate(start.state)
     displacements = changes
+    if system.manifold_of(start.state.q).is_flat:
+        ends = (t, start), (t + h, outcome.step_state)
+        rates = [h * _velocity_rate(system, *end, args) for end in ends]
+        samples = jnp.concatenate([outcome.record.velocity, jnp.stack(rates)])
+        in_velocity = jnp.asarray(_velocity_weights(method), h.dtype) @ samples
+    else:
+        in_velocity = weights[1:] @ outcome.record.velocity
+        in_velocity = jnp.pad(in_velocity, ((0, 1), (0, 0)))
+    moved = in_velocity
     if system.fibre_coordinate_name == "p":
+        moved = jax.vmap(lin.fibre_hessian_inverse.matvec)(moved)
         _, displacements = jax.vmap(
             lambda change: jax.jvp(
                 lambda u: system.velocity(t, start.state.q, u, args), (u,), (change,)
@@ -89,16 +108,38 @@ def local_error(
     mean = jnp.asarray(method.b, h.dtype) @ outcome.record.velocity
     by_chart = _growth_in_chart(system.manifold_of(start.state.q), h * mean)
     # The derivative of order k + 1 of q is that of order k of u.
-    sizes = changes / in_fibre[None], h * displacements / in_position[None]
+    in_position = in_position / jnp.abs(h)
+    sizes = (
+        _largest(changes / in_fibre[None], moved / in_fibre[None]),
+        _largest(displacements / in_position[None], in_velocity / in_position[None]),
+    )
     orders = method.order + 1, method.order
     (fibre, in_u), (position, in_q) = (
-        _extrapolated(jnp.sqrt(jnp.mean(x**2, axis=1)), order, by_chart, known)
+        _extrapolated(x, order, by_chart, known)
         for x, order, known in zip(
             sizes, orders, jnp.abs(h) * growth_rates, strict=True
         )
     )
     error = error_factor(method) * jnp.sqrt(0.5 * (fibre**2 + position**2))
     return error, jnp.stack([in_u, in_q]) / jnp.abs(h)
+
+
+def _largest(by_force: Array, by_velocity: Array) -> Float[Array, " s"]:
+    """Return the sizes of derivatives, one a row, that two kinds of samples show."""
+    both = jnp.stack([by_force, by_velocity])
+    return jnp.max(jnp.sqrt(jnp.mean(both**2, axis=2)), axis=0)
+
+
+def _velocity_rate(
+    system: AbstractMechanicalSystem, t: FloatScalar, y: StepState, args: Args
+) -> Float[Array, " n"]:
+    """Compute the rate of the velocity at a state in a vector space."""
+    rate = y.lin.acceleration
+    if system.fibre_coordinate_name == "v":
+        return rate
+    q, p = y.state.q, y.state.p
+    along = jnp.ones_like(t), system.velocity(t, q, p, args), rate
+    return jax.jvp(lambda t, q, p: system.velocity(t, q, p, args), (t, q, p), along)[1]
 
 
 def _growth_in_chart(
@@ -160,10 +201,30 @@ def derivative_weights(method: AbstractMethod) -> np.ndarray:
 
 
 @functools.cache
+def _velocity_weights(method: AbstractMethod) -> np.ndarray:
+    """Return the weights by which velocities and accelerations give h^k v^(k), k > 0.
+
+    The samples are the velocities at the nodes, and h times the accelerations at both
+    ends. There are as many rows as `derivative_weights` has.
+    """
+    nodes, first = np.unique(method.c, return_index=True)
+    number = len(nodes)
+    legendre = np.polynomial.legendre
+    values = legendre.legvander(2 * nodes - 1, number + 1)
+    slopes = [2 * legendre.legder(unit) for unit in np.eye(number + 2)]
+    at_ends = np.array([legendre.legval([-1, 1], x) for x in slopes]).T
+    inverse = np.linalg.inv(np.concatenate([values, at_ends]))
+    weights = np.zeros((number + 2, method.stages + 2))
+    weights[:, [*first, method.stages, method.stages + 1]] = inverse
+    sizes = [math.factorial(2 * k) // math.factorial(k) for k in range(number + 1)]
+    return (np.array(sizes, float)[:, None] * weights[: number + 1])[1:]
+
+
+@functools.cache
 def error_factor(method: AbstractMethod) -> float:
     """Return the typical error of a step of order p, divided by U_{p+1}."""
     p = method.order
     defect = abs(float(method.b @ method.c**p) - 1 / (p + 1)) / math.factorial(p)
     # Some methods have the order p for another reason than their quadrature.
     defect = max(defect, 1e-2 / math.factorial(2 * p))
-    return defect * _GROWTH ** (p / 2)
+    return defect * _GROWTH ** (p + 1 - len(np.unique(method.c)))

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from scipy.integrate import solve_ivp
+from scipy.integrate import quad, solve_ivp
 
 import nhjax
 from nhjax import (
@@ -759,3 +759,62 @@ def test_suggested_step_inside_of_jit_is_refused():
         jax.jit(lambda y: nhjax.suggest_step(PENDULUM, METHOD, y, t1=1.0, rtol=1e-6))(
             y0
         )
+
+
+# Motions whose momenta are conserved.
+
+
+def _driven_by_gauge(t, q, v, args):
+    """The momentum v + sin(3 t) is conserved."""
+    return 0.5 * v @ v + v[0] * jnp.sin(3 * t)
+
+
+def _with_mass_that_changes(t, q, v, args):
+    return 0.5 * (2 + jnp.sin(3 * t)) * v @ v
+
+
+@pytest.mark.parametrize("stages", [3, 4])
+@pytest.mark.parametrize("lagrangian", [_driven_by_gauge, _with_mass_that_changes])
+def test_pid_with_a_momentum_that_is_conserved_meets_its_tolerance(lagrangian, stages):
+    system = nhjax.LagrangianSystem(lagrangian)
+    y0 = nhjax.initial_state(system, jnp.zeros(1), jnp.ones(1))
+    p = y0.p[0]
+
+    def velocity(t):
+        if lagrangian is _driven_by_gauge:
+            return p - np.sin(3 * t)
+        return p / (2 + np.sin(3 * t))
+
+    exact, _ = quad(velocity, 0, 10, epsabs=1e-12, limit=200)
+    for tolerance in (1e-5, 1e-8):
+        sol = nhjax.integrate(
+            system,
+            nhjax.LobattoIIIAB(stages),
+            y0,
+            t1=10.0,
+            stepsize_controller=nhjax.PIDController(tolerance, tolerance),
+        )
+        assert abs(sol.ys.q[-1, 0] - exact) < 20 * tolerance * 10
+
+
+@pytest.mark.parametrize("stages", [3, 4])
+def test_pid_with_a_free_body_meets_its_tolerance(stages):
+    body = nhjax.systems.FreeRigidBody()
+    y0, moments = body.initial_state(), np.asarray(body.moments)
+    exact = solve_ivp(
+        lambda t, w: np.cross(moments * w, w) / moments,
+        (0, 10),
+        np.asarray(y0.v),
+        "DOP853",
+        rtol=1e-12,
+        atol=1e-13,
+    ).y[:, -1]
+    for tolerance in (1e-5, 1e-8):
+        sol = nhjax.integrate(
+            body.system,
+            nhjax.LobattoIIIAB(stages),
+            y0,
+            t1=10.0,
+            stepsize_controller=nhjax.PIDController(tolerance, tolerance),
+        )
+        assert np.abs(sol.ys.v[-1] - exact).max() < 30 * tolerance
