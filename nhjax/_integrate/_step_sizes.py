@@ -118,6 +118,16 @@ class AbstractStepSizeController(eqx.Module):
         """Return the size and the memory with which a run goes on at a checkpoint."""
         return jnp.abs(size) * context.direction, memory
 
+    def after_reset(
+        self, context: StepContext, t: FloatScalar, after: StepState
+    ) -> tuple[FloatScalar, Memory, RESULTS] | None:
+        """Choose the step after an event has reset the state, as `init` does.
+
+        None, the default, means that the reset changes nothing.
+        """
+        del context, t, after
+        return None
+
     def given_size(
         self, context: StepContext, node: Int[Array, ""]
     ) -> FloatScalar | None:
@@ -505,7 +515,8 @@ class ReversibleController(AbstractStepSizeController):
     Explicit, time reversible, adaptive step size control, 2005). The density follows Q
     up to O(ε²). A run backward in time from the checkpoint of a run takes the same
     steps back. In a reversible system with a symmetric method, energies that do not
-    drift with constant steps do not drift with these. No step is rejected.
+    drift with constant steps do not drift with these. No step is rejected. After an
+    event has reset the state, the density starts again as Q of the new state.
 
     **Arguments:**
 
@@ -642,6 +653,13 @@ class ReversibleController(AbstractStepSizeController):
         # An array differs from the two numbers of a `PIDController`, so that its
         # checkpoints are not taken for those of this controller.
         return size, jnp.stack([density, rate]), result
+
+    def after_reset(
+        self, context: StepContext, t: FloatScalar, after: StepState
+    ) -> tuple[FloatScalar, Memory, RESULTS]:
+        """Start again: the density of the motion before says nothing about this one."""
+        size, memory, result = self.init(context, t, after)
+        return jax.lax.stop_gradient(size), jax.lax.stop_gradient(memory), result
 
     def adapt(self, context: StepContext, attempt: Attempt, memory: Memory) -> Decision:
         """Accept every step that is solved, and move the density on."""

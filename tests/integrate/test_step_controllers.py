@@ -818,3 +818,63 @@ def test_pid_with_a_free_body_meets_its_tolerance(stages):
             stepsize_controller=nhjax.PIDController(tolerance, tolerance),
         )
         assert np.abs(sol.ys.v[-1] - exact).max() < 30 * tolerance
+
+
+# Resets.
+
+
+@pytest.mark.parametrize("factor", [0.3, 0.5, 2.0])
+def test_reversible_controller_after_a_reset_takes_the_density_of_the_new_state(factor):
+    system = nhjax.LagrangianSystem(
+        lambda t, q, v, args: 0.5 * v @ v + 1 / jnp.sqrt(q @ q)
+    )
+    controller = nhjax.ReversibleController(
+        eps=0.1, density=lambda t, q, v, args: (q @ q) ** -0.75
+    )
+
+    def to_another_circle(t, y, args):
+        return factor**2 * y.q, y.v / factor
+
+    event = nhjax.Event(
+        lambda t, y, args: t - 3.05, reset=to_another_circle, max_events=1
+    )
+    y0 = nhjax.initial_state(system, jnp.array([1.0, 0.0]), jnp.array([0.0, 1.0]))
+    sol = nhjax.integrate(
+        system,
+        nhjax.LobattoIIIAB(4),
+        y0,
+        t1=6.0,
+        stepsize_controller=controller,
+        event=event,
+        saveat=nhjax.SaveAt(steps=True),
+    )
+    # On a circle of radius r the density is r^(-3/2).
+    np.testing.assert_allclose(sol.ts[-2] - sol.ts[-3], 0.1 * factor**3, rtol=1e-8)
+    radii = np.linalg.norm(sol.ys.q[-3:], axis=1)
+    np.testing.assert_allclose(radii, factor**2, rtol=1e-9)
+
+
+def test_reversible_controller_with_many_bounces_keeps_its_energy():
+    def potential(q):
+        return q[0] + 0.3 * q[0] ** 2
+
+    system = nhjax.LagrangianSystem(lambda t, q, v, args: 0.5 * v @ v - potential(q))
+    bounce = nhjax.Event(
+        lambda t, y, args: y.q[0],
+        reset=lambda t, y, args: (y.q, -y.v),
+        max_events=100,
+    )
+    sol = nhjax.integrate(
+        system,
+        nhjax.LobattoIIIAB(4),
+        nhjax.initial_state(system, jnp.ones(1), jnp.zeros(1)),
+        t1=100.0,
+        stepsize_controller=nhjax.ReversibleController(
+            eps=0.1, density=lambda t, q, v, args: 1 / (0.1 + jnp.abs(q[0]))
+        ),
+        event=bounce,
+        max_steps=10000,
+    )
+    assert int(sol.stats["num_events"]) > 40
+    energy = 0.5 * sol.ys.v[-1] @ sol.ys.v[-1] + potential(sol.ys.q[-1])
+    np.testing.assert_allclose(energy, 1.3, rtol=1e-11)

@@ -41,7 +41,14 @@ from .._variable import (
     statistics_of_attempt,
     StepSizes,
 )
-from ._event import Conditions, ConditionSigns, Event, EventActions, signs_at
+from ._event import (
+    Conditions,
+    ConditionSigns,
+    Event,
+    EventActions,
+    EventOutcome,
+    signs_at,
+)
 from ._log import LogEntry, reported_log
 from ._root import ImplicitTruncatedStep, TruncatedStep
 
@@ -315,7 +322,12 @@ class EventStepper(AbstractStepper[EventCarry, ReplayedIteration]):
             has_ended = carry.result != RESULTS.successful
             fills = (after.node > before.node) | ends | has_ended
         else:
-            after = replace(after, clock=self._clock_after(before, after, attempt))
+            clock, found = self._clock_after(before, after, attempt, outcome)
+            after = replace(after, clock=clock)
+            is_bad = attempt.fires & (result == RESULTS.successful)
+            is_bad = is_bad & (found != RESULTS.successful)
+            result = RESULTS.where(is_bad, found, result)
+            ends = ends | is_bad
             # Iterations for events are not attempts at a step.
             rejected = attempt.is_rejected.astype(jnp.int32)
             number = after.node + carry.stats["num_rejected_steps"] + rejected
@@ -449,9 +461,16 @@ class EventStepper(AbstractStepper[EventCarry, ReplayedIteration]):
         return decision._replace(result=result)
 
     def _clock_after(
-        self, before: EventLoopState, after: EventLoopState, attempt: AttemptedStep
-    ) -> Clock:
-        """Return the clock after an iteration, which may have reached a node."""
+        self,
+        before: EventLoopState,
+        after: EventLoopState,
+        attempt: AttemptedStep,
+        outcome: EventOutcome,
+    ) -> tuple[Clock, RESULTS]:
+        """Return the clock after an iteration, which may have reached a node.
+
+        The second result tells whether the controller can go on after a reset.
+        """
         assert self.sizes is not None
         assert before.clock is not None
         assert attempt.decision is not None
@@ -462,9 +481,26 @@ class EventStepper(AbstractStepper[EventCarry, ReplayedIteration]):
         size = jnp.where(reaches & attempt.is_kept, decision.size, size)
         end = two_sum(clock.t, attempt.whole + clock.compensation)
         memory = tree_where(attempt.is_kept, decision.memory, clock.memory)
-        return self.sizes.after(
+        clock = self.sizes.after(
             clock, end, attempt.next_step, reaches, size, memory, after.node
         )
+        restarted = None
+        if any(self.actions.resets):
+            restarted = self.sizes.controller.after_reset(
+                self.sizes.context(self.plain),
+                attempt.t + attempt.size,
+                outcome.step_state,
+            )
+        if restarted is None:
+            return clock, RESULTS.successful
+        # The rest of the step between two nodes becomes as long as a new one.
+        size, memory, result = restarted
+        resets = jnp.asarray([x is not None for x in self.actions.resets])
+        is_reset = attempt.fires & resets[attempt.which]
+        size = jnp.where(is_reset, after.offset + size, clock.size)
+        memory = tree_where(is_reset, memory, clock.memory)
+        result = RESULTS.where(is_reset, result, RESULTS.successful)
+        return replace(clock, size=size, memory=memory), result
 
     def _step(
         self,
