@@ -235,8 +235,8 @@ def _box(mass: float, size: tuple[float, ...]) -> np.ndarray:
 
 def tree_by_hand() -> nhjax.LagrangianSystem:
     """Write the same tree as a user would, with one function for all legs."""
-    group, other = nhjax.SE3(), nhjax.SO3()
-    manifold = nhjax.ProductGroup(group, nhjax.Euclidean(14))
+    turns = nhjax.SO3()
+    manifold = nhjax.ProductGroup(nhjax.Euclidean(3), turns, nhjax.Euclidean(14))
     sizes = [(0.05, 0.03, 0.03), (0.03, 0.03, 0.1), (0.02, 0.02, 0.1)]
     leg_masses = np.array([0.5, 0.8, 0.4])
     leg_moments = np.array(list(map(_box, leg_masses, sizes)))
@@ -267,8 +267,8 @@ def tree_by_hand() -> nhjax.LagrangianSystem:
     down, back = jnp.array([0.0, 0.0, -0.1]), jnp.array([-0.08, 0.0, 0.0])
 
     def poses(q):
-        element, angles = q
-        rotation, position = other.matrix(element[:4]), element[4:]
+        position, quaternion, angles = q
+        rotation = turns.matrix(quaternion)
 
         def leg(place, angles):
             offsets = [place, jnp.array([0.0, 0.5, 0.0]) * place, 2 * down]

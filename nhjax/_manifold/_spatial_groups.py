@@ -293,6 +293,11 @@ class SE3(AbstractMotionGroup):
     An element is an array of shape (7,), a unit quaternion q followed by a translation
     x. The body velocity is (v, ω), with dx/dt = R(q) v and dq/dt = q ∘ (0, ω/2).
 
+    Rotation and translation share a chart, so that the error of a step also depends on
+    the distance h|v| in a step. Where it is not small beside the radius of gyration of
+    the body, `ProductGroup(Euclidean(3), SO3())` is more accurate, with the velocity of
+    the origin in space.
+
     **Arguments:**
 
     - `retraction`: `Cayley()` or `Exponential()`.

@@ -308,7 +308,7 @@ def _spring_energy(mechanics, parameters, q, args, dtype):
         for spring in mechanics.ball_springs:
             place = special.index(mechanics.joints[spring.joint])
             back = group.inverse(jnp.asarray(spring.reference, dtype))
-            vector = group.local(group.compose(back, elements[place]))
+            vector = group.local(group.compose(back, elements[place][-1]))
             energy = energy + 0.5 * spring.stiffness * jnp.sum(vector * vector)
     return energy
 
@@ -361,7 +361,6 @@ def force_of(
     parameters: Parameters,
     actuators: Actuators,
     controls: Any,
-    to_mujoco: Any,
 ) -> Any:
     """Return the force F(t, q, v, args) of damping, friction and actuators, or None."""
     space = mechanics.space
@@ -395,7 +394,7 @@ def force_of(
 
     def of_actuators(t, q, v, args):
         if controls is not None:
-            u = jnp.asarray(controls(t, *to_mujoco(q, v), args))
+            u = jnp.asarray(controls(t, space.to_qpos(q), v, args))
             if u.shape != (len(actuators.names),):
                 raise ShapeError(
                     f"`controls` must return shape ({len(actuators.names)},), one "
@@ -416,8 +415,7 @@ def force_of(
             strength = strength + (gain[:, 2] * u + bias[:, 2]) * rate
         strength = limited(strength, actuators.force_range, actuators.smoothing)
         sum_of_all = moment.T @ strength
-        sum_of_all = limited(sum_of_all, actuators.joint_range, actuators.smoothing)
-        return space.to_body(q, sum_of_all)
+        return limited(sum_of_all, actuators.joint_range, actuators.smoothing)
 
     return force
 

@@ -105,7 +105,7 @@ class Robot(eqx.Module):
             y = initial_state(
                 self.system,
                 q,
-                self._space.to_body(q, velocity),
+                velocity,
                 t=t,
                 args=given,
                 project=project,
@@ -163,11 +163,7 @@ class Robot(eqx.Module):
 
         **Raises:** `TypeError` if there are no states.
         """
-        y = _states(sol)
-        convert = self._space.to_space
-        for _ in range(jnp.ndim(y.v) - 1):
-            convert = jax.vmap(convert)
-        return convert(y.q, y.v)
+        return _states(sol).v
 
     def pose(
         self, body: str, q: PyTree[Array], args: Args = None
@@ -261,7 +257,7 @@ def from_mujoco(
     MuJoCo's own compiler reads the model. The Lagrangian is the kinetic energy
     ½ Σ tr(Ṫ J Ṫᵀ) of all bodies with poses T and pseudo-inertias J, with ½ a q̇² for
     each armature a, minus the energies of weight and springs. Free and ball joints are
-    on SE(3) and SO(3), all others on R^n. The equality constraints connect, weld,
+    on R³ x SO(3) and SO(3), all others on R^n. The equality constraints connect, weld,
     joint and tendon are holonomic constraints. They hold exactly, unlike in MuJoCo,
     and `solref` and `solimp` have no effect. Source: Featherstone, *Rigid body dynamics
     algorithms* (2008); the MuJoCo documentation, chapter *Computation*.
@@ -366,7 +362,7 @@ def from_mujoco(
         lagrangian_of(mechanics, known),
         nonholonomic=slips,
         holonomic=positions,
-        force=force_of(mechanics, known, actuators, controls, _to_mujoco(layout)),
+        force=force_of(mechanics, known, actuators, controls),
         manifold=layout.space.manifold,
         coordinates=coordinates,
         constraints=constraints or "independent",
@@ -413,11 +409,6 @@ def _coordinates(layout: Layout) -> tuple[str, ...]:
         own = {"free": [*(f"{joint.name}_{x}" for x in "xyz"), *turns], "ball": turns}
         names += own.get(joint.kind, [joint.name])
     return tuple(names)
-
-
-def _to_mujoco(layout: Layout) -> Callable[..., Any]:
-    space = layout.space
-    return lambda q, v: (space.to_qpos(q), space.to_space(q, v))
 
 
 def _joined(heights: Any, loop: Any) -> Any:

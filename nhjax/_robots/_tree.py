@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Array, Float, PyTree
 
 from .._custom_types import Args
-from .._manifold import AbstractLieGroup, Euclidean, ProductGroup, SE3, SO3
+from .._manifold import AbstractLieGroup, Euclidean, ProductGroup, SO3
 from . import _scalars as entries
 from ._joints import Joint, motions, Shift, twists
 
@@ -27,17 +27,21 @@ LARGEST_OF_SCALARS = 40
 
 
 class Part(NamedTuple):
-    """A factor of the configuration space: one free or ball joint, or some scalars."""
+    """A part of the configuration space: one free or ball joint, or some scalars."""
 
     kind: str
     joints: tuple[int, ...]
     first_velocity: int
 
     @property
-    def group(self) -> AbstractLieGroup:
-        """The factor as a Lie group."""
-        groups = {"free": SE3(), "ball": SO3()}
-        return groups.get(self.kind) or Euclidean(len(self.joints))
+    def groups(self) -> tuple[AbstractLieGroup, ...]:
+        """The part as Lie groups.
+
+        A free joint has a position in space and a rotation. On SE(3) both would share a
+        chart, so that steps of a body that moves fast would be less accurate.
+        """
+        groups = {"free": (Euclidean(3), SO3()), "ball": (SO3(),)}
+        return groups.get(self.kind) or (Euclidean(len(self.joints)),)
 
 
 def parts_of(joints: Sequence[Joint]) -> tuple[Part, ...]:
@@ -59,13 +63,13 @@ def parts_of(joints: Sequence[Joint]) -> tuple[Part, ...]:
 class Space:
     """The configuration space of a robot, and MuJoCo's coordinates of it.
 
-    MuJoCo's velocities of a free joint are the velocity of its origin in space and the
-    angular velocity in the body. Those of SE(3) are both in the body.
+    The velocities are those of MuJoCo. A free joint has the velocity of its origin in
+    space and the angular velocity in the body.
     """
 
     def __init__(self, joints: Sequence[Joint]):
         self.parts = parts_of(joints)
-        groups = [part.group for part in self.parts]
+        groups = [group for part in self.parts for group in part.groups]
         self.is_flat = len(groups) == 1 and self.parts[0].kind == "scalars"
         self.is_product = len(groups) > 1
         self.manifold: AbstractLieGroup | None = None
@@ -88,18 +92,24 @@ class Space:
             for part in self.parts
             for i, joint in enumerate(part.joints)
         }
-        self.free = [part.first_velocity for part in self.parts if part.kind == "free"]
 
-    def split(self, q: PyTree[Array]) -> tuple[list[Array], Array]:
-        """Split q into the elements of free and ball joints, and all scalars."""
-        elements = q if self.is_product else (q,)
+    def split(self, q: PyTree[Array]) -> tuple[list[tuple[Array, ...]], Array]:
+        """Split q into the elements of free and ball joints, and all scalars.
+
+        A free joint has its position and its quaternion, a ball joint its quaternion.
+        """
+        elements = iter(q if self.is_product else (q,))
         special, scalars = [], []
-        for part, element in zip(self.parts, elements, strict=True):
-            (scalars if part.kind == "scalars" else special).append(element)
+        for part in self.parts:
+            own = tuple(next(elements) for _ in part.groups)
+            if part.kind == "scalars":
+                scalars += own
+            else:
+                special.append(own)
         if scalars:
             vector = scalars[0] if len(scalars) == 1 else jnp.concatenate(scalars)
         else:
-            vector = jnp.zeros((0,), special[0].dtype)
+            vector = jnp.zeros((0,), special[0][-1].dtype)
         return special, vector
 
     def tangent(self, q: PyTree[Array], v: Array) -> PyTree[Array]:
@@ -110,48 +120,15 @@ class Space:
         """Convert MuJoCo's coordinates."""
         elements, place = [], 0
         for part in self.parts:
-            size = {"free": 7, "ball": 4}.get(part.kind, len(part.joints))
-            own = qpos[place : place + size]
-            if part.kind == "free":
-                own = jnp.concatenate([own[3:], own[:3]])
-            elements.append(own)
-            place += size
+            sizes = {"free": (3, 4), "ball": (4,)}.get(part.kind, (len(part.joints),))
+            for size in sizes:
+                elements.append(qpos[place : place + size])
+                place += size
         return tuple(elements) if self.is_product else elements[0]
 
     def to_qpos(self, q: PyTree[Array]) -> Float[Array, "*batch nq"]:
         """Convert to MuJoCo's coordinates, with any leading axes."""
-        elements = q if self.is_product else (q,)
-        own = [
-            jnp.concatenate([x[..., 4:], x[..., :4]], axis=-1)
-            if part.kind == "free"
-            else x
-            for part, x in zip(self.parts, elements, strict=True)
-        ]
-        return jnp.concatenate(own, axis=-1)
-
-    def rotations(self, q: PyTree[Array]) -> list[Array]:
-        """Return the rotations of the free joints, by their first velocities."""
-        elements = q if self.is_product else (q,)
-        return [
-            SO3().matrix(element[:4])
-            for part, element in zip(self.parts, elements, strict=True)
-            if part.kind == "free"
-        ]
-
-    def to_space(self, q: PyTree[Array], v: Array) -> Array:
-        """Convert velocities, or covectors, of SE(3) to those of MuJoCo."""
-        return self._turn(self.rotations(q), v)
-
-    def to_body(self, q: PyTree[Array], v: Array) -> Array:
-        """Convert velocities, or covectors, of MuJoCo to those of SE(3)."""
-        return self._turn([rotation.T for rotation in self.rotations(q)], v)
-
-    def _turn(self, rotations: list[Array], v: Array) -> Array:
-        pieces, place = [], 0
-        for first, rotation in zip(self.free, rotations, strict=True):
-            pieces += [v[place:first], rotation @ v[first : first + 3]]
-            place = first + 3
-        return jnp.concatenate([*pieces, v[place:]]) if pieces else v
+        return jnp.concatenate(q, axis=-1) if self.is_product else q
 
 
 def displacement(shifts: Sequence[Shift], args: Args, dtype: Any) -> entries.Vector:
@@ -254,7 +231,8 @@ class Tree:
         args: Args,
     ) -> list[tuple[entries.Vector, entries.Vector, entries.Entry]]:
         """Compute what `motion` does for each node, entry by entry."""
-        own, twists = self._relative_scalars(q, args), self._own_twists_of_scalars(v)
+        own = self._relative_scalars(q, args)
+        twists = self._own_twists_of_scalars(v, [rotation for rotation, _ in own])
         weight = entries.known(np.zeros(3) if gravity is None else gravity)
         found, before = [], []
         for level in self.levels:
@@ -278,10 +256,10 @@ class Tree:
         special, scalars = self.space.split(q)
         found = []
         for place, joint in self.special:
-            matrix = SO3().matrix(special[place][:4])
+            matrix = SO3().matrix(special[place][-1])
             rotation = [[matrix[i, j] for j in range(3)] for i in range(3)]
             if joint.kind == "free":
-                position = [special[place][4 + i] for i in range(3)]
+                position = [special[place][0][i] for i in range(3)]
             else:
                 offset = entries.known(joint.offset[:3, :3])
                 rotation = entries.product(offset, rotation)
@@ -310,16 +288,22 @@ class Tree:
             found.append((rotation, entries.sums(values[9:], shift)))
         return found
 
-    def _own_twists_of_scalars(self, v: Array) -> list[entries.Vector]:
+    def _own_twists_of_scalars(
+        self, v: Array, rotations: list[entries.Matrix]
+    ) -> list[entries.Vector]:
         def component(i):
             return jax.lax.index_in_dim(v, int(i), keepdims=False)
 
         found = []
-        for first, (_, joint) in zip(
-            self.special_velocities, self.special, strict=True
+        for node, (first, (_, joint)) in enumerate(
+            zip(self.special_velocities, self.special, strict=True)
         ):
             if joint.kind == "free":
-                found.append([component(first + i) for i in range(6)])
+                moving, turning = (
+                    [component(first + i) for i in range(k, k + 3)] for k in (0, 3)
+                )
+                back = entries.transposed(rotations[node])
+                found.append([*entries.apply(back, moving), *turning])
             else:
                 turning = [component(first + i) for i in range(3)]
                 moving = entries.cross(joint.anchor.tolist(), turning)
@@ -357,7 +341,7 @@ class Tree:
         The third result is the product of the position with gravity.
         """
         all_rotations, all_positions = self._relative(q, args)
-        all_twists = self._own_twists(v)
+        all_twists = self._own_twists(v, all_rotations)
         twists: list[Array] = []
         falls: list[Array] = []
         depths: list[Array] = []
@@ -393,14 +377,15 @@ class Tree:
         joined = jnp.concatenate(twists)
         return joined, jnp.concatenate(falls), jnp.concatenate(depths)
 
-    def _own_twists(self, v: Array) -> Array:
+    def _own_twists(self, v: Array, rotations: Array) -> Array:
         """Compute the twist of each node relative to the node before it."""
         twists = []
-        for first, (_, joint) in zip(
-            self.special_velocities, self.special, strict=True
+        for node, (first, (_, joint)) in enumerate(
+            zip(self.special_velocities, self.special, strict=True)
         ):
             if joint.kind == "free":
-                twist = v[first : first + 6]
+                moving = rotations[node].T @ v[first : first + 3]
+                twist = jnp.concatenate([moving, v[first + 3 : first + 6]])
             else:
                 turning = v[first : first + 3]
                 moving = jnp.cross(jnp.asarray(joint.anchor, v.dtype), turning)
@@ -417,10 +402,9 @@ class Tree:
         dtype = scalars.dtype
         rotations, positions = [], []
         for place, joint in self.special:
-            element = elements[place]
-            rotation = SO3().matrix(element[:4])
+            rotation = SO3().matrix(elements[place][-1])
             if joint.kind == "free":
-                position = element[4:]
+                position = elements[place][0]
             else:
                 offset = jnp.asarray(joint.offset, dtype)
                 anchor = jnp.asarray(joint.anchor, dtype)
