@@ -730,12 +730,24 @@ class Contacts(eqx.Module):
     # JAX sorts the keys of a dictionary, so that the order would not be kept.
     names: tuple[str, ...] = eqx.field(static=True)
     contacts: tuple[AbstractContact, ...]
+    _num_others: int = eqx.field(static=True)
 
     def __init__(self, **contacts: AbstractContact):
         for name, contact in contacts.items():
             check_type(name, contact, AbstractContact)
         self.names = tuple(contacts)
         self.contacts = tuple(contacts.values())
+        self._num_others = 0
+
+    def followed_by(self, num_others: int) -> "Contacts":
+        """Return the same contacts, for a system with other holonomic constraints.
+
+        `num_others` is the number of these constraints. They must come after the
+        heights, so that their multipliers are the last ones.
+        """
+        found = Contacts(**dict(zip(self.names, self.contacts, strict=True)))
+        object.__setattr__(found, "_num_others", num_others)
+        return found
 
     @property
     def nonholonomic(self) -> "Slips | None":
@@ -773,7 +785,8 @@ class Contacts(eqx.Module):
         **Arguments:**
 
         - `t`, `y`, `args`: the time, the state and the arguments of the system. The
-            system must have the constraints of these contacts and no others.
+            system must have the constraints of these contacts and no others, or
+            others as `followed_by` describes.
         - `frame`: whether the force is a vector in space, or has the components along,
             across and normal of the frame of the contact.
 
@@ -876,11 +889,15 @@ class Contacts(eqx.Module):
 
     def _check_multipliers(self, multipliers: Array) -> None:
         count = sum(len(x.no_slip) + x.touches for x in self.contacts)
-        if multipliers.shape != (count,):
+        if multipliers.shape != (count + self._num_others,):
+            others = (
+                f" and {self._num_others} others follow" if self._num_others else ""
+            )
             raise ShapeError(
-                f"The contacts have {count} multipliers, got multipliers of shape "
-                f"{multipliers.shape}. The system must have the constraints of these "
-                f"contacts and no others; pass one of its states."
+                f"The contacts have {count} multipliers{others}, got multipliers of "
+                f"shape {multipliers.shape}. Pass a state of the system with the "
+                "constraints of these contacts. If it has other holonomic constraints "
+                "after theirs, use `contacts.followed_by(number)`."
             )
 
 

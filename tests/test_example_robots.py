@@ -167,3 +167,20 @@ def test_options_of_an_example_robot_are_those_of_the_user():
     robot = nhjax.example_robot(QUICK, rolling=None, parameters={"mass": ["platform"]})
     assert robot.contacts is None
     assert float(robot.args["mass"]["platform"]) == pytest.approx(18.0)
+
+
+def test_contact_forces_of_a_robot_with_a_closed_loop_are_its_first_multipliers():
+    robot = _robot("ackermann_car")
+    assert robot.loops
+    assert robot.contacts is not None
+    y = robot.initial_state(qvel=ROBOTS["ackermann_car"][1], project=True)
+    names = robot.contacts.multiplier_names
+    assert len(y.multiplier) == len(names) + len(robot.loops)
+    forces = robot.contacts.forces(0.0, y, frame="contact")
+    for name, direction in (
+        ("rear_left_tread", "across"),
+        ("front_left_tread", "along"),
+    ):
+        place = names.index(f"{name} {direction}")
+        found = forces[name][("along", "across").index(direction)]
+        assert float(found) == float(y.multiplier[place])

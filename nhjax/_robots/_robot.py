@@ -354,6 +354,8 @@ def from_mujoco(
         loop = loops_of(layout.joints, layout.space, loops, kept.loops)
         if contacts is not None:
             contacts = _reduced(compiled, layout, contacts, kept, geoms, ground)
+    if contacts is not None:
+        contacts = contacts.followed_by(len(names))
     slips = None if contacts is None else contacts.nonholonomic
     heights = None if contacts is None else contacts.holonomic
     positions = _joined(heights, loop)
