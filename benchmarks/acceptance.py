@@ -12,7 +12,7 @@ Newton's method.
 
 Doubtful steps are judged once more: accepted steps with a residual above 1e-13, or with
 an end that differs by more than 1e-11. Newton's method takes them again from states
-of which one number is moved by one unit in the last place. The largest distance by
+of which one number is moved by one unit in the last place. The sum of the distances by
 which this moves the end is the floor, at least the unit round-off: float64 does not
 know a start better. A step is solved if its end is within 400 floors, because the
 solvers treat 400 units of round-off as noise. The other steps are solved too if their
@@ -435,9 +435,8 @@ def moved_by_last_digit(
 ) -> Float[Array, ""]:
     """How far a step ends from another that starts one unit in the last place away.
 
-    It is the largest of such distances, each relative to the size of the end. Each
-    number of the start is moved alone: moved together, the two ends of a rod can keep
-    its direction.
+    Each number of the start is moved alone, and the distances, relative to the size of
+    the end, are added: moved together, the two ends of a rod can keep its direction.
     """
     z, unravel = ravel_pytree(start)
     moves = jnp.asarray(np.eye(len(z) + 1, len(z), -1))
@@ -453,7 +452,7 @@ def moved_by_last_digit(
     first, *others = (
         jax.tree.map(lambda x, k=k: x[k], ends) for k in range(len(moves))
     )
-    return jnp.max(jnp.stack([apart(other, first) for other in others]))
+    return jnp.sum(jnp.stack([apart(other, first) for other in others]))
 
 
 def measure(name: str, stages: int, make: Callable, num_steps: int) -> dict:
