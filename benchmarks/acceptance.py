@@ -435,8 +435,9 @@ def moved_by_last_digit(
 ) -> Float[Array, ""]:
     """How far a step ends from another that starts one unit in the last place away.
 
-    Each number of the start is moved alone, and the distances, relative to the size of
-    the end, are added: moved together, the two ends of a rod can keep its direction.
+    Each number of the start that is not zero is moved alone, and the distances,
+    relative to the size of the end, are added. Moves of several numbers at once can
+    cancel: if both ends of a rod move alike, its direction stays.
     """
     z, unravel = ravel_pytree(start)
     moves = jnp.asarray(np.eye(len(z) + 1, len(z), -1))
@@ -449,10 +450,10 @@ def moved_by_last_digit(
         return step(arguments, method, nhjax.Newton(), jnp.asarray(False))
 
     ends = jax.lax.map(end, moves)
-    first, *others = (
-        jax.tree.map(lambda x, k=k: x[k], ends) for k in range(len(moves))
+    first, others = (
+        jax.tree.map(lambda x, k=k: x[k], ends) for k in (0, slice(1, None))
     )
-    return jnp.sum(jnp.stack([apart(other, first) for other in others]))
+    return jnp.sum(jax.vmap(apart, (0, None))(others, first))
 
 
 def measure(name: str, stages: int, make: Callable, num_steps: int) -> dict:

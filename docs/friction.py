@@ -52,7 +52,7 @@ def draw_scooter(page: dict[str, Any], speeds: Any, loads: Any) -> None:
 
 
 def draw_ball(page: dict[str, Any], places: Any, speeds: Any) -> None:
-    """Draw the place of the ball, and the two speeds that become equal."""
+    """Draw the position of the ball, and the two speeds that become equal."""
     sol = page["spinning"]
     matrices = jax.vmap(nhjax.SO3().matrix)(sol.ys.q[:, :4])
     velocity = np.einsum("tij,tj->ti", matrices, sol.ys.v[:, :3])

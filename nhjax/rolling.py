@@ -77,12 +77,18 @@ def _length(name: str) -> Callable[[Any], Any]:
     return converted
 
 
-def _length_in(args: Args, name: str, value: Any, dtype: Any) -> Array:
-    """Evaluate a length that may be a function of `args`."""
+def _length_in(
+    args: Args, name: str, value: Any, dtype: Any, shapes: tuple[Any, ...] = ((),)
+) -> Array:
+    """Evaluate a length that may be a function of `args`, and check its shape."""
     if callable(value):
         with naming(f"{name}(args)", as_given(value), args):
             value = value(args)
-    return jnp.asarray(value).astype(dtype)
+    length = jnp.asarray(value)
+    if length.shape not in shapes:
+        expected = " or ".join(map(str, shapes))
+        raise ShapeError(f"`{name}` must have shape {expected}, got {length.shape}.")
+    return length.astype(dtype)
 
 
 def _unit(vector: Array) -> Array:
@@ -366,8 +372,9 @@ class AbstractContact(eqx.Module):
         weights = [_direction(x) for x in self.no_slip]
         if np.linalg.matrix_rank(np.array(weights)) < len(weights):
             raise ValueError(
-                "`no_slip` must name at most two directions that are not parallel, got "
-                f"{self.no_slip!r}. Leave out those that follow from the others."
+                "`no_slip` must name at most two directions that are not parallel, and "
+                f'"spin" at most once, got {self.no_slip!r}. Leave out those that '
+                "follow from the others."
             )
 
     @abc.abstractmethod
@@ -620,21 +627,17 @@ class Ellipsoid(AbstractContact):
 
     def __check_init__(self) -> None:
         if not callable(self.semi_axes):
-            self._check_shape(jnp.asarray(self.semi_axes))
+            self._axes_in(None, jnp.result_type(float))
 
-    def _check_shape(self, axes: Array) -> None:
-        if axes.shape not in ((), (3,)):
-            raise ShapeError(
-                "`semi_axes` must be three lengths or one radius, got shape "
-                f"{axes.shape}."
-            )
+    def _axes_in(self, args: Args, dtype: Any) -> Array:
+        shapes = (3,), ()
+        return _length_in(args, "semi_axes", self.semi_axes, dtype, shapes)
 
     def offset(
         self, rotation: Float[Array, "3 3"], normal: Float[Array, "3"], args: Args
     ) -> Float[Array, "3"]:
         """Compute the vector from the centre to the lowest point."""
-        axes = _length_in(args, "semi_axes", self.semi_axes, rotation.dtype)
-        self._check_shape(axes)
+        axes = self._axes_in(args, rotation.dtype)
         if axes.shape == ():
             return -axes * normal
         # The support function of the ellipsoid in the direction -n.

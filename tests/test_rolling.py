@@ -562,7 +562,7 @@ def test_contacts_keep_the_precision_of_the_state(dtype):
         (
             lambda: rolling.Ellipsoid(_free_body, [1.0, 2.0]),
             nhjax.ShapeError,
-            "three lengths or one radius",
+            r"`semi_axes` must have shape \(3,\) or \(\), got \(2,\)",
         ),
         (
             lambda: rolling.Wheel(_free_body, lambda q, args: 0.3),
@@ -574,7 +574,14 @@ def test_contacts_keep_the_precision_of_the_state(dtype):
                 0.0, jnp.array([1.0, 0, 0, 0, 0, 0, 1])
             ),
             nhjax.ShapeError,
-            "three lengths or one radius",
+            "`semi_axes` must have shape",
+        ),
+        (
+            lambda: rolling.Wheel(_free_body, lambda args: jnp.ones(3)).height(
+                0.0, jnp.array([0.8, 0.6, 0, 0, 0, 0, 1])
+            ),
+            nhjax.ShapeError,
+            r"`radius` must have shape \(\), got \(3,\)",
         ),
         (
             lambda: rolling.Blade(_free_body, ground=cast(Any, (0, 0, 1))),

@@ -121,7 +121,7 @@ class AbstractStepSizeController(eqx.Module):
     def after_reset(
         self, context: StepContext, t: FloatScalar, after: StepState
     ) -> tuple[FloatScalar, Memory, RESULTS] | None:
-        """Choose the step after an event has reset the state, as `init` does.
+        """Return what `init` returns, for the step after an event has reset the state.
 
         None, the default, means that the reset changes nothing.
         """
@@ -658,8 +658,7 @@ class ReversibleController(AbstractStepSizeController):
         self, context: StepContext, t: FloatScalar, after: StepState
     ) -> tuple[FloatScalar, Memory, RESULTS]:
         """Start again: the density of the motion before says nothing about this one."""
-        size, memory, result = self.init(context, t, after)
-        return jax.lax.stop_gradient(size), jax.lax.stop_gradient(memory), result
+        return self.init(context, t, after)
 
     def adapt(self, context: StepContext, attempt: Attempt, memory: Memory) -> Decision:
         """Accept every step that is solved, and move the density on."""

@@ -26,7 +26,7 @@ from ._dynamics import (
     Mechanics,
     Parameters,
 )
-from ._joints import Joint, Shift
+from ._joints import given_in, Joint, Shift
 from ._read import (
     active_equalities,
     has_flag,
@@ -604,7 +604,7 @@ def check_wheels(
                         '`rpy="1.5708 0 0"` into the `<origin>` of its `<collision>`.'
                     )
             # Without slip along its track, the wheel has to turn about its axis.
-            turns = no_slip not in ((), ("across",))
+            turns = any(x not in ("across", "spin") for x in no_slip)
             parallel = abs(frame.matrix[:3, 2] @ joint.axis) > 1 - 1e-6
             if turns and joint.kind in ("hinge", "slide") and not parallel:
                 warnings.warn(
@@ -661,8 +661,7 @@ def _contact(
 
 def _radius_in_args(name: str, default: float) -> Callable[[Args], Any]:
     def radius(args):
-        given = args.get("radius", {}) if isinstance(args, dict) else {}
-        return given.get(name, default)
+        return given_in(args, "radius").get(name, default)
 
     return radius
 
@@ -716,28 +715,21 @@ def _height_varies(
     """
     if not isinstance(ground, Plane):
         return True
-    if moving:
-        other, rng = copy.copy(model), np.random.default_rng(2)
-        for body in range(model.nbody):
-            if name_of(model, "body", body) in moving:
-                other.body_pos[body, :] += 0.1 * rng.normal(size=3)
-        if np.ptp(_heights(other, geom, ground)) > _flat(model, geom):
-            return True
-    heights, scale = _heights(model, geom, ground), _flat(model, geom)
-    if np.ptp(heights) > scale:
+    other, rng = copy.copy(model), np.random.default_rng(2)
+    for body in range(model.nbody):
+        if name_of(model, "body", body) in moving:
+            other.body_pos[body, :] += 0.1 * rng.normal(size=3)
+    heights = _heights(model, geom, ground)
+    size = max(1.0, float(np.abs(model.geom_size[geom]).max()))
+    if any(np.ptp(x) > 1e-9 * size for x in (heights, _heights(other, geom, ground))):
         return True
-    if abs(heights[0]) > 1e3 * scale:
+    if abs(heights[0]) > 1e-6 * size:
         place = "above" if heights[0] > 0 else "below"
         raise ValueError(
             f"from_mujoco: the geom {name!r} is {abs(heights[0]):.3g} m {place} the "
             "ground, and no joint changes its height: move it, or pass another ground."
         )
     return False
-
-
-def _flat(model: Any, geom: int) -> float:
-    """Return the size of heights that are round-off."""
-    return 1e-9 * max(1.0, float(np.abs(model.geom_size[geom]).max()))
 
 
 def _heights(model: Any, geom: int, ground: Plane) -> list[float]:
@@ -795,10 +787,17 @@ class _Rows:
         self.space, self.loop = space, loop
         self.contacts = list(named.values())
         self.heights = [x for x in self.contacts if x.touches]
-        heights = [name for name, x in named.items() if x.touches]
+        heights = [f"{name} normal" for name, x in named.items() if x.touches]
         slips = [f"{name} {x}" for name, one in named.items() for x in one.no_slip]
         self.names = (*heights, *(loops.names if loop is not None else ()), *slips)
-        self.num_positions = len(self.names) - len(slips)
+        self.evaluate = jax.jit(self._evaluate)
+
+    def __getstate__(self) -> dict[str, Any]:
+        # A compiled function cannot be pickled.
+        return {k: x for k, x in self.__dict__.items() if k != "evaluate"}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(state)
         self.evaluate = jax.jit(self._evaluate)
 
     def _positions(self, q: PyTree[Array], args: Args) -> Array:
@@ -831,41 +830,38 @@ class LeftOut:
     def __init__(self, rows: _Rows, keep: np.ndarray):
         self.rows, self.keep = rows, keep
 
-    def __getstate__(self) -> dict[str, Any]:
-        # A compiled function cannot be pickled.
-        return {"rows": None, "keep": self.keep}
-
     def check(self, q: PyTree[Array], args: Args) -> None:
         """Raise unless the constraints hold, and still follow from the others.
 
         Nothing is checked while JAX traces q or the lengths in `args`.
         """
-        given = args if isinstance(args, dict) else {}
-        lengths = {x: given[x] for x in ("position", "radius") if given.get(x)} or None
-        if self.rows is None or is_traced(*jax.tree.leaves((q, lengths))):
+        lengths = {x: given_in(args, x) for x in ("position", "radius")}
+        lengths = {x: given for x, given in lengths.items() if given} or None
+        if is_traced(*jax.tree.leaves((q, lengths))):
             return
         positions, rows = map(np.asarray, self.rows.evaluate(q, lengths))
-        names = self.rows.names
-        size = np.abs(np.where(self.keep[: len(positions)], 0, positions))
-        if np.max(size, initial=0.0) > 1e-6:
-            place = int(np.argmax(size))
-            raise ValueError(
-                f"Robot.initial_state: {names[place]!r} is {positions[place]:.3g} m "
-                "from its place where the other wheels touch the ground and the other "
-                "loops are closed: no pose satisfies all constraints. Correct the "
-                "lengths, or leave it out of `rolling` or of the equalities."
-            )
-        rows = _normalised(rows)
+        names, rows = self.rows.names, _normalised(rows)
         rank = _rank(rows[self.keep])
         for place in np.flatnonzero(~self.keep).tolist():
             if _rank(np.concatenate([rows[self.keep], rows[place][None]])) > rank:
                 raise ValueError(
-                    f"Robot.initial_state: {names[place]!r} is not a constraint of the "
-                    "system, because it follows from the others with the lengths of "
-                    "the file; with the lengths in `args` it does not. Pass "
+                    f"Robot.initial_state: the constraint {names[place]!r} was left "
+                    "out, because it follows from the others with the lengths of the "
+                    "file. With the lengths in `args` it does not follow. Pass "
                     '`constraints="redundant"` to `from_mujoco` to keep it, or choose '
                     "another option of `rolling` for it."
                 )
+        errors = np.where(self.keep[: len(positions)], 0, positions)
+        sizes = [np.abs(x).max(initial=0) for x in jax.tree.leaves(q)]
+        eps = np.finfo(positions.dtype).eps
+        if np.abs(errors).max(initial=0) > max(1e-6, 1e3 * eps * max(sizes)):
+            place = int(np.argmax(np.abs(errors)))
+            raise ValueError(
+                f"Robot.initial_state: the constraint {names[place]!r} was left out, "
+                "because it follows from the others, but is violated by "
+                f"{errors[place]:.3g} where they hold. Correct the lengths, or remove "
+                "it from `rolling` or from the equalities."
+            )
 
 
 def independent_rows(

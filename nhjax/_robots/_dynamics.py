@@ -13,7 +13,7 @@ from .._custom_types import Args, FloatScalarLike
 from .._errors import ShapeError
 from .._manifold import Exponential, SO3
 from . import _scalars as entries
-from ._joints import Joint, Shift
+from ._joints import given_in, Joint, Shift
 from ._rotors import merge_rotors, moved_inertia, spatial_inertia
 from ._tree import displacement, Frame, FramePoses, Space, Tree
 
@@ -89,7 +89,8 @@ class Parameters(eqx.Module):
     """The numbers of a robot that `args` may replace.
 
     - `names`: for each kind, the bodies, joints or geoms, with their places in the
-        arrays. Positions and radii have no places.
+        arrays. The places of positions and radii are those in MuJoCo's model, and are
+        not used here.
     - `controls`: the names of the actuators, or None if a function of the user computes
         the controls: `args["controls"]` may then have any structure.
     """
@@ -99,7 +100,7 @@ class Parameters(eqx.Module):
 
     def replaced(self, kind: str, values: np.ndarray, args: Args, dtype: Any) -> Any:
         """Return an array of numbers with those of `args` in their places."""
-        given = {} if args is None else args.get(kind, {})
+        given = given_in(args, kind)
         if not given:
             return jnp.asarray(values, dtype)
         result = jnp.asarray(values, dtype)

@@ -1,10 +1,12 @@
 """The joints of a robot, and their motions as numbers."""
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
+
+from .._custom_types import Args
 
 
 class Shift(NamedTuple):
@@ -17,6 +19,11 @@ class Shift(NamedTuple):
     body: str
     rotation: Float[np.ndarray, "3 3"]
     reference: Float[np.ndarray, "3"]
+
+
+def given_in(args: Args, kind: str) -> dict[str, Any]:
+    """Return the parameters of a kind in `args`, by name."""
+    return args.get(kind, {}) if isinstance(args, dict) else {}
 
 
 class Joint(NamedTuple):

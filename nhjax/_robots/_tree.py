@@ -18,7 +18,7 @@ from jaxtyping import Array, Float, PyTree
 from .._custom_types import Args
 from .._manifold import AbstractLieGroup, Euclidean, ProductGroup, SO3
 from . import _scalars as entries
-from ._joints import Joint, motions, Shift, twists
+from ._joints import given_in, Joint, motions, Shift, twists
 
 
 # Larger trees are computed as arrays, which have shorter programs. The code of
@@ -133,7 +133,7 @@ class Space:
 
 def displacement(shifts: Sequence[Shift], args: Args, dtype: Any) -> entries.Vector:
     """Compute by how much the parameters in `args` move the origin of a frame."""
-    given = args.get("position", {}) if isinstance(args, dict) else {}
+    given = given_in(args, "position")
     found: entries.Vector = 3 * [0.0]
     for body, rotation, reference in shifts:
         if body in given:
@@ -427,7 +427,7 @@ class Tree:
 
 
 def _rows_of(vectors: list[entries.Vector], dtype: Any) -> Array:
-    """Convert vectors to the rows of an array. Those of floats are zero."""
+    """Convert vectors to the rows of an array. Those without arrays are zero."""
     rows = jnp.zeros((len(vectors), 3), dtype)
     for number, vector in enumerate(vectors):
         if not all(isinstance(x, float) for x in vector):

@@ -6,8 +6,8 @@ the fibre coordinate. Their Legendre coefficients give the sizes U_k = |h^k u^(k
 its derivatives for k = 1, ..., s. Velocities also change where momenta do not: if the
 mass matrix depends on time, or when a free body turns. Therefore each U_k is at least
 the derivative that the velocities of the stages show, with the accelerations at both
-ends. On a group, the velocities of the stages are those in a chart; without these
-accelerations they show U_k for k < s alone.
+ends. On a group these velocities are those in a chart, and the accelerations are not
+used. Then the velocities show U_k for k < s only.
 
 The error of a method of order p is a multiple of U_{p+1}, a derivative of higher order
 than the samples show. From order to order derivatives grow by a factor r, which the
@@ -43,9 +43,9 @@ from .._system import AbstractMechanicalSystem
 from ._step import StepOutcome, StepState
 
 
-# The error of a step is the power p + 1 - s of the first of these, the number of orders
-# beyond the samples, times the error of the quadrature b. The second is the factor of
-# the eigenvalue of ad(h v). Both fit the errors of steps of the gallery
+# The error of a step is the error of the quadrature b times the first of these to the
+# power p + 1 - s, the number of orders that the samples do not show. The second is the
+# factor of the eigenvalue of ad(h v). Both fit the errors of steps of the gallery
 # (`benchmarks.adaptive_steps`).
 _GROWTH, _GROWTH_BY_COMMUTATOR = 2.8, 1.2
 

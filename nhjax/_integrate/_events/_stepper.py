@@ -469,7 +469,8 @@ class EventStepper(AbstractStepper[EventCarry, ReplayedIteration]):
     ) -> tuple[Clock, RESULTS]:
         """Return the clock after an iteration, which may have reached a node.
 
-        The second result tells whether the controller can go on after a reset.
+        The second result is `successful`, or the reason why the controller cannot
+        continue after a reset.
         """
         assert self.sizes is not None
         assert before.clock is not None
@@ -484,8 +485,8 @@ class EventStepper(AbstractStepper[EventCarry, ReplayedIteration]):
         clock = self.sizes.after(
             clock, end, attempt.next_step, reaches, size, memory, after.node
         )
-        restarted = None
-        if any(self.actions.resets):
+        resets, restarted = [x is not None for x in self.actions.resets], None
+        if any(resets):
             restarted = self.sizes.controller.after_reset(
                 self.sizes.context(self.plain),
                 attempt.t + attempt.size,
@@ -495,8 +496,8 @@ class EventStepper(AbstractStepper[EventCarry, ReplayedIteration]):
             return clock, RESULTS.successful
         # The rest of the step between two nodes becomes as long as a new one.
         size, memory, result = restarted
-        resets = jnp.asarray([x is not None for x in self.actions.resets])
-        is_reset = attempt.fires & resets[attempt.which]
+        size, memory = jax.lax.stop_gradient((size, memory))
+        is_reset = attempt.fires & jnp.asarray(resets)[attempt.which]
         size = jnp.where(is_reset, after.offset + size, clock.size)
         memory = tree_where(is_reset, memory, clock.memory)
         result = RESULTS.where(is_reset, result, RESULTS.successful)
