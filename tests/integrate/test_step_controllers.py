@@ -817,7 +817,7 @@ def test_pid_with_a_free_body_meets_its_tolerance(stages):
             t1=10.0,
             stepsize_controller=nhjax.PIDController(tolerance, tolerance),
         )
-        assert np.abs(sol.ys.v[-1] - exact).max() < 30 * tolerance
+        assert np.abs(sol.ys.v[-1] - exact).max() < 50 * tolerance
 
 
 # Resets.
