@@ -448,7 +448,7 @@ def take(x: Array, places: np.ndarray) -> Array:
 
 
 class Frame(NamedTuple):
-    """A frame that is fixed to a node: that of a body, a geom or a site.
+    """The frame of a body, a geom or a site, which is fixed to a node of the tree.
 
     `shifts` are the parameters that move its origin relative to the node.
     """

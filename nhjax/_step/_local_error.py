@@ -198,8 +198,7 @@ def derivative_weights(method: AbstractMethod) -> np.ndarray:
     basis = np.polynomial.legendre.legvander(2 * nodes - 1, len(nodes) - 1)
     weights = np.zeros((len(nodes), method.stages))
     weights[:, first] = np.linalg.inv(basis)
-    sizes = [math.factorial(2 * k) // math.factorial(k) for k in range(len(nodes))]
-    return np.array(sizes, float)[:, None] * weights
+    return _as_derivatives(weights)
 
 
 @functools.cache
@@ -218,8 +217,14 @@ def _velocity_weights(method: AbstractMethod) -> np.ndarray:
     inverse = np.linalg.inv(np.concatenate([values, at_ends]))
     weights = np.zeros((number + 2, method.stages + 2))
     weights[:, [*first, method.stages, method.stages + 1]] = inverse
-    sizes = [math.factorial(2 * k) // math.factorial(k) for k in range(number + 1)]
-    return (np.array(sizes, float)[:, None] * weights[: number + 1])[1:]
+    return _as_derivatives(weights)[1 : number + 1]
+
+
+def _as_derivatives(weights: np.ndarray) -> np.ndarray:
+    """Convert weights for Legendre coefficients to weights for derivatives."""
+    orders = range(len(weights))
+    sizes = [math.factorial(2 * k) // math.factorial(k) for k in orders]
+    return np.array(sizes, float)[:, None] * weights
 
 
 @functools.cache
