@@ -33,7 +33,7 @@ from ._custom_types import (
 )
 from ._errors import check_choice, naming, ShapeError
 from ._integrate import Event
-from ._manifold import AbstractLieGroup
+from ._manifold import AbstractLieGroup, cross_matrix
 from ._numerics import inverse, max_norm, nan_unless, root
 from ._system import (
     AbstractOfSystem,
@@ -452,7 +452,7 @@ class AbstractContact(eqx.Module):
         )
         point, normal, _ = self._touch(position, rotation, args)
         travel = velocity
-        velocity = velocity + turning @ (rotation.T @ (point - position))
+        velocity = velocity + turning @ ((point - position) @ rotation)
         spin = turning @ rotation.T
         if self.ground.velocity is not None:
             ground = self.ground.velocity(t, point, args)
@@ -476,7 +476,8 @@ class AbstractContact(eqx.Module):
         ground.
         """
         at = self.state(t, q, v, args)
-        rates = self.directions(at.rotation, at.normal) @ at.velocity
+        axes = self.axes(at.rotation, at.normal)
+        rates = self.weights(axes.dtype) @ (axes @ at.velocity)
         if "spin" not in self.no_slip:
             return rates
         spin = at.angular_velocity @ at.normal
@@ -576,15 +577,17 @@ class Wheel(AbstractContact):
         radius = _length_in(args, "radius", self.radius, axle.dtype)
         tube = _length_in(args, "tube_radius", self.tube_radius, axle.dtype)
         # In this form a disc that lies nearly flat loses no digits.
-        down = jnp.cross(axle, self.axes(rotation, normal)[0])
+        along, _ = self.axes(rotation, normal)
+        down = cross_matrix(axle) @ along
         return radius * down - tube * normal
 
     def axes(
         self, rotation: Float[Array, "3 3"], normal: Float[Array, "3"]
     ) -> Float[Array, "2 3"]:
         """Compute the rolling direction, and the direction across it."""
-        along = _unit(jnp.cross(self._axle(rotation), normal))
-        return jnp.stack([along, jnp.cross(normal, along)])
+        turn = cross_matrix(normal)
+        along = _unit(self._axle(rotation) @ turn)
+        return jnp.stack([along, turn @ along])
 
     def _axle(self, rotation: Array) -> Array:
         return rotation @ _unit(jnp.asarray(self.axle).astype(rotation.dtype))

@@ -14,4 +14,9 @@ from ._retraction import (
     Cayley as Cayley,
     Exponential as Exponential,
 )
-from ._spatial_groups import Euclidean as Euclidean, SE3 as SE3, SO3 as SO3
+from ._spatial_groups import (
+    cross_matrix as cross_matrix,
+    Euclidean as Euclidean,
+    SE3 as SE3,
+    SO3 as SO3,
+)
