@@ -749,7 +749,8 @@ class Contacts(eqx.Module):
         """Return the same contacts, for a system with other holonomic constraints.
 
         `num_others` is the number of these constraints. They must come after the
-        heights, so that their multipliers are the last ones.
+        heights, so that their multipliers are the last ones. Pass the result to a law
+        of `nhjax.friction` in such a system.
         """
         found = Contacts(**dict(zip(self.names, self.contacts, strict=True)))
         object.__setattr__(found, "_num_others", num_others)
@@ -868,9 +869,11 @@ class Contacts(eqx.Module):
     def check_constraints_of(self, system: Any) -> None:
         """Raise a `ValueError` unless a system has these constraints and no others.
 
-        The multipliers are then in the order of the contacts.
+        The multipliers are then in the order of the contacts. With `followed_by` the
+        holonomic constraints are a function of the user, whose order is not known.
         """
-        for name in ("nonholonomic", "holonomic"):
+        names = ("nonholonomic", "holonomic")
+        for name in names[:1] if self._num_others else names:
             own, given = getattr(self, name), getattr(system, name)
             is_same = own is given is None or (
                 type(own) is type(given)
@@ -881,7 +884,9 @@ class Contacts(eqx.Module):
                 raise ValueError(
                     f"`force` needs the normal force of one of its contacts, but the "
                     f"system has other constraints: pass `{name}=contacts.{name}` to "
-                    "the system, or the load [N] of the contact as `load=`."
+                    "the system, or the load [N] of the contact as `load=`. If other "
+                    "holonomic constraints come after those of the contacts, pass "
+                    "`contacts.followed_by(number)` to the law."
                 )
 
     def __getitem__(self, name: str) -> AbstractContact:

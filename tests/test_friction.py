@@ -847,6 +847,33 @@ def test_friction_in_a_system_with_other_constraints_is_refused(holonomic):
         )
 
 
+def test_friction_of_a_contact_followed_by_a_rod_keeps_the_closed_form():
+    # q = (x, z) of a block of 1 kg that rubs, and x of one of 2 kg that does not.
+    def pose(t, q, args):
+        return jnp.stack([q[0], jnp.zeros_like(q[0]), q[1]]), jnp.eye(3)
+
+    contacts = rolling.Contacts(block=rolling.Blade(pose, no_slip=()))
+
+    def holonomic(t, q, args):
+        return jnp.append(contacts.holonomic(t, q, args), q[2] - q[0] - 1.0)
+
+    law = friction.Coulomb(0.3, smoothing=1e-3)
+    system = nhjax.LagrangianSystem(
+        lambda t, q, v, args: 0.5 * v @ (jnp.array([1.0, 1.0, 2.0]) * v) - G * q[1],
+        holonomic=holonomic,
+        force=friction.Sliding(contacts.followed_by(1), "block", law),
+    )
+    y0 = nhjax.initial_state(
+        system, jnp.array([0.0, 0.0, 1.0]), jnp.array([2.0, 0.0, 2.0])
+    )
+    sol = nhjax.integrate(system, nhjax.LobattoIIIAB(3), y0, dt=0.1, num_steps=10)
+    a = 0.3 * G / 3.0
+    np.testing.assert_allclose(
+        _last(sol).q, [2 - 0.5 * a, 0.0, 3 - 0.5 * a], atol=1e-13
+    )
+    np.testing.assert_allclose(_last(sol).multiplier, [G, -2 * a], rtol=1e-13)
+
+
 @pytest.mark.filterwarnings("ignore:HamiltonianSystem")
 def test_friction_in_a_hamiltonian_system_is_refused():
     contacts = _skate()
