@@ -117,10 +117,17 @@ _BY_NEWTON = (
 _MANY_ITERATIONS = 40
 # Runs with fewer steps than this are over before another program is compiled.
 _FEW_STEPS = 10
-_SLOW = (
-    "The steps of this run took {:.0f} iterations on average. "
-    '`stage_solver=nhjax.SimplifiedNewton(jacobian="full")` takes fewer and often '
-    "allows larger steps. Its first call takes two to three times as long."
+_FULL = (
+    '`stage_solver=nhjax.SimplifiedNewton(jacobian="full")` takes fewer iterations and '
+    "often allows larger steps. Its first call takes two to three times as long."
+)
+_SLOW = "The steps of this run took {:.0f} iterations on average. "
+# With more unsolved attempts in each attempt at a step than this, the equations and not
+# the errors determine the steps.
+_MANY_UNSOLVED = 0.2
+_UNSOLVED = (
+    "In {} of the {} attempts at a step of this run the equations were not solved, and "
+    "a smaller step was taken. "
 )
 _INTERRUPTED = (
     "The run was interrupted after {} steps, and the solution ends there, at t = "
@@ -515,7 +522,7 @@ def _warn_of_iterations(
     y: State,
     args: Args,
 ) -> None:
-    """Warn if steps with the approximate Jacobian converged slowly.
+    """Warn if steps with the approximate Jacobian converged slowly, or did not.
 
     The full Jacobian must be available, and y is the start of the run.
     """
@@ -523,11 +530,16 @@ def _warn_of_iterations(
     if steps < _FEW_STEPS or is_unsolved(sol):
         return
     number = int(sol.stats["num_iterations"]) / steps
-    if number <= _MANY_ITERATIONS:
+    unsolved = int(sol.stats.get("num_unsolved_steps", 0))
+    if unsolved > max(_FEW_STEPS, _MANY_UNSOLVED * steps):
+        message = _UNSOLVED.format(unsolved, steps) + _FULL
+    elif number > _MANY_ITERATIONS:
+        message = _SLOW.format(number) + _FULL
+    else:
         return
     u = system.fibre_coordinate(y)
     if has_force_slopes(system, t, y.q, u, y.multiplier, args):
-        warnings.warn(_SLOW.format(number), stacklevel=3)
+        warnings.warn(message, stacklevel=3)
 
 
 def _require_constraints(

@@ -58,6 +58,8 @@ class Solution(eqx.Module):
         iteration failed, and which Newton's method solved),
         `num_rejected_steps` (only in a run whose steps differ: the number of attempts
         at a step that were repeated with another size),
+        `num_unsolved_steps` (beside it: the number of these attempts whose equations
+        were not solved),
         `max_error_over_tolerance` (only with `PIDController`: the largest estimated
         error of an accepted step, in units of its tolerance),
         `num_redundant` (the number of redundant constraints at the start; if there are

@@ -262,7 +262,9 @@ class VariableStepper(AbstractStepper[VariableCarry, StepLogEntry]):
         for name in ("failed_step", "worst_coordinate"):
             stats[name] = jnp.where(failed, stats[name], carry.stats[name])
         rejected = alive & ~accepted & ~failed
-        stats |= statistics_of_attempt(carry.stats, decision, rejected, accepted)
+        stats |= statistics_of_attempt(
+            carry.stats, decision, solved, rejected, accepted
+        )
         size = jnp.where(alive, decision.size, clock.size)
         end = two_sum(step.t, step.h + clock.compensation)
         clock = sizes.after(
@@ -350,7 +352,8 @@ def started(
     result = RESULTS.where(bad, sized, carry.result)
     none = jnp.zeros_like(carry.stats["num_steps"])
     failed = jnp.where(bad, none, carry.stats["failed_step"])
-    more = {"failed_step": failed, "num_rejected_steps": none}
+    more = {"failed_step": failed}
+    more |= dict.fromkeys(("num_rejected_steps", "num_unsolved_steps"), none)
     if controller.estimates_errors:
         zero = jnp.zeros_like(carry.stats["max_residual"])
         more["max_error_over_tolerance"] = zero
@@ -358,11 +361,20 @@ def started(
 
 
 def statistics_of_attempt(
-    stats: Statistics, decision: Decision, rejected: BoolScalar, accepted: BoolScalar
+    stats: Statistics,
+    decision: Decision,
+    is_solved: BoolScalar,
+    rejected: BoolScalar,
+    accepted: BoolScalar,
 ) -> Statistics:
     """Return those statistics after an attempt that only controllers cause."""
-    number = stats["num_rejected_steps"] + rejected.astype(jnp.int32)
-    more: Statistics = {"num_rejected_steps": number}
+    more: Statistics = {}
+    counted = {
+        "num_rejected_steps": rejected,
+        "num_unsolved_steps": rejected & ~is_solved,
+    }
+    for name, happened in counted.items():
+        more[name] = stats[name] + happened.astype(jnp.int32)
     name = "max_error_over_tolerance"
     if decision.error is not None:
         error = jnp.where(accepted, decision.error, 0)

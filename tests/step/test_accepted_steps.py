@@ -211,6 +211,37 @@ def test_plain_call_with_many_iterations_a_step_names_the_full_jacobian(
     )
 
 
+@pytest.mark.parametrize("jacobian", [None, "full"])
+def test_plain_call_with_a_tolerance_and_unsolved_steps_names_the_full_jacobian(
+    jacobian,
+):
+    system = nhjax.LagrangianSystem(lambda t, q, v, args: 0.5 * v @ v - 0.5 * q @ q)
+    y0 = nhjax.initial_state(system, jnp.array([1.0, 0.0]), jnp.array([0.0, 1.0]))
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        sol = nhjax.integrate(
+            system,
+            nhjax.LobattoIIIAB(4),
+            y0,
+            t1=100.0,
+            max_steps=200,
+            stepsize_controller=nhjax.PIDController(rtol=1e3, atol=1e3),
+            stage_solver=nhjax.SimplifiedNewton(jacobian=jacobian),
+        )
+    rejected, unsolved = (
+        int(sol.stats[f"num_{name}_steps"]) for name in ("rejected", "unsolved")
+    )
+    told = [str(x.message) for x in caught if "were not solved, and" in str(x.message)]
+    assert 0 <= unsolved <= rejected
+    if jacobian == "full":
+        assert unsolved == len(told) == 0
+    else:
+        tried = rejected + int(sol.stats["num_steps"])
+        assert unsolved > 0.2 * tried
+        assert told[0].startswith(f"In {unsolved} of the {tried} attempts")
+        assert 'SimplifiedNewton(jacobian="full")`' in told[0]
+
+
 def test_plain_call_without_slopes_of_forces_fails_without_advice_of_newton():
     with pytest.raises(nhjax.IntegrationError, match="smaller `dt`") as failure:
         stiff_spring(lambda t, q, v, args: drag_without_forward_derivative(v))

@@ -626,7 +626,8 @@ def _statistics_after(
     if attempt.decision is not None:
         is_repeated = attempt.decision.result == RESULTS.successful
         rejected = attempt.is_rejected & is_repeated
-        given = carry.stats, attempt.decision, rejected
+        is_solved = outcome.result == RESULTS.successful
+        given = carry.stats, attempt.decision, is_solved, rejected
         stats |= statistics_of_attempt(*given, kept & (attempt.step.fired < 0))
     stats |= {"num_steps": after.node, "num_events": after.num_events}
     return jax.lax.stop_gradient(stats)
