@@ -507,8 +507,6 @@ CALLS = frozenset(
     custom_vjp_call_jaxpr eval_jaxpr jit kept_call cpu_kernel pjit remat remat2
     """.split()  # noqa: SIM905
 )
-# The primitive that has a method of Python which returns its program.
-EXPANDED = "call_hi_primitive"
 _PROGRAM_KEYS = ("jaxpr", "call_jaxpr", "program", "fun_jaxpr")
 
 

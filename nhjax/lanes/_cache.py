@@ -28,7 +28,7 @@ import jax.core
 import jax.extend
 import numpy as np
 
-from ._builder import called_program, CALLS, EXPANDED, sizes_of_scan
+from ._builder import called_program, CALLS, sizes_of_scan
 from ._native import host, version
 
 
@@ -241,9 +241,6 @@ class _Encoder:
     def _parameters(self, equation: Any) -> Any:
         """Encode the parameters that the code of an equation depends on."""
         name, params = equation.primitive.name, equation.params
-        if name == EXPANDED:
-            # The program depends on code of another library.
-            raise _Unknown
         if name in CALLS:
             # The other parameters are rules for derivatives, and hints for XLA.
             return self.value(called_program(equation))

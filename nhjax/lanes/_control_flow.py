@@ -17,7 +17,6 @@ from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any, TypeAlias
 
-import jax
 import numpy as np
 from jax.extend.core import Literal
 
@@ -26,7 +25,6 @@ from ._builder import (
     Builder,
     called_program,
     CALLS,
-    EXPANDED,
     flat_indices,
     hold,
     InMemory,
@@ -226,19 +224,6 @@ def _taken(nodes: Any, aval: Any) -> np.ndarray:
     return out.reshape(aval.shape)
 
 
-def _expanded(
-    builder: Builder, equation: Any, values: list[ArrayValue]
-) -> list[ArrayValue]:
-    """Run the program of an operation that JAX expands when it compiles."""
-    expand = partial(equation.primitive.to_lojax, **equation.params)
-    avals = [variable.aval for variable in equation.invars]
-    args = [
-        jax.ShapeDtypeStruct(a.shape, a.dtype, weak_type=a.weak_type) for a in avals
-    ]
-    program = jax.make_jaxpr(expand)(*args)
-    return builder.run(program.jaxpr, program.consts, values)
-
-
 def _loop_start(
     builder: Builder, equation: Any, values: list[ArrayValue]
 ) -> list[ArrayValue]:
@@ -257,7 +242,6 @@ BRANCHES: dict[str, Operation] = {
     KEPT_CALL: _function_call,
     "jit": _jit,
     "pjit": _jit,
-    EXPANDED: _expanded,
     "cond": _cond,
     "custom_linear_solve": _linear_solve,
     "loop_start": _loop_start,

@@ -22,6 +22,8 @@ from jax.extend.core.primitives import closed_call_p
 MOST_ROWS = 32
 # More matrices at once would make the written-out program long.
 _MOST_MEMBERS = 16
+# Operations with this name have a method that JAX calls when it compiles them.
+_EXPANDED_BY_JAX = "call_hi_primitive"
 
 
 def expanded(program: Any, known: Container[str]) -> Any:
@@ -83,6 +85,8 @@ class _Expander:
             applies, function = _EXPANSIONS[primitive.name]
             if applies(equation):
                 return _traced(partial(function, **params), equation)
+        if primitive.name == _EXPANDED_BY_JAX:
+            return _traced(partial(primitive.to_lojax, **params), equation)
         if primitive.name in self._stays or not is_foreign(primitive):
             return None
         program = _traced(partial(primitive.impl, **params), equation)

@@ -81,6 +81,23 @@ def _solved(x):
     return lax.custom_linear_solve(lambda y: y * 4, x, lambda _, b: b / 4)
 
 
+def _root(x):
+    """Solve y + tanh y = x; since JAX 0.12 this is expanded when it is compiled."""
+
+    def residual(y):
+        return y + jnp.tanh(y) - x
+
+    def newton(residual, y):
+        for _ in range(3):
+            value, slope = jax.jvp(residual, (y,), (jnp.ones_like(y),))
+            y = y - value / slope
+        return y
+
+    return lax.custom_root(
+        residual, x, newton, lambda linear, b: b / linear(jnp.ones_like(b))
+    )
+
+
 _polynomial = getattr(lax, "polynomial", lambda x, c: (x * c[2] + c[1]) * x + c[0])
 
 # The functions that are called so in `lax`, with the dtypes that they take.
@@ -234,6 +251,7 @@ _CASES = {
         ),
     ],
     "custom_linear_solve": _unary(_solved),
+    "custom_root": _unary(_root),
     "cpu_kernel": _unary(_kernel),
     "batched_call": _unary(
         lambda x: jax.vmap(_kernel)(jnp.outer(x, jnp.arange(1.0, 4.0, dtype=x.dtype)))
@@ -263,9 +281,9 @@ _CASES = {
 }
 # Those that are not rounded correctly, by XLA least of all.
 _INEXACT = """
-    acos acosh asin asinh atan atan2 atanh cbrt cos cosh erf exp exp2 expm1 log log1p
-    log2 logistic one_minus_square polynomial pow rsqrt sin sinh tan tanh reduce_sum
-    reduce_prod add_any scan stop_gradient small_product
+    acos acosh asin asinh atan atan2 atanh cbrt cos cosh custom_root erf exp exp2 expm1
+    log log1p log2 logistic one_minus_square polynomial pow rsqrt sin sinh tan tanh
+    reduce_sum reduce_prod add_any scan stop_gradient small_product
 """.split()  # noqa: SIM905
 
 
