@@ -172,11 +172,6 @@ def require(tree: T, *checks: Check) -> T:
     The returned tree must be used afterwards: `jax.jit` drops checks whose result is
     not used.
     """
-    # The message needs only values, so that their derivatives are dropped.
-    checks = tuple(
-        Check(check.ok, check.error, _without_tangents(check.values))
-        for check in checks
-    )
     later = _undecided(checks)
     if not later:
         return tree
@@ -205,12 +200,6 @@ def _undecided(checks: tuple[Check, ...]) -> list[Check]:
         elif not check.ok:
             raise check.error(*on_host(check.values))
     return [check for check in later if is_traced(check.ok) or not check.ok]
-
-
-def _without_tangents(values: PyTree[Any]) -> PyTree[Any]:
-    return jax.tree.map(
-        lambda x: jax.lax.stop_gradient(x) if is_traced(x) else x, values
-    )
 
 
 def on_host(values: T) -> T:
@@ -262,16 +251,17 @@ def raise_where(
     place = {id(x): i for i, x in enumerate(arrays)}
     places = [place.get(id(leaf)) for leaf in leaves]
 
-    def on_host(bad, *arrays):
+    def on_host(bad, *bits):
+        found = [np.asarray(x).view(y.dtype) for x, y in zip(bits, arrays, strict=True)]
         known = [
-            leaf if place is None else np.asarray(arrays[place])
+            leaf if place is None else found[place]
             for leaf, place in zip(rest, places, strict=True)
         ]
         exception = error(np.asarray(bad), treedef.unflatten(known))
         raise exception.with_traceback(_short_traceback())
 
     rest = [None if eqx.is_array(leaf) else leaf for leaf in leaves]
-    passed = _passes(on_host)(bad, *arrays)
+    passed = _one_result_of_batch(on_host)(bad, *map(_bits, arrays))
     # Every part of the tree must depend on the check, so that `jax.jit` keeps the
     # check.
     dynamic, static = eqx.partition(tree, eqx.is_array)
@@ -279,32 +269,23 @@ def raise_where(
     return eqx.combine(dynamic, static)
 
 
-def _passes(on_host: Callable[..., Any]) -> Callable[..., Bool[Array, ""]]:
-    """Create a function of (bad, *arrays) that returns True, or raises if `bad`.
+def _bits(x: Array) -> Array:
+    """Return the bits of real numbers as integers, which have no derivatives.
 
-    The exception is raised by `on_host(bad, *arrays)`, called on the host.
+    JAX cannot differentiate a call-back. A rule that says that its derivatives vanish
+    would not be enough: JAX writes it out in loops that it differentiates twice.
     """
-
-    @jax.custom_jvp
-    def passes(bad, *arrays):
-        return _one_result_of_batch(on_host)(bad, *arrays)
-
-    @passes.defjvp
-    def _(primals, tangents):
-        # JAX cannot differentiate a call-back.
-        del tangents
-        passed = passes(*primals)
-        zero: Any = np.zeros(passed.shape, jax.dtypes.float0)
-        return passed, zero
-
-    return passes
+    if not jnp.issubdtype(x.dtype, jnp.floating):
+        return x
+    return jax.lax.bitcast_convert_type(x, f"uint{8 * x.dtype.itemsize}")
 
 
 def _one_result_of_batch(on_host: Callable[..., Any]) -> Callable[..., Bool[Array, ""]]:
-    """Wrap the function of `_passes`, so that a batch has one common result.
+    """Create a function of (bad, *arrays) that returns True, or raises if `bad`.
 
-    If each member had its own result, `vmap` would call the host even if all members
-    are good.
+    The exception is raised by `on_host(bad, *arrays)`, called on the host. A batch has
+    one common result: if each member had its own result, `vmap` would call the host
+    even if all members are good.
     """
 
     @custom_vmap

@@ -932,3 +932,32 @@ def test_multipliers_of_a_block_in_a_slot_are_found_where_newton_cycles():
     np.testing.assert_allclose(one + two, 10.0, rtol=1e-12)
     turning = 0.1 - b * mu * (abs(one) - abs(two)) + a * (one - two)
     np.testing.assert_allclose(turning, 0.0, atol=1e-12)
+
+
+@pytest.mark.parametrize("takes_multipliers", [False, True])
+def test_force_with_args_that_are_not_arrays_receives_them_as_given(takes_multipliers):
+    def drag(t, q, v, args):
+        return -args["mu"] * args["law"](v) * (args["name"] == "steel")
+
+    def drag_by_load(t, q, v, multipliers, args):
+        return drag(t, q, v, args) * multipliers[0]
+
+    def holonomic(t, q, args):
+        return q[1] if args["is_flat"] and len(range(args["n"])) == 2 else q[0]
+
+    system = nhjax.LagrangianSystem(
+        lambda t, q, v, args: 0.5 * v @ v - q[1],
+        holonomic=holonomic,
+        force=drag_by_load if takes_multipliers else drag,
+    )
+    args = {"mu": 0.1, "name": "steel", "law": jnp.tanh, "is_flat": True, "n": 2}
+    y0 = nhjax.initial_state(system, jnp.zeros(2), jnp.array([1.0, 0.0]), args=args)
+    np.testing.assert_allclose(y0.multiplier, [1.0], rtol=1e-15)
+    moving = nhjax.motion(system, 0.0, y0, args)
+    np.testing.assert_allclose(
+        moving.acceleration, [-0.1 * np.tanh(1.0), 0.0], rtol=1e-14, atol=1e-15
+    )
+    sol = nhjax.integrate(
+        system, nhjax.LobattoIIIAB(3), y0, dt=0.1, num_steps=2, args=args
+    )
+    assert float(_last(sol).v[0]) < 1.0

@@ -712,7 +712,8 @@ def with_kept_functions(
     """
     multiplier = None
     if system.force_takes_multipliers:
-        shape = jax.eval_shape(system.constraint, t, q, u, args).shape
+        # This is a closure, because `args` may contain objects that are not arrays.
+        shape = jax.eval_shape(lambda: system.constraint(t, q, u, args)).shape
         multiplier = jnp.zeros(shape, u.dtype)
     functions = system.functions(t, q, u, multiplier, args)
     return eqx.tree_at(

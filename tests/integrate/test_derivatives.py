@@ -218,3 +218,30 @@ def test_gradient_in_single_precision_is_accurate():
     double = jax.jit(jax.grad(loss), static_argnums=1)(0.05, jnp.float64)
     assert single.dtype == jnp.float32
     np.testing.assert_allclose(single, double, rtol=1e-4)
+
+
+# Loops of runs ------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("loop", ["scan", "fori_loop"])
+def test_second_derivative_by_step_size_in_a_loop_of_runs_equals_two_forward_ones(loop):
+    particle = systems.NonholonomicParticle()
+    y0 = particle.initial_state()
+
+    def after(h):
+        def run(y):
+            sol = nhjax.integrate(
+                particle.system, LobattoIIIAB(2), y, dt=h, num_steps=2
+            )
+            return jax.tree.map(lambda x: x[-1], sol.ys)
+
+        if loop == "scan":
+            y, _ = jax.lax.scan(lambda y, _: (run(y), None), y0, None, length=2)
+        else:
+            y = jax.lax.fori_loop(0, 2, lambda _, y: run(y), y0)
+        return jnp.sum(y.q**2)
+
+    # The checks of a run raise by a call-back, which has no derivative.
+    found = jax.hessian(after)(0.1)
+    np.testing.assert_allclose(found, jax.jacfwd(jax.jacfwd(after))(0.1), rtol=1e-12)
+    assert abs(found) > 1e-3
