@@ -140,7 +140,8 @@ def check_system(
     from derivatives at three states near the given one.
 
     **Raises:** the errors of `initial_state` for wrong types and shapes of arguments
-    and of values that the system's functions return; `ValueError` if a Lagrangian
+    and of values that the system's functions return, also if they are not finite;
+    `ValueError` if a Lagrangian
     system is given `p`, or a Hamiltonian system is given `v`; `TypeError` under `jit`,
     `vmap` or `grad`.
 
@@ -169,6 +170,9 @@ def check_system(
         require(x, finite(name, x))
     check_functions(system, t, q, args)
     found = jax.tree.map(np.asarray, _measurements(system, t, q, u, args))
+    for name, value in found["values"].items():
+        called = f"{name}({', '.join(system.signatures()[name])})"
+        require(value, finite(called, np.squeeze(value)))
     count, k = found["constraints"].size, found["position_constraints"].size
     m = count - k
     letters = [f"Φ[{i}]" for i in range(m)] + [f"Γ[{i}]" for i in range(k)]
@@ -291,7 +295,14 @@ def _derivatives(system, t, q, u, args, near) -> dict[str, Any]:
     vanishes = jnp.max(jnp.abs(rows), axis=1) <= zero
     rows = jnp.where(vanishes[:, None], 0, rows)
     mass, rows = convert_to_velocities(system, hessian(t, jnp.zeros_like(u), u), rows)
+    # The report shows the values of constraints.
+    values = {
+        name: function(t, jnp.zeros_like(u), u)
+        for name, function in functions.items()
+        if name in (system.generator, "force")
+    }
     return {
+        "values": values,
         "constraints": system.constraint(t, q, u, args),
         "position_constraints": system.position_constraint(t, q, args),
         "mass": mass,

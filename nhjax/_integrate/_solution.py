@@ -124,7 +124,8 @@ class Solution(eqx.Module):
 
         **Arguments:**
 
-        - `t`: a time between `t0` and `t1`; for many, use `jax.vmap(sol.evaluate)`.
+        - `t`: a time between `t0` and `t1`; for many, use `jax.vmap(sol.evaluate)`. To
+            compile it, use `eqx.filter_jit(sol.evaluate)`.
 
         **Returns:** a `State`.
 

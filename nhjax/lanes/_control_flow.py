@@ -468,6 +468,8 @@ def _over_rows(
         else:
             buffer = memory.new(dtype_name(aval.dtype), size)
             saved.append(InMemory(buffer, aval.shape))
+    if length == 0:
+        return [*carry, *saved]
 
     def predicate(values: list[ArrayValue]) -> Node:
         return graph.op("lt", builder.index(values[0]), builder.integer(length))

@@ -276,7 +276,8 @@ def _eigh(a: Any, *, lower: bool, sort_eigenvalues: bool, **_: Any) -> tuple[Any
         is_stable=True,
         num_keys=1,
     )
-    values = jnp.where(jnp.isfinite(jnp.sum(jnp.abs(a))), values, jnp.nan)
+    is_finite = jnp.isfinite(jnp.sum(jnp.abs(a)))
+    values, vectors = (jnp.where(is_finite, x, jnp.nan) for x in (values, vectors))
     chosen = (place[:, None] == jnp.arange(size)[None]).astype(a.dtype)
     return (chosen @ vectors[:size, :size]).T, values
 

@@ -106,11 +106,13 @@ def vmap(
             return jax.vmap(member, in_axes, out_axes, **axes)(*args, **kwargs)
         # JAX decides whether the members share these results. All results of the
         # operation have members, and are equal where the members share them.
-        jax.eval_shape(
-            lambda: jax.vmap(plain, in_axes, out_axes, **axes)(*args, **kwargs)
-        )
+        theirs = partial(jax.vmap(plain, in_axes, out_axes, **axes), *args, **kwargs)
+        jax.eval_shape(theirs)
         all_axes = jax.tree.map(_first_if_none, out_axes, is_leaf=_is_none)
         out = jax.vmap(member, in_axes, all_axes, **axes)(*args, **kwargs)
+        if any(0 in x.shape for x in jax.tree.leaves(out)):
+            # There may be no member.
+            return theirs()
         return jax.tree.map(_shared, out_axes, out, is_leaf=_is_none)
 
     return mapped

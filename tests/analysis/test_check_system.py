@@ -52,6 +52,22 @@ def test_check_system_reports_functions_that_depend_on_time():
     assert report.ignorable == ()
 
 
+@pytest.mark.parametrize("name", ["lagrangian", "force"])
+def test_check_system_of_a_function_that_is_not_finite_names_it(name):
+    def root(q):
+        return jnp.sqrt(-1 - q[0])
+
+    functions = {
+        "lagrangian": lambda t, q, v, args: 0.5 * v @ v,
+        "force": lambda t, q, v, args: -v,
+    }
+    good = functions[name]
+    functions[name] = lambda t, q, v, args: good(t, q, v, args) + root(q)
+    system = nhjax.LagrangianSystem(**functions)
+    with pytest.raises(nhjax.NonFiniteError, match=rf"`{name}\(t, q, v, args\)` is"):
+        nhjax.check_system(system, jnp.ones(2), jnp.ones(2))
+
+
 def test_check_system_reports_the_condition_of_the_mass_matrix():
     body = HeavyTop()
     assert report_of(body).mass_condition == pytest.approx(1.0)

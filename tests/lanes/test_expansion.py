@@ -116,6 +116,13 @@ def test_eigenvectors_in_lanes_diagonalise_matrix(size, dtype):
         np.testing.assert_allclose(v.T @ v, np.eye(size), atol=100 * eps)
 
 
+@pytest.mark.parametrize("number", [np.nan, np.inf])
+def test_eigenvectors_in_lanes_of_a_matrix_that_is_not_finite_are_nan(number):
+    a = np.array([[2.0, number, 0.0], [number, 3.0, 1.0], [0.0, 1.0, 4.0]])
+    for found in lanes_run.run_batched(jnp.linalg.eigh, 4, a[None]):
+        assert np.all(np.isnan(found))
+
+
 def test_eigenvalues_and_pseudoinverse_in_lanes_equal_jax():
     a = _matrices(3, 6, 6)
     a = a + a.transpose(0, 1, 3, 2)

@@ -104,6 +104,24 @@ def test_lanes_vmap_of_booleans_equals_jax_vmap():
     assert_equals_vmap(lambda p, x: (~p, jnp.where(p, x, -x)), X > 1, X)
 
 
+@pytest.mark.parametrize("shape", [(0, 3), (2, 0), (0, 0)])
+def test_nested_lanes_vmap_without_members_equals_jax_vmap(shape):
+    def table(transform):
+        return transform(transform(lambda x: 2 * x))
+
+    x = jnp.ones(shape)
+    assert_same(table(lanes.vmap)(x), table(jax.vmap)(x))
+    assert_same(lanes.jit(table(lanes.vmap))(x), table(jax.vmap)(x))
+
+
+def test_lanes_vmap_with_shared_result_and_no_members_equals_jax_vmap():
+    def mapped(transform):
+        return transform(lambda x, y: (x, 2 * y), (0, None), (0, None))
+
+    given = jnp.ones((0, 5)), X
+    assert_same(mapped(lanes.vmap)(*given), mapped(jax.vmap)(*given))
+
+
 def test_nested_lanes_vmap_equals_jax_vmap():
     def table(transform):
         inner = transform(lambda x, y: root(x + y)[0], (None, 0))
