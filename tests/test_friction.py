@@ -854,8 +854,11 @@ def test_friction_of_a_contact_followed_by_a_rod_keeps_the_closed_form():
 
     contacts = rolling.Contacts(block=rolling.Blade(pose, no_slip=()))
 
+    heights = contacts.holonomic
+    assert heights is not None
+
     def holonomic(t, q, args):
-        return jnp.append(contacts.holonomic(t, q, args), q[2] - q[0] - 1.0)
+        return jnp.append(heights(t, q, args), q[2] - q[0] - 1.0)
 
     law = friction.Coulomb(0.3, smoothing=1e-3)
     system = nhjax.LagrangianSystem(

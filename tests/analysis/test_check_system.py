@@ -63,7 +63,7 @@ def test_check_system_of_a_function_that_is_not_finite_names_it(name):
     }
     good = functions[name]
     functions[name] = lambda t, q, v, args: good(t, q, v, args) + root(q)
-    system = nhjax.LagrangianSystem(**functions)
+    system = nhjax.LagrangianSystem(functions["lagrangian"], force=functions["force"])
     with pytest.raises(nhjax.NonFiniteError, match=rf"`{name}\(t, q, v, args\)` is"):
         nhjax.check_system(system, jnp.ones(2), jnp.ones(2))
 
