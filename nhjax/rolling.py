@@ -92,7 +92,7 @@ def _length_in(
 
 
 def _unit(vector: Array) -> Array:
-    return vector / jnp.sqrt(vector @ vector)
+    return vector * jax.lax.rsqrt(vector @ vector)
 
 
 class Touch(NamedTuple):
