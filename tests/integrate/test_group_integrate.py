@@ -11,7 +11,7 @@ import pytest
 import nhjax
 from nhjax import SaveAt, systems
 from support.helpers import SideBySide
-from support.long import long
+from support.long import exhaustive, long
 from support.own_groups import Heisenberg, HeisenbergBySecondKind
 
 
@@ -109,7 +109,7 @@ def test_group_step_back_with_chart_at_its_start_is_not_reversible():
 
 @pytest.mark.parametrize(
     ("retraction", "stages"),
-    [(nhjax.Cayley(), 2), long(nhjax.Exponential(), 3), long(nhjax.Cayley(), 4)],
+    [(nhjax.Cayley(), 2), long(nhjax.Exponential(), 3), exhaustive(nhjax.Cayley(), 4)],
     ids=str,
 )
 def test_group_step_back_with_chart_in_its_middle_is_reversible(retraction, stages):

@@ -14,7 +14,7 @@ from nhjax._step import first_step_state
 from nhjax._step._jacobian import factorise_stage_jacobian, simplified_newton_update
 from nhjax._step._step import equations_of_step, starting_values, StepArguments
 from support.forms import in_space
-from support.long import long
+from support.long import exhaustive, long
 
 
 def contraction(example, method, h):
@@ -57,7 +57,7 @@ def contraction(example, method, h):
         (systems.ChaplyginSleigh(), "middle"),
         (systems.Unicycle(), "start"),
         long(systems.Suslov(), "middle"),
-        long(systems.HeavyTopSE3(), "middle"),
+        exhaustive(systems.HeavyTopSE3(), "middle"),
     ],
     ids=lambda x: x if isinstance(x, str) else type(x).__name__,
 )

@@ -18,7 +18,7 @@ from nhjax._step._step import (
     StepArguments,
 )
 from support.group_problems import RETRACTIONS
-from support.long import long
+from support.long import exhaustive, long
 
 
 # A body in the plane, and a wheel on its axle.
@@ -80,7 +80,7 @@ def body(form, retraction):
     ("form", "retraction", "chart"),
     [
         ("lagrangian", "exponential", "start"),
-        long("lagrangian", "cayley", "middle"),
+        exhaustive("lagrangian", "cayley", "middle"),
         long("hamiltonian", "exponential", "start"),
         long("hamiltonian", "cayley", "middle"),
     ],

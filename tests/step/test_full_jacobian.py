@@ -12,7 +12,7 @@ from nhjax._step import first_step_state
 from nhjax._step._jacobian import factorise_stage_jacobian, simplified_newton_update
 from nhjax._step._step import equations_of_step, starting_values, StepArguments
 from support.forms import in_space
-from support.long import long
+from support.long import exhaustive, long
 
 
 FULL = nhjax.SimplifiedNewton(jacobian="full", fallback=False)
@@ -50,7 +50,7 @@ def slope_at_solution(system, y0, method, h):
         (systems.NonholonomicParticle(), nhjax.LobattoIIIAB(3)),
         (systems.RodSleigh(), nhjax.LobattoIIIAB(2, "consistent")),
         long(systems.Suslov(), nhjax.LobattoIIIAB(2, "propagated", chart="start")),
-        long(systems.BallInBowl(), nhjax.LobattoIIIAB(2)),
+        exhaustive(systems.BallInBowl(), nhjax.LobattoIIIAB(2)),
         long(systems.HeavyTop(), nhjax.Gauss(2)),
     ],
     ids=lambda x: type(x).__name__,

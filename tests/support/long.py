@@ -15,6 +15,11 @@ def long(*case: Any, id: str | None = None) -> Any:
     return pytest.param(*case, id=id, marks=pytest.mark.long)
 
 
+def exhaustive(*case: Any) -> Any:
+    """A case of a test whose other cases take the same ways through the library."""
+    return pytest.param(*case, marks=pytest.mark.exhaustive)
+
+
 def exhaustive_but(short: Iterable[Any], cases: Iterable[Any]) -> list[Any]:
     """The cases, of which all but the short ones are exhaustive.
 
@@ -24,10 +29,10 @@ def exhaustive_but(short: Iterable[Any], cases: Iterable[Any]) -> list[Any]:
     cases, short = list(cases), list(short)
     missing = [case for case in short if case not in cases]
     assert not missing, f"no such cases: {missing}"
-    return [case if case in short else _exhaustive(case) for case in cases]
-
-
-def _exhaustive(case: Any) -> Any:
     # A named tuple is one argument, a plain one holds several.
-    values = case if type(case) is tuple else (case,)
-    return pytest.param(*values, marks=pytest.mark.exhaustive)
+    return [
+        case
+        if case in short
+        else exhaustive(*(case if type(case) is tuple else (case,)))
+        for case in cases
+    ]
