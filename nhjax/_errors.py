@@ -250,9 +250,11 @@ def raise_where(
     arrays = list({id(x): x for x in leaves if eqx.is_array(x)}.values())
     place = {id(x): i for i, x in enumerate(arrays)}
     places = [place.get(id(leaf)) for leaf in leaves]
+    # The call-back outlives the trace, and must not hold its arrays.
+    dtypes = [x.dtype for x in arrays]
 
     def on_host(bad, *bits):
-        found = [np.asarray(x).view(y.dtype) for x, y in zip(bits, arrays, strict=True)]
+        found = [np.asarray(x).view(d) for x, d in zip(bits, dtypes, strict=True)]
         known = [
             leaf if place is None else found[place]
             for leaf, place in zip(rest, places, strict=True)

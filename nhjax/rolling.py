@@ -884,9 +884,9 @@ class Contacts(eqx.Module):
                 raise ValueError(
                     f"`force` needs the normal force of one of its contacts, but the "
                     f"system has other constraints: pass `{name}=contacts.{name}` to "
-                    "the system, or the load [N] of the contact as `load=`. If other "
-                    "holonomic constraints come after those of the contacts, pass "
-                    "`contacts.followed_by(number)` to the law."
+                    "the system, or the load [N] of the contact as `load=`. If the "
+                    "system has more holonomic constraints than its contacts, put them "
+                    "last and pass `contacts.followed_by(number)` to the law."
                 )
 
     def __getitem__(self, name: str) -> AbstractContact:

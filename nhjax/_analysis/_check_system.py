@@ -141,9 +141,8 @@ def check_system(
 
     **Raises:** the errors of `initial_state` for wrong types and shapes of arguments
     and of values that the system's functions return, also if they are not finite;
-    `ValueError` if a Lagrangian
-    system is given `p`, or a Hamiltonian system is given `v`; `TypeError` under `jit`,
-    `vmap` or `grad`.
+    `ValueError` if a Lagrangian system is given `p`, or a Hamiltonian system is given
+    `v`; `TypeError` under `jit`, `vmap` or `grad`.
 
     !!! example
 
@@ -171,8 +170,7 @@ def check_system(
     check_functions(system, t, q, args)
     found = jax.tree.map(np.asarray, _measurements(system, t, q, u, args))
     for name, value in found["values"].items():
-        called = f"{name}({', '.join(system.signatures()[name])})"
-        require(value, finite(called, np.squeeze(value)))
+        require(value, finite(system.named(name).called, np.squeeze(value)))
     count, k = found["constraints"].size, found["position_constraints"].size
     m = count - k
     letters = [f"Φ[{i}]" for i in range(m)] + [f"Γ[{i}]" for i in range(k)]

@@ -122,8 +122,8 @@ _FULL = (
     "often allows larger steps. Its first call takes two to three times as long."
 )
 _SLOW = "The steps of this run took {:.0f} iterations on average. "
-# With more unsolved attempts in each attempt at a step than this, the equations and not
-# the errors determine the steps.
+# If a larger part of the attempts than this is not solved, the equations and not the
+# errors determine the steps.
 _MANY_UNSOLVED = 0.2
 _UNSOLVED = (
     "In {} of the {} attempts at a step of this run the equations were not solved, and "
