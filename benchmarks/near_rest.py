@@ -92,7 +92,7 @@ def first_arguments(system, method, y0, h) -> StepArguments:
     """Make the arguments of the first step of a run, as `integrate` does."""
     zero = jnp.zeros_like(h)
     first = first_step_state(system, method, zero, y0, None)
-    given = zero, y0.q, system.fibre_coordinate(y0), y0.multiplier, None
+    given = zero, y0.q, system.fibre_coordinate(y0), y0.multiplier, None, h
     noise = function_noise(system, *given)
     round_off = round_off_of_steps(method, first.lin, noise)
     return StepArguments(system, zero, h, first, None, round_off=round_off)

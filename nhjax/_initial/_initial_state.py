@@ -297,7 +297,7 @@ def _noise(
     random = np.random.default_rng(0)
     sizes = random.uniform(0.5, 1.5, u.shape) * random.choice([-1.0, 1.0], u.shape)
     direction = jnp.asarray(sizes, u.dtype)
-    given = system, t, q, u, lin.multiplier, args, direction
+    given = system, t, q, u, lin.multiplier, args, 1.0, direction
     noise = as_cpu_kernel(function_noise, *given, is_brief=True)
     assert noise.slopes is not None
     jacobian = lin.dense[0]

@@ -45,6 +45,7 @@ def kept_invariants(
     invariants: str | Callable[..., Any] | None,
     system: AbstractMechanicalSystem,
     t: FloatScalar,
+    dt: FloatScalar,
     y: State,
     args: Args,
 ) -> Invariants | None:
@@ -69,20 +70,20 @@ def kept_invariants(
             f"{type(invariants).__name__}."
         )
     value = invariant_values(function, system, t, y.q, u, args)
-    given = function, system, t, y.q, u, args, value
+    given = function, system, t, dt, y.q, u, args, value
     noise, least_part = as_cpu_kernel(_noise_and_least_part, *given, is_brief=True)
     sizes = noise / float(jnp.finfo(value.dtype).eps)
     return Invariants(function, value, sizes, least_part)
 
 
 def _noise_and_least_part(
-    function, system, t, q, u, args, value
+    function, system, t, dt, q, u, args, value
 ) -> tuple[Float[Array, " k"], FloatScalar]:
     function, system, args = stop_gradient((function, system, args))
     noise = noise_near(
         lambda t, q, u: invariant_values(function, system, t, q, u, args),
         system.manifold_of(q),
-        *(t, q, u, value),
+        *(t, q, u, dt, value),
     )
     # If the mass matrix is indefinite at one state, it is indefinite along the whole
     # motion: an eigenvalue that changes its sign makes the matrix singular, which ends

@@ -189,10 +189,10 @@ def _stepper(
 ) -> tuple[AbstractStepper[Any, Any], ClosureConverted]:
     """Return the stepper of a run, and the function `fn` of its output."""
     t0, fn = grid.t0, options.fn
-    dt, num_steps = grid.dt, grid.num_steps
+    dt, num_steps = grid.typical_size, grid.num_steps
     if isinstance(grid, VariableGrid):
         # Its steps have no common size, and are not counted from an origin.
-        dt, num_steps = grid.typical_size, grid.most_steps
+        num_steps = grid.most_steps
         origin = Origin(t0, jnp.zeros((), jnp.int32), jnp.zeros_like(t0))
         state = y0.state if isinstance(y0, Checkpoint) else y0
     else:
@@ -211,7 +211,7 @@ def _stepper(
         origin=origin,
         dt=dt,
         args=args,
-        invariants=kept_invariants(options.invariants, system, t0, state, args),
+        invariants=kept_invariants(options.invariants, system, t0, dt, state, args),
         programs=TraceCache(),
         round_off=None,
         num_steps=num_steps,
@@ -631,7 +631,7 @@ def _noise(
     # batched.
     plain = stepper.plain
     u = plain.system.fibre_coordinate(y0)
-    given = plain.system, plain.time(0), y0.q, u, y0.multiplier, plain.args
+    given = plain.system, plain.time(0), y0.q, u, y0.multiplier, plain.args, plain.dt
     return as_cpu_kernel(function_noise, *given, is_brief=True)
 
 

@@ -170,11 +170,12 @@ def function_noise(
     u: Float[Array, " n"],
     multiplier: Float[Array, " l"],
     args: Args,
+    dt: FloatScalarLike,
     direction: Float[Array, " n"] | None = None,
 ) -> FunctionNoise:
     """Measure the round-off of the functions of a system at (t, q, u).
 
-    The force is measured with a constant multiplier.
+    The force is measured with a constant multiplier; `dt` is that of `noise_near`.
     """
     # This is a closure, because `args` may contain objects that are not arrays.
     positions = jax.eval_shape(lambda: system.position_constraint(t, q, args))
@@ -200,7 +201,7 @@ def function_noise(
 
     slopes = None if direction is None else multiplier
     like = FunctionNoise(u, u, multiplier, positions, slopes)
-    return noise_near(values, system.manifold_of(q), t, q, u, like)
+    return noise_near(values, system.manifold_of(q), t, q, u, dt, like)
 
 
 def noise_near(
@@ -209,18 +210,27 @@ def noise_near(
     t: FloatScalar,
     q: PyTree[Array],
     u: Float[Array, " n"],
+    dt: FloatScalarLike,
     like: PyTree[Array | jax.ShapeDtypeStruct],
 ) -> PyTree[Array]:
     """Measure the round-off of a function of (t, q, u) near a state.
 
-    `like` has the structure, shapes and dtype of its results; see `measured_noise`.
+    The step `dt` resolves the motion. Times are displaced in units of `dt` if this is
+    shorter than the unit of time, because a drive can be fast in this unit. If `dt` is
+    longer, velocities and momenta are displaced in units of 1 / `dt`, because they can
+    be slow. `like` has the structure, shapes and dtype of the results; see
+    `measured_noise`.
     """
-    (t, q, u), n = stop_gradient((t, q, u)), u.shape[0]
+    (t, q, u, dt), n = stop_gradient((t, q, u, dt)), u.shape[0]
+    dt = jnp.abs(dt)
+    short = jnp.minimum(dt, 1).astype(t.dtype)
+    slow = (1 / jnp.maximum(dt, 1)).astype(u.dtype)
     # Angles are reduced to the first turn, because angles of many turns have more
     # round-off.
     q = manifold.wrapped(q, manifold.no_compensation(q))
-    return measured_noise(
-        lambda z: function(t + z[0], manifold.act(q, z[1 : n + 1]), u + z[n + 1 :]),
-        2 * n + 1,
-        like,
-    )
+
+    def displaced(z):
+        dt, xi, du = z[0], z[1 : n + 1], z[n + 1 :]
+        return function(t + short * dt, manifold.act(q, xi), u + slow * du)
+
+    return measured_noise(displaced, 2 * n + 1, like)

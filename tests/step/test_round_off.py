@@ -112,7 +112,8 @@ def test_noise_of_smooth_function_in_units_of_any_size_is_round_off(phase):
     assert jnp.max(jax.vmap(noise)(lengths)) < 1e-15
 
 
-def test_run_with_time_in_units_of_a_million_seconds_equals_run_in_seconds():
+@pytest.mark.parametrize("unit", [1e-12, 1e6, 1e15])
+def test_run_with_time_in_other_units_equals_run_in_seconds(unit):
     def after(unit):
         """Drive at 10 rad/s, with the time measured in so many seconds."""
         system = nhjax.LagrangianSystem(
@@ -126,7 +127,7 @@ def test_run_with_time_in_units_of_a_million_seconds_equals_run_in_seconds():
         sol = nhjax.integrate(system, method, y0, dt=dt, num_steps=8)
         return sol.ys.v / unit
 
-    np.testing.assert_allclose(after(1e6), after(1.0), rtol=1e-13)
+    np.testing.assert_allclose(after(unit), after(1.0), rtol=1e-13)
 
 
 def test_starts_near_upright_with_round_off_in_a_height_are_accepted():

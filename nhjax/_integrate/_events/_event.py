@@ -287,7 +287,7 @@ def signs_at(
     )
     bound = round_off
     if bound is None:
-        bound = NOISE_DEVIATIONS * noise_near(values_at, manifold, t, y.q, u, rate)
+        bound = NOISE_DEVIATIONS * noise_near(values_at, manifold, t, y.q, u, dt, rate)
     y = with_continuous_multiplier(system, stepper.method, t, y, args)
     values = conditions(t, y, args)
     small = float(jnp.finfo(values.dtype).eps) ** 0.5
