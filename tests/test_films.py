@@ -468,7 +468,9 @@ class Server:
         return slider
 
     def add_checkbox(self, label, initial_value):
-        return types.SimpleNamespace(value=initial_value)
+        box = types.SimpleNamespace(value=initial_value)
+        box.on_update = lambda function: None
+        return box
 
     def __getattr__(self, method):
         if not method.startswith("add_"):
@@ -493,7 +495,7 @@ def test_view_moves_the_bodies_with_the_slider_and_plays():
         show._play.value = False
         time.sleep(0.1)
         show.show(1.0)
-        body = server.shapes["/bodies/1"]
+        body = server.shapes["/scene/bodies/1"]
         np.testing.assert_allclose(body.position, [1.3, 0, 1], atol=1e-9)
         half = np.array([np.cos(0.65), 0, np.sin(0.65), 0])
         np.testing.assert_allclose(body.wxyz, half, atol=1e-9)
@@ -502,6 +504,17 @@ def test_view_moves_the_bodies_with_the_slider_and_plays():
         time.sleep(0.3)
         assert show._slider.value > 0
         assert body.position[0] < 1.3
+        # The machine stays in the middle of the picture while it is followed.
+        show._play.value = False
+        time.sleep(0.1)
+        show.show(1.0)
+        ground = server.shapes["/scene"]
+        moved = show._scene.centres[20] - show._scene.centres[0]
+        assert moved[0] > 1.0
+        np.testing.assert_allclose(ground.position, -moved, atol=1e-12)
+        show._follow.value = False
+        show.show(1.0)
+        np.testing.assert_array_equal(ground.position, 0.0)
     finally:
         show.stop()
     assert server.stopped

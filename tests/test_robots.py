@@ -684,6 +684,14 @@ REFUSED = {
         "actuator 'm': the transmission site",
         "actuators",
     ),
+    "plugin": (
+        _actuator('<plugin name="m" joint="j" plugin="mujoco.pid"/>').replace(
+            "<worldbody>",
+            '<extension><plugin plugin="mujoco.pid"/></extension><worldbody>',
+        ),
+        "actuator 'm': a plugin",
+        "actuators",
+    ),
     "fluid": (_text(before='<option density="1.2"/>'), "forces of a fluid", "fluid"),
     "contacts": (
         _text(geom="").replace(
@@ -722,9 +730,35 @@ def test_unsupported_part_is_refused_by_name_unless_ignored(name):
     assert nhjax.from_mujoco(_compiled(text), ignore=[word]).coordinates
 
 
-def test_part_that_cannot_be_ignored_says_so():
-    with pytest.raises(ValueError, match="cannot be ignored"):
-        nhjax.from_mujoco(_compiled("<mujoco><worldbody/></mujoco>"))
+CLOTH = (
+    '<flexcomp name="cloth" type="grid" count="3 3 1" spacing="0.1 0.1 0.1" '
+    f'radius="0.01" mass="1" rigid="true"><contact {APART}/></flexcomp></worldbody>'
+)
+COMPENSATED = _text('type="hinge" axis="0 1 0" actuatorgravcomp="true"').replace(
+    '<body name="b"', '<body name="b" gravcomp="1"'
+)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("<mujoco><worldbody/></mujoco>", "nothing in the model can move"),
+        (_text(geom=APART).replace("</worldbody>", CLOTH), "flexes .1.: deformable"),
+        (COMPENSATED, "joint 'j': gravity compensation by actuators, without"),
+    ],
+)
+def test_part_that_cannot_be_ignored_says_so(text, message):
+    with pytest.raises(ValueError, match="cannot be ignored") as caught:
+        nhjax.from_mujoco(_compiled(text))
+    assert re.search(message, str(caught.value))
+
+
+def test_gravity_compensation_by_actuators_acts_as_in_mujoco():
+    motor = '<actuator><motor joint="j"/></actuator></mujoco>'
+    text = COMPENSATED.replace("</mujoco>", motor)
+    robot = nhjax.from_mujoco(_compiled(text))
+    found = nhjax.motion(robot.system, 0.0, robot.initial_state(), robot.args)
+    np.testing.assert_allclose(found.acceleration, 0.0, atol=1e-14)
 
 
 WRONG = [

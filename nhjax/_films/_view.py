@@ -10,28 +10,38 @@ import numpy as np
 from .._integrate import Solution
 from .._robots import mujoco_of
 from ._sampling import check_solution, frame_times
-from ._scene import PLAIN, Scene, visible_geoms
+from ._scene import PLAIN, round_length, Scene, visible_geoms
 
 
 class Show:
     """A machine in a browser, which `nhjax.view` returns.
 
     - `url`: the address of the page.
-    - `server`: the `viser.ViserServer`, to add shapes and controls to.
+    - `server`: the `viser.ViserServer`, to add shapes and controls to. Shapes whose
+        names start with `/scene/` stay in place on the ground.
     """
 
     def __init__(self, server: Any, scene: Scene, speed: float):
         self.server, self._scene, self._speed = server, scene, speed
         self.url = f"http://localhost:{server.get_port()}"
         self._stopped, self._lock = threading.Event(), threading.Lock()
+        self._ground = server.scene.add_frame("/scene", show_axes=False)
         self._frames = _add_shapes(server, scene)
         times = scene.times
         low, high = sorted((float(times[0]), float(times[-1])))
-        step = (high - low) / max(1, len(times) - 1) or 1.0
+        # A round step shows round times.
+        self._step = round_length((high - low) / max(1, len(times) - 1) or 1.0)
         self._slider = server.gui.add_slider(
-            "time [s]", min=low, max=max(high, low + step), step=step, initial_value=low
+            "time [s]",
+            min=low,
+            max=max(high, low + self._step),
+            step=self._step,
+            initial_value=low,
         )
         self._play = server.gui.add_checkbox("play", initial_value=len(times) > 1)
+        # The ground moves instead of the camera, which belongs to the user's mouse.
+        self._follow = server.gui.add_checkbox("follow", initial_value=True)
+        self._follow.on_update(lambda _: self.show(self._slider.value))
         self._slider.on_update(lambda _: self.show(self._slider.value))
         self.show(float(times[0]))
         self._thread = threading.Thread(target=self._run, daemon=True)
@@ -48,6 +58,8 @@ class Show:
         # The slider and the playing are in threads of their own.
         with self._lock, self.server.atomic():
             self._scene.place(k)
+            moved = self._scene.centres[k] - self._scene.centres[0]
+            self._ground.position = -moved if self._follow.value else 0 * moved
             for body, handle in self._frames.items():
                 handle.position = data.xpos[body].copy()
                 handle.wxyz = data.xquat[body].copy()
@@ -69,11 +81,15 @@ class Show:
 
     def _run(self) -> None:
         """Move the slider while the machine plays."""
-        slider, pause = self._slider, 1 / 30
+        slider, pause, rest = self._slider, 1 / 30, 0.0
         while not self._stopped.wait(pause):
             if self._play.value:
-                following = slider.value + self._speed * pause
-                slider.value = slider.min if following > slider.max else following
+                following = slider.value + self._speed * pause + rest
+                if following > slider.max:
+                    following = slider.min
+                steps = round((following - slider.min) / self._step)
+                slider.value = float(f"{slider.min + steps * self._step:.9g}")
+                rest = following - slider.value
                 self.show(slider.value)
 
 
@@ -86,6 +102,9 @@ def view(
     block: bool | None = None,
 ) -> Show:
     """Show a run in a browser, with a slider for the time and a switch that plays it.
+
+    The machine stays in the middle of the picture while the ground moves past, unless
+    the switch "follow" is off.
 
     viser prints the address of the page. The function needs neither a window nor
     OpenGL, because the browser draws.
@@ -135,16 +154,22 @@ def _add_shapes(server: Any, scene: Scene) -> dict[int, Any]:
     extent = float(model.stat.extent)
     frames: dict[int, Any] = {}
     for body in range(1, model.nbody):
-        frames[body] = server.scene.add_frame(f"/bodies/{body}", show_axes=False)
+        name = f"/scene/bodies/{body}"
+        frames[body] = server.scene.add_frame(name, show_axes=False)
     for geom in visible_geoms(model):
         body = int(model.geom_bodyid[geom])
-        parent = f"/bodies/{body}" if body else "/world"
-        _add_geom(mujoco, server.scene, model, geom, f"{parent}/{geom}", extent)
+        name = f"/scene/bodies/{body}/{geom}" if body else f"/scene/world/{geom}"
+        if model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_PLANE:
+            _add_ground(server.scene, scene, geom, name)
+        else:
+            _add_geom(mujoco, server.scene, model, geom, name)
     for k, path in enumerate(scene.trails):
         if len(path) > 1:
             server.scene.add_line_segments(
-                f"/trails/{k}",
+                f"/scene/trails/{k}",
                 points=np.stack([path[:-1], path[1:]], axis=1).astype(np.float32),
+                # A trail in the plane of the ground would flicker.
+                position=(0.0, 0.0, 0.004 * extent),
                 colors=(217, 64, 38),
                 thickness=0.006 * extent,
             )
@@ -155,9 +180,29 @@ def _add_shapes(server: Any, scene: Scene) -> dict[int, Any]:
     return frames
 
 
-def _add_geom(
-    mujoco: Any, space: Any, model: Any, geom: int, name: str, extent: float
-) -> None:
+def _add_ground(space: Any, scene: Scene, geom: int, name: str) -> None:
+    """Add a grid that is large enough for the whole path of the machine."""
+    model, extent = scene.model, float(scene.model.stat.extent)
+    position, section = model.geom_pos[geom].copy(), 2.5 * extent
+    width = 40 * extent + 2 * float(np.max(np.ptp(scene.centres, axis=0)))
+    if model.geom_quat[geom][0] == 1:
+        away = np.mean(scene.centres, axis=0) - position
+        position[:2] += section * np.round(away[:2] / section)
+    space.add_grid(
+        name,
+        width=width,
+        height=width,
+        cell_size=section / 5,
+        section_size=section,
+        plane_color=(225, 228, 232),
+        plane_opacity=1.0,
+        shadow_opacity=0.35,
+        position=position,
+        wxyz=model.geom_quat[geom].copy(),
+    )
+
+
+def _add_geom(mujoco: Any, space: Any, model: Any, geom: int, name: str) -> None:
     kinds, size = mujoco.mjtGeom, model.geom_size[geom]
     rgba = model.geom_rgba[geom]
     if model.geom_matid[geom] >= 0 and np.allclose(rgba, PLAIN):
@@ -169,19 +214,6 @@ def _add_geom(
         "wxyz": model.geom_quat[geom].copy(),
     }
     color = tuple(int(255 * x) for x in rgba[:3])
-    if model.geom_type[geom] == kinds.mjGEOM_PLANE:
-        space.add_grid(
-            name,
-            width=40 * extent,
-            height=40 * extent,
-            cell_size=0.5 * extent,
-            section_size=2.5 * extent,
-            plane_color=(225, 228, 232),
-            plane_opacity=1.0,
-            shadow_opacity=0.35,
-            **options,
-        )
-        return
     options |= {"color": color, "opacity": None if rgba[3] == 1 else float(rgba[3])}
     kind = model.geom_type[geom]
     if kind == kinds.mjGEOM_BOX:

@@ -374,6 +374,12 @@ def _joints(model: Any) -> Iterator[Unsupported]:
                 None,
                 f"joint {name!r}: gravity compensation by an actuator with a limit",
             )
+        # MuJoCo then leaves it out for the directions of this joint alone.
+        if model.jnt_actgravcomp[joint] and model.ngravcomp and not model.nu:
+            yield Unsupported(
+                None,
+                f"joint {name!r}: gravity compensation by actuators, without actuators",
+            )
 
 
 def _tendons(model: Any) -> Iterator[Unsupported]:
