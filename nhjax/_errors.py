@@ -274,8 +274,9 @@ def raise_where(
 def _bits(x: Array) -> Array:
     """Return the bits of real numbers as integers, which have no derivatives.
 
-    JAX cannot differentiate a call-back. A rule that says that its derivatives vanish
-    would not be enough: JAX writes it out in loops that it differentiates twice.
+    JAX cannot differentiate a call-back. A custom rule with zero derivatives would not
+    be enough: in a loop that is differentiated twice, JAX replaces the function by its
+    body, and the rule is lost.
     """
     if not jnp.issubdtype(x.dtype, jnp.floating):
         return x

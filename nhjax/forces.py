@@ -143,9 +143,9 @@ class AbstractSummable(AbstractOfSystem):
 class AbstractForce(AbstractSummable):
     """A generalised force F(t, q, v, args), the `force` of a `LagrangianSystem`.
 
-    Add forces, and functions of (t, q, v, args), with `+`. Their parameters are leaves:
-    with the same functions, changing them does not recompile, and derivatives with
-    respect to them are available.
+    Add forces, and functions of (t, q, v, args), with `+`. Parameters that are numbers
+    or arrays are leaves: new values do not recompile, and derivatives with respect to
+    them are available. A new function recompiles.
 
     A `HamiltonianSystem` passes momenta in place of velocities: use `Drag`, `Motor` and
     a `Spring` with a damper in a `LagrangianSystem`.

@@ -2,9 +2,9 @@
 
 The load of a contact is a reaction, so that these forces depend on the multipliers. All
 laws are smooth: near rest the friction is proportional to the velocity, with a slope
-that a velocity u₀ sets. A contact that should rest on a slope therefore creeps. With
-u₀ = 1e-3 m/s it creeps slower than a millimetre each second. Near rest, steps of the
-size u₀ · mass / friction converge fast.
+that a velocity u₀ sets. A contact that should rest on a slope therefore creeps: if it
+needs the fraction r < 1 of the largest friction, its speed is u₀ artanh(r). Near rest,
+steps of the size u₀ · mass / friction converge fast.
 """
 
 import abc

@@ -580,7 +580,7 @@ class _ZarrEncoder:
         }
 
     def chunk(self, name: str, start: int, rows: np.ndarray) -> dict[str, bytes]:
-        """Return the files of the chunk of an array that begins at row `start`."""
+        """Return the files of the chunk of array `name` whose first row is `start`."""
         self._arrays[name][start : start + len(rows)] = rows
         made = [key for key in self._content if not key.endswith("zarr.json")]
         return {key: self._content.pop(key).to_bytes() for key in sorted(made)}

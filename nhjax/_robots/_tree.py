@@ -159,7 +159,7 @@ class Level(NamedTuple):
 
 
 class Tree:
-    """The joints on the paths to some joints, as arrays in the order of their depth.
+    """The joints on the paths from the world to the joints `kept`, ordered by depth.
 
     `node` maps the number of a joint to its place in this order.
     """

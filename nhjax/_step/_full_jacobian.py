@@ -379,7 +379,10 @@ def _base_slopes(
     transported: Float[Array, "s n"],
     force: Float[Array, "s n"],
 ) -> list[Array]:
-    """Differentiate the constant term of Π by ξ, h Σ b_j n_j and h Σ b_j F_j."""
+    """Differentiate the constant term of Π.
+
+    The derivatives are with respect to ξ, to h Σ b_j n_j and to h Σ b_j F_j.
+    """
 
     def base(xi, transported, force):
         chart = path.chart(xi)

@@ -75,7 +75,7 @@ def _function_call(
     if builder.is_written_out or any(isinstance(x, InMemory) for x in values):
         return _call(builder, equation, values)
     numbers = [node for value in values for node in value.reshape(-1)]  # pyright: ignore
-    # A program that is kept is the same object at all places.
+    # The program of a `kept_call` is one object, the same at all of its calls.
     program = equation.params.get("kept", called_program(equation))
     build = partial(_function, builder, equation, values)
     function = builder.functions.of(program, numbers, build)

@@ -755,8 +755,8 @@ class Functions:
     """The functions of a kernel."""
 
     def __init__(self):
-        # For each program, its functions by the constants among the operands; `None`
-        # for those that are written out.
+        # For each program, a dictionary from its constant operands to the function that
+        # is called with them, or to `None` if the program is written out.
         self._found: dict[Any, dict[_Pattern, Function | None]] = {}
         self._by_structure: dict[Hashable, Function] = {}
 

@@ -293,9 +293,9 @@ def _filled(ax: "Axes", color: str, spatial: bool) -> Any:
 
 
 def _ground(ax: "Axes", height: float, reach: float, spatial: bool) -> Any:
-    """Add the ground; return a function that moves it to a centre of the picture.
+    """Add the ground; return a function that redraws it around the picture's centre.
 
-    Its lines stay in place as the picture moves.
+    The grid lines keep their places in space while the picture moves.
     """
     if not spatial:
         ax.axhspan(height - 100 * reach, height, color=grey(0.88), zorder=0)

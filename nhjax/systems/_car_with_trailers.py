@@ -38,9 +38,9 @@ class CarWithTrailers(AbstractNonholonomicExample):
     forces of the ground on the axles, to the left of the wheels.
 
     `args` is None or a pair of the force that drives the car at the rear axle [N] and
-    the torque that steers the front wheels [N m]; without the torque the momentum
-    J (θ̇₀ + δ̇) is conserved, and without both the energy is. The car turns steadily with
-    `turning`.
+    the torque that steers the front wheels [N m]. Without the torque, the momentum
+    J (θ̇₀ + δ̇) is conserved. Without the force and the torque, the energy is conserved
+    too. The car turns steadily with `turning`.
 
     **Parameters:** `num_trailers` n, static; of the car `wheelbase` L, `centre` of mass
     ahead of the rear axle [m], `mass` [kg], `inertia` about the centre and

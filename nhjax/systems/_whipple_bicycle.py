@@ -64,8 +64,8 @@ class WhippleBicycle(AbstractNonholonomicExample):
     your function needs `args`, pass them also to `initial_state(args=...)`.
 
     Nothing stops the handlebar of a bicycle that falls: its velocities grow without
-    bound, until no step size is small enough. End a run by an `Event` while
-    |lean| < 0.8 and |steer| < 1.
+    bound, until no step size is small enough. End the run with an `Event` before |lean|
+    reaches 0.8 or |steer| reaches 1.
 
     **Parameters:** `wheelbase` w, `trail` c [m], `tilt` λ of the steer axis [rad],
     `gravity` g [m/s²]; of the wheels `rear_radius`, `front_radius` [m],
