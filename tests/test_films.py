@@ -21,6 +21,7 @@ from nhjax._films._render import _gl_context, view_of
 from nhjax._films._sampling import configurations, frame_times
 from nhjax._films._scene import round_length, Scene, visible_geoms
 from nhjax._films._view import _capsule, Show
+from nhjax.systems._base import AbstractExample
 from support.pages import blocks, DOCS, page, run_page
 
 
@@ -94,6 +95,23 @@ def test_dense_output_is_evaluated():
     q = configurations("f", sol, frame_times("f", sol, 0.05), None)
     assert q.shape == (9, 1)
     np.testing.assert_allclose(q[3], sol.evaluate(0.15).q)
+
+
+def test_every_system_of_the_gallery_has_looks():
+    kinds = [x for x in vars(systems).values() if isinstance(x, type)]
+    assert {x for x in kinds if issubclass(x, AbstractExample)} == {*_LOOKS}
+
+
+def test_blade_of_transmission_points_along_the_motion_of_the_passenger():
+    example = systems.ContinuouslyVariableTransmission(
+        q0=(0.3, 0.7, -0.2), v0=(1.0, 0.4, -np.sin(0.7))
+    )
+    scene = Scene("f", example, at_rest(example), np.zeros(1), True)
+    scene.place(0)
+    blade = scene.data.body("passenger").xmat.reshape(3, 3)[:, 0]
+    velocity = np.array([1.0, -np.sin(0.7), 0.0])
+    np.testing.assert_allclose(np.cross(blade, velocity), 0, atol=1e-12)
+    np.testing.assert_allclose(scene.data.body("passenger").xpos, [0.3, -0.2, 0])
 
 
 @pytest.mark.parametrize("machine", _LOOKS, ids=lambda kind: kind.__name__)
@@ -293,9 +311,9 @@ DISC, ROLLING = rolling_disc()
         ({"path": "a.png", "t": 7.0}, ValueError, "`t` must be between 0.0 and 2.0"),
         ({"sol": "run"}, TypeError, "`sol` must be a Solution .* got str"),
         (
-            {"machine": systems.ChaoticSystem()},
+            {"machine": systems.ChaoticSystem().system},
             TypeError,
-            "ChaoticSystem, which has no",
+            "LagrangianSystem, which has no",
         ),
         (
             {"machine": None},

@@ -614,6 +614,63 @@ def _particle(machine: Any) -> Looks:
     )
 
 
+def _beads(machine: Any) -> Looks:
+    """Show each coordinate as the place of a bead on a bar of its own along x."""
+    count = int(machine.q0.shape[0])
+    size = 0.5 * (float(jnp.max(jnp.abs(machine.q0))) or 1.0)
+    apart = size * (np.arange(count) - 0.5 * (count - 1))
+
+    def poses(t, q, args):
+        turn = jnp.eye(3, dtype=q.dtype)
+        places = [
+            jnp.stack([x, y, 0 * x])
+            for x, y in zip(q, jnp.asarray(apart, q.dtype), strict=True)
+        ]
+        return {f"bead {i}": (x, turn) for i, x in enumerate(places)}
+
+    bars = [rod((-3 * size, y, 0), (3 * size, y, 0), 0.06 * size) for y in apart]
+    beads = [
+        body(f"bead {i}", ball(0.25 * size, ORANGE if i == 0 else BLUE))
+        for i in range(count)
+    ]
+    return Looks(model(*beads, *bars), poses, ground=None, elevation=-35.0)
+
+
+def _transmission(machine: systems.ContinuouslyVariableTransmission) -> Looks:
+    """Show the driver as a pendulum, which steers the blade below the passenger."""
+    pivot, top, foot = np.array([[0, 1.5, 1.2], [0, 1.7, 1.2], [0, 1.7, 0]])
+
+    def poses(t, q, args):
+        x, y, z = q
+        # The passenger moves along (1, -sin y) in the plane of x and z.
+        heading = -jnp.arctan(jnp.sin(y))
+        return {
+            "driver": (jnp.asarray(pivot, q.dtype), about("y", -y)),
+            "passenger": (jnp.stack([x, z, 0 * x]), about("z", heading)),
+        }
+
+    return Looks(
+        model(
+            body(
+                "driver",
+                rod((0, 0, 0), (0, 0, -1), 0.03),
+                ball(0.14, ORANGE, (0, 0, -1)),
+            ),
+            body(
+                "passenger",
+                box((0.3, 0.02, 0.1), GREY, (0, 0, 0.1)),
+                ball(0.14, BLUE, (0, 0, 0.34)),
+            ),
+            rod(pivot, top, 0.05, DARK),
+            rod(top, foot, 0.05, DARK),
+        ),
+        poses,
+        lambda t, q, args: jnp.stack([q[0], q[2], 0 * q[0]])[None],
+        azimuth=75.0,
+        elevation=-25.0,
+    )
+
+
 def _linkage(
     points: Callable[..., Mapping[str, Array]],
     start: Array,
@@ -827,13 +884,16 @@ _LOOKS: dict[type, Callable[[Any], Looks]] = {
     systems.BallInBowl: _ball_in_bowl,
     systems.CarAxis: _car_axis,
     systems.CarWithTrailers: _car,
+    systems.ChaoticSystem: _beads,
     systems.ChaplyginSleigh: _sleigh,
     systems.ChaplyginSphere: _chaplygin_sphere,
     systems.ChaplyginTop: _chaplygin_top,
+    systems.ContinuouslyVariableTransmission: _transmission,
     systems.DoublePendulum: _double_pendulum,
     systems.FlyballGovernor: _governor,
     systems.FourBar: _four_bar,
     systems.FreeRigidBody: _rigid_body,
+    systems.HarmonicOscillator: _beads,
     systems.HeavyTop: _heavy_top,
     systems.HeavyTopSE3: _heavy_top,
     systems.KnifeEdge: _knife_edge,
