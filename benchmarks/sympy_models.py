@@ -2,13 +2,16 @@
 
 Time of the processor to trace, lower and compile a run with three stages and its
 gradient: of a particle with three coordinates, and of the bicycle of SymPy's tests with
-eight, each with its constraints. The hand-written ones are those of the gallery. Both
-are compiled in turn, and of each the least of several times counts.
+eight, each with its constraints. The hand-written ones are those of the gallery. Each
+is compiled in a process of its own, since later calls find programs of earlier ones.
+The least of several times counts.
 
     python -m benchmarks.sympy_models
 """
 
 import argparse
+import itertools
+import json
 import time
 from typing import Any, NamedTuple
 
@@ -19,7 +22,7 @@ import nhjax
 from nhjax import systems
 
 from . import _sympy_models as sympy_models
-from ._report import markdown_table, write
+from ._report import from_fresh_process, markdown_table, write
 from .compile_time import compiled, program
 
 
@@ -79,10 +82,17 @@ def seconds(system: Any, y0: nhjax.State, kind: str) -> float:
     return sum(parts)
 
 
-def anew(system: Any, y0: nhjax.State, kind: str) -> float:
-    """The seconds of a first call that finds nothing compiled."""
-    jax.clear_caches()
-    return seconds(system, y0, kind)
+PAIRS = {"particle": particles, "bicycle": bicycles}
+FORMS = "by hand", "from SymPy"
+
+
+def measure(name: str, form: str, kind: str) -> None:
+    """Print the seconds of a first call and of the import, in this process."""
+    jax.jit(jnp.sin).lower(0.1).compile()
+    pair = PAIRS[name]()
+    model = pair.by_hand if form == FORMS[0] else pair.imported
+    found = {"size": pair.size, "import": pair.import_seconds}
+    print(json.dumps(found | {"seconds": seconds(*model, kind)}))
 
 
 def main() -> None:
@@ -90,25 +100,32 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--repeats", type=int, default=3)
     parser.add_argument("--kinds", nargs="+", default=["run", "gradient"])
+    parser.add_argument("--case", nargs=3, help=argparse.SUPPRESS)
     options = parser.parse_args()
     jax.config.update("jax_enable_x64", True)
-    jax.jit(jnp.sin).lower(0.1).compile()
+    if options.case is not None:
+        measure(*options.case)
+        return
     rows, data = [], []
-    for name, size, by_hand, imported, importing in (particles(), bicycles()):
-        for kind in options.kinds:
-            times = [
-                [anew(*model, kind) for model in (by_hand, imported)]
-                for _ in range(options.repeats)
+    for name, kind in itertools.product(PAIRS, options.kinds):
+        found = [
+            [
+                from_fresh_process("sympy_models", "--case", name, form, kind)
+                for form in FORMS
             ]
-            least = [min(column) for column in zip(*times, strict=True)]
-            ratio = least[1] / least[0]
-            row = [name, str(size), kind, *(f"{x:.2f}" for x in (*least, ratio))]
-            print(*row, sep="\t", flush=True)
-            rows.append([*row, f"{importing:.2f}"])
-            data.append(
-                {"model": name, "kind": kind, "seconds": times, "import": importing}
-            )
-    header = ["model", "n", "program", "by hand", "from SymPy", "ratio", "import"]
+            for _ in range(options.repeats)
+        ]
+        times = [[one["seconds"] for one in pair] for pair in found]
+        least = [min(column) for column in zip(*times, strict=True)]
+        importing = min(one["import"] for pair in found for one in pair)
+        ratio, size = least[1] / least[0], found[0][0]["size"]
+        row = [name, str(size), kind, *(f"{x:.2f}" for x in (*least, ratio))]
+        print(*row, sep="\t", flush=True)
+        rows.append([*row, f"{importing:.2f}"])
+        data.append(
+            {"model": name, "kind": kind, "seconds": times, "import": importing}
+        )
+    header = ["model", "n", "program", *FORMS, "ratio", "import"]
     text = (
         "Seconds of the processor, the least of each. The ratio is to be at most "
         f"{BOUND}. The last column is what `from_sympy` itself takes, with the "
