@@ -117,7 +117,8 @@ if TYPE_CHECKING:
 
 __version__ = "0.1.0"
 
-# These take a quarter of the time of `import nhjax`: modules, and names in rooms.
+# These are imported at their first use, because they would take a quarter of the time
+# of `import nhjax`: modules (None), and names with the packages that contain them.
 _LOADED_LATER = {
     **dict.fromkeys(("forces", "friction", "plot", "rolling", "systems")),
     **dict.fromkeys(("Looks", "render", "view"), "._films"),

@@ -161,7 +161,7 @@ def _number(text: str) -> float:
     return value / divisor
 
 
-# argparse names the type in its message.
+# argparse shows this name of the type in its error messages.
 _number.__name__ = "number"
 
 _OPTIONS: dict[str, dict[str, Any]] = {

@@ -39,8 +39,8 @@ class ConstraintViolationError(ValueError):
 class IrregularLagrangianError(ValueError):
     """Raised if the mass matrix D2D2L is singular, so that v does not follow from p.
 
-    For a Hamiltonian system the matrix is D2D2H. The Legendre transform is then not
-    invertible.
+    The Legendre transform is then not invertible. For a Hamiltonian system the matrix
+    is D2D2H.
     """
 
 
@@ -107,7 +107,8 @@ _ADVICE = (
         jax.errors.NonConcreteBooleanIndexError,
         "write `jnp.where(condition, a, 0.0)` in place of `a[condition]`.",
     ),
-    # The functions of `math` need a number: traced values raise the second error here.
+    # The functions of `math` need a number: for traced values they raise the second
+    # error here.
     (
         (jax.errors.TracerArrayConversionError, jax.errors.ConcretizationTypeError),
         "use functions of `jax.numpy` in place of `numpy` and `math`, and leave out "
@@ -181,7 +182,7 @@ def require(tree: T, *checks: Check) -> T:
 
 
 def hold(*checks: Check) -> Bool[Array, ""] | None:
-    """Return whether all checks hold, as a traced value; None if this is known already.
+    """Return whether all checks hold, as a traced value; None if all are known to hold.
 
     If a check of concrete values fails, its exception is raised.
     """
@@ -203,9 +204,9 @@ def _undecided(checks: tuple[Check, ...]) -> list[Check]:
 
 
 def on_host(values: T) -> T:
-    """Return a tree with arrays of NumPy, by which comparisons compile nothing.
+    """Return a tree with NumPy arrays, so that comparisons do not compile.
 
-    A tree with traced arrays is returned as it is.
+    A tree with traced arrays is returned unchanged.
     """
     if is_traced(*jax.tree.leaves(values)):
         return values

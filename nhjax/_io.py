@@ -58,8 +58,8 @@ def save(path: str | os.PathLike[str], tree: Any) -> None:
     nhjax, and the structure of the tree by the names of classes and fields. No code is
     stored, so that files do not depend on the versions of Python, JAX and equinox.
 
-    The file is written under a temporary name and then renamed. If this is interrupted,
-    an existing file of that name is not changed.
+    The file is written under a temporary name and then renamed. If `save` is
+    interrupted, an existing file at `path` is not changed.
 
     **Arguments:**
 
@@ -203,7 +203,7 @@ def _read(path: Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     """Read all entries; the checksums of the .npz file detect damaged entries."""
     # A file that NumPy opens itself stays open if it is damaged.
     with open(path, "rb") as opened:
-        # For other files, NumPy reports pickled objects and recommends loading them.
+        # For files of other formats, NumPy would recommend to load pickled objects.
         if not zipfile.is_zipfile(opened):
             raise ValueError("it is not an .npz")
         opened.seek(0)

@@ -55,9 +55,9 @@ def _counted(codes: np.ndarray, names: dict[int, str]) -> str:
 class RESULTS(eqx.Enumeration, metaclass=_Named):
     """The ways in which a run can end.
 
-    `RESULTS[sol.result]` is the name of the result with a message that says what to do.
-    For many runs it counts the results by name; `sol.failures()` has the message
-    of each failed run. `print(sol.result)` shows the same.
+    `RESULTS[sol.result]` is the name of the result with a message that says what to do;
+    for many runs, it is the number of runs with each result. `print(sol.result)` shows
+    the same text. `sol.failures()` has the message of each failed run.
     """
 
     # With this, a result is printed as `nhjax.RESULTS<...>`.
@@ -186,7 +186,8 @@ def result_codes() -> dict[str, int]:
         "density_not_positive",
         "interrupted",
     )
-    # The items are arrays of JAX, while their codes are needed as Python's integers.
+    # The items hold JAX arrays. Their codes are needed as Python integers, also while
+    # JAX traces the caller.
     with jax.ensure_compile_time_eval():
         return {name: int(getattr(RESULTS, name)._value) for name in names}
 

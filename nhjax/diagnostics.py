@@ -26,8 +26,8 @@ def energy_error(
 ) -> Float[Array, "... k"]:
     """Compute the energy error E(t) - E(t0) along a saved trajectory.
 
-    It works under `vmap`. It also works on a solution returned by `vmap`, if all
-    members share `system` and `args`.
+    The function works under `vmap`. It also works on a solution returned by `vmap`, if
+    all members share `system` and `args`.
 
     **Arguments:**
 
@@ -68,9 +68,9 @@ def momentum_map(
 ) -> Float[Array, "..."]:
     """Compute the momentum p · ξ_Q(q) along an infinitesimal symmetry ξ_Q.
 
-    It is conserved if ξ_Q is a symmetry of the Lagrangian and a virtual displacement
-    that the constraints permit, D2Φ · ξ_Q = 0. Otherwise it satisfies the nonholonomic
-    momentum equation.
+    The momentum is conserved if ξ_Q is a symmetry of the Lagrangian and a virtual
+    displacement that the constraints permit, D2Φ · ξ_Q = 0. Otherwise the momentum
+    satisfies the nonholonomic momentum equation.
 
     **Arguments:**
 

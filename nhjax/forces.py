@@ -93,13 +93,13 @@ def function_or_not_negative(value: Any) -> Any:
 
 
 def position_function(value: Any) -> Any:
-    """Check a function of (t, q, args) of a force: a point, an angle, a rotation."""
+    """Check a function of (t, q, args) that returns a point, an angle or a rotation."""
     check_signature("A force", "its point or angle", value, ("t", "q", "args"))
     return static_function(value)
 
 
 def of_phase(name: str, value: Any, like: Array, *arguments: Any) -> Array:
-    """Evaluate a number, an array or a function of the user, shaped `like`.
+    """Evaluate a number, an array or a user's function, of the shape of `like`.
 
     The function takes (t, q, v, args) or (t, q, v, multipliers, args).
     """
@@ -136,7 +136,7 @@ class AbstractSummable(AbstractOfSystem):
             return self
         return Sum(cast(Any, other), cast(Any, self))
 
-    # NumPy would add the elements of its arrays one by one.
+    # Without this, a NumPy array on the left of `+` would add its elements one by one.
     __array_ufunc__ = None
 
 
@@ -148,7 +148,7 @@ class AbstractForce(AbstractSummable):
     them are available. A new function recompiles.
 
     A `HamiltonianSystem` passes momenta in place of velocities: use `Drag`, `Motor` and
-    a `Spring` with a damper in a `LagrangianSystem`.
+    a `Spring` with a damper only in a `LagrangianSystem`.
 
     To define a force, write a subclass with this method:
 
@@ -329,7 +329,7 @@ class PointForce(_AbstractPulledBack):
 
 
 class Torque(_AbstractPulledBack):
-    """A torque on a body in space, given by its rotation.
+    """A torque on a body in space whose rotation is given.
 
     F · v = τ · ω with the angular velocity ω of the body, hat(ω) = Ṙ Rᵀ.
 
@@ -369,7 +369,7 @@ class Torque(_AbstractPulledBack):
     def _covector(self, t: Any, q: Any, v: Array, args: Any) -> Array:
         rotation = self._place(t, q, args)
         torque = of_phase("vector", self.vector, rotation[0], t, q, v, args)
-        # With Ṙ = hat(ω) R the product of the matrices ½ hat(τ) R and Ṙ is τ · ω.
+        # With Ṙ = hat(ω) R, the inner product of ½ hat(τ) R and Ṙ is τ · ω.
         return 0.5 * jnp.cross(torque[:, None], rotation, axis=0)
 
 
@@ -386,7 +386,7 @@ class Spring(_AbstractPulledBack):
     **Arguments:**
 
     - `first`: x₁, called as `first(t, q, args)`, coordinates [m] of shape (d,).
-    - `second`: x₂, such a function, or the coordinates of a point that is fixed.
+    - `second`: x₂, a function like `first`, or the coordinates of a fixed point.
     - `stiffness`: k [N/m].
     - `rest_length`: l [m].
     - `damping`: c [N s/m].
@@ -500,12 +500,12 @@ class Motor(_AbstractPulledBack):
 
     **Arguments:**
 
-    - `angle`: φ, called as `angle(t, q, args)` [rad], of shape (): the rotation of what
-        the motor drives relative to what carries it.
+    - `angle`: φ, called as `angle(t, q, args)` [rad], of shape (): the rotation of the
+        part that the motor drives relative to the part that carries the motor.
     - `command`: c, a number or a function of (t, q, v, args). Values outside
         [-1, 1] are not limited: see `saturated`.
     - `stall_torque`: τ₀ [N m], the torque of the motor at rest with c = 1.
-    - `no_load_speed`: ω₀ [rad/s], the speed at which the torque vanishes, c = 1.
+    - `no_load_speed`: ω₀ [rad/s], the speed of the motor at zero torque and c = 1.
     - `gear`: i, turns of the motor for each turn of the angle.
     - `manifold`: the `manifold` of the system, required if it has one.
 
@@ -546,11 +546,11 @@ class Brake(_AbstractPulledBack):
     **Arguments:**
 
     - `angle`: φ, called as `angle(t, q, args)` [rad], of shape (): the rotation of the
-        wheel relative to what carries the brake.
+        wheel relative to the part that carries the brake.
     - `torque`: τ >= 0 [N m], a number or a function of (t, q, v, args). For a friction
         that depends on reactions use `nhjax.friction.JointFriction`.
-    - `smoothing`: ω₀ [rad/s]. Below it the brake acts like a damper, so that a wheel
-        which is held still turns slowly.
+    - `smoothing`: ω₀ [rad/s]. Below ω₀ the brake acts like a damper, so that a loaded
+        wheel creeps instead of standing still.
     - `manifold`: the `manifold` of the system, required if it has one.
 
     **Raises:** `ValueError` if τ is a negative number; when called, `ShapeError` if φ

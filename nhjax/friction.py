@@ -1,10 +1,10 @@
 """Friction in contacts, joints and tyres, proportional to the load that they carry.
 
 The load of a contact is a reaction, so that these forces depend on the multipliers. All
-laws are smooth: near rest the friction is proportional to the velocity, with a slope
-that a velocity u₀ sets. A contact that should rest on a slope therefore creeps: if it
-needs the fraction r < 1 of the largest friction, its speed is u₀ artanh(r). Near rest,
-steps of the size u₀ · mass / friction converge fast.
+laws are smooth: at speeds far below a parameter u₀, the friction is proportional to the
+velocity. A contact that should rest on an incline therefore creeps: if it needs the
+fraction r < 1 of the largest friction, its speed is u₀ artanh(r). Near rest, the
+iteration of a step converges fast if the step size is about u₀ · mass / friction.
 """
 
 import abc
@@ -133,7 +133,7 @@ class Stribeck(AbstractFrictionLaw):
 
 
 class LinearSlip(AbstractFrictionLaw):
-    """The law of a tyre that slips a little: μ(σ) = C σ, of the slip σ without unit.
+    """The law of a tyre that slips a little: μ(σ) = C σ, with the dimensionless slip σ.
 
     **Arguments:**
 
@@ -202,7 +202,7 @@ class _AbstractOnContact(AbstractForceOfReactions):
     """A force -|N| f(r) r at a contact with the normal force N.
 
     r is a velocity of the contact that depends on v linearly, and f > 0. The
-    generalised force is (∂r/∂v)ᵀ applied to it, so that the power is -|N| f(r) r².
+    generalised force is (∂r/∂v)ᵀ times this force, so that the power is -|N| f(r) r².
     """
 
     contacts: eqx.AbstractVar[Contacts]
@@ -252,16 +252,16 @@ class Sliding(_AbstractOnContact):
     """Friction of a contact that slides, in the directions that slip.
 
     The force on the body is -|N| μ(u) in the direction of the velocity u at which the
-    contact slides. Only the part of u is used that the constraints of the contact leave
-    free: all of it if `no_slip=()`, and the part along a blade.
+    contact slides. u is the part of the velocity that the constraints of the contact
+    leave free: the whole velocity if `no_slip=()`, and the part along a blade.
 
     **Arguments:**
 
     - `contacts`, `contact`: the contacts of the system, and the name of one of them.
     - `law`: μ(u), such as `Coulomb(0.5, smoothing=0.001)`.
-    - `load`: N if the height of the contact is not a constraint: a number [N], or a
-        function of (t, q, v, multipliers, args). By default N is the multiplier of
-        the height.
+    - `load`: N, a number [N] or a function of (t, q, v, multipliers, args). By default
+        N is the multiplier of the height; if the height of the contact is not a
+        constraint, `load` is required.
 
     **Raises:** `ValueError` if there is no contact of this name, no load, or no
     direction in which the contact slips.
@@ -355,14 +355,14 @@ class RollingResistance(_AbstractOnContact):
     """Rolling resistance: a torque against the rolling of a wheel or a ball.
 
     The torque is -|N| e tanh(|ω| / ω₀) in the direction of ω, the angular velocity of
-    the body along the plane. It is not the friction of a contact that runs along the
-    rim of a spinning coin: write that as a force of your own.
+    the body along the plane. This law does not describe the friction of a contact that
+    runs along the rim of a spinning coin: write such a friction as your own force.
 
     **Arguments:**
 
     - `contacts`, `contact`: the contacts of the system, and the name of one of them.
-    - `arm`: e [m], by which the normal force is ahead of the contact: the coefficient
-        of rolling resistance times the radius.
+    - `arm`: e [m], the distance of the normal force ahead of the contact: the
+        coefficient of rolling resistance times the radius.
     - `smoothing`: ω₀ [rad/s].
     - `load`: as for `Sliding`.
 
@@ -404,7 +404,7 @@ class PivotingFriction(_AbstractOnContact):
     with an even pressure has e = 2/3 μ a.
 
     **Arguments:** as for `RollingResistance`, with the angular velocity about the
-    normal in place of that along the plane.
+    normal in place of the angular velocity along the plane.
 
     **Raises:** as `RollingResistance`.
 
@@ -516,8 +516,8 @@ def _sliding(contact: AbstractContact, at: ContactState) -> Array:
 
 # --- f(x) / x as a function of x², for odd functions f --------------------------------
 
-# The series of these functions are used for x² below this number. With as many terms as
-# below, the error is smaller than the unit round-off.
+# The series of these functions are used for x² below this number. With the terms listed
+# here, the error is smaller than the unit round-off.
 _SMALL = 0.01
 _SIN = [(-1) ** k / math.factorial(2 * k + 1) for k in range(5)]
 _ATAN = [(-1) ** k / (2 * k + 1) for k in range(9)]

@@ -1,14 +1,16 @@
-"""Rolling contacts as parts: wheels, balls and blades on the ground, from their poses.
+"""Rolling contacts: wheels, balls and blades on the ground, given by their poses.
 
 A contact is given by the pose of a body: its position x(t, q) in space and its rotation
-R(t, q). The point c of the body that touches the ground follows from its shape. Its
-height above the ground is the holonomic constraint, and the components of its velocity
+R(t, q). The point c that touches the ground follows from the shape of the body. The
+height of c above the ground is the holonomic constraint. The nonholonomic constraints
+are the components along the ground of the velocity
 
     u = ẋ + Ṙ Rᵀ (c - x) - w
 
-along the ground are the nonholonomic ones, with the velocity w of the ground. Each
-multiplier is the force in newtons in its direction. A body may also be kept from
-spinning about the normal of the ground; this multiplier is a torque in N m.
+of this point of the body relative to the ground, which moves with the velocity w. Each
+multiplier is the force in newtons in the direction of its constraint. A body may also
+be kept from spinning about the normal of the ground; the multiplier of this constraint
+is a torque in N m.
 """
 
 import abc
@@ -111,12 +113,12 @@ class Touch(NamedTuple):
 class AbstractGround(eqx.Module):
     """A ground that bodies roll on.
 
-    To define one, write a subclass with a field `velocity`, as `Plane` has it, and this
+    To define one, write a subclass with a field `velocity`, as in `Plane`, and this
     method:
 
-    - `touch(support, position, args)`: find where a convex body is nearest.
-        `support(normal)` is its point that is farthest in the direction -normal, and
-        `position` the origin of the body.
+    - `touch(support, position, args)`: find where a convex body is nearest to the
+        ground. `support(normal)` is the point of the body that is farthest in the
+        direction -normal, and `position` is the origin of the body.
     """
 
     velocity: eqx.AbstractVar[Callable[[Any, Any, Any], Any] | None]
@@ -146,8 +148,8 @@ class Plane(AbstractGround):
     - `normal`: n, which points away from the ground; its length does not matter.
     - `height`: h [m], the distance of the plane from the origin along n.
     - `velocity`: w [m/s], the velocity of the ground in space, called as
-        `velocity(t, x, args)` at a point x, for a turntable or a belt; by default it
-        rests.
+        `velocity(t, x, args)` at a point x, for a turntable or a belt; by default the
+        ground rests.
 
     !!! example
 
@@ -290,8 +292,9 @@ class Heightfield(eqx.Module):
             )
         import scipy.ndimage
 
-        # Mirroring leaves an error at the border that falls by 0.268 in each row. Two
-        # more rows on each side are enough for a point at the border.
+        # The mirrored border of the spline has an error that falls by the factor 0.268
+        # with each row: 32 extra rows remove it. Two rows outside of the grid are kept,
+        # which are enough to evaluate the spline at the border of the grid.
         padded = np.pad(given, 32, mode="reflect", reflect_type="odd")
         spline = scipy.ndimage.spline_filter(padded, order=3, mode="mirror")
         self.coefficients = spline[30:-30, 30:-30]
@@ -312,7 +315,7 @@ class Heightfield(eqx.Module):
 
 
 def _spline_weights(x: FloatScalar) -> Float[Array, "4"]:
-    """Return the cubic B-splines at -1, 0, 1, 2, evaluated at x in [0, 1]."""
+    """Return the cubic B-splines with centres -1, 0, 1, 2 at x in [0, 1]."""
     y = 1 - x
     return jnp.stack([y**3, 4 - 6 * x**2 + 3 * x**3, 4 - 6 * y**2 + 3 * y**3, x**3]) / 6
 
@@ -428,7 +431,7 @@ class AbstractContact(eqx.Module):
     def height(
         self, t: FloatScalarLike, q: PyTree[Array], args: Args = None
     ) -> Float[Array, ""]:
-        """Compute the height of that point above the ground."""
+        """Compute the height of the point c above the ground."""
         return self.touch(t, q, args).height
 
     def frame(
@@ -470,10 +473,10 @@ class AbstractContact(eqx.Module):
         v: Float[Array, " n"],
         args: Args = None,
     ) -> Float[Array, " k"]:
-        """Compute what must vanish: the velocity in the directions without slip.
+        """Compute the velocity in the directions without slip, which must be zero.
 
-        For `"spin"` it is the angular velocity about the normal, relative to the
-        ground.
+        For `"spin"`, the entry is the angular velocity about the normal, relative to
+        the ground.
         """
         at = self.state(t, q, v, args)
         axes = self.axes(at.rotation, at.normal)
@@ -492,13 +495,13 @@ class AbstractContact(eqx.Module):
         return self.weights(axes.dtype) @ axes
 
     def weights(self, dtype: Any) -> Float[Array, "k 2"]:
-        """Return the parts along and across of the directions without slip."""
+        """Return the directions without slip, as components along and across."""
         weights = [_direction(x)[:2] for x in self.no_slip]
         return jnp.asarray(weights, dtype).reshape(-1, 2)
 
     @property
     def num_directions(self) -> int:
-        """The number of directions along the ground in which it does not slip."""
+        """The number of directions along the ground in which the body does not slip."""
         return sum(x != "spin" for x in self.no_slip)
 
 
@@ -515,9 +518,9 @@ class Wheel(AbstractContact):
     The direction `along` = axle x n, normalised, is the rolling direction, and `across`
     = n x `along`.
 
-    The axle must not be perpendicular to the ground: there is no lowest point then. A
-    track that runs over a sprocket is a wheel too, with the radius of the sprocket,
-    under the middle of the track.
+    The axle must not be perpendicular to the ground, because then no single point of
+    the rim is the lowest. A track that runs over a sprocket is a wheel too, with the
+    radius of the sprocket, under the middle of the track.
 
     **Arguments:**
 
@@ -606,8 +609,8 @@ class Ellipsoid(AbstractContact):
     - `semi_axes`: three lengths [m] along the axes of the body, or the radius of a
         ball; or a function of `args` that returns them.
     - `no_slip`: the directions in which the body does not slip; `()` if it slides. With
-        `"spin"` it does not turn about the normal of the ground either, as a ball of
-        rubber.
+        `"spin"` it does not turn about the normal of the ground either, like a rubber
+        ball.
     - `touches`, `ground`, `manifold`: as for `Wheel`.
 
     **Raises:** when called, `ShapeError` if the pose has other shapes.
@@ -707,9 +710,10 @@ class Blade(AbstractContact):
 class Contacts(eqx.Module):
     """The contacts of a machine, as the constraints of a system.
 
-    Pass its `nonholonomic` and its `holonomic` to `LagrangianSystem`. The multipliers
-    are in the order of the contacts: first all that prevent slip, then all heights.
-    Each is None if there are no such constraints. `multiplier_names` lists them.
+    Pass its `nonholonomic` and its `holonomic` to `LagrangianSystem`; each is None if
+    there are no such constraints. The multipliers of the directions without slip come
+    first, then the multipliers of the heights, both in the order of the contacts.
+    `multiplier_names` lists them.
 
     **Arguments:**
 
@@ -749,8 +753,8 @@ class Contacts(eqx.Module):
         """Return the same contacts, for a system with other holonomic constraints.
 
         `num_others` is the number of these constraints. They must come after the
-        heights, so that their multipliers are the last ones. Pass the result to a law
-        of `nhjax.friction` in such a system.
+        heights, so that their multipliers are the last ones. Pass the result to the
+        forces of `nhjax.friction` in such a system.
         """
         found = Contacts(**dict(zip(self.names, self.contacts, strict=True)))
         object.__setattr__(found, "_num_others", num_others)
@@ -785,9 +789,9 @@ class Contacts(eqx.Module):
     ) -> dict[str, Float[Array, "3"]]:
         """Compute the force of the ground on each body at its contact [N].
 
-        It follows from the multipliers of the state. A contact with `touches=False`
-        lacks the part along the normal, which the coordinates hide, and every contact
-        lacks the parts in directions that are not constrained.
+        The forces follow from the multipliers of the state. They have no parts in
+        directions that are not constrained. For a contact with `touches=False`, they
+        have no part along the normal, because the coordinates hide it.
 
         **Arguments:**
 
@@ -821,7 +825,7 @@ class Contacts(eqx.Module):
         multipliers: Float[Array, " l"],
         args: Args = None,
     ) -> dict[str, Float[Array, "3"]]:
-        """Compute the same forces from multipliers, for a force of your own."""
+        """Compute the result of `forces` from multipliers, for a force of your own."""
         parts = self._in_frames(multipliers)
         return {
             name: parts[name] @ contact.frame(t, q, args)
@@ -869,8 +873,8 @@ class Contacts(eqx.Module):
     def check_constraints_of(self, system: Any) -> None:
         """Raise a `ValueError` unless a system has these constraints and no others.
 
-        The multipliers are then in the order of the contacts. With `followed_by` the
-        holonomic constraints are a function of the user, whose order is not known.
+        The multipliers are then in the order of the contacts. With `followed_by`, the
+        holonomic constraints are a function of the user, and are not checked.
         """
         names = ("nonholonomic", "holonomic")
         for name in names[:1] if self._num_others else names:
@@ -920,7 +924,7 @@ def _check_manifolds(
 
 
 class Slips(AbstractOfSystem):
-    """The nonholonomic constraints of contacts: their velocities without slip."""
+    """The nonholonomic constraints of contacts, which are their velocities of slip."""
 
     contacts: tuple[AbstractContact, ...]
 
@@ -972,9 +976,10 @@ def margin(
 
     It is the function (t, y, args) -> μ |N| - |F_t| [N] of the friction coefficient μ,
     the normal force N and the force F_t of the constraints along the ground. The
-    contact rolls where it is positive. Pass it to `SaveAt(fn=)`, or see `slips`.
+    contact rolls where its value is positive. Pass the function to `SaveAt(fn=)`, or
+    see `slips`.
 
-    **Arguments:** those of `slips`.
+    **Arguments:** as for `slips`, without `options`.
 
     **Raises:** as `slips`.
 
@@ -1019,16 +1024,16 @@ def slips(
 ) -> Event:
     """Return the event that a contact starts to slip.
 
-    This is where the `margin` falls to zero. As every event, it is a change of sign: a
-    contact that needs too much friction from the start on does not trigger it.
-    Therefore look at the `margin` of the first state.
+    The event occurs when the `margin` falls to zero. Like every event, it needs a
+    change of sign: a contact that needs too much friction from the start does not
+    trigger the event. Therefore check the `margin` of the first state.
 
     **Arguments:**
 
     - `contacts`, `contact`: the contacts of the system, and the name of one of them.
     - `friction`: μ.
-    - `load`: N if the height of the contact is not a constraint: a number [N], or a
-        function of (t, q, v, multipliers, args).
+    - `load`: N, as for `nhjax.friction.Sliding`: a number [N] or a function of
+        (t, q, v, multipliers, args). By default it is the multiplier of the height.
     - `options`: passed on to `nhjax.Event`; by default the event ends the run.
 
     **Raises:** `TypeError` if `friction` is not a number; `ValueError` if there is no
@@ -1050,7 +1055,7 @@ def slips(
 def lifts_off(contacts: Contacts, contact: str, **options: Any) -> Event:
     """Return the event that the normal force N [N] of a contact falls to zero.
 
-    A ground that does not hold the contact down loses it there.
+    At this time the body would lift off a ground that does not hold it down.
 
     **Arguments:**
 

@@ -139,8 +139,8 @@ def check_system(
     **Returns:** a `SystemReport`. The arguments on which functions depend are found
     from derivatives at three states near the given one.
 
-    **Raises:** the errors of `initial_state` for wrong types and shapes of arguments
-    and of values that the system's functions return, also if they are not finite;
+    **Raises:** the errors of `initial_state` for arguments, and for values returned by
+    the system's functions, that have a wrong type or shape or are not finite;
     `ValueError` if a Lagrangian system is given `p`, or a Hamiltonian system is given
     `v`; `TypeError` under `jit`, `vmap` or `grad`.
 
@@ -219,7 +219,8 @@ def _condition(reciprocal: np.ndarray) -> float:
 @tracked_jit("system", "args")
 def _measurements(system, t, q, u, args) -> dict[str, Any]:
     system = with_kept_functions(system, t, q, u, args)
-    # These are constants: JAX's random numbers would take most of the time to compile.
+    # NumPy's random numbers are constants of the program. JAX's random numbers would
+    # take most of the compile time.
     shape = (2, _NUM_SAMPLES, u.shape[0])
     random = np.random.default_rng(0).normal(scale=_SPREAD, size=shape)
     xi, w = jnp.asarray(random, u.dtype)
@@ -286,14 +287,14 @@ def _derivatives(system, t, q, u, args, near) -> dict[str, Any]:
 
     by_time, by_position, second = jax.vmap(sample)(*near)
     rows = constraint_rows(t, jnp.zeros_like(u), u)
-    # The square of an expression has a row that is zero where the constraint holds.
+    # If a constraint is the square of an expression, its row is zero where it holds.
     rows_near = jax.vmap(constraint_rows, (None, 0, 0))(t, *near)
     elsewhere = jnp.max(jnp.abs(rows_near), axis=(0, 2))
     zero = jnp.finfo(u.dtype).eps ** 0.75 * elsewhere
     vanishes = jnp.max(jnp.abs(rows), axis=1) <= zero
     rows = jnp.where(vanishes[:, None], 0, rows)
     mass, rows = convert_to_velocities(system, hessian(t, jnp.zeros_like(u), u), rows)
-    # The report shows the values of constraints.
+    # These values are only checked to be finite. Constraints are returned separately.
     values = {
         name: function(t, jnp.zeros_like(u), u)
         for name, function in functions.items()

@@ -45,7 +45,7 @@ class LinearStability(eqx.Module):
         becomes q + ξ, or q τ(ξ) on a group. The last n rows are the change w of the
         velocity, or of the momentum of a Hamiltonian system. With a `symmetry`,
         perturbations that differ along the generators are equivalent, and each column
-        represents its class.
+        represents a class of equivalent perturbations.
     """
 
     matrix: Float[Array, "d d"]
@@ -89,10 +89,11 @@ def linear_stability(
     There are two ways to specify X. With `symmetry`, X is the combination of the given
     generators along which the state moves. Perturbations along the generators only
     shift the motion in time or space and are excluded, so that A belongs to the reduced
-    system. Without `symmetry`, X has the velocity as its constant components. It is
-    then a translation of ignorable coordinates or a left translation of the group. All
-    velocities must be constant (body velocities on a group), or at least the chosen
-    independent velocities. A bicycle on a circle is an example of the second case.
+    system. Without `symmetry`, X generates the translation that has the velocity of the
+    state: a translation of ignorable coordinates, or a left translation of the group.
+    All velocities must be constant (body velocities on a group), or at least the chosen
+    independent velocities. For a bicycle on a circle, only chosen velocities are
+    constant.
 
     About any other motion, A is valid for an instant only, and its eigenvalues do not
     decide stability. `steady_motion` finds steady motions.
@@ -108,8 +109,8 @@ def linear_stability(
         other velocities must follow from the constraints, so that there are n - m - k
         independent velocities. Positions that are not independent and do not follow
         from holonomic constraints are not perturbed. Omit coordinates on which the
-        motion does not depend, such as the position of a wheel. By default, z are
-        coordinates in an orthonormal basis of all perturbations that the constraints
+        motion does not depend, such as the position of a wheel. By default, z consists
+        of coordinates in an orthonormal basis of all perturbations that the constraints
         permit.
     - `symmetry`: generators of symmetries, as vector fields like the generator of
         `momentum_map`: called as `symmetry(q)`, of shape (n,) or (k, n), in the

@@ -3,7 +3,8 @@
 A perturbation x = (ξ, w) changes the state (q, u) to (q τ(ξ), u + w). This file
 differentiates the equations with respect to x, in a frame that moves with the velocity
 or along symmetries. It also computes bases of the perturbations that the constraints
-permit, and checks that given generators are symmetries of the system and the motion.
+permit, and checks that given generators are symmetries of the system, and that the
+motion is an orbit of these symmetries.
 """
 
 import operator
@@ -325,7 +326,7 @@ class BoundedResidual(NamedTuple):
 
     @property
     def holds(self) -> BoolScalar:
-        """Return whether all values are within their bounds; NaN is not."""
+        """Return whether all values are within their bounds; NaN counts as outside."""
         return jnp.all(self.value <= self.allowed)
 
 

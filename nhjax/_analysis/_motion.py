@@ -45,7 +45,7 @@ class Motion(eqx.Module):
         false for redundant constraints, whose multipliers are the solution with the
         least norm. The sum `reaction` is always unique.
 
-    The product of a generalised force and its coordinate is a work, so that the unit of
+    The product of a generalised force and its coordinate is work, so that the unit of
     the force is N for a coordinate in m, and N m for an angle. A multiplier is a force
     in N if its constraint is a velocity in m/s or a distance in m.
     """

@@ -121,7 +121,7 @@ def steady_motion(
     **Arguments:**
 
     - `system`: the mechanical system.
-    - `t`: the time at which functions that depend on time are taken.
+    - `t`: the time at which functions of time are evaluated.
     - `y`: a state from which the search starts.
     - `args`: passed on to the functions of the system.
     - `positions`, `velocities`: the indices that must be steady. Leave out indices that
@@ -155,7 +155,7 @@ def steady_motion(
     !!! example
 
         A pendulum of length 1 m under unit gravity moves on a cone at the rate
-        (g / l cos θ)^½:
+        (g / (l cos θ))^½:
 
         >>> import jax.numpy as jnp, nhjax
         >>> pendulum = nhjax.systems.SphericalPendulum(
@@ -413,8 +413,8 @@ def least_norm_root(
         jnp.any(jacobian != 0, axis=0), jnp.abs(start) + jnp.abs(stop_gradient(x)), 0
     )
     eps = float(jnp.finfo(x.dtype).eps)
-    # All unknowns of one kind get the largest of their sizes. If all are zero, as at
-    # rest or at the origin, a small positive size replaces it.
+    # All unknowns of one kind get the largest of their sizes. If all these sizes are
+    # zero, as at rest or at the origin, a small positive size is used.
     ends = np.cumsum(groups)
     kinds = jnp.split(sizes, ends[:-1])
     sizes = jnp.concatenate(

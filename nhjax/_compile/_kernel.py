@@ -1,7 +1,7 @@
 """Functions of nhjax that are compiled as one program, with a cache of their traces.
 
-`as_cpu_kernel` traces a function to a program and binds it as the operation of
-`nhjax.lanes` that stands for a program compiled as a whole.
+`as_cpu_kernel` traces a function to a program, and calls this program as one operation,
+which `nhjax.lanes` compiles as a whole.
 """
 
 from collections.abc import Callable, Hashable
@@ -17,10 +17,11 @@ T = TypeVar("T")
 
 
 class TraceCache:
-    """The traced programs of functions, by their arguments.
+    """A cache of the traced programs of functions.
 
-    A function of the user may read values that change between two calls of `integrate`.
-    Programs are therefore kept only while one run is traced and differentiated.
+    A key contains the function and the kinds of its arguments. A function of the user
+    may also read values that change between two calls of `integrate`. Programs are
+    therefore kept only while one run is traced and differentiated.
     """
 
     def __init__(self):

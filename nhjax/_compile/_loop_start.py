@@ -1,9 +1,10 @@
-"""An operation that tells the compiler how a loop started that is now continued.
+"""An operation that tells the compiler the initial carry of a loop that is continued.
 
 A run is a loop whose carry starts with constants, such as the zeros of a mass matrix.
-Those that no iteration changes are constants of the whole loop, and the compiler leaves
-out operations with them. If the loop is interrupted and goes on from arrays, the
-compiler no longer sees them, and the loop becomes slower and rounds differently.
+The constants that no iteration changes are constants of the whole loop, and the
+compiler leaves out operations with them. If the loop is interrupted and continued from
+arrays, the compiler no longer knows these constants. Without this operation, the
+continued loop would be slower and would round differently.
 """
 
 from typing import TypeVar
@@ -24,11 +25,11 @@ loop_start.is_high = never_high
 
 
 def started_like(first: T, carry: T) -> T:
-    """Return the carry of a loop that started as `first` and is continued.
+    """Return `carry`, the carry of a loop that started from `first` and is continued.
 
     Where a number of `first` is a constant of the program, and the loop does not change
-    it, the compiler uses the constant. The same loop must have led from `first` to
-    `carry`.
+    this number, the compiler uses the constant. The same loop must have led from
+    `first` to `carry`.
     """
     ours, structure = jax.tree.flatten(carry)
     out = loop_start.bind(*ours, *jax.tree.leaves(first))

@@ -1,7 +1,7 @@
-"""Long functions of each row of some arrays, as one operation of a program.
+"""Functions that are applied to each row of some arrays, as one operation of a program.
 
-A program that contains the function once for each stage of a method would grow with the
-number of stages, and so would the time to compile it.
+A program that contains a long function once for each stage of a method would grow with
+the number of stages, and so would the time to compile it.
 """
 
 from collections.abc import Callable
@@ -22,8 +22,8 @@ from ..lanes import (
 
 T = TypeVar("T")
 
-# Functions that compute fewer numbers for all rows together are written out for each
-# row, because a loop would save little time of the compiler.
+# Functions that compute fewer numbers than this for all rows together are not put in a
+# loop, because a loop would save little compile time.
 SHORTEST_IN_LOOP = 2000
 
 
@@ -31,8 +31,8 @@ def vmapped(function: Callable[..., T], *rows: Any, out_axis: int = 0) -> T:
     """Compute `jax.vmap(function)(*rows)`, with a long function as one operation.
 
     Within a program that nhjax's own compiler compiles, the operation is a loop over
-    the rows. Then the time of compilation does not grow with the number of rows. What
-    does not depend on the rows is computed before, once.
+    the rows. Then the time of compilation does not grow with the number of rows. The
+    operations that do not depend on the rows are computed once, before the loop.
 
     **Arguments:**
 

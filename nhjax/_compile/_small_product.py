@@ -1,7 +1,7 @@
 """The sum of products of two small arrays, as one operation until it is lowered.
 
-Without this operation, a product would be about five operations, and its derivatives
-would be several times as many: tracing a gradient took 15 to 40 percent longer.
+Otherwise a product would be about five operations, and its derivatives would be several
+times as many: tracing a gradient took 15 to 40 percent longer.
 """
 
 import itertools

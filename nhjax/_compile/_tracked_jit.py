@@ -2,8 +2,8 @@
 
 A function compiled by `jax.jit` keeps the values that globals and closed-over variables
 had when it was traced. `tracked_jit` traces the function again when such a value
-changes: at each call `captured` lists the values that the functions of the user read,
-and the list is a part of the key of the compiled program.
+changes: at each call `captured_by` lists the values that the functions of the user
+read, and the list is a part of the key of the compiled program.
 """
 
 import argparse
@@ -266,7 +266,7 @@ class Captured:
                 continue
             content = atom = _atom(value)
             if isinstance(atom, _Unrepeatable):
-                # A function that stores a tracer stores another tracer after tracing.
+                # A function that stores a tracer stores another one at each tracing.
                 content = _Identity(id(value), value)
                 self.is_repeatable = False
             has_objects = isinstance(value, np.ndarray) and value.dtype.hasobject
@@ -302,7 +302,8 @@ _key_before_tracing: dict[_Key, _Key] = {}
 def captured_by(*trees: Any) -> Captured:
     """Return the values that the functions in trees read.
 
-    Programs with the same functions, which are called one after the other, share it.
+    The result can be shared by several programs with the same functions, if they are
+    called one after the other.
     """
     return Captured(static_parts(list(trees)), _changed_by_tracing)
 
@@ -311,8 +312,9 @@ def tracked_jit(*tracked: str) -> Callable[[Callable[..., T]], Callable[..., T]]
     """Compile like `equinox.filter_jit`; trace again if values that functions read
     change.
 
-    It returns a decorator for a function that is called with positional arguments, and
-    with `captured` if the values that its functions read are known.
+    The result is a decorator. The decorated function is called with positional
+    arguments. It also accepts the keyword argument `captured`, the result of
+    `captured_by` if this is already known.
 
     **Arguments:**
 

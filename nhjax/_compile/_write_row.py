@@ -1,4 +1,4 @@
-"""The write of a row into a buffer, as one operation until it is lowered.
+"""A primitive that writes a row into a buffer, and is one operation until lowering.
 
 A loop that saves its states writes each row of a buffer once. JAX's own update of an
 array does not know this: its derivative in reverse mode sets the row of the cotangent
@@ -28,10 +28,10 @@ def write_row(
     row: Shaped[Array, "*shape"],
     slot: Int[Array, ""],
 ) -> Shaped[Array, "rows *shape"]:
-    """Write a row to the index `slot` of a buffer, from 0 to its length less one.
+    """Write a row to the index `slot` of a buffer, where 0 <= slot < length.
 
-    A row may be written only once, unless its result is not used, as for a row that
-    takes what is not kept.
+    Each row of the buffer may be written only once. Only a row that is never read may
+    be written more often, such as a row for data that are not saved.
     """
     return _write.bind(buffer, row, slot, axis=0)
 
@@ -61,7 +61,8 @@ def _jvp(primals, tangents, *, axis):
 
 
 def _transpose(cotangent, buffer, row, slot, *, axis):
-    # Nothing was in the row before, so that it keeps its cotangent.
+    # The row was not written before. Therefore its cotangent in the buffer need not be
+    # set to zero.
     of_buffer = cotangent if ad.is_undefined_primal(buffer) else None
     of_row = None
     if ad.is_undefined_primal(row) and not isinstance(cotangent, ad.Zero):
@@ -71,7 +72,7 @@ def _transpose(cotangent, buffer, row, slot, *, axis):
 
 def _batched(operands, axes, *, axis):
     if axes[2] is not None:
-        # Each member writes its own row.
+        # Each member writes to its own slot.
         return jax.vmap(partial(_written, axis=axis), axes)(*operands), 0
     pairs = list(zip(operands[:2], axes[:2], strict=True))
     size = next(x.shape[place] for x, place in pairs if place is not None)

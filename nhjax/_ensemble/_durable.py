@@ -88,7 +88,9 @@ class Lock:
         self._opened: int | None = None
 
     def acquire(self, path: Path, what: str) -> None:
-        """Lock a file, and create it if it does not exist. `what` names its folder.
+        """Lock a file, and create it if it does not exist.
+
+        `what` is the name of its folder in messages.
 
         **Raises:** `RuntimeError` if another process has locked the file, or if the
         operating system has no such locks.

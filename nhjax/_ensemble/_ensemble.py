@@ -23,10 +23,10 @@ from ._sinks import (
 from ._store import CheckpointedReductionSink, ZarrSink
 
 
-# A chunk of this many members for each device keeps all cores busy. It is smaller if
-# the values of the members would take more than this many bytes.
+# By default a chunk has `_MEMBERS` members for each device, which keeps all cores busy,
+# or fewer, so that the values of these members take at most `_BYTES` bytes.
 _MEMBERS, _BYTES = 1024, 2**26
-# Suffixes of files of other programs, which `out` does not create.
+# Suffixes of file formats. `out` names a folder, and must not end in one of them.
 _FILES = (".nc", ".nc4", ".h5", ".hdf5", ".csv", ".npy", ".npz", ".mat", ".pkl")
 # The shortest time between two updates of a progress meter.
 _SECONDS = 0.1
@@ -48,17 +48,18 @@ def ensemble(
 ) -> EnsembleOutcome:
     """Run a function for every member of an ensemble, in chunks of members.
 
-    It computes `jax.vmap(run)(members)` for more members than fit into one array. One
-    compiled program runs all chunks and spreads the members of a chunk over all
-    devices. The last chunk is padded with members that are ignored.
+    This function computes `jax.vmap(run)(members)`, also for more members than fit into
+    memory at a time. One compiled program runs all chunks and spreads the members of a
+    chunk over all devices. The last chunk is padded with members that are ignored.
 
     If `run` returns an `nhjax.Solution` or `nhjax.RESULTS`, alone or as part of a tree,
     the outcome lists the members whose runs failed, and statistics leave them out. For
     this, call `nhjax.integrate` with `throw=False`; otherwise the first failure ends
     the whole ensemble.
 
-    After `jax.distributed.initialize`, all processes must make the same call. Each runs
-    its share of the chunks on its own devices, and each returns the whole outcome.
+    After `jax.distributed.initialize`, all processes must make the same call. Each
+    process runs its share of the chunks on its own devices, and returns the whole
+    outcome.
 
     **Arguments:**
 
@@ -67,25 +68,26 @@ def ensemble(
         the index of a member to the member. The function needs no memory for the
         members, and JAX traces it.
     - `num_members`: the number of members, if `members` is a function.
-    - `out`: a folder for a Zarr store. The values of each chunk are written to it, and
-        `xarray.open_zarr` opens it. The same call resumes a store that an interrupted
-        run has left. With `reduce`, the folder holds the states of the reductions
+    - `out`: a folder for a Zarr store, to which the values of each chunk are written.
+        `xarray.open_zarr` opens the store. If a run is interrupted, the same call
+        resumes it. With `reduce`, the folder holds the states of the reductions
         instead of values. See `docs/ensembles.md`.
     - `reduce`: an `nhjax.Mean`, `nhjax.Variance`, `nhjax.Minimum`, `nhjax.Maximum`,
         `nhjax.Histogram`, your own `nhjax.AbstractReduction`, or a tree of these such
-        as a dictionary. Then values are not kept, and memory does not grow with the
-        number of members.
+        as a dictionary. With `reduce`, values are not kept, and memory does not grow
+        with the number of members.
     - `chunk_size`: the number of members that run at a time, rounded up to a multiple
         of the number of devices; by default 1024 for each device, or fewer if the
         values of a member are large.
     - `devices`: the JAX devices to use, `jax.local_devices()` by default.
     - `fixed_order`: compute statistics in an order that does not depend on the number
         of devices and processes. If the values of the members are then equal bit for
-        bit, so are the statistics. Each device reduces all members of a chunk, and
-        processes wait for each other after each chunk.
+        bit, so are the statistics. This takes more time, because each device reduces
+        all members of a chunk, and processes wait for each other after each chunk.
     - `progress_meter`: shows the number of finished members; by default a bar on the
         standard error stream if that is a terminal.
-    - `resume`: whether to resume an existing store; otherwise it is refused.
+    - `resume`: whether to resume the run of an existing store; if False, an existing
+        store raises a `FileExistsError`.
     - `units`: units of the arrays in the store, by the names of the arrays.
 
     **Returns:** an `nhjax.EnsembleOutcome` with `values` or `statistics`, or with

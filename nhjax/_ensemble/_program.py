@@ -147,7 +147,7 @@ class Members:
                 f"{self.count} rows: leave it out."
             )
         keys = [jax.random.key_impl(x) if _is_key(x) else None for x in leaves]
-        # For NumPy arrays these are views, so that memory-mapped files are not read.
+        # NumPy arrays are not copied, so that memory-mapped files are not read here.
         self._leaves = [
             np.asarray(jax.random.key_data(x) if impl else _canonical(x))
             for x, impl in zip(leaves, keys, strict=True)
@@ -164,14 +164,17 @@ class Members:
         return [_canonical(x[indices]) for x in self._leaves]
 
     def digest(self) -> str:
-        """Compute a digest of the arrays; the program text identifies a function."""
+        """Compute a digest of the arrays of members.
+
+        If the members are given by a function, the program text identifies it instead.
+        """
         if self._leaves is None:
             return "a function"
         made = hashlib.sha256()
         for x in self._leaves:
             made.update(f"{x.dtype.str}{x.shape}".encode())
-            # This reads blocks, because a copy of a whole memory-mapped array may not
-            # fit into memory.
+            # Blocks are read one after the other, because a copy of a whole
+            # memory-mapped array may not fit into memory.
             for start in range(0, len(x), 65536):
                 made.update(np.ascontiguousarray(x[start : start + 65536]).tobytes())
         return made.hexdigest()
@@ -193,7 +196,7 @@ class _MemberFromArrays(eqx.Module):
 
 
 def _canonical(x: Any) -> Any:
-    """Convert as JAX does: float64 to float32, unless float64 is enabled."""
+    """Convert an array as JAX does: float64 to float32, unless float64 is enabled."""
     if isinstance(x, jax.Array):
         return x
     return np.asarray(x, jax.dtypes.canonicalize_dtype(np.asarray(x).dtype))
@@ -237,7 +240,7 @@ def _leading_size(members: Any) -> int:
 
 
 def value_structure(run: Any, make: Any, inputs: Any) -> Any:
-    """Compute the shapes and dtypes of what `run` returns for one member.
+    """Compute the shapes and dtypes of the arrays that `run` returns for one member.
 
     **Raises:** `TypeError` if `run` returns anything except arrays of numbers.
     """
@@ -338,8 +341,9 @@ def _run_members(run: Any, make: Any, inputs: Any, layout: Layout) -> Any:
 
     every = jax.vmap(member)
     if len(layout.devices) > 1:
-        # Members are independent. JAX's check of what varies between devices
-        # (`check_vma`) does not know the primitives that nhjax adds.
+        # Members are independent, so that the result is right without JAX's check of
+        # values that vary between devices (`check_vma`). This check does not know the
+        # primitives that nhjax adds.
         every = _on_each_device(layout, every, jax.P(AXIS), jax.P(AXIS))
     return every(inputs)
 
@@ -377,9 +381,9 @@ def is_success(codes: Any) -> Any:
 def first_failure(value: Any) -> tuple[Int[Array, ""], Int[Array, ""]]:
     """Return the code of the first failure in a value, and its step.
 
-    It searches every `nhjax.Solution` and `nhjax.RESULTS` in the value. Without a
-    failure, the result is the code of `RESULTS.successful`. The step is -1 if it is not
-    known.
+    This function searches every `nhjax.Solution` and `nhjax.RESULTS` in the value.
+    Without a failure, the code is the code of `RESULTS.successful`. The step is -1 if
+    it is not known.
     """
     codes, steps = [], []
     nodes = jax.tree.leaves(

@@ -2,8 +2,8 @@
 
 A reduction has a state of fixed size. `update` adds the members of a chunk to a state,
 `merge` combines the states of two sets of members, and `finish` computes the statistic.
-Sums are kept in double-double arithmetic, so that the result does not depend on the
-size of the chunks beyond its last bit.
+Sums are kept in double-double arithmetic, so that another size of the chunks changes at
+most the last bit of the result.
 """
 
 import math
@@ -26,8 +26,8 @@ class AbstractReduction(eqx.Module):
     To define your own reduction, write a subclass with the four methods below. JAX
     traces all of them except `finish`. A value is the result of `run` for one member,
     with `None` in place of its `nhjax.RESULTS`. A state is any tree of arrays with
-    fixed shapes. `merge` must be associative up to round-off, and the state that `init`
-    returns must be its neutral element.
+    fixed shapes. `merge` must be associative up to round-off, and merging a state with
+    the state that `init` returns must not change the state.
     """
 
     @abstractmethod
@@ -104,10 +104,11 @@ class Mean(AbstractReduction):
 class Variance(AbstractReduction):
     """The variance over the members of an ensemble, for every number `run` returns.
 
-    It is Σ (x_j - mean)² / (n - ddof), by the update of Chan, Golub and LeVeque (1983,
-    *Algorithms for computing the sample variance*), which for one additional member is
-    Welford's update. If δ is the difference of the means of two sets of n_a and n_b
-    members,
+    The variance is Σ (x_j - mean)² / (n - ddof), computed by the update of Chan, Golub
+    and LeVeque (1983, *Algorithms for computing the sample variance*). For one
+    additional member this is Welford's update. Let two sets have n_a and n_b members,
+    n = n_a + n_b, sums of squares about their means S_a and S_b, and the difference of
+    means δ = mean_b - mean_a. Then
 
     mean = mean_a + δ n_b/n,   S = S_a + S_b + δ² n_a n_b/n.
 
@@ -190,7 +191,10 @@ class Variance(AbstractReduction):
 
 
 class _AbstractExtreme(AbstractReduction):
-    """The best of the values of members; every value is at least as good as `worst`."""
+    """The smallest or the largest of the values of members, chosen by `best`.
+
+    No value is worse than `worst`, with which the comparison starts.
+    """
 
     worst: eqx.AbstractClassVar[float]
     of: Callable[[Any], Any] | None = eqx.field(static=True, default=None)
@@ -466,10 +470,10 @@ def fold(
     values: PyTree[Array],
     counts: Bool[Array, " c"],
 ) -> PyTree[Array]:
-    """Merge the states of the members of a chunk, in an order that depends on c only.
+    """Merge the states of the c members of a chunk, in an order that depends only on c.
 
     About √c states collect members side by side and are merged at the end. This needs
-    few iterations, uses long vectors, and memory does not grow with c.
+    only about 2√c iterations, uses long vectors, and stores only about √c states.
 
     **Arguments:**
 

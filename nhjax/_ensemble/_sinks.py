@@ -41,8 +41,8 @@ class EnsembleOutcome(eqx.Module):
     """The outcome of `nhjax.ensemble`.
 
     - `num_members`: the number of members, including those that failed.
-    - `values`: what `run` returned, as NumPy arrays with the members as leading axis;
-        None if the values were reduced or written to a store.
+    - `values`: the values that `run` returned, as NumPy arrays with the members as
+        leading axis; None if the values were reduced or written to a store.
     - `statistics`: the results of the reductions, in a tree like `reduce`, or None.
     - `failed`: the indices of the members that failed, in increasing order.
     - `failed_step`: the steps at which they failed, -1 if a step is not known.
@@ -173,7 +173,7 @@ class MemorySink(AbstractSink):
         )
 
     def remaining_chunks(self) -> Iterable[int]:
-        """Return the share of this process."""
+        """Return the chunks of this process, which are consecutive."""
         return self.job.share(self.job.processes.index)
 
     def start(self, chunk: int) -> ChunkResult:

@@ -75,8 +75,8 @@ class ZarrSink(AbstractSink):
                 for name, (dims, x) in self.variables.items()
             },
         )
-        # This comes before all comparisons and writes, so that a missing package is
-        # reported.
+        # The encoder is created before all comparisons and writes, so that a missing
+        # package zarr is reported first.
         self.encoder, self.lock = self._encoder(self.variables), durable.Lock()
         self.program = program_text(job)
         job.processes.check_same_call(

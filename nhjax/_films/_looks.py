@@ -24,21 +24,21 @@ Pose: TypeAlias = tuple[Float[Array, "3"], Float[Array, "3 3"]]
 class Looks(eqx.Module):
     """The shapes of a machine, and where they are at a configuration.
 
-    `nhjax.render` and `nhjax.view` show it. The machines of `nhjax.systems` and the
-    robots of `from_mujoco` have looks already.
+    `nhjax.render` and `nhjax.view` accept a `Looks`. The machines of `nhjax.systems`
+    and the robots of `from_mujoco` need none.
 
     - `mjcf`: the shapes, as the text of an MJCF model. Its bodies are children of
         `<worldbody>`, have names and no joints. Geoms of the world itself do not move.
     - `poses`: a function of (t, q, args) that returns a dictionary from the names of
         the bodies to pairs: the position [m], of shape (3,), and the rotation to space,
-        of shape (3, 3). z points upwards. It is called with `args=None`.
+        of shape (3, 3). z points upwards. `args` is always None.
     - `trails`: a function of (t, q, args) that returns points [m], of shape (k, 3),
         whose paths are drawn, such as the contacts of wheels; None draws no paths.
-    - `ground`: the height of the ground [m]. None is just below everything.
+    - `ground`: the height of the ground [m]. None puts it just below everything.
     - `azimuth`, `elevation`: the default direction of the camera [degrees]: 90 looks
         along y, and negative elevations look down.
-    - `manifold`: the manifold of the configurations, which interpolates between saved
-        states. The default is R^n.
+    - `manifold`: the manifold of the configurations, for the interpolation between
+        saved states. The default is R^n.
 
     !!! example
 
@@ -81,11 +81,11 @@ def body(name: str, *geoms: str) -> str:
 
 
 def frame(*geoms: str, pos: Numbers = (0, 0, 0), turn: str = "") -> str:
-    """Return geoms in a frame; `turn` is its attribute of orientation."""
+    """Return geoms in a frame; `turn` is an attribute such as `euler='0 0 1'`."""
     return f"<frame pos='{_text(pos)}' {turn}>{''.join(geoms)}</frame>"
 
 
-# The axle of a wheel, y in the frame of the shape, along the third axis of its body.
+# The `turn` of a wheel, so that its axle is along z of its body instead of y.
 AXLE_ALONG_Z = f"euler='{-math.pi / 2} 0 0'"
 
 
@@ -188,7 +188,7 @@ def bowl(name: str, heights: Numbers, radius: float) -> str:
             a, b = i * num + k, i * num + following
             faces += [(a, a + num, b + num), (a, b + num, b)]
     inside = np.asarray(faces)
-    # The other side is a surface of its own, with vertices of its own, for its normals.
+    # The other side has its own vertices, because its normals are opposite.
     outside = inside[:, ::-1] + len(points)
     thick = points - [0, 0, 0.01 * radius]
     vertices = np.concatenate([points, thick])
@@ -209,9 +209,9 @@ def between(start: Array, end: Array) -> Pose:
 
 
 def along(direction: Array) -> Float[Array, "3 3"]:
-    """Return a rotation whose third axis has a direction."""
+    """Return a rotation whose third axis has the given direction."""
     z = direction / jnp.sqrt(direction @ direction)
-    # The axis that is farthest from the direction is never parallel to it.
+    # The coordinate axis farthest from the direction is never parallel to it.
     aside = jnp.eye(3, dtype=z.dtype)[jnp.argmin(jnp.abs(z))]
     x = jnp.cross(aside, z)
     x = x / jnp.sqrt(x @ x)

@@ -38,8 +38,8 @@ def render(
 ) -> Path:
     """Write a film of a run, with light and shadows, or a picture of one time.
 
-    MuJoCo's renderer draws the shapes off screen. The film has the speed of the motion
-    for any step sizes: configurations between saved states are interpolated.
+    MuJoCo's renderer draws the shapes off screen. The film plays at the speed of the
+    motion for any step sizes: configurations between saved states are interpolated.
 
     **Arguments:**
 
@@ -294,7 +294,7 @@ def _write_mp4(
     command = [
         *(encoder.get_ffmpeg_exe(), "-y", "-loglevel", "error", "-f", "rawvideo"),
         *("-pix_fmt", "rgb24", "-s", f"{width}x{height}", "-r", f"{fps}", "-i", "-"),
-        # Players and browsers show no other format of pixels.
+        # Many players and browsers show this format of pixels only.
         *("-c:v", "libx264", "-pix_fmt", "yuv420p", "-crf", "23"),
         *("-movflags", "+faststart", str(path)),
     ]
@@ -324,7 +324,8 @@ def _write_gif(
     sheet = image.new("RGB", (size[0], size[1] * len(some)))
     for k, picture in enumerate(some):
         sheet.paste(picture, (0, k * size[1]))
-    # The first colours are frequent, and the others keep those of small parts.
+    # The first 176 colours are the frequent ones; the others keep the colours of
+    # small parts.
     frequent = sheet.quantize(176, image.Quantize.MEDIANCUT).getpalette()
     apart = sheet.quantize(80, image.Quantize.MAXCOVERAGE).getpalette()
     palette = image.new("P", (1, 1))

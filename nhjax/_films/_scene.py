@@ -60,7 +60,8 @@ class Scene:
 
     - `times`: the times, of shape (k,).
     - `centres`: where the camera of a film looks, of shape (k, 3).
-    - `reach`: the radius of a ball around the centre that has the machine at all times.
+    - `reach(centres)`: the radius of the balls about these centres, one for each time,
+        that contain the machine.
     - `trails`: the paths to draw, of shape (paths, k, 3).
     """
 
@@ -78,7 +79,10 @@ class Scene:
         self.data = self._mujoco.MjData(self.model)
 
     def _places(self, who: str, subject: Subject, q: Any) -> tuple[Any, Any, Any]:
-        """Return qpos, or the poses of the bodies, and the model without a scene."""
+        """Return qpos, the poses of the bodies, and the model without a scene.
+
+        For a robot the poses are None, and for a `Looks` qpos is None.
+        """
         mujoco, spec = self._mujoco, subject.spec
         if subject.robot is not None:
             is_spec = isinstance(spec, mujoco.MjSpec)
@@ -112,7 +116,7 @@ class Scene:
         return None, (positions, quaternions), model
 
     def _paths(self, subject: Subject, q: Any) -> np.ndarray:
-        """Compute the paths of contacts, or those that the looks choose."""
+        """Compute the paths of a robot's contacts, or the `trails` of the looks."""
         ts = jnp.asarray(self.times, jax.tree.leaves(q)[0].dtype)
         if subject.robot is not None:
             contacts = subject.robot.contacts
@@ -132,7 +136,8 @@ class Scene:
         """Find where the machine is, how large it is, and how low it comes."""
         mujoco, data = self._mujoco, self._mujoco.MjData(model)
         solid = model.geom_type != mujoco.mjtGeom.mjGEOM_PLANE
-        # The world of a robot can be large; a machine's own fixed parts belong to it.
+        # The fixed geoms of a `Looks` belong to the machine. The fixed geoms of a robot
+        # are its world, which can be large.
         moving = solid & ((model.geom_bodyid > 0) | (self.looks is not None))
         moving = moving if np.any(moving) else solid
         mass = model.body_mass[1:]
@@ -167,7 +172,7 @@ class Scene:
         """Compile the model with ground, light and sky, if it lacks them."""
         mujoco = self._mujoco
         if not isinstance(subject.spec, mujoco.MjSpec):
-            # A copy, because the renderer sets the size of its pictures.
+            # A copy, because the renderer writes the size of its pictures into it.
             return copy.copy(subject.spec), None
         spec, size = subject.spec.copy(), self.reach(self.centres)
         if subject.robot is not None:
@@ -225,7 +230,7 @@ class Scene:
     def place(self, k: int) -> None:
         """Put the bodies and the light where they are at the k-th time."""
         if self._light is not None:
-            # The shadows of a directional light reach only so far from it.
+            # A directional light casts shadows only up to a distance from its position.
             distance = 5 * self.model.stat.extent
             self.model.light_pos[self._light] = self.centres[k] - distance * LIGHT
         self._move(self.model, self.data, k)
@@ -245,7 +250,8 @@ class Scene:
 
 # The direction of the light: from the left, from behind the camera, and from above.
 LIGHT = np.array([0.35, 0.45, -0.82]) / np.linalg.norm([0.35, 0.45, -0.82])
-# MuJoCo's colour of geoms without one. With it, a material shows its own colour.
+# MuJoCo's colour for geoms that specify none. A geom of this colour shows the colour of
+# its material.
 PLAIN = [0.5, 0.5, 0.5, 1]
 
 
@@ -259,7 +265,8 @@ def _add_ground(mujoco: Any, spec: Any, height: float, size: float) -> None:
         width=256,
         height=256,
     )
-    # A texture has two cells, and a cell is the round length below the machine's size.
+    # A texture is two cells wide. The width of a cell is a round length, at most the
+    # size of the machine.
     cell = round_length(size)
     names = [""] * mujoco.mjtTextureRole.mjNTEXROLE
     names[mujoco.mjtTextureRole.mjTEXROLE_RGB] = "nhjax ground"
@@ -292,7 +299,7 @@ def round_length(size: float) -> float:
 def _mark_wheels(mujoco: Any, spec: Any, robot: Robot) -> None:
     """Draw bars on the wheels of a robot, so that their rolling is visible.
 
-    Geoms without a colour are blue, and such wheels dark.
+    Geoms without a colour become blue, and wheels without a colour become dark.
     """
     model = spec.copy().compile()
     rolling = () if robot.contacts is None else robot.contacts.names
@@ -327,7 +334,7 @@ def _smoothed(centres: np.ndarray, times: np.ndarray) -> np.ndarray:
     width = max(1, len(times) // 20)
     if len(times) < 3:
         return centres
-    # Beyond its ends the path continues with its last velocity.
+    # Beyond its ends the path continues with the velocities at its ends.
     before = centres[0] + np.arange(-width, 0)[:, None] * (centres[1] - centres[0])
     after = centres[-1] + np.arange(1, width + 1)[:, None] * (centres[-1] - centres[-2])
     path = np.concatenate([before, centres, after])

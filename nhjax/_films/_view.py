@@ -29,7 +29,7 @@ class Show:
         self._frames = _add_shapes(server, scene)
         times = scene.times
         low, high = sorted((float(times[0]), float(times[-1])))
-        # A round step shows round times.
+        # With a round step, the slider shows round times.
         self._step = round_length((high - low) / max(1, len(times) - 1) or 1.0)
         self._slider = server.gui.add_slider(
             "time [s]",
@@ -39,7 +39,7 @@ class Show:
             initial_value=low,
         )
         self._play = server.gui.add_checkbox("play", initial_value=len(times) > 1)
-        # The ground moves instead of the camera, which belongs to the user's mouse.
+        # The ground moves instead of the camera, which the user moves with the mouse.
         self._follow = server.gui.add_checkbox("follow", initial_value=True)
         self._follow.on_update(lambda _: self.show(self._slider.value))
         self._slider.on_update(lambda _: self.show(self._slider.value))
@@ -55,7 +55,7 @@ class Show:
         """Show the machine at the frame nearest to a time."""
         k = int(np.argmin(np.abs(self._scene.times - t)))
         data = self._scene.data
-        # The slider and the playing are in threads of their own.
+        # The callbacks of the slider and the playback run in different threads.
         with self._lock, self.server.atomic():
             self._scene.place(k)
             moved = self._scene.centres[k] - self._scene.centres[0]
@@ -113,7 +113,7 @@ def view(
 
     - `machine`, `sol`: as for `nhjax.render`.
     - `port`: the port of the server; if it is taken, the next free one is used.
-    - `speed`: the number of seconds of the motion in a second.
+    - `speed`: the number of seconds of the motion that are shown in one second.
     - `block`: whether to wait until Ctrl-C. The default is to wait in a script, which
         would end otherwise, and not in an interactive session.
 
@@ -148,7 +148,7 @@ def view(
 
 
 def _add_shapes(server: Any, scene: Scene) -> dict[int, Any]:
-    """Add the geoms of all bodies and the trails; the frames of bodies that move."""
+    """Add all geoms and trails, and return the frames of the bodies by number."""
     mujoco, model = mujoco_of("nhjax.view", "view"), scene.model
     server.scene.set_up_direction("+z")
     extent = float(model.stat.extent)

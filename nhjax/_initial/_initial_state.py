@@ -76,8 +76,8 @@ def initial_state(
     You give the velocity or the momentum; the other follows from the Legendre transform
     p = D2L or v = D2H. The multiplier is the multiplier of the continuous problem. It
     follows from the hidden constraints: dΦ/dt = 0 for nonholonomic and d²Γ/dt² = 0 for
-    holonomic constraints. With an inconsistent λ_0, a method with the closure
-    `"propagated"` has in general only order 2, for any number of stages.
+    holonomic constraints. With an inconsistent initial multiplier λ_0, a method with
+    the closure `"propagated"` has in general only order 2, for any number of stages.
 
     **Arguments:**
 
@@ -113,13 +113,13 @@ def initial_state(
     - `ValueError`: `v` and `p` are both given or both left out; a component to keep is
         unknown, or chosen twice or without `project=True`.
     - `ShapeError`, `DTypeError`, `NonFiniteError`: an argument, or the value of one of
-        the system's functions, is not what it should be.
+        the system's functions, has a wrong shape or dtype, or is not finite.
     - `ConstraintViolationError`: a constraint is violated, or `q` is not on the group,
         and `project` is false or the kept components prevent the correction.
     - `IrregularLagrangianError`: D2D2L (or D2D2H) is singular.
     - `DependentConstraintsError`: D2Φ and DΓ do not have full rank (admissibility), and
         the constraints of the system are `"independent"`.
-    - `IncompatibleConstraintsError`: C^{ab} is singular (compatibility).
+    - `IncompatibleConstraintsError`: the compatibility matrix C^{ab} is singular.
     - `NewtonError`: no velocity was found for the momentum (or the reverse), or the
         projection by Newton's method did not converge.
 
@@ -131,7 +131,8 @@ def initial_state(
         >>> [float(x) for x in y0.v]
         [1.0, 1.0, 0.0]
 
-    A disc that rolls at exactly 3 m/s, for which its roll rate must be 3 rad/s:
+    In the next example a disc of radius 1 m rolls at exactly 3 m/s, because `keep_v`
+    keeps this speed. Its roll rate must then be 3 rad/s:
 
         >>> disc = nhjax.systems.VerticalRollingDisc(radius=1.0).system
         >>> v = jnp.array([3.0, 0.0, 0.0, 0.0])
@@ -288,11 +289,11 @@ def _project(
 def _noise(
     system, lin: Linearisation, t, q, u, args
 ) -> tuple[FunctionNoise, Float[Array, "l n"]]:
-    """Measure round-off, and set rows of D2Φ that are zero to round-off to zero.
+    """Measure round-off, and set rows of D2Φ that are only round-off to exact zeros.
 
-    A constraint that is the square of an expression has such a row where it holds. The
-    round-off of a row is measured along one direction, which is cheaper than for all
-    columns.
+    A constraint that is the square of an expression has such a row at states that
+    satisfy it. The round-off of a row is measured along one direction, which is cheaper
+    than for all columns.
     """
     random = np.random.default_rng(0)
     sizes = random.uniform(0.5, 1.5, u.shape) * random.choice([-1.0, 1.0], u.shape)
@@ -330,10 +331,9 @@ def _ranks_judged(
 ) -> tuple[list[BoolScalar], FloatScalar]:
     """Return which ranks are deficient, and the reciprocal condition number of C.
 
-    Redundant constraints are compatible if C has the rank of their derivatives. The
-    condition number that is returned is then one, and it is zero if they are not
-    compatible. Their ranks are deficient only if all derivatives of a constraint are
-    zero.
+    Redundant constraints are compatible if C has the rank of their derivatives. For
+    redundant constraints, the second result is one if they are compatible and zero
+    otherwise, and a rank is deficient only if all derivatives of a constraint are zero.
     """
     jacobian, reaction, _ = lin.dense
     delassus = jacobian @ reaction

@@ -344,8 +344,8 @@ def _nearest_keeping(
     Such a combination may be violated at the result: the caller must check all
     constraints there.
 
-    `terms_of_held` has the sizes of the terms of `held`, to which their round-off is
-    proportional.
+    `terms_of_held` has the sizes of the terms of `held`. The round-off of `held` is
+    proportional to these sizes.
     """
     jacobian = jax.jacrev(constraint)(x)
     size, terms = sizes(jacobian)
@@ -431,15 +431,16 @@ def _nearest(
     - `metric`: the matrix K.
     - `constraint`: the function that must vanish.
     - `x`: the point from which the search starts.
-    - `sizes`: called as `sizes(jacobian)`; returns the sizes of y and of the terms of
-        the constraint, to which their round-off is proportional.
+    - `sizes`: called as `sizes(jacobian)`; returns the size of y and the sizes of the
+        terms of the constraint. The round-off of y and of the constraint is
+        proportional to these sizes.
     - `is_redundant`: whether constraints may be dependent.
     - `idle`: one for rows of the constraint that are zero everywhere, and zero for the
         others. The multipliers of idle rows are zero.
     """
     jacobian = jax.jacrev(constraint)(x)
     size, terms = sizes(jacobian)
-    # Round-off of the constraint changes y too; it is the only round-off if y is zero.
+    # Round-off of the constraint also changes y; if y is zero, there is no other one.
     reaction = inverse(metric) @ jacobian.T
     delassus = jacobian @ reaction
     if idle is not None:

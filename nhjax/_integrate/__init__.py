@@ -1,9 +1,11 @@
 """Integration over many steps: the time loop, events, output and derivatives.
 
-`_integrate` checks the arguments, `_run` has the compiled programs, `_chunks` drives
-them outside of transformations, `_loop` iterates and is differentiated by adjoints, of
-which `_reversible` is one, `_stepper` takes the steps, and `_events` wraps the plain
-stepper.
+`_integrate` checks the arguments. `_run` has the compiled programs, and outside of
+transformations `_chunks` calls them for one chunk of steps after the other. The plain
+stepper in `_stepper` takes steps of equal size; the steppers in `_variable` and
+`_events` use it for steps of different sizes and for events. `_loop` has the time loop
+and the adjoints, which decide how the loop is differentiated. A further adjoint is in
+`_reversible`.
 """
 
 from ._checkpoint import Checkpoint as Checkpoint

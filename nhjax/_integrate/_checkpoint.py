@@ -28,9 +28,9 @@ MOST_STEPS = 2**31 - 1
 class Checkpoint(eqx.Module):
     """All data that a run carries from step to step, to continue it bit for bit.
 
-    A `State` is not enough for this. The sums q and p are compensated, and their
-    rounding errors are carried along. The times t_k = t0 + k dt are products, which
-    depend on their origin. The iteration of a step starts from the linearisation of the
+    A `State` is not enough for this. The run adds up q and p by compensated sums, and
+    also carries the rounding errors of these sums. The times t_k = t0 + k dt depend on
+    their origin t0. The iteration of a step starts from the linearisation of the
     step before. `SaveAt(checkpoint=True)` saves a checkpoint, `integrate` accepts one
     in place of a state, and `nhjax.save` writes one to a file.
 
@@ -42,16 +42,18 @@ class Checkpoint(eqx.Module):
     - `dt`: the step size.
     - `num_steps`: the number of steps taken since `t0`.
     - `clock`: the data of the `stepsize_controller`; empty after a run with constant
-        steps. A run with different steps has its end as `t0`, and zero `num_steps`.
+        steps. After a run whose steps differ, `t0` is the end of the run, and
+        `num_steps` is zero.
 
     Under `vmap` every array has the batch as its leading axis. Derivatives pass through
     `state`, `t0` and `dt`.
 
     The bits of a result depend on the compiled instructions. A run in parts repeats a
     run in one piece bit for bit if all parts save the same output, with the same
-    releases on the same machine; under `jit` all parts must also save a checkpoint (the
-    last part need not). Otherwise it repeats the run up to round-off. Samples by
-    `SaveAt(ts=...)` and dense output count times from the start of their run.
+    releases on the same machine. Under `jit` the run in one piece must also save a
+    checkpoint, as all parts except the last do. Otherwise the results agree up to
+    round-off. Samples by `SaveAt(ts=...)` and dense output count times from the start
+    of their own part.
 
     !!! example
 

@@ -1,9 +1,9 @@
-"""The loop on the host that drives a plain call of `integrate` in chunks of steps.
+"""The loop on the host that runs `integrate` in chunks of steps.
 
 Outside of transformations a run is not one compiled program. A program takes a chunk of
-steps: it leads from a carry to a carry, and writes rows to a buffer of fixed size. The
-first step, the number of steps and the stride of the output are arguments of it, so
-that a run of another length or with other output compiles nothing. Between chunks the
+steps: it leads from a carry to a carry, and writes rows to a buffer of fixed size. Its
+arguments include the first step, the number of steps and the stride of the output, so
+that a run of another length or with other output does not recompile. Between chunks the
 host moves the rows to the output, updates the progress meter, and stops the run after
 Ctrl-C.
 """
@@ -27,8 +27,8 @@ from ._progress_meter import AbstractProgressMeter
 # The size of the buffers of a chunk, in numbers, and limits of their length in rows.
 _BUFFER_SIZE = 2**17
 _LEAST_ROWS, _MOST_ROWS = 16, 4096
-# The first chunk without rows has this many iterations. Later chunks take about this
-# many seconds, after which a chunk returns to the host.
+# Unless a progress meter sets the lengths of chunks, the first chunk has at most
+# `_FIRST_ITERATIONS` iterations, and later chunks take about `_SECONDS` or less.
 _FIRST_ITERATIONS = 256
 _SECONDS = 0.2
 # The number of times of `SaveAt(ts=...)` at which one call computes the output.
@@ -99,16 +99,18 @@ def drive(
     - `chunk`: takes a chunk; a function of the carry, the log and the numbers of a
         `Span`. Its result has the fields `carry`, `log`, `num_filled`, `saved` and
         `records`.
-    - `carry`, `log`: those before the first iteration.
+    - `carry`, `log`: the carry and the log before the first iteration.
     - `num_steps`, `num_iterations`: the numbers of steps and of iterations.
-    - `stride`, `room`: the stride of the output, and the rows of the buffers.
-    - `saves_end`: whether a run of a number of steps saves its last state.
+    - `stride`, `room`: the stride of the output, and the number of rows of the buffers.
+    - `saves_end`: a function that returns whether a run of a given number of steps
+        saves its last state.
     - `recorded`: the sorted indices of the steps whose records are needed; None for
         all.
     - `keeps_records`: whether chunks return records of steps.
     - `meter`: the progress meter.
-    - `may_end_early`: whether a chunk says by its fields `is_over` and `progress`
-        whether the run has ended, and which part of it is done.
+    - `may_end_early`: whether the run may end before its last iteration. The result of
+        a chunk then also has the fields `is_over`, whether the run has ended, and
+        `progress`, the part of the run that is done.
     """
     done, filled, last = 0, 0, None
     saved, records = [], []
@@ -152,7 +154,7 @@ def drive(
 
 def on_device(tree: PyTree[np.ndarray], like: Any) -> PyTree[Any]:
     """Return arrays of JAX with these values, on the device of the array `like`."""
-    # In contrast to `jnp.asarray`, this compiles nothing.
+    # In contrast to `jnp.asarray`, this does not compile a program.
     with jax.default_device(next(iter(like.devices()))):
         return jax.device_put(tree)
 
@@ -163,7 +165,7 @@ def joined(pieces: list[PyTree[Any]]) -> PyTree[np.ndarray]:
 
 
 def padded(x: np.ndarray, length: int) -> np.ndarray:
-    """Return an array that is continued by its last entry up to a length."""
+    """Extend an array to a given length by repeating its last entry."""
     return np.concatenate([x, np.broadcast_to(x[-1:], (length - len(x), *x.shape[1:]))])
 
 
@@ -177,7 +179,7 @@ def _rows(buffers: PyTree[Any], which: Any) -> PyTree[np.ndarray]:
 
 
 def _asked(recorded: np.ndarray | None, before: int, filled: int) -> Any:
-    """Find the rows of a buffer that have the records of steps that are needed."""
+    """Find the rows of a buffer with records that are needed."""
     if recorded is None:
         return slice(filled - before)
     return recorded[(recorded >= before) & (recorded < filled)] - before
@@ -192,8 +194,8 @@ def _joined(pieces: list[PyTree[np.ndarray]]) -> PyTree[np.ndarray] | None:
 class _Schedule:
     """The lengths of the chunks, and the reports to the progress meter.
 
-    An event takes additional iterations. The first `surplus` iterations are therefore
-    not reported: the steps that are reported are certain to be complete.
+    Events may take up to `surplus` additional iterations. After `done` iterations,
+    at least `done - surplus` steps are therefore complete, and only these are reported.
     """
 
     def __init__(
@@ -220,7 +222,7 @@ class _Schedule:
         return min(self._every - steps % self._every, most)
 
     def finished(self, length: int, seconds: float) -> None:
-        """Learn from a chunk of this length how long the next ones may be."""
+        """Set the length of the next chunk from the time that a chunk has taken."""
         factor = _SECONDS / max(seconds, 1e-3 * _SECONDS)
         self._next = max(1, min(int(length * factor), 8 * self._next))
 
@@ -243,9 +245,8 @@ class _Schedule:
 def _interruptions() -> Iterator[Callable[[], bool]]:
     """Catch Ctrl-C; yield a function that returns whether it was pressed.
 
-    A second one raises `KeyboardInterrupt` as usual. Handlers that others have
-    installed are left alone, as are threads other than the main thread, which have no
-    handlers.
+    A second Ctrl-C raises `KeyboardInterrupt` as usual. If another handler is
+    installed, or if this is not the main thread, Ctrl-C is not caught.
     """
     pressed = threading.Event()
     is_ours = (

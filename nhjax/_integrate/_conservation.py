@@ -32,7 +32,8 @@ from .._system import (
 )
 
 
-# Rates of change are checked at the initial state and at this many states near it.
+# Rates of change are checked at the initial state and at `_SAMPLES` states near it.
+# `_SPREAD` is the size of the random displacements that lead to these states.
 _SAMPLES, _SPREAD = 3, 0.3
 # The number of Newton iterations that move these states onto constraints on velocities,
 # which may be nonlinear.

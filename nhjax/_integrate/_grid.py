@@ -45,9 +45,9 @@ class TimeGrid(eqx.Module):
 class VariableGrid(eqx.Module):
     """The nodes of a run whose steps differ.
 
-    - `dt`: the size of the user, or None.
+    - `dt`: the step size that the user gave, or None.
     - `t1`: the end, or None for a run of `num_steps` steps.
-    - `direction`: 1.0 or -1.0.
+    - `direction`: 1.0 for a run forward in time, -1.0 for a run backward in time.
     - `num_steps`: the number of steps, or None for a run to `t1`.
     - `max_steps`: the largest number of attempts at a step.
     """
@@ -76,7 +76,7 @@ class VariableGrid(eqx.Module):
 
     @property
     def typical_size(self) -> FloatScalar:
-        """Return a size of the order of a step, by which errors per step are judged."""
+        """Return a typical size of a step, for estimates of the round-off in a step."""
         if self.dt is not None:
             return self.dt
         return self.direction if self.t1 is None else 1e-2 * (self.t1 - self.t0)
@@ -141,7 +141,7 @@ def variable_grid(
         raise TypeError(_NEEDS_SIZE)
     end = None if t1 is None else real_scalar("t1", t1, dtype)
     values = [x for x in (t0, size, end) if x is not None]
-    # Operations of NumPy on known values take a tenth of the time.
+    # On known values, operations of NumPy take a tenth of the time of JAX operations.
     numpy = jnp if is_traced(*values) else np
     first, step = numpy.asarray(t0), numpy.asarray(1 if size is None else size)
     forward = step if end is None else numpy.asarray(end) - first
@@ -154,7 +154,7 @@ def variable_grid(
     checks += controller.checks()
     if most is None:
         most = _default_limit(controller, t0, size, end, number)
-    # As arrays, other tolerances do not recompile.
+    # Tolerances are passed as arrays, so that other values do not recompile.
     known, rest = eqx.partition((controller, direction), _is_known_number)
     known = jax.tree.map(lambda x: np.asarray(x, dtype), known)
     with jax.ensure_compile_time_eval():
@@ -216,7 +216,7 @@ def _default_limit(
     if num_steps is not None:
         if not controller.estimates_errors:
             return num_steps
-        # Steps may be repeated.
+        # The limit exceeds `num_steps`, because steps may be repeated.
         return min(max(_MOST_STEPS, 4 * num_steps), 2**31 - 1)
     if not isinstance(controller, ConstantStepSize) or size is None or end is None:
         return _MOST_STEPS

@@ -112,18 +112,19 @@ _BY_NEWTON = (
     "Newton's method for such steps",
     "nhjax.SimplifiedNewton(fallback=True)` or `nhjax.Newton()",
 )
-# With more iterations a step than this, the full Jacobian takes less time on the
-# machines that were measured (`benchmarks.iterations`).
+# If the average step takes more iterations than this, the full Jacobian takes less time
+# on the machines that were measured (`benchmarks.iterations`).
 _MANY_ITERATIONS = 40
-# Runs with fewer steps than this are over before another program is compiled.
+# Runs with fewer steps than this cause no warning of slow convergence, because they
+# take less time than compiling another program.
 _FEW_STEPS = 10
 _FULL = (
     '`stage_solver=nhjax.SimplifiedNewton(jacobian="full")` takes fewer iterations and '
     "often allows larger steps. Its first call takes two to three times as long."
 )
 _SLOW = "The steps of this run took {:.0f} iterations on average. "
-# If a larger part of the attempts than this is not solved, the equations and not the
-# errors determine the steps.
+# If more than this fraction of the attempts is not solved, the step sizes are limited
+# by the convergence of the stage solver, and not by the estimated errors.
 _MANY_UNSOLVED = 0.2
 _UNSOLVED = (
     "In {} of the {} attempts at a step of this run the equations were not solved, and "
@@ -157,16 +158,16 @@ def integrate(
 ) -> Solution:
     """Integrate a mechanical system over `num_steps` steps, or to the time `t1`.
 
-    Each step solves the discrete equations of the paper (its four summaries) to
-    round-off. So the constraints on velocities and positions hold at every node to
-    round-off as well. The sums q and p are compensated, and elements of a group stay on
-    the group.
+    Each step solves the discrete equations of the paper (listed in its four summaries)
+    to round-off. So the constraints on velocities and positions hold at every node to
+    round-off as well. Compensated sums add the steps to q and p, and elements of a
+    group stay on the group.
 
     `integrate` works under `jit`, `vmap`, `grad`, `jvp` and `hessian`, with respect to
     `y0`, `args`, `dt`, `t0` and the array leaves of `system`. Stage equations are
-    differentiated by the implicit function theorem. Use `initial_state` to perturb a
-    state: the equations of a step read q and p, and read v only for the first
-    multiplier.
+    differentiated by the implicit function theorem. To perturb a state, call
+    `initial_state` with the perturbed values: a step starts from q and p, and reads v
+    only for the first multiplier.
 
     **Arguments:**
 
@@ -174,8 +175,8 @@ def integrate(
     - `method`: such as `nhjax.LobattoIIIAB(stages=3)`; `Gauss` only without
         constraints.
     - `y0`: a consistent state, from `nhjax.initial_state` or an earlier `Solution`.
-        Only the propagated closure uses its multiplier. It may also be the `Checkpoint`
-        of an earlier run, which then continues bit for bit.
+        Only the propagated closure uses its multiplier. `y0` may also be the
+        `Checkpoint` of an earlier run, which then continues bit for bit.
     - `dt`: the step size, a scalar, in units of time; negative to integrate backwards.
         An array of shape (num_steps,) gives the size of each step. With a controller
         that chooses the sizes, it is the first size, and may be left out.
@@ -193,11 +194,12 @@ def integrate(
     - `stepsize_controller`: how the sizes of the steps are chosen: all equal to `dt` by
         default, or `nhjax.PIDController(rtol, atol)`, which keeps an estimated error
         below a tolerance, or `nhjax.ReversibleController(eps, density)`. Derivatives
-        count the sizes that a controller chose as given.
-    - `max_steps`: the largest number of attempts at a step in a run to `t1`, an int,
-        4096 by default, and with constant steps as many as are needed. Under `jit`,
-        `SaveAt(steps=..., ts=..., dense=...)` and reverse mode need memory for this
-        number of steps.
+        treat the sizes that a controller chooses as constants.
+    - `max_steps`: the largest number of attempts at a step in a run to `t1`, an int.
+        The default is 4096, or the number of steps that the run needs if the steps are
+        constant and this number is known when tracing. Under `jit`,
+        `SaveAt(steps=..., ts=..., dense=...)` and reverse mode need memory for
+        `max_steps` steps.
     - `adjoint`: which data reverse mode stores: `nhjax.DirectAdjoint()` by default,
         `nhjax.RecursiveCheckpointAdjoint()`, or `nhjax.ReversibleAdjoint()`.
     - `throw`: raise an error if a step cannot be solved. Otherwise the trajectory stays
@@ -210,12 +212,13 @@ def integrate(
         must conserve these quantities.
         `docs/invariants.md` describes the method, its cost and its behaviour at rest.
     - `event`: an `nhjax.Event`, or a sequence of them: zeros of functions of the state,
-        where the run ends or the state is reset. The first event in time happens first.
+        where the run ends or the state is reset. If a step has several events, the
+        earliest is handled first.
 
     **Returns:** a `Solution`.
 
-    **Raises:** `IntegrationError` as described (under `jit` its message is in an error
-    of JAX, a `JaxRuntimeError` or a `ValueError`); `ShapeError`, `DTypeError`,
+    **Raises:** `IntegrationError` if the run fails and `throw` is true (under `jit` its
+    message is in a `JaxRuntimeError` or `ValueError`); `ShapeError`, `DTypeError`,
     `NonFiniteError`, `TypeError` and `ValueError` for invalid arguments;
     `DependentConstraintsError` with the names of constraints that depend on each other
     in `y0`; a `ValueError` that names the failing hypothesis (H1, H2, H3) if the method
@@ -231,9 +234,9 @@ def integrate(
         solution up to there, whose `result` is `nhjax.RESULTS.interrupted`.
 
         Under `jit` an int `num_steps` is static. An integer array is traced, and under
-        `vmap` each member may have its own; then `saveat` must not depend on the
-        number (only `t0`, `t1` and `fn`). Reverse mode needs an int, or
-        `ReversibleAdjoint`.
+        `vmap` each member may have its own number. With an array, `saveat` must not
+        have `steps`, `ts` or `dense`, because their output depends on the number.
+        Reverse mode needs an int, or `ReversibleAdjoint`.
 
     !!! note
 
@@ -298,8 +301,8 @@ def integrate(
             )
     saveat, valid = saveat.within(t0), None
     if throw:
-        # All checks go through times that are always used: jit drops checks of unused
-        # values.
+        # All checks are attached to the grid, whose times are always used, because jit
+        # drops checks of unused values.
         grid = require(grid, *checks)
     else:
         valid = hold(*checks)
@@ -371,11 +374,12 @@ def step(
 ) -> State:
     """Take one step of size `dt`, from the state `y` at `t` to the state at `t + dt`.
 
-    The step solves the discrete equations of the paper (its four summaries), and its
-    result equals the result of `integrate` with `num_steps=1` bit for bit. Use it for
-    control loops, environments and other time loops that `integrate` does not offer. It
-    works under `jit`, `vmap`, `grad`, `jvp`, `hessian` and inside `jax.lax.scan`. Over
-    many steps `integrate` is faster, and its compensated sums lose less to round-off.
+    The step solves the discrete equations of the paper (listed in its four summaries).
+    The result equals the result of `integrate` with `num_steps=1` bit for bit. Use this
+    function for control loops, environments and other time loops that `integrate` does
+    not offer. It works under `jit`, `vmap`, `grad`, `jvp`, `hessian` and inside
+    `jax.lax.scan`. Over many steps `integrate` is faster, and its compensated sums lose
+    less to round-off.
 
     **Arguments:**
 
@@ -441,11 +445,11 @@ def suggest_step(
     """Suggest a step size for runs with constant steps, from a trial run.
 
     The trial run from `t0` to `t1` takes steps by `nhjax.PIDController(rtol, atol)`.
-    The suggested size is the smallest that it needed, without the first steps, whose
-    sizes are still being found, and the last one, which ends at `t1`. It is rounded
-    down so that whole steps lead from `t0` to `t1`. Constant steps of this size have
-    errors within the tolerance in the fastest phase of the motion, and smaller errors
-    elsewhere.
+    The suggestion is the smallest size of these steps. The first steps, in which the
+    controller still searches for a suitable size, and the last step, which must end at
+    `t1`, are left out. The size is then rounded down, so that a whole number of steps
+    leads from `t0` to `t1`. Constant steps of this size have errors within the
+    tolerance in the fastest phase of the motion, and smaller errors elsewhere.
 
     **Arguments:**
 
@@ -488,7 +492,7 @@ def suggest_step(
     )
     ts = np.asarray(sol.ts, float)
     sizes = np.abs(np.diff(ts))
-    # Sizes grow by large factors until the controller has found the first one.
+    # Sizes grow by large factors until the controller has found a suitable size.
     growing = sizes[1:] > 2 * sizes[:-1]
     first = len(growing) if growing.all() else int(np.argmin(growing))
     needed = sizes[first:-1] if sizes[first:-1].size else sizes[-1:]
@@ -498,7 +502,7 @@ def suggest_step(
 
 def _program_of_run(grid: Grid) -> Callable[..., Solution]:
     """Choose between one program for the whole run and chunks of steps."""
-    # With `jax.disable_jit`, nothing is compiled, and the user wants to step through.
+    # With `jax.disable_jit`, the user wants to step through single operations.
     no_jit = jax.config.jax_disable_jit  # pyright: ignore[reportAttributeAccessIssue]
     if _is_tracing() or no_jit or not isinstance(grid.most_steps, int):
         return run
@@ -522,9 +526,10 @@ def _warn_of_iterations(
     y: State,
     args: Args,
 ) -> None:
-    """Warn if steps with the approximate Jacobian converged slowly, or did not.
+    """Warn if steps with the approximate Jacobian converged slowly or not at all.
 
-    The full Jacobian must be available, and y is the start of the run.
+    There is no warning if the full Jacobian is not available. The time `t` and the
+    state `y` are the start of the run.
     """
     steps = int(sol.stats["num_steps"]) + int(sol.stats.get("num_rejected_steps", 0))
     if steps < _FEW_STEPS or is_unsolved(sol):
@@ -561,7 +566,7 @@ def _require_constraints(
 
 
 def _invalid_unless(valid: BoolScalar, sol: Solution) -> Solution:
-    """Return the solution, with `invalid_argument` unless its arguments are valid."""
+    """Return the solution, with the result `invalid_argument` unless `valid`."""
     result = RESULTS.where(valid, sol.result, RESULTS.invalid_argument)
     failed_step = jnp.where(valid, sol.stats["failed_step"], 0)
     return replace(sol, result=result, stats=sol.stats | {"failed_step": failed_step})
@@ -624,7 +629,8 @@ def _check_num_steps(num_steps: Any, needed_by: str | None) -> int | IntScalar:
 
     - `num_steps`: the argument of the user.
     - `needed_by`: the name of an option that needs the number of steps when tracing,
-        for instance because the shape of its output depends on it; None for none.
+        for instance because the shape of its output depends on it; None if no option
+        needs it.
     """
     if isinstance(num_steps, jax.Array | np.ndarray):
         return _traced_count(num_steps, needed_by)

@@ -56,8 +56,8 @@ def interpolate(
 class DenseInterpolation(eqx.Module):
     """The collocation polynomials of a whole trajectory, one for each of its steps.
 
-    They are defined on [t0, t0 + num_steps dt], and in a run whose steps differ up to
-    its end. `integrate` returns an instance with `SaveAt(dense=True)`; users evaluate
+    They are defined from t0 to t0 + num_steps dt or, if the steps differ, to the end of
+    the run. `integrate` returns an instance with `SaveAt(dense=True)`; users evaluate
     it through `Solution.evaluate`.
     """
 
@@ -139,7 +139,7 @@ def _outside_of_steps(t: np.ndarray, t0: np.ndarray, t1: np.ndarray) -> ValueErr
 def is_within(
     t: Float[Array, "*k"], t0: FloatScalar, t1: FloatScalar
 ) -> Bool[Array, "*k"]:
-    """Return which times lie between t0 and t1, or outside by round-off."""
+    """Return which times lie between t0 and t1, or outside by round-off only."""
     slack = 8 * float(jnp.finfo(t.dtype).eps) * jnp.maximum(jnp.abs(t0), jnp.abs(t1))
     least, most = jnp.minimum(t0, t1) - slack, jnp.maximum(t0, t1) + slack
     return (t >= least) & (t <= most)

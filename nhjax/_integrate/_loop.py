@@ -67,8 +67,9 @@ class Loop(eqx.Module):
     def _report(self, k: Int[Array, ""]) -> None:
         """Report the steps that are certain to be complete after iteration k.
 
-        A stepper may need more iterations than there are steps. Their largest number is
-        known, so that all members of a batch report the same, and report once.
+        A stepper may need more iterations than there are steps. The report assumes the
+        largest number of iterations, so that all members of a batch report the same
+        number of steps, and the meter is called once for all.
         """
         length = static_length(self.stepper.plain.num_steps)
         surplus = static_length(self.num_iterations) - length
@@ -108,7 +109,10 @@ class Loop(eqx.Module):
         return jax.eval_shape(rows)
 
     def moving(self, carry: AbstractCarry) -> AbstractCarry:
-        """Return the same carry; its state gets zero tangents if the run has any."""
+        """Return the same carry.
+
+        If the run is differentiated, the state also has tangents, which may be zero.
+        """
         state = with_zero_tangents(carry.step_state.state, self.stepper)
         return eqx.tree_at(lambda x: x.step_state.state, carry, state)
 
@@ -189,8 +193,8 @@ class DirectAdjoint(AbstractAdjoint):
 
         This differs from the `DirectAdjoint` of diffrax, which nests scans and
         checkpoints up to a maximum number of steps, and which diffrax advises against.
-        In nhjax the number of steps is known, a plain loop runs all steps, and this
-        adjoint is the default.
+        In nhjax the number of steps, or with a controller a limit for it, is known, a
+        plain loop runs all steps, and this adjoint is the default.
 
     !!! example
 
@@ -229,9 +233,9 @@ class RecursiveCheckpointAdjoint(AbstractAdjoint):
         This differs from the `RecursiveCheckpointAdjoint` of diffrax. In diffrax a
         binomial scheme places checkpoints while the number of steps is not yet known,
         takes log(max_steps) checkpoints by default, and allows reverse mode only. In
-        nhjax the number of steps is known and blocks have equal length. `checkpoints`
-        is the number of blocks on one level, and the default is faster and needs more
-        memory.
+        nhjax the number of steps, or with a controller a limit for it, is known, and
+        blocks have equal length. `checkpoints` is the number of blocks on one level,
+        and the default is faster and needs more memory.
 
     **Arguments:**
 
@@ -314,7 +318,7 @@ def _block(advance: _Advance, length: int, stride: int, *, keep_all: bool) -> _A
 def _idle_after_the_end(loop: Loop) -> _Advance:
     """Return a variant of `advance` that is a no-op after the end of the run.
 
-    It is needed if the last block extends beyond the end of the run.
+    It is needed if the loop or its last block extends beyond the end of the run.
     """
 
     def advance_or_idle(k, state):

@@ -22,9 +22,9 @@ class ReversibleAdjoint(AbstractAdjoint):
     """Store only the end of the run and retrace the steps from there: memory O(1).
 
     If the method is symmetric, a step of -h leads back to the start of a step of h.
-    With the consistent closure, and on a group with the chart at the start of a step,
-    it leads back only up to a small error. An iteration that starts from the step of -h
-    then inverts the step.
+    With the consistent closure, and on a group with the chart at the start of a step, a
+    step of -h leads back only up to a small error. In these cases an iteration that
+    starts from the step of -h inverts the step.
 
     The retraced states differ from the states of the run by round-off. If the motion is
     attracted to a set, like the motion of a sleigh, the set repels it in reversed time,

@@ -1,8 +1,8 @@
-"""The compiled programs of a run, and how they are put together to a solution.
+"""The compiled programs of a run, and how their results become a solution.
 
 Inside transformations, `run` is one program for all steps. Outside of them,
-`run_in_chunks` calls a program that takes a chunk of steps as often as needed, so that
-a run of another length or with other output compiles nothing.
+`run_in_chunks` repeatedly calls a program that takes a chunk of steps, so that a run of
+another length or with other output does not recompile.
 """
 
 import reprlib
@@ -101,9 +101,9 @@ from ._variable import StepSizes, VariableStepper
 class RunOptions(eqx.Module):
     """The user's options that contain functions.
 
-    `fn` is that of `SaveAt`, `invariants` and `controller` are arguments of
-    `integrate`, and `events` is its argument `event` as a tuple. The `controller` is
-    None for a run with constant steps.
+    `fn` is the function of `SaveAt`. `invariants` is the argument of `integrate`,
+    `events` is its argument `event` as a tuple, and `controller` is its argument
+    `stepsize_controller`, or None for a run with constant steps.
     """
 
     fn: Callable[[Any, Any, Any], PyTree[Array]]
@@ -143,7 +143,8 @@ def run(
     is_variable, sampled = isinstance(grid, VariableGrid), None
     if not isinstance(grid, VariableGrid):
         sampled = _sampled_steps(saveat, grid)
-    # The steps in which times lie are not known before they are taken.
+    # If the steps differ, it is not known before the run which steps contain the times
+    # `ts`, so that the records of all steps are kept.
     keeps_all = saveat.dense or (is_variable and saveat.ts is not None)
     places = record_places(keeps_all, sampled, most)
     saving = Saving.of(saveat, fn, most, places, stepper.log_length)
@@ -152,7 +153,7 @@ def run(
     round_off, start, carry, rows = _all_steps(adjoint, loop, y0, saveat.checkpoint)
     given = (system, y0, t0, grid, args), options.events, options.controller
     end = loop.stepper.finish(carry, (rows.saved, rows.record), rows.log, given)
-    # With events, the event that ends the run has a row of its own.
+    # The number of filled rows includes a row for an event that ends the run.
     zero = jnp.zeros((), jnp.int32)
     number = stepper.num_filled(carry, zero) if is_variable else None
     if number is None:
@@ -191,7 +192,7 @@ def _stepper(
     t0, fn = grid.t0, options.fn
     dt, num_steps = grid.typical_size, grid.num_steps
     if isinstance(grid, VariableGrid):
-        # Its steps have no common size, and are not counted from an origin.
+        # Steps that differ have no common size, and are not counted from an origin.
         num_steps = grid.most_steps
         origin = Origin(t0, jnp.zeros((), jnp.int32), jnp.zeros_like(t0))
         state = y0.state if isinstance(y0, Checkpoint) else y0
@@ -240,11 +241,11 @@ def _sizes(
 class _Start(NamedTuple):
     """The start of a run in chunks.
 
-    - `carry`, `log`: those before the first iteration.
+    - `carry`, `log`: the carry and the log before the first iteration.
     - `round_off`: the round-off of the functions of the system.
     - `saved`: the output of the initial state, if it is asked for.
-    - `surplus`: the number of iterations that the run may need beyond its steps; all
-        of them in a run whose steps differ.
+    - `surplus`: the number of iterations that the run may need in addition to one for
+        each step; in a run whose steps differ, the number of all iterations.
     - `room`: the number of rows of the buffers of a chunk.
     """
 
@@ -259,7 +260,7 @@ class _Start(NamedTuple):
 class _Chunk(NamedTuple):
     """The result of a chunk of steps.
 
-    - `carry`, `log`: those after the chunk.
+    - `carry`, `log`: the carry and the log after the chunk.
     - `num_filled`: the number of rows that the run has filled.
     - `saved`, `records`: buffers, with the rows of this chunk at their start.
     - `end`: the end of the run, if this was its last chunk.
@@ -297,7 +298,8 @@ def _started(
     saves_start: BoolScalar,
 ) -> _Start:
     """Return the start of a run in chunks."""
-    # The start does not depend on the number of steps, apart from events.
+    # The start does not depend on the number of steps. With zero steps, the number of
+    # iterations is the surplus.
     none = jnp.zeros((), jnp.int32)
     grid = grid.of_length(none)
     stepper, fn = _stepper(system, method, y0, grid, args, options, stage_solver)
@@ -344,7 +346,8 @@ def _chunk(
 
     def steps(loop: Loop, carry: AbstractCarry, log: Any, start: Any, end: Any):
         # The entries that are constant in the first step are constant in all steps.
-        # The matrices are evaluated only to find these entries, and are not computed.
+        # The matrices are traced to find these entries; the program does not compute
+        # them.
         plain, state = loop.stepper.plain, carry.step_state.state
         u = plain.system.fibre_coordinate(state)
         given = plain.system, plain.time(0), state.q, u, plain.args
@@ -394,7 +397,7 @@ def _saving_in_chunks(
     num_records: int,
     room: int,
 ) -> Saving:
-    """Return the data that a chunk saves, with the stride 1."""
+    """Return the `Saving` of a chunk, with the stride 1."""
     return Saving(
         fn=fn,
         num_steps=num_steps,
@@ -534,9 +537,10 @@ def run_in_chunks(
 def _steps_taken(
     saveat: SaveAt, t0: FloatScalar, t1: FloatScalar, records: StepRecord | None
 ) -> tuple[SaveAt, np.ndarray]:
-    """Find the steps in which the times of `SaveAt(ts=...)` lie, after they were taken.
+    """Find the steps in which the times of `SaveAt(ts=...)` lie, after the run.
 
-    Return them with options that contain only the times that were reached.
+    Return options that contain only the times that were reached, and the indices of the
+    steps.
     """
     ts = np.asarray(saveat.ts)
     if records is None or records.interval is None or not len(records.force):
@@ -552,13 +556,14 @@ def _steps_taken(
 def _sampled_in_chunks(
     given: tuple[Any, ...], saveat: SaveAt, steps: np.ndarray, output: Output
 ) -> list[PyTree[np.ndarray]]:
-    """Compute the output at `SaveAt(ts=...)`, a fixed number of times at once.
+    """Compute the output at the times `SaveAt(ts=...)`, in blocks of fixed length.
 
     `steps` are the indices of the steps in which the times lie.
     """
     reached = steps < output.num_steps
     ts, steps = np.asarray(saveat.ts)[reached], steps[reached]
-    # The records are those of different steps, and all of them for dense output.
+    # There is one record for each step that contains a time or, if `keeps_all`, one
+    # record for each step of the run.
     assert output.records is not None
     keeps_all = saveat.dense or len(output.records.force) == output.num_steps
     places = steps if keeps_all else np.unique(steps, return_inverse=True)[1]
@@ -577,7 +582,7 @@ def _sampled_in_chunks(
 
 
 def _sampled_steps(saveat: SaveAt, grid: TimeGrid) -> Int[Array, " k"] | None:
-    """Find the steps in which the times of `SaveAt(ts=...)` lie; None without these."""
+    """Find the steps that contain the times of `SaveAt(ts=...)`; None without `ts`."""
     if saveat.ts is None:
         return None
     length = static_length(grid.num_steps)
@@ -670,7 +675,8 @@ def _padded_output(
 ) -> tuple[PyTree[Array], PyTree[Array]]:
     """Join the output of a run whose number of steps is not known when tracing.
 
-    Entries after the last one, and those at times that were not reached, are infinite.
+    Entries after the last saved one, and entries at times that were not reached, are
+    infinite.
     """
     saving, args, ts = loop.saving, loop.stepper.plain.args, saveat.ts
     saved, records = end.rows
@@ -679,7 +685,7 @@ def _padded_output(
         pieces.append(_one(saving.saved(t0, start, args)))
     last = _one(saving.saved(end.t, end.state, args)) if saveat.t1 else None
     if saveat.steps:
-        # The extra row of the buffers is there for the end of the run.
+        # The extra row of the buffers takes the end of the run.
         rows = jnp.arange(saving.num_saved + 1, dtype=jnp.int32)
         count = number // saveat.steps
         padded_rows = _infinite_unless(rows < count, saved)
@@ -713,7 +719,7 @@ def _infinite_unless(valid: Bool[Array, " k"], saved: PyTree[Array]) -> PyTree[A
 
 
 def _along(condition: Bool[Array, " k"], x: Array) -> Array:
-    """Return a condition on the entries of an array with axes for those of x."""
+    """Add axes to a condition on the entries of x, so that it broadcasts with x."""
     return condition.reshape(condition.shape + (1,) * (x.ndim - 1))
 
 

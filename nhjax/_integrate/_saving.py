@@ -42,9 +42,10 @@ class SaveAt(eqx.Module):
     - `checkpoint`: save a `Solution.checkpoint`, from which a later run continues bit
         for bit; see `nhjax.Checkpoint`.
 
-    The output has exactly as many entries as are saved. Saving every k-th step
-    (`steps=k`) and saving at given times (`ts`) need no buffer of the length of the
-    run, unless `dense` needs one. The samples at `ts` are computed after the run, from
+    The output has one entry for each saved state; `nhjax.Solution` describes the
+    exceptions in runs with events or with steps that differ. With constant steps,
+    saving every k-th step (`steps=k`) and saving at given times (`ts`) need no buffer
+    of the length of the run. The samples at `ts` are computed after the run, from
     the records of the steps that contain them. Between steps, the polynomials have
     larger errors than the states at the steps, and the constraint holds to their
     accuracy only, not to round-off.
@@ -151,7 +152,7 @@ class SaveAt(eqx.Module):
 
     @property
     def saves_rows(self) -> bool:
-        """Return whether output at times is asked for."""
+        """Return whether an option other than `dense` or `checkpoint` saves output."""
         return self.t0 or self.t1 or self.steps > 0 or self.ts is not None
 
     def saves_end(self, num_steps: int | IntScalar) -> bool:
@@ -275,8 +276,9 @@ class Saving(eqx.Module):
     records of steps, and `log_length` entries of the stepper's log. `num_steps` is used
     only if steps save rows or records.
 
-    The buffers of a part of a run begin with the step `first_step`. Then `num_saved`
-    and `num_records` are the room in the buffers, and all steps keep their records.
+    For a chunk of a run, `first_step` is set, and the buffers begin with this step.
+    Then `num_saved` and `num_records` are the numbers of rows in the buffers, and the
+    records of all steps of the chunk are kept.
     """
 
     fn: Callable[[FloatScalar, State, Args], PyTree[Array]]
@@ -297,7 +299,7 @@ class Saving(eqx.Module):
         places: RecordPlaces,
         log_length: int,
     ) -> "Saving":
-        """Return the choice of `saveat`, with the function `fn`."""
+        """Return the `Saving` for the options `saveat` and the function `fn`."""
         needs_length = saveat.steps or places.slots is not None
         length = static_length(num_steps) if needs_length else 0
         return cls(
@@ -357,7 +359,7 @@ class Saving(eqx.Module):
     def _record_slot(self, k: Int[Array, ""]) -> Int[Array, ""]:
         if self.record_slots is not None:
             return self.record_slots[jnp.minimum(k, self.num_steps)]
-        # A part of a run has no slots: it records each of its steps.
+        # A chunk of a run has no slots: it keeps the records of all its steps.
         slot = k - cast(Array, self.first_step)
         return jnp.where(k < self.num_steps, slot, self.num_records)
 

@@ -29,7 +29,7 @@ class EventLog(eqx.Module):
 
     - `num`: the number of events.
     - `ts`: their times, of shape (e,) for the e events that the run had room for.
-    - `which`: for each of them, the index in the events that `integrate` was given.
+    - `which`: for each entry, the index of the event in the argument `event`.
     - `before`, `after`: the states at the events before and after their resets, each a
         `State` with a leading axis of length e.
 
@@ -58,8 +58,8 @@ class Solution(eqx.Module):
         iteration failed, and which Newton's method solved),
         `num_rejected_steps` (only in a run whose steps differ: the number of attempts
         at a step that were repeated with another size),
-        `num_unsolved_steps` (beside it: the number of these attempts whose equations
-        were not solved),
+        `num_unsolved_steps` (also only in such a run: the number of these attempts
+        whose equations were not solved),
         `max_error_over_tolerance` (only with `PIDController`: the largest estimated
         error of an accepted step, in units of its tolerance),
         `num_redundant` (the number of redundant constraints at the start; if there are
@@ -86,13 +86,14 @@ class Solution(eqx.Module):
         with `SaveAt(checkpoint=True)`; None otherwise.
     - `coordinates`: the names of the coordinates, if the system has names.
     - `events`: an `nhjax.EventLog` of the events of the run if `event` was given; None
-        otherwise. Then `stats` also has `num_events`, and `num_steps` is the number of
-        nodes that were reached. After an event that ends the run, all entries of `ts`
-        and `ys`, and `t1`, are the time and state of the event.
+        otherwise. With `event`, `stats` also has `num_events`, and `num_steps` is the
+        number of nodes that were reached. If an event ends the run, `t1` is its time,
+        and with constant steps all later entries of `ts` and `ys` repeat the time and
+        the state of the event.
 
-    If the steps differ, the output of a plain call has exactly the steps that were
-    taken. Under `jit` it has room for `max_steps` steps, and entries that are not used
-    are infinite.
+    If the steps differ, the output of a call outside of transformations has exactly the
+    steps that were taken. Under `jit` it has room for the largest number of steps, and
+    entries that are not used are infinite.
 
     Under `vmap` every array has a leading axis for the members of the batch.
     """
@@ -184,7 +185,7 @@ class Solution(eqx.Module):
 
         **Raises:** `ImportError` without xarray (`pip install "nhjax[xarray]"`);
         `RuntimeError` under `jit` and `vmap`; `ValueError` if the run saved no states,
-        or for names that do not fit.
+        for unknown names in `units`, or for a wrong number of names in `coordinates`.
 
         !!! example
 
@@ -241,7 +242,7 @@ def ended_as(sol: Solution, *results: str) -> bool:
 
 
 def is_singular_from_the_start(sol: Solution) -> bool:
-    """Return whether a run without a batch failed at step 0 by a singular matrix."""
+    """Return whether a single run failed in step 0 because a matrix is singular."""
     singular = ended_as(sol, "singular_stage_matrix")
     return singular and int(sol.stats["failed_step"]) == 0
 
@@ -251,8 +252,8 @@ def raise_failures(
 ) -> Solution:
     """Return `sol`, or raise an `IntegrationError` with member, step and reason.
 
-    With the step size `dt`, the message suggests another one. It recommends Newton's
-    method unless the run has already `used_newton`.
+    The message may suggest a smaller step size if `dt` is given, and may recommend
+    Newton's method unless the run has already `used_newton`.
     """
     outcome = on_host(_outcome(sol))
     bad = outcome.codes != messages().index("")

@@ -36,10 +36,10 @@ Memory: TypeAlias = PyTree[Array]
 
 
 class StepContext(NamedTuple):
-    """What is the same in all steps of a run.
+    """The data that all steps of a run share.
 
-    - `direction`: 1.0 for a run forward in time, -1.0 for one backward.
-    - `dt`: the step size of the user, or None.
+    - `direction`: 1.0 for a run forward in time, -1.0 for a run backward in time.
+    - `dt`: the step size that the user gave, or None.
     - `length`: the time from the start to the end of the run; infinite if it is not
         known.
     """
@@ -55,11 +55,12 @@ class StepContext(NamedTuple):
 class Attempt(NamedTuple):
     """A step that was tried: from the time t, of size h, with its outcome.
 
-    - `chosen`: the size that the controller chose. A step is shorter at the end of a
-        run, and before and after an event in it.
-    - `is_solved`: whether its equations were solved.
-    - `is_whole`: whether it ends where the controller wants it to end.
-    - `node`: the number of steps before it.
+    - `chosen`: the size that the controller chose. The size h is smaller if the run
+        ends in the step, and for the parts of a step before and after an event.
+    - `is_solved`: whether the equations of the step were solved.
+    - `is_whole`: whether the step ends where a step of the size `chosen` would end, and
+        not earlier at the end of the run.
+    - `node`: the number of steps before this step.
     """
 
     t: FloatScalar
@@ -73,9 +74,9 @@ class Attempt(NamedTuple):
 
 
 class Decision(NamedTuple):
-    """What a controller decides on a step.
+    """The decision of a controller about a step.
 
-    - `is_accepted`: whether the step is accepted. A step that is not solved is not.
+    - `is_accepted`: whether the step is accepted. An unsolved step is never accepted.
     - `result`: `RESULTS.successful`, or the reason why the run fails.
     - `size`: the size of the next step, or of the next attempt at this one.
     - `memory`: the data of the controller after an accepted step.
@@ -106,7 +107,10 @@ class AbstractStepSizeController(eqx.Module):
     def init(
         self, context: StepContext, t: FloatScalar, start: StepState
     ) -> tuple[FloatScalar, Memory, RESULTS]:
-        """Choose the first step: its size, the first memory, and whether they exist."""
+        """Return the size of the first step, the first memory, and a result.
+
+        The result is `RESULTS.successful`, or the reason why the run fails.
+        """
 
     @abstractmethod
     def adapt(self, context: StepContext, attempt: Attempt, memory: Memory) -> Decision:
@@ -115,15 +119,18 @@ class AbstractStepSizeController(eqx.Module):
     def resume(
         self, context: StepContext, size: FloatScalar, memory: Memory
     ) -> tuple[FloatScalar, Memory]:
-        """Return the size and the memory with which a run goes on at a checkpoint."""
+        """Return the size and the memory with which a run continues from a checkpoint.
+
+        `size` and `memory` are the values in the checkpoint.
+        """
         return jnp.abs(size) * context.direction, memory
 
     def after_reset(
         self, context: StepContext, t: FloatScalar, after: StepState
     ) -> tuple[FloatScalar, Memory, RESULTS] | None:
-        """Return what `init` returns, for the step after an event has reset the state.
+        """Return new values as `init` does, after an event has reset the state.
 
-        None, the default, means that the reset changes nothing.
+        None, the default, means that the size and the memory stay the same.
         """
         del context, t, after
         return None
@@ -149,7 +156,7 @@ class AbstractStepSizeController(eqx.Module):
     def closure_converted(
         self, system: AbstractMechanicalSystem, t: FloatScalar, y: State, args: Args
     ) -> "AbstractStepSizeController":
-        """Return the controller, with arrays that its functions read as leaves."""
+        """Return the controller; arrays that its functions close over become leaves."""
         del system, t, y, args
         return self
 
@@ -191,7 +198,7 @@ class ConstantStepSize(AbstractStepSizeController):
     def resume(
         self, context: StepContext, size: FloatScalar, memory: Memory
     ) -> tuple[FloatScalar, Memory]:
-        """Return `dt`, which may differ from that of the run before."""
+        """Return `dt`, which may differ from the `dt` of the run before."""
         del size
         return _size_of_user(context), memory
 
@@ -227,7 +234,7 @@ class GivenStepSizes(AbstractStepSizeController):
     def resume(
         self, context: StepContext, size: FloatScalar, memory: Memory
     ) -> tuple[FloatScalar, Memory]:
-        """Return the first size: a run that goes on is given its own sizes."""
+        """Return the first size: a resumed run has its own array of sizes."""
         del context, size
         return self.sizes[0], memory
 
@@ -241,9 +248,10 @@ class PIDController(AbstractStepSizeController):
     r"""Steps whose estimated error is at most a tolerance.
 
     The error of a step is estimated from the forces at its stages; see
-    `docs/step_sizes.md`. Divided by atol + rtol |y| for each component of the state y,
-    it has a root mean square e_n. A step is accepted if e_n <= 1, and otherwise
-    repeated, as is a step whose equations are not solved. The next size is
+    `docs/step_sizes.md`. The error of each component of the state y is divided by
+    atol + rtol |y|, and e_n is the root mean square of these quotients. A step is
+    accepted if e_n <= 1. Otherwise, or if its equations are not solved, the step is
+    repeated with a smaller size. The next size is
 
         h_{n+1} = h_n safety e_n^{-β1} e_{n-1}^{-β2} e_{n-2}^{-β3}
 
@@ -254,15 +262,15 @@ class PIDController(AbstractStepSizeController):
         β3 = dcoeff / k
 
     (Söderlind, Digital filters in adaptive time-stepping, 2003, and the controller of
-    the same name in diffrax). Take a method with three stages or more: with two, the
-    estimate vanishes for single steps. Sizes that follow the error destroy the
+    the same name in diffrax). Use a method with three stages or more: with two stages,
+    the estimated error of some steps is zero. Sizes that follow the error destroy the
     reversibility of a method, so that energies may drift; see
     `nhjax.ReversibleController`.
 
     **Arguments:**
 
-    - `rtol`, `atol`: the relative and the absolute tolerance. On a group, the size of a
-        position is that of its largest number.
+    - `rtol`, `atol`: the relative and the absolute tolerance. For a position on a
+        group, |y| is the largest absolute value among the numbers of the element.
     - `pcoeff`, `icoeff`, `dcoeff`: the coefficients of the controller. The default
         depends on the last error only.
     - `dtmin`, `dtmax`: the smallest and the largest size of a step, in units of time,
@@ -339,7 +347,7 @@ class PIDController(AbstractStepSizeController):
 
     @property
     def estimates_errors(self) -> bool:
-        """Return True: its decisions rest on the error of a step."""
+        """Return True: this controller estimates the error of every step."""
         return True
 
     def checks(self) -> list[Check]:
@@ -361,7 +369,7 @@ class PIDController(AbstractStepSizeController):
         y: State,
         args: Args,
     ) -> None:
-        """Raise for a method whose stages do not show its error."""
+        """Raise if the error cannot be estimated from the stages of the method."""
         del system, t, y, args
         if len(np.unique(method.c)) < 2:
             raise ValueError(
@@ -374,7 +382,7 @@ class PIDController(AbstractStepSizeController):
         self, context: StepContext, t: FloatScalar, start: StepState
     ) -> tuple[FloatScalar, Memory, RESULTS]:
         """Return `dt`, or a size for which the state changes by one percent."""
-        # Errors of one, and unknown growth, for the steps before the first.
+        # Before the first step, two errors of one and unknown growth rates are assumed.
         one = jnp.ones((), t.dtype)
         memory = one, one, jnp.full(2, jnp.inf, t.dtype)
         if context.dt is not None:
@@ -396,7 +404,7 @@ class PIDController(AbstractStepSizeController):
         position = position_sizes(manifold, start.state.q, v)
         state = max_norm(position / in_position, u / in_fibre)
         rates = v / in_position, start.lin.acceleration / in_fibre
-        # Numbers that are zero have no scale without an absolute tolerance.
+        # Without an absolute tolerance, components that are zero have no scale.
         least = 2 * _smallest_scale(u)
         known = (
             jnp.where(scale > least, rate, 0)
@@ -445,7 +453,8 @@ class PIDController(AbstractStepSizeController):
             *(start, outcome, scales, context.args, growth_rates),
         )
         error, found, size = jax.lax.stop_gradient((error, found, jnp.abs(h)))
-        # The growth may fall in a step by chance. Each step forgets a half of it.
+        # The growth rate of a single step may be small by chance. The stored growth
+        # rate therefore falls by at most a half in each step.
         is_first = jnp.isinf(growth_rates)
         growth_rates = jnp.where(
             is_first, found, jnp.maximum(found, 0.5 * growth_rates)
@@ -461,7 +470,8 @@ class PIDController(AbstractStepSizeController):
             jnp.asarray(x, dtype) for x in (self.factormin, self.factormax, self.safety)
         )
         estimate = jnp.where(is_known, error, jnp.inf)
-        # Smaller errors do not change the size further, and have logarithms.
+        # An error below this bound already gives the largest factor. The bound keeps
+        # the error positive, so that its negative powers are finite.
         error = jnp.maximum(error, (safety / most) ** number)
         factor = (
             safety
@@ -472,7 +482,8 @@ class PIDController(AbstractStepSizeController):
         factor = jnp.clip(factor, least, jnp.where(accepted, most, safety))
         factor = jnp.where(is_known, factor, least)
         following = self._limited(size * factor)
-        # A step that had to be shorter says little about the next step.
+        # If a step was shorter than the chosen size, its error says little about the
+        # next step.
         chosen = jax.lax.stop_gradient(jnp.abs(attempt.chosen))
         is_shorter = size < (1 - 1e-9) * chosen
         kept = jnp.maximum(following, chosen)
@@ -484,7 +495,8 @@ class PIDController(AbstractStepSizeController):
         result = RESULTS.where(
             accepted | (size > smallest), RESULTS.successful, RESULTS.dt_min_reached
         )
-        # A step that is not solved at any size has another reason.
+        # If the smallest step is not solved, the run fails for the reason that the
+        # solver gives.
         result = RESULTS.where(
             (result == RESULTS.successful) | attempt.is_solved,
             result,
@@ -497,7 +509,7 @@ class PIDController(AbstractStepSizeController):
     def resume(
         self, context: StepContext, size: FloatScalar, memory: Memory
     ) -> tuple[FloatScalar, Memory]:
-        """Return `dt` if it is given, or the next size of the run before."""
+        """Return `dt` if the user gives it, otherwise the size in the checkpoint."""
         size = jnp.abs(size if context.dt is None else context.dt)
         size = jax.lax.stop_gradient(self._limited(size))
         return size * context.direction, memory
@@ -506,8 +518,8 @@ class PIDController(AbstractStepSizeController):
 class ReversibleController(AbstractStepSizeController):
     r"""Steps whose sizes follow a density, such that the run can be retraced.
 
-    The step density ρ is the number of steps per unit of time, divided by 1/ε. With
-    a function Q(y) of the state, the sizes are
+    The step density ρ is ε times the number of steps per unit of time. With a positive
+    function Q(y) of the state, the argument `density`, the sizes are
 
         ρ_{n+1/2} = ρ_{n-1/2} + ε G(y_n),  h_{n+1/2} = ε / ρ_{n+1/2},
 
@@ -515,12 +527,14 @@ class ReversibleController(AbstractStepSizeController):
     Explicit, time reversible, adaptive step size control, 2005). The density follows Q
     up to O(ε²). A run backward in time from the checkpoint of a run takes the same
     steps back. In a reversible system with a symmetric method, energies that do not
-    drift with constant steps do not drift with these. No step is rejected. After an
-    event has reset the state, the density starts again as Q of the new state.
+    drift with constant steps do not drift with these steps either. No step is rejected.
+    After an event has reset the state, the density starts again from Q of the new
+    state.
 
     **Arguments:**
 
-    - `eps`: ε > 0, the size of a step times the density. In units of Q times time.
+    - `eps`: ε > 0, the size of a step times the density. Its unit is the unit of Q
+        times the unit of time.
     - `density`: Q(t, q, v, args) > 0, for Hamiltonian systems a function of
         (t, q, p, args). It should not change if velocities change their signs. The
         default is an estimate of the fastest frequency of the motion, from the
@@ -574,7 +588,7 @@ class ReversibleController(AbstractStepSizeController):
     def closure_converted(
         self, system: AbstractMechanicalSystem, t: FloatScalar, y: State, args: Args
     ) -> "ReversibleController":
-        """Return the controller, with arrays that the density reads as leaves."""
+        """Return the controller; arrays that the density closes over become leaves."""
         if self.density is None:
             return self
         given = t, y.q, system.fibre_coordinate(y), args
@@ -641,7 +655,7 @@ class ReversibleController(AbstractStepSizeController):
     def init(
         self, context: StepContext, t: FloatScalar, start: StepState
     ) -> tuple[FloatScalar, Memory, RESULTS]:
-        """Return the first size, for a density that equals that of the state."""
+        """Return the first size, for a density that is equal to Q of the state."""
         density, rate = self._density(context, t, start)
         size = self._size(context, density, rate)
         result = RESULTS.where(
@@ -650,23 +664,24 @@ class ReversibleController(AbstractStepSizeController):
             RESULTS.density_not_positive,
         )
         size = jnp.where(result == RESULTS.successful, size, context.direction)
-        # An array differs from the two numbers of a `PIDController`, so that its
-        # checkpoints are not taken for those of this controller.
+        # The memory is a single array, unlike the three arrays of a `PIDController`.
+        # Checkpoints of the two controllers can therefore be told apart.
         return size, jnp.stack([density, rate]), result
 
     def after_reset(
         self, context: StepContext, t: FloatScalar, after: StepState
     ) -> tuple[FloatScalar, Memory, RESULTS]:
-        """Start again: the density of the motion before says nothing about this one."""
+        """Start again, because the density before the reset has no meaning after it."""
         return self.init(context, t, after)
 
     def adapt(self, context: StepContext, attempt: Attempt, memory: Memory) -> Decision:
-        """Accept every step that is solved, and move the density on."""
+        """Accept every step that is solved, and compute the density after it."""
         density, rate = memory
         end = attempt.t + attempt.h
         _, following = self._density(context, end, attempt.outcome.step_state)
         eps = jnp.asarray(self.eps, density.dtype) * context.direction
-        # A shorter step counts as one of a smaller ε, h = ε / (ρ + ε G / 2).
+        # A shorter step counts as a step with a smaller ε, the solution of the equation
+        # h = ε / (ρ + ε G / 2).
         h = jax.lax.stop_gradient(attempt.h)
         part = jnp.where(attempt.is_whole, eps, h * density / (1 - 0.5 * h * rate))
         moved = (density + 0.5 * part * rate) + 0.5 * part * following
@@ -686,7 +701,7 @@ class ReversibleController(AbstractStepSizeController):
 
 
 def _smallest_scale(like: Array) -> float:
-    """Return what is added to an absolute tolerance of zero, for a dtype."""
+    """Return a tiny number of a dtype, which keeps absolute tolerances positive."""
     return float(jnp.finfo(like.dtype).tiny) ** 0.25
 
 
@@ -718,10 +733,10 @@ def _is_number(x: Any) -> bool:
 def position_sizes(
     manifold: AbstractLieGroup, q: PyTree[Array], like: Float[Array, " n"]
 ) -> Float[Array, " n"]:
-    """Return the sizes of the n coordinates of a position, of the shape of `like`.
+    """Return the sizes of the n coordinates of a position, in the shape of `like`.
 
-    They are |q| on a vector space. The elements of other groups have other numbers than
-    displacements, and all n sizes are that of the largest one.
+    On a vector space the sizes are |q|. An element of another group may have more than
+    n numbers, and all n sizes are equal to the largest absolute value among them.
     """
     leaves = [jnp.ravel(jnp.abs(x)) for x in jax.tree.leaves(q)]
     flat = jnp.concatenate(leaves)
@@ -739,9 +754,9 @@ def fastest_frequency(
 ) -> FloatScalar:
     """Estimate the fastest angular frequency of the motion near a state.
 
-    With the acceleration a(q, u), constraints included, it is (|∂a/∂q| + |∂a/∂u|²)^½.
-    The norms are Frobenius norms in the metric of the kinetic energy, which do not
-    depend on the units of coordinates.
+    With the acceleration a(q, u), which includes the constraints, the estimate is
+    (|∂a/∂q| + |∂a/∂u|²)^½. The norms are Frobenius norms in the metric of the kinetic
+    energy, which do not depend on the units of coordinates.
     """
     manifold = system.manifold_of(q)
 
@@ -751,8 +766,8 @@ def fastest_frequency(
     by_position, by_fibre = jax.jacfwd(acceleration, argnums=(0, 1))(
         jnp.zeros_like(u), u
     )
-    # This is M for a Lagrangian system and its inverse for a Hamiltonian one. The
-    # derivative of a momentum by a position is a form and not a map.
+    # The metric is M for a Lagrangian system, and M⁻¹ for a Hamiltonian system, where
+    # the derivative of dp/dt with respect to q is a bilinear form, not a linear map.
     metric = system.metric(t, q, u, args)
     inverse_metric = inverse(metric)
     other = inverse_metric if system.fibre_coordinate_name == "v" else metric

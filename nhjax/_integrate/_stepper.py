@@ -2,8 +2,9 @@
 
 A stepper has its own loop carry: `init` creates it, `advance` performs one iteration,
 and `finish` returns the end of the run. The plain stepper takes one step of the method
-in each iteration. The stepper of runs with events, in the room `_events`, is built on
-it. The loop and the adjoints work with any stepper.
+in each iteration. The steppers in `_variable`, for steps of different sizes, and in
+`_events`, for runs with events, are built on it. The loop and the adjoints work with
+any stepper.
 """
 
 from abc import abstractmethod
@@ -121,7 +122,7 @@ class AbstractStepper(eqx.Module, Generic[C, R]):
     def progress(self, carry: C) -> Any:
         """Compute the part of the run that is done, from 0 to 1.
 
-        It is None unless the run may end early.
+        The result is None unless the run may end early.
         """
         del carry
         return None
@@ -154,7 +155,8 @@ class AbstractStepper(eqx.Module, Generic[C, R]):
     ) -> tuple[C, StepResult]:
         """Perform iteration i. A run that has ended or failed keeps its state.
 
-        With `replay` the iteration is repeated as a reverse replay found it.
+        A reverse replay passes its data about the iteration as `replay`. The iteration
+        then repeats what it did in the run.
         """
 
     @abstractmethod
@@ -178,7 +180,7 @@ class AbstractStepper(eqx.Module, Generic[C, R]):
     def differentiable(self, carry: C) -> PyTree[Array]:
         """Return the parts of a carry, or of its cotangent, that have derivatives.
 
-        It serves as the `where` of `equinox.tree_at`, too.
+        This method also serves as the argument `where` of `equinox.tree_at`.
         """
 
     @abstractmethod
@@ -207,7 +209,7 @@ class AbstractReverseReplay(eqx.Module, Generic[C, R]):
     ) -> tuple[R, StepState]:
         """Find the data of iteration i and the state from which it started.
 
-        `following` and `step_state` belong to the iteration after it.
+        `following` and `step_state` belong to iteration i + 1.
         """
 
     @abstractmethod
@@ -218,7 +220,7 @@ class AbstractReverseReplay(eqx.Module, Generic[C, R]):
     def places(
         self, replay: R, i: Int[Array, ""]
     ) -> tuple[Int[Array, ""], Int[Array, ""] | None]:
-        """Return the output row that iteration i filled, and its place in the log."""
+        """Return the indices of the output row and of the log entry of iteration i."""
 
 
 class PlainCarry(AbstractCarry):
@@ -282,7 +284,10 @@ class PlainStepper(AbstractStepper[PlainCarry, None]):
         return t0 + number * self.dt + shift
 
     def init(self, y0: State | Checkpoint, noise: FunctionNoise | None) -> PlainCarry:
-        """Return the carry before the first step, with a failure if it cannot start."""
+        """Return the carry before the first step.
+
+        Its `result` is a failure if the run cannot start.
+        """
         system, t, args = self.system, self.time(0), self.args
         checkpoint = y0 if isinstance(y0, Checkpoint) else None
         if isinstance(y0, Checkpoint):
@@ -409,8 +414,8 @@ class PlainStepper(AbstractStepper[PlainCarry, None]):
     ) -> Checkpoint:
         """Return the checkpoint after the last step.
 
-        `end` is the last state with the derivatives for the checkpoint, and `round_off`
-        is the value from the start of the run.
+        `end` is the last state, through which the checkpoint is differentiated, and
+        `round_off` is the value from the start of the run.
         """
         origin, last = self.origin, carry.step_state
         return Checkpoint(
@@ -426,7 +431,7 @@ class PlainStepper(AbstractStepper[PlainCarry, None]):
 
 
 class PlainReverseReplay(AbstractReverseReplay[PlainCarry, None]):
-    """The replay of a run without events: the index of a step says where it started."""
+    """The replay of a run without events: the index of a step gives its start time."""
 
     stepper: PlainStepper
     start: PlainCarry

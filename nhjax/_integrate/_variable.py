@@ -1,7 +1,7 @@
 """The stepper of runs whose steps have different sizes.
 
-Each iteration tries one step. Its size and its time are part of the carry, in contrast
-to the plain stepper, whose times are multiples of a constant size. A controller accepts
+Each iteration tries one step. The carry has the time and the size of this step, whereas
+the plain stepper computes times as multiples of a constant size. A controller accepts
 the step or rejects it, and chooses the size of the next one.
 """
 
@@ -58,7 +58,11 @@ class Clock(eqx.Module):
 
 
 class NextStep(NamedTuple):
-    """A step from t of size h; whether h is the chosen size, and reaches the end."""
+    """The next step of a run, from the time t with the size h.
+
+    - `is_whole`: whether the step ends where the chosen size leads.
+    - `is_last`: whether the step instead ends at the given end `t1` of the run.
+    """
 
     t: FloatScalar
     h: FloatScalar
@@ -67,7 +71,7 @@ class NextStep(NamedTuple):
 
 
 class StepSizes(eqx.Module):
-    """The sizes of the steps of a run: their controller, and where the run ends.
+    """How a run chooses the sizes of its steps, and where it ends.
 
     - `t1`: the end of the run, or None for a run of `num_steps` steps.
     - `max_steps`: the largest number of attempts at a step.
@@ -109,14 +113,15 @@ class StepSizes(eqx.Module):
     def next_step(self, clock: Clock, offset: FloatScalar | float = 0.0) -> NextStep:
         """Return the next step, or the rest of it after an event at an `offset`.
 
-        It ends at the end of the run if it would reach beyond it, or almost reach it.
+        A step that would pass the end of the run, or almost reach it, ends exactly
+        there.
         """
         t, h = clock.t + offset, clock.size - offset
         never = jnp.zeros((), bool)
         if self.t1 is None:
             return NextStep(t, h, ~never, never)
         rest = (self.t1 - t) - clock.compensation
-        # The round-off of times may be larger than that of a step.
+        # The round-off of the time may be larger than a small fraction of the step.
         eps, size = float(jnp.finfo(t.dtype).eps), jnp.abs(h)
         largest = jnp.maximum(jnp.abs(self.t1), jnp.abs(t))
         slack = jnp.maximum(1e-9 * size, 4 * eps * largest)
@@ -199,7 +204,7 @@ class VariableStepper(AbstractStepper[VariableCarry, StepLogEntry]):
 
     @property
     def log_length(self) -> int:
-        """Return the largest number of steps, if it is known when tracing."""
+        """Return the largest number of steps, or 0 if it is not known when tracing."""
         number = self.plain.num_steps
         return number if isinstance(number, int) else 0
 
@@ -240,7 +245,8 @@ class VariableStepper(AbstractStepper[VariableCarry, StepLogEntry]):
         alive, node = ~self.is_over(carry), carry.stats["num_steps"]
         context = sizes.context(plain)
         if replay is not None:
-            # A size that the user gives has a derivative.
+            # Sizes that the user gives have derivatives. They are therefore not read
+            # from the log.
             given = sizes.controller.given_size(context, node)
             size = replay.size if given is None else given
             clock = replace(clock, size=size)
@@ -270,7 +276,7 @@ class VariableStepper(AbstractStepper[VariableCarry, StepLogEntry]):
         clock = sizes.after(
             clock, end, step, accepted, size, decision.memory, stats["num_steps"]
         )
-        # The last attempt must have reached the end.
+        # The run fails if its last attempt has not reached the end.
         i = jnp.asarray(i, jnp.int32)
         spent = alive & ~failed & ~clock.is_done & (i + 1 >= sizes.max_steps)
         result = RESULTS.where(spent, RESULTS.max_steps_reached, result)
@@ -347,7 +353,10 @@ class VariableStepper(AbstractStepper[VariableCarry, StepLogEntry]):
 def started(
     carry: AbstractCarry, sized: RESULTS, controller: AbstractStepSizeController
 ) -> tuple[RESULTS, Statistics]:
-    """Return the result and the statistics of a start whose first step is `sized`."""
+    """Return the result and the statistics before the first step.
+
+    `sized` is the result of the controller's search for the first size.
+    """
     bad = (carry.result == RESULTS.successful) & (sized != RESULTS.successful)
     result = RESULTS.where(bad, sized, carry.result)
     none = jnp.zeros_like(carry.stats["num_steps"])
@@ -367,7 +376,7 @@ def statistics_of_attempt(
     rejected: BoolScalar,
     accepted: BoolScalar,
 ) -> Statistics:
-    """Return those statistics after an attempt that only controllers cause."""
+    """Return the statistics that only runs with a controller have, after an attempt."""
     more: Statistics = {}
     counted = {
         "num_rejected_steps": rejected,

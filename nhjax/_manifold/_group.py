@@ -1,7 +1,7 @@
 """The interface of a configuration manifold: a Lie group with a retraction.
 
 `AbstractLieGroup` derives every tangent map by automatic differentiation from a few
-basic maps. `AbstractMotionGroup` adds the shortcuts of groups whose retraction
+basic maps. `AbstractMotionGroup` adds shorter formulas for groups whose retraction
 satisfies τ(-ξ) = τ(ξ)⁻¹.
 """
 
@@ -25,9 +25,9 @@ Vector = Float[Array, " n"]
 class AbstractLieGroup(eqx.Module):
     """A configuration manifold: a Lie group G with a retraction τ: 𝔤 -> G.
 
-    The stage equations are written on the chart Ξ -> g_k τ(Ξ) around the current
-    configuration (paper, section 5). Velocities and momenta are left-trivialised: they
-    are vectors of 𝔤 and 𝔤*.
+    The stage equations of a step are written in a chart y -> g_o τ(y), whose origin g_o
+    is in the middle or at the start of the step (paper, section 5). Velocities and
+    momenta are left-trivialised: they are vectors of 𝔤 and 𝔤*.
 
     To define your own group, write a subclass with `dim`, `identity`, `check`,
     `compose`, `inverse`, `retract` and `local`. All other methods follow from these by
@@ -48,7 +48,7 @@ class AbstractLieGroup(eqx.Module):
     def check(self, q: Element, name: str = "q") -> Element:
         """Return `q`, or raise a `ShapeError` if it cannot be an element.
 
-        The error message refers to it by `name`.
+        The error message refers to the element by `name`.
         """
 
     @abstractmethod
@@ -125,7 +125,8 @@ class AbstractLieGroup(eqx.Module):
         """Compute g τ(ξ) and the compensation, the accumulated rounding error.
 
         The next call adds the compensation, so that rounding errors do not grow over
-        many steps. A group without compensated summation returns it unchanged.
+        many steps. A group without compensated summation returns the compensation
+        unchanged.
         """
         return self.act(q, xi), compensation
 

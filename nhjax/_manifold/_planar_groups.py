@@ -80,7 +80,7 @@ class SO2(AbstractLieGroup):
         return check_shape(q, (1,), "SO2", name, "an angle")
 
     def in_chart(self, xi: Rate) -> BoolScalar:
-        """Return whether the rotation is inside the chart, if the chart has an end."""
+        """Return whether the rotation is in the chart; True for the exponential map."""
         if self.is_flat:
             return jnp.asarray(True)
         return self.retraction.in_chart(xi[0] ** 2)
@@ -330,7 +330,7 @@ def framed(group: AbstractLieGroup, q: PyTree[Array]) -> PyTree[Array]:
     The methods `act`, `act_back` and `tangent` of the group accept such an element. An
     element without planar poses is returned unchanged.
     """
-    # A subclass may override methods, and these do not support framed poses.
+    # A subclass may override methods with versions that do not support framed poses.
     if type(group) is SE2:
         return FramedPose(q, jnp.cos(q[2]), jnp.sin(q[2]))
     if type(group) is ProductGroup:

@@ -111,7 +111,7 @@ class ProductGroup(AbstractLieGroup):
         return self._tuple(lambda group, g, x: group.act_back(g, x), g, xi)
 
     def no_compensation(self, q: Element) -> Element:
-        """Return the tuple of the compensations to start `advance` from."""
+        """Return the tuple of the factors' initial compensations of `advance`."""
         return self._tuple(lambda group, g: group.no_compensation(g), q)
 
     def wrapped(self, q: Element, compensation: Element) -> Element:

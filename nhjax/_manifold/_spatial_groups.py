@@ -294,9 +294,10 @@ class SE3(AbstractMotionGroup):
     x. The body velocity is (v, ω), with dx/dt = R(q) v and dq/dt = q ∘ (0, ω/2).
 
     Rotation and translation share a chart, so that the error of a step also depends on
-    the distance h|v| in a step. Where it is not small beside the radius of gyration of
-    the body, `ProductGroup(Euclidean(3), SO3())` is more accurate, with the velocity of
-    the origin in space.
+    the distance h|v| that the body moves in the step. If this distance is not small
+    compared with the radius of gyration of the body, the group
+    `ProductGroup(Euclidean(3), SO3())` is more accurate. In this group the components
+    of the translational velocity are along the axes of space.
 
     **Arguments:**
 

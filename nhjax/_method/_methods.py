@@ -50,10 +50,10 @@ _STATEMENTS = {
 _UNIT_TOLERANCE = 1e-9
 
 # At s = 32, 60 digits still resolve every order condition, the rounded coefficients
-# satisfy the stage conditions to 2e-16, and runs converge to round-off. Two things get
-# worse: the defect of the multiplier, which is round-off at s = 16, is six times as
-# large, and the checks of a tableau, whose cost grows at least as s^4, take 5 s
-# (s = 20: 0.8 s; s = 100: minutes).
+# satisfy the stage conditions to 2e-16, and runs converge to round-off. Two things are
+# worse than with fewer stages. The defect of the multiplier is six times as large as at
+# s = 16, where it is round-off. The checks of a tableau take 5 s (s = 20: 0.8 s;
+# s = 100: minutes), because their cost grows at least as s^4.
 MAX_STAGES = 32
 
 
@@ -129,8 +129,8 @@ class AbstractMethod(eqx.Module):
     def order(self) -> int:
         """Return the order of q and p in systems without constraints.
 
-        Up to order 8 it follows from the order conditions of the pair (a, â). Beyond
-        that it is min(p, 2r + 2) of B(p) and D(r), which agrees with measurements.
+        Up to order 8 it follows from the order conditions of the pair (a, â). Above
+        order 8 it is min(p, 2r + 2) of B(p) and D(r), which agrees with measurements.
         """
         return _order_conditions.order(self._tableau())
 
@@ -167,11 +167,12 @@ class AbstractMethod(eqx.Module):
     def multiplier_order(self) -> int:
         """Return the order of convergence of the multiplier that a solution reports.
 
-        With `closure="propagated"` it is Q of CĈ(Q), less one if R_A(∞) = 1, then
-        rounded up to an even number if the method is symmetric. Runs of many tableaux
-        show this. (The paper's theorem on global convergence has q of C(q) in place of
-        Q; the two are equal for Lobatto nodes only.) With the other closures the
-        multiplier is the continuous multiplier, which has the order of the state.
+        With `closure="propagated"` it is the smaller of q in C(q) and Q in CĈ(Q), less
+        one if R_A(∞) = 1, then rounded up to an even number if the method is symmetric,
+        and at most `constrained_order`. Runs of many tableaux show this. (The paper's
+        theorem on global convergence has q instead; q and Q are equal for Lobatto nodes
+        only.) With the other closures the multiplier is the continuous multiplier,
+        which has the order of the state.
 
         **Raises:** `ValueError`, as `require_constraint_hypotheses` does.
         """
@@ -320,15 +321,15 @@ class LobattoIIIAB(AbstractMethod):
             coefficients take minutes to compute.
         - `closure`: how a step determines the first of its s multipliers, for which
             there is no equation. `"propagated"`, the choice of the paper, uses Λ^s of
-            the previous step as Λ^1. `"consistent"` uses the continuous multiplier of
-            the state as Λ^1. `"symmetric"` uses the continuous multipliers of the
-            states at both ends of the step, with one more unknown that makes the step
+            the previous step as Λ^1. `"consistent"` uses the continuous multiplier at
+            the start of the step as Λ^1. `"symmetric"` uses the continuous multipliers
+            at both ends of the step, with one more unknown that makes the step
             symmetric; a step then depends on its initial state only.
         - `chart`: the origin of the chart of a step on a Lie group. With `"middle"` a
-            step leads from -ξ/2 to ξ/2 in its chart; it is symmetric, and symplectic
-            if there are no constraints. With `"start"`, the choice of the paper, a step
-            leads from 0 to ξ, and is not symmetric. On a vector space both are the
-            same.
+            step with the increment ξ leads from -ξ/2 to ξ/2 in its chart; the step is
+            symmetric, and symplectic if there are no constraints. With `"start"`, the
+            choice of the paper, a step leads from 0 to ξ, and is not symmetric. On a
+            vector space both are the same.
 
         **Raises:**
 
@@ -347,9 +348,9 @@ class LobattoIIIAB(AbstractMethod):
     ) -> "LobattoIIIAB":
         """Return the method whose number of stages suits a tolerance.
 
-        More stages allow larger steps, which pays for small errors. The numbers are
-        those that took the least time for an error of this size in most of four
-        systems, measured by `benchmarks.adaptive_steps`.
+        With more stages, steps can be larger, which saves time if errors must be small.
+        The number of stages is the number that took the least time for an error of this
+        size in most of four systems, measured by `benchmarks.adaptive_steps`.
 
         **Arguments:**
 
@@ -387,7 +388,7 @@ class LobattoIIIAB(AbstractMethod):
 
 
 class Gauss(AbstractMethod):
-    """The symplectic, symmetric Gauss method of order 2s, without constraints.
+    """The symplectic, symmetric Gauss method of order 2s, for unconstrained systems.
 
     Its tableau (a, b) is its own symplectic conjugate. The stages do not include the
     ends of the step (hypotheses H1 and H3 fail), so that `integrate` raises an error
@@ -439,8 +440,8 @@ class PartitionedRungeKutta(AbstractMethod):
 
     The nodes c_i = Σ_j a_ij and the symplectic conjugate â_ij = b_j (1 - a_ji / b_i)
     follow from the tableau. The float64 coefficients are taken as exact, and conditions
-    on them are checked to 1e-13. (With 12 or more stages, the first order condition
-    that fails can have a defect below 1e-13; `orders` is then too high.) For systems
+    on them are checked to 1e-13. (With 12 or more stages, the lowest condition that
+    fails can have a defect below 1e-13; `orders` is then too high.) For systems
     with constraints the tableau must satisfy H1, H2 and H3.
 
     !!! example

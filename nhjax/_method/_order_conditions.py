@@ -302,8 +302,9 @@ def _leading_term(
     for k in range(1, n + 1):
         product = m * auxiliary
         f = -CONTEXT.fsum(product[i, i] for i in range(n)) / k
-        # f_k scales like the k-th power of M and decreases like 1/(2n)!. It counts as
-        # zero relative to the last nonzero coefficient, not on an absolute scale.
+        # f_k scales like the k-th power of M, and the coefficients decrease like
+        # 1/(2n)!. Therefore f_k counts as zero if it is small relative to the last
+        # nonzero coefficient, not on an absolute scale.
         if abs(f) > tolerance * abs(leading) * norm ** (k - degree):
             degree, leading = k, f
         auxiliary = product + f * CONTEXT.eye(n)

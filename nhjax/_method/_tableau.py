@@ -14,8 +14,8 @@ the coefficients of monomials would cancel. The integral of the basis is
 
     ∫_0^θ ℓ_j = θ K_0j - 2 θ (1 - θ) Σ_{n>=1} K_nj P_n'(x) / (n (n + 1)),
 
-by Legendre's equation ((1 - x²) P_n')' = -n (n + 1) P_n. It is exactly 0 at θ = 0 and
-exactly K_0j, the weight b_j of a collocation method, at θ = 1.
+by Legendre's equation ((1 - x²) P_n')' = -n (n + 1) P_n. The integral is exactly 0 at
+θ = 0 and exactly K_0j, the weight b_j of a collocation method, at θ = 1.
 """
 
 import math
@@ -74,8 +74,8 @@ class Tableau:
         a_hat = CONTEXT.matrix(s, s)
         for i in range(s):
             for j in range(s):
-                # If a_ji = b_i (hypothesis H1') the entry is exactly zero, but b_j -
-                # b_j a_ji / b_i would differ from zero by one unit of the last digit.
+                # If a_ji = b_i, the entry is exactly zero, but b_j - b_j a_ji / b_i
+                # could differ from zero by one unit of the last digit.
                 if a[j, i] != b[i]:
                     a_hat[i, j] = b[j] * (1 - a[j, i] / b[i])
         return a_hat
@@ -358,7 +358,8 @@ def _as_floating(theta: ArrayLike) -> Array:
 
 
 def _combine(polynomials: list[Array], coefficients: np.ndarray) -> Array:
-    # The default precision on a GPU may be TensorFloat-32.
+    # The highest precision is requested, because the default on a GPU may be
+    # TensorFloat-32.
     values = jnp.stack(polynomials, axis=-1)
     return jnp.matmul(
         values,

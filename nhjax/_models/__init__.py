@@ -1,3 +1,3 @@
-"""Mechanical systems imported from models of other libraries, so far of SymPy."""
+"""Mechanical systems imported from other libraries; so far, only from SymPy."""
 
 from ._from_sympy import from_sympy as from_sympy, SymPyModel as SymPyModel

@@ -114,7 +114,7 @@ def _nonholonomic(
     """Return the velocity constraints that are not rates of holonomic constraints.
 
     Kane's method needs the rates of configuration constraints among its velocity
-    constraints. All of these are linear in the speeds.
+    constraints. All velocity constraints are linear in the speeds.
     """
     if not method._f_nh:
         return []
@@ -158,9 +158,9 @@ def _forces(
 def _check_velocity(body: Any, frame: Any, solved: dict[Any, Any]) -> None:
     """Raise if a constraint was substituted into the velocity of a body.
 
-    In Kane's method, the point where a wheel touches the ground can have the velocity
-    zero, although the contact moves. The energy is then correct only for motions that
-    satisfy the constraint, and its Lagrange equations are wrong.
+    In Kane's method, a model may set the velocity of the point where a wheel touches
+    the ground to zero, although the contact moves. The energy is then correct only for
+    motions that satisfy the constraint, and its Lagrange equations are wrong.
     """
     centre = body.masscenter
     for point in _connected_points(centre)[1:]:
@@ -256,7 +256,7 @@ def rates(coordinates: list[Any]) -> list[Any]:
 
 
 def check_coordinates(coordinates: Any) -> list[Any]:
-    """Return the coordinates as a list; raise if they are not distinct q(t)."""
+    """List the coordinates; raise unless they are distinct functions q(t)."""
     library, t = sympy(), mechanics().dynamicsymbols._t
     found = expressions("coordinates", coordinates)
     if not found:

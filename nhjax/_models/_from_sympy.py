@@ -79,7 +79,7 @@ class SymPyModel(eqx.Module):
         """
         q, v = self._array("q", q), self._array("v", v)
         args = self.args if args is None else args
-        # Check this first, because JAX cannot sort keys that are symbols.
+        # Check `args` first, because JAX cannot sort keys that are symbols.
         parameter_values(self.parameters, args)
         return initial_state(
             self.system,
@@ -140,9 +140,9 @@ def from_sympy(
         differential equations replace speeds by rates of coordinates, its loads become
         forces, and its configuration and velocity constraints become constraints.
     - `coordinates`: the functions q(t), a list of `dynamicsymbols`, in the order of q.
-    - `nonholonomic`: expressions in q, q' and t that must be zero, linear in q' or not;
-        or equations.
-    - `holonomic`: expressions in q and t that must be zero; or equations.
+    - `nonholonomic`: expressions in q, q' and t that must be zero, or equations. They
+        need not be linear in q'.
+    - `holonomic`: expressions in q and t that must be zero, or equations.
     - `forces`: generalised forces, as a list with one for each coordinate, or as a
         dictionary by coordinates or their names. It may also be a list of pairs of a
         point and a force, or a frame and a torque, as for `LagrangesMethod`, together
@@ -152,7 +152,8 @@ def from_sympy(
     - `frame`: the inertial frame for forces at points and torques on frames.
     - `potential`: the potential energy of a `KanesMethod`. The default is the sum of
         the potential energies of its bodies. It is required if bodies have a potential
-        energy and there are loads; pass 0 if the loads contain its forces.
+        energy and there are loads; pass 0 if the loads include the forces of this
+        energy.
 
     **Returns:** a `SymPyModel` with the `system`, the `args` for `integrate`, and the
     names of the coordinates, which `Solution.to_xarray` uses.

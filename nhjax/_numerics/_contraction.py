@@ -1,8 +1,8 @@
 """Products and inverses of small matrices, written in elementary operations.
 
 For matrices of a few rows, calling a library of linear algebra is too expensive. Inside
-a time loop the calls cost more than the arithmetic. They cannot be compiled into one
-kernel with the operations around them, and a batch of them runs one by one.
+a time loop the calls cost more than the arithmetic. The calls cannot be compiled into
+one kernel with the operations around them, and a batch of calls runs one by one.
 `small_einsum` and `inverse` consist of elementary operations up to a limit of size;
 `with_small_products` rewrites the products in the functions of a user.
 """
@@ -156,9 +156,9 @@ def _sum_of_rows(rows: Float[Array, "k n"]) -> Float[Array, " n"]:
 def mapped(
     function: Callable[[Array], PyTree[Array]], rows: Shaped[Array, "k *n"]
 ) -> PyTree[Array]:
-    """Apply a function to each row, in a loop that is never written out.
+    """Apply a function to each row, in a loop that is never unrolled.
 
-    Unlike `jax.lax.map` it has no derivative in reverse mode.
+    Unlike `jax.lax.map`, this function has no derivative in reverse mode.
     """
     shapes = jax.eval_shape(function, rows[0])
     empty = jax.tree.map(
@@ -181,9 +181,10 @@ def inverse_by_blocks(matrix: Float[Array, "s n s n"]) -> Float[Array, "s n s n"
     """Invert a matrix of s x s blocks by Gauss-Jordan elimination of blocks.
 
     Rows are exchanged only within a block. This is stable if the diagonal blocks
-    dominate, or if the matrix is close to a Kronecker product with a matrix that is
-    stable in the same sense. The elimination is a loop over blocks, so that the
-    program is short and the matrix may be larger than for `inverse`.
+    dominate, or if the matrix is close to a Kronecker product A ⊗ C with n rows in C,
+    and eliminating A without row exchanges is stable. The elimination is a loop over
+    blocks, so that the program is short and the matrix may be larger than for
+    `inverse`.
     """
     s = matrix.shape[0]
 
@@ -211,9 +212,9 @@ def solve_by_rows(
 ) -> Float[Array, "k r"]:
     """Solve linear equations by Gaussian elimination with partial pivoting.
 
-    All loops go over single rows, so that the program is short and calls no library. It
-    is slower than a library from about 100 rows on. Like `mapped` it has no derivative
-    in reverse mode.
+    All loops go over single rows, so that the program is short and calls no library.
+    This function is slower than a library from about 100 rows on. Like `mapped`, it has
+    no derivative in reverse mode.
     """
     size = matrix.shape[0]
     numbers = jnp.arange(size, dtype=jnp.int32)
@@ -257,8 +258,8 @@ def solve_by_rows(
 
 
 def repeated(count: int | Array, body: Callable[[Array, Any], Any], carry: Any) -> Any:
-    # Unlike a `fori_loop` this has no derivative in reverse mode, and our compiler
-    # never writes it out.
+    # Unlike a `fori_loop`, this loop has no derivative in reverse mode, and our
+    # compiler never unrolls it.
     def step(given):
         k, carry = given
         return k + 1, body(k, carry)

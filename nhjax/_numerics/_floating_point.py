@@ -125,10 +125,11 @@ def measured_noise(
     cancellation, and of the rounding of arguments, magnified by steep functions.
 
     Very small displacements may be lost next to a constant in the function, and values
-    at larger displacements may differ by more than round-off. The function is measured
-    at four distances (5e-14 to 1e-8 in double precision). The search stops at the
-    first distance at which the differences decrease with their order, as for a smooth
-    function. The largest result is returned. The points lie on rays from the
+    at larger displacements may differ by more than round-off. Therefore the function is
+    measured at four distances (5e-14 to 1e-8 in double precision). The search stops at
+    the first distance at which the differences decrease with their order, as for a
+    smooth function. The result is the largest difference at shorter distances, or at
+    the shortest distance if the search stops there. The points lie on rays from the
     point of interest, so that a kink or a jump at this point, such as friction at rest,
     is not mistaken for round-off.
 

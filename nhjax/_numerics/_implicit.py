@@ -28,7 +28,8 @@ from ._iteration import dense_increment, iterate, Solved, UpdateNorms
 
 # Terms of the Neumann series below this many units of round-off are left out.
 _UNITS_LEFT = 256
-# The path to a root is divided into this many parts, with so many iterations in each.
+# The path to a root is divided into `_PARTS_OF_PATH` parts, with
+# `_ITERATIONS_OF_PART` iterations in each part.
 _PARTS_OF_PATH, _ITERATIONS_OF_PART = 32, 3
 # If the terms of the series stop falling above this many units of round-off, the series
 # does not converge. The derivative is then NaN rather than a wrong number.
@@ -43,13 +44,13 @@ Solution = TypeVar("Solution")
 class AbstractImplicitFunction(eqx.Module, Generic[Arguments, Solution]):
     """A function whose value solves equations, with derivatives from these equations.
 
-    Call it with its arguments, a tree. It is differentiable with respect to them, but
-    not to its own fields. JAX never differentiates `solve`: derivatives of every order
-    come from `tangent`.
+    Call it with its arguments, a tree. The function is differentiable with respect to
+    its arguments, but not with respect to its own fields. JAX never differentiates
+    `solve`: derivatives of every order come from `tangent`.
 
     - `programs`: a cache of traced programs; None if the function is part of a larger
-        program. With a cache, the rule of derivatives finds the program of `solve` that
-        is already traced instead of tracing it again.
+        program. With a cache, the derivative rule reuses the traced program of `solve`
+        instead of tracing `solve` again.
     """
 
     programs: eqx.AbstractVar[TraceCache | None]
@@ -231,9 +232,10 @@ def root(
         left out.
     - `solve`: called as `solve(jacobian, b)` for the increments and for the derivative
         of the root; a dense solve by default.
-    - `path`: a function (θ, x) of residuals that is followed from θ = 0, where `x0` is
-        a root, to θ = 1, where it equals `residual`, if Newton's method does not find
-        a root. It may cycle where the residual has kinks.
+    - `path`: a function of (θ, x) that returns residuals. It has the root `x0` at
+        θ = 0, and is equal to `residual` at θ = 1. If Newton's method does not find a
+        root, the root of `path` is followed from θ = 0 to θ = 1. Newton's method may
+        cycle where the residual has kinks.
     - `max_iterations`: the largest number of iterations.
     """
     flat, unravel = ravel_pytree(x0)
@@ -258,7 +260,7 @@ def root(
             def residual(z):
                 return ravel_pytree(path(part, unravel(z)))[0], None
 
-            # Shorter increments cross a kink where whole ones would cycle.
+            # Shorter increments cross a kink where whole increments would cycle.
             dx, _ = dense_increment(residual, x, solve)
             shorter = x[None] + jnp.outer(0.5 ** jnp.arange(5, dtype=x.dtype), dx)
             sizes = jax.vmap(lambda z: max_norm(residual(z)[0]))(shorter)
@@ -351,7 +353,8 @@ def with_zero_tangents(tree: X, parameters: PyTree[Any]) -> X:
 
 @eqx.filter_custom_jvp
 def _with_zero_tangents(leaves: list[Array], parameters: list[Array]) -> list[Array]:
-    # The parameters are arguments because their tangents start the rule below.
+    # The parameters are arguments, because JAX applies the rule below only if an
+    # argument has a tangent.
     del parameters
     return leaves
 

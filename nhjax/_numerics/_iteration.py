@@ -20,14 +20,14 @@ Aux = TypeVar("Aux")
 # slow iteration that spirals towards the solution.
 NOISE_UNITS = 400
 # When an increment fails to fall for the first time, this many units of round-off are
-# treated as noise. Each time that this happens again, the level grows by one of the two
-# factors below, and each time that an increment is the smallest so far, it falls by the
-# same factor. The factor is smaller for iterations that may be slow, since their
-# increments may rise and fall before they have converged.
+# treated as noise. Each further failure multiplies this level by one of the two factors
+# below, and each new smallest increment divides the level by the same factor. The
+# factor is smaller for iterations that may be slow, since their increments may rise and
+# fall before they have converged.
 _FIRST_UNITS = 30.0
 _GROWTH, _GROWTH_IF_SLOW = 30.0, 2.0
-# An iteration diverges if an increment is larger by this factor than x and the first
-# increment together.
+# An iteration counts as divergent if an increment is larger than this factor times the
+# sum of the size of x and the first increment.
 _HOPELESS = 1e6
 # An upper bound on the magnification of round-off by the problem.
 _LARGEST_NOISE = 1e5
@@ -39,7 +39,7 @@ class UpdateNorms(NamedTuple):
     """The sizes of an increment and of the iterate that it leads to, in the same unit.
 
     `noise`, if it is known, is the change of the iterate per relative change of the
-    data of the problem. Round-off is a relative change of a few units of round-off.
+    data of the problem. Rounding changes the data by a few units of round-off.
     """
 
     increment: FloatScalar
@@ -113,7 +113,7 @@ def iterate(
     start from zero. If both are zero, increments are measured relative to the first
     one. The round-off of x is proportional to the same size or, if data are larger than
     x, to `scale` plus `round_off`. `noise` is a measured size: increments always
-    contain its round-off.
+    contain errors of about the unit round-off times `noise`.
 
     The iteration ends
 
@@ -132,8 +132,8 @@ def iterate(
     to the number of iterations, because the error of a slow iteration is much larger
     than its increment.
     """
-    # `jit` makes JAX trace the iteration once, for the shapes and for the loop: that is
-    # most of the work of tracing a step.
+    # `jit` makes JAX trace the iteration only once, for both the shapes and the loop.
+    # Tracing the iteration is most of the work of tracing a step.
     iteration = jax.jit(iteration, inline=True)
     aux_shape = jax.eval_shape(iteration, x)[2]
     aux = jax.tree.map(lambda s: jnp.zeros(s.shape, s.dtype), aux_shape)
@@ -190,8 +190,8 @@ def _progress(rules: _Rules, before: _Progress, sizes: UpdateNorms) -> _Progress
         # eps^(1/n). The error that it leaves is larger than an increment, by a factor
         # that grows with n.
         left = increment * jnp.maximum(1, count.astype(increment.dtype) / _SLOW)
-    # Only increments that can be noise raise its level: the increments of an iteration
-    # that spirals towards the solution rise and fall as well.
+    # Only increments that can be noise raise the level `believed`: the increments of an
+    # iteration that spirals towards the solution rise and fall as well.
     may_be_noise = left <= rules.noisiest * magnified
     stalls = may_be_noise & (increment >= before.smallest)
     more = jnp.minimum(rules.growth * before.believed, rules.noisiest)

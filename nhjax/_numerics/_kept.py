@@ -4,7 +4,7 @@ A run needs the Lagrangian of a system and its derivatives at more than ten plac
 JAX traces and differentiates a function again at each of them. This would take most of
 the time of a first call. Here a function becomes one operation, `kept_call`, whose
 program is traced once. The programs of its derivatives are kept with it, and later runs
-use all of them again.
+reuse all of these programs.
 """
 
 from collections import OrderedDict
@@ -33,7 +33,7 @@ from ..lanes import (
 from ._contraction import with_small_products
 
 
-# The programs of this many functions are kept: those that were used last.
+# The programs of the functions that were used last are kept, up to this number.
 _MOST_FUNCTIONS = 32
 
 
@@ -74,8 +74,8 @@ def kept_function(
     """Trace a function for arguments with the structure and the dtypes of an example.
 
     If the same function is traced again for the same kinds of arguments, and the values
-    that it reads have not changed, its programs are found again. The result is None for
-    a function that must not become one operation: because it has effects, such as
+    that it reads have not changed, its programs are reused. The result is None for a
+    function that must not become one operation: because it has effects, such as
     printing, or because its arguments are sharded over devices.
 
     **Arguments:**
@@ -123,7 +123,7 @@ def kept_function(
 
 
 def _is_plain(x: Any) -> bool:
-    """Return whether an array is whole on each device that uses it."""
+    """Return whether an array is not sharded over devices."""
     kind = jax.typeof(x)
     return kind == jax.core.ShapedArray(kind.shape, kind.dtype, kind.weak_type)
 
@@ -165,7 +165,10 @@ class _Program:
         return kept_call.bind(*operands, jaxpr=self.closed, kept=self)
 
     def derived(self, key: Any, function: Any, operands: Sequence[Any]) -> "_Program":
-        """Return the program of a function of this one, which `key` identifies."""
+        """Return the program of a function derived from this program.
+
+        `key` identifies the function.
+        """
         kinds = tuple(map(_kind, operands))
         if (key, kinds) not in self._derived:
             self._derived[key, kinds] = _traced(function, kinds)
@@ -200,14 +203,15 @@ def _inlined(*operands: Any, jaxpr: Any, kept: _Program) -> list[Any]:
 
 
 def _in_kernel(*operands: Any, jaxpr: Any, kept: _Program) -> list[Any]:
-    # XLA aborts if it compiles a kernel whose results are all constants.
+    # The engine `kernels` is left out: XLA aborts if it compiles a kernel whose results
+    # are all constants.
     options = CompileOptions(is_brief=True, engines=("lanes", "xla"))
     return run_program(jaxpr, list(operands), options)
 
 
-# JAX must not keep what it lowered: inside of a kernel, a program is lowered in another
-# way than outside. XLA takes milliseconds to compile each operation, and these programs
-# are long.
+# JAX must not cache a lowered program, because a program is lowered differently inside
+# and outside of a kernel. On the CPU `run_program` lowers the programs, because they
+# are long, and XLA takes milliseconds to compile each operation.
 for _lower, _platform in ((_inlined, None), (_in_kernel, "cpu")):
     mlir.register_lowering(
         kept_call,
@@ -268,7 +272,7 @@ def _transpose(cotangents, *operands, jaxpr: Any, kept: _Program):
 def _batched(operands, axes, *, jaxpr: Any, kept: _Program):
     sizes = [x.shape[a] for x, a in zip(operands, axes, strict=True) if a is not None]
     if sizes[0] * num_results(jaxpr.jaxpr) >= SHORTEST_IN_LOOP:
-        # A long program is a loop over the members.
+        # A long program becomes a loop over the members.
         marks = tuple(axis is not None for axis in axes)
         moved = [
             x if axis is None else jnp.moveaxis(x, axis, 0)

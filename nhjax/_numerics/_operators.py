@@ -1,8 +1,9 @@
 """The matrices of a step as operators: dense, diagonal, sparse or block tridiagonal.
 
-A step multiplies vectors by four kinds of matrices. With N = ∂p/∂u, a mass matrix K and
-the Jacobian B of the constraints these are N⁻¹, B, K⁻¹ Bᵀ and (B K⁻¹ Bᵀ)⁻¹. Each of
-them is an `AbstractOperator`. The classes differ in how they store the entries:
+A step multiplies vectors by four kinds of matrices. With N = ∂p/∂u, the fibre Hessian K
+(the mass matrix or its inverse) and the Jacobian B of the constraints, these are N⁻¹,
+B, K⁻¹ Bᵀ and (B K⁻¹ Bᵀ)⁻¹. Each of them is an `AbstractOperator`. The classes differ in
+how they store the entries:
 
 - `DenseMatrix` stores all entries, `DiagonalMatrix` only the diagonal.
 - `SparseMatrix` stores the entries of a Jacobian B whose rows have few entries, in
@@ -71,7 +72,7 @@ class DenseMatrix(AbstractOperator):
     def matvec(self, x: Float[Array, "... n"]) -> Float[Array, "... k"]:
         """Multiply the vectors along the last axis of x, which has at most four axes.
 
-        A stack of matrices multiplies one vector by each of its matrices.
+        In a stack of matrices, matrix j multiplies row j of x.
         """
         if self.entries.ndim == 3:
             return small_einsum("jkn,jn->jk", self.entries, x)
@@ -115,9 +116,9 @@ class DenseMatrix(AbstractOperator):
     def is_nearly_singular(
         self, left: AbstractOperator, right: AbstractOperator
     ) -> BoolScalar:
-        """Return whether left @ right, whose inverse is `self`, is singular.
+        """Return whether left @ right is singular up to round-off.
 
-        It counts as singular if it is singular up to round-off.
+        The inverse of the product is `self`.
         """
         factors = left.as_matrix(), right.as_matrix()
         return is_nearly_singular(small_einsum("kn,nl->kl", *factors), self.entries)
@@ -146,7 +147,7 @@ class DenseMatrix(AbstractOperator):
     def max_norm_equivalent(self) -> "DenseMatrix":
         """Return a matrix whose products with vectors have the same max norm.
 
-        For a matrix of one column its largest entry is enough.
+        For a matrix with one column this is its largest entry.
         """
         if self.entries.shape[1] != 1:
             return self
@@ -302,14 +303,14 @@ class BlockTridiagonalInverse(AbstractOperator):
     """The inverse of a block tridiagonal matrix, by the factors of its elimination.
 
     There are q unknowns and q residuals for each row of the pattern, of shape (q, l) or
-    in one vector. Blocks are eliminated from the first to the last. D_k, L_k, U_k are
-    the blocks of row k, and
+    in one vector. Blocks are eliminated from the first to the last. With the diagonal,
+    lower and upper blocks D_k, L_k and U_k of row k, and
 
     P_k = D_k - L_k P_{k-1}⁻¹ U_{k-1},
 
     `inverses` are P_k⁻¹, `lower` is P_k⁻¹ L_k and `upper` is P_k⁻¹ U_k. Rows are not
     exchanged between blocks. This elimination is stable if the matrix is close to a
-    Kronecker product A ⊗ C of a small matrix with a definite one.
+    Kronecker product A ⊗ C of a small matrix A and a definite matrix C.
     """
 
     inverses: Float[Array, "N g g"]
@@ -358,8 +359,8 @@ class BlockTridiagonalInverse(AbstractOperator):
     ) -> BoolScalar:
         """Return whether left @ right, whose inverse is `self`, is singular.
 
-        It counts as singular if a pivot is round-off compared with the diagonal entries
-        of its rows. The two factors are B and diag(w) Bᵀ.
+        The product counts as singular if a pivot is round-off compared with the
+        diagonal entries of its rows. The two factors are B and diag(w) Bᵀ.
         """
         assert isinstance(left, SparseMatrix)
         assert isinstance(right, WeightedTranspose)
@@ -378,8 +379,8 @@ class _EstimatedAbsolute(AbstractOperator):
     """An estimate of |C⁻¹|, by products with C⁻¹ alone.
 
     For x >= 0, each entry of |C⁻¹| x is the largest |C⁻¹ y| of all y that differ from x
-    in signs alone. The estimate takes two choices of signs. They are exact for the
-    matrices of springs or rods in a row: the entries of their inverses have the same
+    in signs alone. The estimate takes two choices of signs. It is exact for the
+    matrices of a chain of springs or rods: the entries of their inverses have the same
     sign, or signs that alternate.
     """
 
@@ -436,7 +437,7 @@ def square_jacobian(
 def full_jacobian(
     function: Callable[[Array], PyTree[Array]], u: Float[Array, " n"]
 ) -> PyTree[Array]:
-    """Compute the derivatives of all results of a function by u, on their last axis."""
+    """Compute the derivatives of all results of a function in u, on their last axis."""
 
     def push(du):
         return jax.jvp(function, (u,), (du,))[1]

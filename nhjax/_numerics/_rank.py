@@ -58,8 +58,10 @@ def active_ranks(ranks: list[RankCondition]) -> list[RankCondition]:
 def reciprocal_condition(matrix: Float[Array, "k l"]) -> FloatScalar:
     """Compute the reciprocal condition number of the rows of a matrix, after scaling.
 
-    Rows are scaled to size one, and so are the columns of square matrices. This makes
-    the ratio independent of the units of single coordinates and constraints.
+    In a square matrix, row k and column k are both divided by the square root of the
+    largest entry of row k. In other matrices, each row is divided by its largest entry.
+    This makes the ratio independent of the units of the quantities that belong to the
+    rows: of constraints, or of coordinates in a mass matrix.
     """
     if matrix.shape[0] == 0:
         return jnp.ones((), matrix.dtype)
@@ -162,9 +164,10 @@ def least_norm_inverse_by_blocks(
 ) -> Float[Array, "l l"]:
     """Compute a generalised inverse of C that solves the last equations first.
 
-    The unknowns of the `first` equations are zero as far as these equations follow from
-    the other equations. Apart from this, each of the two parts of x has the least norm
-    of `least_norm_inverse`. If no equation of one part follows from the other part, the
+    The equations have two parts, and `first` is the number of equations in the first
+    part. The unknowns of the first part are zero as far as its equations follow from
+    the second part. Apart from this, each of the two parts of x has the least norm of
+    `least_norm_inverse`. If no equation of one part follows from the other part, the
     result is `least_norm_inverse`.
     """
     if first in (0, matrix.shape[0]):
@@ -220,8 +223,8 @@ def _roots(matrix: Float[Array, "l l"]) -> Float[Array, " l"]:
 def least_norm_solve(matrix: Float[Array, "l l"], b: Array) -> Array:
     """Solve nearly dependent symmetric equations, ignoring small singular values.
 
-    Rows and columns are first scaled to size one. This is for Newton's method with
-    equations that are dependent at the solution.
+    Rows and columns are first scaled to about size one. Newton's method uses this
+    function if the equations are dependent at the solution.
     """
     largest = jnp.max(jnp.abs(matrix), axis=1)
     size = jnp.sqrt(jnp.where(largest > 0, largest, 1))

@@ -44,10 +44,11 @@ _KINDS = ("free", "ball", "slide", "hinge")
 class Layout:
     """The joints of a model, and the frame of each body relative to its last joint.
 
-    `source` is the model as it was read, for its shapes. The positions of the bodies
-    with the names `moving` are parameters.
+    `source` is the `MjSpec` or `MjModel` that was read; films take the shapes from it.
+    The positions of the bodies with the names `moving` are parameters.
 
-    It is compared by identity, so that it can be a part of the structure of a `Robot`.
+    Layouts are compared by identity, so that a layout can be a static field of a
+    `Robot`.
     """
 
     def __init__(
@@ -105,7 +106,7 @@ def layout_of(model: Any, source: Any, moving: Collection[str]) -> Layout:
 
 
 def fixed_to(layout: Layout, body: int, position: Any, quaternion: Any) -> Frame:
-    """Return a frame that is fixed to a body, such as that of a geom or a site."""
+    """Return a frame that is fixed to a body, such as the frame of a geom or a site."""
     frame = layout.bodies[body]
     return frame._replace(matrix=frame.matrix @ homogeneous(position, quaternion))
 
@@ -122,7 +123,7 @@ def mechanics_of(
     tendons, numbers = fixed_tendons(model, space, "tendons" in ignore)
     tendon_armature = model.tendon_armature[numbers].copy()
     tendon_damping = model.tendon_damping[numbers].copy()
-    # MuJoCo adds these numbers of actuators to those of joints and tendons.
+    # MuJoCo adds damping and armature of actuators to those of joints and tendons.
     for i in range(model.nactuator):
         square = model.actuator_gear[model.actuator_outadr[i], 0] ** 2
         target, kind = model.actuator_trnid[i, 0], model.actuator_trntype[i]
@@ -216,7 +217,10 @@ def _bodies(model: Any, layout: Layout) -> Bodies:
 def fixed_tendons(
     model: Any, space: Space, without: bool
 ) -> tuple[np.ndarray, list[int]]:
-    """Return the rows of the fixed tendons, and their numbers."""
+    """Return the lengths of the fixed tendons as rows, and the numbers of the tendons.
+
+    A row times the scalar coordinates is the length of a tendon.
+    """
     numbers = [
         i for i in range(model.ntendon) if not without and is_fixed_tendon(model, i)
     ]
@@ -231,7 +235,7 @@ def fixed_tendons(
 
 
 def check_kinds(given: Any) -> Mapping[str, Sequence[str]]:
-    """Raise unless `parameters` has sequences of names by known kinds; return it."""
+    """Raise unless `parameters` maps known kinds to sequences of names; return it."""
     if given is None:
         return {}
     if not isinstance(given, Mapping):
@@ -506,8 +510,8 @@ def rolling_geoms(
 ) -> dict[str, RollingGeom]:
     """Return the geoms that roll, by name.
 
-    The name of a body means its only round geom. The radii of those named in `radii`
-    are parameters.
+    The name of a body stands for its only round geom. The radii of the geoms named in
+    `radii` are parameters.
     """
     geoms = {name_of(model, "geom", i): i for i in range(model.ngeom)}
     bodies = {name_of(model, "body", i): i for i in range(1, model.nbody)}
@@ -701,7 +705,7 @@ def _ground(model: Any, layout: Layout, ground: Any) -> AbstractGround:
             "a parameter. Only positions of other bodies can be parameters."
         )
     normal = frame.matrix[:3, 2]
-    # An exact direction of an axis keeps zeros out of the program.
+    # Remove round-off, so that the normal of a horizontal plane is exactly vertical.
     normal = np.where(np.abs(normal) < 1e-15, 0.0, normal)
     return Plane(normal, height=float(normal @ frame.matrix[:3, 3]))
 
@@ -801,7 +805,8 @@ class _Rows:
         self.evaluate = jax.jit(self._evaluate)
 
     def _positions(self, q: PyTree[Array], args: Args) -> Array:
-        # Positions come first: a velocity that follows from them is left out.
+        # Constraints on positions come first and are kept; a constraint on velocities
+        # that follows from them is left out.
         rows = [x.height(0.0, q, args)[None] for x in self.heights]
         if self.loop is not None:
             rows.append(self.loop(0.0, q, args))
@@ -822,9 +827,9 @@ class _Rows:
 
 
 class LeftOut:
-    """The constraints of a robot that follow from the others with the file's lengths.
+    """The constraints that follow from the others with the lengths of the file.
 
-    It is compared by identity, so that it can be a part of the structure of a `Robot`.
+    Objects are compared by identity, so that one can be a static field of a `Robot`.
     """
 
     def __init__(self, rows: _Rows, keep: np.ndarray):
@@ -833,7 +838,7 @@ class LeftOut:
     def check(self, q: PyTree[Array], args: Args) -> None:
         """Raise unless the constraints hold, and still follow from the others.
 
-        Nothing is checked while JAX traces q or the lengths in `args`.
+        The check is skipped while JAX traces q or the lengths in `args`.
         """
         lengths = {x: given_in(args, x) for x in ("position", "radius")}
         lengths = {x: given for x, given in lengths.items() if given} or None
@@ -870,8 +875,8 @@ def independent_rows(
     """Find the constraints that follow from the others in every pose.
 
     Such rows are left out if the others are independent at the pose at rest and at
-    random poses. Otherwise all rows are kept, since a dependence that holds in some
-    poses only needs all of them.
+    random poses. Otherwise all rows are kept, because rows that depend on each other
+    only in some poses are needed in the others.
     """
     all_rows = _Rows(space, contacts, loops, loop)
     rng, found = np.random.default_rng(1), []

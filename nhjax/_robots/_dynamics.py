@@ -21,11 +21,12 @@ from ._tree import displacement, Frame, FramePoses, Space, Tree
 class Bodies(NamedTuple):
     """The bodies that can move, as arrays with one row for each.
 
-    - `names`, `joints`: the joint of each body is the last one on its path.
+    - `names`, `joints`: the name of each body, and the number of the last joint on the
+        path from the world to the body.
     - `inertia`: the pseudo-inertia [[Σ m x xᵀ, Σ m x], [Σ m xᵀ, Σ m]] in the frame
         after that joint.
     - `mass`: in kg.
-    - `weight`: the part of the weight that gravity compensation leaves.
+    - `weight`: the fraction of the weight that gravity compensation leaves.
     - `shifts`: the parameters that move each body relative to that frame.
     """
 
@@ -49,7 +50,8 @@ class Mechanics(NamedTuple):
     """All numbers of a robot that its functions use.
 
     Arrays with one entry for each velocity are in MuJoCo's order, which is the order of
-    the velocities of the system too. Those of tendons are for all fixed tendons.
+    the velocities of the system too. Arrays for tendons have one entry for each fixed
+    tendon.
     """
 
     joints: tuple[Joint, ...]
@@ -60,7 +62,8 @@ class Mechanics(NamedTuple):
     damping: Float[np.ndarray, "3 n"]
     friction: Float[np.ndarray, " n"]
     friction_smoothing: float
-    # Of the scalar joints: stiffness, its polynomial, and the reference position.
+    # For the scalar joints: the coefficients of x, x² and x³ in the force of the
+    # spring, and the position at rest.
     stiffness: Float[np.ndarray, "3 s"]
     rest: Float[np.ndarray, " s"]
     ball_springs: tuple[BallSpring, ...]
@@ -88,9 +91,9 @@ KINDS = (
 class Parameters(eqx.Module):
     """The numbers of a robot that `args` may replace.
 
-    - `names`: for each kind, the bodies, joints or geoms, with their places in the
-        arrays. The places of positions and radii are those in MuJoCo's model, and are
-        not used here.
+    - `names`: for each kind, a dictionary from the names of bodies, joints or geoms to
+        their places in the arrays. For positions and radii these are places in
+        MuJoCo's model, and are not used here.
     - `controls`: the names of the actuators, or None if a function of the user computes
         the controls: `args["controls"]` may then have any structure.
     """
@@ -99,7 +102,7 @@ class Parameters(eqx.Module):
     controls: tuple[str, ...] | None = eqx.field(static=True)
 
     def replaced(self, kind: str, values: np.ndarray, args: Args, dtype: Any) -> Any:
-        """Return an array of numbers with those of `args` in their places."""
+        """Return the array `values`, with the entries that `args` gives replaced."""
         given = given_in(args, kind)
         if not given:
             return jnp.asarray(values, dtype)
@@ -165,7 +168,7 @@ def lagrangian_of(mechanics: Mechanics, parameters: Parameters) -> Any:
     """Return the Lagrangian L(t, q, v, args) of a robot.
 
     The kinetic energy of all bodies between two joints is ½ ξ·M ξ with the body twist
-    ξ = (v, ω) of their frame and their spatial inertia M, which depends on nothing but
+    ξ = (v, ω) of their frame and their spatial inertia M, which depends only on
     parameters.
     """
     space, bodies = mechanics.space, mechanics.bodies
@@ -202,7 +205,7 @@ def lagrangian_of(mechanics: Mechanics, parameters: Parameters) -> Any:
     gravity = mechanics.gravity if np.any(mechanics.gravity) else None
 
     def inertias(args, dtype):
-        """Compute the inertia of each node, and its moment for weight, as entries."""
+        """Compute the inertia M and the weight (m c, m) of each node, as lists."""
         inertia, moment = total.tolist(), total_moment.tolist()
         masses = args.get("mass", {})
         for i in changed:
@@ -330,7 +333,8 @@ class Actuators(NamedTuple):
     bias: Float[np.ndarray, "a 3"]
     control_range: Float[np.ndarray, "a 2"]
     force_range: Float[np.ndarray, "a 2"]
-    # The limits of the sum of all actuators on a scalar joint, one for each velocity.
+    # The limits of the sum of all actuator forces on a scalar joint, with one row for
+    # each velocity.
     joint_range: Float[np.ndarray, "n 2"]
     smoothing: float
 
@@ -338,8 +342,8 @@ class Actuators(NamedTuple):
 def limited(x: Array, bounds: np.ndarray, smoothing: float) -> Array:
     """Limit signals smoothly: x is unchanged to round-off well inside its bounds.
 
-    The width of the transition is `smoothing` times the range, or times the bound if
-    the range has one only.
+    The width of the transition is `smoothing` times the range, or times the magnitude
+    of the bound if there is only one.
     """
     low, high = bounds[:, 0], bounds[:, 1]
     has = np.isfinite(bounds)
@@ -425,7 +429,7 @@ def force_of(
 
 
 class Connection(NamedTuple):
-    """Two points that coincide, of a connect or a weld."""
+    """Two frames whose origins coincide, by an equality `connect` or `weld`."""
 
     name: str
     first: Frame
@@ -455,7 +459,7 @@ class Loops(NamedTuple):
 
     @property
     def names(self) -> tuple[str, ...]:
-        """The name of each equation, in their order."""
+        """The names of the equations, in order."""
         points = [
             f"{loop.name} {x}"
             for loop in (*self.connections, *self.welds)
@@ -493,7 +497,8 @@ def loops_of(
             if loops.welds:
                 a, b = (x[len(loops.connections) :] for x in jnp.split(rotation, 2))
                 relative = jnp.einsum("nji,njk->nik", b, a)
-                # The antisymmetric part of a rotation is the axis times the sine.
+                # The antisymmetric part of a rotation is its axis times the sine of its
+                # angle.
                 part = relative - jnp.swapaxes(relative, 1, 2)
                 turn = jnp.stack([part[:, 2, 1], part[:, 0, 2], part[:, 1, 0]], axis=1)
                 rows.append(0.5 * turn.ravel())

@@ -1,4 +1,4 @@
-"""The joints of a robot, and their motions as numbers."""
+"""The joints of a robot, and the coefficients of their twists and poses."""
 
 from collections.abc import Sequence
 from typing import Any, NamedTuple
@@ -10,7 +10,7 @@ from .._custom_types import Args
 
 
 class Shift(NamedTuple):
-    """How a frame depends on the position of a body that is a parameter.
+    """How a frame depends on the position of a body that is moved by `args`.
 
     `args["position"][body]` moves the origin of the frame by `rotation` times the
     difference of this position from `reference`, the position in the file.
@@ -71,7 +71,7 @@ def motions(joints: Sequence[Joint]) -> Float[np.ndarray, "4 n 12"]:
         if joint.kind == "slide":
             found[3, number, 9:] = turn @ joint.axis
             continue
-        # Its columns are a × e_i, so that it maps x to a × x.
+        # The columns of `hat` are a × e_i, so that it maps x to a × x.
         hat = np.cross(joint.axis, np.eye(3)).T
         for row, matrix in ((1, hat), (2, hat @ hat)):
             turned = turn @ matrix

@@ -16,9 +16,11 @@ import numpy as np
 from .._errors import check_choice
 
 
-# Angles of URDF files that are closer to quarter turns were meant as such [rad].
+# Angles in URDF files that differ by less than this [rad] from a multiple of a
+# quarter turn are replaced by this multiple.
 _ROUNDED_ANGLE = 1e-3
-# The addresses of files in URDF files that were written for ROS begin with this.
+# URDF files that were written for ROS give the files of meshes by addresses that begin
+# with this.
 _PACKAGE = "package://"
 
 IGNORABLE = (
@@ -52,9 +54,9 @@ def mujoco() -> Any:
 def compile_model(
     model: Any, root: str | None, motors: Sequence[str]
 ) -> tuple[Any, Any]:
-    """Return the model of a file, an `MjSpec` or an `MjModel`, and it compiled.
+    """Return a model as an `MjSpec`, and the compiled model.
 
-    The first one is an `MjSpec`, to which films can add a scene, except for an
+    Films can add a scene to the `MjSpec`. For an `MjModel`, both results are this
     `MjModel`. Each joint in `motors` gets a motor.
     """
     library = mujoco()
@@ -189,7 +191,11 @@ def _complete_quarter_turns(robot: ElementTree.Element) -> None:
 
 
 def _find_packages(robot: ElementTree.Element, path: Path) -> None:
-    """Replace addresses of ROS packages around the file by the paths of their files."""
+    """Replace addresses of meshes in ROS packages by paths.
+
+    The package of an address package://NAME/... is a folder NAME that contains the
+    URDF file at any depth.
+    """
     for mesh in robot.iter("mesh"):
         address = mesh.get("filename", "")
         package, _, rest = address.removeprefix(_PACKAGE).partition("/")
@@ -277,10 +283,10 @@ class Unsupported(NamedTuple):
 def check_supported(
     model: Any, ignore: Sequence[str], rolling: Collection[int]
 ) -> dict[str, set[int]]:
-    """Raise a `ValueError` that names all parts that are neither supported nor ignored.
+    """Raise a `ValueError` if parts are neither supported nor ignored, and name them.
 
-    `rolling` has the numbers of the geoms that roll. Return the numbers of the parts to
-    leave out: actuators, tendons and equalities.
+    `rolling` has the numbers of the geoms that roll. Return the numbers of the
+    actuators and of the equalities to leave out.
     """
     if isinstance(ignore, str):
         raise TypeError(
@@ -374,7 +380,8 @@ def _joints(model: Any) -> Iterator[Unsupported]:
                 None,
                 f"joint {name!r}: gravity compensation by an actuator with a limit",
             )
-        # MuJoCo then leaves it out for the directions of this joint alone.
+        # Without actuators, MuJoCo omits gravity compensation in the coordinates of
+        # this joint only.
         if model.jnt_actgravcomp[joint] and model.ngravcomp and not model.nu:
             yield Unsupported(
                 None,
@@ -556,7 +563,7 @@ def _touching_pairs(model: Any) -> list[tuple[int, int]]:
             is_parent = (
                 weld[one] == parent_of_weld[other] or weld[other] == parent_of_weld[one]
             )
-            # The filter does not apply to the world.
+            # The filter of parents does not apply to the world.
             if filters_parents and is_parent and weld[one] and weld[other]:
                 continue
             low, high = min(one, other), max(one, other)

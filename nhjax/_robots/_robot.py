@@ -82,7 +82,8 @@ class Robot(eqx.Module):
 
         - `qpos`, `qvel`: positions and velocities in MuJoCo's conventions, of shape
             (nq,) and (nv,), or dictionaries by the names of joints. The default is the
-            pose of the file at rest; joints that a dictionary omits have it too.
+            pose of the file with zero velocity. Joints that a dictionary omits have
+            the default values.
         - `t`: the time.
         - `args`: the parameters and controls. The default is `self.args`.
         - `project`: whether to project the state onto the constraints.
@@ -91,10 +92,10 @@ class Robot(eqx.Module):
 
         **Returns:** a `State`.
 
-        **Raises:** as `nhjax.initial_state`; `ValueError` for unknown joints, and for
-        constraints that the system leaves out because they follow from the others, if
-        they do not hold in this state or no longer follow with the lengths in `args`
-        (unless JAX traces the call); `ShapeError` for wrong shapes.
+        **Raises:** as `nhjax.initial_state`; `ValueError` for unknown joints;
+        `ValueError` if a constraint that was left out, because it follows from the
+        others, is violated in this state or no longer follows with the lengths in
+        `args` (not checked while JAX traces the call); `ShapeError` for wrong shapes.
         """
         rest = jnp.asarray(self._rest, jnp.result_type(float))
         position = self._array("qpos", qpos, rest)
@@ -268,42 +269,45 @@ def from_mujoco(
         `rpy` of a URDF file that differ by less than 1e-3 rad from quarter turns, such
         as 1.5708, are taken as quarter turns.
     - `rolling`: the names of the geoms that roll on the ground, or of bodies with one
-        round geom. A dictionary says how:
+        round geom. A dictionary maps these names to the kind of contact:
         `"no slip"`, `"no lateral slip"`, `"no longitudinal slip"`, `"slides"` (the geom
         keeps touching), an angle [rad] for the rollers of a mecanum wheel, or a tuple
         like `no_slip` of `nhjax.rolling.Wheel`. A cylinder is a wheel whose rim is in
-        the middle of its length, a capsule a wheel with a round tread; a sphere and an
-        ellipsoid roll in all directions. These geoms can never lift off.
+        the middle of its length, and a capsule is a wheel with a round tread; a sphere
+        and an ellipsoid roll in all directions. The geoms in `rolling` can never lift
+        off.
     - `ground`: the name of a plane that is fixed to the world, or a ground of
         `nhjax.rolling`. The default is the only plane of the model, or z = 0.
     - `root`: for a URDF file, how the root link can move. MuJoCo fixes it to the world;
         `"free"` adds a free joint, and `"planar"` the coordinates x, y and heading.
     - `motors`: the names of joints that get a motor, in addition to the actuators of
-        the file: the control is its torque [N m] or force [N]. URDF files have no
-        actuators; `<transmission>` is not read.
+        the file. The control of a motor is its torque [N m] or force [N]. URDF files
+        have no actuators; `<transmission>` is not read.
     - `controls`: a function of (t, qpos, qvel, args) that returns the controls of all
         actuators, for feedback. It can read gains from `args["controls"]`, which may
         then have any structure, such as a dictionary. Without a function,
         `args["controls"]` are the controls themselves.
-    - `parameters`: names of bodies for `"mass"` and `"position"`, of joints for
-        `"damping"`, `"stiffness"`, `"armature"` and `"friction"`, and of `rolling` for
-        `"radius"`: their values are then in `args`. A body with another mass keeps its
-        shape and its centre of mass. The position of a body is the vector [m] from the
-        frame of its parent to its own, of shape (3,), such as the length of a link; the
-        body and all that is attached to it move along. A wheel with another radius
-        keeps its mass and its inertia. Films show the lengths of the file.
+    - `parameters`: a dictionary with names of bodies for `"mass"` and `"position"`, of
+        joints for `"damping"`, `"stiffness"`, `"armature"` and `"friction"`, and with
+        names in `rolling` for `"radius"`. `args` can then replace these values of the
+        file. A body with another mass keeps its shape and its centre of mass. The
+        position of a body is the vector [m] from the frame of its parent to its own
+        frame, of shape (3,), such as the length of a link; the body and all that is
+        attached to it move along. A wheel with another radius keeps its mass and its
+        inertia. Films show the lengths of the file.
     - `ignore`: unsupported parts to leave out: `"actuators"`, `"contacts"`,
         `"equalities"`, `"fluid"`, `"friction loss"`, `"limits"`, `"plugins"`,
         `"springs"`, `"tendons"`.
-    - `constraints`: as for `LagrangianSystem`; all constraints are then kept. By
-        default, constraints that follow from others in every pose are left out, such as
-        `"across"` of the second of two wheels on one axle. If others depend on each
-        other near the pose of the file, it is `"redundant"`.
+    - `constraints`: `"independent"` or `"redundant"`, as for `LagrangianSystem`; both
+        keep all constraints. By default, constraints that follow from others in every
+        pose are left out, such as `"across"` of the second of two wheels on one axle.
+        If constraints depend on each other only in some poses near the pose of the
+        file, the default keeps all and is `"redundant"`.
     - `friction_smoothing`: v₀ [rad/s or m/s] in the friction loss f tanh(q̇ / v₀) of a
         joint.
     - `limit_smoothing`: the width of the smooth transition at the limits of controls
-        and forces of actuators, in parts of their range. Farther than 36 widths from
-        the limits, values are not changed.
+        and forces of actuators, as a fraction of their range. Farther than 36 widths
+        from the limits, values are not changed.
 
     **Returns:** a `Robot`.
 
@@ -429,9 +433,10 @@ def _joined(heights: Any, loop: Any) -> Any:
 _FOLDER = Path(__file__).parent / "models"
 
 _LEFT_ROLLERS, _RIGHT_ROLLERS = -math.pi / 4, math.pi / 4
-# The front wheel on the right of the car slips sideways, because a trapezoid does not
-# turn both wheels exactly about one centre. A wheel opposite to another one of the
-# quadruped would repeat its constraint when all wheels are parallel.
+# The right front wheel of the car may slip sideways, because a steering trapezoid does
+# not turn both front wheels exactly about one centre. On the quadruped, the lateral
+# constraint of a right wheel would repeat the lateral constraint of the left wheel
+# opposite to it when all wheels are parallel.
 _OPTIONS: Mapping[str, tuple[str, dict[str, Any]]] = MappingProxyType(
     {
         "ackermann_car": (
@@ -534,7 +539,7 @@ def example_robot(name: str, **options: Any) -> Robot:
     path = example_robot_file(name)
     own: dict[str, Any] = dict(_OPTIONS[name][1])
     if "ground" in own:
-        # The plane has the precision of this call.
+        # Create the plane here, in the precision that JAX has at this call.
         own["ground"] = Plane(height=own["ground"])
     own |= options
     return from_mujoco(path, **own)

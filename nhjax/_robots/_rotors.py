@@ -41,7 +41,7 @@ class Merged(NamedTuple):
     rotors: list[Rotor]
 
 
-# Angles that are no simple fractions of a turn.
+# Zero, and angles that are not simple fractions of a turn.
 _ANGLES = (0.0, 1.1, 2.3, 4.1)
 
 
@@ -57,9 +57,10 @@ def merge_rotors(
     **Arguments:**
 
     - `joints`: all joints.
-    - `bodies`, `inertia`, `moment`: the joint of each body, its pseudo-inertia, and the
-        part of it that has weight.
-    - `variable`: bodies whose inertia can change, which stay as they are.
+    - `bodies`, `inertia`, `moment`: for each body, the joint, the pseudo-inertia, and
+        the vector (Σ m x, Σ m) times the fraction of the weight that gravity
+        compensation leaves.
+    - `variable`: bodies whose inertia can change. They are not treated as rotors.
     """
     own, inertia, moment = list(bodies), inertia.copy(), moment.copy()
     rotors: list[Rotor] = []
@@ -126,7 +127,7 @@ def moved_inertia(
 
     - `inertia`: the pseudo-inertia.
     - `shift`: the vector by which all points of the body move.
-    - `factor`: by which its mass and its moments of inertia grow.
+    - `factor`: the factor by which mass and moments of inertia are multiplied.
     """
     to = [[float(i == j) for j in range(3)] + [shift[i]] for i in range(3)]
     to.append([0.0, 0.0, 0.0, 1.0])

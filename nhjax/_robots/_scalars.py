@@ -52,7 +52,7 @@ def times(a: Entry, b: Entry) -> Entry:
 
 
 def _combined(operation: Any, a: Entry, b: Entry) -> Entry:
-    """Combine two entries. JAX traces its basic operations in the least time."""
+    """Add or multiply two entries by `jax.lax`, whose operations trace fastest."""
     if isinstance(a, float) and isinstance(b, float):
         return a + b if operation is jax.lax.add else a * b
     return operation(a, b)

@@ -2,7 +2,7 @@
 
 Each joint is a node of the tree. The recursions from the world to the ends of the tree
 treat all nodes at the same depth together, so that the number of operations in the
-program grows as the depth, not as the number of joints: the legs of a robot cost no
+program grows with the depth, not with the number of joints: the legs of a robot cost no
 more operations than one leg. Small trees are written in scalars instead, because most
 entries of their frames are zero.
 """
@@ -21,8 +21,9 @@ from . import _scalars as entries
 from ._joints import given_in, Joint, motions, Shift, twists
 
 
-# Larger trees are computed as arrays, which have shorter programs. The code of
-# scalars is shorter: it has no products with zeros, and compiles in less time.
+# Trees with more nodes are computed as arrays, whose programs have fewer
+# operations. For smaller trees scalars are better: the program has no products with
+# zeros, and compiles in less time.
 LARGEST_OF_SCALARS = 40
 
 
@@ -45,7 +46,7 @@ class Part(NamedTuple):
 
 
 def parts_of(joints: Sequence[Joint]) -> tuple[Part, ...]:
-    """Divide the joints, in the order of the file, into factors."""
+    """Divide the joints, in the order of the file, into parts of the space."""
     parts: list[Part] = []
     velocity = 0
     for number, joint in enumerate(joints):
@@ -149,7 +150,8 @@ def displacement(shifts: Sequence[Shift], args: Args, dtype: Any) -> entries.Vec
 class Level(NamedTuple):
     """The nodes at one depth.
 
-    - `nodes`: their places in the order of the joints.
+    - `nodes`: their places among the joints of the tree, where free and ball joints
+        come first.
     - `parents`: for each, the place of its parent in the level before, which is the
         world for the first level.
     """
@@ -230,7 +232,7 @@ class Tree:
         gravity: Float[np.ndarray, "3"] | None,
         args: Args,
     ) -> list[tuple[entries.Vector, entries.Vector, entries.Entry]]:
-        """Compute what `motion` does for each node, entry by entry."""
+        """Compute the results of `motion` for each node, entry by entry."""
         own = self._relative_scalars(q, args)
         twists = self._own_twists_of_scalars(v, [rotation for rotation, _ in own])
         weight = entries.known(np.zeros(3) if gravity is None else gravity)
@@ -275,7 +277,8 @@ class Tree:
             reference = float(self.reference[number])
             s = entries.add(s, -reference)
             first, sine, versine, linear = self.constants[:, number]
-            # In this form an axis of the frame leaves single sines and cosines.
+            # In terms of cos s, instead of 1 - cos s, the entries for a joint along a
+            # coordinate axis are single sines and cosines.
             parts: entries.Vector = [1.0, 0.0, 0.0, 0.0]
             if np.any(sine):
                 parts[1:3] = [jnp.sin(s), jnp.cos(s)]
@@ -427,7 +430,7 @@ class Tree:
 
 
 def _rows_of(vectors: list[entries.Vector], dtype: Any) -> Array:
-    """Convert vectors to the rows of an array. Those without arrays are zero."""
+    """Convert vectors to rows of an array. Vectors of Python floats are zero."""
     rows = jnp.zeros((len(vectors), 3), dtype)
     for number, vector in enumerate(vectors):
         if not all(isinstance(x, float) for x in vector):

@@ -76,7 +76,7 @@ class AbstractChart(eqx.Module):
         """Compute (Π, F), the momenta and forces conjugate to the coordinates y.
 
         They are Π = dτ_y^* μ and F = dτ_y^* w + (ddτ_y)^*(H, Π) for body momenta μ and
-        body forces w. The second term of F is the derivative of ⟨μ, dτ_y H⟩ along y.
+        body forces w. The second term of F is the gradient of ⟨μ, dτ_y H⟩ in y.
         """
 
     @abstractmethod

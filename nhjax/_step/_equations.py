@@ -46,10 +46,9 @@ T = TypeVar("T")
 
 
 class StageUnknowns(eqx.Module):
-    """The unknowns of one step: stage velocities, node coordinates and multipliers.
+    """The unknowns of one step: velocities, momenta and multipliers.
 
-    An unknown that the system or the closure of the multiplier does not have is an
-    empty array.
+    An unknown that does not occur with the given system or closure is an empty array.
 
     - `velocity`: H^1..H^s, the stage velocities in the chart (V^i on R^n).
     - `momentum`: the stage momenta in the body frame, for Hamiltonian systems. For
@@ -89,10 +88,12 @@ class StageEquations(eqx.Module):
     """The discrete equations of one step from (q_k, p_k, λ_k).
 
     These are the four Summaries of the paper, for the `StageUnknowns` in the chart of
-    the method. Let w^i be the body force at stage i, including reactions, and let y^i
-    be the coordinates of the stage. Let n^i = Ad^*_{τ(y^i)⁻¹} w^i, let F^i be the same
-    force in the chart, and let M be the momentum μ_k carried to the origin. The
-    equations are
+    the method. Let y^i be the coordinates of stage i in the chart, and Π^i its momentum
+    in the chart. Let w^i be the body force at stage i, including reactions, let
+    n^i = Ad^*_{τ(y^i)⁻¹} w^i be this force carried to the origin of the chart, and F^i
+    the same force in the chart. Let μ^i be the body momentum at node i, and M the
+    momentum μ_k carried to the origin. With `base` from `AbstractChart.base_momentum`,
+    the equations are
 
     Π^i = base + h Σ â_ij F^j,    μ^i = Ad^*_{τ(y^i)} (M + h Σ a_ij n^j),
 
@@ -620,8 +621,8 @@ def end_position(stages: StageEquations, x: StageUnknowns) -> PyTree[Array]:
 def with_moved_positions(stages: StageEquations, nudge: FloatScalar) -> StageEquations:
     """Return the equations with q_k moved by about `nudge` times its size.
 
-    This move changes the solution. The change divided by `nudge` estimates the effect
-    of the round-off of positions, divided by the unit round-off. The coordinates move
+    The resulting change of the solution, divided by `nudge` and multiplied by the unit
+    round-off, estimates the effect of the round-off of positions. The coordinates move
     by different amounts, so that the moves do not cancel in a difference of two
     coordinates.
     """
@@ -647,7 +648,10 @@ class Evaluation(NamedTuple):
 
 
 class StageResiduals(NamedTuple):
-    """The residuals of all equations of a step; None where there is no equation.
+    """The residuals of all equations of a step.
+
+    If the step does not have the equations of a field, the field is None, or an empty
+    array for `kinematic` and `holonomic`.
 
     - `momentum`, `node`: of the momentum equations at the stages and nodes.
     - `velocity`: of the stage velocities, for Hamiltonian systems.
@@ -704,7 +708,7 @@ def stage_residual(
 
     **Returns:** the residuals, of shape (k,) with as many entries as `x` has numbers,
     in the units of momenta and of the constraints; and the values that were evaluated
-    on the way, which belong into the field `aux` of `Solved`.
+    on the way, which `solve` must return in the field `aux` of `Solved`.
 
     !!! example
 
@@ -731,11 +735,12 @@ def stage_residual(
 
 
 def unknown_units(stages: StageEquations, lin: Linearisation) -> list[FloatScalar]:
-    """Return the size of each field of `StageUnknowns` that changes u by one.
+    """Return how much each field of `StageUnknowns` must change to change u by one.
 
-    Multipliers are measured by their effect h N⁻¹ R δΛ on u.
-    The round-off of a multiplier grows like 1 / h: measured relative to its own size,
-    it would look like an iteration that does not converge.
+    Multipliers are measured by their effect h N⁻¹ R δΛ on u, with the matrices of
+    `Linearisation`. The round-off of a multiplier grows like 1 / h. If changes were
+    measured relative to the multiplier itself, this round-off would look like an
+    iteration that does not converge.
     """
     h = jnp.abs(stages.h)
     one = jnp.ones_like(h)

@@ -1,10 +1,11 @@
 """The terms of order h in the Jacobian of the stage equations, and when to use them.
 
 With the mass matrix and the constraints at the start of the step alone, simplified
-Newton reduces the error by a factor O(h) an iteration. `FirstOrderTerms` makes this
-O(h²): it adds how the mass matrix changes along the step, and the derivatives of
-momenta by positions and of forces by velocities. `uses_first_order_terms` decides
-whether these terms are available and whether they make a step faster.
+Newton reduces the error by a factor O(h) an iteration. With `FirstOrderTerms` the
+factor is O(h²): they add the change of the mass matrix along the step, and the
+derivatives of momenta with respect to positions and of forces with respect to
+velocities. `uses_first_order_terms` decides whether these terms are available and
+whether they make a step faster.
 """
 
 from typing import Literal, NamedTuple, TypeAlias
@@ -21,7 +22,7 @@ from ._equations import StageEquations, StageUnknowns
 
 
 # The part of the Jacobian that simplified Newton inverts; None selects the faster one
-# of the first two.
+# of "leading" and "first_order".
 JacobianName: TypeAlias = Literal["leading", "first_order", "full"] | None
 
 # The terms are worthwhile if the saved iterations cost more time than the terms: up to
@@ -61,7 +62,7 @@ def uses_first_order_terms(
 
 
 def forces_have_slopes(stages: StageEquations) -> bool:
-    """Return whether the forces in these equations have slopes in velocities."""
+    """Return whether the forces in these equations pass `has_force_slopes`."""
     at_start = stages.t, stages.q, stages.p, stages.multiplier, stages.args
     return has_force_slopes(stages.system, *at_start)
 
@@ -76,8 +77,9 @@ def has_force_slopes(
 ) -> bool:
     """Return whether forces have forward-mode derivatives in the velocities.
 
-    Callbacks and functions with a custom rule for reverse mode only do not have them.
-    No other part of a step needs this derivative.
+    Callbacks do not have them, nor do functions whose custom derivative rule is for
+    reverse mode only. Simplified Newton with the leading part of the Jacobian does not
+    need these derivatives.
     """
 
     def force(u):
@@ -170,9 +172,9 @@ class FirstOrderTerms(eqx.Module):
         return -_times(self.node_momentum, _weighted(stages.node_weights, change))
 
 
-# If forces change more than this, such as friction that is steep at rest, the series
-# does not converge. The leading part alone does better, in particular if the friction
-# saturates soon.
+# If the size of h N⁻¹ ∂F/∂H is larger than this, the series does not converge. An
+# example is friction that is steep at rest. The leading part alone then converges
+# better, in particular if the friction saturates at a low velocity.
 _LARGEST = 5.0
 
 
@@ -196,7 +198,8 @@ def first_order_terms(
 ) -> FirstOrderTerms:
     """Compute the terms at the start of the step, in the chart of the stages x."""
     h, c = stages.h, stages.coefficients("c")
-    # The starting values begin at the fibre coordinate u_k of the start.
+    # The starting value of the first stage is u_k + `first` h u̇, from which the fibre
+    # coordinate u_k at the start of the step follows.
     first = jnp.sum(stages.coefficients("a_hat"), axis=1)[0]
     u = x.velocity[0] - first * h * lin.acceleration
     inverse = lin.momentum_inverse.as_matrix()
@@ -225,7 +228,7 @@ def first_order_terms(
         node_momentum=h * scaled(body.momentum),
         node_force=h * scaled(chart.body_force),
     )
-    # A derivative may not be finite, such as the derivative of |v| at rest.
+    # A derivative can be infinite or NaN, such as the derivative of |v| at rest.
     is_finite = [jnp.all(jnp.isfinite(x)) for x in jax.tree.leaves(terms)]
     is_usable = jnp.all(jnp.stack(is_finite)) & (_size(terms.force) <= _LARGEST)
     return jax.tree.map(lambda x: jnp.where(is_usable, x, 0), terms)
@@ -240,8 +243,8 @@ class _BodySlopes(NamedTuple):
     """Derivatives at the start of a step, in the body frame.
 
     - `inertia_rate`: the rate of N = ∂p/∂u along the motion.
-    - `momentum`: the derivative of the momentum by the position, minus the derivative
-        of the momentum that the chart transports to this position.
+    - `momentum`: the derivative, with respect to the position, of the momentum at this
+        position minus the initial momentum that the chart transports to this position.
     """
 
     inertia_rate: Float[Array, "n n"]
@@ -251,9 +254,10 @@ class _BodySlopes(NamedTuple):
 class _ChartSlopes(NamedTuple):
     """Derivatives at the start of a step, in its chart.
 
-    - `turning`: the rate of ∂Π/∂H along y = v that comes from the change of dτ_y.
+    - `turning`: the rate of ∂Π/∂H if y changes at the rate v, from the change of dτ_y.
     - `momentum`, `force`, `body_force`: ∂Π/∂y, ∂F/∂H and ∂w/∂H.
-    - `base`: the derivative of the constant term of Π by the increment of the step.
+    - `base`: the derivative of the constant term of Π with respect to the increment ξ
+        of the step.
     """
 
     turning: Float[Array, "n n"]

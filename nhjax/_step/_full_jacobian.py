@@ -42,9 +42,10 @@ class StageResponses(NamedTuple):
 
 
 class Slopes(NamedTuple):
-    """The derivatives of rows by quantities of the same rows, and by ξ.
+    """The derivatives of quantities of the stages with respect to H, Ξ and ξ.
 
-    On a vector space nothing depends on ξ, so that `by_xi` is None.
+    Row i of a quantity depends on H_i and Ξ_i of the same row, and on ξ. On a vector
+    space it does not depend on ξ, and `by_xi` is None.
     """
 
     by_velocity: Float[Array, "s n n"]
@@ -57,7 +58,7 @@ class Slopes(NamedTuple):
         increment: Float[Array, "s n"],
         xi: Float[Array, "1 n"],
     ) -> Float[Array, "s n"]:
-        """Compute the change for given changes."""
+        """Compute the change of the quantity for given changes of H, Ξ and ξ."""
         total = _times(self.by_velocity, velocity) + _times(
             self.by_increment, increment
         )
@@ -88,10 +89,11 @@ class LinearisedStep(eqx.Module):
 
     and likewise F_i and n_i, where ∂F/∂Ξ is the stiffness, including the change of the
     reactions Bᵀλ with positions, and ∂F/∂H is the damping. The residuals of the stages
-    r_i = Π_i - base(ξ, h Σ b_j n_j, h Σ b_j F_j) - h Σ â_ij F_j are then a matrix of
-    s n rows times δH. It is inverted by blocks of n rows. It does not split into
-    smaller systems, since the matrices A and Â of the method do not commute. The nodes
-    follow from the stages, and the multipliers from a Schur complement.
+    are r_i = Π_i - base(ξ, h Σ b_j n_j, h Σ b_j F_j) - h Σ â_ij F_j. Their changes are
+    a matrix of s n rows times δH. This matrix is inverted by blocks of n rows. It does
+    not split into smaller systems, since the matrices A and Â of the method do not
+    commute. The changes of the nodes follow from the changes of the stages, and the
+    multipliers from a Schur complement.
 
     For a Hamiltonian system δμ_i = (∂v_i/∂μ)⁻¹ (δH_i - ∂v_i/∂Ξ δΞ_i - ∂v_i/∂ξ δξ), and
     the derivatives above are total derivatives.
@@ -100,11 +102,11 @@ class LinearisedStep(eqx.Module):
     stages: Float[Array, "s n s n"]  # the inverse of ∂r_i/∂H_j
     transported: Slopes  # of n_i
     conjugate: Slopes | None  # of μ_i, for a Hamiltonian system
-    node_inverse: Float[Array, "r n n"]  # of the nodes' residuals by u_i
+    node_inverse: Float[Array, "r n n"]  # the inverse of ∂r_i/∂u_i of the nodes
     end_inverse: Float[Array, "n n"]  # (∂p/∂u)⁻¹ at the end
-    node_gain: Float[Array, "r n n"] | None  # the identity on a vector space
-    node_position: Float[Array, "r n n"]  # by Ξ_i of the nodes
-    node_xi: Float[Array, "r n n"] | None
+    node_gain: Float[Array, "r n n"] | None  # None for the identity on a vector space
+    node_position: Float[Array, "r n n"]  # ∂r_i/∂Ξ_i of the nodes
+    node_xi: Float[Array, "r n n"] | None  # ∂r_i/∂ξ of the nodes
 
     def of_stages(
         self, stages: StageEquations, residual: Float[Array, "s n"]
@@ -118,7 +120,7 @@ class LinearisedStep(eqx.Module):
     def by_force(
         self, stages: StageEquations, change: Float[Array, "s n"]
     ) -> Float[Array, "r n"]:
-        """Compute the momenta of the nodes from forces that change with δH."""
+        """Compute the changes of the momenta at the nodes by forces, given δH."""
         force = self.transported.along(*_moves(stages, change))
         gained = stages.h * _weighted(stages.node_weights, force)
         return gained if self.node_gain is None else _times(self.node_gain, gained)
@@ -126,7 +128,7 @@ class LinearisedStep(eqx.Module):
     def by_position(
         self, stages: StageEquations, change: Float[Array, "s n"]
     ) -> Float[Array, "r n"]:
-        """Compute the residuals of the nodes from positions that change with δH."""
+        """Compute the changes of the residuals of the nodes by positions, given δH."""
         moved = stages.h * _weighted(stages.node_weights, change)
         moved = _times(self.node_position, moved)
         if self.node_xi is None:
@@ -153,7 +155,7 @@ class LinearisedStep(eqx.Module):
         x: StageUnknowns,
         reaction: Float[Array, "s n"],
     ) -> StageResponses:
-        """Compute the changes by reactions at the stages, for h = 1."""
+        """Compute how stages and nodes change by given reactions, for h = 1."""
         on_stages, on_nodes = momenta_of_forces(stages, x, reaction[..., None])
         on_stages, on_nodes = on_stages[..., 0], on_nodes[..., 0]
         velocity, momentum = self.of_stages(stages, on_stages)
@@ -195,7 +197,8 @@ def _products(
 def _block_product(
     matrix: Float[Array, "r k s n"], z: Float[Array, "s n"]
 ) -> Float[Array, "r k"]:
-    # Row by row, in a loop: written out, the product would be most of the program.
+    # The loop computes row by row. Without it, the product would be unrolled, and would
+    # be the largest part of the program.
     rows = matrix.reshape(-1, *matrix.shape[2:])
     found = jax.lax.map(lambda row: small_einsum("jn,jn->", row, z), rows)
     return found.reshape(matrix.shape[:2])
@@ -204,12 +207,13 @@ def _block_product(
 def slopes(
     function: Callable[..., PyTree[Array]], *args: Float[Array, "*r n"]
 ) -> tuple[PyTree[Array], tuple[PyTree[Array], ...]]:
-    """Evaluate a function of rows, and differentiate it by each of its arguments.
+    """Evaluate a function of rows, and differentiate it in each of its arguments.
 
-    Row i of a result depends only on row i of each argument, so that one direction
-    moves all rows. An argument with a single axis moves all results.
+    Row i of a result depends only on row i of each argument. Therefore one directional
+    derivative serves for all rows. All rows depend on an argument with a single axis.
 
-    **Returns:** the values, and for each argument the derivatives, on a last axis.
+    **Returns:** the values, and for each argument the derivatives, whose last axis
+    lists the components of the argument.
     """
     value, push = jax.linearize(function, *args)
     sizes = [x.shape[-1] for x in args]
@@ -227,7 +231,7 @@ def slopes(
     # This is a loop over the directions, so that the program has one copy of the
     # linearised function.
     found = mapped(along, jnp.eye(sum(sizes), dtype=args[0].dtype))
-    # A derivative may not be finite, such as the derivative of |v| at rest.
+    # A derivative can be infinite or NaN, such as the derivative of |v| at rest.
     found = jax.tree.map(lambda x: jnp.where(jnp.isfinite(x), x, 0), found)
 
     def columns(first, last):
@@ -263,8 +267,8 @@ def linearised_step(
 ) -> LinearisedStep:
     """Linearise the equations of stages and nodes at the stages x.
 
-    With `has_impulse_slopes` this includes the change of the direction of the impulse
-    at the end, which is small, since it is proportional to the impulse.
+    With `has_impulse_slopes` the result includes the change of the direction of the
+    impulse at the end, which is small, since it is proportional to the impulse.
     """
     h, path, flat = stages.h, _path(stages, x), stages.manifold.is_flat
     a_hat, b = stages.coefficients("a_hat"), stages.coefficients("b")[None]
@@ -310,7 +314,7 @@ def _stage_slopes(
 ) -> tuple[tuple[Array, Array], Slopes, Slopes, Slopes, Slopes | None]:
     """Differentiate Π, F, n and, for a Hamiltonian system, μ at the stages.
 
-    The first results are the values n and F themselves.
+    The first result is the pair of the values n and F themselves.
     """
     system, args = stages.system, stages.args
     multipliers, xi = stages.multipliers(x), path.xi
@@ -402,7 +406,7 @@ def _node_slopes(
     path: _Path,
     transported: Float[Array, "s n"],
 ) -> tuple[Array, Array | None, Array, Array | None]:
-    """Differentiate the equations of the nodes by u, gained momenta, Ξ and ξ."""
+    """Differentiate the equations of the nodes in u, gained momenta, Ξ and ξ."""
     system, args, u = stages.system, stages.args, x.node_fibre_coordinate
 
     def momenta(increments, u, xi):
@@ -432,10 +436,11 @@ def _node_slopes(
 
 
 def _end_impulse_slopes(stages: StageEquations, x: StageUnknowns) -> tuple[Array, ...]:
-    """Differentiate the impulse at the end of the step by ξ and by u at the end."""
+    """Differentiate the impulse at the end of the step in ξ and in u at the end."""
 
     def impulse(xi, u):
-        # The weights b_j have the sum 1, so that this changes the increment by xi.
+        # The weights b_j have the sum 1, so that this change of velocities changes the
+        # increment by xi.
         moved = x.velocity + xi[None] / stages.h
         nodes = jnp.concatenate([x.node_fibre_coordinate[:-1], u[None]])
         at = replace(x, velocity=moved, node_fibre_coordinate=nodes)
@@ -453,8 +458,8 @@ class ConstraintSlopes(eqx.Module):
     rates of holonomic constraints, and `positions` are the holonomic constraints.
     """
 
-    values: tuple[Float[Array, "r l n"], ...]  # by Ξ_i, ξ and u_i
-    positions: tuple[Float[Array, "r k n"], ...]  # by Ξ_i and ξ
+    values: tuple[Float[Array, "r l n"], ...]  # with respect to Ξ_i, ξ and u_i
+    positions: tuple[Float[Array, "r k n"], ...]  # with respect to Ξ_i and ξ
 
     @classmethod
     def at(cls, stages: StageEquations, x: StageUnknowns) -> "ConstraintSlopes":
@@ -500,9 +505,10 @@ class ConstraintSlopes(eqx.Module):
         velocity: Float[Array, "s n"],
         at_nodes: Float[Array, "r n"],
     ) -> Float[Array, " e"]:
-        """Compute the changes of `constraint_values` with those of stages and nodes.
+        """Compute how `constraint_values` change with the stages and the nodes.
 
-        If constraints are redundant, these are the independent combinations of them.
+        If constraints are redundant, the changes are multiplied by the projector P of
+        `Redundancy`.
         """
         h, m, k = stages.h, stages.num_nonholonomic, stages.num_holonomic
         increments = h * _weighted(stages.coefficients("a")[1:], velocity)
@@ -542,7 +548,7 @@ class ConstraintSlopes(eqx.Module):
 def _rows(
     function: Callable[..., Float[Array, "r l"]], *args: Float[Array, "r n"]
 ) -> tuple[Float[Array, "r l n"], ...]:
-    """Differentiate a function by each argument in reverse mode.
+    """Differentiate a function in each of its arguments by reverse mode.
 
     Row i of the result depends only on row i of each argument.
     """
@@ -557,7 +563,7 @@ def inverse_of_schur(
 ) -> Float[Array, "c c"]:
     """Invert the Schur complement of the multipliers, by blocks of constraints.
 
-    The first `num_kinematic` unknowns are blocks of m, the others blocks of k.
+    The first `num_kinematic` unknowns form blocks of m, the others form blocks of k.
     """
     sizes = stages.num_nonholonomic, stages.num_holonomic
 
@@ -624,7 +630,7 @@ def _reactions(
 def end_slopes(
     stages: StageEquations, x: StageUnknowns
 ) -> tuple[tuple[Array, Array], ...]:
-    """Differentiate `end_residual` by the increment ξ and by u at the end."""
+    """Differentiate `end_residual` in the increment ξ and in u at the end."""
     given = _path(stages, x)
 
     def residual(xi, u):

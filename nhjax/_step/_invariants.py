@@ -41,7 +41,7 @@ class Invariants(eqx.Module):
         for the energy of the system.
     - `value`: the k values.
     - `least_sizes`: the measured round-off of the functions at the start of the run,
-        divided by the unit round-off. It includes constants that cancel.
+        divided by the unit round-off. Constants that cancel contribute to it.
     - `least_part`: zero if the mass matrix is definite, otherwise `LEAST_PART`.
     """
 
@@ -118,9 +118,9 @@ class Invariants(eqx.Module):
     ) -> Float[Array, " k"]:
         """Compute the difference between I - μ·Φ and the values to keep.
 
-        Where the constraints hold, I - μ·Φ = I, and its derivative is `slopes` of
-        `directions`. To leading order, a correction of the constraints does not change
-        it.
+        Where the constraints hold, I - μ·Φ is equal to I, and its derivative is the
+        `slopes` of `directions`. To leading order, a correction of the constraints does
+        not change I - μ·Φ.
         """
         error = self.error(system, t, q, u, args)
         multipliers = self.directions(system, t, q, u, args).multipliers
@@ -177,7 +177,7 @@ def _is_constrained(system: AbstractMechanicalSystem) -> bool:
 class Directions(NamedTuple):
     """The directions of the impulses that keep invariants, at one state.
 
-    - `slopes`: ∂I/∂u - Bᵀ μ, the part of ∂I/∂u that reactions do not change.
+    - `slopes`: ∂I/∂u - Bᵀ μ, which is ∂I/∂u without its part along the reactions.
     - `covectors`: ω, the slopes as covectors, which are the directions.
     - `multipliers`: μ = C⁻¹ B M⁻¹ ∂I/∂v; None if μ = 0 without computation.
     """

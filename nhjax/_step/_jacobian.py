@@ -3,10 +3,11 @@
 The stage equations are solved by iterations `x -> x - J⁻¹ r(x)`. Simplified Newton
 inverts a part of the Jacobian J once a step, in `factorise_stage_jacobian`: the mass
 matrix and the Schur complement of the constraints at the start of the step, with or
-without the terms of order h of `FirstOrderTerms`. Each `simplified_newton_update` then
-evaluates the stage equations once and multiplies by these factors. All matrices are
-tiny, so that the factors are inverses: a triangular solve inside an iteration costs far
-more than a product.
+without the terms of order h of `FirstOrderTerms`. With `FullFactors` it inverts all of
+J at the starting values. Each `simplified_newton_update` then evaluates the stage
+equations once and multiplies by these factors. The factors are stored as inverses,
+because all matrices are tiny: a triangular solve inside an iteration costs far more
+than a product.
 
 The end of the file has the norms by which iterations measure their updates.
 """
@@ -89,9 +90,9 @@ def simplified_newton_update(
     change = x_next.velocity - x.velocity
     x_next = factors.correct_nodes(stages, x_next, r_nodes, change)
     if stages.invariants is not None:
-        # The impulses come before the constraints, so that the constraints see the
-        # change by the impulses. If a system is nearly at rest, the work of the
-        # reactions on this change is not negligible.
+        # The impulses come before the constraints, so that the constraints are
+        # evaluated with the change by the impulses. If a system is nearly at rest, the
+        # work of the reactions on this change is not negligible.
         error = invariant_errors(stages, x_next)
         x_next = factors.correct_impulses(stages, x_next, error)
     if factors.full is not None:
@@ -126,15 +127,15 @@ class FullFactors(eqx.Module):
     """The factors of the Jacobian of all stage equations.
 
     The unknowns of the multipliers are h δy of the closure, h δΛ of the holonomic
-    constraints and, with the symmetric closure, h δλ_c at the end of the step. The last
-    change includes the change of the closure that keeps the nodes to leading order.
+    constraints and, with the symmetric closure, h δλ_c at the end of the step. A change
+    h δλ_c includes the change of y that leaves the nodes unchanged to leading order.
     """
 
     step: LinearisedStep
     responses: StageResponses | None
     schur_inverse: Float[Array, "c c"]
     end: Linearisation
-    end_slopes: tuple[tuple[Array, Array], ...] | None  # by ξ and u
+    end_slopes: tuple[tuple[Array, Array], ...] | None  # with respect to ξ and u
     slopes: ConstraintSlopes | None
     unknowns: StageUnknowns
 
@@ -198,12 +199,13 @@ class FullFactors(eqx.Module):
     ) -> StageUnknowns:
         """Solve the linearised equations J dx = r with constant impulses.
 
-        `push` is the product with J at the stages of these factors.
+        `push` multiplies by J at the stages of these factors.
         """
         h, m = stages.h, stages.num_nonholonomic
         momentum = jnp.zeros_like(r.momentum)[:, :0]
         if r.velocity is not None:
-            # The momenta take up the residuals of the velocities, by (∂v/∂μ)⁻¹.
+            # A change of the momenta, with the matrix (∂v/∂μ)⁻¹, cancels the residuals
+            # of the velocities.
             assert self.step.conjugate is not None
             matrices = self.step.conjugate.by_velocity
             momentum = -small_einsum("ikn,in->ik", matrices, r.velocity)
@@ -261,8 +263,9 @@ class FullFactors(eqx.Module):
     ) -> tuple[Float[Array, " n"], Float[Array, " l"]]:
         """Compute the changes of acceleration and λ_c at the end of the step.
 
-        The stages and the end change by given velocities and u, and the equations of
-        motion at the end change by the `residual`, or keep their values.
+        The stage velocities change by `velocity`, and the fibre coordinate at the end
+        changes by `u`. The residuals of the equations of motion at the end change by
+        `residual`, or by zero if it is None.
         """
         assert self.end_slopes is not None
         b = stages.coefficients("b")
@@ -278,9 +281,10 @@ class NewtonFactors(eqx.Module):
     """The factors of the Jacobian of all equations of a step at given unknowns.
 
     If the run keeps invariants, the impulses are eliminated last. Row k of `impulses`
-    is a change of all unknowns with a unit impulse for invariant k. It does not change
-    the residuals, except those of the equations of the impulses. `schur_inverse` is the
-    inverse of the matrix of their changes. Without invariants both are None.
+    is a change of all unknowns with a unit impulse for invariant k. This change leaves
+    all residuals the same, except the residuals of the equations for the impulses. The
+    changes of the latter form a matrix, whose inverse is `schur_inverse`. Without
+    invariants `impulses` and `schur_inverse` are None.
     """
 
     full: FullFactors
@@ -295,7 +299,7 @@ class NewtonFactors(eqx.Module):
         lin: Linearisation,
         push: Linearised,
     ) -> "NewtonFactors":
-        """Factorise the Jacobian J at the unknowns x; `push` is the product with J."""
+        """Factorise the Jacobian J at the unknowns x; `push` multiplies by J."""
         full = full_factors(stages, x, lin, has_impulse_slopes=True)
         if stages.invariants is None:
             return cls(full, None, None)
@@ -347,8 +351,9 @@ class StageJacobianFactors(eqx.Module):
     invertible by hypothesis H2 (for the symmetric closure by the sign of ν) and the
     compatibility condition.
 
-    With `first_order`, the terms of order h are added to N⁻¹ r, and the changes with
-    the multipliers are the `responses`, which include these terms.
+    With `first_order`, the terms of order h are added to N⁻¹ r. The changes of the
+    unknowns with the multipliers are then the `responses`, which include these terms.
+    With `full`, the factors of the full Jacobian replace all others but `impulses`.
     """
 
     momentum_inverse: SquareMatrix
@@ -514,7 +519,8 @@ def factorise_stage_jacobian(
 ) -> StageJacobianFactors:
     """Factorise the stage Jacobian, with N and K at the start of the step, B_i at x.
 
-    `jacobian` selects whether the terms of order h are included.
+    `jacobian` selects the part of the Jacobian, as for `SimplifiedNewton`. With
+    `"full"`, all derivatives are taken at x.
     """
     factors = _factors_without_impulses(stages, x, lin, jacobian)
     if stages.invariants is None:
@@ -593,7 +599,7 @@ def _dense_factors(
 def _schur_complement(
     stages: StageEquations, blocks: Float[Array, "r s l l"]
 ) -> Float[Array, "c c"]:
-    """Assemble the derivative of the constraints by h δy and h δΛ.
+    """Assemble the derivative of the constraints with respect to h y and h Λ.
 
     `blocks` are the products B_i K⁻¹ B_jᵀ for i >= 2 and all j.
     """
@@ -627,7 +633,7 @@ def _sparse_factors(
     lin: Linearisation,
     pattern: SparsityPattern,
 ) -> StageJacobianFactors:
-    """Compute the factors if each constraint uses few coordinates."""
+    """Compute the factors as sparse matrices with the given `pattern`."""
     nodes = sparse_constraint_jacobian(stages, x, pattern)
     rows = nodes.stacked_after(lin.jacobian)
     reaction = rows.weighted_transpose(lin.fibre_hessian_inverse)
@@ -877,7 +883,7 @@ def fibre_coordinate_size(stages: StageEquations, x: StageUnknowns) -> FloatScal
     """Return the smaller of the max norms of the stage and node fibre coordinates.
 
     While an iteration is far from a solution, one of the two norms can be much larger
-    than the other, and is not a useful size then.
+    than the other, and is then not a useful size.
     """
     u = x.momentum if stages.hamiltonian else x.velocity
     return jnp.minimum(max_norm(u), max_norm(x.node_fibre_coordinate))
@@ -902,7 +908,7 @@ def increment_size(
         # changes of u itself: Λ can still be wrong where the stages and nodes happen to
         # be right.
         before, after = map(stages.multiplier_change, (x, x_next))
-        # With one constraint this is a number that is the same for all iterates.
+        # With one constraint, this matrix is replaced by its largest entry.
         reaction = lin.reaction.max_norm_equivalent()
         changes.append(stages.h * reaction.matvec(after - before))
     size = max_norm(*changes)

@@ -1,27 +1,28 @@
 """An estimate of the error of one step, from the forces and velocities at its stages.
 
 The estimate needs no further evaluations. The forces of the stages sample the rate of
-the momentum at s points of the step, and with the mass matrix at its start that of u,
-the fibre coordinate. Their Legendre coefficients give the sizes U_k = |h^k u^(k)| of
-its derivatives for k = 1, ..., s. Velocities also change where momenta do not: if the
-mass matrix depends on time, or when a free body turns. Therefore each U_k is at least
-the derivative that the velocities of the stages show, with the accelerations at both
-ends. On a group these velocities are those in a chart, and the accelerations are not
-used. Then the velocities show U_k for k < s only.
+the momentum at s points of the step. Multiplied by the inverse mass matrix at the start
+of the step, they sample the rate of the fibre coordinate u. The Legendre coefficients
+of these samples give the sizes U_k = |h^k u^(k)| of the derivatives of u, where k is
+1, ..., s. Velocities can also change where momenta do not: if the mass matrix depends
+on time, or when a free body turns. Therefore a second estimate of each U_k is computed
+from the velocities of the stages and the accelerations at both ends, and the larger
+estimate is used. On a group, the second estimate uses the velocities in the chart
+without the accelerations, and exists for k < s only.
 
 The error of a method of order p is a multiple of U_{p+1}, a derivative of higher order
-than the samples show. From order to order derivatives grow by a factor r, which the
-samples do show, so that
+than the samples determine. From order to order, derivatives grow by a factor r. The
+samples determine this factor, so that
 
     U_{p+1} ≈ U_s r^(p+1-s).
 
 In an oscillation the rate of u, and with it U_1, passes through zero twice in each
-period, and so does U_3. Their ratio still shows r. The ratio of U_2 and U_1 serves
-where U_3 alone vanishes. It grows near a zero of U_1, and is therefore limited by the r
-of the steps before.
+period, and so does U_3. The ratio of U_3 and U_1 still determines r. Where only U_3
+vanishes, the ratio of U_2 and U_1 is used. This ratio grows near a zero of U_1, and is
+therefore limited by the growth that earlier steps have shown.
 
-On a group, displacements are differentiated in a chart. There each further derivative
-brings a commutator with the velocity, so that
+On a group, displacements are differentiated in a chart, in which each further
+derivative adds a commutator with the velocity, so that
 
     U_{p+1} ≈ U_s r^(p+1-s) + max_k U_k a^(p+1-k),
 
@@ -43,12 +44,13 @@ from .._system import AbstractMechanicalSystem
 from ._step import StepOutcome, StepState
 
 
-# The error of a step is the error of the quadrature b times the first of these to the
-# power p + 1 - s, the number of orders that the samples do not show. The second is the
-# factor of the eigenvalue of ad(h v). Both fit the errors of steps of the gallery
-# (`benchmarks.adaptive_steps`).
+# The error of a step is the error of the quadrature b times `_GROWTH` to the power
+# p + 1 - s, the number of orders that the samples do not determine. The factor a is
+# `_GROWTH_BY_COMMUTATOR` times the eigenvalue of ad(h v). Both values were fitted to
+# the errors of steps of the gallery (`benchmarks.adaptive_steps`).
 _GROWTH, _GROWTH_BY_COMMUTATOR = 2.8, 1.2
-# Velocities in a chart also change because of the chart. This part of them fits too.
+# Velocities in a chart also change because of the chart. Therefore their derivatives
+# are multiplied by this factor, which was fitted in the same way.
 _PART_IN_CHART = 0.5
 
 
@@ -71,7 +73,7 @@ def local_error(
     - `start`, `outcome`: the state before the step, and its outcome.
     - `scales`: the sizes that count as an error of one, for the n coordinates of a
         displacement in q and for the n fibre coordinates.
-    - `growth_rates`: r / h of the steps before, for u and for q; infinite if unknown.
+    - `growth_rates`: r / h of earlier steps, for u and for q; infinite if unknown.
 
     **Returns:** the root mean square over all 2n components, and r / h of this step.
     """
@@ -81,8 +83,8 @@ def local_error(
         h * jax.vmap(lin.momentum_inverse.matvec)(outcome.record.force)
     )
     if start.state.multiplier.shape[0]:
-        # Multipliers of single stages may be wrong although their sum is right. The
-        # reactions in the differences are therefore left out.
+        # Multipliers of single stages may be wrong although their sum is right.
+        # Therefore the reactions are left out of all derivatives but the first.
         excess = jax.vmap(lin.jacobian.matvec)(changes)
         excess = jax.vmap(lin.delassus_inverse.matvec)(excess)
         reactions = jax.vmap(lin.reaction.matvec)(excess)
@@ -109,7 +111,7 @@ def local_error(
     # The step back has the same velocities in reverse order, and so the same mean.
     mean = jnp.asarray(method.b, h.dtype) @ outcome.record.velocity
     by_chart = _growth_in_chart(system.manifold_of(start.state.q), h * mean)
-    # The derivative of order k + 1 of q is that of order k of u.
+    # The derivative of order k + 1 of q is the derivative of order k of the velocity.
     in_position = in_position / jnp.abs(h)
     sizes = (
         _largest(changes / in_fibre[None], moved / in_fibre[None]),
@@ -127,7 +129,7 @@ def local_error(
 
 
 def _largest(by_force: Array, by_velocity: Array) -> Float[Array, " s"]:
-    """Return the sizes of derivatives, one a row, that two kinds of samples show."""
+    """Return the size of each derivative, a row, as the larger of two estimates."""
     both = jnp.stack([by_force, by_velocity])
     return jnp.max(jnp.sqrt(jnp.mean(both**2, axis=2)), axis=0)
 
@@ -147,7 +149,7 @@ def _velocity_rate(
 def _growth_in_chart(
     manifold: AbstractLieGroup, xi: Float[Array, " n"]
 ) -> FloatScalar | None:
-    """Return by how much derivatives in a chart grow from order to order, or None."""
+    """Return the growth of derivatives in a chart from order to order; None if flat."""
     if manifold.is_flat:
         return None
     ad = jax.jacfwd(lambda eta: manifold.ad(xi, eta))(jnp.zeros_like(xi))
@@ -169,13 +171,14 @@ def _extrapolated(
     **Returns:** the size, and the growth r from order to order.
     """
     number = sizes.shape[0]
-    # The first derivative may vanish inside the step, but not at both of its ends.
+    # If the first derivative vanishes in the middle of the step, it is about half of
+    # U_2 at the ends.
     first = jnp.maximum(sizes[0], 0.5 * sizes[1])
     first = jnp.maximum(first, float(jnp.finfo(sizes.dtype).tiny) ** 0.25)
     last = sizes[-1]
     growth = (last / first) ** (1 / (number - 1))
     if number > 2:
-        # One derivative may vanish at a time, but not the next one with it.
+        # A derivative can vanish, but not at the same time as the next one.
         other = (sizes[-2] / first) ** (1 / (number - 2))
         growth = jnp.maximum(growth, jnp.minimum(other, known_growth))
         last = jnp.sqrt(last**2 + (growth * sizes[-2]) ** 2)
@@ -232,6 +235,6 @@ def error_factor(method: AbstractMethod) -> float:
     """Return the typical error of a step of order p, divided by U_{p+1}."""
     p = method.order
     defect = abs(float(method.b @ method.c**p) - 1 / (p + 1)) / math.factorial(p)
-    # Some methods have the order p for another reason than their quadrature.
+    # With some methods the quadrature has a higher order than p.
     defect = max(defect, 1e-2 / math.factorial(2 * p))
     return defect * _GROWTH ** (p + 1 - len(np.unique(method.c)))

@@ -23,11 +23,11 @@ class Redundancy(eqx.Module):
     so that the multipliers keep the least norm, up to the change of the derivatives
     within the step.
 
-    P is block diagonal: it does not mix nonholonomic constraints, which hold at the
-    nodes, with holonomic constraints, which hold at the stages, where their rates do
-    not vanish. The blocks are the first and the last diagonal block of C C⁻. A
-    combination of nonholonomic constraints that follows from holonomic ones is among
-    the remaining equations. At the end of the step both kinds hold, and so do all
+    P must not mix the two kinds of constraints. Nonholonomic constraints are imposed at
+    the nodes. Holonomic constraints are imposed at the stages, where their rates do not
+    vanish. Therefore P is block diagonal, with the first and the last diagonal block of
+    C C⁻. A combination of nonholonomic constraints that follows from holonomic ones is
+    among the remaining equations. At the end of the step both kinds hold, and so do all
     equations that follow from them.
     """
 
@@ -46,7 +46,7 @@ class Redundancy(eqx.Module):
         projector = jax.scipy.linalg.block_diag(whole[:m, :m], whole[m:, m:])
         unit = jnp.eye(projector.shape[0], dtype=projector.dtype)
         sizes = jnp.sum(jnp.abs(delassus) * unit, axis=1)
-        # The multiplier of a row without derivatives has no unit.
+        # A constraint whose derivatives are zero gives its multiplier no unit.
         sizes = jnp.where(sizes > 0, sizes, 1)
         return cls(projector, (unit - projector) * sizes[None, :])
 
@@ -63,7 +63,7 @@ class Redundancy(eqx.Module):
         ) + small_einsum("ab,rb->ra", self.rest[rows, rows], multipliers)
 
     def schur_rest(self, stages: int, m: int) -> Float[Array, "c c"]:
-        """Compute the derivative of (1 - P) diag(C) h Λ by all h Λ.
+        """Compute the derivative of (1 - P) diag(C) h Λ with respect to all h Λ.
 
         `m` is the number of nonholonomic constraints.
         """

@@ -16,14 +16,14 @@ from .._system import FunctionNoise, Linearisation
 class RoundOff(eqx.Module):
     """The round-off of the functions of a system, as sizes of fibre coordinates.
 
-    A size is a round-off divided by the unit round-off, so that it is comparable to the
-    size of the coordinates. It is measured once, at the start of a run, because
-    constants inside the functions do not change. Each step adds the sizes of its own
-    coordinates. The size in a step of length h is
+    A size is the fraction `PART` of a round-off, divided by the unit round-off, so that
+    it is comparable to the size of the coordinates. The round-off is measured once, at
+    the start of a run, because constants inside the functions do not change. Each step
+    adds the sizes of its own coordinates. The size in a step of length h is
 
     `by_velocity` + h `by_force` + `by_position` / h.
 
-    - `by_velocity`: from momenta and nonholonomic constraints.
+    - `by_velocity`: from momenta and constraints on velocities.
     - `by_force`: from forces.
     - `by_position`: from holonomic constraints.
     - `violations`: the violations of the constraints on velocities and on positions
@@ -49,8 +49,9 @@ class RoundOff(eqx.Module):
 
 
 # When the increments of the stages stop falling, they can be six times as large as the
-# round-off that the functions of a system cause in them. They count as noise up to 400
-# units of a size. Therefore a size is this fraction of the measured round-off.
+# round-off that the functions of a system cause in them. Increments count as noise up
+# to `NOISE_UNITS` = 400 times the unit round-off times a size. With this fraction, they
+# count as noise up to 50 times the measured round-off.
 PART = 1 / 8
 
 
@@ -59,8 +60,8 @@ def round_off_of_steps(
 ) -> RoundOff:
     """Compute the round-off of steps from the noise of the functions of a system.
 
-    `lin` is the linearisation at the state of the noise. The inverse of the matrix of
-    the method's coefficients magnifies the round-off of constraints.
+    `lin` is the linearisation at the state at which the noise was measured. The inverse
+    of the matrix of the method's coefficients magnifies the round-off of constraints.
     """
     lin = stop_gradient(lin)
     inverse = lin.momentum_inverse.absolute()

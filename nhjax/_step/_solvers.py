@@ -53,10 +53,10 @@ from ._round_off import PART
 from ._step import AbstractStageSolver, FrozenNewtonMap
 
 
-# If the residual is larger than this, relative to the momenta, the iterate is not a
-# solution.
+# If N⁻¹ times the residual is larger than this, relative to the fibre coordinates, the
+# iterate is not a solution.
 _GROSS = 1e-6
-# Newton's method solves larger systems by a library.
+# For larger systems, Newton's method calls `jnp.linalg.solve`.
 _MOST_COORDINATES, _MOST_UNKNOWNS = 32, 256
 # After this many iterations of simplified Newton, the fallback is faster.
 _MOST_BEFORE_NEWTON = 100
@@ -81,27 +81,29 @@ class SimplifiedNewton(AbstractStageSolver):
     once per step, at the start of the step. Each iteration costs one evaluation of the
     stage equations and a few small products.
 
-    The leading part of the Jacobian contains only these two matrices. With it, an
-    iteration reduces the error by a factor O(h²) on a vector space if M is constant,
-    forces do not depend on v, and the constraints are linear in v. Otherwise the factor
-    is O(h). The terms of order h are the derivatives of momenta with respect to
-    positions, and of forces with respect to velocities, at the start of the step. With
-    these terms the factor is always O(h²).
+    The leading part of the Jacobian contains only these two matrices. With the leading
+    part alone, an iteration reduces the error by a factor O(h²) on a vector space if M
+    is constant, forces do not depend on v, and the constraints are linear in v.
+    Otherwise the factor is O(h). The terms of order h are the derivatives of momenta
+    with respect to positions, and of forces with respect to velocities, at the start of
+    the step. With these terms the factor is always O(h²).
 
-    Both omit the stiffness: the derivatives of forces, inertia and reactions with
-    respect to positions. On machines with feedback control, stiff springs or light
-    steered parts this makes the iteration slow or divergent. The full Jacobian has all
-    derivatives, at the starting values of the step. It is computed and inverted once a
-    step, which costs as much as 3 to 15 iterations.
+    The leading part and the terms of order h omit the stiffness: the derivatives of
+    forces, inertia and reactions with respect to positions. On machines with feedback
+    control, stiff springs or light steered parts this makes the iteration slow or
+    divergent. The full Jacobian has all derivatives, at the starting values of the
+    step. It is computed and inverted once a step, which costs as much as 3 to 15
+    iterations.
 
-    If this iteration does not converge, Newton's method with the exact Jacobian may
+    If simplified Newton does not converge, Newton's method with the exact Jacobian may
     still converge. With the fallback, Newton's method takes over in such a step, and
     `Solution.stats["num_newton_steps"]` counts these steps. A program that contains
     both methods takes about three times as long to compile. For this reason a plain
-    call of `integrate` first runs without the fallback. If a step was not solved, the
-    call repeats the run with the full Jacobian, and if that does not help, with the
-    fallback. In your own transformed program (`jax.jit`, `jax.vmap`, `jax.grad`), a
-    step that is not solved ends the run, unless you ask for one of these.
+    call of `integrate`, outside all transformations of JAX, first runs without the
+    fallback. If a step was not solved, the call repeats the run with the full Jacobian.
+    If that does not help, the call repeats the run with the fallback. In your own
+    transformed program (`jax.jit`, `jax.vmap`, `jax.grad`), a step that is not solved
+    ends the run, unless you request the full Jacobian or the fallback.
 
     **Arguments:**
 
@@ -255,7 +257,7 @@ class Newton(AbstractStageSolver):
             r, push, evaluation = jax.linearize(
                 lambda x: stage_residuals(stages, x), x, has_aux=True
             )
-            # After a change of x by a few units in the last place, the equations differ
+            # After a change of x by a few units in the last place, the residuals differ
             # from the prediction of the Jacobian by their round-off.
             near_z = z + 8 * eps * uneven_perturbations(z)
             near = stage_residuals(stages, unravel(near_z))[0]
@@ -317,11 +319,11 @@ def _solved(
 ) -> Float[Array, "r k"]:
     """Solve the linearised equations J dx = r of a step for some residuals r.
 
-    `push` is the product with J. The equations are eliminated by blocks, with one round
-    of refinement for the first r. Blocks are inverted without exchanges of rows between
-    blocks, which can lose digits although J is regular. The refinement shows this, and
-    the equations are then solved by elimination with partial pivoting of all rows.
-    Larger systems are solved by a library.
+    `push` multiplies by J. The equations are eliminated by blocks, with one round of
+    refinement for the first r. Rows are not exchanged between blocks, so that the
+    elimination can lose digits although J is regular. The refinement detects such a
+    loss. The equations are then solved by elimination with partial pivoting of all
+    rows. Larger systems are solved by `jnp.linalg.solve`.
     """
     flat = jnp.stack([ravel_pytree(r)[0] for r in rights])
     _, residuals = ravel_pytree(rights[0])
@@ -351,7 +353,7 @@ def _solved(
         def with_rest():
             return sides.at[1].set(sides[0] - pushed(dx))
 
-        # The second side is the residual that the first solution leaves.
+        # The second right-hand side is the residual that the first solution leaves.
         sides = jax.lax.cond(k == 0, with_rest, lambda: sides)
         return sides, found.at[k].set(dx)
 
@@ -364,8 +366,9 @@ def _solved(
         is_solved, _ = carry
 
         def put_column(k, table):
-            # `is_solved` is false here. XLA would move a column that does not depend on
-            # the carry out of the loop, and compute it in any case.
+            # `is_solved` is false here, but makes the column depend on the carry. XLA
+            # would move a column without this dependence out of the loop, and compute
+            # it even if the loop makes no iteration.
             unit = (jnp.arange(size, dtype=k.dtype) == k) & ~is_solved
             column = pushed(unit.astype(dtype))[:, None]
             return jax.lax.dynamic_update_slice_in_dim(table, column, k, axis=1)
@@ -381,7 +384,7 @@ def _solved(
 
 
 def _eliminates_blocks(stages: StageEquations, size: int) -> bool:
-    """Return whether Newton's method solves its equations without a library."""
+    """Return whether Newton's method eliminates its equations by blocks."""
     is_small = stages.p.shape[0] <= _MOST_COORDINATES and size <= _MOST_UNKNOWNS
     return is_small and forces_have_slopes(stages)
 
@@ -393,10 +396,11 @@ def _minus(tree: StageResiduals, other: StageResiduals) -> StageResiduals:
 class Scale(NamedTuple):
     """The size of the fibre coordinates of a step, and their additional round-off.
 
-    All are in units of fibre coordinates. The round-off of fibre coordinates is about
-    the unit round-off times the sum of the first two. `noise` is the measured
-    round-off of the functions of the system: increments below the unit round-off times
-    `noise` are noise.
+    The fibre coordinates are v, or p for a Hamiltonian system. All fields are in units
+    of fibre coordinates. `round_off` and `noise` are values of round-off divided by the
+    unit round-off. The round-off of fibre coordinates is about the unit round-off times
+    `size + round_off`. Increments below the unit round-off times `noise` count as the
+    round-off of the functions of the system, which is measured.
     """
 
     size: FloatScalar
@@ -442,7 +446,8 @@ def fibre_coordinate_scale(
         grown large, such as the heading of a car after many turns.
     - The round-off of invariants, through the impulses that keep them.
 
-    It is at least the measured round-off of the functions of the system.
+    The additional round-off is at least the measured round-off of the functions of the
+    system.
     """
     h = jnp.abs(stages.h)
     rate = max_norm(lin.acceleration)
@@ -474,9 +479,10 @@ def fibre_coordinate_scale(
 def _kinematic_scale(
     stages: StageEquations, q: PyTree[Array], x0: StageUnknowns
 ) -> Float[Array, " m"]:
-    """Estimate the change of nonholonomic constraints if positions move by their size.
+    """Estimate the change of nonholonomic constraints if each position changes by its
+    own size.
 
-    One direction of the move is enough for an estimate. Moving each coordinate
+    One direction of change is enough for an estimate. Changing each coordinate
     separately would need one derivative per coordinate.
     """
     system, t, args = stages.system, stages.t, stages.args
@@ -486,5 +492,5 @@ def _kinematic_scale(
         (q,),
         (uneven_perturbations(q),),
     )[1]
-    # If the slope of a constraint is not finite, it does not measure the round-off.
+    # A slope that is not finite does not measure the round-off.
     return jnp.where(jnp.isfinite(change), jnp.abs(change), 0)

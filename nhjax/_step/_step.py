@@ -232,9 +232,9 @@ def first_step_state(
 class _ContinuousMultiplier(AbstractImplicitFunction[Any, Float[Array, " l"]]):
     """The continuous multiplier λ_c as a function of (system, t, q, u, args).
 
-    Its derivative is zero where the multiplier is not finite. Otherwise, if a sum
-    leaves out a failed member, the derivative of the sum would still be NaN, because
-    NaN times zero is NaN.
+    Its derivative is zero where the multiplier is not finite. With a derivative of NaN,
+    a sum over an ensemble that leaves out failed members would have the derivative NaN,
+    because NaN times zero is NaN.
     """
 
     programs: None = None
@@ -346,8 +346,8 @@ def starting_values(
     push = stages.h * lin.acceleration
     stage_times = jnp.sum(stages.coefficients("a_hat"), axis=1)
     node_times = jnp.sum(stages.node_weights, axis=1)
-    # The unknown ν of the symmetric closure vanishes with h, and starts from zero. All
-    # other unknowns of a closure are multipliers.
+    # The unknown ν of the symmetric closure tends to zero with h, and starts from zero.
+    # All other unknowns of a closure are multipliers, and start from λ_c.
     free = (jnp.arange(s - 1) >= int(stages.end_multiplier_is_unknown)).astype(u.dtype)
     empty = jnp.zeros((0,), u.dtype)
     at_stages = u[None] + jnp.outer(stage_times, push)
@@ -446,7 +446,7 @@ def _result(
     result = RESULTS.where(solved.converged, converged, failed)
     result = RESULTS.where(is_in_chart, result, RESULTS.left_chart)
     # If M or C is singular at the end of the step, λ_c does not exist there. Therefore
-    # this step reports it, and not the next step.
+    # this step, and not the next one, reports the singular matrix.
     singular = lin.is_singular | (solved.converged & step_state.lin.is_singular)
     return RESULTS.where(singular, RESULTS.singular_stage_matrix, result)
 
@@ -480,11 +480,11 @@ def error_ratios(
     """Compare two quadratures of a step, in positions and in fibre coordinates.
 
     The state changes by h Σ b_j (H^j, N⁻¹ n^j), with the velocities H^j and the forces
-    n^j of the stages. A second quadrature leaves out the last node. The difference of
-    the two is the same sum with the weights `method.embedded_difference`. The first
-    ratio divides the difference in positions per h by the change of the state. The
-    second ratio divides the difference in fibre coordinates by the same change. See
-    `estimated_error`.
+    n^j of the stages, and with N = ∂p/∂u. A second quadrature leaves out the last node.
+    The difference of the two quadratures is the same sum with the weights
+    `method.embedded_difference`. The first ratio divides the difference in positions
+    per h by the change of the state. The second ratio divides the difference in fibre
+    coordinates by the same change. See `estimated_error`.
 
     **Arguments:**
 

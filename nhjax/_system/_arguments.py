@@ -115,7 +115,7 @@ def real_scalar(name: str, x: FloatScalarLike, dtype: Any) -> FloatScalar:
     Other types raise a `DTypeError`. Arrays that are not scalars raise a `ShapeError`.
     """
     # A concrete number stays concrete inside `jit`, and its conversion on the host
-    # compiles nothing.
+    # needs no compilation.
     array: Any = None
     if eqx.is_array_like(x):
         array = x if is_traced(x) else np.asarray(x)
@@ -211,7 +211,7 @@ def all_finite(tree: Any) -> BoolScalar | np.bool_:
     """Return whether every number in `tree` is finite."""
     leaves = jax.tree.leaves(tree)
     if not is_traced(*leaves):
-        # NumPy gives a concrete answer inside `jit` too, and compiles nothing.
+        # NumPy gives a concrete answer inside `jit` too, and needs no compilation.
         finite = [np.all(np.isfinite(np.asarray(leaf))) for leaf in leaves]
         return np.all(finite)
     return jnp.all(jnp.stack([jnp.all(jnp.isfinite(leaf)) for leaf in leaves]))
@@ -270,8 +270,8 @@ def check_third_argument(
     system receive p. Holonomic constraints receive neither v nor p. `letter` is "v" or
     "p".
 
-    Constraints and forces only lead to a warning: where the momentum equals the
-    velocity, one function can serve both kinds of systems.
+    Nonholonomic constraints and forces only lead to a warning: where the momentum
+    equals the velocity, one function can serve both kinds of systems.
     """
     signature = _signature(function)
     given = [] if signature is None else _positional_names(signature)[2:3]
@@ -302,8 +302,9 @@ def check_third_argument(
 def takes_multipliers(force: Any) -> bool:
     """Return whether a force is a function of (t, q, v, multipliers, args).
 
-    A class of forces can say it by an attribute `takes_multipliers`. Otherwise the
-    fourth argument is called `multipliers`, or a fifth one is required.
+    If the force has an attribute `takes_multipliers`, its value is returned. Otherwise
+    the force takes multipliers if its fourth argument is called `multipliers`, or if it
+    can be called with five arguments but not with four.
     """
     stated = getattr(force, "takes_multipliers", None)
     if stated is not None:
@@ -351,7 +352,7 @@ def check_same_manifold(
 
     **Arguments:**
 
-    - `name`: the name of the argument of the system that has the part.
+    - `name`: the name of the system's argument in which the part was passed.
     - `part`: the part, such as a force or a contact.
     - `own`, `of_system`: the manifold of the part and of the system.
     """

@@ -156,8 +156,8 @@ def check_multiplier(
 ) -> None:
     """Raise unless `y` has a multiplier for each constraint of `system`.
 
-    This traces the constraints of the user, so that programs do it when they are
-    traced.
+    The check traces the user's constraints. Compiled programs run it while they are
+    traced, so that calls of a compiled program do not repeat it.
     """
     t = jax.ShapeDtypeStruct((), y.v.dtype)
     u = system.fibre_coordinate(y)

@@ -41,9 +41,10 @@ from ._systems import AbstractMechanicalSystem, check_time_and_state, State
 
 
 # With fewer constraints than this, sparse matrices save little. With four constraints
-# in a row, sparse matrices reduce the time of a step to a third.
+# in a chain, sparse matrices reduce the time of a step to a third.
 _FEWEST_SPARSE = 4
-# A block may hold at most this fraction of all constraints.
+# Matrices are sparse only if each block (`SparsityPattern.group` constraints) has at
+# most this fraction of all constraints.
 _LARGEST_BLOCK = 1 / 4
 
 
@@ -54,7 +55,7 @@ class Linearisation(eqx.Module):
     B = ∂Φ/∂u of the constraints on velocities, and the reactions R = ♭ Bᵀ, the motion
     satisfies
 
-    N u̇ - R λ = ad*_v p + free force - ∂t p - D1p v,    B u̇ = -∂t Φ - D1Φ v,
+    N u̇ - R λ = ad*_v p + free force - ∂t p - D1p v,    B u̇ = -∂t Φ - D1Φ v.
 
     These equations determine C λ, and therefore the multiplier λ. Here C = B N⁻¹ R is
     the Delassus matrix, which the paper calls the compatibility matrix C^{ab} (section
@@ -195,7 +196,7 @@ def motion_residual(
 
     These are ṗ - ad*_v p - W and dΦ/dt along (q̇, u̇) = (q v, a), where a is the given
     `acceleration`. They vanish if the multiplier is the continuous multiplier λ_c(q, u)
-    and a is its acceleration.
+    and a is the acceleration of the motion.
     """
     v = system.velocity(t, q, u, args)
     (p, _), (p_dot, phi_dot) = jax.jvp(
@@ -331,7 +332,7 @@ def _with_force_of_multipliers(
     known: Float[Array, " n"],
     hidden: Float[Array, " l"],
 ) -> Linearisation:
-    """Solve N u̇ - R λ - F(λ) = known and B u̇ = hidden, and linearise F there.
+    """Solve N u̇ - R λ - F(λ) = known, B u̇ = hidden; linearise F at the solution.
 
     The multiplier is NaN if Newton's method does not find one. The matrices N⁻¹ R and C
     of the result include ∂F/∂λ.
@@ -351,8 +352,8 @@ def _with_force_of_multipliers(
     def solve(jacobian, b):
         return small_einsum("kl,l->k", inverse(jacobian), b)
 
-    # Newton's method may cycle if friction depends on |λ|. The multiplier is then
-    # followed while the friction grows from zero.
+    # Newton's method may cycle if friction depends on |λ|. In that case `root` follows
+    # the multiplier along a path on which the force grows from zero to its full value.
     without = lin.momentum_inverse.matvec(known)
     start = lin.delassus_inverse.matvec(hidden - lin.jacobian.matvec(without))
     residual = partial(along_path, 1.0)
@@ -414,8 +415,9 @@ def _constraint_pattern(
 ) -> SparsityPattern | None:
     """Find the sparsity pattern of B = ∂Φ/∂u; None if B is better stored dense.
 
-    B is dense if constraints are redundant, if they are of both kinds, or if each
-    shares coordinates with many others, so that B K⁻¹ Bᵀ is full.
+    B is stored dense if constraints are redundant or of both kinds, if the force
+    depends on the multipliers, or if each constraint shares coordinates with many
+    others, so that B K⁻¹ Bᵀ is full.
     """
     kinds = [system.nonholonomic, system.holonomic]
     if system.constraints == "redundant" or None not in kinds:

@@ -81,8 +81,9 @@ def position_terms(
     """Estimate, row by row, how large the terms of Γ are at q.
 
     These terms, times the unit round-off, bound the change of Γ if each entry of q is
-    rounded. A machine far from the origin has large entries that Γ does not depend on.
-    A sparse linearisation `lin` at q already has the derivatives of Γ; they are used.
+    rounded. Entries that Γ does not depend on do not count, although they can be large,
+    such as the position of a machine far from the origin. If the linearisation `lin` at
+    q is sparse and of a Lagrangian system, its derivatives of Γ are used.
     """
     sizes = jax.tree.map(jnp.abs, q)
     if lin.is_sparse and lin.fibre_coordinate_name == "v":
@@ -142,7 +143,7 @@ def _finite_or_zero(x: Array) -> Array:
 
 
 class FunctionNoise(NamedTuple):
-    """The round-off of the functions of a system at a state, a number for each value.
+    """The round-off of the functions of a system at a state, for each component.
 
     The functions are the momentum, the free force, all constraints on velocities, the
     holonomic constraints on positions and, with a `direction`, the derivatives of all
@@ -157,7 +158,7 @@ class FunctionNoise(NamedTuple):
 
     @property
     def violations(self) -> tuple[Float[Array, " l"], Float[Array, " k"]]:
-        """Return bounds of the round-off in violations of velocities and positions."""
+        """Return bounds on the violations of constraints that round-off can cause."""
         parts = self.on_velocities, self.on_positions
         on_velocities, on_positions = (NOISE_DEVIATIONS * x for x in parts)
         return on_velocities, on_positions
@@ -175,7 +176,7 @@ def function_noise(
 ) -> FunctionNoise:
     """Measure the round-off of the functions of a system at (t, q, u).
 
-    The force is measured with a constant multiplier; `dt` is that of `noise_near`.
+    The force is measured with a constant multiplier; `dt` is passed on to `noise_near`.
     """
     # This is a closure, because `args` may contain objects that are not arrays.
     positions = jax.eval_shape(lambda: system.position_constraint(t, q, args))
@@ -215,10 +216,10 @@ def noise_near(
 ) -> PyTree[Array]:
     """Measure the round-off of a function of (t, q, u) near a state.
 
-    The step `dt` resolves the motion. Times are displaced in units of `dt` if this is
-    shorter than the unit of time, because a drive can be fast in this unit. If `dt` is
-    longer, velocities and momenta are displaced in units of 1 / `dt`, because they can
-    be slow. `like` has the structure, shapes and dtype of the results; see
+    `dt` is a time step that resolves the motion. If `dt` is shorter than the unit of
+    time, times are displaced in units of `dt`, because a drive can be fast. If `dt` is
+    longer, velocities and momenta are displaced in units of 1 / `dt`, because the
+    motion can be slow. `like` has the structure, shapes and dtype of the results; see
     `measured_noise`.
     """
     (t, q, u, dt), n = stop_gradient((t, q, u, dt)), u.shape[0]

@@ -2,7 +2,8 @@
 
 A system is written on TQ or on T*Q: its state has a position q and a fibre coordinate
 u, which is the velocity v of a Lagrangian and the momentum p of a Hamiltonian system.
-Everything above this room uses the common interface, `AbstractMechanicalSystem`.
+All rooms above this one (`docs/rooms.md`) use only the common interface of both kinds,
+`AbstractMechanicalSystem`.
 """
 
 from abc import abstractmethod
@@ -45,8 +46,9 @@ class State(eqx.Module):
     - `v`: the velocity, shape (n,); on a group the body velocity.
     - `p`: the momentum, shape (n,), with p = D2L(t, q, v) or v = D2H(t, q, p).
     - `multiplier`: shape (m + k,): λ of the m nonholonomic constraints, then ν of the k
-        holonomic ones. The reaction on the system is λᵀ D2Φ + νᵀ L_q^* DΓ, with ♭_H D2Ψ
-        in place of D2Φ for a Hamiltonian system.
+        holonomic ones. The reaction on the system is λᵀ D2Φ + νᵀ L_q^* DΓ, where L_q^*
+        gives the components in the body frame (the identity on R^n). A Hamiltonian
+        system has ♭_H D2Ψ in place of D2Φ, with ♭_H = (D2D2H)⁻¹.
 
     Create one with `nhjax.initial_state`, which makes the four parts consistent.
     """
@@ -73,8 +75,8 @@ def check_time_and_state(function: str, t: Any, y: Any, first: str = "") -> None
 class StaticFunction(eqx.Module):
     """A Python function as a part of the structure of a pytree, not as a leaf.
 
-    The leaves of a system are then arrays alone, so that `jax.jit`, `jax.vmap` and
-    `jax.grad` accept a system as an argument.
+    All leaves of a system are then arrays, so that `jax.jit`, `jax.vmap` and `jax.grad`
+    accept a system as an argument.
     """
 
     function: Callable[..., Any] = eqx.field(static=True)
@@ -139,7 +141,7 @@ class AbstractOfSystem(eqx.Module):
 
     @abstractmethod
     def check_system(self, system: Any) -> None:
-        """Raise a `ValueError` if the system has another manifold, or other parts."""
+        """Raise a `ValueError` if the function does not fit the system."""
 
 
 class AbstractMechanicalSystem(eqx.Module):
@@ -165,7 +167,8 @@ class AbstractMechanicalSystem(eqx.Module):
     fibre_coordinate_name: eqx.AbstractClassVar[Literal["v", "p"]]
 
     def __post_init__(self):
-        # Programs replace the functions by traced ones without these signatures.
+        # This is determined once, since programs replace the functions by traced
+        # functions, which do not have the signatures of the user's functions.
         self.force_takes_multipliers = takes_multipliers(as_given(self.force))
 
     def __check_init__(self):
@@ -265,11 +268,11 @@ class AbstractMechanicalSystem(eqx.Module):
         multiplier: Float[Array, " l"],
         args: Args,
     ) -> Float[Array, " n"]:
-        """Compute the user's force F. There must be one."""
+        """Compute the user's force F; the system must have a force."""
         given = (multiplier,) if self.force_takes_multipliers else ()
         force = self.call("force", t, q, u, *given, args)
-        # A scalar would act on all coordinates. `initial_state` finds this only for the
-        # system with which it is called.
+        # A scalar would act on all coordinates. `initial_state` detects this error only
+        # in the system with which it is called.
         if jnp.shape(force) != u.shape:
             raise ShapeError(
                 f"`force({', '.join(self.signatures()['force'])})` must return shape "
@@ -428,9 +431,9 @@ class LagrangianSystem(AbstractMechanicalSystem):
     Values that the functions read besides their arguments (globals, variables of
     enclosing functions, attributes of objects) are compiled in. `integrate` and
     `initial_state` compare them from call to call and compile again if one has changed.
-    Your own `jax.jit` does not: pass values that change in `args`, or as array fields
-    of an `equinox.Module`. Changes of these never recompile. `docs/systems.md` has the
-    details.
+    Your own `jax.jit` does not compare them. Put values that change into `args`, or
+    into array fields of an `equinox.Module`: new values there never recompile.
+    `docs/systems.md` has the details.
 
     **Arguments:**
 
@@ -444,8 +447,8 @@ class LagrangianSystem(AbstractMechanicalSystem):
         on a group in left-trivialised components. A force that depends on the reactions
         of the constraints, such as friction, is called as
         `force(t, q, v, multipliers, args)`, with the λ and ν of all constraints in the
-        order of `State.multiplier`. Its derivative by the multipliers must exist in
-        forward mode, and the constraints must be independent.
+        order of `State.multiplier`. Such a force must have a forward-mode derivative
+        with respect to the multipliers, and the constraints must be independent.
     - `manifold`: the configuration manifold; by default R^n with the n of the state.
     - `constraints`: `"independent"` refuses dependent constraints. `"redundant"` allows
         constraints that follow from others, also nonholonomic constraints that follow
@@ -526,7 +529,7 @@ class LagrangianSystem(AbstractMechanicalSystem):
         u: Float[Array, " n"],
         args: Args = None,
     ) -> Float[Array, " n"]:
-        """Compute L_q^* D1L, the derivative of the Lagrangian by the position."""
+        """Compute L_q^* D1L, the derivative of L with respect to the position."""
         return self.manifold_of(q).left_gradient(
             lambda g: self.call("lagrangian", t, g, u, args), q
         )
@@ -673,7 +676,7 @@ class HamiltonianSystem(AbstractMechanicalSystem):
         u: Float[Array, " n"],
         args: Args = None,
     ) -> Float[Array, " n"]:
-        """Compute -L_q^* D1H from the derivative of H by the position."""
+        """Compute -L_q^* D1H from the derivative of H with respect to the position."""
         return -self.manifold_of(q).left_gradient(
             lambda g: self.call("hamiltonian", t, g, u, args), q
         )
@@ -734,7 +737,7 @@ def with_frames(system: S, q: PyTree[Array]) -> tuple[S, PyTree[Array]]:
     positions with and without frames; the user's functions receive positions without
     frames. On a manifold without frames the system and q are returned unchanged.
     """
-    # The methods of a subclass may not support frames.
+    # The methods of a subclass might not support frames.
     if type(system) not in (LagrangianSystem, HamiltonianSystem):
         return system, q
     position = framed(system.manifold_of(q), q)

@@ -68,7 +68,7 @@ def _broadcast_in_dim(
     if not isinstance(value, InMemory) and value.size == 1:
         node = value.reshape(-1)[0]
         if node.op == "const" and node.attr == 0 and not np.signbit(float(node.attr)):
-            # JAX writes tangents that are zero in this way.
+            # JAX writes symbolic zero tangents in this way.
             node = builder.graph.zero(node.dtype)
         return builder.full(shape, node)
     if isinstance(value, InMemory) and math.prod(shape) == value.size:
@@ -370,8 +370,8 @@ def _located(
 ) -> tuple[Node, Node]:
     """Return where a window starts in memory, and whether it lies in the array.
 
-    Its index is at `place` in the array of indices. The start of a window outside the
-    array is clamped.
+    The index of the window is at `place` in the array of indices. The start of a window
+    outside the array is clamped.
     """
     graph = builder.graph
     starts: list[Node | int] = [0] * len(shape)

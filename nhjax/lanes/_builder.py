@@ -1,7 +1,8 @@
 """Conversion of a jaxpr to the graph: equation by equation, with inner programs.
 
 An array is either in registers, as a NumPy array of nodes, or in memory. Large arrays
-are in memory, and so are arrays that are read or updated at an index that is not known.
+are in memory, and so are arrays that are read or updated at an index that is only known
+at run time.
 `Builder.run` interprets a jaxpr: for each equation it calls the operation that
 `_elementwise`, `_arrays` or `_control_flow` provides for the primitive.
 
@@ -314,7 +315,8 @@ class Builder:
         self.path: list[int] = []
         # The numbers of each loop that are known to change, by the path of the loop.
         self.changing: dict[tuple[int, ...], set[int]] = {}
-        # The constants with which numbers started that loops may have changed since.
+        # For numbers that an earlier loop may have changed: the constants with which
+        # the numbers started.
         self.loop_starts: dict[Node, Node] = {}
         self.functions = Functions()
         # Whether programs are written out here and not called as functions.
@@ -519,7 +521,7 @@ def called_program(equation: Any) -> Any:
 def inner_programs(equation: Any) -> Iterator[tuple[Any, int]]:
     """List the inner programs of an equation, and where their operands start.
 
-    Constants of loops are listed too, which is harmless.
+    The listed operands of a loop include its constants, which is harmless.
     """
     params, name = equation.params, equation.primitive.name
     if name == "while":

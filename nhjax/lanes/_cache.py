@@ -2,10 +2,10 @@
 
 The key of a program is a hash of all that its code depends on: the jaxpr with its
 constants, how it is compiled, the machine, and the versions of this compiler, of LLVM,
-of JAX and of NumPy. It is computed from the jaxpr alone, in a small part of the time
-that compiling takes. A program gets no key if a parameter of an operation has a type
-that is not known here, such as a function of Python; it is then compiled in each
-process.
+of JAX and of NumPy. To compute it, the graph is not needed, so that it takes a small
+part of the time of compilation. A program gets no key if a parameter of an operation
+has a type that is not known here, such as a function of Python; it is then compiled in
+each process.
 
 The cache follows JAX's options for its persistent compilation cache. It is a folder in
 JAX's directory, with one file for each program. A file contains its key and a checksum,
@@ -69,7 +69,7 @@ def read(folder: Path, key: str) -> Entry | None:
         data = path.read_bytes()
         entry = _unpacked(data, key)
         if entry is not None:
-            # The oldest files are deleted first.
+            # The least recently used files are deleted first: mark this one as used.
             os.utime(path)
     except FileNotFoundError:
         return None
@@ -80,10 +80,10 @@ def read(folder: Path, key: str) -> Entry | None:
 
 
 def write(folder: Path, key: str, entry: Entry, seconds: float) -> None:
-    """Store an entry whose program took this time to compile, if JAX's options ask it.
+    """Store the entry of a program that compiled in `seconds`, if JAX's options permit.
 
-    JAX does not store programs that compile quickly or are small, and has a limit of
-    the size of its cache. The same limits apply here.
+    JAX does not store programs that compile quickly or are small, and limits the size
+    of its cache. The same limits apply here.
     """
     shortest = _option("jax_persistent_cache_min_compile_time_secs")
     smallest = _option("jax_persistent_cache_min_entry_size_bytes")
@@ -118,9 +118,9 @@ def _unpacked(data: bytes, key: str) -> Entry | None:
 
 
 def _shrink(folder: Path, most: int) -> None:
-    """Delete the files that were not used for the longest time, down to `most` bytes.
+    """Delete the least recently used files until at most `most` bytes are left.
 
-    A negative number is no limit.
+    A negative number means that there is no limit.
     """
     if most < 0:
         return
@@ -170,7 +170,8 @@ def _hash_of_sources() -> str:
     return digest.hexdigest()
 
 
-# The sources of this compiler when it was imported: they may change on disk later.
+# A hash of the sources of this compiler at the time of its import: the files may change
+# later.
 _SOURCES = _hash_of_sources()
 
 
@@ -184,7 +185,7 @@ class _Unknown(Exception):
     """A value that cannot be compared by its contents."""
 
 
-# The parameters that say on which devices arrays lie, which no rule reads.
+# Parameters that describe the devices of arrays. No rule reads these parameters.
 _DEVICES = ("sharding", "out_sharding")
 _PLAIN = frozenset((int, bool, str, bytes, type(None)))
 

@@ -3,8 +3,9 @@
 A loop carries arrays as parameters, number by number, or leaves them in place in
 memory. Numbers that start as constants are first assumed to stay constant. The body is
 built. If some of these numbers change, the body is built again without the assumption
-for them. The changing numbers are remembered, so that building an outer loop again does
-not multiply the time with the depth of nesting. If a loop continues an earlier one, the
+for them. The changing numbers are remembered: if an outer loop is built again, its
+inner loops need no second attempt, and the time does not multiply with the depth of
+nesting. If a loop continues an earlier one, the
 operation `loop_start` names the constants with which the earlier loop started.
 
 Short scans are unrolled, unless their body contains loops. Products of arrays are
@@ -53,8 +54,8 @@ from ._jaxprs import COMPILED_ONCE, KEPT_CALL, WRITE_ROW
 # `jax.numpy.einsum`.
 _Indices: TypeAlias = tuple[str, str, str]
 
-# Longer sums of products of two arrays are computed in a loop, which takes less time to
-# compile, and for products of this length runs as fast.
+# Longer sums of products of two arrays are computed in a loop. The loop takes less time
+# to compile, and is as fast for products of this length.
 _LONGEST_PRODUCT = 1000
 # Larger products are left to a library.
 _LARGEST_PRODUCT = 2**16
@@ -161,7 +162,7 @@ def _branch(
     no: Callable[[], list[ArrayValue]],
     avals: list[Any],
 ) -> list[ArrayValue]:
-    """Create a branch; only the side that is taken runs."""
+    """Create a branch; each side has a region of its own."""
     if predicate.is_constant:
         return yes() if predicate.attr else no()
     memory = builder.memory
@@ -723,7 +724,8 @@ class _Attempt:
             if not isinstance(old, InMemory):
                 value = memory.registers(value)
             elif isinstance(value, InMemory) and value.buffer is not old.buffer:
-                # The array would be overwritten when it takes the place of another one.
+                # `value` may be in the buffer of another carried array, which is
+                # overwritten below.
                 hold(value)
                 value_free = memory.owned(value) if value.buffer in own else value
                 release(value)
@@ -763,7 +765,7 @@ _SAME = ("reshape", "squeeze", "expand_dims", "copy", "copy_p", "optimization_ba
 
 
 def updated_inputs(jaxpr: Any) -> frozenset[int]:
-    """List the inputs of a jaxpr that it, or an inner program, updates at an index.
+    """List the inputs that a jaxpr, or an inner program of it, updates at an index.
 
     Such arrays belong in memory. Updates at an index that is a literal do not count.
     """

@@ -10,8 +10,8 @@ uniform become jumps. Where the predicate is divergent, members that do not take
 are masked: they compute too, but their results are discarded. `_Memory` writes loads
 and stores.
 
-A kernel allocates only its scratch memory: up to 64 kB on the stack, and more by
-`malloc`. Programs that need more than 64 MB are refused.
+A kernel allocates only its scratch memory: up to 64 kB on the stack, and larger memory
+by `malloc`. Programs that need more than 64 MB are refused.
 """
 
 import numpy as np
@@ -70,7 +70,7 @@ def emit(
         mark_broadcast(live)
     else:
         for buffer in live.buffers:
-            # The address of such an operand still depends on the member.
+            # The address of a batched operand depends on the member also at width 1.
             buffer.is_divergent = buffer.kind == "operand" and is_batched[buffer.place]
     writer = Writer(width, contract)
     writer.lines.extend(_members(width))
@@ -334,7 +334,7 @@ class _Functions:
     """The functions that a kernel calls, for vectors and for numbers."""
 
     def __init__(self, live: LiveNodes):
-        # The results that are used, with their places: no others are computed.
+        # The results that are used, with their places. The others are not computed.
         self._used: dict[Function, dict[int, int]] = {}
         self._names: dict[tuple[Function, int], str] = {}
         for node in live.nodes:
@@ -367,8 +367,8 @@ class _Functions:
         floats = [x for x in dtypes if is_float(x)]
         if width == 1 and len(floats) in (3, 4):
             # On x86-64 LLVM returns a third and a fourth float in registers of the x87
-            # unit, without optimisation by instructions that do not exist. Five floats
-            # are returned in memory.
+            # unit. Without optimisation, it does so with instructions that do not
+            # exist. Five floats are returned in memory, so add floats up to five.
             dtypes += floats[: 5 - len(floats)]
         return result_type([vector(scalar_type(x), width) for x in dtypes])
 
@@ -399,7 +399,7 @@ class _Functions:
                 whole = writer.value(f"insertvalue {result} {whole}, {number}, {index}")
         writer.add(f"ret {result} {whole}")
         given = ", ".join(_typed(writer, x, is_divergent) for x in function.parameters)
-        # With these attributes LLVM moves calls and merges equal ones.
+        # These attributes allow LLVM to move calls, and to merge equal calls.
         attributes = "noinline nounwind willreturn memory(none)"
         head = f"define internal {result} {name}({given}) {attributes}"
         return writer.definition(head)
@@ -420,9 +420,9 @@ def _called(node: Node) -> tuple[Function, list[Node]]:
 class _Regions:
     """The writer of regions, with the loops and branches in them.
 
-    `mask` has the members that are running; `None` stands for all of them. Wherever
-    instructions are written at least one member is running: a region that no member
-    enters is jumped over.
+    `mask` marks the members that are running; `None` stands for all members. Regions
+    that no member enters are skipped at run time, except for short sides of divergent
+    branches.
     """
 
     def __init__(
@@ -659,7 +659,7 @@ class _LoopResults:
             self.slots.append((result, loop.params[index], slot))
 
     def store(self, ending: str) -> None:
-        """Store the present values of the members of a mask."""
+        """Store the current values of the members in the mask `ending`."""
         writer, flags = self.writer, vector("i1", self.writer.width)
         for result, param, slot in self.slots:
             value, kind = self._in_memory(param), self._type(result)

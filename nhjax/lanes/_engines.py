@@ -72,9 +72,9 @@ def engines(function: Callable[..., Any], *args: Any) -> tuple[EngineUse, ...]:
     `nhjax.lanes.vmap` and `nhjax.lanes.jit`. The function is compiled, but not run. On
     the CPU, nhjax compiles an ensemble (a run under `jax.vmap`) itself if possible, and
     vectorises over its members (SIMD). The environment variable `NHJAX_ENGINE` chooses
-    the engine: `lanes`, `kernels` or `xla`. A program that `lanes` cannot compile then
-    raises a `RuntimeError` with the reason. Programs that were compiled before keep
-    their engine until `jax.clear_caches()`.
+    the engine: `lanes`, `kernels` or `xla`. If it is `lanes`, a program that `lanes`
+    cannot compile raises a `RuntimeError` with the reason. Programs that were compiled
+    before keep their engine until `jax.clear_caches()`.
 
     **Arguments:**
 
@@ -110,8 +110,8 @@ def is_within_kernel() -> bool:
     return _within.get()
 
 
-# Whether XLA lowers the surrounding program. Then it also lowers the functions of rows
-# in this program.
+# Whether XLA lowers the surrounding program. XLA then also lowers the operations
+# `batched_call` in this program.
 _is_part = ContextVar("is_part", default=False)
 
 
@@ -121,7 +121,7 @@ def is_part_of_a_program() -> bool:
 
 
 def as_parts_of_a_program(lower: Callable[..., T]) -> Callable[..., T]:
-    """Return a function that lowers a program, and all its operations with it."""
+    """Return `lower`, wrapped so that `is_part_of_a_program` is true while it runs."""
 
     def lower_all(*args: Any, **params: Any) -> T:
         token = _is_part.set(True)
@@ -194,9 +194,9 @@ def by_one_kernel(ctx, *operands, program, options):
 def _tied(operands: tuple[Any, ...]) -> list[Any]:
     """Return the same operands, in a form that XLA cannot recognise as unused.
 
-    XLA aborts if a parameter of a marked call is unused, even if this turns out only
-    after all simplifications. For this reason every small operand is made to depend on
-    all others, in a way that never changes its value.
+    XLA aborts if a parameter of a marked call is unused, even if only its
+    simplifications remove the last use. For this reason every small operand is made to
+    depend on all others, in a way that never changes its value.
     """
     firsts = [x.reshape(-1)[0] for x in operands]
     signs = [(x != jnp.zeros_like(x)).astype(jnp.int32) for x in firsts]

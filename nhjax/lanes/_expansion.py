@@ -1,9 +1,9 @@
 """Operations that are replaced by programs of simpler operations before compilation.
 
 Factorisations of small matrices are written out, since XLA calls a library for them.
-Loops whose iterations end member by member, as under `vmap`, get one condition.
-The operations of other libraries, such as those that equinox defines for its loops, are
-replaced by the program of their implementation: what they compute outside of `vmap`.
+Under `vmap`, a loop can have a condition for each member. It gets a single condition.
+Operations of other libraries, such as equinox's operations for loops, are replaced by
+the program of their implementation, which they also run outside of transformations.
 """
 
 import math
@@ -109,7 +109,7 @@ def _holds_programs(value: Any) -> bool:
 
 
 def is_foreign(primitive: Any) -> bool:
-    """Return whether another library than JAX has defined an operation.
+    """Return whether a library other than JAX has defined an operation.
 
     JAX implements its own operations by compiling and running them.
     """
@@ -129,7 +129,8 @@ def _traced(function: Callable[..., Any], equation: Any) -> Any:
     try:
         program = jax.make_jaxpr(function)(*args)
     except Exception:
-        # The code of another library may need numbers, or call other code.
+        # The code of another library may need concrete values, or call code that JAX
+        # cannot trace.
         return None
     found = [(x.shape, x.dtype) for x in program.out_avals]
     wanted = [(x.aval.shape, x.aval.dtype) for x in equation.outvars]
@@ -137,7 +138,7 @@ def _traced(function: Callable[..., Any], equation: Any) -> Any:
 
 
 def _contains(jaxpr: Any, primitive: Any) -> bool:
-    """Return whether a jaxpr or one of its inner programs has an operation."""
+    """Return whether a jaxpr or one of its inner programs contains `primitive`."""
     for equation in jaxpr.eqns:
         if equation.primitive is primitive:
             return True
@@ -213,9 +214,9 @@ _MOST_SWEEPS = 16
 def _eigh(a: Any, *, lower: bool, sort_eigenvalues: bool, **_: Any) -> tuple[Any, Any]:
     """Diagonalise a symmetric matrix by Jacobi's method.
 
-    Each round turns disjoint pairs of rows and columns, and a sweep of rounds treats
+    Each round rotates disjoint pairs of rows and columns, and a sweep of rounds treats
     all pairs (Brent and Luk, SIAM J. Sci. Stat. Comput. 6, 1985). The results are the
-    vectors, as columns, and the eigenvalues in ascending order.
+    eigenvectors, as columns, and the eigenvalues in ascending order.
     """
     del sort_eigenvalues
     size = len(a)
@@ -297,8 +298,8 @@ def _permutation(pivots: Any, *, permutation_size: int, **_: Any) -> Any:
 def _sort(*operands: Any, dimension: int, is_stable: bool, num_keys: int) -> list[Any]:
     """Sort numbers, and other operands in the same order.
 
-    Each number is moved to its rank, the number of those that come before it. NaN is
-    the last.
+    Each number is moved to its rank, which is the number of elements that come before
+    it. NaN comes last.
     """
     del dimension, is_stable, num_keys
     keys = operands[0]
@@ -362,7 +363,7 @@ def _nextafter(x: Any, y: Any, **_: Any) -> Any:
     bits = jnp.dtype(f"int{8 * x.dtype.itemsize}")
     number = jax.lax.bitcast_convert_type(x, bits)
     one = jnp.ones_like(number)
-    # Away from zero the bits, read as an integer, grow.
+    # The bits, read as an integer, increase with the distance from zero.
     grows = (y > x) == (x > 0)
     next_bits = jnp.where(grows, number + one, number - one)
     after = jax.lax.bitcast_convert_type(next_bits, x.dtype)

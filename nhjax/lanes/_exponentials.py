@@ -134,7 +134,7 @@ def _hyperbolic(x: Value, odd: bool) -> Value:
     z = r * r
     c, s = z * polynomial(z, COSH), r * z * polynomial(z, SINH) + rest
     high, low = fast_two_sum(1.0 - u, r)
-    # r itself is added last, without a factor, so that sinh(r) = r for small r.
+    # `high` contains r without a factor, so that sinh(r) = r for small r.
     tail = u * r + (low + ((1.0 - u) * c + (1.0 + u) * s))
     return times_power_of_two(high + tail, exponent - 1)
 

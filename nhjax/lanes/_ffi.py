@@ -2,10 +2,11 @@
 
 The structures come from the header `xla/ffi/api/c_api.h` in `jax.ffi.include_dir()`, as
 LLVM types, which have the layout of the platform's C compiler. The listed fields keep
-their offsets: within a major version of the interface structures only grow at the end,
-so that code compiled with an older header keeps working, and each structure contains
-its size. Names may change: the names here are those of version 0.3, and version 0.5 has
-the same fields at the same offsets. A test compares them with the installed header.
+their offsets: within a major version of the interface, structures only grow at the end,
+and each structure contains its size, so that code compiled with an older header keeps
+working. Names may change: the names here are the names of version 0.3, and version 0.5
+has the same fields at the same offsets. A test compares the structures with the
+installed header.
 """
 
 # The lowest version of the interface that has all fields that the handler uses. A

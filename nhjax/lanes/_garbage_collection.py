@@ -9,7 +9,7 @@ from contextlib import contextmanager
 # A large program consists of millions of objects, nearly all of which live as long as
 # the program. By default Python looks for cycles each time that 700 objects have been
 # created. This took a third of the time to trace a bicycle's gradient, and found almost
-# nothing.
+# no garbage.
 _OBJECTS = 100_000
 
 _lock = threading.Lock()

@@ -7,8 +7,8 @@ arguments, and a load comes after the stores that it must see.
 
 Pure nodes are hash-consed: an operation with the same arguments exists once. A pure
 node lies in the deepest region of its arguments, so that invariant code is hoisted out
-of loops. It never leaves the side of a branch in which it was created, because that
-side may not be taken.
+of loops. It never leaves the side of a branch in which it was created, because the
+program may take the other side.
 
 `Graph.op` folds constants and removes operations, but never changes a result: rounding,
 infinities, NaN and -0.0 are unchanged. Only a structural zero makes a product zero for
@@ -75,10 +75,10 @@ class Node:
     """A node of the graph: a number that is computed, or a statement.
 
     `attr` is the data of the operation besides its arguments: the value of a constant,
-    the address of a load, the loop of a parameter. The fields from `is_live` on belong
-    to the passes over the finished graph: whether the node is needed, whether it
-    differs between members, whether a uniform value is needed as a vector too, and the
-    names in LLVM IR.
+    the address of a load, the loop of a parameter. The passes over the finished graph
+    record in the node whether it is needed (`is_live`), whether it differs between
+    members (`is_divergent`), whether a uniform value is needed as a vector too
+    (`is_broadcast`), and the names in LLVM IR.
     """
 
     __slots__ = (
@@ -171,7 +171,8 @@ class Graph:
         """Return the node of a constant.
 
         A product with a structural zero is zero for every value of the other factor.
-        Structural zeros come from padding and from tangents that do not exist.
+        Structural zeros come from padding, from arrays filled with zero, and from JAX's
+        symbolic zero tangents.
         """
         value = np.dtype(dtype).type(value)
         op = "zero" if is_structural else "const"
@@ -206,7 +207,7 @@ class Graph:
         The node is not hoisted out of the region `within`.
         """
         # This is the inner loop of the compiler: nodes are compared by identity, and
-        # `next_number` and `home` are written out.
+        # `next_number` and `home` are inlined.
         key = (op, dtype, attr, *args)
         region = self.region.floor
         floor: Region | None = region
@@ -305,7 +306,7 @@ class Buffer:
 
     The kind is "operand", "result", "constant" or "scratch". Operands and constants are
     only read, results are only written, scratch memory is read and written. `is_fixed`
-    means that there are no more stores.
+    means that no more stores follow.
     """
 
     __slots__ = (
@@ -613,7 +614,7 @@ class LoopBuilder:
         return node
 
     def goes_on_while(self, predicate: Node) -> None:
-        """Set the predicate; nodes that follow belong to iterations that take place."""
+        """Set the predicate; later nodes run only in iterations where it is true."""
         self.info.predicate = predicate
         self.info.split = self.graph.next_number()
 
@@ -681,23 +682,25 @@ class BranchBuilder:
 
 # Functions
 
-# A run calls each function of a system, and its derivatives, at ten places and more:
+# A run calls each function of a system, and its derivatives, at ten or more places:
 # without functions, LLVM would compile a copy at each of them. A program becomes a
 # function if it is long and pure arithmetic on numbers. Operands that are constants are
 # part of the function, so that zeros and ones are simplified as in a copy.
 #
 # A copy shares its common subexpressions with its surroundings, and its invariant
 # operations are hoisted out of loops. Therefore programs are still written out in
-# loops, except in a loop that contains an iteration, such as the loop over the steps of
-# a run.
+# loops, except in a loop that contains another loop of unknown length, such as the loop
+# over the steps of a run.
 #
-# A function is a region of its own, whose nodes depend on the nodes `parameter`. A node
-# `call` stands for all results, and a node `part` for one of them. Both are pure, so
-# that calls with equal arguments are merged, and calls without users are removed.
+# A function is a region of its own, in which `parameter` nodes stand for the arguments.
+# A node `call` stands for all results, and a node `part` for one of them. Both are
+# pure, so that calls with equal arguments are merged, and calls without users are
+# removed.
 
-# Shorter programs are written out: they gain too little time.
+# Shorter programs are written out: a function would save too little compile time.
 _SHORTEST = 500
-# A function with constants is replaced by one without if it saves less than this part.
+# A function with constants is replaced by a more general function if the constants save
+# less than this fraction of the nodes.
 _LEAST_GAIN = 0.1
 # A function needs neither memory nor jumps.
 _STATEMENTS = frozenset(
@@ -714,8 +717,8 @@ class Function:
     - `parameters`: the numbers that it is called with.
     - `outs`: its results.
     - `nodes`: the nodes that compute the results, in order.
-    - `general`: the function that is called instead, with its arguments: constants, and
-        indices of arguments of this function.
+    - `general`: `None`, or the more general function that is called instead, with its
+        arguments: constants, and indices of arguments of this function.
     """
 
     __slots__ = ("general", "nodes", "outs", "parameters")
@@ -732,11 +735,12 @@ class Function:
         return is_pure and len(self.nodes) >= _SHORTEST
 
     def structure(self) -> Hashable:
-        """Return a value that is equal for functions that compute the same."""
+        """Return a value that is equal for functions that compute the same results."""
         places = {node: k for k, node in enumerate(self.parameters)}
 
         def place(node: Node) -> int:
-            # Constants are the same nodes in all functions, whose numbers are positive.
+            # Functions share the nodes of constants. The numbers of nodes are positive,
+            # so that negative places stand for constants.
             return -node.number if node.is_constant else places[node]
 
         lines: list[Hashable] = []
@@ -781,7 +785,7 @@ class Functions:
 
 
 def _unify(one: Function, own: _Pattern, general: Function, wider: _Pattern) -> None:
-    """Let a function call another one that has fewer constants, if it is as short."""
+    """Let `one` call `general`, if that has fewer constants and is hardly longer."""
     pairs = list(zip(own, wider, strict=True))
     is_wider = all(b is None or a is b for a, b in pairs)
     is_short = len(one.nodes) >= (1 - _LEAST_GAIN) * len(general.nodes)

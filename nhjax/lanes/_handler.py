@@ -10,11 +10,11 @@ block. The caller's thread runs blocks. Threads of XLA's pool help if this saves
 
 - An atomic counter assigns blocks to the caller and to its helpers.
 - The caller asks the pool for helpers. Their number is smaller than the number of
-    threads of the pool, because the caller works too. It is so small that the work of
-    each helper takes longer than waking it.
+    threads of the pool, because the caller works too. The number is so small that each
+    helper works for longer than waking it takes.
 - At the end the caller waits for the blocks that helpers have begun. It does not wait
-    for helpers that have not started: there may be none, because the pool has no free
-    thread, or because this process was forked and has no pool any more. A call
+    for helpers that have not started: they may never start, because the pool has no
+    free thread, or because this process was forked and has no pool any more. A call
     therefore always ends, since a thread needs no other thread to finish its block.
 - The data that helpers share with the caller, the job, is kept until the last helper
     has seen that no block is left, which may be long after the call.
@@ -94,7 +94,7 @@ def job_field(name: str) -> str:
     return f"getelementptr inbounds %Job, ptr %job, i32 0, i32 {list(JOB).index(name)}"
 
 
-# The counter of the threads that are working in blocks, of all programs.
+# The counter of the threads that are working in blocks. All programs share it.
 WORKERS = "nhjax.workers"
 
 _POOL_DECLARATIONS = f"""
@@ -360,8 +360,8 @@ def handler_ir(
     - `num_operands`, `num_results`: the numbers of arrays that the kernel reads and
         writes.
     - `width`: the number of members that it computes at once.
-    - `is_batched`: whether the results have members, along the leading axis. Otherwise
-        there is one member. A program without results is empty.
+    - `is_batched`: whether the leading axis of the results is the axis of the members.
+        Otherwise there is one member. A program without results has no members.
     """
     values = {
         "kernel": "@kernel",

@@ -80,8 +80,9 @@ def _div(writer: Writer, node: Node, width: int, args: list[str]) -> str:
 
 
 def _integer_division(writer: Writer, node: Node, width: int, args: list[str]) -> str:
-    """Divide integers; zero and the overflow of -1 give XLA's results, where LLVM may
-    trap.
+    """Divide integers with XLA's results for divisors that may trap in LLVM.
+
+    These divisors are zero, and -1 if the quotient overflows.
     """
     a, b = args
     divisor, signed = node.args[1], is_signed(node.dtype)
@@ -237,9 +238,10 @@ _SHIFTS = {
 
 
 def _shift(writer: Writer, node: Node, width: int, args: list[str]) -> str:
-    """Shift integers as XLA does, also by their number of bits or more.
+    """Shift integers as XLA does.
 
-    Such a shift gives zero; an arithmetic shift to the right gives sign bits.
+    A shift by the number of bits or more gives zero, or only sign bits if it is an
+    arithmetic shift to the right.
     """
     kind, flag = vector(scalar_type(node.dtype), width), vector("i1", width)
     size, op = bits(node.dtype), _SHIFTS[node.op]

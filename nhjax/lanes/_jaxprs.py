@@ -22,8 +22,8 @@ import numpy as np
 # kernel. Calls into libraries (products of matrices, factorisations, transforms),
 # sorting, scattering and callbacks are not in the lists.
 #
-# These operations act element by element, and `_sparsity` relies on this: do not list
-# other operations here.
+# These operations act element by element, and `nhjax._numerics._sparsity` relies on
+# this: do not list other operations here.
 ELEMENTWISE = """
     abs acos acosh add add_any and asin asinh atan atan2 atanh
     bitcast_convert_type cbrt ceil clamp convert_element_type cos cosh div eq erf
@@ -51,9 +51,11 @@ _ARITHMETIC = {"add", "add_any", "div", "mul", "neg", "sub"}
 SMALL_PRODUCT = "small_product"
 # nhjax's own operation, which writes a row of an array.
 WRITE_ROW = "write_row"
-# nhjax's own operation, a call of a program that is kept with its derivatives.
+# nhjax's own operation, which calls a program. The program and its derivatives are
+# traced once and kept.
 KEPT_CALL = "kept_call"
-# Functions under `jax.jit` whose names begin with this are compiled once, and called.
+# Functions under `jax.jit` whose names have this prefix are compiled once, and called
+# by kernels.
 COMPILED_ONCE = "compiled_once_"
 # These operations contain programs; the operations of these programs are checked too.
 CALLING = """
@@ -70,8 +72,8 @@ _CONTAINING = [
     "scan",
     "while",
 ]
-# Numbers of elements. XLA leaves larger reductions to a library, and shares work on
-# larger arrays among threads, which a kernel cannot start.
+# These limits are numbers of elements. XLA leaves larger reductions to a library, and
+# shares work on larger arrays among threads, which a kernel cannot start.
 LARGEST_REDUCTION = 1024
 LARGEST_ARRAY = 4096
 
@@ -151,7 +153,7 @@ def _sizes_of_product(product: Any) -> Iterator[int]:
 
 
 def num_results(program: Any) -> int:
-    """Count the numbers that the operations of a jaxpr compute, each loop once."""
+    """Count the numbers that a jaxpr computes; the body of a loop counts once."""
     count = 0
     for equation in program.eqns:
         inner = [num_results(part) for part in _programs(equation.params)]
@@ -249,7 +251,7 @@ def _used(jaxpr: Any) -> list[Any]:
 
 
 def variables(operands: Any) -> list[Any]:
-    """Return the operands that are not numbers."""
+    """Return the operands that are variables, and not literals."""
     return [v for v in operands if not isinstance(v, jax.extend.core.Literal)]
 
 

@@ -27,11 +27,11 @@ ENGINES = ("lanes", "kernels", "xla")
 class CompileOptions(NamedTuple):
     """How a program is compiled.
 
-    - `is_brief`: whether it runs once and for a short time. Then it is compiled in less
-        time, to slower code.
+    - `is_brief`: whether the program runs once and for a short time. It is then
+        compiled in less time, to slower code.
     - `engines`: the engines that may compile it, and its derivatives, in the order in
         which they are tried.
-    - `note`: what `engines` adds to the reason.
+    - `note`: text that the function `engines` adds to the reason.
     """
 
     is_brief: bool = False
@@ -40,7 +40,7 @@ class CompileOptions(NamedTuple):
 
 
 def run_program(program: Any, leaves: list[Any], options: CompileOptions) -> list[Any]:
-    """Compute a program as one operation, or operation by operation if it has effects.
+    """Compute a program as one operation if possible, otherwise operation by operation.
 
     **Arguments:**
 
@@ -49,7 +49,7 @@ def run_program(program: Any, leaves: list[Any], options: CompileOptions) -> lis
     - `options`: how it is compiled.
     """
     program = cse_dce(program)
-    # All traced values must be operands of a primitive, and it must have no effects,
+    # A primitive must receive all traced values as operands, and must have no effects,
     # such as printing.
     if program.effects or captures_tracers(program):
         return jax.extend.core.jaxpr_as_fun(program)(*leaves)
@@ -64,8 +64,9 @@ def captures_tracers(program: Any) -> bool:
 def never_high(*_: Any, **__: Any) -> bool:
     """Tell JAX not to expand operations inside a program before it is lowered.
 
-    Since JAX 0.12 a primitive whose program contains such operations would need a rule
-    to expand them (`to_lojax`). Here they are expanded when a program is lowered.
+    Since JAX 0.12, some operations ("high" primitives) are expanded to simpler ones. A
+    primitive whose program contains such operations would need a rule that expands them
+    (`to_lojax`). Here they are expanded when the program is lowered.
     """
     return False
 
@@ -78,7 +79,8 @@ kernel.is_high = never_high
 @kernel.def_impl
 def _run(*operands, program, options):
     if jax.config.jax_disable_jit:  # pyright: ignore[reportAttributeAccessIssue]
-        # A kernel that was traced before. `jax.jit` would call this same rule again.
+        # The kernel was traced before JIT was disabled. `jax.jit` would now only call
+        # this rule again.
         return jax.extend.core.jaxpr_as_fun(program)(*operands)
     run = partial(kernel.bind, program=program, options=options)
     return jax.jit(run)(*operands)
@@ -148,7 +150,10 @@ def kernel_jvp(operands, tangents, *, program, options):
 
 
 def _fixed_part(program) -> tuple[list[Any], list[bool]]:
-    """Find the operations that depend on no operand, and mark the other results."""
+    """Return the operations that depend on no operand of the program.
+
+    The second result marks the results of the program that depend on an operand.
+    """
     traced = [isinstance(const, jax.core.Tracer) for const in program.consts]
     constants = partition_list(traced, program.jaxpr.constvars)[0]
     fixed, _, varying = _split([*program.jaxpr.invars, *constants], program.eqns)
@@ -157,10 +162,10 @@ def _fixed_part(program) -> tuple[list[Any], list[bool]]:
 
 
 def split_by_operands(program) -> tuple[list[Any], Any]:
-    """Compute what depends on no operand, and return a program for the rest.
+    """Compute the operations that depend on no operand; return a program for the rest.
 
-    Returns the values that the rest uses, and the rest. These values are its first
-    operands.
+    Returns the computed values that this program uses, and the program. The values are
+    its first operands.
     """
     jaxpr = program.jaxpr
     fixed, others, varying = _split(jaxpr.invars, jaxpr.eqns)
@@ -179,8 +184,8 @@ def _split(
 ) -> tuple[list[Any], list[Any], set[Any]]:
     """Split operations into those that depend on no operand, and the others.
 
-    Operations with effects count as dependent. The last result are the operands and
-    all variables that depend on them.
+    Operations with effects count as dependent. The third result is the set of the
+    operands and of all variables that depend on them.
     """
     varying, fixed, others = set(operands), [], []
     for equation in equations:
@@ -195,7 +200,8 @@ def _split(
 def part_of(program, consts: list[Any] | None = None, **fields: Any):
     """Return a program with some of its fields replaced.
 
-    `fields` are the operations, operands, constants or results of its jaxpr.
+    `fields` are new values for fields of its jaxpr: `eqns`, `invars`, `constvars` or
+    `outvars`.
     """
     names = program.jaxpr.debug_info.with_unknown_names()
     jaxpr = program.jaxpr.replace(debug_info=names, **fields)

@@ -5,8 +5,8 @@ can be imported without llvmlite.
 
 The code is position-independent, has the small code model, and is linked by JITLink, so
 that the constants of a kernel are reached by short addresses. The large code model,
-llvmlite's default for a JIT, first loads the address of each constant: kernels were a
-tenth to a third slower, and compiled more slowly.
+llvmlite's default for a JIT, first loads the address of each constant: with it, kernels
+were a tenth to a third slower, and took longer to compile.
 """
 
 import platform
@@ -31,12 +31,12 @@ class Target(NamedTuple):
 _PLATFORMS = {("linux", "x86_64"), ("linux", "aarch64"), ("darwin", "arm64")}
 
 # The level of LLVM's passes on the IR. Kernels are simplified when they are created:
-# level 1 gave the speed of level 3 in half of the time. Without passes the code was 5
-# to 15 percent slower.
+# code of level 1 was as fast as code of level 3, and took half of the time to compile.
+# Without passes the code was 5 to 15 percent slower.
 _PASSES = 1
 # The levels of the code generator for modules of fewer characters than this, and for
-# longer modules. Level 1 takes half of the time of level 2. With level 1 a short kernel
-# was 6 percent slower, and a long kernel was 2 percent faster.
+# longer modules. Level 1 takes half of the compile time of level 2. With level 1 a
+# short kernel was 6 percent slower, and a long kernel was 2 percent faster.
 _LONG_TEXT = 1_000_000
 _GENERATION_OF_SHORT, _GENERATION_OF_LONG = 2, 1
 # The level of both for programs that must compile quickly: no optimisation.

@@ -2,7 +2,8 @@
 
 A compiled operation cannot call Python, as `jax.debug.print` and the error checks of
 other libraries do. `parts` divides the operations of a program, and `evaluate` computes
-those outside of the compiled part one by one, as JAX would without compilation.
+the operations outside of the compiled part one by one, as JAX would without
+compilation.
 """
 
 from collections.abc import Iterable
@@ -28,11 +29,12 @@ class Parts(NamedTuple):
 
 
 def parts(equations: list[Any]) -> Parts:
-    """Divide a program so that no operation inside calls Python.
+    """Divide a program so that no operation of the part `inside` calls Python.
 
-    Checks of the operands, which take a small part of the time, are computed before.
-    Other calls, and the operations that depend on them, are computed after. Operations
-    that are needed by two parts are computed twice.
+    Calls of Python that need no loop and at most a quarter of the operations, such as
+    checks of the operands, are computed before this part. Other calls of Python, and
+    the operations that depend on them, are computed after it. Operations that are
+    needed by two parts are computed twice.
     """
     total = sum(map(_count, equations))
     maker = {x: index for index, e in enumerate(equations) for x in e.outvars}
@@ -80,8 +82,9 @@ def _across_members(equations: list[Any], is_late: list[bool]) -> list[bool]:
     """Mark operations that must be repeated after the compiled part.
 
     Operations of other libraries may combine members under `jax.vmap`: an error check
-    finds out whether any member has failed. If late operations use their results, JAX
-    computes them again, except in loops.
+    computes whether any member has failed. If the part after the compiled part needs
+    the results of such operations, JAX computes the operations again, unless they
+    contain loops.
     """
     wanted: set[Any] = set()
     serves = []
@@ -100,7 +103,7 @@ def _across_members(equations: list[Any], is_late: list[bool]) -> list[bool]:
 
 
 def inlined(program: Any, *leaves: Any) -> list[Any]:
-    """Compute a program, with calls of functions that call Python inlined."""
+    """Compute a program; calls of functions that call Python are inlined."""
     values = start(program, leaves)
     for equation in program.jaxpr.eqns:
         if equation.primitive.name in ("jit", "pjit") and python_calls(equation):
@@ -142,7 +145,7 @@ def _count(equation: Any) -> int:
 
 
 def python_calls(equation: Any) -> set[str]:
-    """Return the names of operations with effects in an equation, and of callbacks."""
+    """Return the names of callbacks and of operations with effects in an equation."""
     name = equation.primitive.name
     if name in _CALLBACKS:
         return {name}

@@ -1,4 +1,4 @@
-"""Compilation of a program, from a jaxpr to a name that XLA can call, and to the call.
+"""Compilation of a jaxpr to native code that XLA calls by a name, and lowering rules.
 
 `compile_batched` and `compile_single` build the graph of a program (`build_graph`),
 write its kernel (`llvm_ir`), compile it together with a handler, and register the
@@ -15,7 +15,8 @@ process, and then in the cache on disk if JAX's options switch it on. The entry 
 name and the native code, so that a known program needs neither the graph nor LLVM.
 
 The rules at the end of the file lower the operations that stand for a program
-(`_kernel`, `_batched_call`) to such calls, or leave the program to another engine.
+(`_kernel`, `_batched_call`) to calls of native code, or leave the program to another
+engine.
 
 Executables in JAX's persistent cache call programs by these names too. JAX lowers a
 program before it looks for its executable, and lowering registers the name. If an
@@ -107,7 +108,7 @@ def compile_batched(
 def _compile(
     program: Any, is_batched: tuple[bool, ...] | None, width: int, is_brief: bool
 ) -> str:
-    """Return the name of a program, which is found or compiled.
+    """Return the name of a program: find its code in a cache, or compile it.
 
     `is_batched` is `None` for a single run.
     """
@@ -159,8 +160,8 @@ def llvm_ir(
 
     The text of an LLVM module with the function `i1 kernel(ptr operands, ptr results,
     i64 first, i64 last)`. It computes the members from `first` to `first + width - 1`;
-    members beyond `last` repeat `last`. It returns true if it failed. It fails only if
-    there is no scratch memory.
+    members beyond `last` repeat `last`. It returns true if it failed, which happens
+    only if it cannot allocate scratch memory.
 
     **Raises:** `Unsupported` if the program cannot be compiled.
     """
@@ -229,7 +230,7 @@ def _count_operations(jaxpr: Any) -> int:
     count = len(jaxpr.eqns)
     for equation in jaxpr.eqns:
         if equation.primitive.name == "small_product":
-            # It stands for two broadcasts, a product and a sum.
+            # A small product stands for two broadcasts, a product and a sum.
             count += 3
         for part in jax.tree.leaves(equation.params):
             part = getattr(part, "jaxpr", part)
@@ -244,7 +245,7 @@ _programs: dict[str, int] = {}
 # name.
 _names: dict[str, str] = {}
 
-# The number of threads that are working in kernels, which all programs count together.
+# The number of threads that are working in kernels. All programs share this counter.
 _workers = ctypes.c_int64(0)
 
 # One program is compiled at a time: LLVM must not be used by two threads at once, and
@@ -297,8 +298,8 @@ def register_kernel(
         members.
     - `num_operands`, `num_results`: the numbers of arrays that it reads and writes.
     - `width`: the number of members that it computes at once.
-    - `is_batched`: whether the results have members, along the leading axis. Otherwise
-        it is called once, for member 0.
+    - `is_batched`: whether the leading axis of the results is the axis of the members.
+        Otherwise the kernel is called once, for member 0.
     - `is_brief`: whether to compile in less time, to slower code.
 
     **Returns:** a name for `jax.ffi.ffi_call` and `jax.ffi.ffi_lowering`.
@@ -346,8 +347,8 @@ def _register(name: str, code: bytes) -> None:
 def _shared_handler() -> int:
     """Return the address of the function that the handlers of all programs call.
 
-    It runs for less than a microsecond besides the kernels, so that optimising it would
-    cost more than it gains.
+    Apart from the kernels that it runs, it takes less than a microsecond, so that
+    optimising it would cost more than it gains.
     """
     code = object_code([shared_handler_ir()], SHARED_HANDLER, host(), is_quick=True)
     imports = {WORKERS: ctypes.addressof(_workers)}
@@ -370,12 +371,12 @@ def _name(*texts: str) -> str:
 # The lowering of the operations that stand for programs
 
 
-# Measurements on the gallery's systems with 2 to 8 stages, and on larger systems, show
-# that this compiler, which turns all arrays into scalars, runs faster below the first
-# root mean square of array sizes. Above it XLA is often faster, since it uses vectors
-# for loops over larger arrays also in a single run. But XLA takes more than 1 ms to
-# compile an operation. Therefore only short programs are left to it between the two
-# sizes, and all programs above the second one.
+# This compiler turns all arrays into scalars. Measurements on the gallery's systems
+# with 2 to 8 stages, and on larger systems, show that its code is faster if the root
+# mean square of array sizes is at most `_SMALL_ARRAYS`. For larger arrays XLA is often
+# faster, since it uses vectors for loops over arrays also in a single run. But XLA
+# takes more than 1 ms to compile an operation. Therefore XLA compiles only short
+# programs between the two sizes, and all programs above `_LARGE_ARRAYS`.
 _SMALL_ARRAYS, _LARGE_ARRAYS = 40, 110
 _SHORT_PROGRAM = 2800
 
@@ -395,7 +396,7 @@ _NOT_LANES = (
 
 
 class _Ways(NamedTuple):
-    """How an operation is lowered: to native code of a name, by XLA, or to kernels."""
+    """The ways to lower an operation: named native code, XLA, and kernels of XLA."""
 
     compiled: Callable[[], str]
     by_xla: Callable[..., Any]
@@ -444,7 +445,7 @@ def _by_first_engine(
 ):
     """Lower a program by the first engine that can compile it, and record the engine.
 
-    `reason` says why native code is not tried, if it is not.
+    `reason` is the reason not to try native code, or `None` if it is tried.
     """
     options = params["options"]
     if is_exported(ctx):

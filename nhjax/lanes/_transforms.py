@@ -5,8 +5,8 @@ The function is traced to a program, which becomes one operation (`_kernel`). Un
 it has rules for derivatives. `_program` lowers it to native code, or leaves it to XLA.
 
 Calls of Python, such as `jax.debug.print` or the error checks of other libraries,
-cannot be part of such an operation. JAX computes these calls, before and after it
-(`_parts`).
+cannot be part of such an operation. JAX computes these calls before and after the
+operation (`_parts`).
 """
 
 import inspect
@@ -51,16 +51,17 @@ def vmap(
     """Vectorise a function like `jax.vmap`, over SIMD lanes and threads where possible.
 
     On the CPU the function is compiled to native code that computes 2 to 8 members at
-    once, with loops and branches that each member leaves when it has finished. It is
-    meant for functions of small arrays, such as ODE solvers, filters and controllers.
-    If the function cannot be compiled, the result is that of `jax.vmap`, and
+    once (up to 16 in float32), with loops and branches that each member leaves when it
+    has finished. This is meant for functions of small arrays, such as ODE solvers,
+    filters and controllers.
+    If the function cannot be compiled, `jax.vmap` computes the result, and
     `nhjax.engines` returns the reason.
 
     **Main arguments:**
 
     - `fun`: a function of arrays and trees of arrays.
-    - `in_axes`: the axis of the members in each argument, or `None` for an argument
-        that all members share; an integer, or a tree of them.
+    - `in_axes`: the axis of the members in each argument: an integer, `None` for an
+        argument that all members share, or a tree of these values.
     - `out_axes`: the axis of the members in each result.
 
     **Other arguments:**
@@ -82,7 +83,7 @@ def vmap(
         >>> print(jax.jit(root)(jnp.array([1.0, 4.0, 9.0]), 2.0))
         [2. 4. 6.]
 
-    **Raises:** `TypeError` if `fun` is not a function or returns something else than
+    **Raises:** `TypeError` if `fun` is not a function or returns anything other than
     arrays and numbers; the errors of `jax.vmap` if the axes do not fit the arguments.
     """
     _check_callable(fun)
@@ -104,14 +105,15 @@ def vmap(
         axes["spmd_axis_name"] = spmd_axis_name
         if None not in jax.tree.leaves(out_axes, is_leaf=_is_none):
             return jax.vmap(member, in_axes, out_axes, **axes)(*args, **kwargs)
-        # JAX decides whether the members share these results. All results of the
-        # operation have members, and are equal where the members share them.
+        # All members share the results with `None` in `out_axes`. Otherwise JAX raises
+        # an error in `eval_shape`. The compiled operation returns all results for each
+        # member, so that shared results are taken from the first member.
         theirs = partial(jax.vmap(plain, in_axes, out_axes, **axes), *args, **kwargs)
         jax.eval_shape(theirs)
         all_axes = jax.tree.map(_first_if_none, out_axes, is_leaf=_is_none)
         out = jax.vmap(member, in_axes, all_axes, **axes)(*args, **kwargs)
         if any(0 in x.shape for x in jax.tree.leaves(out)):
-            # There may be no member.
+            # There may be no first member.
             return theirs()
         return jax.tree.map(_shared, out_axes, out, is_leaf=_is_none)
 
@@ -121,8 +123,8 @@ def vmap(
 def jit(fun: Callable[..., Any]) -> Callable[..., Any]:
     """Compile a function like `jax.jit`, to native code without XLA where possible.
 
-    XLA runs a program on the CPU as a sequence of kernels, and starting one takes as
-    long as the arithmetic of tens of numbers. Functions with loops over small arrays
+    XLA runs a program on the CPU as a sequence of kernels, and starting a kernel takes
+    as long as the arithmetic of tens of numbers. Functions with loops over small arrays
     are therefore several times faster as native code. If the function cannot be
     compiled, or has larger arrays, XLA compiles it, and `nhjax.engines` returns the
     reason.
@@ -145,7 +147,7 @@ def jit(fun: Callable[..., Any]) -> Callable[..., Any]:
         >>> print(nhjax.lanes.jit(halve)(20.0))
         0.625
 
-    **Raises:** `TypeError` if `fun` is not a function, returns something else than
+    **Raises:** `TypeError` if `fun` is not a function, returns anything other than
     arrays and numbers, or has an argument that is neither an array nor hashable.
     """
     _check_callable(fun)
@@ -191,7 +193,10 @@ def _check_callable(fun: Any) -> None:
 
 
 def _partition(tree: Any) -> tuple[Any, Any]:
-    """Split a tree into arrays and numbers, and other objects; None stands for both."""
+    """Split a tree into a tree of arrays and numbers and a tree of other objects.
+
+    Each of the two trees has None in the places of the other tree's objects.
+    """
     leaves, treedef = jax.tree.flatten(tree)
     marks = [isinstance(x, (*_ARRAYS, *_NUMBERS)) for x in leaves]
     pairs = list(zip(marks, leaves, strict=True))
@@ -248,7 +253,7 @@ def _compiled_whole(
     if jax.config.jax_disable_jit:  # pyright: ignore[reportAttributeAccessIssue]
         return fun(*args, **kwargs)
     leaves, treedef = jax.tree.flatten((args, kwargs))
-    # The members of a `vmap` that share a number of Python see this number.
+    # Numbers of Python are not traced: `fun` receives them unchanged.
     is_array = [isinstance(x, _ARRAYS) for x in leaves]
     arrays, others = partition_list(is_array, leaves)
     structure = None
@@ -306,7 +311,7 @@ def _run(program: Any, leaves: list[Any]) -> list[Any]:
 
 
 def _run_whole(program: Any, leaves: list[Any], note: str = "") -> list[Any]:
-    """Compute a program as one operation, whose operands include traced constants."""
+    """Compute a program as one operation; traced and large constants are operands."""
     jaxpr, consts = program.jaxpr, program.consts
     is_operand = [
         isinstance(x, jax.core.Tracer) or np.size(x) > _LARGEST_CONSTANT for x in consts

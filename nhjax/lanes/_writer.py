@@ -166,7 +166,7 @@ class Writer:
         yield
         self.contract = before
 
-    # What formulas need
+    # Methods for formulas
 
     def type(self, scalar: str) -> str:
         """Return the type of the vectors of a scalar type."""
@@ -360,7 +360,7 @@ class Value:
         return self._compare("oge", "sge", other)
 
     def equals(self, other: "Operand") -> "Value":
-        """Return for which members two values are equal; NaN equals nothing."""
+        """Return for which members two values are equal; NaN equals no value."""
         return self._compare("oeq", "eq", other)
 
     def cast(self, instruction: str, kind: str) -> "Value":
@@ -422,7 +422,7 @@ def _intrinsic(name: str, *arguments: Value) -> Value:
 # round-off of the first number.
 DoubleDouble: TypeAlias = tuple[Value, Value]
 
-# Adding this rounds to an integer, which then stands in the lowest bits.
+# Adding this number rounds to an integer, which is then in the lowest bits.
 _TO_INTEGER = 1.5 * 2.0**52
 # The bits of 1.0.
 ONE_BITS = 0x3FF0000000000000
@@ -454,7 +454,8 @@ def polynomial(x: Value, coefficients: Sequence[float]) -> Value:
 def nearest(x: Value) -> tuple[Value, Value]:
     """Return the integer nearest to x, as a float and in the lowest bits of an integer.
 
-    This holds for |x| < 2^51; 51 bits are the integer and its sign.
+    This holds for |x| < 2^51. The lowest 51 bits of the second result are the integer
+    modulo 2^51.
     """
     with x.writer.exact():
         shifted = x + _TO_INTEGER

@@ -39,17 +39,17 @@ def animate(
     **Arguments:**
 
     - `ts`: the saved times of one trajectory.
-    - `points`: the saved positions by name: points of shape (times, 2) or (times, 3),
-        outlines of bodies, which are filled, of shape (times, corners, 2) or (times,
-        corners, 3). The
-        machines of `nhjax.systems` have a method `points`, which
+    - `points`: the saved positions by name. A point has shape (times, 2) or (times, 3).
+        The outline of a body has shape (times, corners, 2) or (times, corners, 3), and
+        is filled. The machines of `nhjax.systems` have a method `points`, whose result
         `SaveAt(fn=lambda t, y, args: machine.points(t, y.q))` saves. For a run that has
         saved states, use `jax.vmap(machine.points)(sol.ts, sol.ys.q)`.
     - `rods`: chains of names of points that are connected by lines, such as
         `[("hub", "end")]`.
     - `wheels`: the hub and a point of the rim of each wheel, by name, and in space
-        another point of the axle. Wheels are filled, with a mark at the point of the
-        rim. A point that is fixed in the wheel shows the rolling.
+        another point of the axle. Wheels are filled, with a line from the hub to the
+        point of the rim. If this point is fixed in the wheel, the line shows how the
+        wheel turns.
     - `traced`: the names of points whose past paths are drawn.
     - `ground`: the height of the ground, which is drawn below the machine.
     - `follow`: the name of a point that stays in the centre of the picture.
@@ -143,7 +143,7 @@ def animate(
 
     if spatial:
         ax.set_box_aspect(tuple(sides))  # pyright: ignore[reportArgumentType]
-        # Marks are in front of the wheels, which hide nothing else.
+        # `zorder` puts lines and marks in front of filled bodies and wheels.
         axes: Any = ax
         axes.computed_zorder = False
     else:
@@ -280,7 +280,7 @@ def _circle(frames: Mapping[str, np.ndarray], wheel: Sequence[str]) -> np.ndarra
 
 
 def _filled(ax: "Axes", color: str, spatial: bool) -> Any:
-    """Add a polygon without corners, which has them once a frame is shown."""
+    """Add a polygon whose corners are set when a frame is shown."""
     if spatial:
         from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 

@@ -43,8 +43,9 @@ def trajectory(
     - `sol`: a `Solution` with saved states; for a batch, one path is drawn for each
         member.
     - `coordinates`: the indices of two or three entries of q, or their names if the
-        system has `coordinates`. On a group, they index the flattened numbers of an
-        element; on a product, the numbers of all factors are joined in order.
+        system has `coordinates`. On a group, an index selects one of the flattened
+        numbers of an element; on a product, the numbers of all factors are joined in
+        order.
     - `names`: the labels of the axes. The default is the names of the system, or
         q₁, q₂, ....
     - `ground`: the value of the third coordinate at which a plane is drawn.
@@ -75,7 +76,8 @@ def trajectory(
     parts = [np.asarray(leaf).reshape(*lead, -1) for leaf in jax.tree.leaves(ys.q)]
     q = np.concatenate(parts, axis=-1)
     n = q.shape[-1]
-    # The names of a system on a group count velocities, not the numbers of an element.
+    # On a group, a system has one name for each velocity, but an element of the group
+    # has more numbers.
     known = sol.coordinates or ()
     known = known if len(known) == n else ()
     chosen = _indices(coordinates, n, known)
@@ -122,7 +124,7 @@ def _indices(coordinates: Any, n: int, known: tuple[str, ...]) -> list[int]:
 
 
 def _set_box(ax: Any, ground: float | None) -> None:
-    """Set the proportions of the box to those of the data, with limits."""
+    """Set the proportions of the box to the proportions of the data, at most 2 : 1."""
     if ground is not None:
         low, high = ax.get_zlim()
         ax.set_zlim(min(low, ground), max(high, ground))

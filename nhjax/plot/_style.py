@@ -1,4 +1,4 @@
-"""The style of figures, and the figures that have it."""
+"""The style of figures, and the creation of axes in this style."""
 
 import contextlib
 import functools
@@ -33,9 +33,9 @@ def style(*, dark: bool = False) -> contextlib.ExitStack:
     """Set matplotlib's settings to the style of the figures of nhjax.
 
     The style sets the colours of Okabe and Ito, which colour-blind readers can tell
-    apart, and the sizes, widths, grid, layout and resolution of figures. Call it once
-    for all figures that follow, or use it in a `with` statement, which restores the
-    previous settings at its end.
+    apart, and the sizes, widths, grid, layout and resolution of figures. Call `style`
+    once for all figures that follow, or use it in a `with` statement, which restores
+    the previous settings at its end.
 
     The functions of `nhjax.plot` use the light style by themselves for the figures
     that they create. They keep every setting that you have changed from matplotlib's
@@ -113,7 +113,8 @@ def _set(settings: dict[str, Any]) -> contextlib.ExitStack:
     from matplotlib import rcParams
 
     current: Any = rcParams
-    # Not `rc_context`, which restores the settings when it is garbage-collected.
+    # `rc_context` is not used, because it restores the settings when it is
+    # garbage-collected.
     restoration = contextlib.ExitStack()
     restoration.callback(current.update, {name: current[name] for name in settings})
     current.update(settings)
@@ -140,7 +141,7 @@ def _settings(dark: bool) -> dict[str, Any]:
         "axes.axisbelow": True,
         "grid.color": grid,
         "grid.linewidth": 0.6,
-        # 0.05 instead of 5 × 10⁻².
+        # Labels show 0.05 instead of 5 × 10⁻².
         "axes.formatter.min_exponent": 2,
         "axes.spines.top": False,
         "axes.spines.right": False,

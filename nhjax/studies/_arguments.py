@@ -42,7 +42,8 @@ _START_SECONDS = 4.0
 class ArgumentError(ValueError):
     """Raised if an argument of a study is invalid.
 
-    `argument` is its name, so that the command line can name its option.
+    `argument` is the name of the argument, from which the command line finds the
+    option.
     """
 
     def __init__(self, argument: str, problem: str):

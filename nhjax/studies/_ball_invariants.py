@@ -52,15 +52,15 @@ ENERGY_FLOOR, POSITION_FLOOR = 4e-15, 1e-13
 
 @dataclasses.dataclass(frozen=True)
 class BallRun:
-    """The measurements of one run, with an entry for every step.
+    """The measurements of one run of k steps.
 
     - `integrals`: shape (k + 1, 4), the three linear first integrals and the moving
         energy.
     - `positions`: (x, y), shape (k + 1, 2).
     - `circle_deviation`: the distance from the exact position at the common final time
         of all step sizes.
-    - `timing`: the times of the program that runs all step sizes with this s side by
-      side.
+    - `timing`: the times to compile and to run the program that runs all step sizes
+      with this s side by side.
     """
 
     stages: int
@@ -253,8 +253,8 @@ def ball_invariants(
     like the energy of a holonomic system. In addition, this study measures whether the
     moving energy stays bounded, its order, and the distance of the ball from its exact
     position on a circle. The paper does not give its data; this study uses the data
-    of `nhjax.systems.TurntableBall`, a solid ball, with the constraints in the spatial
-    angular velocity.
+    of `nhjax.systems.TurntableBall`, a solid ball whose constraints are written in the
+    spatial angular velocity.
 
     **Arguments:**
 

@@ -214,8 +214,8 @@ def chaotic_energy(
 ) -> ChaoticEnergy:
     """Compute the mean squared energy error of an ensemble of the chaotic system.
 
-    This is the third experiment of the paper: J + 1 motions of a system with 7 degrees
-    of freedom on one energy surface. μ(E, k), the mean of (E_jk - E_0)² over the
+    This is the third experiment of the paper: J + 1 motions of a system with 7
+    coordinates on one energy surface. μ(E, k), the mean of (E_jk - E_0)² over the
     ensemble at step k, scales as h^{4(s-1)}. Every motion is chaotic, so that only such
     statistics can be compared. Members run in chunks and statistics are updated after
     each chunk, so that memory does not grow with J. The error bar of μ is its standard
@@ -412,7 +412,8 @@ def _figure(runs: list[ChaoticRun], title: str) -> "Figure":
 
 
 def _panel(ax: "Axes", runs: list[ChaoticRun], power: int) -> None:
-    # The first steps start from zero. Including them would compress the other curves.
+    # The error starts from zero. To include the first steps in the limits of the axis
+    # would compress the curves.
     levels = []
     for i, run in enumerate(runs):
         h, times = run.dt, run.times

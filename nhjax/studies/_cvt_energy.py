@@ -44,11 +44,11 @@ REGIMES = {
 
 @dataclasses.dataclass(frozen=True)
 class CVTRun:
-    """The energies of one run, at every step.
+    """The energies of one run of k steps, at every step.
 
     - `energies`: shape (k + 1, 3): total, driver and passenger.
-    - `timing`: the times of the program that runs all regimes with this s and h side by
-      side.
+    - `timing`: the times to compile and to run the program that runs all regimes with
+      this s and h side by side.
     """
 
     regime: str
@@ -218,8 +218,9 @@ def cvt_energy(
 ) -> CVTEnergy:
     """Compute the energies of the CVT, its driver and passenger over a long time.
 
-    This is the second experiment of the paper. The driver oscillates at low energy and
-    rotates at high energy. The driver and the passenger each conserve their energy.
+    This is the second experiment of the paper, on a continuously variable transmission
+    (CVT). The driver oscillates at low energy and rotates at high energy. The driver
+    and the passenger each conserve their energy.
 
     **Arguments:**
 

@@ -55,7 +55,7 @@ SYMBOLS = {
     "multiplier": ("λ", r"$\lambda$"),
     "continuous_multiplier": ("λ_c", r"$\lambda_c(q, p)$"),
 }
-# In contrast to the particle, the mass matrix of the sleigh depends on position.
+# The mass matrix is constant for the particle, and depends on position for the sleigh.
 EXAMPLES = {"particle": NonholonomicParticle, "sleigh": ChaplyginSleigh}
 
 

@@ -169,7 +169,7 @@ if TYPE_CHECKING:
 # The colours of Okabe and Ito, which colour-blind readers can distinguish; most of them
 # also differ in a grey print.
 COLOURS = ("#0072B2", "#E69F00", "#009E73", "#D55E00", "#CC79A7", "#56B4E9", "#000000")
-# The number of bins of an envelope. It is so small that its edges are smooth lines.
+# The number of bins of an envelope: so small that the envelope has smooth edges.
 BINS = 200
 
 

@@ -32,10 +32,10 @@ class AndrewsSqueezer(AbstractExample):
     and K1 reaches nearly 11 000 revolutions a minute within 0.03 s.
 
     **Parameters:** `masses` m_k [kg] and `inertias` I_k about the centres [kg m²], of
-    shape (7,); `arms`, the vectors from the inner joint to the outer end, and
-    `centres`, those to the centre of mass, of shape (7, 2), in the frames of the bodies
-    [m]; the points `A`, `B`, `C` in space and `hook`, D from B in the frame of K3 [m];
-    `stiffness` c₀ [N/m] and `rest_length` l₀ [m] of the spring; `torque` M [N m].
+    shape (7,); `arms` and `centres`, the vectors from the inner joint to the outer end
+    and to the centre of mass, of shape (7, 2), in the frames of the bodies [m]; the
+    points `A`, `B`, `C` in space, and `hook`, the vector from B to D in the frame of K3
+    [m]; `stiffness` c₀ [N/m] and `rest_length` l₀ [m] of the spring; `torque` M [N m].
 
     **Source:** Schiehlen, *Multibody Systems Handbook* (1990); Hairer and Wanner,
     *Solving Ordinary Differential Equations II*, section VII.7; Mazzia and Magherini,

@@ -145,9 +145,9 @@ class BallInBowl(AbstractConstrainedGroupExample):
     ) -> "BallInBowl":
         """Create a ball that moves steadily on a horizontal circle about the axis.
 
-        The circle of its centre has the radius `radius_of_path` [m], and the rate is
-        `path_rate` [1/s]; the balance of moments determines the spin. `parameters` are
-        the parameters of the class.
+        The centre of the ball moves on a circle of radius `radius_of_path` [m] at the
+        rate `path_rate` [1/s]; the balance of moments determines the spin. `parameters`
+        are the parameters of the class.
         """
         path, rate = parameter(radius_of_path), parameter(path_rate)
         require_positive(radius_of_path=path)
@@ -215,8 +215,9 @@ class BallInBowl(AbstractConstrainedGroupExample):
 def _steady_spin(ball: BallInBowl, rate: Array) -> Array:
     """Compute the spin that keeps a moving ball on its circle.
 
-    a n × F = -I ω' is along the path, and ω turns with the ball at the given rate. The
-    ball is on the first axis, without spin.
+    The moment a n × F = -I ω' of the force F of the bowl is along the path, and ω turns
+    about the vertical with the ball at the given rate. `ball` is on the first axis and
+    has no spin.
     """
     normal, path = ball.bowl.normal(ball.q0[1]), ball.q0[1][0]
     moment = normal[0] * ball.gravity + normal[2] * rate**2 * path

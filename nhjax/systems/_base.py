@@ -18,15 +18,15 @@ from .._manifold import AbstractLieGroup
 from .._system import LagrangianSystem, parameter as parameter, State
 
 
-# Gauss-Legendre rule of one panel: exact to round-off on panels whose length is
-# below the distance of the integrand's nearest complex singularity.
+# The Gauss-Legendre rule of one panel. It is exact to round-off if the panel is shorter
+# than its distance from the nearest complex singularity of the integrand.
 NODES, WEIGHTS = np.polynomial.legendre.leggauss(20)
 
 
 def coordinates(
     value: ArrayLike | tuple[float, ...] | tuple[tuple[float, ...], ...],
 ) -> Array:
-    """Convert to a floating array a tuple or an array of coordinates."""
+    """Convert a tuple or an array of coordinates to a floating-point array."""
     array = jnp.asarray(value)
     if not jnp.issubdtype(array.dtype, jnp.inexact):
         array = array.astype(jnp.result_type(float))
@@ -34,7 +34,7 @@ def coordinates(
 
 
 def pair(value: tuple) -> tuple[Array, Array]:
-    """Convert to floating arrays an element of a product of two groups."""
+    """Convert an element of a product of two groups to floating-point arrays."""
     first, second = value
     return coordinates(first), coordinates(second)
 
@@ -54,7 +54,7 @@ def require_not_negative(**parameters: Array) -> None:
 
 
 def require_possible(possible: Array, message: str) -> None:
-    """Raise with the message if a motion is not possible, unless it is being traced."""
+    """Raise with the message if `possible` is false, unless it is being traced."""
     if not is_traced(possible) and not np.all(np.asarray(possible)):
         raise ValueError(message)
 
@@ -67,16 +67,17 @@ def require_shape(shape: tuple[int, ...], **parameters: Array) -> None:
 
 
 def require_nonzero(name: str, value: float, consequence: str) -> None:
-    """Raise where a closed formula would divide by `value` = 0."""
+    """Raise if `value` is 0, because an exact solution divides by it."""
     if value == 0:
         raise ValueError(f"`{name}` must be nonzero, got {value}: {consequence}.")
 
 
 def require_consistent(name: str, violation: ArrayLike, scale: ArrayLike) -> None:
-    """Raise where `name` violates a constraint by more than the rounding of `scale`.
+    """Raise if `name` violates a constraint by more than √ε (1 + |scale|).
 
-    A closed-form solution uses the constraint to drop velocities: for data that violate
-    it, the formula would silently give the solution of other data.
+    Here ε is the machine epsilon. An exact solution uses the constraint to eliminate
+    velocities. For data that violate the constraint, its formula would silently give
+    the solution for other data.
     """
     largest = np.max(np.abs(np.asarray(violation)))
     sizes = np.asarray(scale)
@@ -91,7 +92,7 @@ def require_consistent(name: str, violation: ArrayLike, scale: ArrayLike) -> Non
 def given_forces(
     args: Args, shape: tuple[int, ...], dtype: DTypeLike, what: str
 ) -> Array:
-    """Return the forces in `args` as an array; they are zero where it is None.
+    """Return the forces in `args` as an array, which is zero if `args` is None.
 
     Raise a `ShapeError` unless they have the given shape. `what` describes them in
     messages.
@@ -101,7 +102,7 @@ def given_forces(
     try:
         forces = jnp.asarray(args, dtype)
     except (TypeError, ValueError):
-        # No numbers, or of several shapes.
+        # `args` has no numbers, or parts of different shapes.
         forces = None
     if forces is None or forces.shape != shape:
         raise ShapeError(
@@ -121,8 +122,8 @@ def integral(
 ) -> np.ndarray:
     """Integrate a function of time over [0, t] to round-off.
 
-    `integrand` maps an array of times to values along its last axes; `rate` is the
-    inverse of the shortest time scale on which it varies.
+    `integrand` maps an array of times to values whose last axes are the axes of this
+    array; `rate` is the inverse of the shortest time scale on which they vary.
     """
     panels = math.ceil(abs(t) * rate) + 1
     edges = np.linspace(0.0, t, panels + 1)
@@ -134,8 +135,8 @@ def integral(
 class AbstractExample(eqx.Module):
     """An example of the gallery: a system with parameters and default initial data.
 
-    On a Lie group `q` is an element, a tuple of arrays on a product, and `v` the body
-    velocity.
+    On a Lie group, `q` is an element of the group (on a product of groups, a tuple of
+    arrays), and `v` is the body velocity.
     """
 
     q0: eqx.AbstractVar[PyTree[Array]]
@@ -164,8 +165,8 @@ class AbstractExample(eqx.Module):
     ) -> State:
         """Create the consistent state at (`q0`, `v0`).
 
-        `dtype` defaults to JAX's default float. `args` are the `args` of the run: its
-        forces determine the multiplier.
+        `dtype` defaults to JAX's default float. `args` are the `args` of the run: the
+        multiplier depends on the forces in them.
         """
         if dtype is None:
             dtype = jnp.result_type(float)
@@ -181,7 +182,7 @@ class AbstractNonholonomicExample(AbstractExample):
         """Compute the constraint Φ(t, q, v), a scalar or of shape (m,)."""
 
     def _consistent_data(self) -> tuple[Any, np.ndarray]:
-        """Return (q0, v0) in float64 on the host, if they satisfy the constraint."""
+        """Return (q0, v0) in float64 on the host; raise if v0 is not consistent."""
         time = jnp.asarray(0.0, dtype=self.v0.dtype)
         violation = self.constraint(time, self.q0, self.v0, None)
         require_consistent("v0", violation, self.v0)

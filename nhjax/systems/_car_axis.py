@@ -26,7 +26,7 @@ class CarAxis(AbstractExample):
 
     with q = (x_l, y_l, x_r, y_r) [m]: the ends of the axle, each with half of the mass
     of the chassis. The left wheel stays at the origin, the right one is at b. Both
-    constraints are holonomic, the first one depends on time: the left spring stays
+    constraints are holonomic. The first one depends on time, and keeps the left spring
     perpendicular to the line of the wheels. Energies are scaled by ε², where 1/ε² is
     the stiffness of the springs.
 
@@ -80,7 +80,8 @@ class CarAxis(AbstractExample):
     def level(cls, **parameters: ArrayLike) -> "CarAxis":
         """Create a level axle on springs at their rest length, as in the source.
 
-        It moves sideways at the rate at which the line of the wheels turns at t = 0.
+        The axle moves sideways, with the velocity that the first constraint requires at
+        t = 0.
         `parameters` are the parameters of the class.
         """
         axis = cls(**parameters)

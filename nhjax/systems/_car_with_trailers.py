@@ -27,9 +27,9 @@ class CarWithTrailers(AbstractNonholonomicExample):
     L = Σ ½ m |ċ|² + ½ I θ̇² over the car (i = 0) and its trailers, + ½ J (θ̇₀ + δ̇)²,
 
     q = (x, y, θ₀, δ, θ₁ ... θₙ): the middle of the rear axle [m], the heading of the
-    car, the steer angle of the front wheels relative to it, and the headings of the
-    trailers [rad]. With the unit vector n(θ) to the left of a heading, the wheels do
-    not slip sideways:
+    car, the steer angle of the front wheels relative to the car, and the headings of
+    the trailers [rad]. With the unit vector n(θ) to the left of a heading, the wheels
+    do not slip sideways:
 
     Φ = (n(θ₀)·ṙ₀, n(θ₀ + δ)·ṙ_front, n(θ₁)·ṙ₁ ... n(θₙ)·ṙₙ)
 
@@ -40,16 +40,16 @@ class CarWithTrailers(AbstractNonholonomicExample):
     `args` is None or a pair of the force that drives the car at the rear axle [N] and
     the torque that steers the front wheels [N m]. Without the torque, the momentum
     J (θ̇₀ + δ̇) is conserved. Without the force and the torque, the energy is conserved
-    too. The car turns steadily with `turning`.
+    too. `turning` creates a car that turns steadily.
 
-    **Parameters:** `num_trailers` n, static; of the car `wheelbase` L, `centre` of mass
-    ahead of the rear axle [m], `mass` [kg], `inertia` about the centre and
-    `steer_inertia` J of the front wheels about the vertical [kg m²]; of the trailers,
-    one number for all or n of them, `trailer_length` d from hitch to axle,
-    `trailer_hitch` h, the distance of the hitch behind the axle of the vehicle in
+    **Parameters:** `num_trailers` n, static. For the car: `wheelbase` L, `centre` of
+    mass ahead of the rear axle [m], `mass` [kg], `inertia` about the centre and
+    `steer_inertia` J of the front wheels about the vertical [kg m²]. For the trailers,
+    each one number for all or an array of n numbers: `trailer_length` d from hitch to
+    axle, `trailer_hitch` h, the distance of the hitch behind the axle of the vehicle in
     front, `trailer_centre` of mass ahead of the axle [m], `trailer_mass` [kg] and
     `trailer_inertia` about the centre [kg m²]. The default values do not describe a
-    particular car. By default, `v0` belongs to a speed of 5 m/s at `q0`.
+    particular car. The default `v0` is consistent at `q0`, with a speed of 5 m/s.
 
     **Source:** Laumond, *Controllability of a multibody mobile robot* (1993), and
     Rouchon, Fliess, Lévine and Martin, *Flatness and motion planning: the car with n
@@ -79,7 +79,7 @@ class CarWithTrailers(AbstractNonholonomicExample):
     v0: Array = eqx.field(converter=coordinates, default=None, kw_only=True)
 
     def __post_init__(self) -> None:
-        # Converters of fields come after this.
+        # Equinox applies the converters of the fields after this method.
         if self.num_trailers < 0:
             raise ValueError(
                 f"`num_trailers` must not be negative, got {self.num_trailers}."
@@ -149,11 +149,11 @@ class CarWithTrailers(AbstractNonholonomicExample):
     def velocity(
         self, q: Array, speed: ArrayLike, steer_rate: ArrayLike = 0.0
     ) -> Array:
-        """Compute the v that satisfies the constraints, by the speed of the rear axle.
+        """Compute the v that satisfies the constraints from the speed of the rear axle.
 
         A trailer turns at the rate (v sin β - h θ̇ cos β)/d and has the speed
-        v cos β + h θ̇ sin β, with v and θ̇ of the vehicle in front and the angle β
-        between the two.
+        v cos β + h θ̇ sin β, where v and θ̇ are the speed and the turning rate of the
+        vehicle in front, and β is the angle between the two vehicles.
         """
         along, steering = (jnp.asarray(x, q.dtype) for x in (speed, steer_rate))
         heading, steer = q[2], q[3]
@@ -180,7 +180,7 @@ class CarWithTrailers(AbstractNonholonomicExample):
         return value
 
     def constraint(self, t: FloatScalarLike, q: Array, v: Array, args: Args) -> Array:
-        """Compute Φ, the velocities of the axles to the left of their wheels."""
+        """Compute Φ, the sideways velocities of the axles, positive to the left."""
         _, velocities = jax.jvp(lambda q: _axles(self, q), (q,), (v,))
         headings = [q[2], q[2] + q[3], *q[4:]]
         slips = [
@@ -207,7 +207,7 @@ class CarWithTrailers(AbstractNonholonomicExample):
         }
 
     def points(self, t: FloatScalarLike, q: Array) -> dict[str, Float[Array, "2"]]:
-        """Compute the axles, the centres of mass and the hitches, by name."""
+        """Compute the positions of axles, centres of mass and hitches, by name."""
         rear, front, *axles = _axles(self, q)
         centre, *centres = _centres(self, q)
         points = {"rear_axle": rear, "front_axle": front, "centre": centre}
@@ -246,7 +246,7 @@ def _hitches(car: CarWithTrailers, dtype: DTypeLike) -> list[tuple[Array, Array]
 
 
 def _of_trailers(car: CarWithTrailers, name: str, dtype: DTypeLike) -> list[Array]:
-    """Return a parameter of each trailer."""
+    """Return one value of a parameter for each trailer."""
     value = coordinates(getattr(car, name)).astype(dtype)
     if value.shape == ():
         return [value] * car.num_trailers

@@ -81,8 +81,8 @@ class ChaoticSystem(AbstractConstrainedExample):
         """Create initial data (q0, v0) of shape (J + 1, n), all with the same energy.
 
         `members` is the paper's J: row j = 0..J has q_1 = cos(jπ/2J) and
-        v_2 = sin(jπ/2J). For m = 3 these are the paper's data, of energy 3.06; for
-        another m the same pattern, q_2..q_{m+1} = m/5..1/5 and q_{m+2}..q_n = 1.
+        v_2 = sin(jπ/2J). For m = 3 these are the paper's data, of energy 3.06. Other
+        m have the same pattern: q_2..q_{m+1} = m/5..1/5 and q_{m+2}..q_n = 1.
         """
         if members < 1:
             raise ValueError(f"`members` must be at least 1, got {members}.")

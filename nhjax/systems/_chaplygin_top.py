@@ -28,7 +28,7 @@ class ChaplyginTop(AbstractRollingBody):
     contact is s, seen from the centre of mass; Φ is its height, and φ the horizontal
     velocity there. The multipliers are the force of the plane in space [N].
 
-    If I₁ = I₂, it is Routh's sphere, which is integrable: besides the energy it
+    If I₁ = I₂, the body is Routh's sphere, which is integrable: besides the energy it
     conserves Jellett's integral K·s, with the angular momentum K about the contact, and
     Routh's integral ω₃ √(I₁I₃ + m (I₁ (s₁² + s₂²) + I₃ s₃²)).
 

@@ -85,8 +85,8 @@ class ContinuouslyVariableTransmission(AbstractConstrainedExample):
     def exact_driver(self, t: float) -> tuple[float, float]:
         """Compute (y, ẏ) at `t` for ε = 0, except at the upright equilibrium.
 
-        With k² = (1 + E_d)/2 the pendulum is sin(y/2) = k sn(t + t0 | k²) where it
-        oscillates, k <= 1, and y/2 = ±am(k(t + t0) | 1/k²) where it rotates.
+        With k² = (1 + E_d)/2, sin(y/2) = k sn(t + t0 | k²) if the pendulum oscillates
+        (k < 1), and y/2 = ±am(k(t + t0) | 1/k²) if it rotates.
         """
         if float(self.epsilon) != 0:
             raise ValueError(

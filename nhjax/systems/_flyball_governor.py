@@ -33,12 +33,13 @@ class FlyballGovernor(AbstractExample):
     radius a and the height h. Seen from the hinge, the centre of the rod is c_k = ½ l
     u_k, and its ball is b_k = l u_k.
 
-    A coupler of length d ties the middle of each rod to the slider at the radius a. It
-    is either a rigid rod (`couplers="rods"`), V = 0 and Φ_k = d_k² - d² with d_k the
-    distance of its ends, or a spring with a damper (`"springs"`), V = Σ K/2 (d_k - d)²
-    and forces -C ḋ_k, for which the published parameters are stiff.
+    A coupler of length d ties the middle of each rod to the slider at the radius a; d_k
+    is the distance between its ends. The couplers are either rigid rods
+    (`couplers="rods"`), with V = 0 and Φ_k = d_k² - d², or springs with dampers
+    (`"springs"`), with V = Σ K/2 (d_k - d)² and the forces -C ḋ_k. With springs and the
+    published parameters, the system is stiff.
 
-    `args` may contain a torque on the shaft [N m], a scalar.
+    `args` is None or the torque on the shaft [N m], a scalar.
 
     **Parameters:** `shaft_inertia` J_s, `slider_inertia` J_m, `rod_inertias` (A, B)
     along and across a rod [kg m²]; `slider_mass` m, `rod_mass` m_r, `ball_mass` M [kg];
@@ -165,7 +166,7 @@ class FlyballGovernor(AbstractExample):
         return self._square_distances(q) - self.coupler_length**2
 
     def force(self, t: FloatScalarLike, q: Array, v: Array, args: Args) -> Array:
-        """Compute the forces of the dampers, and the torque in `args` on the shaft."""
+        """Compute the forces of the dampers, and the torque `args` on the shaft."""
         torque = given_forces(args, (), v.dtype, "a torque on the shaft")
         driving = jnp.zeros_like(v).at[0].set(torque)
         if self.couplers == "rods":
@@ -187,7 +188,7 @@ class FlyballGovernor(AbstractExample):
         return conserved | {"energy": self.energy(t, q, v)}
 
     def points(self, t: FloatScalarLike, q: Array) -> dict[str, Array]:
-        """Compute hinges, middles of rods, balls, and joints of the slider, (3,)."""
+        """Compute hinges, middles of rods, balls and joints of the slider in space."""
         hinges, rods = self._rods(q)
         lifted = hinges.at[:, 2].set(q[3])
         places = {

@@ -29,8 +29,8 @@ class FourBar(AbstractExample):
 
     with q = (θ₁, θ₂, θ₃), the angles of crank, coupler and rocker from the horizontal
     [rad], and e(θ) = (cos θ, sin θ). The crank turns about the origin, the rocker about
-    (l₄, 0). The bars are uniform, I = m l²/12 about their centres c. By default it is
-    a crank-rocker of 1 kg/m whose crank makes full turns.
+    (l₄, 0). The bars are uniform, I = m l²/12 about their centres c. The default is a
+    crank-rocker, whose crank makes full turns, with bars of 1 kg/m.
 
     **Parameters:** `lengths` (l₁, l₂, l₃, l₄) [m], the last for the ground; `masses`
     (m₁, m₂, m₃) [kg]; `gravity` g [m/s²]; `torque` M on the crank [N m].
@@ -67,8 +67,9 @@ class FourBar(AbstractExample):
 
     @classmethod
     def turning(cls, angle: ArrayLike, rate: ArrayLike, **parameters: Any) -> "FourBar":
-        """Create a linkage with the crank at `angle` and `rate`, the coupler above.
+        """Create a linkage with the crank at `angle` and `rate`.
 
+        The coupler is on the left of the line from the crank's end to (l₄, 0).
         `parameters` are the parameters of the class.
         """
         first, second, third, ground = cls(**parameters).lengths
@@ -95,8 +96,8 @@ class FourBar(AbstractExample):
     def parallelogram(cls) -> "FourBar":
         """Create the benchmark of one loop: bars of 1 m, 1 kg, falling to the right.
 
-        The crank is upright, and its end moves at 1 m/s. With all bars horizontal,
-        first after 0.71 s, the loop may fold: the constraints are dependent there.
+        The crank is upright, and its end moves at 1 m/s. When all bars are horizontal,
+        first after 0.71 s, the constraints are dependent, and the loop may fold.
         """
         q0, v0 = (0.5 * math.pi, 0.0, 0.5 * math.pi), (-1.0, 0.0, -1.0)
         return cls((1.0,) * 4, (1.0,) * 3, q0=q0, v0=v0)

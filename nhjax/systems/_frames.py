@@ -23,10 +23,10 @@ class Frame(NamedTuple):
 def angular_velocity(
     frame: Frame, rate: Frame, spin: Float[Array, ""]
 ) -> Float[Array, "3"]:
-    """Compute the angular velocity, in the axes of a moving frame, of a wheel on it.
+    """Compute the angular velocity of a wheel on a moving frame, in the frame's axes.
 
-    The wheel turns at the rate `spin` about the second axis of the frame; zero for the
-    frame itself.
+    The wheel turns at the rate `spin` about the second axis of the frame. With the rate
+    zero, this is the angular velocity of the frame itself.
     """
     skew = frame.rotation.T @ rate.rotation
     return jnp.stack([skew[2, 1], skew[0, 2] + spin, skew[1, 0]])
@@ -35,7 +35,7 @@ def angular_velocity(
 def down(rotation: Float[Array, "3 3"]) -> Float[Array, "3"]:
     """Compute the direction from the hub of a wheel to its point with largest z.
 
-    Its axle is the second axis of the frame with `rotation`.
+    The axle of the wheel is the second axis of the frame with `rotation`.
     """
     axle = rotation[:, 1]
     below = jnp.asarray([0, 0, 1], axle.dtype) - axle[2] * axle
@@ -56,7 +56,7 @@ def contact_velocity(
     rate: Frame,
     spin: Float[Array, ""],
 ) -> Float[Array, "3"]:
-    """Compute the velocity of the point of the wheel that is its contact point."""
+    """Compute the velocity of the material point of a wheel at its contact."""
     turning = frame.rotation @ angular_velocity(frame, rate, spin)
     return rate.move(hub) + jnp.cross(turning, radius * down(frame.rotation))
 
@@ -83,7 +83,7 @@ def about_z(angle: Float[Array, ""]) -> Float[Array, "3 3"]:
 
 
 def about_axis(axis: Float[Array, "3"], angle: Float[Array, ""]) -> Float[Array, "3 3"]:
-    """Compute the rotation by `angle` about a unit vector, exactly 1 at 0."""
+    """Compute the rotation about a unit vector; the identity exactly at angle 0."""
     x, y, z = axis
     zero = jnp.zeros_like(x)
     skew = jnp.stack([zero, -z, y, z, zero, -x, -y, x, zero]).reshape(3, 3)

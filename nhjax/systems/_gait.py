@@ -1,4 +1,4 @@
-"""Joints that move as given functions of time, and so propel a machine."""
+"""Joints that move as given functions of time and thus propel a machine."""
 
 import abc
 from collections.abc import Callable
@@ -21,7 +21,7 @@ class Sinusoid(eqx.Module):
     phase: Array = eqx.field(converter=coordinates)
 
     def __call__(self, t: Array) -> Array:
-        """Compute the angles at `t`, in its precision."""
+        """Compute the angles at `t`, in the precision of `t`."""
         amplitude, rate, phase = jax.tree.map(
             lambda x: x.astype(t.dtype), (self.amplitude, self.rate, self.phase)
         )
@@ -34,7 +34,7 @@ class Sinusoid(eqx.Module):
 
 
 class AbstractGaitMachine(AbstractNonholonomicExample):
-    """A machine whose joints move by a `gait`, or freely under torques without one."""
+    """A machine whose joints follow a `gait`, or move freely if `gait` is None."""
 
     gait: eqx.AbstractVar[Callable[[Array], Array] | None]
 

@@ -23,7 +23,7 @@ class HeavyTop(AbstractExample):
 
     with q the attitude R, a quaternion, ω the body angular velocity along the principal
     axes, and X the centre of mass in the body, seen from the pivot. If J₁ = J₂ and X
-    lies on the third axis, as by default, it is Lagrange's top.
+    lies on the third axis, as by default, the body is Lagrange's top.
 
     **Parameters:** `mass` m [kg], `moments` (J₁, J₂, J₃) about the centre of mass
     [kg m²], `centre` X [m], `gravity` g [m/s²]; `retraction`, the retraction of SO(3).
@@ -115,7 +115,7 @@ class HeavyTopSE3(AbstractExample):
     with q = (R, x): the attitude, a quaternion, and the position of the centre of mass;
     (v, ω) are their body velocities, and X is the centre of mass in the body, seen from
     the pivot. The three constraints are holonomic, and their multiplier is the force of
-    the pivot in space. It moves like `HeavyTop` with the same parameters.
+    the pivot in space. The body moves like `HeavyTop` with the same parameters.
 
     **Parameters:** the parameters of `HeavyTop`; `retraction`, the retraction of SE(3).
 

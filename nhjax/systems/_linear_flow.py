@@ -1,4 +1,4 @@
-"""Solutions to round-off of linear equations with given coefficients, and attitudes."""
+"""Solutions of linear differential equations, and attitudes, to round-off."""
 
 import math
 from collections.abc import Callable
@@ -26,9 +26,9 @@ def linear_flow(
 ) -> np.ndarray:
     """Compute the solution at `t` of u' = A u, u(0) = `start`, of shape (n,) or (n, k).
 
-    Gauss collocation of order 40 on panels of length 1/`rate`. `matrix` maps times of
-    shape (k,) to A of shape (k, n, n); `rate` is the inverse of the shortest time scale
-    of A and of u.
+    The method is Gauss collocation of order 40 on panels of length 1/`rate` or less.
+    `matrix` maps times of shape (k,) to A of shape (k, n, n); `rate` is the inverse of
+    the shortest time scale of A and of u.
     """
     panels = math.ceil(abs(t) * rate) + 1
     half_width = 0.5 * t / panels
@@ -84,7 +84,10 @@ def rotation(quaternion: np.ndarray) -> np.ndarray:
 
 
 def _product_matrix(omega: np.ndarray, side: float) -> np.ndarray:
-    """Create the matrix of the product with (0, ω) from the right (1) or left (-1)."""
+    """Create the matrix of the product with (0, ω).
+
+    The factor (0, ω) is on the right if `side` is 1, and on the left if it is -1.
+    """
     a, b, c = omega
     zero = np.zeros_like(a)
     rows = (

@@ -23,15 +23,15 @@ class PendulumChain(AbstractExample):
     L = Σ m_k (½ |ṙ_k|² - g y_k),  Φ_k = |r_k - r_{k-1}|² - l_k²,  k = 1, ..., n,
 
     with q = (x₁, y₁, ..., x_n, y_n) [m], y upwards, and the pivot r₀ = 0. There are n
-    holonomic constraints on 2n coordinates; with many links it is a discrete rope.
+    holonomic constraints on 2n coordinates. A chain with many links is a discrete rope.
 
     **Parameters:** `num_links` n, static; `masses` m_k [kg] and `lengths` l_k [m], one
     for all or of shape (n,); `gravity` g [m/s²]. By default all rods lie on one line,
     at half a radian from the vertical and at rest.
 
     **Source:** Daniel Bernoulli (1738); Hairer, Lubich and Wanner, *Geometric Numerical
-    Integration*, section VII.1, for the formulation. With two links it is the
-    `DoublePendulum`.
+    Integration*, section VII.1, for the formulation. With two links the chain is
+    the `DoublePendulum`.
 
     !!! example
 

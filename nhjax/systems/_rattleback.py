@@ -43,7 +43,8 @@ class Rattleback(AbstractRollingBody):
 
     **Source:** Kane and Levinson, *Realistic mathematical modeling of the rattleback*,
     International Journal of Non-Linear Mechanics 17 (1982), whose parameters are the
-    default. Their third axis is downward, so that D = -J₁₂ there; their σ is 1e-4.
+    default. Their third axis is downward, so that their product D is -J₁₂; their σ is
+    1e-4.
 
     !!! example
 
@@ -106,9 +107,9 @@ class Rattleback(AbstractRollingBody):
     ) -> "Rattleback":
         """Create a stone that spins at the rate ω₃ = `spin` about its own third axis.
 
-        `tilts` are the angles (α, β) of Kane and Levinson in degrees: it is turned
-        about the horizontal first axis by α, and then about its second one by -β.
-        `parameters` are the parameters of the class.
+        `tilts` are the angles (α, β) of Kane and Levinson in degrees: the stone is
+        turned about its first axis, which is horizontal, by α, and then about its
+        second axis by -β. `parameters` are the parameters of the class.
         """
         lean, pitch = 0.5 * jnp.deg2rad(coordinates(tilts))
         zero = jnp.zeros_like(lean)
@@ -150,7 +151,7 @@ class Rattleback(AbstractRollingBody):
         return jnp.concatenate([jnp.zeros_like(v[:3]), -damping * v[3:]])
 
     def invariants(self, t: FloatScalarLike, q: Array, v: Array) -> dict[str, Array]:
-        """Compute the conserved quantities: the energy, or with damping none."""
+        """Compute the conserved quantities: the energy, or none with damping."""
         if self.damping is not None:
             return {}
         return {"energy": self.energy(t, q, v)}

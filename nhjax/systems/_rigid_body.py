@@ -83,8 +83,8 @@ class FreeRigidBody(AbstractExample):
     def exact(self, t: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Compute (q, v, λ) at time `t`; λ is empty without constraints.
 
-        ω is given by Jacobi's elliptic functions; the attitude follows from ω by a
-        linear equation, to round-off.
+        ω is given by Jacobi's elliptic functions. The attitude then satisfies a linear
+        differential equation, which is solved to round-off.
         """
         quaternion, omega0, moments = on_host((self.q0, self.v0, self.moments))
         angular_velocity, rate = _euler_solution(moments, omega0)
@@ -98,10 +98,11 @@ class FreeRigidBody(AbstractExample):
 def _euler_solution(
     moments: np.ndarray, omega0: np.ndarray
 ) -> tuple[Callable[[np.ndarray], np.ndarray], float]:
-    """Find the solution ω(t) of Euler's equations, and a bound of its rate and size.
+    """Find the solution ω(t) of Euler's equations, and a bound on its rate and size.
 
-    Let 3 be the axis that ω turns about in the body, the largest or the smallest one,
-    and 2 the middle one: then ω₁, ω₂, ω₃ are multiples of cn, sn, dn.
+    Let 2 be the principal axis with the middle moment, and 3 the principal axis around
+    which ω moves in the body; axis 3 has the largest or the smallest moment. Then ω₁,
+    ω₂, ω₃ are multiples of cn, sn, dn.
     """
     size = float(np.linalg.norm(omega0))
     gaps = np.roll(moments, -1) - np.roll(moments, 1)
@@ -135,7 +136,7 @@ def _euler_solution(
 
 
 def _cn_sn_dn_axes(moments: np.ndarray, omega0: np.ndarray) -> list[int]:
-    """Find the axes 1, 2, 3 of the solution by cn, sn, dn."""
+    """Find the axes along which ω is a multiple of cn, sn and dn, in this order."""
     low, middle, high = np.argsort(moments)
     # The sign of L² - 2E I₂ gives the side of the separatrix on which ω is.
     excess = moments * (moments - moments[middle]) * omega0**2

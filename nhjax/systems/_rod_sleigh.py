@@ -26,7 +26,8 @@ class RodSleigh(AbstractNonholonomicExample):
 
     L = m₁/2 |ṙ₁|² + m₂/2 |ṙ₂|²,  q = (x₁, y₁, x₂, y₂),
 
-    the nonholonomic constraint Φ = n·ṙ₁ and the holonomic one Φ_hol = |r₂ - r₁|² - l².
+    with the nonholonomic constraint Φ = n·ṙ₁ and the holonomic constraint
+    Φ_hol = |r₂ - r₁|² - l².
     The blade makes the angle β with the rod; its normal n is (r₂ - r₁)/l turned by
     β + π/2. For β = 0 this is the `ChaplyginSleigh`. For other angles n is not
     orthogonal to the rod, so that the reactions of the two constraints are coupled.
@@ -133,7 +134,7 @@ class RodSleigh(AbstractNonholonomicExample):
     def exact(self, t: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Compute (q, v, λ) at `t`, for consistent data, a turning rod and cos β != 0.
 
-        λ is (nonholonomic, holonomic); the motion is the same as of
+        λ is (nonholonomic, holonomic). The motion is computed from the motion of
         `equivalent_sleigh`.
         """
         self._consistent_data()
@@ -167,7 +168,7 @@ class RodSleigh(AbstractNonholonomicExample):
         )
 
     def equivalent_sleigh(self) -> ChaplyginSleigh:
-        """Create the Chaplygin sleigh of the same motion, its contact moved along n."""
+        """Create a Chaplygin sleigh with this motion; its contact is moved along n."""
         rod, swing = self.q0[2:] - self.q0[:2], self.v0[2:] - self.v0[:2]
         heading = jnp.arctan2(rod[1], rod[0]) + self.angle
         turn_rate = (rod[0] * swing[1] - rod[1] * swing[0]) / self.length**2

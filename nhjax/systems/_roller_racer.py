@@ -28,10 +28,10 @@ class RollerRacer(AbstractGaitMachine):
     Φ = (n₁ · ṙ₁, n₂ · ṙ₂),  r₂ = r₁ + d₁ e(θ) + d₂ e(θ + φ),
 
     with q = (x, y, θ, φ): the axle r₁ [m] and the heading θ [rad] of the seat, and the
-    angle φ of the handlebar relative to it [rad]; e is the unit vector at an angle, and
-    n₁, n₂ are the unit vectors across the two bodies. The centres of mass lie at the
-    axles, d₁ behind and d₂ ahead of the pivot. Where d₁ cos φ + d₂ = 0 the turning is
-    not determined by the constraints.
+    angle φ of the handlebar relative to the seat [rad]; e is the unit vector at an
+    angle, and n₁, n₂ are the unit vectors across the two bodies. The centres of mass
+    lie at the axles, d₁ behind and d₂ ahead of the pivot. Where d₁ cos φ + d₂ = 0 the
+    constraints do not determine the turning rate.
 
     The pivot is either prescribed by a `gait`, Γ = φ - gait(t), or with `gait=None` it
     moves freely under the torque [N m] in `args`, a scalar or `None`. By default it

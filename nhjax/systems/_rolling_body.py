@@ -35,7 +35,8 @@ class AbstractRollingBody(AbstractConstrainedGroupExample):
     mass: eqx.AbstractVar[Array]
     retraction: eqx.AbstractVar[AbstractRetraction]
 
-    # An abstract field `gravity` would come second among the arguments of all bodies.
+    # This is a property, because an abstract field `gravity` would become the second
+    # argument of all bodies.
     @property
     @abc.abstractmethod
     def weight(self) -> Array:

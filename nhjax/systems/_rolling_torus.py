@@ -28,10 +28,11 @@ class RollingTorus(AbstractRollingBody):
     ω) are their body velocities [m/s, 1/s], and the third body axis is the axle. The
     lowest point is s, seen from the centre; Φ is its height, and φ the horizontal
     velocity at the contact. The multipliers are the force of the plane in space [N].
-    With r = 0, the default, it is a disc of zero thickness: Euler's disc without slip.
+    With r = 0, the default, the body is a disc of zero thickness: Euler's disc without
+    slip.
 
     The axle must not be vertical. In a steady motion the centre moves on a circle, or
-    rests, at a constant tilt: `steady`, `circling`.
+    rests, at a constant tilt; `steady` and `circling` create such motions.
 
     **Parameters:** `mass` m [kg]; `radius` a of the circle in the middle of the tube,
     and `tube_radius` r [m]; `diametral_inertia` I and `axial_inertia` J about the
@@ -113,10 +114,10 @@ class RollingTorus(AbstractRollingBody):
     ) -> "RollingTorus":
         """Create a torus whose centre moves steadily on a circle, or rests.
 
-        `tilt` [rad] is the angle of the axle to the vertical, below π/2, and
-        `radius_of_path` the radius [m] of the circle of the centre, towards the middle
-        of which the torus leans. It is 0 if the centre rests. `parameters` are the
-        parameters of the class.
+        `tilt` [rad] is the angle of the axle to the vertical, below π/2.
+        `radius_of_path` [m] is the radius of the circle on which the centre moves, or 0
+        if the centre rests. The torus leans towards the middle of the circle.
+        `parameters` are the parameters of the class.
         """
         angle, path = parameter(tilt), parameter(radius_of_path)
         _require_between("tilt", angle, 0.5 * jnp.pi, "π/2")

@@ -107,7 +107,7 @@ class SliderCrank(AbstractExample):
         return bars + slider - self.gravity * (masses @ centres[:, 1])
 
     def holonomic(self, t: FloatScalarLike, q: Array, args: Args) -> Array:
-        """Compute the constraints, by which the rod ends at the slider."""
+        """Compute the constraints, which connect the rod to the slider."""
         return self._pin(q) + self._rod(q) - self._slider(q)
 
     def force(self, t: FloatScalarLike, q: Array, v: Array, args: Args) -> Array:
@@ -119,7 +119,7 @@ class SliderCrank(AbstractExample):
         return {"energy_less_work": self.energy(t, q, v) - self.torque * q[0]}
 
     def points(self, t: FloatScalarLike, q: Array) -> dict[str, Array]:
-        """Compute the places of the crank's axle, its pin and the slider, (2,)."""
+        """Compute the places of the axle, the pin and the slider, of shape (2,)."""
         pin = self._pin(q)
         return {"axle": jnp.zeros_like(pin), "pin": pin, "slider": self._slider(q)}
 

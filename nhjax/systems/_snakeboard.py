@@ -29,8 +29,8 @@ class Snakeboard(AbstractGaitMachine):
          -sin(θ + φ_f) ẋ + cos(θ + φ_f) ẏ + l cos φ_f θ̇),
 
     with q = (x, y, θ, ψ, φ_b, φ_f): the centre [m] and heading [rad] of the board, and
-    the angles of rotor, rear and front axle relative to it [rad]. The axles lie l
-    behind and ahead of the centre, and do not slip sideways. If φ_b = φ_f = π/2, the
+    the angles of rotor, rear and front axle relative to the board [rad]. The axles lie
+    l behind and ahead of the centre, and do not slip sideways. If φ_b = φ_f = π/2, the
     constraints are dependent.
 
     The joints are either prescribed by a `gait`, Γ = (ψ, φ_b, φ_f) - gait(t), or with
@@ -123,7 +123,7 @@ class Snakeboard(AbstractGaitMachine):
     ) -> "Snakeboard":
         """Create a board with gait (ψ, φ_b, φ_f) = amplitudes sin(rates t + phases).
 
-        It starts at t = 0 at the origin, and its centre moves ahead at `speed`.
+        The board starts at t = 0 at the origin, and its centre moves ahead at `speed`.
         """
         gait = Sinusoid(amplitudes, rates, phases)
         joints, joint_rates = gait.at_start()
@@ -169,7 +169,7 @@ class Snakeboard(AbstractGaitMachine):
         }
 
     def points(self, t: FloatScalarLike, q: Array) -> dict[str, Array]:
-        """Compute the places of centre, axles and one end of the rotor, (2,)."""
+        """Compute the places of centre, axles and a rotor end, of shape (2,)."""
         rear, front = self._axles(q)
         rotor = q[:2] + self.half_length * direction(q[2] + q[3])
         return {"centre": q[:2], "rear": rear, "front": front, "rotor_end": rotor}

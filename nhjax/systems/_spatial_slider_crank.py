@@ -32,8 +32,8 @@ class SpatialSliderCrank(AbstractExample):
     with q = (θ, α, β, x): the angle of the crank about the x-axis, the two angles of
     the universal joint at the slider [rad], and the place of the slider [m]. The rod
     has the angular velocity ω = (α̇ cos β, β̇, α̇ sin β) in its own axes, of which the
-    first is e, and ends in a spherical joint at the pin p of the crank; c is its
-    centre, and J = I_c + m_c r²/4.
+    first is e. It ends in a spherical joint at the pin p of the crank. The centre of
+    the rod is c, and J = I_c + m_c r²/4.
 
     **Parameters:** `crank_length` r, `rod_length` l, `axle` (y₀, z₀) [m]; `crank_mass`
     m_c, `rod_mass` m_r, `slider_mass` m_s [kg]; `crank_inertia` I_c about its middle,
@@ -139,7 +139,7 @@ class SpatialSliderCrank(AbstractExample):
         return {"energy": self.energy(t, q, v)}
 
     def points(self, t: FloatScalarLike, q: Array) -> dict[str, Array]:
-        """Compute the places of the crank's axle and pin, and of the slider, (3,)."""
+        """Compute the places of the axle, the pin and the slider, of shape (3,)."""
         pin = self._pin(q[0])
         axle = jnp.concatenate([jnp.zeros_like(pin[:1]), self.axle.astype(q.dtype)])
         return {"axle": axle, "pin": pin, "slider": _along(q[3])}

@@ -97,8 +97,8 @@ class SphericalPendulum(AbstractExample):
     def exact(self, t: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Compute (q, v, λ) at `t`, for every consistent (`q0`, `v0`).
 
-        The height is z = z₁ + (z₂ - z₁) sn². With it the multiplier is known, and x and
-        y follow from the linear equation m ẍ = 2λx, to round-off.
+        The height is z = z₁ + (z₂ - z₁) sn², and determines the multiplier. Then x and
+        y satisfy the linear equation m ẍ = 2λx, which is solved to round-off.
         """
         require_consistent("q0", self.holonomic(0.0, self.q0, None), self.q0)
         require_consistent("v0", self.q0 @ self.v0, self.v0)
@@ -127,7 +127,7 @@ def _height(
     """Create the function that computes (z, ż) at given times.
 
     l²ż² is a cubic in z with the leading coefficient 2g and the roots z₁ <= z₂ <= z₃.
-    In powers of z - z₀ its small roots keep their digits.
+    It is written in powers of z - z₀, so that roots near z₀ lose no digits.
     """
     z0, dz0 = q0[2], v0[2]
     kinetic, radius_squared = 0.5 * (v0 @ v0), q0[0] ** 2 + q0[1] ** 2

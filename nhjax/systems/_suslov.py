@@ -87,8 +87,8 @@ class Suslov(AbstractConstrainedGroupExample):
         """Compute (q, v, λ) at `t`, for consistent data and `products` != 0.
 
         With √I₁₁ ω₁ = √(2E) cos α and √I₂₂ ω₂ = √(2E) sin α, α̇ = κ cos(α - α*): the
-        components of ω are tanh and sech functions. The attitude follows from ω by a
-        linear equation, to round-off.
+        components of ω are tanh and sech functions. The attitude then satisfies a
+        linear differential equation, which is solved to round-off.
         """
         quaternion, v0 = self._consistent_data()
         I1, I2, _ = np.asarray(self.moments, dtype=np.float64)

@@ -143,8 +143,9 @@ class TurntableBall(AbstractConstrainedGroupExample):
     ) -> dict[str, Array]:
         """Compute the moving energy and the momentum about the contact, in space.
 
-        For a homogeneous ball, the components of this momentum are r(1 + a) times the
-        components of `first_integrals` (r²a for the third).
+        For a homogeneous ball, the horizontal components of this momentum are r(1 + a)
+        times the second and the third value of `first_integrals`, and the vertical
+        component is r²a times the first value.
         """
         x, y = q[1]
         energy = self.energy(t, q, v)
@@ -175,7 +176,7 @@ class TurntableBall(AbstractConstrainedGroupExample):
     ) -> tuple[tuple[np.ndarray, np.ndarray], np.ndarray, np.ndarray]:
         """Compute (q, v, λ) at `t`, for consistent data and a = b = c.
 
-        The attitude is the solution of a linear equation with the known angular
+        The attitude solves a linear differential equation with the known angular
         velocity, to round-off. All other values have closed formulas.
         """
         (quaternion, (x0, y0)), v0 = self._consistent_data()

@@ -32,17 +32,18 @@ class TwoWheeledRobot(AbstractNonholonomicExample):
 
     Φ = (n·ṙ, e·ṙ + b θ̇ - ρ φ̇_R, e·ṙ - b θ̇ - ρ φ̇_L).
 
-    The multipliers are the forces of the ground [N]: on both wheels together to the
-    left, and ahead on the right and on the left wheel. Castors are left out.
+    The multipliers are the forces of the ground [N]: the force to the left on both
+    wheels together, and the forward forces on the right and on the left wheel. Castors
+    are left out.
 
     `args` is None or a pair of the torques of the motors on the right and on the left
     wheel [N m]; without them energy is conserved.
 
     **Parameters:** `mass` m of the platform [kg], its `inertia` I about its centre of
-    mass [kg m²] and the `offset` d of this ahead of the axle [m]; `half_track` b, half
-    of the distance of the wheels, and their `radius` ρ [m]; of each wheel `wheel_mass`
-    m_w [kg] and, with the rotor of its motor, `axle_inertia` I_w about the axle and
-    `wheel_inertia` I_m about a diameter [kg m²].
+    mass [kg m²] and the `offset` d of this centre ahead of the axle [m]; `half_track`
+    b, half of the distance between the wheels, and their `radius` ρ [m]; for each
+    wheel, `wheel_mass` m_w [kg], and `axle_inertia` I_w about the axle and
+    `wheel_inertia` I_m about a diameter [kg m²], both with the rotor of its motor.
 
     **Source:** Yamamoto and Yun, *Coordinating locomotion and manipulation of a mobile
     manipulator* (1994); Dhaouadi and Abu Hatab, *Dynamic modelling of
@@ -93,7 +94,7 @@ class TwoWheeledRobot(AbstractNonholonomicExample):
         heading: ArrayLike = 0.0,
         **parameters: Any,
     ) -> "TwoWheeledRobot":
-        """Create a robot that rolls with the speed of the middle of its axle [m/s]."""
+        """Create a rolling robot; the middle of its axle moves at `speed` [m/s]."""
         robot = cls(**parameters)
         ahead, turn = parameter(speed), parameter(turn_rate)
         zero, angle = jnp.zeros_like(ahead), parameter(heading)

@@ -178,7 +178,7 @@ class UnicycleInCoordinates(AbstractConstrainedExample):
 def _lagrangian(
     unicycle: Unicycle | UnicycleInCoordinates, q: Array, v: Array
 ) -> Array:
-    # The rotation is the same for body and for spatial velocities.
+    # The kinetic energy is the same function of body and of spatial velocities.
     translation = 0.5 * unicycle.mass * (v[0] ** 2 + v[1] ** 2)
     rotation = 0.5 * unicycle.inertia * v[2] ** 2
     return translation + rotation - 0.5 * unicycle.spring * (q[0] ** 2 + q[1] ** 2)

@@ -57,23 +57,25 @@ class WhippleBicycle(AbstractNonholonomicExample):
     the rear and on the front wheel, and the force z on the front wheel.
 
     `WhippleBicycle.running(speed, lean=, lean_rate=, steer=, steer_rate=)` creates a
-    bicycle that rolls; all of them are zero by default, except the speed of 4.6 m/s.
-    `steering` is the torque on the steer axis: `SteerTorque()`, a number in `args`;
-    `LeanToSteer(lean_gain=0.0, lean_rate_gain=20.0)`, a rider; your own function
-    (t, q, v, args); or None for an uncontrolled bicycle, whose energy is conserved. If
-    your function needs `args`, pass them also to `initial_state(args=...)`.
+    bicycle that rolls; all these arguments are zero by default, except the speed of
+    4.6 m/s. `steering` gives the torque on the steer axis: `SteerTorque()` reads a
+    number from `args`; `LeanToSteer(lean_gain=0.0, lean_rate_gain=20.0)` is a rider;
+    or pass your own function of (t, q, v, args), or None for an uncontrolled bicycle,
+    whose energy is conserved. If your function needs `args`, pass them also to
+    `initial_state(args=...)`.
 
-    Nothing stops the handlebar of a bicycle that falls: its velocities grow without
+    Nothing stops the handlebar of a bicycle that falls: the velocities grow without
     bound, until no step size is small enough. End the run with an `Event` before |lean|
     reaches 0.8 or |steer| reaches 1.
 
     **Parameters:** `wheelbase` w, `trail` c [m], `tilt` λ of the steer axis [rad],
-    `gravity` g [m/s²]; of the wheels `rear_radius`, `front_radius` [m],
+    `gravity` g [m/s²]. For the wheels: `rear_radius`, `front_radius` [m],
     `rear_wheel_mass`, `front_wheel_mass` [kg], `rear_wheel_inertia` and
-    `front_wheel_inertia` (xx, yy) [kg m²] about a diameter and the axle; of the frames
-    `rear_frame_mass`, `front_frame_mass` [kg], `rear_frame_centre` and
-    `front_frame_centre` (x, z) [m] from the rear contact in the upright bicycle,
-    `rear_frame_inertia` and `front_frame_inertia` (xx, yy, zz, xz) [kg m²] about it.
+    `front_wheel_inertia` (xx, yy) [kg m²] about a diameter and the axle. For the
+    frames: `rear_frame_mass`, `front_frame_mass` [kg], `rear_frame_centre` and
+    `front_frame_centre` (x, z) [m] from the rear contact in the upright bicycle, and
+    `rear_frame_inertia` and `front_frame_inertia` (xx, yy, zz, xz) [kg m²] about the
+    centre of the frame.
 
     **Source:** Meijaard, Papadopoulos, Ruina and Schwab, *Linearized dynamics equations
     for the balance and steer of a bicycle*, Proc. R. Soc. A 463 (2007), table 1, whose
@@ -269,7 +271,7 @@ def _wheels(bicycle: WhippleBicycle, q: Array) -> tuple[_Wheel, _Wheel]:
 
 
 def _frames(bicycle: WhippleBicycle, q: Array) -> tuple[Frame, Frame]:
-    """Compute the positions of the rear and front frame, from the upright bicycle."""
+    """Compute the rigid motions of rear and front frame from the upright bicycle."""
     x, y, yaw, lean, pitch, steer = q[:6]
     rotation = about_z(yaw) @ about_x(lean) @ about_y(pitch)
     hub, radius = _wheels(bicycle, q)[0]
@@ -290,7 +292,7 @@ def _in_plane(q: Array, x: Array, z: Array) -> Float[Array, "3"]:
 class SteerTorque(eqx.Module):
     """The torque of a rider on the handlebar: `args`, in N m, positive to the right.
 
-    Without `args` there is none.
+    If `args` is None, the torque is zero.
 
     !!! example
 
@@ -340,7 +342,7 @@ def _rolling_start(
     steer_rate: Array,
     speed: Array,
 ) -> tuple[Array, Array, Array]:
-    """Compute (q0, v0): the pitch by Newton's method, the other rates linearly.
+    """Compute (q0, v0) by Newton's method for the pitch and a linear solve for v.
 
     The third result is whether both wheels touch the ground.
     """

@@ -264,9 +264,10 @@ def signs_at(
 ) -> tuple[ConditionSigns, BoolScalar]:
     """Compute the signs of all conditions at a state, and whether all are finite.
 
-    A condition counts as zero if the motion brings it to zero, or has left zero, within
-    a small part of a step. It also counts as zero if it is not larger than its
-    `round_off`, which is measured unless it is given.
+    A condition counts as zero if, at its present rate, it changes by its own value
+    within a small part of a step: it will be zero or was zero at almost the same time.
+    It also counts as zero if its absolute value is not larger than its `round_off`,
+    which is measured unless it is given.
     """
     step_state = jax.lax.stop_gradient(step_state)
     system, dt, args = stepper.system, stepper.dt, stepper.args
@@ -324,7 +325,7 @@ class EventOutcome(NamedTuple):
     - `step_state`: the state from which the run continues.
     - `signs`: the signs of the conditions at this state.
     - `pending`: the conditions that a reset has carried across zero.
-    - `result`: whether the run goes on, ends or fails.
+    - `result`: whether the run continues, ends or fails.
     """
 
     step_state: StepState
@@ -372,7 +373,7 @@ class EventActions(eqx.Module):
     def only_end(self) -> bool:
         """Return whether every event ends the run and none resets the state.
 
-        The run then keeps no log.
+        In this case the run keeps no log.
         """
         return all(self.terminates) and not any(self.resets)
 
@@ -390,10 +391,10 @@ class EventActions(eqx.Module):
     ) -> EventOutcome:
         """Apply the action of event `which` if it `fires`; otherwise do nothing.
 
-        The condition of the event has this `value`, zero up to round-off: after a
+        `value` is the value of the event's condition, zero up to round-off. After a
         reset, values of this size count as zero, so that the event does not occur
-        again at once. The step that led here started with these `signs` and `pending`
-        conditions.
+        again at once. `signs` and `pending` are the signs and the pending conditions at
+        the start of the step that led to the event.
         """
         ends = jnp.asarray(self.terminates)[which]
         result = RESULTS.where(ends, RESULTS.event_occurred, RESULTS.successful)

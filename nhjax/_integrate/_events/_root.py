@@ -29,7 +29,7 @@ class TruncatedStep(NamedTuple):
     - `outcome`: the outcome of the step.
     - `h`: its size.
     - `fired`: the index of the event at its end, -1 if the step is not truncated.
-    - `values`: the conditions at its end.
+    - `values`: the values of the conditions at its end.
     - `crossed`: the conditions that crossed zero in the step.
     """
 
@@ -65,7 +65,8 @@ class ImplicitTruncatedStep(AbstractImplicitFunction[Given, TruncatedStep]):
     - `step`: the step of any size.
     - `signs`: the signs of the conditions at the start of the step.
     - `truncates`: whether to truncate the step at the first event in it.
-    - `values_at_end`: in that case the conditions at the end of the whole step.
+    - `values_at_end`: in that case the values of the conditions at the end of the whole
+        step.
     - `known_event`: the event at which a step of the given size is known to end, -1 for
         none; None if the event must be searched for.
     """
@@ -269,8 +270,9 @@ class Bracket(eqx.Module):
     This method needs about as many evaluations as Newton's method, and at most about
     three times as many evaluations as bisection.
 
-    - `new`, `other`, `old`: the newest point, the other end, and the point before. Each
-        is θ and the values of all functions there.
+    - `new`, `other`, `old`: the newest point, which is one end of the interval, the
+        other end, and the point that was an end before. Each is a pair of θ and the
+        values of all functions there.
     - `is_upper`: whether the newest point is the upper end.
     - `crossed`: the functions that have crossed zero at the upper end.
     """

@@ -60,13 +60,16 @@ class EventLoopState(eqx.Module):
 
     - `node`, `offset`: the time is t_k + offset with k = `node`.
     - `row`: the number of output rows that are filled. It equals `node` until the run
-        ends. After that every iteration fills one more.
-    - `num_iterations`: the number of iterations before the end of the run.
+        ends. After that, with constant steps, every iteration fills one more row.
+    - `num_iterations`: the number of iterations so far, except idle iterations after
+        the end of the run.
     - `num_events`, `last_event`: the number of events, and the index of the last one.
     - `truncates`: whether the next step is to be truncated, since an event is in it.
-    - `values_at_end`: in that case the conditions at the end of the whole step.
+    - `values_at_end`: in that case the values of the conditions at the end of the whole
+        step.
     - `signs`: the signs of the conditions.
-    - `pending`: the conditions that the last reset has carried across zero.
+    - `pending`: the conditions that the last resets have carried across zero, and whose
+        events have not happened yet.
     - `clock`: the time of the last node and the size of the step, in a run whose steps
       differ.
     """
@@ -135,10 +138,12 @@ class AttemptedStep(NamedTuple):
     - `which`: the index of the event at its end, -1 if it ended at a node.
     - `values_at_end`: if the step is truncated, the conditions at the end of the whole
         step.
-    - `meets`, `fires`: whether there is an event, and whether there is room for it.
+    - `meets`, `fires`: whether there is an event, and whether its action is taken. The
+        action is not taken if there is no room for another event, or if the same event
+        repeats at the same time.
     - `whole`: the size of the whole step from the last node.
-    - `decision`, `next_step`: in a run whose steps differ, what the controller decides
-        on the step, and the step as it would end without events.
+    - `decision`, `next_step`: in a run whose steps differ, the decision of the
+        controller about the step, and the step as it would end without events.
     """
 
     is_alive: BoolScalar
@@ -169,7 +174,7 @@ class AttemptedStep(NamedTuple):
 
     @property
     def value(self) -> FloatScalar:
-        """Return the value of the condition at the event if it is round-off, or 0."""
+        """Return the value of the event's condition if it is round-off, otherwise 0."""
         value, at_end = self.step.values[self.which], self.values_at_end[self.which]
         small = float(jnp.finfo(value.dtype).eps) ** 0.5
         is_small = self.is_kept & (jnp.abs(value) <= small * jnp.abs(at_end))
@@ -179,7 +184,8 @@ class AttemptedStep(NamedTuple):
 class EventStepper(AbstractStepper[EventCarry, ReplayedIteration]):
     """Steps from node to node that are truncated at events.
 
-    `plain` takes the single steps, and `sizes` has their sizes if they differ.
+    `plain` takes the single steps. `sizes` chooses their sizes, or is None for constant
+    steps.
     """
 
     plain: PlainStepper
@@ -230,12 +236,13 @@ class EventStepper(AbstractStepper[EventCarry, ReplayedIteration]):
     def log_length(self) -> int:
         """Return the number of events for which the log has room.
 
-        If events only end the run, no log is kept on the way: `finish` makes it.
+        If events only end the run, no log is kept during the run, and `finish` creates
+        it.
         """
         return 0 if self.actions.only_end else self.actions.max_events
 
     def num_filled(self, carry: EventCarry, i: Int[Array, ""]) -> Int[Array, ""]:
-        """Return the number of output rows that are filled: the carry knows it."""
+        """Return the number of output rows that are filled, from the carry."""
         del i
         return carry.place.row
 
@@ -293,7 +300,7 @@ class EventStepper(AbstractStepper[EventCarry, ReplayedIteration]):
     ) -> tuple[EventCarry, StepResult]:
         """Advance to the next node or event. A run that has ended does not change.
 
-        With `replay` the step has the size and the event that are known.
+        If an iteration is repeated, `replay` has the size and the event of its step.
         """
         before, num_steps = carry.place, self.plain.num_steps
         attempt = self._attempt(carry, replay)
@@ -388,7 +395,7 @@ class EventStepper(AbstractStepper[EventCarry, ReplayedIteration]):
     def _attempt(
         self, carry: EventCarry, replay: ReplayedIteration | None
     ) -> AttemptedStep:
-        """Take the rest of a step, or the part up to an event that is known."""
+        """Take the rest of a step, or the part up to the event that `replay` has."""
         before, plain = carry.place, self.plain
         alive = ~self.is_over(carry)
         at_once = jnp.any(before.pending)
@@ -404,8 +411,9 @@ class EventStepper(AbstractStepper[EventCarry, ReplayedIteration]):
         solved = is_taken & (step.outcome.result == RESULTS.successful)
         if self.sizes is not None and next_step is not None:
             decision = self._decision(carry, next_step, step, solved)
-            # An event in an inaccurate step may not be one. A step that ends at an
-            # event is a part of a step that was accurate.
+            # An event that was found in an inaccurate step may not exist, so that the
+            # step must be accepted. A step that ends at an event is a part of a step
+            # that was accepted before.
             solved = solved & (decision.is_accepted | (step.fired >= 0))
         is_discarded = solved & (step.fired < 0) & jnp.any(step.crossed)
         if replay is not None:
@@ -446,7 +454,7 @@ class EventStepper(AbstractStepper[EventCarry, ReplayedIteration]):
         step: TruncatedStep,
         solved: BoolScalar,
     ) -> Decision:
-        """Return what the controller decides on a step or on a part of one."""
+        """Return the decision of the controller about a step or a part of a step."""
         assert self.sizes is not None
         assert carry.place.clock is not None
         clock, place = carry.place.clock, carry.place
@@ -494,7 +502,8 @@ class EventStepper(AbstractStepper[EventCarry, ReplayedIteration]):
             )
         if restarted is None:
             return clock, RESULTS.successful
-        # The rest of the step between two nodes becomes as long as a new one.
+        # After a reset, the rest of the step up to the next node becomes as long as a
+        # new step.
         size, memory, result = restarted
         size, memory = jax.lax.stop_gradient((size, memory))
         is_reset = attempt.fires & jnp.asarray(resets)[attempt.which]
@@ -649,12 +658,12 @@ def _log_at_end(place: EventLoopState, t: FloatScalar, y: State) -> LogEntry:
         node_after=node,
         offset_after=offset,
     )
-    # A log has one row more than it has room for.
+    # The last row of a log is not used.
     return jax.tree.map(lambda x: jnp.stack([x, x]), entry)
 
 
 class EventReverseReplay(AbstractReverseReplay[EventCarry, ReplayedIteration]):
-    """The replay of a run with events, whose log has the states before them."""
+    """The replay of a run with events; the log has the states before the events."""
 
     stepper: EventStepper
     start: EventCarry
@@ -692,10 +701,10 @@ class EventReverseReplay(AbstractReverseReplay[EventCarry, ReplayedIteration]):
     ) -> tuple[ReplayedIteration, StepState]:
         """Find the data of iteration i and the state from which it started.
 
-        Iterations are undone last to first, and `following` says where the next one
-        started. If the last remaining entry of the log has the number of this
-        iteration, the iteration ended at that event, and the step back starts from the
-        state `before` the reset.
+        Iterations are undone from the last to the first, and `following` has the start
+        of iteration i + 1. If the last remaining entry of the log has the number of
+        this iteration, the iteration ended at that event, and the step back starts from
+        the state `before` the reset.
         """
         plain, end = self.stepper.plain, self.end.place
         i = i.astype(jnp.int32)
@@ -771,7 +780,7 @@ class EventReverseReplay(AbstractReverseReplay[EventCarry, ReplayedIteration]):
     def places(
         self, replay: ReplayedIteration, i: Int[Array, ""]
     ) -> tuple[Int[Array, ""], Int[Array, ""]]:
-        """Return the output row that iteration i filled, and its place in the log."""
+        """Return the indices of the output row and of the log entry of iteration i."""
         is_event = replay.which >= 0
         is_last = i.astype(jnp.int32) == self.end.place.num_iterations - 1
         ends_here = self._ended & is_last
