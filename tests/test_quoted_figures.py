@@ -306,8 +306,9 @@ def test_accepted_step_errors_quoted_agree_with_the_result():
     assert int(number) == sum(count.values())
     found = sum(row["simplified accepted"] + row["newton accepted"] for row in rows)
     assert int(accepted.replace(" ", "")) == pytest.approx(found, rel=0.01)
-    floor = quoted(text, "{} of them end within {} times that sum")
-    assert_agree(floor, [count["at the floor"], NOISE_UNITS])
+    sentence = "For {} steps, the distance from the solution is at most {} times this"
+    floor = [count["at the floor"], NOISE_UNITS]
+    assert_agree(quoted(text, sentence), floor)
     sentence = "In {} steps both solvers solve the equations and find two different"
     assert_agree(quoted(text, sentence), [count["two solutions"]])
     sentence = "{} steps have a nearly singular Jacobian"
@@ -316,7 +317,7 @@ def test_accepted_step_errors_quoted_agree_with_the_result():
     assert_agree(quoted(text, sentence), [count["overflow"]])
     assert count["wrong"] == 0
     least = min(row["least h"] for row in doubtful)
-    assert_agree(quoted(text, "step sizes from {} on"), [least])
+    assert_agree(quoted(text, "their step sizes are {} and more"), [least])
 
 
 def test_steps_near_rest_quoted_agree_with_the_result():

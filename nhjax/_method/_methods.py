@@ -25,7 +25,7 @@ from .._errors import check_choice
 from . import _order_conditions
 from ._order_conditions import Hypotheses, SimplifyingAssumptions
 from ._tableau import (
-    CONTEXT,
+    context,
     gauss_tableau,
     integrated_lagrange,
     lagrange,
@@ -533,23 +533,23 @@ def multiplier_closure_weights(t: Tableau, symmetric: bool) -> ClosureWeights:
         [[1.0, 0.0], [0.0, 1.0], [-1.0, 0.0]]
     """
     s = t.stages
-    e = CONTEXT.matrix(s, s - 1)
-    end = [CONTEXT.mpf(0)] * s
+    e = context().matrix(s, s - 1)
+    end = [context().mpf(0)] * s
     if symmetric:
-        e[0, 0] = CONTEXT.one
-        e[s - 1, 0] = CONTEXT.mpf(-round(_order_conditions.stability_at_infinity(t)))
-        end[s - 1] = CONTEXT.one
+        e[0, 0] = context().one
+        e[s - 1, 0] = context().mpf(-round(_order_conditions.stability_at_infinity(t)))
+        end[s - 1] = context().one
         for i in range(1, s - 1):
-            e[i, i] = CONTEXT.one
+            e[i, i] = context().one
     else:
         for i in range(1, s):
-            e[i, i - 1] = CONTEXT.one
+            e[i, i - 1] = context().one
     # Both responses are used in an approximate Jacobian only: float64 suffices.
     weights, last = to_float64(e), to_float64(end)
     response = -np.linalg.solve(t.a[1:] @ weights, t.a[1:] @ last)
     return ClosureWeights(
         E=weights,
-        start=to_float64([CONTEXT.one] + [CONTEXT.mpf(0)] * (s - 1)),
+        start=to_float64([context().one] + [context().mpf(0)] * (s - 1)),
         end=last,
         response=to_float64(list(response)),
         stage_response=to_float64(list(t.a_hat @ (weights @ response + last))),

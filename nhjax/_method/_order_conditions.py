@@ -28,7 +28,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ._tableau import CONTEXT, Matrix, Number, Tableau
+from ._tableau import context, Matrix, Number, Tableau
 
 
 class SimplifyingAssumptions(NamedTuple):
@@ -81,7 +81,9 @@ def simplifying_assumptions(t: Tableau) -> SimplifyingAssumptions:
     a, a_hat, b, c = t.mp_a, t.mp_a_hat, t.mp_b, t.mp_c
 
     def quadrature(k: int) -> list[Number]:
-        return [CONTEXT.fdot(zip(b, _power(c, k - 1), strict=True)) - CONTEXT.one / k]
+        return [
+            context().fdot(zip(b, _power(c, k - 1), strict=True)) - context().one / k
+        ]
 
     def stage(k: int) -> list[Number]:
         sums = _matvec(a, _power(c, k - 1))
@@ -265,11 +267,11 @@ def _products(
 
 
 def _power(c: list[Number], exponent: int) -> list[Number]:
-    return [x**exponent if exponent else CONTEXT.mpf(1) for x in c]
+    return [x**exponent if exponent else context().mpf(1) for x in c]
 
 
 def _matvec(a: Matrix, x: list[Number]) -> list[Number]:
-    return [CONTEXT.fdot(zip(row, x, strict=True)) for row in a.tolist()]
+    return [context().fdot(zip(row, x, strict=True)) for row in a.tolist()]
 
 
 def _largest_order(
@@ -283,7 +285,7 @@ def _largest_order(
 
 
 def _leading_term(
-    rows: list[list[Number]], keep: range, tolerance: Number
+    rows: list[list[Number]], keep: range, tolerance: float
 ) -> tuple[int, Number]:
     """Compute the degree and the leading coefficient of the polynomial det(I - zM).
 
@@ -292,20 +294,20 @@ def _leading_term(
     f_k = -tr(M N_k) / k, N_1 = I, N_{k+1} = M N_k + f_k I.
     """
     n = len(keep)
-    degree, leading = 0, CONTEXT.one
+    degree, leading = 0, context().one
     if n == 0:
         return degree, leading
-    m = CONTEXT.matrix([[rows[i][j] for j in keep] for i in keep])
-    sums: list[Number] = [CONTEXT.fsum(row, absolute=True) for row in m.tolist()]
+    m = context().matrix([[rows[i][j] for j in keep] for i in keep])
+    sums: list[Number] = [context().fsum(row, absolute=True) for row in m.tolist()]
     norm = max(sums)
-    auxiliary = CONTEXT.eye(n)
+    auxiliary = context().eye(n)
     for k in range(1, n + 1):
         product = m * auxiliary
-        f = -CONTEXT.fsum(product[i, i] for i in range(n)) / k
+        f = -context().fsum(product[i, i] for i in range(n)) / k
         # f_k scales like the k-th power of M, and the coefficients decrease like
         # 1/(2n)!. Therefore f_k counts as zero if it is small relative to the last
         # nonzero coefficient, not on an absolute scale.
         if abs(f) > tolerance * abs(leading) * norm ** (k - degree):
             degree, leading = k, f
-        auxiliary = product + f * CONTEXT.eye(n)
+        auxiliary = product + f * context().eye(n)
     return degree, leading

@@ -26,24 +26,33 @@ from typing import Any, TypeAlias
 
 import jax
 import jax.numpy as jnp
-import mpmath
 import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
-
-# A separate context, independent of a user's `mpmath.mp.dps`. With 60 digits, order
-# conditions can be checked to 1e-40 with 20 digits to spare.
-CONTEXT = mpmath.MPContext()
-CONTEXT.dps = 60
 
 # mpmath creates the classes of numbers and matrices for each context.
 Number: TypeAlias = Any
 Matrix: TypeAlias = Any
 
 
-BUILT_IN_TOLERANCE = CONTEXT.mpf("1e-40")
-USER_TOLERANCE = CONTEXT.mpf("1e-13")
+BUILT_IN_TOLERANCE = 1e-40
+USER_TOLERANCE = 1e-13
+
+
+@cache
+def context() -> Any:
+    """Return the context of all computations with mpmath.
+
+    It is independent of a user's `mpmath.mp.dps`. With 60 digits, order conditions can
+    be checked to 1e-40 with 20 digits to spare.
+    """
+    # `import nhjax` does not need mpmath, which would be a sixth of its time.
+    import mpmath
+
+    made = mpmath.MPContext()
+    made.dps = 60
+    return made
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,7 +69,7 @@ class Tableau:
     mp_a: Matrix
     mp_b: list[Number]
     mp_c: list[Number]
-    tolerance: Number
+    tolerance: float
 
     @property
     def stages(self) -> int:
@@ -71,7 +80,7 @@ class Tableau:
     def mp_a_hat(self) -> Matrix:
         """Compute the symplectic conjugate â_ij = b_j (1 - a_ji / b_i)."""
         a, b, s = self.mp_a, self.mp_b, self.stages
-        a_hat = CONTEXT.matrix(s, s)
+        a_hat = context().matrix(s, s)
         for i in range(s):
             for j in range(s):
                 # If a_ji = b_i, the entry is exactly zero, but b_j - b_j a_ji / b_i
@@ -116,8 +125,8 @@ def lagrange_in_legendre(nodes: list[Number]) -> Matrix:
     The s x s mpmath matrix K.
     """
     s = len(nodes)
-    vandermonde = CONTEXT.matrix([legendre(s - 1, 2 * c - 1) for c in nodes])
-    return CONTEXT.inverse(vandermonde)
+    vandermonde = context().matrix([legendre(s - 1, 2 * c - 1) for c in nodes])
+    return context().inverse(vandermonde)
 
 
 def _integrated_legendre(degree: int, x: Number) -> list[Number]:
@@ -134,11 +143,11 @@ def _collocation(points: list[Number]) -> Tableau:
     s = len(points)
     nodes = [(1 + x) / 2 for x in points]
     k = lagrange_in_legendre(nodes)
-    integrals = CONTEXT.matrix([_integrated_legendre(s - 1, x) for x in points])
+    integrals = context().matrix([_integrated_legendre(s - 1, x) for x in points])
     # Only P_0 has a nonzero integral over [0, 1].
     b = [(k[0, j] + k[0, s - 1 - j]) / 2 for j in range(s)]
     raw = integrals * k
-    a = CONTEXT.matrix(s, s)
+    a = context().matrix(s, s)
     for i in range(s):
         for j in range(s):
             # Average a_ij with its reflection b_j - a_{s+1-i,s+1-j}, which equals it in
@@ -147,7 +156,7 @@ def _collocation(points: list[Number]) -> Tableau:
     if points[0] == -1:
         # The integrals to c_1 = 0 and c_s = 1 are known exactly.
         for j in range(s):
-            a[0, j], a[s - 1, j] = CONTEXT.mpf(0), b[j]
+            a[0, j], a[s - 1, j] = context().mpf(0), b[j]
     return Tableau(a, b, nodes, BUILT_IN_TOLERANCE)
 
 
@@ -215,9 +224,9 @@ def user_tableau(a: tuple[tuple[float, ...], ...], b: tuple[float, ...]) -> Tabl
         >>> user_tableau(((0.0, 0.0), (0.5, 0.5)), (0.5, 0.5)).c.tolist()
         [0.0, 1.0]
     """
-    mp_a = CONTEXT.matrix([[CONTEXT.mpf(x) for x in row] for row in a])
-    mp_b = [CONTEXT.mpf(x) for x in b]
-    mp_c = [CONTEXT.fsum(mp_a[i, j] for j in range(len(b))) for i in range(len(b))]
+    mp_a = context().matrix([[context().mpf(x) for x in row] for row in a])
+    mp_b = [context().mpf(x) for x in b]
+    mp_c = [context().fsum(mp_a[i, j] for j in range(len(b))) for i in range(len(b))]
     return Tableau(mp_a, mp_b, mp_c, USER_TOLERANCE)
 
 
@@ -262,7 +271,7 @@ def lobatto_points(stages: int) -> list[Number]:
 
     guesses = [math.cos(math.pi * k / n) for k in range(1, stages // 2)]
     inner = [_newton(derivative, g) for g in guesses]
-    return _mirrored([CONTEXT.mpf(1), *inner], stages)
+    return _mirrored([context().mpf(1), *inner], stages)
 
 
 def gauss_points(stages: int) -> list[Number]:
@@ -293,21 +302,21 @@ def gauss_points(stages: int) -> list[Number]:
 
 def _newton(f: Callable[[Number], tuple[Number, Number]], guess: float) -> Number:
     """Find the root of `f` near `guess`; `f` returns its value and derivative."""
-    x = CONTEXT.mpf(guess)
+    x = context().mpf(guess)
     for _ in range(100):
         value, slope = f(x)
         step = value / slope
         x = x - step
         # Newton's method converges quadratically: the error after this step is far
         # below 1e-60.
-        if abs(step) < CONTEXT.mpf("1e-40"):
+        if abs(step) < context().mpf("1e-40"):
             return x
     raise RuntimeError("Newton's iteration for the nodes of a tableau did not converge")
 
 
 def _mirrored(right: list[Number], count: int) -> list[Number]:
     """Build all points, symmetric and increasing, from the positive points."""
-    centre = [CONTEXT.mpf(0)] if count % 2 else []
+    centre = [context().mpf(0)] if count % 2 else []
     return [-x for x in right] + centre + right[::-1]
 
 
@@ -343,7 +352,7 @@ def _basis_coefficients(t: Tableau) -> tuple[np.ndarray, np.ndarray]:
                     "the Lagrange basis needs distinct nodes"
                 )
     k = lagrange_in_legendre(c)
-    integrated = CONTEXT.matrix(s, s)
+    integrated = context().matrix(s, s)
     for n in range(1, s):
         for j in range(s):
             integrated[n, j] = -2 * k[n, j] / (n * (n + 1))
