@@ -114,33 +114,39 @@ def _programs(params: Any) -> Iterator[Any]:
             yield leaf
 
 
-def rms_array_size(program: Any) -> float:
+def rms_array_size(program: Any, per_loop: int = 1) -> float:
     """Return the root mean square of the sizes of arrays in arithmetic.
+
+    An operation inside a loop counts `per_loop` times as much as an operation around
+    the loop.
 
     In a program with loops, large arrays outside of them do not count: they are often
     the rows of all steps, and the steps take far longer than an operation on the rows.
     """
-    found = list(_arithmetic_sizes(program, is_repeated=False))
-    has_loop = any(is_repeated for _, is_repeated in found)
+    found = list(_arithmetic_sizes(program, 0))
+    has_loop = any(depth for _, depth in found)
     squares = [
-        size * size
-        for size, is_repeated in found
-        if is_repeated or not has_loop or size <= LARGEST_REDUCTION
+        (size * size, per_loop**depth)
+        for size, depth in found
+        if depth or not has_loop or size <= LARGEST_REDUCTION
     ]
-    return math.sqrt(sum(squares) / len(squares)) if squares else 0.0
+    if not squares:
+        return 0.0
+    total = sum(weight for _, weight in squares)
+    return math.sqrt(sum(square * weight for square, weight in squares) / total)
 
 
-def _arithmetic_sizes(program: Any, is_repeated: bool) -> Iterator[tuple[int, bool]]:
-    """List the sizes of arrays in arithmetic, and whether a loop repeats it."""
+def _arithmetic_sizes(program: Any, depth: int) -> Iterator[tuple[int, int]]:
+    """List the sizes of arrays in arithmetic, and how many loops contain it."""
     for equation in program.eqns:
         name = equation.primitive.name
         if name in _ARITHMETIC:
-            yield _size(equation.outvars[0]), is_repeated
+            yield _size(equation.outvars[0]), depth
         if name == SMALL_PRODUCT:
             for size in _sizes_of_product(equation):
-                yield size, is_repeated
+                yield size, depth
         for part in _programs(equation.params):
-            yield from _arithmetic_sizes(part, is_repeated or name in ("scan", "while"))
+            yield from _arithmetic_sizes(part, depth + (name in ("scan", "while")))
 
 
 def _sizes_of_product(product: Any) -> Iterator[int]:

@@ -31,11 +31,15 @@ class CompileOptions(NamedTuple):
         compiled in less time, to slower code.
     - `engines`: the engines that may compile it, and its derivatives, in the order in
         which they are tried.
+    - `xla_below`: a program with fewer operations than this is compiled by XLA if XLA
+        compiles the program around it. Calls of native code from a loop of XLA take
+        longer than few operations.
     - `note`: text that the function `engines` adds to the reason.
     """
 
     is_brief: bool = False
     engines: tuple[str, ...] = ENGINES
+    xla_below: int = 0
     note: str = ""
 
 

@@ -379,13 +379,17 @@ def _name(*texts: str) -> str:
 # programs between the two sizes, and all programs above `_LARGE_ARRAYS`.
 _SMALL_ARRAYS, _LARGE_ARRAYS = 40, 110
 _SHORT_PROGRAM = 2800
+# A program can have its large arrays in operations that are made once a step, and small
+# arrays in the iteration of the step. The code of this compiler is faster then.
+_PER_LOOP, _SMALL_IN_LOOPS = 16, 32
 
 
 def _suits_vectors(program: Any) -> bool:
     """Return whether XLA should compile a single run, with vectors for its arrays."""
     size = rms_array_size(program)
     if _SMALL_ARRAYS < size <= _LARGE_ARRAYS:
-        return _count_operations(program) < _SHORT_PROGRAM
+        is_small = rms_array_size(program, _PER_LOOP) <= _SMALL_IN_LOOPS
+        return not is_small and _count_operations(program) < _SHORT_PROGRAM
     return size > _LARGE_ARRAYS
 
 
@@ -406,7 +410,10 @@ class _Ways(NamedTuple):
 @rare_collections()
 def _lower_single(ctx: Any, *operands: Any, program: Any, options: CompileOptions):
     params = {"program": program, "options": options}
-    if is_within_kernel():
+    is_inlined = is_part_of_a_program() and (
+        _count_operations(program.jaxpr) < options.xla_below
+    )
+    if is_within_kernel() or is_inlined:
         return _single_by_xla(ctx, *operands, **params)
     reason = reason_against_lanes()
     is_free = reason is None and chosen_engine() is None

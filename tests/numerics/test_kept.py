@@ -227,3 +227,31 @@ def test_functions_of_a_system_are_called_once_for_all_uses():
     assert seen.call_count == 2
     nhjax.check_system(system, q, v, args=stiffness)
     assert seen.call_count == 3
+
+
+def test_run_that_xla_compiles_calls_native_code_for_long_functions_only(monkeypatch):
+    # XLA compiles all programs but the functions of the system.
+    patched = "nhjax.lanes._program."
+    monkeypatch.setattr(f"{patched}_suits_vectors", _contains_kept_functions)
+    monkeypatch.setattr(f"{patched}reason_against_kernel", lambda program: "large")
+
+    def engines(terms):
+        def lagrangian(t, q, v, args):
+            potential = sum(jnp.cos((k + 1) * q[0]) for k in range(terms))
+            return 0.5 * v @ v - potential
+
+        system = nhjax.LagrangianSystem(lagrangian)
+        y0 = nhjax.initial_state(system, jnp.ones(2), jnp.ones(2))
+
+        def run(y0):
+            method = nhjax.LobattoIIIAB(2)
+            return nhjax.integrate(system, method, y0, dt=0.1, num_steps=3, throw=False)
+
+        return {use.engine for use in nhjax.engines(run, y0)}
+
+    assert engines(3) == {"xla"}
+    assert engines(300) == {"xla", "lanes"}
+
+
+def _contains_kept_functions(program):
+    return "kept_call" in str(program)
