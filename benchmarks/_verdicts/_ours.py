@@ -85,8 +85,9 @@ def _coincidences() -> Found:
                 f"{of('DLA, SPARK 2')}",
                 command(PART),
                 OURS if one else REFUTED,
-                "½ (b(q_k) + b(q_{k+1})) = b(½ (q_k + q_{k+1})) for such b; the CVT "
-                f"has sin y; {RECONSTRUCTED}",
+                "½ (b(q_k) + b(q_{k+1})) = b(½ (q_k + q_{k+1})) if the direction b(q) "
+                "of the constraint is affine in q; in the CVT, b contains sin y; "
+                f"{RECONSTRUCTED}",
             ),
             Claim(
                 "Lobatto-2 of the paper is the leapfrog with the constraint at the "

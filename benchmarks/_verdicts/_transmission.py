@@ -196,7 +196,7 @@ def _others(by_epsilon: dict[float, CVTEnergy], baselines: dict) -> Claim:
         "|E - E_0| in the first / last fifth, h = 1/10, ε = 1/2: " + "; ".join(texts),
         command(PART),
         DEPENDS,
-        ("the paper's method gains where the rotating driver is perturbed" if gains else
-         "none is better throughout")
+        ("the paper's method does not drift where the rotating driver is perturbed"
+         if gains else "none is better throughout")
         + f"; drifting: {', '.join(drifts)}; {RECONSTRUCTED}",
     )  # fmt: skip
