@@ -775,8 +775,8 @@ def _textbook_systems() -> list[Picture]:
             "position and velocity",
             _two_stages,
             "change of energy [J]",
-            "with long steps of two stages the energy oscillates and returns after 12 "
-            "steps",
+            "with two stages and long steps the energy oscillates, and the motion "
+            "returns to its start after 12 steps",
             axes=("q [m]", "v [m/s]"),
         ),
         Picture(

@@ -803,7 +803,7 @@ class Contacts(eqx.Module):
 
         **Returns:** vectors of shape (3,), by the names of the contacts.
 
-        **Raises:** `ShapeError` if the state has another number of multipliers.
+        **Raises:** `ShapeError` if the number of multipliers does not fit the contacts.
         """
         check_type("y", y, State)
         check_choice("`frame`", frame, ("space", "contact"))

@@ -169,7 +169,7 @@ def _parts(value: Any) -> Iterator[Part]:
 
 
 def _read_by(function: types.FunctionType) -> Iterator[Part]:
-    """Yield the closed-over values, defaults and read globals of a function.
+    """Yield a function's closed-over values, its defaults and the globals it reads.
 
     The globals of libraries are assumed to stay the same. If a value is a module of the
     user, yield also the variables of the module whose names occur as attributes in the

@@ -27,7 +27,7 @@ from ._processes import Processes
 from ._reductions import AbstractReduction
 
 
-# The step of a failure whose step is not known.
+# The number that stands for an unknown step.
 UNKNOWN_STEP = -1
 # The name of the mesh axis along which members are spread over devices.
 AXIS = "members"
@@ -181,7 +181,7 @@ class Members:
 
 
 class _MemberFromArrays(eqx.Module):
-    """Create a member from its leaves, with random keys from their integers."""
+    """Create a member from its leaves, and its random keys from their integer data."""
 
     treedef: Any = eqx.field(static=True)
     keys: tuple[Any, ...] = eqx.field(static=True)

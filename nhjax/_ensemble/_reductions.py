@@ -378,7 +378,7 @@ class Histogram(AbstractReduction):
         return jax.tree.map(jnp.add, one, other)
 
     def finish(self, state: PyTree[Array]) -> Any:
-        """Compute the counts of the bins as differences between neighbouring edges."""
+        """Compute the count of each bin from the counts at or above its two edges."""
 
         def leaf(x):
             total, not_nan, reached = x[0], x[1], x[2:]

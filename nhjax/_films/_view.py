@@ -114,8 +114,8 @@ def view(
     - `machine`, `sol`: as for `nhjax.render`.
     - `port`: the port of the server; if it is taken, the next free one is used.
     - `speed`: the number of seconds of the motion that are shown in one second.
-    - `block`: whether to wait until Ctrl-C. The default is to wait in a script, which
-        would end otherwise, and not in an interactive session.
+    - `block`: whether to wait until Ctrl-C. The default is True in a script, which
+        would otherwise end at once, and False in an interactive session.
 
     **Returns:** a `Show` with the fields `url` and `server` and the methods `show(t)`
     and `stop()`.

@@ -80,7 +80,7 @@ def motions(joints: Sequence[Joint]) -> Float[np.ndarray, "4 n 12"]:
 
 
 def pose_of_joint(joint: Joint, angle: float) -> Float[np.ndarray, "4 4"]:
-    """Return the pose after a hinge that has turned by an angle from rest."""
+    """Return a hinge's pose in the frame of its parent, at an angle from rest."""
     parts = np.array([1.0, np.sin(angle), 1 - np.cos(angle), angle])
     numbers = np.tensordot(parts, motions([joint])[:, 0], axes=1)
     found = np.eye(4)

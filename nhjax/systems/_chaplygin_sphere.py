@@ -16,7 +16,7 @@ class ChaplyginSphere(AbstractRollingBody):
     ℓ = m/2 |v|² + ½ (I₁ω₁² + I₂ω₂² + I₃ω₃²) - m g z,  Φ = z - r,
     φ = (R (v - r ω × γ))₁₂,  γ = Rᵀ e₃,
 
-    with q = (R, x): the attitude, a quaternion, and the position of the centre, which
+    with q = (R, x): the attitude quaternion and the position of the centre, which
     is also the centre of mass [m]; (v, ω) are their body velocities along the principal
     axes [m/s, 1/s]. Φ is the height of the contact, and φ the horizontal velocity
     there; their multipliers are the force of the plane in space [N].

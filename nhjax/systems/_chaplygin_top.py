@@ -22,7 +22,7 @@ class ChaplyginTop(AbstractRollingBody):
     ℓ = m/2 |v|² + ½ (I₁ω₁² + I₂ω₂² + I₃ω₃²) - m g z,  Φ = z + e₃·(R s),
     φ = (R (v + ω × s))₁₂,  s = a e₃ - r γ,  γ = Rᵀ e₃,
 
-    with q = (R, x): the attitude, a quaternion, and the position of the centre of mass
+    with q = (R, x): the attitude quaternion and the position of the centre of mass
     [m]; (v, ω) are their body velocities along the principal axes [m/s, 1/s]. If the
     third axis is upward, the centre of mass is below the centre of the sphere by a. The
     contact is s, seen from the centre of mass; Φ is its height, and φ the horizontal

@@ -26,7 +26,7 @@ class Rattleback(AbstractRollingBody):
     ℓ = m/2 |v|² + ½ ω·(J ω) - m g z,  Φ = z + e₃·(R s),  φ = (R (v + ω × s))₁₂,
     s = h e₃ - A γ / √(γ·(A γ)),  A = diag(a², b², c²),  γ = Rᵀ e₃,
 
-    with q = (R, x): the attitude, a quaternion, and the position of the centre of mass
+    with q = (R, x): the attitude quaternion and the position of the centre of mass
     [m]; (v, ω) are their body velocities [m/s, 1/s]. The body axes are the axes of the
     ellipsoid, the third one upward at rest, and s is the lowest point, seen from the
     centre of mass. Φ is its height, and φ the horizontal velocity at the contact; their

@@ -34,8 +34,8 @@ class RollerRacer(AbstractGaitMachine):
     constraints do not determine the turning rate.
 
     The pivot is either prescribed by a `gait`, Γ = φ - gait(t), or with `gait=None` it
-    moves freely under the torque [N m] in `args`, a scalar or `None`. By default it
-    swings as a sine, which drives the seat from rest.
+    moves freely under the torque [N m] in `args`, a scalar or `None`. The default gait
+    is a sine, which accelerates the seat from rest.
 
     **Parameters:** `masses` (m₁, m₂) [kg], `inertias` (I₁, I₂) [kg m²], `distances`
     (d₁, d₂) [m]; `gait`, a function of time. The mass of the handlebar may be 0.

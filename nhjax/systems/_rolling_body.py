@@ -25,7 +25,7 @@ class AbstractRollingBody(AbstractConstrainedGroupExample):
 
     ℓ = m/2 |v|² + ½ ω·(J ω) - m g z,  Φ = z + e₃·(R s),  φ = (R (v + ω × s))₁₂,
 
-    with q = (R, x): the attitude, a quaternion, and the position of the centre of mass
+    with q = (R, x): the attitude quaternion and the position of the centre of mass
     [m]; (v, ω) are their body velocities [m/s, 1/s]. The lowest point of the body is s,
     seen from the centre of mass in body axes: Φ is its height, and φ the horizontal
     velocity of the material point that is there. The multipliers are the force of the

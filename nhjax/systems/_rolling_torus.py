@@ -24,7 +24,7 @@ class RollingTorus(AbstractRollingBody):
     ℓ = m/2 |v|² + ½ (I (ω₁² + ω₂²) + J ω₃²) - m g z,  Φ = z + e₃·(R s),
     φ = (R (v + ω × s))₁₂,  s = -r γ - a (γ₁, γ₂, 0)/√(γ₁² + γ₂²),  γ = Rᵀ e₃,
 
-    with q = (R, x): the attitude, a quaternion, and the position of the centre [m]; (v,
+    with q = (R, x): the attitude quaternion and the position of the centre [m]; (v,
     ω) are their body velocities [m/s, 1/s], and the third body axis is the axle. The
     lowest point is s, seen from the centre; Φ is its height, and φ the horizontal
     velocity at the contact. The multipliers are the force of the plane in space [N].
