@@ -2,9 +2,9 @@
 
 Time of the processor to trace, lower and compile a run with three stages and its
 gradient: of a particle with three coordinates, and of the bicycle of SymPy's tests with
-eight, each with its constraints. The hand-written ones are those of the gallery. Each
-is compiled in a process of its own, since later calls find programs of earlier ones.
-The least of several times counts.
+eight, each with its constraints. The models by hand are those of the gallery. Each
+first call has a process of its own, since a later call would find programs of an
+earlier call. The least of several times counts.
 
     python -m benchmarks.sympy_models
 """

@@ -1033,7 +1033,7 @@ def slips(
     - `contacts`, `contact`: the contacts of the system, and the name of one of them.
     - `friction`: μ.
     - `load`: N, as for `nhjax.friction.Sliding`: a number [N] or a function of
-        (t, q, v, multipliers, args). By default it is the multiplier of the height.
+        (t, q, v, multipliers, args). The default is the multiplier of the height.
     - `options`: passed on to `nhjax.Event`; by default the event ends the run.
 
     **Raises:** `TypeError` if `friction` is not a number; `ValueError` if there is no

@@ -550,6 +550,18 @@ def test_view_shows_meshes_ellipsoids_and_round_bars():
     assert faces.max() == len(vertices) - 1
 
 
+def test_view_does_not_show_a_plane_that_is_transparent():
+    hidden = nhjax.Looks(
+        "<mujoco><worldbody><geom type='plane' size='1 1 1' rgba='0 0 0 0'/>"
+        "<body name='ball'><geom size='0.1'/></body></worldbody></mujoco>",
+        lambda t, q, args: {"ball": (q, jnp.eye(3, dtype=q.dtype))},
+    )
+    server = Server()
+    sol = made_up([0], [[0.0, 0.0, 0.0]], [[0.0, 0.0, 0.0]])
+    Show(server, Scene("view", hidden, sol, np.zeros(1), True), 1.0).stop()
+    assert "grid" not in {shape.kind for shape in server.shapes.values()}
+
+
 def test_view_serves_a_page_or_says_what_is_missing():
     disc, sol = rolling_disc()
     if importlib.util.find_spec("viser") is None:

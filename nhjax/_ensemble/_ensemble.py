@@ -23,8 +23,8 @@ from ._sinks import (
 from ._store import CheckpointedReductionSink, ZarrSink
 
 
-# By default a chunk has `_MEMBERS` members for each device, which keeps all cores busy,
-# or fewer, so that the values of these members take at most `_BYTES` bytes.
+# By default a chunk has `_MEMBERS` members for each device, which keep all cores busy.
+# It has fewer members if the values of so many would take more than `_BYTES` bytes.
 _MEMBERS, _BYTES = 1024, 2**26
 # Suffixes of file formats. `out` names a folder, and must not end in one of them.
 _FILES = (".nc", ".nc4", ".h5", ".hdf5", ".csv", ".npy", ".npz", ".mat", ".pkl")

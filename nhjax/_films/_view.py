@@ -159,10 +159,7 @@ def _add_shapes(server: Any, scene: Scene) -> dict[int, Any]:
     for geom in visible_geoms(model):
         body = int(model.geom_bodyid[geom])
         name = f"/scene/bodies/{body}/{geom}" if body else f"/scene/world/{geom}"
-        if model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_PLANE:
-            _add_ground(server.scene, scene, geom, name)
-        else:
-            _add_geom(mujoco, server.scene, model, geom, name)
+        _add_geom(mujoco, server.scene, scene, geom, name)
     for k, path in enumerate(scene.trails):
         if len(path) > 1:
             server.scene.add_line_segments(
@@ -180,12 +177,14 @@ def _add_shapes(server: Any, scene: Scene) -> dict[int, Any]:
     return frames
 
 
-def _add_ground(space: Any, scene: Scene, geom: int, name: str) -> None:
+def _add_ground(
+    space: Any, scene: Scene, name: str, position: np.ndarray, wxyz: np.ndarray
+) -> None:
     """Add a grid that is large enough for the whole path of the machine."""
-    model, extent = scene.model, float(scene.model.stat.extent)
-    position, section = model.geom_pos[geom].copy(), 2.5 * extent
+    extent = float(scene.model.stat.extent)
+    section = 2.5 * extent
     width = 40 * extent + 2 * float(np.max(np.ptp(scene.centres, axis=0)))
-    if model.geom_quat[geom][0] == 1:
+    if wxyz[0] == 1:
         away = np.mean(scene.centres, axis=0) - position
         position[:2] += section * np.round(away[:2] / section)
     space.add_grid(
@@ -198,11 +197,12 @@ def _add_ground(space: Any, scene: Scene, geom: int, name: str) -> None:
         plane_opacity=1.0,
         shadow_opacity=0.35,
         position=position,
-        wxyz=model.geom_quat[geom].copy(),
+        wxyz=wxyz,
     )
 
 
-def _add_geom(mujoco: Any, space: Any, model: Any, geom: int, name: str) -> None:
+def _add_geom(mujoco: Any, space: Any, scene: Scene, geom: int, name: str) -> None:
+    model = scene.model
     kinds, size = mujoco.mjtGeom, model.geom_size[geom]
     rgba = model.geom_rgba[geom]
     if model.geom_matid[geom] >= 0 and np.allclose(rgba, PLAIN):
@@ -213,6 +213,9 @@ def _add_geom(mujoco: Any, space: Any, model: Any, geom: int, name: str) -> None
         "position": model.geom_pos[geom].copy(),
         "wxyz": model.geom_quat[geom].copy(),
     }
+    if model.geom_type[geom] == kinds.mjGEOM_PLANE:
+        _add_ground(space, scene, name, **options)
+        return
     color = tuple(int(255 * x) for x in rgba[:3])
     options |= {"color": color, "opacity": None if rgba[3] == 1 else float(rgba[3])}
     kind = model.geom_type[geom]

@@ -388,8 +388,8 @@ def _suits_vectors(program: Any) -> bool:
     """Return whether XLA should compile a single run, with vectors for its arrays."""
     size = rms_array_size(program)
     if _SMALL_ARRAYS < size <= _LARGE_ARRAYS:
-        is_small = rms_array_size(program, _PER_LOOP) <= _SMALL_IN_LOOPS
-        return not is_small and _count_operations(program) < _SHORT_PROGRAM
+        is_short = _count_operations(program) < _SHORT_PROGRAM
+        return is_short and rms_array_size(program, _PER_LOOP) > _SMALL_IN_LOOPS
     return size > _LARGE_ARRAYS
 
 

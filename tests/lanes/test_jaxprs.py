@@ -1,4 +1,4 @@
-"""What is counted in programs, to choose the engine that compiles them."""
+"""The sizes of arrays in a program, which decide the engine that compiles it."""
 
 import jax
 import jax.numpy as jnp
